@@ -120,14 +120,14 @@ class Journal:
         pid = about.pop("pid", None)
         self._begun = run, time.time(), None, None, None, _dump(about), pid
         self._begun_steps: dict[int, tuple[str, int, float]] = {}
-        self._insert("runs", "id, started, ended, outcome, reason, info, pid", *self._begun)
+        self._insert("runs", "id, started, ended, outcome, reason, info, pid", self._begun)
 
     def step_started(self, name: str, attempt: int) -> int:
         """Record that an attempt (counted from 1) at a step begins; returns the key for `step_ended`."""
         begun = name, attempt, time.time()
         row = *begun, None, "running", None, None, None
         key = self._insert(
-            "steps", "run, name, attempt, started, ended, state, duration_s, result, error", self.run, *row
+            "steps", "run, name, attempt, started, ended, state, duration_s, result, error", (self.run, *row)
         )
         self._begun_steps[key] = begun
         return key
@@ -145,7 +145,7 @@ class Journal:
 
     def event(self, kind: str, step: str | None = None, data: Mapping[str, object] | None = None) -> None:
         """Record something that happened; `data` is JSON-ready."""
-        self._insert("events", "run, at, kind, step, data", self.run, time.time(), kind, step, _dump(data or {}))
+        self._insert("events", "run, at, kind, step, data", (self.run, time.time(), kind, step, _dump(data or {})))
 
     def run_ended(self, outcome: str, reason: str) -> None:
         """Record the end of the run."""
@@ -177,7 +177,7 @@ class Journal:
             self._asked.close()
             self._base.close()
 
-    def _insert(self, table: str, columns: str, *values: object) -> int:
+    def _insert(self, table: str, columns: str, values: tuple[object, ...]) -> int:
         marks = ", ".join("?" * (len(values) + 1))
         return self._write(f"INSERT INTO {table} ({columns}, crc) VALUES ({marks})", *values, _crc(*values))
 
@@ -228,8 +228,8 @@ def read(folder: Path, *, whole: bool = False) -> JournalRecord:
             return _is(value, kind, needed=False)
 
         runs = tuple(
-            RunRow(_is(key, str), _is(started, float), may(ended, float), may(outcome, str), may(reason, str),
-                   _table(info), None if pid is None else int(pid))
+            RunRow(_is(key, str), _is(started, float), may(ended, float), may(outcome, str), reason=may(reason, str),
+                   info=_table(info), pid=None if pid is None else int(pid))
             for key, started, ended, outcome, reason, info, pid in _checked(
                 base, "runs", "id, started, ended, outcome, reason, info, pid", "ORDER BY rowid"
             )
@@ -238,8 +238,9 @@ def read(folder: Path, *, whole: bool = False) -> JournalRecord:
             raise JournalError(f"the journal in {folder} holds no run")
         own = "WHERE run = ? ORDER BY id", runs[-1].id
         steps = tuple(
-            StepRow(_is(name, str), int(attempt), _is(started, float), may(ended, float), _is(state, str),
-                    may(duration, float), None if result is None else _table(result), may(error, str))
+            StepRow(_is(name, str), int(attempt), _is(started, float), ended=may(ended, float), state=_is(state, str),
+                    duration_s=may(duration, float), result=None if result is None else _table(result),
+                    error=may(error, str))
             for _, name, attempt, started, ended, state, duration, result, error in _checked(
                 base, "steps", "run, name, attempt, started, ended, state, duration_s, result, error", *own
             )

@@ -39,7 +39,7 @@ def performed(
             watchman.teller.failed(step.name, attempt, end, "tried again")
             sequence.fire(JobTrigger.RETRY)
         elif end.recoverable and step.on_failure is OnFailure.RECOVER and recover is not None:
-            failed, by = recovered(step, end, error, recover, sequence, watchman)
+            failed, by = recovered(step, end, error, recover=recover, sequence=sequence, watchman=watchman)
             if failed is not None:
                 return failed
             watchman.teller.failed(step.name, attempt, end, f"confirmed by {by}, recovered" if by else "recovered")

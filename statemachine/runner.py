@@ -140,7 +140,7 @@ class Runner:
 
     def _perform(self, step: Step) -> Failure | None:
         """Do one step, with its repetitions; None when it has succeeded."""
-        return performed(step, self._attempts, self.recover, self.sequence, self._watchman, self._hold)
+        return performed(step, self._attempts, self.recover, self.sequence, watchman=self._watchman, hold=self._hold)
 
     # --- the end ---
 
@@ -173,9 +173,9 @@ class Runner:
             outcome,
             said,
             code,
-            tuple(self._attempts.records[name] for name in self.sequence.steps),
-            dict(self._attempts.results),
-            self._watchman.error,
-            self.control.signal,
-            tuple(self._teller.faults),
+            steps=tuple(self._attempts.records[name] for name in self.sequence.steps),
+            results=dict(self._attempts.results),
+            error=self._watchman.error,
+            signal=self.control.signal,
+            faults=tuple(self._teller.faults),
         )

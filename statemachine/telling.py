@@ -34,7 +34,7 @@ class Teller:
             attempt, code, reason = (event.data[key] for key in ("attempt", "code", "reason"))
             remedy = str(event.data.get("remedy", "noted"))
             assert isinstance(attempt, int)
-            self.faults.append(FaultRecord(event.at, event.step or "", attempt, str(code), str(reason), remedy))
+            self.faults.append(FaultRecord(event.at, event.step or "", attempt, str(code), str(reason), remedy=remedy))
         observer = self._observer
         if observer is not None:
             try:

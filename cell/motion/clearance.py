@@ -57,7 +57,7 @@ def first_touch(
         if opening:
             needed = np.where(needed > -np.inf, np.maximum(needed, np.minimum(kept, apart - GIVE)), needed)
         room = np.maximum(apart - needed, 2.0 * ROUNDING)
-        joints, place, sample = _onwards(model, samples, turned, place, sample, room)
+        joints, place, sample = _onwards(model, samples, turned, place=place, sample=sample, room=room)
         apart = model.distances(joints)
 
 

@@ -146,12 +146,12 @@ class JobRun:
                 self.config,
                 self.job,
                 self.nominal,
-                self.calibration,
-                self.devices,
-                frames,
-                folder,
-                whereabouts,
-                self.earlier,
+                calibration=self.calibration,
+                devices=self.devices,
+                frames=frames,
+                folder=folder,
+                whereabouts=whereabouts,
+                earlier=self.earlier,
                 needs_part=self.kind.places,
                 sweeping=self._sweeping,
                 registered=self._registered,
@@ -191,16 +191,17 @@ class JobRun:
         if self.devices.following is not None:
             facts["following"] = self._following(self.devices.following)
         report = make_report(
-            folder, self.config, self.job, self.nominal, here.repeatability, result, facts, started, witness, frames,
+            folder, self.config, self.job, nominal=self.nominal, repeatability=here.repeatability, result=result,
+            info=facts, started=started, witness=witness, frames=frames,
         )  # fmt: skip
         return RunOutcome(
             report["outcome"],
             report["reason"],
             folder,
-            report,
-            result.results,
-            self.run.control,
-            time.time() - started,
+            report=report,
+            results=result.results,
+            control=self.run.control,
+            wall_s=time.time() - started,
         )
 
     def _sweeping(self, collector: SweepCollector, base_from_surface: pin.SE3) -> None:

@@ -245,7 +245,15 @@ class ArmSession:
     # --- inside ---
 
     def _connect(self, wanted: Callable[[], bool]) -> ArmLink:
-        return ArmLink(self._name, self.setup, self._connect_timeout, self._take, self._on_ended, self._on_lost, wanted)
+        return ArmLink(
+            self._name,
+            self.setup,
+            self._connect_timeout,
+            on_snapshot=self._take,
+            on_ended=self._on_ended,
+            on_lost=self._on_lost,
+            wanted=wanted,
+        )
 
     def _take(self, snapshot: Snapshot) -> None:
         self.statistics.traffic.received(snapshot)

@@ -252,7 +252,7 @@ class V4l2Camera:
             self._count += max(1, round((stamp - self._stamp) * self._timing.frame_rate))
         self._stamp = stamp
         host = received - age * self._clock.rate - self.time_bound
-        return Frame(to_grey(raw, self.shape), self._count, self._timing.exposure, stamp, host, received)
+        return Frame(to_grey(raw, self.shape), self._count, self._timing.exposure, stamp, host, received=received)
 
     def _fault(self, code: str, what: str, hint: str) -> DeviceFault:
         return DeviceFault(self.name, code, f"{what} from {self._path}", recoverable=False, hint=hint)

@@ -140,7 +140,7 @@ class AgilexVehicle:
         heard = [(stamp * self._clock.rate, frame) for stamp, frame in frames]
         interface = None if self._system_name is None else can_interface(self._system_name)
         judged = self._clock.rate <= 1.0
-        return health.readings(heard, seconds, self._bitrate, self._database, interface, judged)
+        return health.readings(heard, seconds, self._bitrate, self._database, interface=interface, judge_times=judged)
 
     def state(self, max_age: float = 0.2) -> VehicleState:
         """The newest feedback, at most `max_age` s old (see `MessageFeedback.state`), else `DeadlineError`."""
@@ -223,8 +223,8 @@ class AgilexVehicle:
         Raises `LimitError`, `InterlockError` before `enable()`, `DeviceFault` as `check` does, `Aborted` while a stop
         is under way.
         """
-        speed = check_range(self.name, "speed", speed, -self._max_speed, self._max_speed, "m/s")
-        yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, "rad/s")
+        speed = check_range(self.name, "speed", speed, low=-self._max_speed, high=self._max_speed, unit="m/s")
+        yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, unit="rad/s")
         self._link.require_unspoken()
         self._check(driving=True)
         with self._command:

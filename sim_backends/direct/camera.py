@@ -148,7 +148,7 @@ class DirectCamera:
         stamp = 1e-9 * spec.device_ns(begin + spec.latency)
         image = self._world.render(self._camera, begin + 0.5 * exposure, exposure)
         self.shots[frame_id] = self._shot(begin + 0.5 * exposure)
-        return Frame(image, frame_id, exposure, stamp, self._map.host_time(stamp), self.clock.now())
+        return Frame(image, frame_id, exposure, stamp, host_time=self._map.host_time(stamp), received=self.clock.now())
 
     def _compare_clocks(self) -> None:
         self._require_answer()

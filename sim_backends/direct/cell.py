@@ -51,8 +51,8 @@ class DirectCell:
         self.arm = DirectArm("arm", self.world.arm, self.clock, setup.arm)
         self.rail = DirectRail("rail", self.world.rail, self.clock, setup.rail, wire)
         self.vehicle = DirectVehicle("vehicle", self.world.vehicle, self.clock, setup.vehicle)
-        self.scan_camera = DirectCamera("scan_camera", "scan", self.world, self.clock, setup.camera, wire)
-        self.target_camera = DirectCamera("target_camera", "target", self.world, self.clock, setup.camera, wire)
+        self.scan_camera = DirectCamera("scan_camera", "scan", self.world, self.clock, setup=setup.camera, wire=wire)
+        self.target_camera = DirectCamera("target_camera", "target", self.world, self.clock, setup.camera, wire=wire)
         self._ticking: tuple[Ticking, ...] = (self.arm, self.vehicle)
 
     def truth(self) -> dict[str, Any]:

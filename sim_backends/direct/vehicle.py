@@ -94,8 +94,8 @@ class DirectVehicle:
     def drive(self, speed: float, yaw_rate: float) -> None:
         """Set the velocity that is kept alive for 0.5 s; `InterlockError` when braked or not enabled."""
         limit, turn = self._setup.max_speed, self._setup.max_yaw_rate
-        speed = within(self.name, "speed", speed, -limit, limit, "m/s")
-        yaw_rate = within(self.name, "yaw rate", yaw_rate, -turn, turn, "rad/s")
+        speed = within(self.name, "speed", speed, low=-limit, high=limit, unit="m/s")
+        yaw_rate = within(self.name, "yaw rate", yaw_rate, low=-turn, high=turn, unit="rad/s")
         self.check()
         if self._stopping:
             raise Aborted(f"{self.name}: a stop is under way")

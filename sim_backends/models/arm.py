@@ -361,7 +361,7 @@ class ArmModel:
         true = Kinematics(table + params.dh_error)
         bends = params.harmonics.any() or params.compliance > 0.0
         joints = JointErrors(true, params.harmonics, params.compliance, params.carried) if bends else None
-        return TruePose(true, params.repeatability, params.blend_time, self._rng, joints, params.memory)
+        return TruePose(true, params.repeatability, params.blend_time, self._rng, joints=joints, memory=params.memory)
 
     def _replace(self, motion: SimulatedMotion) -> None:
         self._queue = deque([StopMotion(_BRAKE), motion] if motion.from_rest and self.moving else [motion])

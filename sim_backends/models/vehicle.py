@@ -153,14 +153,14 @@ class VehicleModel:
                 self._state(),
                 self._mode,
                 self._motion_mode,
-                self._braked,
-                self._errors,
-                self.params.battery_volts,
-                self._speed,
-                self._yaw_rate,
-                self._left,
-                self._right,
-                tuple(self._drivers),
+                braked=self._braked,
+                errors=self._errors,
+                volts=self.params.battery_volts,
+                speed=self._speed,
+                yaw_rate=self._yaw_rate,
+                left=self._left,
+                right=self._right,
+                drivers=tuple(self._drivers),
             )
 
     def set_mode(self, t: float, mode: Mode) -> None:

@@ -174,7 +174,7 @@ class WorldFollowing:
         vehicle = self._world.vehicle
         assert isinstance(vehicle, FollowedVehicle)
         x, y, yaw, speed, yaw_rate, braked = (float(v) for v in values)
-        vehicle.follow(t, x, y, yaw, speed, yaw_rate, bool(braked))
+        vehicle.follow(t, x, y, yaw=yaw, speed=speed, yaw_rate=yaw_rate, braked=bool(braked))
         return []
 
     def _take_laser(self, t: float, values: NDArray[np.float64]) -> list[float]:

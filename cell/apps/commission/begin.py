@@ -58,7 +58,7 @@ def begin(
         world = "" if truth is None else hashlib.sha256(truth.read_bytes()).hexdigest()[:12]
         which |= {"seed": seed, "level": level, "clock": clock, "world": world}
     folder = path.resolve().parent / FOLDER
-    desk = CommissionWorkplace(path, partial(Cell.open, path, **options), person, folder, job, simulated)
+    desk = CommissionWorkplace(path, partial(Cell.open, path, **options), person, folder, job, simulated=simulated)
     return Commissioning(desk, Progress(folder, which, desk.job), path, show)
 
 

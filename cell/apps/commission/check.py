@@ -70,7 +70,7 @@ class Result:
         remedy: str = "",
     ) -> Reading:
         """Note a figure with its limits; one outside makes the check wrong."""
-        reading = Reading(what, float(value), unit, least, most, remedy)
+        reading = Reading(what, float(value), unit, least=least, most=most, remedy=remedy)
         self.readings.append(reading)
         if not reading.ok:
             self.verdict = CheckVerdict.WRONG

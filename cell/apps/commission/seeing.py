@@ -72,8 +72,8 @@ def eye_of(desk: CommissionWorkplace, name: str) -> Eye:
     """The eye "scan_camera" or "target_camera" of the cell."""
     config = desk.config
     if name == "scan_camera":
-        return Eye(name, config.scan_camera, config.calibration.fine, "calibration.fine", 0.130, 0.005)
-    return Eye(name, config.target_camera, config.calibration.large, "calibration.large", 0.650, 0.030)
+        return Eye(name, config.scan_camera, config.calibration.fine, key="calibration.fine", depth=0.130, step=0.005)
+    return Eye(name, config.target_camera, config.calibration.large, key="calibration.large", depth=0.650, step=0.030)
 
 
 def camera_of(desk: CommissionWorkplace, eye: Eye) -> Camera:

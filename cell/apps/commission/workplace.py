@@ -183,7 +183,7 @@ class CommissionWorkplace:
             }
         )
         config = config.model_copy(update={"arm": slow})
-        return SlowMover(devices.arm, devices.clock, config, self.job, self.look_around, devices.interlocks)
+        return SlowMover(devices.arm, devices.clock, config, self.job, self.look_around, interlocks=devices.interlocks)
 
     def fold(self) -> None:
         """The arm to its folded posture above the deck, unless it is there."""

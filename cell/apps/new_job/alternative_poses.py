@@ -41,7 +41,7 @@ def rivals(seen: Sequence[SeenSurface], nominal: NominalSurface, job: Job) -> li
     shift, turn = min(6 * job.surface.prior_sigma, MOST_SHIFT), 6 * job.surface.prior_sigma_angle
     information = sum((each.information(each.solid) for each in seen), np.zeros((6, 6)))
     found: list[tuple[Array, float]] = []
-    for start in candidates(pin.SE3.Identity(), points, nominal, shift, turn, MOST_PLACES):
+    for start in candidates(pin.SE3.Identity(), points, nominal, shift=shift, turn=turn, most=MOST_PLACES):
         where = settled(start, points, nominal)
         turned = float(np.linalg.norm(pin.log3(where.rotation)))
         middle = where.act(nominal.centre) - nominal.centre

@@ -49,7 +49,7 @@ def verdict(information: Array, points: int, radius: float, job: Job, config: Ce
     known = np.linalg.inv(information + np.linalg.inv(prior_of(job)))
     gain = known @ information
     covariance = known + gain @ shared_by_all(config) @ gain.T
-    return judge(covariance, information, variance, points, radius, _tolerance(job))
+    return judge(covariance, information, variance, points=points, radius=radius, tolerance=_tolerance(job))
 
 
 def known(seen: Sequence[SeenSurface], surface: NominalSurface, job: Job, config: CellConfig) -> PoseVerdict:

@@ -132,7 +132,7 @@ def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,), tell: Callable[[str]
         share = np.zeros(len(pieces))
         for k in np.unique(body):
             mine = body == k
-            share[mine] = _seen_share(pieces[mine], normals[mine], rays, earlier[k], towards, finest)
+            share[mine] = _seen_share(pieces[mine], normals[mine], rays, earlier=earlier[k], ways=towards, step=finest)
         longest = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2).max(axis=1)
         mixed = (share > 0.0) & (share < 1.0) & (longest > finest)
         kept.append(pieces[~mixed & (share > 0.5)])

@@ -126,7 +126,7 @@ def _sweep(config: CellConfig, job: Job, plan: ScanPlan, rays: Rays) -> SeenSurf
     shape = (count, ROWS, 3)
     return SeenSurface(
         made[0].reshape(shape), made[1].reshape(shape), made[2].reshape(shape),
-        np.array([flange.homogeneous for flange in flanges]), rail, turns[0][:, 0], eyes, lamps,
+        np.array([flange.homogeneous for flange in flanges]), rail=rail, along=turns[0][:, 0], eyes=eyes, lamps=lamps,
     )  # fmt: skip
 
 

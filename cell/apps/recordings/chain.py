@@ -109,7 +109,17 @@ def solve_chain(
         plane = replace(plane, place=math.hypot(plane.place, (scale.value - 1) * reach))
     best, closed = (replace(s, unsure=np.abs(unsure)) for s in (choice.best, choice.closed))
     choice = replace(choice, best=best, closed=closed)
-    return CalibrationChain(setup, observations, staged, pictures, choice, stripes, no_plane, plane, scale)
+    return CalibrationChain(
+        setup,
+        observations,
+        staged,
+        pictures=pictures,
+        choice=choice,
+        stripes=stripes,
+        no_plane=no_plane,
+        plane_known=plane,
+        scale=scale,
+    )
 
 
 def _refuse_strangers(staged: Staged, scale: Scale | None, reach: float) -> None:
@@ -227,11 +237,11 @@ def check_chain(chain: CalibrationChain, pictures: Intrinsics) -> list[QualityCh
     cloud = np.concatenate(points_on_boards(staged, chain.observations))
     lit = sum(len(rows) > 0 for rows in staged.plane.rows)
     rms = max(staged.plane.rms, adjusted.stripe_rms_m)
-    made += plane_checks(rms, chain.noise, cloud, lit, known, len(chain.stripes))
+    made += plane_checks(rms, chain.noise, cloud, frames=lit, known=known, left_out=len(chain.stripes))
     apart = math.degrees(math.acos(min(1.0, abs(float(plane.n @ staged.plane.plane.n)))))
     name, tilt = "plane with the arm against plane of the pictures", math.degrees(known.tilt)
     text = "the arm's poses and the board's in the pictures do not agree about it"
-    made.append(QualityCheck("light_plane", name, apart, max(1.0, 4 * tilt), max(4.0, 8 * tilt), "deg", text))
+    made.append(QualityCheck("light_plane", name, apart, max(1.0, 4 * tilt), max(4.0, 8 * tilt), unit="deg", says=text))
     return made
 
 
@@ -289,7 +299,7 @@ def report_chain(chain: CalibrationChain, pictures: Intrinsics, result: dict[str
     depths = form.seen_depths(state.plane, state.camera, [v.stripe for v in best.views if len(v.stripe)])
     checked = None if staged.paper is None else form.finite(1e3 * staged.paper.cross_ratio_m)
     result["light_plane"] = {
-        **form.plane_dict(best.name, state.plane, adjusted.stripe_rms_m, chain.noise, chain.plane_known, depths),
+        **form.plane_dict(best.name, state.plane, adjusted.stripe_rms_m, chain.noise, chain.plane_known, depths=depths),
         "sigma_distance_mm": 1e3 * float(sigma[PLANE][2]),
         "staged": {**form.normal_dict(staged.plane.plane, staged.plane.rms), "cross_ratio_check_mm": checked},
     }

@@ -111,7 +111,7 @@ def calibrate_pairs(pairs: Sequence[Pair]) -> dict[str, Any]:
     share, sigmas = 0.1 / reach, float(np.max(np.abs(apart) / np.maximum(sigma, 1e-9)))
     most = 6.0 if share * far > 3.0 else math.inf
     checks = [
-        QualityCheck("hand_eye", name, value, doubt, refused, unit, text)
+        QualityCheck("hand_eye", name, value, doubt=doubt, refuse=refused, unit=unit, says=text)
         for name, value, doubt, refused, unit, text in (
             ("σ of its place", share * place, 1.0, 5.0, "% of the board's distance", f"{place:.1f} mm {advice}"),
             ("σ of its turn", math.degrees(float(sigma[3:].max())), 0.6, 3.0, "deg", advice),

@@ -180,8 +180,8 @@ def solve_frames(
             "the place of the board or of the arm's base, changed in between? Then calibrate each part by itself"
         )  # fmt: skip
         share = 100 * left_out / told
-        checks = [QualityCheck("hand_eye", name, share, 25.0, 40.0, "%", text)]
-        checks.append(QualityCheck("intrinsics", name, share, 25.0, math.inf, "%", text))
+        checks = [QualityCheck("hand_eye", name, share, doubt=25.0, refuse=40.0, unit="%", says=text)]
+        checks.append(QualityCheck("intrinsics", name, share, doubt=25.0, refuse=math.inf, unit="%", says=text))
     if len(used(frames)) < len(chosen.view_rms):
         try:
             chosen, plain = camera_of(frames, given)
@@ -290,6 +290,6 @@ def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result:
     known = PlaneKnown.of(plane.plane, planes_without_one(clouds), cloud, moved)
     own = float(np.sqrt(np.mean(noise))) * float(np.median(cloud[:, 2])) / camera.fx
     depths = seen_depths(plane.plane, camera, [stripe_pixels(p, r) for p, r in both])
-    result["light_plane"] = plane_dict("fit on the board's poses", plane.plane, plane.rms, own, known, depths)
+    result["light_plane"] = plane_dict("fit on the board's poses", plane.plane, plane.rms, own, known, depths=depths)
     result["stripe_points"] = {f.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}
-    return plane_checks(plane.rms, own, cloud, len(both), known, len(wrong))
+    return plane_checks(plane.rms, own, cloud, frames=len(both), known=known, left_out=len(wrong))

@@ -232,7 +232,9 @@ def _record(path: Path, place: list[str], label: str | None, numbers: Array, nam
     label = label or next((p for p in reversed(place) if re.search(r"\d", p)), None)
     pattern, exact = ("/".join(re.sub(old, new, p) for p in place) for old, new in ((r"\d+", "N"), (r"\[\d+\]", "[N]")))
     time = float(numbers[0]) if len(numbers) not in COUNTS else None
-    return PoseRecord(path, pattern, label, _squared(numbers if time is None else numbers[1:]), named, time, exact)
+    return PoseRecord(
+        path, pattern, label, _squared(numbers if time is None else numbers[1:]), named=named, time=time, exact=exact
+    )
 
 
 def _array(data: Any) -> Array | None:
@@ -365,7 +367,7 @@ def _read_table(path: Path, text: str, content: Content) -> None:
             pose = np.array(found)
             if len(pose) not in COUNTS:
                 raise ValueError(f"line {k + 1} of its table holds {len(found)} numbers; {NEEDED}")
-        content.records.append(PoseRecord(path, "row", label or f"[{k}]", _squared(pose), named, time))
+        content.records.append(PoseRecord(path, "row", label or f"[{k}]", _squared(pose), named=named, time=time))
 
 
 def _cells(line: str) -> list[str]:

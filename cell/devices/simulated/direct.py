@@ -71,7 +71,15 @@ class VirtualCell(DirectCell):
         laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
         vehicle = self.vehicle if config.vehicle.DRIVES else connect_one(config, "vehicle", self.clock)
         self.devices: Devices = behind_gate(
-            config, self.clock, self.arm, self.rail, vehicle, self.scan_camera, self.target_camera, laser, claw
+            config,
+            self.clock,
+            self.arm,
+            rail=self.rail,
+            vehicle=vehicle,
+            scan_camera=self.scan_camera,
+            target_camera=self.target_camera,
+            laser=laser,
+            claw=claw,
         )
 
     def _switch(self, name: str, direct: type[DirectLaser | DirectClaw]) -> Any:
@@ -133,10 +141,10 @@ def setup_of(config: CellConfig) -> DirectSetup:
             vehicle.max_speed,
             vehicle.max_yaw_rate,
             PlanarOdometry(vehicle.track, count),
-            lambda bits: system_trouble(bits, commanded=True),
-            lambda name, bits, trouble, driven: vehicle_error(name, bits, trouble, driven=driven),
-            _VEHICLES.get(vehicle.driver, vehicle.driver),
-            count,
+            trouble=lambda bits: system_trouble(bits, commanded=True),
+            error=lambda name, bits, trouble, driven: vehicle_error(name, bits, trouble, driven=driven),
+            make=_VEHICLES.get(vehicle.driver, vehicle.driver),
+            count=count,
         ),
         CameraSetup(ClockMap, Latch),
     )

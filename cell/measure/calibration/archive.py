@@ -113,7 +113,7 @@ def read_archive(path: Path) -> Observations:
         require_date("made", float(about["made"]))
         found = Observations(
             [
-                ScanObservation(view, profile, flange, float(rail), name, bool(same))
+                ScanObservation(view, profile, flange, rail_position=float(rail), name=name, same_rest=bool(same))
                 for (view, flange, name), profile, rail, same in zip(scan, profiles, rails, same_rest, strict=True)
             ],
             [
@@ -122,14 +122,14 @@ def read_archive(path: Path) -> Observations:
                 if view is not None
             ],
             _camera(about["scan_camera"]),
-            _camera(about["target_camera"]),
-            priors,
-            _positive(about, "rail_lead"),
-            {str(name): str(serial) for name, serial in about["identities"].items()},
-            str(about["configuration"]),
-            float(about["made"]),
-            str(about.get("kinematics", "")),
-            _read_witness(data, about),
+            target_camera=_camera(about["target_camera"]),
+            priors=priors,
+            rail_lead=_positive(about, "rail_lead"),
+            identities={str(name): str(serial) for name, serial in about["identities"].items()},
+            configuration=str(about["configuration"]),
+            made=float(about["made"]),
+            kinematics=str(about.get("kinematics", "")),
+            witness=_read_witness(data, about),
         )
         # Last: what is wrong with a figure says more than that something was changed.
         if about["format"] == FORMAT or DIGEST in data:
@@ -194,7 +194,15 @@ def _read_views(data: Mapping[str, Any], camera: str) -> list[tuple[BoardView | 
             if count and not 0 <= int(ids[part].min()) <= int(ids[part].max()) < len(spec.points()):
                 raise ValueError(f"{camera}_ids of {name} lie outside 0 to {len(spec.points()) - 1} of {spec.name}")
             size = (int(sizes[k, 0]), int(sizes[k, 1]))
-            view = BoardView(spec, size, ids[part], pixels[part], sigma[part], bool(assumed[k]), float(radii[k]))
+            view = BoardView(
+                spec,
+                size,
+                ids[part],
+                pixels=pixels[part],
+                sigma=sigma[part],
+                order_assumed=bool(assumed[k]),
+                dot_radius=float(radii[k]),
+            )
             start, k = start + count, k + 1
         made.append((view, _pose(flange, str(name)), str(name)))
     return made
@@ -259,7 +267,7 @@ def _camera_dict(camera: CameraModel) -> dict[str, Any]:
 
 
 def _camera(data: Mapping[str, Any]) -> CameraModel:
-    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, 1.0, 0.0, 0.0)
+    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, fy=1.0, cx=0.0, cy=0.0)
     made = model.with_parameters(data["parameters"])
     if not np.isfinite(made.parameters).all() or made.fx <= 0 or made.fy <= 0:
         raise ValueError("a nominal camera needs finite parameters and focal lengths above 0 px")

@@ -161,9 +161,9 @@ def invert_pose(
         turn @ covariance @ turn.T,
         told,
         float(1.0 / np.mean(1.0 / found.sigmas**2)),
-        len(found.used),
-        nominal.radius,
-        tolerance,
+        points=len(found.used),
+        radius=nominal.radius,
+        tolerance=tolerance,
     )
     with _shown(pose, *numbers):
         verdict.require()

@@ -77,7 +77,7 @@ def photographed(here: Workplace, goal: pin.SE3, progress: Callable[[float, str]
     here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
     vehicle = here.config.arm.vehicle_from_base.se3().inverse()
     count, wait = here.job.photo.count, here.devices.clock.sleep
-    return board_photo(goal, vehicle, here.mover, lambda: here.photograph(count), wait, progress)
+    return board_photo(goal, vehicle, here.mover, lambda: here.photograph(count), wait=wait, progress=progress)
 
 
 def _at(here: Workplace, context: StepContext) -> BoardFix:

@@ -131,7 +131,7 @@ def drive_to_target(
         hold()
         way.require_line(goal)
         speed = approach.speed * (1.0 if pace is None else pace.share)
-        drive_line(vehicle, whereabouts, goal, speed, clock, check)
+        drive_line(vehicle, whereabouts, goal, speed=speed, clock=clock, check=check)
 
     approach = job.approach
     staging, target = Planar.of(approach.staging.se3()), Planar.of(approach.target.se3())
@@ -156,7 +156,7 @@ def drive_to_target(
         near = abs(error.x) < 0.8 * approach.tolerance and abs(error.y) < 0.8 * approach.tolerance
         if near and abs(error.yaw) < 0.5 * approach.tolerance_angle:
             vehicle.brake()
-            return VehicleArrival(base_from_place, fix, error.x, error.y, error.yaw, count)
+            return VehicleArrival(base_from_place, fix, error.x, error.y, error_yaw=error.yaw, photographs=count)
         if near:
             hold()
             way.require_turn(target.yaw)
@@ -177,7 +177,7 @@ def drive_to_target(
             "from photograph to photograph: see whether warm air shimmers before the camera, a fan blows, or board or "
             "camera are loose; the wheels are not the cause"
         )
-    raise _off_target(error, job, fix, "the vehicle", f" after {count} photographs", remedy)
+    raise _off_target(error, job, fix, who="the vehicle", after=f" after {count} photographs", remedy=remedy)
 
 
 def stand_at_target(
@@ -201,10 +201,10 @@ def stand_at_target(
     most, most_angle = job.approach.tolerance, job.approach.tolerance_angle
     if not (abs(error.x) <= most and abs(error.y) <= most and abs(error.yaw) <= most_angle):
         raise _off_target(
-            error, job, fix, "the arm, on its fixed frame,", "", "move the station, or correct approach.target"
+            error, job, fix, "the arm, on its fixed frame,", "", remedy="move the station, or correct approach.target"
         )
     vehicle.brake()
-    return VehicleArrival(base_from_place, fix, error.x, error.y, error.yaw, 1, driven=False)
+    return VehicleArrival(base_from_place, fix, error.x, error.y, error_yaw=error.yaw, photographs=1, driven=False)
 
 
 def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, remedy: str) -> RefusedError:
@@ -252,15 +252,15 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         here.job,
         here.config.arm.vehicle_from_base.se3(),
         vehicle,
-        here.whereabouts,
-        here.photograph,
-        here.devices.clock,
-        context.check,
-        context.progress,
-        lambda text: context.note(text=text),
-        context.safe_point,
-        here.mover.solids(),
-        here.mover.pace,
+        whereabouts=here.whereabouts,
+        photograph=here.photograph,
+        clock=here.devices.clock,
+        check=context.check,
+        progress=context.progress,
+        note=lambda text: context.note(text=text),
+        hold=context.safe_point,
+        carried=here.mover.solids(),
+        pace=here.mover.pace,
     )
 
 

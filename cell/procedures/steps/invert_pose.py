@@ -103,7 +103,7 @@ def invert_pose(
     times, vehicle, hz = taken.times, taken.base_from_vehicle, rocking.hz
 
     def by_poses(lines: Indices, rows: Indices) -> Vector:
-        shaken = rocking_motions(scan.cloud, lines, rows, vehicle, times, hz)
+        shaken = rocking_motions(scan.cloud, lines, rows, base_from_vehicle=vehicle, times=times, hz=hz)
         return np.concatenate([scan.by_poses(lines, rows), shaken], axis=2)
 
     unknown = rocking_covariance(rocking, vehicle, expected.translation)
@@ -126,7 +126,7 @@ def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: Boa
         head = Head.of(scan.cloud, sweep.base_from_flange, known.flange_from_camera, known.rail_direction, travel)
     taken = LineTimes(sweep.times, here.config.arm.vehicle_from_base.se3().inverse(), head)
     try:
-        return invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken)
+        return invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken=taken)
     except NotObservable as refused:
         if not sweep.notes:
             raise

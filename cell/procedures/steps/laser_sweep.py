@@ -147,21 +147,21 @@ def swept(
         scan_plans(here.config, here.job.model_copy(update={"scan": scan}), base_from_surface, head),
         scan,
         head.geometry(),
-        SweepErrors(
+        errors=SweepErrors(
             here.repeatability,
             here.config.calibration.rail_sigma,
             SHIFT_SHARE * here.job.place.tolerance,
-            devices.clock.rate,
-            math.hypot(here.config.scan_camera.late, here.config.rail.late),
-            times_known(here.calibration.scan, here.config)[0],
-            most_lost,
+            rate=devices.clock.rate,
+            late=math.hypot(here.config.scan_camera.late, here.config.rail.late),
+            timing=times_known(here.calibration.scan, here.config)[0],
+            lost=most_lost,
         ),
-        here.mover,
-        devices,
-        keep_frame,
-        check,
-        progress,
-        lambda collector: sweeping(collector, base_from_surface),
+        mover=here.mover,
+        devices=devices,
+        keep_frame=keep_frame,
+        check=check,
+        progress=progress,
+        sweeping=lambda collector: sweeping(collector, base_from_surface),
     )
 
 
@@ -176,11 +176,11 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         here,
         fix,
         head,
-        unhurried(here.job.scan, context.attempt),
-        lambda frame: here.frames.keep("stripe", frame),
-        context.check,
-        context.progress,
-        here.sweeping,
+        scan=unhurried(here.job.scan, context.attempt),
+        keep_frame=lambda frame: here.frames.keep("stripe", frame),
+        check=context.check,
+        progress=context.progress,
+        sweeping=here.sweeping,
     )
     rest = here.devices.interlocks.situation.last if here.job.scan.mode == "rail" else None
     doubts = (*record.doubts, *unwatched(head.witness), *doubts, *here.notes)
@@ -239,7 +239,9 @@ def _seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | No
         return None, None
     context.progress(0.0, "looking where the laser points")
     seen = require_witness(config, devices, keep)
-    pointing = pointing_since(before, seen, head.camera, head.light_plane, config.laser.exit_point, head.confirmed)
+    pointing = pointing_since(
+        before, seen, head.camera, plane=head.light_plane, exit_point=config.laser.exit_point, confirmed=head.confirmed
+    )
     if before.edge is None:
         return pointing, None
     context.progress(0.005, "looking whether the scan head has slipped")

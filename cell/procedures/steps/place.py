@@ -186,13 +186,13 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         here.job,
         pose.base_from_surface,
         expected,
-        here.mover,
-        here.devices.arm,
-        here.devices.claw,
-        here.part,
-        context.check,
-        context.progress,
-        lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
+        mover=here.mover,
+        arm=here.devices.arm,
+        claw=here.devices.claw,
+        part=here.part,
+        check=context.check,
+        progress=context.progress,
+        note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
     )
     done = replace(done, look=look, pose=pose)
     for note in done.notes:
@@ -229,7 +229,7 @@ def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> Sec
     lies = here.job.place.surface_from_part.se3()
     found = highest_standing(scan.cloud, here.nominal, pose.base_from_surface, lies, here.job.grasp.size)
     require_bare(found, here.job.place.tolerance)
-    return require_in_place(here, fix, sweep, scan, pose, context)
+    return require_in_place(here, fix, sweep, scan=scan, pose=pose, context=context)
 
 
 # A part that may have touched the surface is not placed a second time by itself. The second look takes as long as a

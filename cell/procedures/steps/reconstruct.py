@@ -80,7 +80,7 @@ def reconstruct(
     covariances = [swath.covariance for swath in sweep.swaths]
 
     def by_calibration(lines: Indices, rows: Indices) -> Array:
-        return calibration_motions(cloud, lines, rows, None, geometry, variants)
+        return calibration_motions(cloud, lines, rows, base_from_flange=None, geometry=geometry, variants=variants)
 
     def by_poses(lines: Indices, rows: Indices) -> Array:
         leaning = lean_motions(cloud, lines, rows, base_from_vehicle, lean_sigma)
@@ -104,10 +104,10 @@ def reconstructed(here: Workplace, sweep: SweepRecord) -> Reconstruction:
         sweep,
         head if sweep.pointing is None else head.pointed(sweep.pointing, here.config.laser.exit_point),
         here.job.scan.largest_hole,
-        path,
-        here.config.arm.vehicle_from_base.se3().inverse(),
-        here.config.vehicle.lean_sigma,
-        here.config.cell.sim,
+        path=path,
+        base_from_vehicle=here.config.arm.vehicle_from_base.se3().inverse(),
+        lean_sigma=here.config.vehicle.lean_sigma,
+        simulated=here.config.cell.sim,
     )
 
 

@@ -137,12 +137,12 @@ class Workplace:
             self.devices.arm,
             self.devices.target_camera,
             self.calibration.target,
-            self.board,
-            self.job.photo,
-            self.repeatability,
-            count,
-            lambda frame: self.frames.keep(what, frame),
-            lambda: self.devices.clock.sleep(APART_S),
+            spec=self.board,
+            limits=self.job.photo,
+            repeatability=self.repeatability,
+            count=count,
+            keep=lambda frame: self.frames.keep(what, frame),
+            pause=lambda: self.devices.clock.sleep(APART_S),
         )
         self.frames.found = fix.frames[-1], fix.views[-1].pixels
         if self.devices.following is not None:

@@ -190,7 +190,7 @@ def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeomet
     collector = SweepCollector(geometry, scan, lambda frame: None, lambda fraction, text: None)
     for frame_id in arrays["seen"]:
         image = read_image(frame_path(folder, int(frame_id)), shape)
-        collector.see(Frame(image, int(frame_id), scan.exposure, 0.0, 0.0, 0.0))
+        collector.see(Frame(image, int(frame_id), scan.exposure, device_time=0.0, host_time=0.0, received=0.0))
     lines = arrays["lines"]
     middle = collector.require_frames("stored sweep", lines)
     return Swath(

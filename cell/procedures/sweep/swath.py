@@ -205,7 +205,7 @@ class SweepCollector:
     def require_one_clock(self, camera: str, errors: SweepErrors) -> None:
         """Raise `DeviceFault` where the camera's clock stepped meanwhile."""
         allowed = STEP_SHARE * errors.shift
-        require_one_clock(camera, self.frame_ids, self.times, self.received, self.scan.speed, allowed)
+        require_one_clock(camera, self.frame_ids, self.times, self.received, speed=self.scan.speed, most=allowed)
 
 
 @dataclass(frozen=True, eq=False)

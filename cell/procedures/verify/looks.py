@@ -101,7 +101,7 @@ def scan_looks(state: AdjustmentState, seen: CheckObservations) -> list[PictureM
     assert near.view is not None
     pose = board_pose(near.view, state.camera).camera_from_board
     few = seen.sweep[:: max(1, len(seen.sweep) // SWEEP_PROFILES)]
-    lit = [look for profile in few if (look := _stripe(state, profile, near, pose, rest, stop)) is not None]
+    lit = [look for profile in few if (look := _stripe(state, profile, near, pose, rest=rest, stop=stop)) is not None]
     if len(lit) < LEAST_PROFILES:
         raise RefusedError(
             f"{len(lit)} of {len(few)} profiles of the sweep cross the fine board, at least {LEAST_PROFILES} are "

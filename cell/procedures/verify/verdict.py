@@ -70,11 +70,11 @@ class Verification:
             verdict,
             [effect(suspect.chain, suspect.change) for suspect in verdict.suspects],
             [at_most(suspect) for suspect in verdict.suspects],
-            unseen,
-            job.place.tolerance,
-            calibration.date,
-            witness,
-            0.0 if witness is None else effect("scan", witness.wrong),
+            unseen=unseen,
+            tolerance=job.place.tolerance,
+            date=calibration.date,
+            witness=witness,
+            misled=0.0 if witness is None else effect("scan", witness.wrong),
         )
 
     def __str__(self) -> str:

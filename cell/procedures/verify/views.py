@@ -80,15 +80,15 @@ def collect_verification(
                 config,
                 devices,
                 mover,
-                calibration.scan.geometry(),
-                scan_view,
-                ends,
-                lambda f, t: progress(0.3 + 0.2 * f, t),
-                lambda frame: keep("stripe", frame),
+                geometry=calibration.scan.geometry(),
+                view=scan_view,
+                ends=ends,
+                progress=lambda f, t: progress(0.3 + 0.2 * f, t),
+                keep_frame=lambda frame: keep("stripe", frame),
             )
         else:
             move_to_view(devices, mover, scan_view, k)
-        photographs.append(_photographs(config, devices, fine, ends, keep, f"fine-{k + 1}"))
+        photographs.append(_photographs(config, devices, fine, ends=ends, keep=keep, what=f"fine-{k + 1}"))
     target: list[TargetObservation] = []
     devices.target_camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)
     for k in range(TARGET_APPROACHES):

@@ -207,7 +207,7 @@ class GenicamCamera:
 
         network = self._setup.network if self._place.control else None
         buffers = max(4, min(64, _QUEUE_BYTES // max(1, self.shape[0] * self.shape[1])))
-        acquisition = Acquisition(device, network, buffers, take, queue.wake, self.statistics)
+        acquisition = Acquisition(device, network, buffers, take=take, failed=queue.wake, statistics=self.statistics)
         self._queue, self._acquisition = queue, acquisition
         try:
             with in_the_end(acquisition.stop):
@@ -238,7 +238,7 @@ class GenicamCamera:
         assert self._wish is not None
         device_time = picture.device_ns * 1e-9 if self._device.stamps else 0.0
         host_time = self._stamps.host_time(device_time, latest=received - self._wish.exposure)
-        return Frame(picture.image, count, self._wish.exposure, device_time, host_time, received)
+        return Frame(picture.image, count, self._wish.exposure, device_time, host_time=host_time, received=received)
 
     def _timing(self, device: GenicamDevice) -> Wish:
         """What is set; before the first `configure` whatever the camera has."""

@@ -144,10 +144,10 @@ def _require_rest(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives) -> Non
 def _map_all(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives) -> None:
     motion = [od.VELOCITY] if wheels.stop_input is None else [od.VELOCITY, od.INPUTS]
     health = [od.ERROR_CODE] if _told(bus, drive, od.DC_LINK) is None else [od.ERROR_CODE, od.DC_LINK]
-    _map(bus, drive, 0x1400, od.COMMAND, _AT_ONCE, [od.CONTROLWORD, od.TARGET_VELOCITY])
-    _map(bus, drive, 0x1800, od.STATUS, _EACH_SYNC, [od.STATUSWORD, od.POSITION, od.MODE_DISPLAY])
-    _map(bus, drive, 0x1801, od.MOTION, _EACH_SYNC, motion)
-    _map(bus, drive, 0x1802, od.HEALTH, _SELDOM, health)
+    _map(bus, drive, 0x1400, service=od.COMMAND, transmission=_AT_ONCE, entries=[od.CONTROLWORD, od.TARGET_VELOCITY])
+    _map(bus, drive, 0x1800, od.STATUS, transmission=_EACH_SYNC, entries=[od.STATUSWORD, od.POSITION, od.MODE_DISPLAY])
+    _map(bus, drive, 0x1801, service=od.MOTION, transmission=_EACH_SYNC, entries=motion)
+    _map(bus, drive, 0x1802, service=od.HEALTH, transmission=_SELDOM, entries=health)
 
 
 def _map(

@@ -86,7 +86,7 @@ class CanopenVehicle:
             statistics=self.statistics,
             alone=f"the drives stop by themselves {watchdog.seconds:g} s after the last sign of life",
         )
-        self._master = Master(name, open_bus, self._feedback, wheels, watchdog, clock, self.statistics)
+        self._master = Master(name, open_bus, self._feedback, wheels, watchdog, clock=clock, statistics=self.statistics)
         try:
             if look:
                 for drive in self._feedback.drives:
@@ -137,7 +137,9 @@ class CanopenVehicle:
         judged = self._clock.rate <= 1.0
         heard = [frame for _, frame in frames]
         drives = self._feedback.drives
-        return health.readings(heard, seconds, self._bitrate, others, drives, self._system_name, judged)
+        return health.readings(
+            heard, seconds, self._bitrate, others=others, drives=drives, system_name=self._system_name, judged=judged
+        )
 
     def state(self, max_age: float = 0.2) -> VehicleState:
         """The newest feedback, at most `max_age` s old, else `DeadlineError`."""
@@ -213,8 +215,8 @@ class CanopenVehicle:
         Raises `LimitError`, `InterlockError` before `enable()`, `DeviceFault` as `check` does, `Aborted` while a stop
         is under way.
         """
-        speed = check_range(self.name, "speed", speed, -self._max_speed, self._max_speed, "m/s")
-        yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, "rad/s")
+        speed = check_range(self.name, "speed", speed, low=-self._max_speed, high=self._max_speed, unit="m/s")
+        yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, unit="rad/s")
         self._bus.require_unspoken()
         self._check(driving=True)
         with self._master.command:

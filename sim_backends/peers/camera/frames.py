@@ -182,7 +182,7 @@ class FramePeer:
         return {"device_ns": self.camera.spec.device_ns(self._clock.now())}
 
     def _rate(self, request: dict[str, Any], key: str) -> float:
-        return number(request, key, self.camera.frame_rate, _SLOWEST, self.camera.spec.frame_rate_max, "Hz")
+        return number(request, key, self.camera.frame_rate, _SLOWEST, high=self.camera.spec.frame_rate_max, unit="Hz")
 
     def _set(self, exposure: float, frame_rate: float) -> None:
         if exposure * frame_rate > 1.0:

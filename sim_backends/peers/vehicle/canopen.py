@@ -198,7 +198,7 @@ class DriveNode:
 
             return Value("<I", round(0.5 / self._rim_per_unit), writable=True, write=write)
 
-        def option(form: str, value: int, *allowed: int, name: str = "") -> Value:
+        def option(form: str, value: int, allowed: tuple[int, ...], name: str = "") -> Value:
             def write(wanted: int) -> None:
                 if wanted not in allowed:
                     raise Abort(WRONG_VALUE)
@@ -214,14 +214,14 @@ class DriveNode:
             (0x1018, 2): Value("<I", 402),
             (0x1018, 3): Value("<I", 0x00010004),
             (0x1018, 4): Value("<I", 7000 + number),
-            (0x6007, 0): option("<h", 1, 0, 1, 2, 3, name="connection_lost_as"),
+            (0x6007, 0): option("<h", 1, (0, 1, 2, 3), name="connection_lost_as"),
             (0x603F, 0): Value("<H", mappable=True, read=lambda: self._code),
             (0x6040, 0): Value("<H", writable=True, mappable=True, write=self._control),
             (0x6041, 0): Value("<H", mappable=True, read=lambda: wheel.statusword),
-            (0x605A, 0): option("<h", 2, 1, 2, 5, 6, name="quick_stop_option"),
-            (0x605D, 0): option("<h", 1, 1, 2),
-            (0x605E, 0): option("<h", 2, 0, 1, 2),
-            (0x6060, 0): option("<b", 0, 0, 3, name="mode"),
+            (0x605A, 0): option("<h", 2, (1, 2, 5, 6), name="quick_stop_option"),
+            (0x605D, 0): option("<h", 1, (1, 2)),
+            (0x605E, 0): option("<h", 2, (0, 1, 2)),
+            (0x6060, 0): option("<b", 0, (0, 3), name="mode"),
             (0x6061, 0): Value("<b", mappable=True, read=lambda: wheel.mode),
             (0x6064, 0): Value("<i", mappable=True, read=self._position),
             (0x606C, 0): Value("<i", mappable=True, read=lambda: round(self._sign * wheel.speed / self._rim_per_unit)),

@@ -104,7 +104,7 @@ def _ground(name: str, vertices: Floats, faces: Faces) -> Surface:
 
     half, centre = 0.5 * (high - low), 0.5 * (high + low)
     return Surface(
-        name, relief, float(half[0]), float(half[1]), (float(centre[0]), float(centre[1])), float(high[2])
+        name, relief, float(half[0]), float(half[1]), centre=(float(centre[0]), float(centre[1])), top=float(high[2])
     )  # fmt: skip
 
 

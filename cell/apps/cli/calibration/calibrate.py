@@ -106,7 +106,9 @@ def calibrate(
         from cell.apps.recordings.known_camera import read_camera
 
         known = None if camera in (None, "pictures") else read_camera(Path(str(camera)))
-        options = Options(poses, pose_field, _setup(setup), plan, known, camera == "pictures", _laser(laser))
+        options = Options(
+            poses, pose_field, _setup(setup), plan, camera=known, hold_camera=camera == "pictures", laser=_laser(laser)
+        )
         _from_folder(source, board, options, json, details)
         return
     from cell.apps.cli.calibration.tables import print_examination

@@ -71,22 +71,22 @@ def _job(part: bool, desk: CommissionWorkplace, result: Result) -> None:
 CHECKS = [
     CommissionCheck(
         "calibration", "Calibration", "arm, rail and laser, over the two boards on the deck", "their whole reach there",
-        "as configured", "solved, and its own checks good",
-        ALL, ("station",), _calibrate, recorded=False,
+        fast="as configured", limit="solved, and its own checks good",
+        keys=ALL, needs=("station",), work=_calibrate, recorded=False,
     ),
     CommissionCheck(
         "verification", "Verification of the calibration", "arm, rail and laser, one view of each board",
-        "their whole reach there", "as configured", "no part suspected at the job's tolerance",
-        ALL, ("calibration",), _verify, recorded=False,
+        far="their whole reach there", fast="as configured", limit="no part suspected at the job's tolerance",
+        keys=ALL, needs=("calibration",), work=_verify, recorded=False,
     ),
     CommissionCheck(
         "job_empty", "First job, empty claw, up to the place pose", "everything: vehicle, arm, rail, laser",
-        "the whole job but placing", "as configured", "done",
-        (*ALL, "job"), ("verification",), partial(_job, False), recorded=False,
+        far="the whole job but placing", fast="as configured", limit="done",
+        keys=(*ALL, "job"), needs=("verification",), work=partial(_job, False), recorded=False,
     ),
     CommissionCheck(
-        "job_part", "First job with the part", "everything: vehicle, arm, rail, laser, claw", "the whole job",
-        "as configured", "placed",
-        (*ALL, "job"), ("job_empty",), partial(_job, True), recorded=False,
+        "job_part", "First job with the part", "everything: vehicle, arm, rail, laser, claw", far="the whole job",
+        fast="as configured", limit="placed",
+        keys=(*ALL, "job"), needs=("job_empty",), work=partial(_job, True), recorded=False,
     ),
 ]  # fmt: skip

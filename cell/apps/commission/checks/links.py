@@ -38,7 +38,7 @@ def _links(desk: CommissionWorkplace, result: Result) -> None:
 CHECKS = [
     CommissionCheck(
         "links", "Links and identities: every device answers and is well",
-        "nothing", "", "", "identity, round trips and figures as in `cell diag`",
-        WHERE, (), _links,
+        "nothing", far="", fast="", limit="identity, round trips and figures as in `cell diag`",
+        keys=WHERE, needs=(), work=_links,
     ),
 ]  # fmt: skip

@@ -88,9 +88,9 @@ def _outputs(desk: CommissionWorkplace, result: Result) -> None:
             Finding(
                 "laser.output, claw.output",
                 "the outputs of laser and claw are swapped: the claw's output lights the laser",
-                f"laser {laser}, claw {claw}", f"laser {claw}, claw {laser}",
-                "Swap the two numbers, or the two wires.",
-                {"laser.output": str(claw), "claw.output": str(laser)},
+                f"laser {laser}, claw {claw}", found=f"laser {claw}, claw {laser}",
+                remedy="Swap the two numbers, or the two wires.",
+                write={"laser.output": str(claw), "claw.output": str(laser)},
             )
         )  # fmt: skip
     else:
@@ -115,7 +115,7 @@ def _no_light(desk: CommissionWorkplace, result: Result, laser: int, claw: int, 
             str(laser), f"the laser is lit by output {lit[0]}" if lit else "no output lights it",
             "See that laser.output is the connector that the laser hangs on, that the laser has power and its shutter "
             "is open, and that calibration.stripe_exposure is long enough.",
-            {"laser.output": str(lit[0])} if lit else {},
+            write={"laser.output": str(lit[0])} if lit else {},
         )
     )  # fmt: skip
 
@@ -207,9 +207,9 @@ def _claw(desk: CommissionWorkplace, result: Result) -> None:
 CHECKS = [
     CommissionCheck(
         "outputs", "Outputs: laser and claw, each by what the camera and the inputs show",
-        "laser and claw, each by its own output; the arm to its view of the board", "half a second each",
-        "on and off", "a stripe with laser.output alone; claw.feedback follows claw.output",
-        ("laser", "claw", "scan_camera", "calibration.fine", "calibration.stripe_exposure"),
-        ("rail_direction",), _outputs,
+        "laser and claw, each by its own output; the arm to its view of the board", far="half a second each",
+        fast="on and off", limit="a stripe with laser.output alone; claw.feedback follows claw.output",
+        keys=("laser", "claw", "scan_camera", "calibration.fine", "calibration.stripe_exposure"),
+        needs=("rail_direction",), work=_outputs,
     ),
 ]  # fmt: skip

@@ -86,7 +86,7 @@ def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
                 f"+{1e3 * abs(told):.1f} mm", f"{1e3 * moved[0] * np.sign(told):+.1f} mm along the camera's x axis",
                 "Have the module turn the motor the other way, or swap the two wires of one of its coils. If it was "
                 "seen by eye to go away from its home switch, the camera sits upside down on the carriage instead.",
-                {"rail.reversed": str(not now).lower()} if hasattr(rail, "reversed") else {},
+                write={"rail.reversed": str(not now).lower()} if hasattr(rail, "reversed") else {},
             )
         )  # fmt: skip
     ratio = way / abs(told)
@@ -97,9 +97,9 @@ def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
         result.find(
             Finding(
                 "rail.lead", f"the carriage goes {ratio:.2f} times as far as it is told",
-                f"{1e3 * rail.lead:g} mm a turn", f"{1e3 * lead:.2f} mm a turn",
-                "Read the lead on the screw; steps per turn (motor) and microsteps (module) count as well.",
-                {"rail.lead": f'"{1e3 * value:.4g} mm"'},
+                f"{1e3 * rail.lead:g} mm a turn", found=f"{1e3 * lead:.2f} mm a turn",
+                remedy="Read the lead on the screw; steps per turn (motor) and microsteps (module) count as well.",
+                write={"rail.lead": f'"{1e3 * value:.4g} mm"'},
             )
         )  # fmt: skip
 
@@ -216,15 +216,15 @@ def _switches(desk: CommissionWorkplace, result: Result, speed: float) -> None:
 CHECKS = [
     CommissionCheck(
         "rail_direction", "Rail: which way and how far it goes, seen by its camera",
-        "the carriage, before it was ever homed", "1 mm, then 5 mm, and back", "5 mm/s",
-        "along the camera's x axis within 15 deg, and as far as told within 5 %",
-        ("rail", "scan_camera", "calibration.fine"), ("scan_mounting",), _direction,
+        "the carriage, before it was ever homed", far="1 mm, then 5 mm, and back", fast="5 mm/s",
+        limit="along the camera's x axis within 15 deg, and as far as told within 5 %",
+        keys=("rail", "scan_camera", "calibration.fine"), needs=("scan_mounting",), work=_direction,
     ),
     CommissionCheck(
         "rail_limits", "Rail: home switch, ends of the travel, limits",
-        "the carriage", "its whole travel, and 6 mm beyond each end",
-        "half of rail.max_speed to its switch, then 20 and 5 mm/s",
-        "home found; both ends reached without a switch; commands beyond refused; limit switches stop it",
-        ("rail",), ("rail_direction",), _limits,
+        "the carriage", far="its whole travel, and 6 mm beyond each end",
+        fast="half of rail.max_speed to its switch, then 20 and 5 mm/s",
+        limit="home found; both ends reached without a switch; commands beyond refused; limit switches stop it",
+        keys=("rail",), needs=("rail_direction",), work=_limits,
     ),
 ]  # fmt: skip

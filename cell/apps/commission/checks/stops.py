@@ -38,7 +38,7 @@ def _stops(desk: CommissionWorkplace, result: Result) -> None:
         if name == "vehicle" and not desk.config.vehicle.DRIVES:
             continue
         for sign, cause, stop in ((1.0, "Cell.stop()", _by_program), (-1.0, "`cell abort`", _by_request)):
-            _measured(desk, result, name, cause, partial(start, sign), stop)
+            _measured(desk, result, name, cause=cause, start=partial(start, sign), stop=stop)
     _vehicle_unrenewed(desk, result)
     _laser(desk, result)
     _emergency(desk, result)
@@ -132,7 +132,7 @@ def _drive_back(desk: CommissionWorkplace, stood: RelativeOdometry) -> None:
     vehicle = desk.devices.vehicle
     vehicle.enable()
     try:
-        drive_line(vehicle, stood, Planar(0.0, 0.0, 0.0), VEHICLE_SPEED, desk.devices.clock, desk.look_around)
+        drive_line(vehicle, stood, Planar(0.0, 0.0, 0.0), VEHICLE_SPEED, desk.devices.clock, check=desk.look_around)
     finally:
         vehicle.brake()
 
@@ -260,8 +260,10 @@ CHECKS = [
     CommissionCheck(
         "stops", "Stops: from each cause, time and way",
         "rail, joint 1 and wheels, one after the other, each stopped on its way; the laser",
-        "rail 20 mm, joint 1 6 deg, wheels 100 mm at most", "20 mm/s, 5 deg/s, 100 mm/s",
-        f"at rest within {MOST_S:g} s, {MOST_WAY['rail']:g} mm, {MOST_WAY['arm']:g} deg, {MOST_WAY['vehicle']:g} mm",
-        ("rail", "arm.model", "vehicle", "laser"), ("rail_limits", "vehicle", "outputs"), _stops, recorded=False,
+        far="rail 20 mm, joint 1 6 deg, wheels 100 mm at most", fast="20 mm/s, 5 deg/s, 100 mm/s",
+        limit=f"at rest within {MOST_S:g} s, {MOST_WAY['rail']:g} mm, {MOST_WAY['arm']:g} deg, "
+        f"{MOST_WAY['vehicle']:g} mm",
+        keys=("rail", "arm.model", "vehicle", "laser"), needs=("rail_limits", "vehicle", "outputs"), work=_stops,
+        recorded=False,
     ),
 ]  # fmt: skip

@@ -43,10 +43,10 @@ def _wheels(desk: CommissionWorkplace, result: Result) -> None:
     devices.vehicle.enable()
     try:
         odometry = RelativeOdometry(devices.vehicle)
-        drive_line(devices.vehicle, odometry, Planar(WAY, 0.0, 0.0), SPEED, devices.clock, _look(desk))
+        drive_line(devices.vehicle, odometry, Planar(WAY, 0.0, 0.0), SPEED, clock=devices.clock, check=_look(desk))
         there = odometry.pose()
         seen = desk.person.sees(f"Did the vehicle go {1e3 * WAY:.0f} mm ahead, the way it goes to the station?")
-        drive_line(devices.vehicle, odometry, Planar(0.0, 0.0, 0.0), SPEED, devices.clock, _look(desk))
+        drive_line(devices.vehicle, odometry, Planar(0.0, 0.0, 0.0), SPEED, clock=devices.clock, check=_look(desk))
     finally:
         devices.vehicle.brake()
     back = odometry.pose()
@@ -140,7 +140,7 @@ def _drive(desk: CommissionWorkplace, odometry: RelativeOdometry, ahead: float) 
     vehicle = desk.devices.vehicle
     vehicle.enable()
     try:
-        drive_line(vehicle, odometry, Planar(ahead, 0.0, 0.0), STRIDE_SPEED, desk.devices.clock, _look(desk))
+        drive_line(vehicle, odometry, Planar(ahead, 0.0, 0.0), STRIDE_SPEED, desk.devices.clock, check=_look(desk))
     finally:
         vehicle.brake()
 
@@ -224,17 +224,17 @@ def _board_at(desk: CommissionWorkplace, result: Result, name: str) -> np.ndarra
 CHECKS = [
     CommissionCheck(
         "vehicle", "Vehicle: its wheels, direction and unit",
-        "the wheels, with the arm folded", f"{1e3 * WAY:.0f} mm ahead and back", f"{1e3 * SPEED:.0f} mm/s",
-        f"{1e3 * WAY:.0f} mm within {MOST_OFF_MM:.0f} mm, straight, and seen to go ahead",
-        ("vehicle",), ("target_mounting", "outputs"), _wheels,
+        "the wheels, with the arm folded", far=f"{1e3 * WAY:.0f} mm ahead and back", fast=f"{1e3 * SPEED:.0f} mm/s",
+        limit=f"{1e3 * WAY:.0f} mm within {MOST_OFF_MM:.0f} mm, straight, and seen to go ahead",
+        keys=("vehicle",), needs=("target_mounting", "outputs"), work=_wheels,
     ),
 ]  # fmt: skip
 STATION_CHECKS = [
     CommissionCheck(
         "station", "Station: its board by the arm's measure, the wheels by the board",
         "the arm to the job's looking pose; the wheels, until the board is seen, and back",
-        f"up to {LEAST_LEFT:g} m before the job's target", f"{1e3 * STRIDE_SPEED:.0f} mm/s",
-        f"board within {100 * PITCH_OFF:g} % of its name; {1e3 * WAY:.0f} mm of the wheels bring it nearer",
-        ("vehicle", "target_camera", "arm.vehicle_from_base", "job"), ("stops",), _station,
+        far=f"up to {LEAST_LEFT:g} m before the job's target", fast=f"{1e3 * STRIDE_SPEED:.0f} mm/s",
+        limit=f"board within {100 * PITCH_OFF:g} % of its name; {1e3 * WAY:.0f} mm of the wheels bring it nearer",
+        keys=("vehicle", "target_camera", "arm.vehicle_from_base", "job"), needs=("stops",), work=_station,
     ),
 ]  # fmt: skip

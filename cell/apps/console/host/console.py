@@ -122,7 +122,8 @@ class Console:
         facts = cell_facts(cell, job)
         self._server = ServerProcess(
             lambda fd: ServerSetup(
-                fd, self.port, address.hosts, token, certificate, key, str(cell.runs_folder.resolve()), facts
+                fd, self.port, address.hosts, lasting=token, cert=certificate, key=key,
+                runs=str(cell.runs_folder.resolve()), cell=facts
             ),
             bound, self._heard, self._stop, self._left_alone,
         )  # fmt: skip

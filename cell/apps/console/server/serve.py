@@ -108,10 +108,10 @@ class Server:
             self.access,
             self.pages,
             Archive(Path(self._setup.runs)),
-            self._setup.cell,
-            self._do,
-            self._stop,
-            self._of_job,
+            cell=self._setup.cell,
+            do=self._do,
+            stop=self._stop,
+            of_job=self._of_job,
         )
         config = uvicorn.Config(
             application.asgi() if self._setup.lasting is not None else _entering(application.asgi(), self._renew),

@@ -111,9 +111,9 @@ def verdict(evidences: Mapping[str, DriftEvidence], states: Mapping[str, Adjustm
         if np.isfinite(weighed.stripe):
             fit["stripe"] = weighed.stripe
     figures = [figure for name in evidences for figure in _figures(name, evidences[name], states[name])]
-    seen = detectable(evidences, states, tests, scores, drawn, threshold)
+    seen = detectable(evidences, states, tests, scores=scores, factors=drawn, threshold=threshold)
     return DriftVerdict(
-        float(log_mean(found[None])[0]), threshold, fit, _suspects(evidences, tests, found), figures, seen
+        float(log_mean(found[None])[0]), threshold, fit, _suspects(evidences, tests, found), figures, detectable=seen
     )
 
 

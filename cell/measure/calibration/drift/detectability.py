@@ -101,11 +101,17 @@ def changes(chain: str, state: AdjustmentState) -> list[Change]:
     depth = SCAN_DEPTH if chain == "scan" else TARGET_DEPTH
     focal = unit[:, CAMERA][:, :4] * state.camera.fx
     made = [
-        Change(chain, mount, "shift", SHIFT, "m", unit[:, HAND][:, :3]),
-        Change(chain, mount, "turn", TURN, "rad", unit[:, HAND][:, 3:]),
-        Change(chain, lens, "principal point", TURN, "rad", focal[:, 2:]),
+        Change(chain, mount, "shift", wanted=SHIFT, unit="m", directions=unit[:, HAND][:, :3]),
+        Change(chain, mount, "turn", wanted=TURN, unit="rad", directions=unit[:, HAND][:, 3:]),
+        Change(chain, lens, "principal point", wanted=TURN, unit="rad", directions=focal[:, 2:]),
         Change(
-            chain, lens, "focal length", SHIFT, "m", (focal[:, :1] + focal[:, 1:2]) / depth, f" at {1e3 * depth:.0f} mm"
+            chain,
+            lens,
+            "focal length",
+            wanted=SHIFT,
+            unit="m",
+            directions=(focal[:, :1] + focal[:, 1:2]) / depth,
+            where=f" at {1e3 * depth:.0f} mm",
         ),
     ]
     if others:
@@ -115,10 +121,10 @@ def changes(chain: str, state: AdjustmentState) -> list[Change]:
         across = np.column_stack(tangents(along))
         lead = unit[:, RAIL] @ along[:, None] / LEAD_WAY
         made += [
-            Change(chain, plane, "turn", TURN, "rad", unit[:, PLANE][:, :2]),
-            Change(chain, plane, "shift", SHIFT, "m", unit[:, PLANE][:, 2:]),
-            Change(chain, rail, "turn", TURN, "rad", unit[:, RAIL] @ across * length),
-            Change(chain, rail, "lead", SHIFT, "m", lead, f" in {1e3 * LEAD_WAY:.0f} mm"),
+            Change(chain, plane, "turn", wanted=TURN, unit="rad", directions=unit[:, PLANE][:, :2]),
+            Change(chain, plane, "shift", wanted=SHIFT, unit="m", directions=unit[:, PLANE][:, 2:]),
+            Change(chain, rail, "turn", wanted=TURN, unit="rad", directions=unit[:, RAIL] @ across * length),
+            Change(chain, rail, "lead", wanted=SHIFT, unit="m", directions=lead, where=f" in {1e3 * LEAD_WAY:.0f} mm"),
         ]
     return made
 

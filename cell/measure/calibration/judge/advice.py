@@ -103,7 +103,7 @@ def _more_views(joint: Joint, board: BoardSpec, travel: tuple[float, float]) -> 
         ),
         "four more views, turned about the optical axis by 90 and 180 deg": made(
             [
-                square(0, 0, middle, rx, ry, rz)
+                square(0, 0, middle, rx=rx, ry=ry, rz=rz)
                 for rz, (rx, ry) in zip((np.pi / 2, -np.pi / 2, np.pi, np.pi), diagonal, strict=True)
             ],
             between,
@@ -145,12 +145,12 @@ def _view(joint: Joint, board: BoardSpec, at: Array, turn: Array, rail: float) -
         points[inside],
         pixels[inside],
         np.full(int(inside.sum()), sigma),
-        radius,
-        stripe,
-        np.full(len(stripe), stripe_sigma),
-        flange,
-        rail,
-        lit[0].stripe_axis,
+        dot_radius=radius,
+        stripe=stripe,
+        stripe_sigma=np.full(len(stripe), stripe_sigma),
+        base_from_flange=flange,
+        rail=rail,
+        stripe_axis=lit[0].stripe_axis,
     )
 
 

@@ -47,8 +47,8 @@ def against_pictures(given: Intrinsics, views: Sequence[BoardView]) -> tuple[Int
     refuse = REFUSE_SIGMAS if np.any(far & (np.abs(apart) / sigma >= REFUSE_SIGMAS)) else np.inf
     check = QualityCheck(
         "intrinsics", "given camera against that of the pictures", float(np.abs(apart[worst]) / sigma[worst]),
-        DOUBT_SIGMAS, refuse, "σ",
-        f"{PARAMETER_NAMES[worst]} is given as {given.camera.parameters[worst]:.1f} px, these pictures have "
+        doubt=DOUBT_SIGMAS, refuse=refuse, unit="σ",
+        says=f"{PARAMETER_NAMES[worst]} is given as {given.camera.parameters[worst]:.1f} px, these pictures have "
         f"{pictures.camera.parameters[worst]:.1f} ± {sigma[worst]:.1f} px: is it the file of another camera, focus, "
         "picture size or crop? Leave --camera out, or calibrate the camera anew",
     )  # fmt: skip
@@ -60,8 +60,8 @@ def _unchecked(given: Intrinsics, why: str) -> tuple[Intrinsics, list[QualityChe
     covariance = given.covariance.copy()
     covariance[:4, :4] += np.diag((USUAL_SHARE * given.camera.parameters[[0, 1, 0, 1]]) ** 2)
     check = QualityCheck(
-        "intrinsics", "given camera, not checked", 1.0, 0.5, np.inf, "",
-        f"{why}; focal length and principal point are taken to be off by {100 * USUAL_SHARE:.0f} % of the focal length "
-        f"since it was calibrated; take {LEAST_LEFT_OUT} stops or more, the board tilted to several sides",
+        "intrinsics", "given camera, not checked", 1.0, doubt=0.5, refuse=np.inf, unit="",
+        says=f"{why}; focal length and principal point are taken to be off by {100 * USUAL_SHARE:.0f} % of the focal "
+        f"length since it was calibrated; take {LEAST_LEFT_OUT} stops or more, the board tilted to several sides",
     )  # fmt: skip
     return replace(given, sigma=np.sqrt(np.diag(covariance)), covariance=covariance), [check]

@@ -30,34 +30,36 @@ def hand_eye_checks(choice: Choice, boards: Sequence[pin.SE3], pictures: Intrins
     count = len(boards)
     made = [
         QualityCheck(
-            "hand_eye", "σ of its place", 100 * float(shift.max()) / reach, 1.0, 5.0, "% of the board's distance",
-            f"{_mm(shift)} mm from {count} frames; turn the flange about two axes by 20° or more, to several sides",
+            "hand_eye", "σ of its place", 100 * float(shift.max()) / reach, 1.0, 5.0, unit="% of the board's distance",
+            says=f"{_mm(shift)} mm from {count} frames; turn the flange about two axes by 20° or more, to "
+            "several sides",
         ),
         QualityCheck(
-            "hand_eye", "σ of its turn", math.degrees(float(turn.max())), 0.6, 3.0, "deg",
-            f"from {count} frames; turn the flange about two axes by 20° or more, to several sides",
+            "hand_eye", "σ of its turn", math.degrees(float(turn.max())), doubt=0.6, refuse=3.0, unit="deg",
+            says=f"from {count} frames; turn the flange about two axes by 20° or more, to several sides",
         ),
         QualityCheck(
-            "hand_eye", "board in left-out frames", 100 * off / 1e3 / reach, 1.0, 5.0, "% of its distance",
-            f"{off:.1f} mm from where the other frames put it at the reported poses: the arm scatters (about "
+            "hand_eye", "board in left-out frames", 100 * off / 1e3 / reach, 1.0, refuse=5.0, unit="% of its distance",
+            says=f"{off:.1f} mm from where the other frames put it at the reported poses: the arm scatters (about "
             f"{arm_mm:.2g} mm and {math.degrees(choice.arm[1]):.2g}° an axis), or poses and pictures do not belong "
             "together",
         ),
         QualityCheck(
-            "hand_eye", "the arm's scatter", arm_mm, 2.0, 9.9, "mm",
-            f"{math.degrees(choice.arm[1]):.2g}° beside it, by variance components with the camera of the pictures",
+            "hand_eye", "the arm's scatter", arm_mm, doubt=2.0, refuse=9.9, unit="mm",
+            says=f"{math.degrees(choice.arm[1]):.2g}° beside it, by variance components with the camera of the "
+            "pictures",
         ),
         QualityCheck(
-            "hand_eye", "scatter of left-out solutions over the formal σ", _ratio(best), 3.0, math.inf, "",
-            "the residuals are not independent noise; the larger of both is stated",
+            "hand_eye", "scatter of left-out solutions over the formal σ", _ratio(best), 3.0, refuse=math.inf, unit="",
+            says="the residuals are not independent noise; the larger of both is stated",
         ),
         _closed_against(choice, reach),
     ]  # fmt: skip
     if count < LEAST_FRAMES:
         made.append(
             QualityCheck(
-                "hand_eye", "frames that are missing", LEAST_FRAMES - count, 0.5, math.inf, "",
-                f"{count} frames check each other little; take {LEAST_FRAMES} or more",
+                "hand_eye", "frames that are missing", LEAST_FRAMES - count, doubt=0.5, refuse=math.inf, unit="",
+                says=f"{count} frames check each other little; take {LEAST_FRAMES} or more",
             )
         )  # fmt: skip
     made += _camera_against(choice, pictures)
@@ -73,8 +75,8 @@ def _closed_against(choice: Choice, reach: float) -> QualityCheck:
     worst = float(np.max(np.abs(apart) / sigma)) if best.joint else 0.0
     far = 100 * float(np.linalg.norm(apart[:3])) / reach
     return QualityCheck(
-        "hand_eye", "closed form against adjustment", worst, 3.0, 6.0 if far > SHIFT_SHARE else math.inf, "σ",
-        f"{1e3 * float(np.linalg.norm(apart[:3])):.1f} mm and "
+        "hand_eye", "closed form against adjustment", worst, 3.0, 6.0 if far > SHIFT_SHARE else math.inf, unit="σ",
+        says=f"{1e3 * float(np.linalg.norm(apart[:3])):.1f} mm and "
         f"{math.degrees(float(np.linalg.norm(apart[3:]))):.2f}° apart",
     )  # fmt: skip
 
@@ -90,8 +92,9 @@ def _camera_against(choice: Choice, pictures: Intrinsics) -> list[QualityCheck]:
     kept = "kept is that of the arm and the pictures" if choice.best.camera_free else "kept is that of the pictures"
     return [
         QualityCheck(
-            "hand_eye", "camera with the arm against camera from the pictures", float(apart[worst]), 3.0, math.inf, "σ",
-            f"{PARAMETER_NAMES[worst]} would be {camera[worst]:.1f} px, by the pictures it is "
+            "hand_eye", "camera with the arm against camera from the pictures", float(apart[worst]), doubt=3.0,
+            refuse=math.inf, unit="σ",
+            says=f"{PARAMETER_NAMES[worst]} would be {camera[worst]:.1f} px, by the pictures it is "
             f"{pictures.camera.parameters[worst]:.1f} ± {pictures.sigma[worst]:.1f} px; {kept}: the arm, the board's "
             "size or the lens is not what it is taken for",
         )

@@ -30,20 +30,21 @@ def joint_checks(joint: Joint, nominal: CameraModel) -> list[QualityCheck]:
     excess = max(adjusted.excess.get("shift", 1.0), adjusted.excess.get("turn", 1.0))
     made = [
         QualityCheck(
-            "hand_eye", "closed form against adjustment", shift / 10 / reach, 2.0, 8.0, "% of the board's distance",
-            f"{shift:.2f} mm and {turn:.3f}° apart; see whether the views turn the flange about two axes",
+            "hand_eye", "closed form against adjustment", shift / 10 / reach, doubt=2.0, refuse=8.0,
+            unit="% of the board's distance",
+            says=f"{shift:.2f} mm and {turn:.3f}° apart; see whether the views turn the flange about two axes",
         ),
         QualityCheck(
-            "hand_eye", "the arm's scatter over what is configured", excess, 4.0, 9.9, "",
-            "the arm repeats worse than the configuration says, or something moved in between",
+            "hand_eye", "the arm's scatter over what is configured", excess, doubt=4.0, refuse=9.9, unit="",
+            says="the arm repeats worse than the configuration says, or something moved in between",
         ),
         QualityCheck(
-            "intrinsics", "focal length against the drawing", focal, 6.0, 20.0, "%",
-            f"{state.camera.fx:.0f} px, drawn {nominal.fx:.0f} px: is it the lens that the configuration names?",
+            "intrinsics", "focal length against the drawing", focal, doubt=6.0, refuse=20.0, unit="%",
+            says=f"{state.camera.fx:.0f} px, drawn {nominal.fx:.0f} px: is it the lens that the configuration names?",
         ),
         QualityCheck(
             "intrinsics", f"{PARAMETER_NAMES[4 + worst]} against what lenses have", float(lens[worst]), 3.0, math.inf,
-            "σ", f"{state.camera.dist[worst]:.3g}: is it the lens that the configuration names?",
+            unit="σ", says=f"{state.camera.dist[worst]:.3g}: is it the lens that the configuration names?",
         ),
     ]  # fmt: skip
     parts, noise = [], []

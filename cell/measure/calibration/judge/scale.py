@@ -77,8 +77,8 @@ class Scale:
                 "says: measure its pitch; if that is right, the poses are in another unit or of another arm"
             )
         return QualityCheck(
-            "hand_eye", "arm's travel against the board's size", off, max(DOUBT, DOUBT_SIGMAS * share),
-            math.inf if alone and self.unit is None else max(REFUSE, REFUSE_SIGMAS * share), "%", says,
+            "hand_eye", "arm's travel against the board's size", off, doubt=max(DOUBT, DOUBT_SIGMAS * share),
+            refuse=math.inf if alone and self.unit is None else max(REFUSE, REFUSE_SIGMAS * share), unit="%", says=says,
         )  # fmt: skip
 
 

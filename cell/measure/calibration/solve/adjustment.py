@@ -205,7 +205,7 @@ class Adjustment:
         for k, (view, rail) in enumerate(zip(self.views, state.rails.tolist(), strict=True)):
             for name, rows, residual, cost in self.rows_of(k, state):
                 share = self.priors.stripe_share if name == "stripe" else 1.0
-                normal.add_view(name, k, rows, residual, cost, share)
+                normal.add_view(name, k, rows, residual=residual, cost=cost, share=share)
             if settles[k]:
                 white = self.arm_prior(k, state)[1]
                 normal.add_prior("shift", k, 0, white[:3], self.priors.arm_translation)

@@ -77,10 +77,10 @@ class AdjustmentState:
             self.camera.with_parameters(self.camera.parameters + step[CAMERA]),
             plane,
             self.rail_direction + step[RAIL],
-            perturbed(self.flange_from_camera, step[HAND]),
-            perturbed(self.base_from_board, step[BOARD]),
-            [perturbed(pose, d[:6]) for pose, d in zip(self.flanges, own, strict=True)],
-            self.rails + own[:, 6],
+            flange_from_camera=perturbed(self.flange_from_camera, step[HAND]),
+            base_from_board=perturbed(self.base_from_board, step[BOARD]),
+            flanges=[perturbed(pose, d[:6]) for pose, d in zip(self.flanges, own, strict=True)],
+            rails=self.rails + own[:, 6],
         )
 
     def camera_from_board(self, flange: pin.SE3, rail: float) -> pin.SE3:
@@ -105,14 +105,14 @@ def dots_block(state: AdjustmentState, view: ViewData, flange: pin.SE3, rail: fl
         state.camera.parameters,
         board.rotation,
         flange.rotation,
-        hand.rotation,
-        np.array([board.translation, flange.translation, hand.translation]),
-        float(rail),
-        np.ascontiguousarray(state.rail_direction, dtype=np.float64),
-        np.ascontiguousarray(view.points),
-        float(view.dot_radius),
-        pixels,
-        jacobian,
+        hand=hand.rotation,
+        places=np.array([board.translation, flange.translation, hand.translation]),
+        rail=float(rail),
+        travel=np.ascontiguousarray(state.rail_direction, dtype=np.float64),
+        points=np.ascontiguousarray(view.points),
+        radius=float(view.dot_radius),
+        pixels=pixels,
+        jacobian=jacobian,
     )
     return view.pixels - pixels, jacobian
 

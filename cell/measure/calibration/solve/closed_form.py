@@ -50,11 +50,13 @@ def closed_form(
         covariance = np.diag(np.full(SHARED, np.inf))
     dots_px, stripe_m, board_m, squares = figures.T
     known = [other or state for other in states]
-    left = LeftOut(known, dots_px, stripe_m, board_m, squares, covariance, np.zeros((SHARED, SHARED)))
+    left = LeftOut(
+        known, dots_px, stripe_m, board_m, squares=squares, covariance=covariance, by_held=np.zeros((SHARED, SHARED))
+    )
     seen = replace(state, flanges=[flange_seen(state, board) for board in boards])
     dots, stripe = Adjustment(views, free, Priors()).residual_rms(seen)
     nothing = np.zeros((SHARED, SHARED))
-    return ClosedForm(Adjusted(state, nothing, float("nan"), dots, stripe, Priors(), 0), left)
+    return ClosedForm(Adjusted(state, nothing, float("nan"), dots, stripe, priors=Priors(), iterations=0), left)
 
 
 def flange_seen(state: AdjustmentState, camera_from_board: pin.SE3) -> pin.SE3:

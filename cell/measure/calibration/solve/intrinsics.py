@@ -226,8 +226,9 @@ def _intrinsics(
             covariance = covariance + np.outer(moved, moved)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return Intrinsics(
-        fit.camera, rms, _mean(rms, views), fit.held_out, sigma, formal, covariance, fit.model, tried, fit.bend,
-        np.zeros(0) if fit.left is None else _pull(fit.camera, fit.left, fit.covariance),
+        fit.camera, rms, _mean(rms, views), held_out_px=fit.held_out, sigma=sigma, formal=formal,
+        covariance=covariance, model=fit.model, tried=tried, bend=fit.bend,
+        pull=np.zeros(0) if fit.left is None else _pull(fit.camera, fit.left, fit.covariance),
     )  # fmt: skip
 
 
@@ -241,8 +242,8 @@ def _data(views: Sequence[BoardView], camera: CameraModel) -> list[ViewData]:
     nothing = np.zeros(0)
     return [
         ViewData(
-            v.object_points, v.pixels, v.sigma, v.dot_radius, np.zeros((0, 2)), nothing,
-            board_pose(v, camera).camera_from_board.inverse(), 0.0,
+            v.object_points, v.pixels, v.sigma, dot_radius=v.dot_radius, stripe=np.zeros((0, 2)), stripe_sigma=nothing,
+            base_from_flange=board_pose(v, camera).camera_from_board.inverse(), rail=0.0,
         )
         for v in views
     ]  # fmt: skip

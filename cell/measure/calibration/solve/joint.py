@@ -113,7 +113,7 @@ def solve_staged(
             plane = replace(plane, plane=paper.plane, rms=paper.rms)
         rows, nothing = iter(plane.rows), np.empty(0, dtype=np.intp)
         plane = replace(plane, rows=[nothing if o.same_rest else next(rows) for o in every])
-    return Staged(camera, view_rms, poses, hand_eye, plane, paper)
+    return Staged(camera, view_rms, poses, hand_eye=hand_eye, plane=plane, paper=paper)
 
 
 def paper_plane_of(
@@ -185,7 +185,7 @@ def solve_joint(
     px, stripe = float("nan"), float("nan")
     if held_out and len(views) > FOLDS:
         px, stripe = _held_out(views, free, adjusted)
-    return Joint(staged, adjusted, views, px, stripe, free)
+    return Joint(staged, adjusted, views, held_out_px=px, held_out_stripe_m=stripe, free=free)
 
 
 def _held_out(views: list[ViewData], free: NDArray[np.bool_], adjusted: Adjusted) -> tuple[float, float]:

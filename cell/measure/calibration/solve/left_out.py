@@ -96,7 +96,7 @@ def leave_out(adjustment: Adjustment, adjusted: Adjusted) -> LeftOut:
     )
     dots, stripe, board, squares = figures.T
     scatter = np.asarray((count - 1) / count * apart.T @ apart)
-    return LeftOut(states, dots, stripe, board, squares, scatter, by_held)
+    return LeftOut(states, dots, stripe, board_m=board, squares=squares, covariance=scatter, by_held=by_held)
 
 
 def _reduced(adjustment: Adjustment, k: int, state: AdjustmentState) -> tuple[Array, Array]:

@@ -50,7 +50,7 @@ class Quality:
         a = joint.adjusted
         lit = a.state.plane is not None
         stripe, held_out = (a.stripe_rms_m, joint.held_out_stripe_m) if lit else (None, None)
-        return cls(len(joint.views), a.chi2_per_dof, a.dots_rms_px, stripe, joint.held_out_px, held_out)
+        return cls(len(joint.views), a.chi2_per_dof, a.dots_rms_px, stripe, joint.held_out_px, held_out_stripe=held_out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,13 +97,13 @@ class ScanCalibration:
             state.camera,
             state.plane,
             state.rail_direction,
-            state.flange_from_camera,
-            reference.covariance[:KEPT, :KEPT],
-            Quality.of(joint),
-            reference,
-            bow.sigma * joint.adjusted.inflation,
-            bow.gain[:KEPT],
-            (*((bow.words,) if bow.sigma else ()), *(joint.size.notes if joint.size else ())),
+            flange_from_camera=state.flange_from_camera,
+            covariance=reference.covariance[:KEPT, :KEPT],
+            quality=Quality.of(joint),
+            reference=reference,
+            bow_sigma=bow.sigma * joint.adjusted.inflation,
+            bow_gain=bow.gain[:KEPT],
+            notes=(*((bow.words,) if bow.sigma else ()), *(joint.size.notes if joint.size else ())),
         )
 
     def flange_from_camera_at(self, rail_position: float) -> pin.SE3:
@@ -125,10 +125,10 @@ class ScanCalibration:
             self.camera,
             self.light_plane,
             self.rail_direction,
-            self.flange_from_camera,
-            pin.SE3.Identity(),
-            [],
-            np.zeros(0),
+            flange_from_camera=self.flange_from_camera,
+            base_from_board=pin.SE3.Identity(),
+            flanges=[],
+            rails=np.zeros(0),
         )
         made = []
         by_bow = self.bow_sigma * self.bow_gain
@@ -199,14 +199,14 @@ class ScanCalibration:
             _camera(data["camera"]),
             LightPlane.of(plane["normal"], float(plane["distance"])).bowed(float(plane.get("bow", 0.0))),
             np.array(data["rail_direction"], dtype=np.float64),
-            from_matrix(data["flange_from_camera"]),
-            np.array(data["covariance"], dtype=np.float64).reshape(KEPT, KEPT),
-            Quality(**data["quality"]),
-            Reference.read(data.get("reference")),
-            float(plane.get("bow_sigma", 0.0)),
-            np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
-            tuple(data.get("notes", ())),
-            PlateLine.read(data.get("witness")),
+            flange_from_camera=from_matrix(data["flange_from_camera"]),
+            covariance=np.array(data["covariance"], dtype=np.float64).reshape(KEPT, KEPT),
+            quality=Quality(**data["quality"]),
+            reference=Reference.read(data.get("reference")),
+            bow_sigma=float(plane.get("bow_sigma", 0.0)),
+            bow_gain=np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
+            notes=tuple(data.get("notes", ())),
+            witness=PlateLine.read(data.get("witness")),
             confirmed=confirmed,
             timing=timing,
             shutter=shutter,
@@ -269,5 +269,5 @@ def _camera_dict(camera: CameraModel) -> dict[str, Any]:
 
 
 def _camera(data: dict[str, Any]) -> CameraModel:
-    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, 1.0, 0.0, 0.0)
+    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, fy=1.0, cx=0.0, cy=0.0)
     return model.with_parameters(data["parameters"])

@@ -118,7 +118,9 @@ def predict(camera: CameraModel, camera_from_board: pin.SE3, points: Array, dot_
     """Pixels (n, 2) where board points (n, 3) are measured: ellipse centres of dots, images of corners."""
     pixels = np.empty((len(points), 2))
     rotation, translation = camera_from_board.rotation, camera_from_board.translation
-    seen_points(camera.parameters, rotation, translation, np.ascontiguousarray(points), float(dot_radius), pixels)
+    seen_points(
+        camera.parameters, rotation, translation, np.ascontiguousarray(points), radius=float(dot_radius), pixels=pixels
+    )
     return pixels
 
 
@@ -191,7 +193,7 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
     lens, radius, factor = camera.parameters, float(view.dot_radius), np.sqrt(weights) / view.sigma
 
     def residual_of(candidate: pin.SE3) -> tuple[Array, float]:
-        seen_points(lens, candidate.rotation, candidate.translation, points, radius, pixels)
+        seen_points(lens, candidate.rotation, candidate.translation, points=points, radius=radius, pixels=pixels)
         residual = view.pixels - pixels
         white = (factor[:, None] * residual).ravel()
         total = float(white @ white)
@@ -201,7 +203,9 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
     residual, squares = residual_of(pose)
     normal, right = np.eye(6), np.zeros(6)
     for _ in range(STEPS):
-        pose_equations(lens, pose.rotation, pose.translation, points, factor, residual, normal, right)
+        pose_equations(
+            lens, pose.rotation, pose.translation, points, factor=factor, residual=residual, normal=normal, right=right
+        )
         damped = normal.copy()
         damped.flat[::7] *= 1 + damping
         step = np.linalg.solve(damped, right)

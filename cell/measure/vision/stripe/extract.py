@@ -53,7 +53,7 @@ def extract(
     if image.ndim != 2 or image.dtype != np.uint8:
         picture = as_picture(image, settings.saturation_dn)
         if not picture.plain:
-            return _carefully(picture, dark, axis, settings, laser, like, None)
+            return _carefully(picture, dark, axis, settings=settings, laser=laser, like=like, starts=None)
         dark = None if dark is None else _whole(_same_range(dark, picture, settings))
         image = _whole(picture)
     profile, verdict = read_quickly(image, dark, axis, settings, like)
@@ -61,7 +61,9 @@ def extract(
     if verdict is QuickVerdict.ORDINARY:
         return profile
     starts = profile.centres if _trusted(profile) else None
-    careful = _carefully(as_picture(image, settings.saturation_dn), dark, axis, settings, laser, like, starts)
+    careful = _carefully(
+        as_picture(image, settings.saturation_dn), dark, axis, settings=settings, laser=laser, like=like, starts=starts
+    )
     # Clear peaks that make no line, such as those of a comb, are what they are.
     alone = verdict is QuickVerdict.UNMISTAKABLE and careful.valid.sum() < 0.5 * profile.valid.sum()
     return profile if alone else careful
@@ -86,12 +88,13 @@ def _carefully(
     if axis == "columns":
         picture, off = picture.turned(), None if off is None else off.turned()
     taught = like.learned if like is not None else None
-    seen = read_carefully(picture, off, laser, settings, taught, starts)
+    seen = read_carefully(picture, off, laser, settings=settings, like=taught, starts=starts)
     widen_what_departs(seen.centres, seen.sigma)
     double = np.nan_to_num(seen.rival) > DOUBLE
     return StripeProfile(
-        axis, seen.centres, seen.sigma, seen.amplitude, seen.width, seen.saturated,
-        double & np.isfinite(seen.centres), None, None, seen.rival, seen.misfit, seen.learned,
+        axis, seen.centres, seen.sigma, amplitude=seen.amplitude, width=seen.width, saturated=seen.saturated,
+        double=double & np.isfinite(seen.centres), speckle=None, noise=None, rival=seen.rival, misfit=seen.misfit,
+        learned=seen.learned,
     )  # fmt: skip
 
 

@@ -95,7 +95,7 @@ def _knowledge(
     k = max(1, int(scale / BINNED_WIDTH))
     plane, at, width = binned(Plane(value, usable, shade), k), (at - 0.5 * (k - 1)) / k, scale / k
     noise = surrounded(plane, rows, at, 4 * width, Noise(0.1, 1 / 40 * float(np.abs(MIXES[mix]).sum())))
-    fitted = fit_shape(plane, rows, at, gaussian(width, 4 * width + 3), noise, FREE_SCALE)
+    fitted = fit_shape(plane, rows, at, shape=gaussian(width, 4 * width + 3), noise=noise, scale_prior=FREE_SCALE)
     good = fitted.good & (fitted.amplitude > SURE * fitted.amplitude_sigma)
     good &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
     variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), 4 * width)

@@ -73,11 +73,11 @@ def read_carefully(
     `starts` (lines,) in px, NaN where there is none, spare the following. Pieces of another width are read where the
     picture itself teaches the profile.
     """
-    line = _of_one_width(picture, off, laser, settings, like, starts)
+    line = _of_one_width(picture, off, laser, settings=settings, like=like, starts=starts)
     if like is None:
         fill_gaps(
             line,
-            lambda rows: _of_one_width(picture.rows(rows), off and off.rows(rows), laser, settings, None, None),
+            lambda rows: _of_one_width(picture.rows(rows), off and off.rows(rows), laser, settings, None, starts=None),
         )
     return line
 
@@ -111,19 +111,22 @@ def _of_one_width(
         shape, spread, noise = learn_profile(plane, rows, at, scale / k, noise)
         if shape.width * k > WIDEST:
             return _nothing(lines)
-        learned = Learned(mix, shape.width * k, k, shape, spread, noise, along)
+        learned = Learned(mix, shape.width * k, k, shape=shape, spread=spread, noise=noise, along=along)
     else:
         learned = like
     shape, noise = learned.shape, learned.noise
-    fitted = fit_shape(plane, rows, at, shape, noise, max(learned.spread, 0.002) if shape.learned else FREE_SCALE)
+    fitted = fit_shape(
+        plane, rows, at, shape, noise=noise, scale_prior=max(learned.spread, 0.002) if shape.learned else FREE_SCALE
+    )
     variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), shape.reach)
     sigma = carried(fitted, variance, correlation)
-    out = _believed(fitted, sigma, at, shape, k, lines, plane, noise)
+    out = _believed(fitted, sigma, at, shape=shape, k=k, lines=lines, plane=plane, noise=noise)
     # A surface may be rough: lines that wander tell of errors only where something is there to make them.
     unquiet = noise.contrast > 0.02 or (correlation[1:] != 0).any()
     factor = min(wander(out.centres, out.sigma), MOST_WANDER) if unquiet else 1.0
     return Careful(
-        out.centres, out.sigma * factor, out.amplitude, out.width, out.saturated, rival, out.misfit, learned
+        out.centres, out.sigma * factor, out.amplitude, width=out.width, saturated=out.saturated, rival=rival,
+        misfit=out.misfit, learned=learned
     )  # fmt: skip
 
 
@@ -228,10 +231,13 @@ def _believed(
     inside = (np.abs(fitted.x) < width) & np.isinf(fitted.variance)
     saturated[rows] = inside[keep].any(axis=1)
     return Careful(
-        out["centres"], out["sigma"], out["amplitude"], out["width"], saturated, np.zeros(lines), out["misfit"], None
+        out["centres"], out["sigma"], out["amplitude"], width=out["width"], saturated=saturated, rival=np.zeros(lines),
+        misfit=out["misfit"], learned=None
     )  # fmt: skip
 
 
 def _nothing(lines: int) -> Careful:
     none, no = np.full(lines, np.nan), np.zeros(lines, np.bool_)
-    return Careful(none, none.copy(), none.copy(), none.copy(), no, np.zeros(lines), none.copy(), None)
+    return Careful(
+        none, none.copy(), none.copy(), none.copy(), no, rival=np.zeros(lines), misfit=none.copy(), learned=None
+    )

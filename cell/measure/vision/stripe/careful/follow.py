@@ -73,7 +73,7 @@ def respond(picture: NDArray[np.float32], scale: float, along: float) -> NDArray
     rows = cv2.getGaussianKernel(2 * int(2.5 * along) + 1, along or 1.0)
     smooth = cv2.sepFilter2D(picture, cv2.CV_32F, across, rows, borderType=cv2.BORDER_REPLICATE)
     away = max(2, round(SIDES * scale))
-    padded = cv2.copyMakeBorder(smooth, 0, 0, away, away, cv2.BORDER_REPLICATE)
+    padded = cv2.copyMakeBorder(smooth, 0, 0, away, away, borderType=cv2.BORDER_REPLICATE)
     n = picture.shape[1]
     return np.asarray(smooth - np.maximum(padded[:, :n], padded[:, 2 * away :]), dtype=np.float32)
 
@@ -93,7 +93,7 @@ def candidates(
         if 6 * scale > n:
             continue
         response = respond(part, scale, along)
-        _take_better(response, np.float32(_noise(response)), k, best, answer, of)
+        _take_better(response, np.float32(_noise(response)), k, best=best, answer=answer, of=of)
     edge = 2
     peak = np.zeros(part.shape, np.bool_)
     peak[:, edge:-edge] = (best[:, edge:-edge] >= best[:, edge - 1 : -edge - 1]) & (
@@ -136,7 +136,7 @@ def follow(found: Candidates, spacing: float = 1.0) -> StripeChain:
     share = light / np.maximum(light.max(axis=1, keepdims=True), 1e-9)
     gain = np.minimum(found.clear, MOST) * (1 - BY_LIGHT * (1 - share)) - LEAST * (found.clear > 0)
     best, back_row, back_which, opens = _chain(
-        found.rows.astype(np.float64), found.place, gain, found.clear > 0, found.scale, float(spacing)
+        found.rows.astype(np.float64), found.place, gain, found.clear > 0, scale=found.scale, spacing=float(spacing)
     )
     rows, which, fresh = [], [], []
     end = int(best.argmax())

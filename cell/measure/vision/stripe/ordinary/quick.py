@@ -62,7 +62,9 @@ def read_quickly(
     least = max(settings.least_peak_dn, 5 * sqrt(whole))
     start = np.zeros((len(work), find.CANDIDATES, find.START))
     cut, cut_at = np.empty((len(work), find.CUT), np.uint8), np.full(len(work), find.NOWHERE)
-    several = stripe_search.find_lines(work, seen, shade, settings.saturation_dn, least, start, cut, cut_at)
+    several = stripe_search.find_lines(
+        work, seen, shade, saturation=settings.saturation_dn, least_peak=least, start=start, cut=cut, cut_at=cut_at
+    )
     double = choose(start) if several else np.zeros(len(start), np.bool_)
     low, high = settings.width_range_px
     found, widths = survey(start, low, high)
@@ -73,8 +75,9 @@ def read_quickly(
 
     def run(which: NDArray[np.intp], contrast: float, rho: Any) -> None:
         fit.fit_lines(
-            work, cut, cut_at, shade, start, widths, np.log(widths), which, settings.saturation_dn,
-            (noise2, gain, contrast), of_dark, rho, settings.steps, fitted,
+            work, cut, cut_at, dark=shade, start=start, widths=widths, log_widths=np.log(widths), which=which,
+            saturation=settings.saturation_dn,
+            noise=(noise2, gain, contrast), dark_noise=of_dark, rho=rho, steps=settings.steps, out=fitted,
         )  # fmt: skip
 
     speckle = like.speckle if like is not None else None
@@ -83,7 +86,9 @@ def read_quickly(
         if speckle is None:
             pairs = neighbours(start, double, SPECKLE_PAIRS)
             run(np.concatenate([pairs, pairs + 1]), ASSUMED_CONTRAST, NO_LAGS)
-            speckle = measure_speckle(work, shade, pairs, widths, fitted, noise2, gain, ASSUMED_CONTRAST)
+            speckle = measure_speckle(
+                work, shade, pairs, widths=widths, fitted=fitted, noise2=noise2, gain=gain, contrast=ASSUMED_CONTRAST
+            )
         seen_contrast, seen_grain, widening = speckle or (ASSUMED_CONTRAST, ASSUMED_GRAIN, 1.0)
         widths = np.minimum(np.maximum(widths * widening, low), high)
         contrast = seen_contrast if contrast is None else contrast
@@ -92,9 +97,21 @@ def read_quickly(
     run(found, contrast, rho)
     saturated = np.empty(len(work), np.bool_)
     excess = 1 + SECOND_ORDER * contrast**2
-    believe(fitted, start, work.shape[1], low, high, 0.5 * least, excess, double, saturated)
+    believe(
+        fitted, start, work.shape[1], low, high, least=0.5 * least, excess=excess, double=double, saturated=saturated
+    )
     centres, sigma, amplitude, width = (fitted[k] for k in (fit.FIT_CENTRE, fit.SIGMA, fit.AMPLITUDE, fit.WIDTH))
-    profile = StripeProfile(axis, centres, sigma, amplitude, width, saturated, double, speckle, (noise2, whole))
+    profile = StripeProfile(
+        axis,
+        centres,
+        sigma,
+        amplitude=amplitude,
+        width=width,
+        saturated=saturated,
+        double=double,
+        speckle=speckle,
+        noise=(noise2, whole),
+    )
     if like is not None and like.speckle is not None:
         return profile, QuickVerdict.ORDINARY
     if like is not None and max(profile.valid.mean(), like.valid.mean()) < HARDLY_ANY:
