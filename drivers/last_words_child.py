@@ -125,4 +125,4 @@ def say(port: int, pause: float, words: list[bytes]) -> bool:
 if __name__ == "__main__":
     pipe_end, told_end, port_end, pause_s, silence_s, *said = sys.argv[1:]
     last = [bytes.fromhex(word) for word in said]
-    main(int(pipe_end), int(told_end), int(port_end), float(pause_s), float(silence_s), last)
+    main(int(pipe_end), int(told_end), int(port_end), pause=float(pause_s), silence=float(silence_s), words=last)

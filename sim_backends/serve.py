@@ -40,7 +40,7 @@ from sim_backends.peers.vehicle.wired_vehicle import vehicle_peer
 from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.world.bodies.surfaces import SURFACES
 from sim_backends.world.drawing import STOCK, read
-from sim_backends.world.following import FOLLOWED, Following
+from sim_backends.world.following import FOLLOWED, WorldFollowing
 from sim_backends.world.hardware import camera_spec
 from sim_backends.world.levels import LEVELS
 from sim_backends.world.truth import truth
@@ -89,7 +89,7 @@ class ServedCell:
         """
         self.world = world
         clock = world.clock
-        self.following = Following(world, [name for name in FOLLOWED if name in follow])
+        self.following = WorldFollowing(world, [name for name in FOLLOWED if name in follow])
         with contextlib.ExitStack() as bound:
             self._arm = None if "arm" in follow else _bound(bound, RtdePeer(world.arm, clock))
             self._rail = None if "rail" in follow else _bound(bound, rail_peer(world))
@@ -113,9 +113,13 @@ class ServedCell:
             self._told = _bound(bound, FollowingPeer(world, self.following)) if follow else None
             self._truth = _bound(bound, TruthPeer(self.truth, self.fault, self.reset, self.make_ready))
             self._peers = bound.pop_all()
+        self._faults = self._fault_actions()
+
+    def _fault_actions(self) -> dict[str, Callable[[], None]]:
+        """What causes each fault, by its name; none of devices that are real."""
         arm, rail, vehicle = self._arm, self._rail, self._vehicle
-        self._faults: dict[str, Callable[[], None]] = {
-            **({name: partial(world.arm.fault, name.removeprefix("arm.")) for name in ARM_FAULTS} if arm else {}),
+        return {
+            **({name: partial(self.world.arm.fault, name.removeprefix("arm.")) for name in ARM_FAULTS} if arm else {}),
             **({name: partial(arm.fault, name) for name in CONTROLLER_FAULTS} if arm else {}),
             **({name: partial(rail.fault, name) for name in RAIL_FAULTS} if rail else {}),
             **({name: partial(vehicle.fault, name) for name in VEHICLE_FAULTS} if vehicle else {}),

@@ -50,11 +50,11 @@ class Attempts:
             step,
             number,
             deadline,
-            dict(self.results),
-            clock,
-            teller.tell,
-            watchman.control,
-            watchman.waiting.look,
+            results=dict(self.results),
+            clock=clock,
+            tell=teller.tell,
+            control=watchman.control,
+            look=watchman.waiting.look,
         )
         key = watchman.journal.step_started(step.name, number)
         teller.tell(Event("step_started", step.name, {"attempt": number}))

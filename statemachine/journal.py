@@ -87,7 +87,7 @@ class EventRow:
 
 
 @dataclass(frozen=True)
-class Request:
+class RunRequest:
     """Something that another process asked for; `number` is that of the question that a "confirm" answers."""
 
     kind: str
@@ -120,14 +120,14 @@ class Journal:
         pid = about.pop("pid", None)
         self._begun = run, time.time(), None, None, None, _dump(about), pid
         self._begun_steps: dict[int, tuple[str, int, float]] = {}
-        self._insert("runs", "id, started, ended, outcome, reason, info, pid", *self._begun)
+        self._insert("runs", "id, started, ended, outcome, reason, info, pid", self._begun)
 
     def step_started(self, name: str, attempt: int) -> int:
         """Record that an attempt (counted from 1) at a step begins; returns the key for `step_ended`."""
         begun = name, attempt, time.time()
         row = *begun, None, "running", None, None, None
         key = self._insert(
-            "steps", "run, name, attempt, started, ended, state, duration_s, result, error", self.run, *row
+            "steps", "run, name, attempt, started, ended, state, duration_s, result, error", (self.run, *row)
         )
         self._begun_steps[key] = begun
         return key
@@ -145,7 +145,7 @@ class Journal:
 
     def event(self, kind: str, step: str | None = None, data: Mapping[str, object] | None = None) -> None:
         """Record something that happened; `data` is JSON-ready."""
-        self._insert("events", "run, at, kind, step, data", self.run, time.time(), kind, step, _dump(data or {}))
+        self._insert("events", "run, at, kind, step, data", (self.run, time.time(), kind, step, _dump(data or {})))
 
     def run_ended(self, outcome: str, reason: str) -> None:
         """Record the end of the run."""
@@ -156,7 +156,7 @@ class Journal:
             *ended, _crc(run, started, *ended, *rest), run,
         )  # fmt: skip
 
-    def take_requests(self) -> list[Request]:
+    def take_requests(self) -> list[RunRequest]:
         """What other processes have asked for since the last call, oldest first; asked by one thread.
 
         It only reads, over a connection of its own: a write that stalls keeps nobody from being heard.
@@ -169,7 +169,7 @@ class Journal:
             raise JournalError(f"the journal {self.path} cannot be read: {error}") from error
         if rows:
             self._taken = rows[-1][0]
-        return [Request(*row) for _, *row in rows]
+        return [RunRequest(*row) for _, *row in rows]
 
     def close(self) -> None:
         """Close the file; the record is complete without it as well."""
@@ -177,7 +177,7 @@ class Journal:
             self._asked.close()
             self._base.close()
 
-    def _insert(self, table: str, columns: str, *values: object) -> int:
+    def _insert(self, table: str, columns: str, values: tuple[object, ...]) -> int:
         marks = ", ".join("?" * (len(values) + 1))
         return self._write(f"INSERT INTO {table} ({columns}, crc) VALUES ({marks})", *values, _crc(*values))
 
@@ -190,7 +190,7 @@ class Journal:
 
 
 @dataclass(frozen=True)
-class Record:
+class JournalRecord:
     """A journal as it was read: all runs, and the steps and events of the newest."""
 
     runs: tuple[RunRow, ...]
@@ -213,14 +213,14 @@ class Record:
         return {step.name: step.result or {} for step in self.steps if step.state == "done"}
 
 
-def read(folder: Path, *, whole: bool = False) -> Record:
+def read(folder: Path, *, whole: bool = False) -> JournalRecord:
     """Read the journal in a run's folder, also while it is being written.
 
     With `whole` the file's structure is checked as well, which takes longer. `JournalError` if there is none, or one
     with a row that is not as it was written.
     """
 
-    def rows(base: sqlite3.Connection) -> Record:
+    def rows(base: sqlite3.Connection) -> JournalRecord:
         if whole and (found := base.execute("PRAGMA quick_check(1)").fetchone()) != ("ok",):
             raise JournalError(f"the journal in {folder} is damaged: {found[0] if found else 'no word of it'}")
 
@@ -228,8 +228,8 @@ def read(folder: Path, *, whole: bool = False) -> Record:
             return _is(value, kind, needed=False)
 
         runs = tuple(
-            RunRow(_is(key, str), _is(started, float), may(ended, float), may(outcome, str), may(reason, str),
-                   _table(info), None if pid is None else int(pid))
+            RunRow(_is(key, str), _is(started, float), may(ended, float), may(outcome, str), reason=may(reason, str),
+                   info=_table(info), pid=None if pid is None else int(pid))
             for key, started, ended, outcome, reason, info, pid in _checked(
                 base, "runs", "id, started, ended, outcome, reason, info, pid", "ORDER BY rowid"
             )
@@ -238,8 +238,9 @@ def read(folder: Path, *, whole: bool = False) -> Record:
             raise JournalError(f"the journal in {folder} holds no run")
         own = "WHERE run = ? ORDER BY id", runs[-1].id
         steps = tuple(
-            StepRow(_is(name, str), int(attempt), _is(started, float), may(ended, float), _is(state, str),
-                    may(duration, float), None if result is None else _table(result), may(error, str))
+            StepRow(_is(name, str), int(attempt), _is(started, float), ended=may(ended, float), state=_is(state, str),
+                    duration_s=may(duration, float), result=None if result is None else _table(result),
+                    error=may(error, str))
             for _, name, attempt, started, ended, state, duration, result, error in _checked(
                 base, "steps", "run, name, attempt, started, ended, state, duration_s, result, error", *own
             )
@@ -248,7 +249,7 @@ def read(folder: Path, *, whole: bool = False) -> Record:
             EventRow(_is(at, float), _is(kind, str), may(step, str), _table(data))
             for _, at, kind, step, data in _checked(base, "events", "run, at, kind, step, data", *own)
         )
-        return Record(runs, steps, events)
+        return JournalRecord(runs, steps, events)
 
     try:
         return _in_existing(folder, rows)

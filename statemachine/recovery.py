@@ -8,7 +8,7 @@ from dataclasses import replace
 from statemachine.attempts import Attempts
 from statemachine.cancel import CancelToken
 from statemachine.policy import Failure, OnFailure, Outcome, Step
-from statemachine.sequence import Sequence, Trigger
+from statemachine.sequence import JobTrigger, Sequence
 from statemachine.standing import await_word
 from statemachine.watchman import Watchman
 
@@ -37,9 +37,9 @@ def performed(
             if (unsafe := watchman.halt_before(f"before {step.name} is tried again", end)) is not None:
                 return unsafe
             watchman.teller.failed(step.name, attempt, end, "tried again")
-            sequence.fire(Trigger.RETRY)
+            sequence.fire(JobTrigger.RETRY)
         elif end.recoverable and step.on_failure is OnFailure.RECOVER and recover is not None:
-            failed, by = recovered(step, end, error, recover, sequence, watchman)
+            failed, by = recovered(step, end, error, recover=recover, sequence=sequence, watchman=watchman)
             if failed is not None:
                 return failed
             watchman.teller.failed(step.name, attempt, end, f"confirmed by {by}, recovered" if by else "recovered")
@@ -55,7 +55,7 @@ def recovered(
     step: Step, end: Failure, error: BaseException, recover: Recover, sequence: Sequence, watchman: Watchman
 ) -> tuple[Failure | None, str | None]:
     """Clear the fault `end` of a step: why that ended the run, or None; and who has confirmed it, where needed."""
-    sequence.fire(Trigger.FAULT)
+    sequence.fire(JobTrigger.FAULT)
     # The failed attempt was stopped already. A device that is to be recovered may not have confirmed it; after the
     # recovery all have to.
     by = None
@@ -63,7 +63,7 @@ def recovered(
         refused, by = await_word(step, end, watchman)
         if refused is not None:
             return refused, None
-    sequence.fire(Trigger.RECOVER)
+    sequence.fire(JobTrigger.RECOVER)
     token = CancelToken(watchman.control.token)
     deadline = watchman.clock.now() + watchman.policy.recovery_deadline_s
     call, failed = watchman.watch("the recovery", lambda: recover(error, token, by is not None), deadline, token)
@@ -76,5 +76,5 @@ def recovered(
     if failed is None:
         failed = watchman.halt_before(f"recovered, before {step.name} is tried again", end)
     if failed is None:
-        sequence.fire(Trigger.RECOVERED)
+        sequence.fire(JobTrigger.RECOVERED)
     return failed, by

@@ -16,20 +16,20 @@ from statemachine.journal import Journal, JournalError
 from statemachine.policy import Failure, Outcome, Policy, Step
 from statemachine.recovery import Recover, performed
 from statemachine.script import NO_SCRIPT, Again, Script, Scripting
-from statemachine.sequence import Sequence, SequenceError, Trigger
+from statemachine.sequence import JobTrigger, Sequence, SequenceError
 from statemachine.standing import hold
 from statemachine.step import Event, FaultRecord, Observer, RunResult, StepCall, StepContext, StepRecord
 from statemachine.telling import Teller
 from statemachine.waiting import waiting_on
-from statemachine.watch import Clock, SignalWatch
+from statemachine.watch import RunClock, SignalWatch
 from statemachine.watchman import Watchman
 
 __all__ = ["Event", "FaultRecord", "RunResult", "Runner", "StepContext", "StepRecord"]
 
 _END_TRIGGERS = {
-    Outcome.REFUSED: Trigger.REFUSE,
-    Outcome.FAULTED: Trigger.FAULT,
-    Outcome.ABORTED: Trigger.ABORT,
+    Outcome.REFUSED: JobTrigger.REFUSE,
+    Outcome.FAULTED: JobTrigger.FAULT,
+    Outcome.ABORTED: JobTrigger.ABORT,
 }
 
 
@@ -48,7 +48,7 @@ class Runner:
     steps: Mapping[str, StepCall]
     policy: Policy
     journal: Journal
-    clock: Clock
+    clock: RunClock
     classify: Callable[[BaseException], Failure]
     safe_stop: Callable[[str], None]
     observer: Observer | None = None
@@ -105,7 +105,7 @@ class Runner:
             return end
         attempts = self._attempts
         script = Scripting(self.script, self.sequence.steps, self._watchman)
-        self.sequence.fire(Trigger.START)
+        self.sequence.fire(JobTrigger.START)
         while (state := self.sequence.state) in self.sequence.steps:
             attempts.tries = 1
             end = (
@@ -113,7 +113,7 @@ class Runner:
             )
             if end is None:
                 self.sequence.facts.done.add(state)
-                self.sequence.fire(Trigger.NEXT)
+                self.sequence.fire(JobTrigger.NEXT)
                 continue
             decided = script.decide(state, end)
             end = self._go_back(state, end, decided) if isinstance(decided, Again) else decided
@@ -135,12 +135,12 @@ class Runner:
         self._teller.tell(Event("decided", name, {"reason": end.reason, "again": chosen.step, "why": chosen.why}))
         self._attempts.forget_from(chosen.step)
         self.sequence.facts.chosen = chosen.step
-        self.sequence.fire(Trigger.AGAIN)
+        self.sequence.fire(JobTrigger.AGAIN)
         return None
 
     def _perform(self, step: Step) -> Failure | None:
         """Do one step, with its repetitions; None when it has succeeded."""
-        return performed(step, self._attempts, self.recover, self.sequence, self._watchman, self._hold)
+        return performed(step, self._attempts, self.recover, self.sequence, watchman=self._watchman, hold=self._hold)
 
     # --- the end ---
 
@@ -173,9 +173,9 @@ class Runner:
             outcome,
             said,
             code,
-            tuple(self._attempts.records[name] for name in self.sequence.steps),
-            dict(self._attempts.results),
-            self._watchman.error,
-            self.control.signal,
-            tuple(self._teller.faults),
+            steps=tuple(self._attempts.records[name] for name in self.sequence.steps),
+            results=dict(self._attempts.results),
+            error=self._watchman.error,
+            signal=self.control.signal,
+            faults=tuple(self._teller.faults),
         )

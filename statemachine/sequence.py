@@ -16,7 +16,7 @@ from functools import partial
 from transitions import Machine, MachineError
 
 
-class State(StrEnum):
+class JobState(StrEnum):
     """Where a job stands when it is in none of its steps; in a step, its state is the step's name."""
 
     IDLE = "idle"
@@ -29,7 +29,7 @@ class State(StrEnum):
     REFUSED = "refused"
 
 
-class Trigger(Enum):
+class JobTrigger(Enum):
     """What can happen to the job."""
 
     START = "start"
@@ -46,7 +46,7 @@ class Trigger(Enum):
     RESET = "reset"
 
 
-class Guard(Enum):
+class TransitionGuard(Enum):
     """Conditions on a transition; the value is what a reader of the diagram sees."""
 
     ALWAYS = ""
@@ -62,36 +62,37 @@ class Guard(Enum):
 class Transition:
     """`trigger` takes the job from `source` to `target` if `guard` holds."""
 
-    trigger: Trigger
+    trigger: JobTrigger
     source: str
     target: str
-    guard: Guard = Guard.ALWAYS
+    guard: TransitionGuard = TransitionGuard.ALWAYS
 
 
-def table(steps: tuple[str, ...], success: State) -> tuple[Transition, ...]:
+def table(steps: tuple[str, ...], success: JobState) -> tuple[Transition, ...]:
     """Every transition of a job with these steps, which ends in `success` when all are done."""
-    around = [state for state in State if state is success or state not in (State.PLACED, State.DONE)]
+    around = [state for state in JobState if state is success or state not in (JobState.PLACED, JobState.DONE)]
     states = [*around, *steps]
-    rows = [Transition(Trigger.START, State.IDLE, step, Guard.FIRST_OPEN) for step in steps]
+    rows = [Transition(JobTrigger.START, JobState.IDLE, step, TransitionGuard.FIRST_OPEN) for step in steps]
     rows += [
-        Transition(Trigger.NEXT, step, after, Guard.DONE)
+        Transition(JobTrigger.NEXT, step, after, TransitionGuard.DONE)
         for step, after in zip(steps, (*steps[1:], success), strict=True)
     ]
-    rows += [Transition(Trigger.RETRY, step, step, Guard.RETRIES_LEFT) for step in steps]
+    rows += [Transition(JobTrigger.RETRY, step, step, TransitionGuard.RETRIES_LEFT) for step in steps]
     rows += [
-        Transition(Trigger.AGAIN, step, earlier, Guard.CHOSEN)
+        Transition(JobTrigger.AGAIN, step, earlier, TransitionGuard.CHOSEN)
         for k, step in enumerate(steps)
         for earlier in steps[: k + 1]
     ]
-    rows += [Transition(Trigger.PAUSE, step, State.PAUSED) for step in steps]
-    rows += [Transition(Trigger.RESUME, State.PAUSED, step, Guard.INTERRUPTED) for step in steps]
-    rows += [Transition(Trigger.REFUSE, step, State.REFUSED) for step in (State.IDLE, *steps)]
-    rows += [Transition(Trigger.RECOVER, State.FAULTED, State.RECOVERING, Guard.RECOVERABLE)]
-    rows += [Transition(Trigger.RECOVERED, State.RECOVERING, step, Guard.INTERRUPTED) for step in steps]
-    rows += [Transition(Trigger.FAULT, state, State.FAULTED) for state in states]
-    rows += [Transition(Trigger.ABORT, state, State.ABORTED) for state in states]
+    rows += [Transition(JobTrigger.PAUSE, step, JobState.PAUSED) for step in steps]
+    rows += [Transition(JobTrigger.RESUME, JobState.PAUSED, step, TransitionGuard.INTERRUPTED) for step in steps]
+    rows += [Transition(JobTrigger.REFUSE, step, JobState.REFUSED) for step in (JobState.IDLE, *steps)]
+    rows += [Transition(JobTrigger.RECOVER, JobState.FAULTED, JobState.RECOVERING, TransitionGuard.RECOVERABLE)]
+    rows += [Transition(JobTrigger.RECOVERED, JobState.RECOVERING, step, TransitionGuard.INTERRUPTED) for step in steps]
+    rows += [Transition(JobTrigger.FAULT, state, JobState.FAULTED) for state in states]
+    rows += [Transition(JobTrigger.ABORT, state, JobState.ABORTED) for state in states]
     rows += [
-        Transition(Trigger.RESET, end, State.IDLE) for end in (success, State.REFUSED, State.FAULTED, State.ABORTED)
+        Transition(JobTrigger.RESET, end, JobState.IDLE)
+        for end in (success, JobState.REFUSED, JobState.FAULTED, JobState.ABORTED)
     ]
     return tuple(rows)
 
@@ -111,7 +112,7 @@ class Facts:
     recoverable: bool = False
 
 
-ChangeHook = Callable[[Trigger, str, str], None]
+ChangeHook = Callable[[JobTrigger, str, str], None]
 
 
 class _Model:
@@ -129,10 +130,10 @@ class Sequence:
     """
 
     def __init__(
-        self, steps: tuple[str, ...], success: State = State.PLACED, on_change: ChangeHook | None = None
+        self, steps: tuple[str, ...], success: JobState = JobState.PLACED, on_change: ChangeHook | None = None
     ) -> None:
-        if not steps or len(set(steps)) < len(steps) or set(steps) & set(State):
-            raise ValueError(f"steps need names of their own, other than {', '.join(State)}; given: {list(steps)}")
+        if not steps or len(set(steps)) < len(steps) or set(steps) & set(JobState):
+            raise ValueError(f"steps need names of their own, other than {', '.join(JobState)}; given: {list(steps)}")
         self.steps = steps
         self.success = success
         self.facts = Facts()
@@ -143,7 +144,7 @@ class Sequence:
         self._machine = Machine(
             model=self._model,
             states=list(dict.fromkeys(str(row.source) for row in self.table)),
-            initial=State.IDLE.value,
+            initial=JobState.IDLE.value,
             auto_transitions=False,
             queued=False,
             send_event=False,
@@ -155,13 +156,13 @@ class Sequence:
 
     @property
     def state(self) -> str:
-        """The present state: a step's name, or a `State`."""
+        """The present state: a step's name, or a `JobState`."""
         return self._model.state
 
-    def fire(self, trigger: Trigger) -> str:
+    def fire(self, trigger: JobTrigger) -> str:
         """Take the transition that `trigger` names and return the new state; `SequenceError` if there is none."""
         source = self.state
-        if source in self.steps and trigger in (Trigger.PAUSE, Trigger.FAULT):
+        if source in self.steps and trigger in (JobTrigger.PAUSE, JobTrigger.FAULT):
             self.facts.interrupted = source
         try:
             moved = self._model.trigger(trigger.value)
@@ -170,9 +171,9 @@ class Sequence:
         if not moved:
             guards = {row.guard.value for row in self.table if (row.trigger, row.source) == (trigger, source)}
             raise SequenceError(f"'{trigger.value}' is held back in state '{source}': not {', '.join(guards)}")
-        if trigger is Trigger.RESET:
+        if trigger is JobTrigger.RESET:
             self.facts = Facts()
-        if trigger is Trigger.AGAIN:
+        if trigger is JobTrigger.AGAIN:
             self.facts.done -= set(self.steps[self.steps.index(self.state) :])
             self.facts.chosen = None
         if self.on_change is not None:
@@ -187,7 +188,7 @@ class Sequence:
         """The transitions as the machine itself holds them, for the diagram."""
         guards = {(row.trigger, str(row.source), str(row.target)): row.guard for row in self.table}
         found = []
-        for trigger in Trigger:
+        for trigger in JobTrigger:
             for way in self._machine.get_transitions(trigger.value):
                 source, target = str(way.source), str(way.dest)
                 found.append(Transition(trigger, source, target, guards[trigger, source, target]))
@@ -196,31 +197,31 @@ class Sequence:
     def _holds(self, row: Transition) -> bool:
         facts = self.facts
         match row.guard:
-            case Guard.FIRST_OPEN:
+            case TransitionGuard.FIRST_OPEN:
                 return row.target == next((step for step in self.steps if step not in facts.done), None)
-            case Guard.DONE:
+            case TransitionGuard.DONE:
                 return row.source in facts.done
-            case Guard.RETRIES_LEFT:
+            case TransitionGuard.RETRIES_LEFT:
                 return facts.retries_left > 0
-            case Guard.RECOVERABLE:
+            case TransitionGuard.RECOVERABLE:
                 return facts.recoverable and facts.interrupted is not None and facts.retries_left > 0
-            case Guard.INTERRUPTED:
+            case TransitionGuard.INTERRUPTED:
                 return row.target == facts.interrupted
-            case Guard.CHOSEN:
+            case TransitionGuard.CHOSEN:
                 return row.target == facts.chosen
         return True
 
 
 def mermaid(sequence: Sequence) -> str:
     """The diagram as `stateDiagram-v2` text, without a fence, ending in a newline."""
-    ends = (sequence.success, State.REFUSED, State.FAULTED, State.ABORTED)
+    ends = (sequence.success, JobState.REFUSED, JobState.FAULTED, JobState.ABORTED)
     inner: list[str] = []
     outer: list[str] = []
     for row in _drawn(sequence):
         (inner if row[0] in sequence.steps and row[1] in sequence.steps else outer).append(_edge(*row))
     lines = ["stateDiagram-v2", "    direction LR", "    state job {", "        direction LR"]
     lines += [f"        {line}" for line in inner]
-    lines += ["    }", '    state "any state" as any_state', f"    [*] --> {State.IDLE.value}"]
+    lines += ["    }", '    state "any state" as any_state', f"    [*] --> {JobState.IDLE.value}"]
     lines += [f"    {line}" for line in outer]
     lines += [f"    {end.value} --> [*]" for end in ends]
     return "\n".join(lines) + "\n"
@@ -230,8 +231,8 @@ def _drawn(sequence: Sequence) -> list[tuple[str, str, str]]:
     """Edges (source, target, label), with the rows that share all steps or all states folded into one."""
     rows, steps = sequence.rows(), set(sequence.steps)
     states = {row.source for row in rows}
-    by_target: dict[tuple[Trigger, str], set[str]] = defaultdict(set)
-    by_source: dict[tuple[Trigger, str], set[str]] = defaultdict(set)
+    by_target: dict[tuple[JobTrigger, str], set[str]] = defaultdict(set)
+    by_source: dict[tuple[JobTrigger, str], set[str]] = defaultdict(set)
     for row in rows:
         by_target[row.trigger, row.target].add(row.source)
         by_source[row.trigger, row.source].add(row.target)
@@ -245,7 +246,7 @@ def _drawn(sequence: Sequence) -> list[tuple[str, str, str]]:
         if by_source[row.trigger, row.source] == steps:
             target = "job"
         # To any step up to the one where it stands: one arrow says as much as all of them.
-        if row.trigger is Trigger.AGAIN:
+        if row.trigger is JobTrigger.AGAIN:
             source = target = "job"
         label = row.trigger.value + (f" [{row.guard.value}]" if row.guard.value else "")
         if (source, target, label) not in edges:

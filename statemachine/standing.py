@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 
 from statemachine.policy import Failure, Outcome, Step
-from statemachine.sequence import Sequence, Trigger
+from statemachine.sequence import JobTrigger, Sequence
 from statemachine.step import Event
 from statemachine.watchman import Watchman
 
@@ -20,13 +20,13 @@ def hold(sequence: Sequence, watchman: Watchman) -> tuple[Failure | None, Except
     control, tell = watchman.control, watchman.teller.tell
     if end is None and control.paused():
         step = sequence.state
-        sequence.fire(Trigger.PAUSE)
+        sequence.fire(JobTrigger.PAUSE)
         tell(Event("paused", step, {"text": f"held before {step}"}))
         while end is None and control.paused() and ailment is None:
             end = watchman.wait_briefly()
             ailment = watchman.examine()
         if end is None:
-            sequence.fire(Trigger.RESUME)
+            sequence.fire(JobTrigger.RESUME)
             text = "goes on" if ailment is None else f"held no longer: {ailment}"
             tell(Event("going_on", step, {"text": text}))
     return end, ailment

@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar, runtime_checkable
 from statemachine.cancel import CancelToken
 from statemachine.control import RunControl
 from statemachine.policy import Outcome, Step
-from statemachine.watch import Clock
+from statemachine.watch import RunClock
 
 Made = TypeVar("Made")
 
@@ -71,7 +71,7 @@ class StepContext:
         attempt: int,
         deadline: float,
         results: Mapping[str, object],
-        clock: Clock,
+        clock: RunClock,
         tell: Observer,
         control: RunControl | None = None,
         look: Callable[[], None] = lambda: None,

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from statemachine.journal import Journal
 from statemachine.policy import Failure, Outcome
-from statemachine.sequence import Trigger
+from statemachine.sequence import JobTrigger
 from statemachine.step import Event, FaultRecord, Observer
 
 JOURNALLED = frozenset(
@@ -34,7 +34,7 @@ class Teller:
             attempt, code, reason = (event.data[key] for key in ("attempt", "code", "reason"))
             remedy = str(event.data.get("remedy", "noted"))
             assert isinstance(attempt, int)
-            self.faults.append(FaultRecord(event.at, event.step or "", attempt, str(code), str(reason), remedy))
+            self.faults.append(FaultRecord(event.at, event.step or "", attempt, str(code), str(reason), remedy=remedy))
         observer = self._observer
         if observer is not None:
             try:
@@ -44,7 +44,7 @@ class Teller:
                 self._observer = None
                 self._journal.event("observer_failed", event.step, {"error": f"{type(error).__name__}: {error}"})
 
-    def changed(self, trigger: Trigger, source: str, target: str) -> None:
+    def changed(self, trigger: JobTrigger, source: str, target: str) -> None:
         """The sequence went from one state to another."""
         self.tell(Event("state", None, {"trigger": trigger.value, "from": str(source), "to": str(target)}))
 

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager
 from typing import Protocol, runtime_checkable
 
 from statemachine.cancel import Cancelled
-from statemachine.watch import Call, Clock, begin
+from statemachine.watch import Call, RunClock, begin
 
 POLL_S = 0.02
 """How often a watch looks around while work goes on: seconds on the wall, or of the virtual clock."""
@@ -23,7 +23,7 @@ Cut = Callable[[], str | None]
 
 
 @runtime_checkable
-class VirtualClock(Clock, Protocol):
+class WaitableClock(RunClock, Protocol):
     """A clock whose time moves when somebody waits on it."""
 
     def looking(self, look: Callable[[], None]) -> AbstractContextManager[None]:
@@ -47,15 +47,15 @@ class Waiting(Protocol):
         """Do every action whatever becomes of the others; a line for each that was not confirmed in `timeout` s."""
 
 
-def waiting_on(clock: Clock) -> Waiting:
+def waiting_on(clock: RunClock) -> Waiting:
     """The way that suits a clock."""
-    return InLine(clock) if isinstance(clock, VirtualClock) else Threads(clock)
+    return InLine(clock) if isinstance(clock, WaitableClock) else Threads(clock)
 
 
 class Threads:
     """Each piece of work in a thread of its own; `clock` runs at its own pace."""
 
-    def __init__(self, clock: Clock) -> None:
+    def __init__(self, clock: RunClock) -> None:
         self._clock = clock
 
     def do(self, name: str, work: Callable[[], object], cut: Cut, grace: float) -> Call:
@@ -87,7 +87,7 @@ class Threads:
 class InLine:
     """Everything in the thread that asks for it, one after another; `clock` moves when it waits."""
 
-    def __init__(self, clock: VirtualClock) -> None:
+    def __init__(self, clock: WaitableClock) -> None:
         self._clock = clock
         self._look_out: _LookOut | None = None
 
@@ -119,7 +119,7 @@ class InLine:
         return problems
 
 
-def _within(clock: Clock, timeout: float) -> Cut:
+def _within(clock: RunClock, timeout: float) -> Cut:
     until = clock.now() + timeout
     return lambda: f"it took longer than {timeout:.0f} s" if clock.now() > until else None
 
@@ -127,7 +127,7 @@ def _within(clock: Clock, timeout: float) -> Cut:
 class _LookOut:
     """Looks around for work in line; `moved` is called each time that has let time pass."""
 
-    def __init__(self, clock: VirtualClock, cut: Cut, grace: float) -> None:
+    def __init__(self, clock: WaitableClock, cut: Cut, grace: float) -> None:
         self._clock = clock
         self._cut = cut
         self._grace = grace

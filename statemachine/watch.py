@@ -9,7 +9,7 @@ from types import FrameType, TracebackType
 from typing import Protocol
 
 
-class Clock(Protocol):
+class RunClock(Protocol):
     """The cell's clock: seconds that run `rate` times as fast as the wall."""
 
     rate: float

@@ -15,7 +15,7 @@ from statemachine.policy import Failure, Outcome, Policy
 from statemachine.step import StepOverrun
 from statemachine.telling import Teller
 from statemachine.waiting import POLL_S, Waiting
-from statemachine.watch import Call, Clock, SignalWatch
+from statemachine.watch import Call, RunClock, SignalWatch
 
 REQUEST_POLLS = 10
 """The journal's requests are looked at every so many polls."""
@@ -33,7 +33,7 @@ class Watchman:
 
     policy: Policy
     journal: Journal
-    clock: Clock
+    clock: RunClock
     control: RunControl
     classify: Callable[[BaseException], Failure]
     safe_stop: Callable[[str], None]

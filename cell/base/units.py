@@ -123,7 +123,7 @@ def number(low: float, high: float) -> Any:
     return BeforeValidator(check)
 
 
-def whole(low: int, high: int, *allowed: int, meaning: str = "") -> Any:
+def whole(low: int, high: int, *, allowed: tuple[int, ...] = (), meaning: str = "") -> Any:
     """Validator for a field of type int from `low` to `high`, or one of `allowed`; `meaning` tells what they are."""
     text = f" (allowed: {', '.join(map(str, allowed))})" if allowed else range_text(low, high)
 

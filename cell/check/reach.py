@@ -89,9 +89,9 @@ def nominal_scan(config: CellConfig) -> ScanCalibration:
         nominal_camera(config.scan_camera),
         LightPlane.from_baseline(laser.baseline, float(np.arctan(laser.tan_theta))),
         np.array([1.0, 0.0, 0.0]),
-        config.scan_camera.flange_from_camera.se3(),
-        np.zeros((size, size)),
-        Quality(0, 0.0, 0.0, None, 0.0, None),
+        flange_from_camera=config.scan_camera.flange_from_camera.se3(),
+        covariance=np.zeros((size, size)),
+        quality=Quality(0, 0.0, 0.0, stripe_rms=None, held_out_px=0.0, held_out_stripe=None),
     )
 
 

@@ -15,7 +15,7 @@ from drivers.interfaces import Arm, Camera, Claw, Device, Vehicle
 from statemachine.waiting import waiting_on
 
 if TYPE_CHECKING:
-    from cell.devices.simulated.following import Following
+    from cell.devices.simulated.following import DeviceFollowing
 
 SAFE_STOP_TIMEOUT_S = 5.0
 
@@ -27,7 +27,7 @@ class Devices:
     simulated world what the real ones do; None where all are real, or all simulated.
     """
 
-    following: Following | None = None
+    following: DeviceFollowing | None = None
 
     def __init__(
         self,

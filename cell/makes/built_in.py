@@ -63,9 +63,9 @@ class TmclRailConfig(RailConfig):
     address: Annotated[int, whole(1, 255)] = 1
     motor: Annotated[int, whole(0, 5)] = 0
     steps_per_turn: Annotated[int, whole(20, 2000)]
-    microsteps: Annotated[int, whole(1, 256, 1, 2, 4, 8, 16, 32, 64, 128, 256)]
-    baud: Annotated[int, whole(9600, 1_000_000, *BAUDS)] = 9600
-    reference_mode: Annotated[int, whole(1, 255, *REFERENCE_MODES, meaning=MODES_TOLD)] = 5
+    microsteps: Annotated[int, whole(1, 256, allowed=(1, 2, 4, 8, 16, 32, 64, 128, 256))]
+    baud: Annotated[int, whole(9600, 1_000_000, allowed=BAUDS)] = 9600
+    reference_mode: Annotated[int, whole(1, 255, allowed=REFERENCE_MODES, meaning=MODES_TOLD)] = 5
     reversed: StrictBool = False
 
     @model_validator(mode="after")

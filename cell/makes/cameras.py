@@ -104,8 +104,8 @@ class FolderCameraConfig(CameraConfig):
 def _genicam(name: str, config: GenicamConfig, place: Place, around: Surroundings) -> GenicamCamera:
     from drivers.camera.genicam.acquisition import Network
     from drivers.camera.genicam.camera import GenicamCamera
-    from drivers.camera.genicam.connection import Setup
-    from drivers.camera.genicam.settings import Region, Trigger
+    from drivers.camera.genicam.connection import GenicamSetup
+    from drivers.camera.genicam.settings import ExposureTrigger, Region
 
     left, top = config.offset
     network = Network()
@@ -113,11 +113,11 @@ def _genicam(name: str, config: GenicamConfig, place: Place, around: Surrounding
         network = Network(
             config.packet_size, config.packet_delay, config.resend, config.packet_timeout, config.retention
         )
-    setup = Setup(
+    setup = GenicamSetup(
         Region(config.width, config.height, left, top),
         config.pixel_format,
         config.gain,
-        Trigger(config.trigger, config.trigger_line, f"{config.trigger_edge.capitalize()}Edge"),
+        ExposureTrigger(config.trigger, config.trigger_line, f"{config.trigger_edge.capitalize()}Edge"),
         network,
     )
     return GenicamCamera(name, place, setup, clock=around.clock, look=around.look)

@@ -120,7 +120,7 @@ class ModbusRailConfig(RailConfig):
     driver: Literal["modbus"] = "modbus"
     url: Annotated[str, Port]
     unit: Annotated[int, whole(1, 247)] = 1
-    baud: Annotated[int, whole(4800, 230400, *BAUDS)] = 115200
+    baud: Annotated[int, whole(4800, 230400, allowed=BAUDS)] = 115200
     parity: Literal["none", "even", "odd"] = "none"
     stop_bits: Annotated[int, whole(1, 2)] = 1
     counts_per_turn: Annotated[int, whole(20, 10_000_000, meaning=" of the position register in one turn of the motor")]

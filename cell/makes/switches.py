@@ -51,7 +51,7 @@ class NumatoLaserConfig(OnBoard, LaserConfig):
 
     driver: Literal["numato"] = "numato"
     relay: NumatoRelay
-    baud: Annotated[int, whole(9600, 921600, *NUMATO_BAUDS)] = 19200
+    baud: Annotated[int, whole(9600, 921600, allowed=NUMATO_BAUDS)] = 19200
 
 
 class LcusLaserConfig(OnBoard, LaserConfig):
@@ -64,7 +64,7 @@ class LcusLaserConfig(OnBoard, LaserConfig):
 
     driver: Literal["lcus"] = "lcus"
     relay: Annotated[int, whole(1, 8, meaning=": relays as the board counts them, from 1")] = 1
-    baud: Annotated[int, whole(9600, 115200, 9600, 115200)] = 9600
+    baud: Annotated[int, whole(9600, 115200, allowed=(9600, 115200))] = 9600
 
 
 class NumatoClawConfig(OnBoard, ClawConfig):
@@ -78,7 +78,7 @@ class NumatoClawConfig(OnBoard, ClawConfig):
     relay: NumatoRelay
     feedback: NumatoInput
     held_is: Literal["high", "low"] = "high"
-    baud: Annotated[int, whole(9600, 921600, *NUMATO_BAUDS)] = 19200
+    baud: Annotated[int, whole(9600, 921600, allowed=NUMATO_BAUDS)] = 19200
 
 
 class RobotiqClawConfig(ClawConfig):

@@ -27,7 +27,7 @@ _POSTURES: Joints = np.random.default_rng(1).uniform(-2.8, 2.8, (24, 6))
 
 
 @dataclass(frozen=True)
-class ArmModel:
+class ArmDimensions:
     """One model: lengths of the maker's table in m, and the thickness of its links in m.
 
     `upper` and `forearm` are how far the two long links lie beside joint 2, along its axis, and their radius; `wrist`
@@ -67,17 +67,17 @@ _HEAVY = (0.25, 0.095), (0.043, 0.080), 0.056, 0.12
 MODELS = {
     model.name: model
     for model in (
-        ArmModel("UR3", 0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, *_SMALL),
-        ArmModel("UR5", 0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, *_MIDDLE),
-        ArmModel("UR10", 0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, *_LARGE),
-        ArmModel("UR3e", 0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, *_SMALL),
-        ArmModel("UR5e", 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, *_MIDDLE),
-        ArmModel("UR7e", 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, *_MIDDLE),
-        ArmModel("UR10e", 0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, *_LARGE),
-        ArmModel("UR12e", 0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, *_LARGE),
-        ArmModel("UR16e", 0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, *_LARGE),
-        ArmModel("UR20", 0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, *_HEAVY),
-        ArmModel("UR30", 0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543, *_HEAVY),
+        ArmDimensions("UR3", 0.1519, -0.24365, -0.21325, 0.11235, 0.08535, 0.0819, *_SMALL),
+        ArmDimensions("UR5", 0.089159, -0.425, -0.39225, 0.10915, 0.09465, 0.0823, *_MIDDLE),
+        ArmDimensions("UR10", 0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, *_LARGE),
+        ArmDimensions("UR3e", 0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, *_SMALL),
+        ArmDimensions("UR5e", 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, *_MIDDLE),
+        ArmDimensions("UR7e", 0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, *_MIDDLE),
+        ArmDimensions("UR10e", 0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, *_LARGE),
+        ArmDimensions("UR12e", 0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, *_LARGE),
+        ArmDimensions("UR16e", 0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, *_LARGE),
+        ArmDimensions("UR20", 0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, *_HEAVY),
+        ArmDimensions("UR30", 0.2363, -0.637, -0.5037, 0.201, 0.1593, 0.1543, *_HEAVY),
     )
 }
 """By the maker's name. The UR7e has the links of the UR5e, the UR12e those of the UR10e."""

@@ -22,7 +22,7 @@ AHEAD = 256
 
 
 @dataclass(frozen=True, eq=False)
-class Touch:
+class FirstContact:
     """Where on a way bodies touch first: joint angles (6,) rad, about which sample that is, and the pairs."""
 
     joints: Joints
@@ -32,7 +32,7 @@ class Touch:
 
 def first_touch(
     model: CollisionModel, way: NDArray[np.float64], allowed: tuple[Pair, ...] = (), opening: bool = False
-) -> Touch | None:
+) -> FirstContact | None:
     """The first touch on a way (n, 6) rad, straight in joint angles between its samples; None when it is free.
 
     Pairs in `allowed` are not looked at. With `opening`, pairs that are nearer than the margin at the beginning may be
@@ -51,13 +51,13 @@ def first_touch(
     while True:
         met = apart < needed
         if met.any():
-            return Touch(joints, sample, [pair for pair, close in zip(model.pairs, met, strict=True) if close])
+            return FirstContact(joints, sample, [pair for pair, close in zip(model.pairs, met, strict=True) if close])
         if sample == len(samples) - 1:
             return None
         if opening:
             needed = np.where(needed > -np.inf, np.maximum(needed, np.minimum(kept, apart - GIVE)), needed)
         room = np.maximum(apart - needed, 2.0 * ROUNDING)
-        joints, place, sample = _onwards(model, samples, turned, place, sample, room)
+        joints, place, sample = _onwards(model, samples, turned, place=place, sample=sample, room=room)
         apart = model.distances(joints)
 
 

@@ -33,7 +33,7 @@ PNG = (
 """A third of the time of the default and no larger: choosing a filter for each row of a noisy picture gains nothing."""
 
 
-class Picture:
+class FrameFile:
     """A frame's file: its `name`, and its bytes once they are there."""
 
     def __init__(self, name: str) -> None:
@@ -52,7 +52,7 @@ class Picture:
         return self._png
 
 
-Listener = Callable[[str, Frame, Picture], None]
+Listener = Callable[[str, Frame, FrameFile], None]
 """Told of each frame that is kept: of what, the frame, and its file."""
 
 
@@ -68,7 +68,7 @@ class FrameStore:
         self.found: tuple[Frame, Vector] | None = None
         self._folder = folder
         self._listener = listener
-        self._waiting: queue.Queue[tuple[Picture, Frame] | threading.Event | None] = queue.Queue(CAPACITY)
+        self._waiting: queue.Queue[tuple[FrameFile, Frame] | threading.Event | None] = queue.Queue(CAPACITY)
         self._failure: str | None = None
         self._digests: dict[str, str] = {}
         self._thread = threading.Thread(target=self._write, name="frame store", daemon=True)
@@ -86,7 +86,7 @@ class FrameStore:
         name = f"{what}-{frame.frame_id:06d}.png"
         self.recent.append(name)
         self.last = what, frame
-        picture = Picture(name)
+        picture = FrameFile(name)
         if self._listener is not None:
             self._listener(what, frame, picture)
         try:

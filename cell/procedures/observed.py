@@ -16,7 +16,7 @@ class RailPath:
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
+class TimedCloud:
     """A cloud, and the host `times` (lines,) in s at which its lines were taken."""
 
     cloud: Cloud

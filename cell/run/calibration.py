@@ -72,9 +72,9 @@ def stored(cell: Opened) -> CellCalibration:
         cell.calibrations_folder,
         serial_numbers(cell.devices),
         cell.config.calibration_hash(),
-        cell.config.calibration.max_age,
-        arm_table(cell.config, cell.devices),
-        why_untold(cell.devices.arm),
+        max_age=cell.config.calibration.max_age,
+        kinematics=arm_table(cell.config, cell.devices),
+        untold=why_untold(cell.devices.arm),
     )
     require_as_configured(found, cell.config)
     return found
@@ -101,11 +101,13 @@ def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
         witness = look_at_witness(config, devices, hands.keep)
         target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
         tell(0.96, "solving")
-        observations = gathered(scan, target, serial_numbers(devices), config, arm_table(config, devices), witness)
+        observations = gathered(
+            scan, target, serial_numbers(devices), config=config, kinematics=arm_table(config, devices), witness=witness
+        )
         made = solve_observations(observations).calibration
         tell(0.98, "looking at the scan camera's shutter")
         with kept_if_refused(cell.calibrations_folder, made.name):
-            made = look_at_shutter(config, devices, mover, made, hands.check, hands.keep)
+            made = look_at_shutter(config, devices, mover, calibration=made, check=hands.check, keep=hands.keep)
         made = with_edge(config, devices, hands.keep, made)
         return replace(observations, witness=made.scan.witness), made
 
@@ -146,7 +148,9 @@ def verify(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) 
         mover = cell.mover(job, hands.safe_point)
         cell.devices.interlocks.work_with(calibration.configuration)
         cell.devices.vehicle.recover()
-        seen = collect_verification(cell.config, cell.devices, mover, calibration, hands.check, tell, hands.keep)
+        seen = collect_verification(
+            cell.config, cell.devices, mover, calibration=calibration, check=hands.check, progress=tell, keep=hands.keep
+        )
         return Verification.of(calibration, job, seen)
 
     made = cell.recorded(run, "verification", work)
@@ -168,7 +172,9 @@ def time_stamps(cell: Opened, run: Run[Any], calibration: CellCalibration, job: 
         cell.devices.interlocks.work_with(calibration.configuration)
         cell.devices.vehicle.recover()
         with kept_if_refused(cell.calibrations_folder, calibration.name):
-            timing = collect_timing(cell.config, cell.devices, mover, calibration, hands.check, tell, hands.keep)
+            timing = collect_timing(
+                cell.config, cell.devices, mover, calibration, check=hands.check, progress=tell, keep=hands.keep
+            )
         return replace(calibration, scan=replace(calibration.scan, timing=timing))
 
     made = cell.recorded(run, "timing", work)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from cell.base.lateness import LATENESS, MOST_S
 from cell.devices.devices import Devices
-from cell.devices.simulated.following import Following
+from cell.devices.simulated.following import DeviceFollowing
 from drivers.errors import (
     Aborted,
     CalibrationStale,
@@ -30,7 +30,7 @@ UNHEARD = frozenset(("arm.link_lost", "arm.program_stopped"))
 BUSY = "this computer is too busy"
 
 
-def classify(error: BaseException, following: Following | None = None) -> Failure:
+def classify(error: BaseException, following: DeviceFollowing | None = None) -> Failure:
     """What an exception means for the run; what failed besides, as it was ended, is told after it.
 
     What a person is asked says what is simulated beside real devices (`following`).

@@ -19,7 +19,7 @@ from cell.config.calibrations.store import CellCalibration, save_calibration
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.devices.devices import Devices
-from cell.devices.simulated.following import Following
+from cell.devices.simulated.following import DeviceFollowing
 from cell.devices.simulated.injection import Injector
 from cell.devices.stopping import require_healthy, stop_cell
 from cell.measure.inversion import NominalSurface
@@ -29,7 +29,7 @@ from cell.procedures.pace import Pace
 from cell.procedures.steps.kinds import Kind
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep
-from cell.procedures.sweep.swath import Collector, Sweeping
+from cell.procedures.sweep.swath import SweepCollector, Sweeping
 from cell.run.faults import classify, clear
 from cell.run.files.folder import new_run
 from cell.run.files.logs import run_log
@@ -37,7 +37,7 @@ from cell.run.record.perception import save as save_perception
 from cell.run.record.recorder import Recorder, recorded
 from cell.run.report.figures import told
 from cell.run.report.report import make_report
-from cell.run.report.truth import Witness
+from cell.run.report.truth import TruthRecorder
 from cell.run.run import Run
 from drivers.errors import CellError
 from statemachine.control import RunControl
@@ -138,7 +138,7 @@ class JobRun:
         started = time.time()
         begun = self.devices.clock.now()
         open_before = self.devices.gate.is_open
-        witness = None if self.truth is None else Witness(self.truth)
+        witness = None if self.truth is None else TruthRecorder(self.truth)
         observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
         with FrameStore(folder / "frames", None if record is None else record.frame) as frames:
             self.run.frames = frames
@@ -146,12 +146,12 @@ class JobRun:
                 self.config,
                 self.job,
                 self.nominal,
-                self.calibration,
-                self.devices,
-                frames,
-                folder,
-                whereabouts,
-                self.earlier,
+                calibration=self.calibration,
+                devices=self.devices,
+                frames=frames,
+                folder=folder,
+                whereabouts=whereabouts,
+                earlier=self.earlier,
                 needs_part=self.kind.places,
                 sweeping=self._sweeping,
                 registered=self._registered,
@@ -191,26 +191,27 @@ class JobRun:
         if self.devices.following is not None:
             facts["following"] = self._following(self.devices.following)
         report = make_report(
-            folder, self.config, self.job, self.nominal, here.repeatability, result, facts, started, witness, frames,
+            folder, self.config, self.job, nominal=self.nominal, repeatability=here.repeatability, result=result,
+            info=facts, started=started, witness=witness, frames=frames,
         )  # fmt: skip
         return RunOutcome(
             report["outcome"],
             report["reason"],
             folder,
-            report,
-            result.results,
-            self.run.control,
-            time.time() - started,
+            report=report,
+            results=result.results,
+            control=self.run.control,
+            wall_s=time.time() - started,
         )
 
-    def _sweeping(self, collector: Collector, base_from_surface: pin.SE3) -> None:
+    def _sweeping(self, collector: SweepCollector, base_from_surface: pin.SE3) -> None:
         self.run.registered = None
         self.run.sweeping = Sweeping(collector, base_from_surface, self.nominal)
 
     def _registered(self, base_from_surface: pin.SE3) -> None:
         self.run.registered = base_from_surface
 
-    def _following(self, following: Following) -> dict[str, Any]:
+    def _following(self, following: DeviceFollowing) -> dict[str, Any]:
         try:
             return following.figures()
         except CellError as error:

@@ -193,7 +193,7 @@ def _jog_vehicle(cell: Cell, wish: Jog, check: Callable[[], None]) -> dict[str, 
         if wish.axis == "yaw":
             turn_to(vehicle, odometry, wish.amount, clock, look)
         else:
-            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), JOG_SPEED, clock, look)
+            drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), speed=JOG_SPEED, clock=clock, check=look)
     finally:
         vehicle.brake()
     pose = odometry.pose()

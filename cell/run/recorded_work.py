@@ -33,7 +33,7 @@ from statemachine.cancel import CancelToken
 from statemachine.journal import Journal, JournalError
 from statemachine.policy import Failure, Outcome, Policy, Step
 from statemachine.recovery import performed
-from statemachine.sequence import Sequence, State, Trigger
+from statemachine.sequence import JobState, JobTrigger, Sequence
 from statemachine.step import Event, StepContext
 from statemachine.telling import Teller
 from statemachine.waiting import waiting_on
@@ -152,7 +152,7 @@ class RecordedWork:
             stopped = False
             clear(devices, error, token, confirmed)
 
-        sequence = Sequence((self.kind,), State.DONE)
+        sequence = Sequence((self.kind,), JobState.DONE)
         step = Step(self.kind, math.inf, RETRIES)
         simulated = self.config is not None and self.config.cell.confirm == "simulated"
         open_before, end = devices.gate.is_open, None
@@ -170,7 +170,7 @@ class RecordedWork:
                 teller=Teller(journal, self._heard, lambda: sequence.state),
             )
             attempts = Attempts(sequence.steps, {self.kind: begin}, watchman)
-            sequence.fire(Trigger.START)
+            sequence.fire(JobTrigger.START)
             try:
                 end = performed(step, attempts, recover, sequence, watchman)
                 stops = devices.gate.stops

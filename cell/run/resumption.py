@@ -15,7 +15,7 @@ from cell.procedures.arm.part import PartState
 from cell.procedures.steps import laser_sweep
 from cell.procedures.sweep.stored_sweep import FILE, StoredSweep
 from drivers.errors import ConfigError, RefusedError
-from statemachine.journal import JournalError, Record, read
+from statemachine.journal import JournalError, JournalRecord, read
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def _require_facts(folder: Path, info: dict[str, Any]) -> None:
             raise ConfigError(f"the journal of run {folder.name} tells its {name} as {info[name]!r}; run the job again")
 
 
-def _require_held(folder: Path, record: Record) -> None:
+def _require_held(folder: Path, record: JournalRecord) -> None:
     """`ConfigError` when the part is not in the claw any more, or may not be."""
     told = [event for event in record.events if "part" in event.data]
     match told[-1].data["part"] if told else PartState.HELD.value:
@@ -123,7 +123,7 @@ def _require_held(folder: Path, record: Record) -> None:
             )
 
 
-def _swept(record: Record) -> bool:
+def _swept(record: JournalRecord) -> bool:
     sweeps = [step for step in record.steps if step.name == laser_sweep.STEP.name]
     if not sweeps or sweeps[-1].state != "done" or sweeps[-1].ended is None:
         return False

@@ -34,14 +34,14 @@ class ArmLimits:
         """The joint angles (6,) in rad if all are inside the limits, else `LimitError`."""
         joints = _six(device, "joint angles", joints)
         for index, (angle, (low, high)) in enumerate(zip(joints, self.joints, strict=True)):
-            check_range(device, f"angle of joint {index + 1}", angle, low, high, "rad")
+            check_range(device, f"angle of joint {index + 1}", angle, low=low, high=high, unit="rad")
         return joints
 
     def check_pose(self, device: str, flange: Vector) -> Vector:
         """The flange pose (6,) if its place is within reach, else `LimitError`."""
         flange = _six(device, "flange pose", flange)
         check_range(
-            device, "distance of the flange from the base", float(np.linalg.norm(flange[:3])), 0, self.reach, "m"
+            device, "distance of the flange from the base", float(np.linalg.norm(flange[:3])), 0, self.reach, unit="m"
         )
         return flange
 
@@ -57,8 +57,8 @@ class ArmLimits:
 
     def check_payload(self, device: str, mass: float, centre: Vector) -> tuple[float, tuple[float, float, float]]:
         """Mass in kg and centre of gravity (3,) in m if the arm may carry it, else `LimitError`."""
-        mass = check_range(device, "payload", mass, 0.0, self.payload, "kg")
-        x, y, z = (check_range(device, "payload offset", float(v), -0.5, 0.5, "m") for v in centre)
+        mass = check_range(device, "payload", mass, low=0.0, high=self.payload, unit="kg")
+        x, y, z = (check_range(device, "payload offset", float(v), low=-0.5, high=0.5, unit="m") for v in centre)
         return mass, (x, y, z)
 
     def check_trajectory(self, device: str, times: Vector, joints: Vector) -> tuple[Vector, Vector]:
@@ -78,8 +78,8 @@ class ArmLimits:
             raise LimitError(device, "the trajectory's times must begin at 0 s and increase; nothing was sent")
         for index, (low, high) in enumerate(self.joints):
             what = f"angle of joint {index + 1} on the trajectory"
-            check_range(device, what, float(joints[:, index].min()), low, high, "rad")
-            check_range(device, what, float(joints[:, index].max()), low, high, "rad")
+            check_range(device, what, float(joints[:, index].min()), low=low, high=high, unit="rad")
+            check_range(device, what, float(joints[:, index].max()), low=low, high=high, unit="rad")
         speeds = np.abs(np.diff(joints, axis=0)) / np.diff(times)[:, None]
         point, joint = np.unravel_index(int(np.argmax(speeds / np.array(self.joint_speeds))), speeds.shape)
         if speeds[point, joint] > self.joint_speeds[joint] * (1 + 1e-9):

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
-from drivers.arm.messages import UNANSWERED, Ended, Lost, Reply, Request, Setup, Snapshot
+from drivers.arm.messages import UNANSWERED, ChildReply, ChildRequest, ChildSetup, Ended, Lost, Snapshot
 from drivers.errors import Aborted, DeviceFault, NotConnectedError
 from drivers.packages import lacking
 from drivers.pulse import Pulse
@@ -44,7 +44,7 @@ class ArmLink:
     def __init__(
         self,
         name: str,
-        setup: Setup,
+        setup: ChildSetup,
         connect_deadline: float,
         on_snapshot: Callable[[Snapshot], None],
         on_ended: Callable[[Ended], None],
@@ -109,7 +109,7 @@ class ArmLink:
             # Under the lock: whoever is not told of the loss by it will be by `_fail`, which takes all that wait.
             self._raise_if_lost()
             self._pending[number] = pending
-        self._transmit(Request(number, name, arguments))
+        self._transmit(ChildRequest(number, name, arguments))
         if not pending.done.wait(deadline):
             self._fail(f"its process did not answer '{name}' within {deadline:g} s")
             self._raise_if_lost()
@@ -120,7 +120,7 @@ class ArmLink:
     def tell(self, name: str, *arguments: Any) -> None:
         """Tell the child something that it does not answer; raises the link's `DeviceFault` when it is lost."""
         self._raise_if_lost()
-        self._transmit(Request(UNANSWERED, name, arguments))
+        self._transmit(ChildRequest(UNANSWERED, name, arguments))
         self._raise_if_lost()
 
     def close(self, deadline: float) -> None:
@@ -134,7 +134,7 @@ class ArmLink:
             if up:
                 self._pending[number] = pending
         if up:
-            self._transmit(Request(number, "close"))
+            self._transmit(ChildRequest(number, "close"))
             pending.done.wait(deadline)
         self._fail("it was closed")
         self._end()
@@ -145,7 +145,7 @@ class ArmLink:
         """A sign of life; one that cannot be sent is no fault: a child that ends by itself makes the arm safe first."""
         self._raise_if_lost()
         with self._sending:
-            self._pipe.send(Request(UNANSWERED, "alive"))
+            self._pipe.send(ChildRequest(UNANSWERED, "alive"))
 
     def _raise_if_lost(self) -> None:
         if self.lost is not None:
@@ -166,7 +166,7 @@ class ArmLink:
             )
         return Connection(ours.detach()), process
 
-    def _transmit(self, message: Setup | Request) -> None:
+    def _transmit(self, message: ChildSetup | ChildRequest) -> None:
         try:
             with self._sending:
                 self._pipe.send(message)
@@ -185,11 +185,11 @@ class ArmLink:
         except (EOFError, OSError):
             self._fail(self._death())
 
-    def _route(self, message: Reply | Snapshot | Ended | Lost) -> None:
+    def _route(self, message: ChildReply | Snapshot | Ended | Lost) -> None:
         match message:
             case Snapshot():
                 self._on_snapshot(message)
-            case Reply():
+            case ChildReply():
                 with self._lock:
                     pending = self._pending.pop(message.number, None)
                 self._connected = self._connected or message.problem is None

@@ -1,8 +1,8 @@
 """What the arm driver and its child process say to each other over their pipe, pickled.
 
-The driver sends one `Setup`, then `Request`s; the child answers each with a `Reply` and sends `Snapshot`s, `Ended` and
-`Lost` by itself. Positions in m and rad, forces in N, times in s of the system's monotonic clock, which all processes
-share.
+The driver sends one `ChildSetup`, then `ChildRequest`s; the child answers each with a `ChildReply` and sends
+`Snapshot`s, `Ended` and `Lost` by itself. Positions in m and rad, forces in N, times in s of the system's monotonic
+clock, which all processes share.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ Six = tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Setup:
+class ChildSetup:
     """How the child works: `rate` is the clock's, `safe_off` the outputs to switch off when the owner is lost.
 
     `payload` is mass in kg and centre of gravity in the flange frame in m. The controller ends its program when it
@@ -35,7 +35,7 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Request:
+class ChildRequest:
     """Do `name` with `arguments`.
 
     Names: stop, close, output, safe_off, alive, attend, payload, zero_force, move_joints, move_linear, follow. `alive`
@@ -53,7 +53,7 @@ UNANSWERED = -1
 
 
 @dataclass(frozen=True)
-class Reply:
+class ChildReply:
     """The request was carried out, or `problem` says (code, text) why not. Number 0 tells that the child is up."""
 
     number: int
@@ -96,7 +96,7 @@ class Snapshot:
 
 
 @dataclass(frozen=True)
-class Pace:
+class StreamTiming:
     """How regularly the points of a trajectory went out: their number, their rate in Hz, and the time between two, in s
     on the wall: median, 99 % and longest."""
 
@@ -117,7 +117,7 @@ class Ended:
     motion: int
     how: str
     text: str = ""
-    pace: Pace | None = None
+    pace: StreamTiming | None = None
 
 
 @dataclass(frozen=True)

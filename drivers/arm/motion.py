@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from drivers.arm.faults import fault
-from drivers.arm.messages import Pace, Six
+from drivers.arm.messages import Six, StreamTiming
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceError
 
@@ -24,7 +24,7 @@ class UrMotion:
 
     def __init__(self, device: str, what: str, number: int, clock: Clock, stop: Callable[[], None]) -> None:
         self.contact = False
-        self.pace: Pace | None = None
+        self.pace: StreamTiming | None = None
         self.number = number
         self._device = device
         self._what = what
@@ -72,7 +72,7 @@ class UrMotion:
             self._ended.set()
 
 
-class Trajectory:
+class JointTrajectory:
     """Joint angles over time, straight lines between the given points; `times` begin at 0 and increase."""
 
     def __init__(self, times: list[float], joints: list[Six]) -> None:

@@ -13,7 +13,7 @@ from drivers.arm.dashboard import Dashboard
 from drivers.arm.faults import fault, require_named, require_remote, unlock
 from drivers.arm.feed import StateFeed
 from drivers.arm.link import ArmLink
-from drivers.arm.messages import MODE_RUNNING, PLAYING, Ended, Setup, Snapshot, safety_code
+from drivers.arm.messages import MODE_RUNNING, PLAYING, ChildSetup, Ended, Snapshot, safety_code
 from drivers.arm.rtde_link import look
 from drivers.arm.safing import Safing
 from drivers.arm.wrong_arm import Forward, flange_agrees, require_same_flange, require_same_payload, same_payload
@@ -41,7 +41,7 @@ class ArmSession:
     def __init__(
         self,
         name: str,
-        setup: Setup,
+        setup: ChildSetup,
         clock: Clock,
         connect_timeout: float,
         forward: Forward | None,
@@ -245,7 +245,15 @@ class ArmSession:
     # --- inside ---
 
     def _connect(self, wanted: Callable[[], bool]) -> ArmLink:
-        return ArmLink(self._name, self.setup, self._connect_timeout, self._take, self._on_ended, self._on_lost, wanted)
+        return ArmLink(
+            self._name,
+            self.setup,
+            self._connect_timeout,
+            on_snapshot=self._take,
+            on_ended=self._on_ended,
+            on_lost=self._on_lost,
+            wanted=wanted,
+        )
 
     def _take(self, snapshot: Snapshot) -> None:
         self.statistics.traffic.received(snapshot)

@@ -23,7 +23,7 @@ from drivers.arm.dashboard import unknown
 from drivers.arm.factory import read_factory_kinematics
 from drivers.arm.faults import late_words
 from drivers.arm.limits import ArmLimits
-from drivers.arm.messages import MODE_RUNNING, Ended, Setup, Snapshot, safety_code
+from drivers.arm.messages import MODE_RUNNING, ChildSetup, Ended, Snapshot, safety_code
 from drivers.arm.motion import UrMotion
 from drivers.arm.session import ArmSession
 from drivers.arm.wrong_arm import Forward
@@ -93,21 +93,28 @@ class UrArm:
         self._numbers = itertools.count(1)
         self._starting = threading.Lock()
         self._motion: UrMotion | None = None
-        setup = Setup(
+        setup = ChildSetup(
             address,
             clock.rate,
             tuple(_check_output(name, index) for index in safe_off_outputs),
-            self.limits.check_payload(name, payload[0], np.array(payload[1])),
-            _WATCHDOG_S if clock.rate <= 1.0 else _WATCHDOG_FAST_S,
-            check_positive(name, "braking", braking, 20.0, "rad/s^2"),
-            control,
-            model,
+            payload=self.limits.check_payload(name, payload[0], np.array(payload[1])),
+            watchdog=_WATCHDOG_S if clock.rate <= 1.0 else _WATCHDOG_FAST_S,
+            braking=check_positive(name, "braking", braking, 20.0, "rad/s^2"),
+            control=control,
+            model=model,
         )
         self.factory = read_factory_kinematics(address, min(connect_timeout, _TOLD_S))
         if forward_of is not None:
             forward = forward_of(self.factory.table)
         self._session = ArmSession(
-            name, setup, clock, connect_timeout, forward, self.factory.missing, self._on_ended, self._end_motion
+            name,
+            setup,
+            clock,
+            connect_timeout=connect_timeout,
+            forward=forward,
+            unknown=self.factory.missing,
+            on_ended=self._on_ended,
+            on_broken=self._end_motion,
         )
         self._feed = self._session.feed
         self.statistics = self._session.statistics

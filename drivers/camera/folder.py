@@ -112,7 +112,7 @@ class FolderCamera:
         self._position += 1
         image = read_image(self._files[index], self.shape)
         now = self._clock.now()
-        return Frame(image, index, 0.0, index * self._period, now, now)
+        return Frame(image, index, 0.0, device_time=index * self._period, host_time=now, received=now)
 
     @contextmanager
     def stream(self) -> Iterator[FolderCamera]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 
-from drivers.camera.stamps import Stamps
+from drivers.camera.stamps import StampCheck
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault
 from drivers.interfaces import Frame, LinkStatistics
@@ -56,7 +56,7 @@ class FrameQueue:
         self._news = threading.Condition()
         self._closed = False
         self._aborted = False
-        self._fresh = partial(Stamps, name, clock, exposure)
+        self._fresh = partial(StampCheck, name, clock, exposure)
         self._stamps = self._fresh()
         self._untrue: DeviceFault | None = None
         self._untrue_id = 0

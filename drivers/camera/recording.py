@@ -182,7 +182,15 @@ class RecordedCamera:
         lost = 0 if self._last is None else row.number - self._last - 1
         self._last = row.number
         self.lost += lost
-        return Frame(image, row.number, row.exposure, row.time, self._begun + row.time, self._clock.now(), lost)
+        return Frame(
+            image,
+            row.number,
+            row.exposure,
+            device_time=row.time,
+            host_time=self._begun + row.time,
+            received=self._clock.now(),
+            lost_before=lost,
+        )
 
     def __iter__(self) -> Iterator[Frame]:
         """Pictures until the last one or the end of the stream."""

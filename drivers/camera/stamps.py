@@ -19,7 +19,7 @@ _APART = 0.5
 """Share of the exposure before that two stamps are apart at least."""
 
 
-class Stamps:
+class StampCheck:
     """Judges the frames of one acquisition of the camera `name`, in the order in which they come; all of them are
     exposed `exposure` s, where that is known."""
 

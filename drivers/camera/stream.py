@@ -94,7 +94,7 @@ class StreamCamera:
         while frames are being acquired, `DeviceFault` when the camera takes other values.
         """
         about = self._about
-        check_range(self.name, "exposure", exposure, about.exposure_min, about.exposure_max, "s")
+        check_range(self.name, "exposure", exposure, low=about.exposure_min, high=about.exposure_max, unit="s")
         check_positive(self.name, "frame rate", frame_rate, about.frame_rate_max, "Hz")
         if exposure * frame_rate > 1.0:
             raise LimitError(

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 import cv2
 
 from drivers.camera.frame_queue import FrameQueue
-from drivers.camera.v4l2_pictures import Timing, to_grey
+from drivers.camera.v4l2_pictures import ExposureTiming, to_grey
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, LimitError, NotConnectedError
 from drivers.interfaces import Frame, Identity, LinkStatistics
@@ -47,7 +47,7 @@ class V4l2Camera:
         self._path = path
         self._clock = clock
         self._look = look
-        self._timing = Timing(0.01, 10.0)
+        self._timing = ExposureTiming(0.01, 10.0)
         self._acquiring = threading.Lock()
         self._queue: FrameQueue | None = None
         self._ended = threading.Event()
@@ -105,7 +105,7 @@ class V4l2Camera:
             self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL)
             self._set(cv2.CAP_PROP_EXPOSURE, "exposure", round(exposure / _EXPOSURE_UNIT_S), "x 0.1 ms")
             self._set(cv2.CAP_PROP_FPS, "frame rate", frame_rate, "Hz")
-            self._timing = Timing(exposure, frame_rate)
+            self._timing = ExposureTiming(exposure, frame_rate)
 
     def grab(self, timeout: float = 2.0) -> Frame:
         """One frame whose exposure began after the call, as far as its stamp can tell: never a buffered one."""
@@ -252,7 +252,7 @@ class V4l2Camera:
             self._count += max(1, round((stamp - self._stamp) * self._timing.frame_rate))
         self._stamp = stamp
         host = received - age * self._clock.rate - self.time_bound
-        return Frame(to_grey(raw, self.shape), self._count, self._timing.exposure, stamp, host, received)
+        return Frame(to_grey(raw, self.shape), self._count, self._timing.exposure, stamp, host, received=received)
 
     def _fault(self, code: str, what: str, hint: str) -> DeviceFault:
         return DeviceFault(self.name, code, f"{what} from {self._path}", recoverable=False, hint=hint)

@@ -11,7 +11,7 @@ from drivers.interfaces import Image
 
 
 @dataclass(frozen=True)
-class Timing:
+class ExposureTiming:
     """Exposure in s and frame rate in Hz."""
 
     exposure: float

@@ -23,7 +23,7 @@ _ATTEMPTS = 2
 _ACK = re.compile(rb"ack\s*")
 
 
-class BadReply(Exception):
+class BadClawReply(Exception):
     """What came is no reply to what was asked."""
 
 
@@ -44,7 +44,7 @@ class RobotiqLink:
 
         def value(data: bytes) -> int:
             if (found := wanted.fullmatch(data)) is None:
-                raise BadReply(f"{data!r} came")
+                raise BadClawReply(f"{data!r} came")
             return int(found[1])
 
         return value(self._ask(f"GET {variable}\n".encode(), wanted))

@@ -162,7 +162,7 @@ class RailAxis(ABC):
 
     def nudge(self, distance: float, speed: float) -> RailMotion:
         """Move by `distance` m, whether homed or not; see `drivers.interfaces.Nudged`."""
-        check_range(self.name, "distance of a nudge", distance, -LONGEST_NUDGE_M, LONGEST_NUDGE_M, "m")
+        check_range(self.name, "distance of a nudge", distance, low=-LONGEST_NUDGE_M, high=LONGEST_NUDGE_M, unit="m")
         speed = self._checked_speed("speed", speed)
         with self._starting:
             issued = self._free()
@@ -191,7 +191,7 @@ class RailAxis(ABC):
             self._motion = RailMotion(
                 self.name,
                 self._clock,
-                arrived=ZeroCheck(self.name, begin, self._position, switch, forget, self._max_speed),
+                arrived=ZeroCheck(self.name, begin, self._position, switch, forget=forget, speed=self._max_speed),
                 halt=self._halt(issued),
                 duration=duration + LONGEST_S,
             )

@@ -11,14 +11,14 @@ from typing import Protocol
 from drivers.errors import DeviceFault
 from drivers.interfaces import Identity
 from drivers.quantities import UNTOLD
-from drivers.relay.port import BadReply, RelayPort
+from drivers.relay.port import BadRelayReply, RelayPort
 
 _DIGITS = "0123456789ABCDEFGHIJKLMNOPQRSTUV"
 """Relays and inputs as a Numato board counts them: those from 10 on by letters."""
 _PROMPT = b">"
 
 
-class Board(Protocol):
+class RelayWiring(Protocol):
     """One board, as the device behind `port` uses it. Relays and inputs are counted as the board counts them."""
 
     port: RelayPort
@@ -95,7 +95,7 @@ class NumatoBoard:
                 return True
             if told in ("off", "0"):
                 return False
-            raise BadReply(f"{told!r} is neither on nor off")
+            raise BadRelayReply(f"{told!r} is neither on nor off")
 
         return self.port.ask(f"{command}\r".encode(), _PROMPT, level)[0]
 
@@ -105,7 +105,7 @@ def _answer(data: bytes, command: str) -> str:
     lines = [line.strip() for line in re.split(r"[\r\n]+", data.decode("ascii", "replace").rstrip(">"))]
     told = [line for line in lines if line]
     if not told or told[0] != command:
-        raise BadReply(f"{data!r} came, which does not repeat the command")
+        raise BadRelayReply(f"{data!r} came, which does not repeat the command")
     return " ".join(told[1:])
 
 

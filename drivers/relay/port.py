@@ -27,7 +27,7 @@ _LONGEST = 256
 Answer = TypeVar("Answer")
 
 
-class BadReply(Exception):
+class BadRelayReply(Exception):
     """What came is no reply to what was asked."""
 
 
@@ -112,7 +112,7 @@ class RelayPort:
 
         What is sent has to mean the same when it is heard twice: a lost or damaged reply is asked for again.
         """
-        failure = BadReply("nothing came")
+        failure = BadRelayReply("nothing came")
         for attempt in range(_ATTEMPTS):
             if attempt:
                 self.statistics.count("retries")
@@ -126,9 +126,9 @@ class RelayPort:
             try:
                 if not data.endswith(end):
                     self.statistics.count("timeouts")
-                    raise BadReply(f"{data!r} came")
+                    raise BadRelayReply(f"{data!r} came")
                 answer = decode(data)
-            except BadReply as problem:
+            except BadRelayReply as problem:
                 failure = problem
                 continue
             self.statistics.add_round_trip(took)

@@ -16,19 +16,19 @@ from drivers.endings import in_the_end
 from drivers.errors import InterlockError, NotConnectedError
 from drivers.interfaces import Identity
 from drivers.last_words import LastWords
-from drivers.relay.boards import Board, NumatoBoard
+from drivers.relay.boards import NumatoBoard, RelayWiring
 from drivers.switches import ConfirmedClaw
 
 
 class _OnBoard:
     """What both share: a relay of a board, which is the wire."""
 
-    def __init__(self, board: Board, relay: int) -> None:
+    def __init__(self, board: RelayWiring, relay: int) -> None:
         self.name = board.port.name
         self.statistics = board.port.statistics
         self._relay = relay
 
-    _board: Board
+    _board: RelayWiring
 
     def identity(self) -> Identity:
         """The board's identity, with the relay in the address."""
@@ -36,7 +36,7 @@ class _OnBoard:
         return Identity(who.model, who.serial, who.firmware, f"{who.address} relay {self._relay}")
 
     def ping(self) -> float:
-        """See `Board.ping`."""
+        """See `RelayWiring.ping`."""
         return self._board.ping()
 
 
@@ -47,7 +47,7 @@ class BoardLaser(_OnBoard):
     at: then nothing is sent but questions.
     """
 
-    def __init__(self, board: Board, relay: int, *, control: bool = True) -> None:
+    def __init__(self, board: RelayWiring, relay: int, *, control: bool = True) -> None:
         super().__init__(board, relay)
         self._board = board
         self._control = control

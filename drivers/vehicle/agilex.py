@@ -23,7 +23,7 @@ from drivers.vehicle import health
 from drivers.vehicle.agilex_link import AgilexLink, load_database
 from drivers.vehicle.can_interface import can_interface
 from drivers.vehicle.faults import OUT_OF_COMMAND
-from drivers.vehicle.feedback import CAN_MODE, CYCLIC, WANTED, Feedback, patience
+from drivers.vehicle.feedback import CAN_MODE, CYCLIC, WANTED, MessageFeedback, patience
 from drivers.vehicle.version import TEXT_REQUEST, UNKNOWN
 
 KEEP_ALIVE_S = 0.020
@@ -67,7 +67,7 @@ class AgilexVehicle:
         self._max_speed = max_speed
         self._max_yaw_rate = max_yaw_rate
         self._clock = clock
-        self._feedback = Feedback(
+        self._feedback = MessageFeedback(
             name, clock, track=track, max_speed=max_speed, max_yaw_rate=max_yaw_rate, statistics=self.statistics
         )
         self._command = threading.Lock()
@@ -140,17 +140,17 @@ class AgilexVehicle:
         heard = [(stamp * self._clock.rate, frame) for stamp, frame in frames]
         interface = None if self._system_name is None else can_interface(self._system_name)
         judged = self._clock.rate <= 1.0
-        return health.readings(heard, seconds, self._bitrate, self._database, interface, judged)
+        return health.readings(heard, seconds, self._bitrate, self._database, interface=interface, judge_times=judged)
 
     def state(self, max_age: float = 0.2) -> VehicleState:
-        """The newest feedback, at most `max_age` s old (see `Feedback.state`), else `DeadlineError`."""
+        """The newest feedback, at most `max_age` s old (see `MessageFeedback.state`), else `DeadlineError`."""
         self._link.check()
         state = self._feedback.state(max_age, self._braked)
         lost = self._enabled and not state.command_mode
         return replace(state, braked=None) if lost or state.interruptions != self._interruptions else state
 
     def check(self) -> None:
-        """Raise the `DeviceFault` that the vehicle shows now; see `Feedback.check`. Returns at once otherwise.
+        """Raise the `DeviceFault` that the vehicle shows now; see `MessageFeedback.check`. Returns at once otherwise.
 
         One that somebody else commands or moves is out of command from then on, until it is enabled again.
         """
@@ -223,8 +223,8 @@ class AgilexVehicle:
         Raises `LimitError`, `InterlockError` before `enable()`, `DeviceFault` as `check` does, `Aborted` while a stop
         is under way.
         """
-        speed = check_range(self.name, "speed", speed, -self._max_speed, self._max_speed, "m/s")
-        yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, "rad/s")
+        speed = check_range(self.name, "speed", speed, low=-self._max_speed, high=self._max_speed, unit="m/s")
+        yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, unit="rad/s")
         self._link.require_unspoken()
         self._check(driving=True)
         with self._command:

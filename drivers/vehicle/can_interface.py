@@ -48,9 +48,9 @@ def parse_interface(name: str, text: str) -> CanInterface | None:
                 name,
                 "UP" in row.get("flags", ()),
                 _table(data, "bittiming").get("bitrate"),
-                data.get("state"),
-                counters.get("tx"),
-                counters.get("rx"),
+                state=data.get("state"),
+                sent_errors=counters.get("tx"),
+                received_errors=counters.get("rx"),
             )
     return None
 

@@ -52,7 +52,7 @@ def patience(clock: Clock, seconds: float) -> float:
     return max(seconds, WALL_FLOOR_S * clock.rate)
 
 
-class Feedback:
+class MessageFeedback:
     """The newest messages by name, each with its host time; filled by the receive thread through `take`."""
 
     def __init__(
@@ -86,10 +86,7 @@ class Feedback:
                 self._quiet = 0.0
             if message == "Odometry":
                 self._travel.count(now, int(signals["Left"]), int(signals["Right"]))
-                counts = signals["Left"], signals["Right"]
-                self._still_at = self._still_at or counts
-                if max(abs(a - b) for a, b in zip(counts, self._still_at, strict=True)) > _CREPT:
-                    self._still, self._still_at = 0, counts
+                self._compare_counts((signals["Left"], signals["Right"]))
             elif message == "MotionState":
                 if max(abs(signals["Speed"]), abs(signals["YawRate"])) <= STILL:
                     self._still += 1
@@ -103,6 +100,12 @@ class Feedback:
                 self._version.take(message, signals)
             self._newest[message] = (now, signals)
             self._news.notify_all()
+
+    def _compare_counts(self, counts: tuple[float, float]) -> None:
+        """Wheels that count on do not stand, whatever the speed says."""
+        self._still_at = self._still_at or counts
+        if max(abs(a - b) for a, b in zip(counts, self._still_at, strict=True)) > _CREPT:
+            self._still, self._still_at = 0, counts
 
     def idle(self, seconds: float) -> None:
         """The receiver has waited for `seconds` on the wall; what came then may have been another's."""

@@ -87,7 +87,9 @@ def _told(heard: Heard, database: Database) -> list[Reading]:
     if (battery := told.get("BatteryState")) is not None:
         charge, warm = battery["StateOfCharge"], battery["Temperature"]
         found.append(Reading("charge", charge, "%", least=LEAST_CHARGE, remedy="Charge the vehicle."))
-        found.append(Reading("battery's temperature", warm, "°C", 0.0, 50.0, "Let the battery cool down or warm up."))
+        found.append(
+            Reading("battery's temperature", warm, "°C", 0.0, most=50.0, remedy="Let the battery cool down or warm up.")
+        )
     motors = [signals for name, signals in told.items() if name.startswith("MotorDriver")]
     if motors:
         hottest = max(max(motor["DriverTemperature"], motor["MotorTemperature"]) for motor in motors)

@@ -18,7 +18,7 @@ from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import ArmSetup, within
 from sim_backends.models.arm import ArmModel, Power, Safety
 from sim_backends.models.arm_kinematics import matrix_from_pose, pose_from_matrix
-from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
+from sim_backends.models.arm_motion import JointMove, LinearMove, StopMotion
 
 _BRAKING = 4.0
 _FIRST_POINT = 0.02
@@ -118,7 +118,7 @@ class DirectArm:
         """Stream a joint trajectory; see `drivers.interfaces.Arm`."""
         times, joints = self._setup.limits.check_trajectory(self.name, times, joints)
         if force_limit is not None:
-            within(self.name, "force limit", force_limit, 1e-9, _MOST_FORCE, "N")
+            within(self.name, "force limit", force_limit, low=1e-9, high=_MOST_FORCE, unit="N")
         gap = float(np.abs(joints[0] - self.model.drive.q).max())
         if gap > _FIRST_POINT:
             raise InterlockError(
@@ -141,14 +141,14 @@ class DirectArm:
 
     def set_digital_output(self, index: int, value: bool) -> None:
         """Set an output and let a tick pass, in which the world follows it."""
-        within(self.name, "digital output", index, 0, _OUTPUTS - 1, "")
+        within(self.name, "digital output", index, low=0, high=_OUTPUTS - 1, unit="")
         self.model.write_digital_outputs(1 << index, int(value) << index)
         self.clock.sleep(TICK_S)
 
     @contextmanager
     def trying(self, index: int) -> Iterator[None]:
         """See `drivers.interfaces.TriesOutputs`."""
-        within(self.name, "digital output", index, 0, _OUTPUTS - 1, "")
+        within(self.name, "digital output", index, low=0, high=_OUTPUTS - 1, unit="")
         self._tried.append(index)
         try:
             yield
@@ -157,7 +157,7 @@ class DirectArm:
 
     def digital_input(self, index: int) -> bool:
         """What is wired to input `index`."""
-        within(self.name, "digital input", index, 0, _OUTPUTS - 1, "")
+        within(self.name, "digital input", index, low=0, high=_OUTPUTS - 1, unit="")
         return bool(self.model.digital_inputs >> index & 1)
 
     def recover(self, *, confirmed: bool = False) -> None:
@@ -184,7 +184,7 @@ class DirectArm:
         """Brake now, and wait until the arm stands."""
         self._stops += 1
         self.end_motion(Aborted(f"{self.name}: stopped before the end of its motion"))
-        self.model.start(Stop(_BRAKING))
+        self.model.start(StopMotion(_BRAKING))
         while self.model.moving:
             self.clock.sleep(TICK_S)
 

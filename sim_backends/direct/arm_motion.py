@@ -9,7 +9,7 @@ import numpy as np
 from drivers.errors import CellError, DeadlineError
 from drivers.interfaces import Vector
 from sim_backends.models.arm import Safety
-from sim_backends.models.arm_motion import Motion, Stop
+from sim_backends.models.arm_motion import SimulatedMotion, StopMotion
 from sim_backends.models.arm_streams import Servo
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ class ArmMove:
 
     tick_s = TICK_S
 
-    def __init__(self, arm: DirectArm, motion: Motion) -> None:
+    def __init__(self, arm: DirectArm, motion: SimulatedMotion) -> None:
         self.contact = False
         self.motion = motion
         self._arm = arm
@@ -114,4 +114,4 @@ class Streamed(ArmMove):
             self.fail(self._arm.fault("arm.not_arrived", f"a joint is {off:.4f} rad off"))
         elif arrived or self.contact:
             self._ending = True
-            model.start(Stop(_SERVO_BRAKING, linear=True))
+            model.start(StopMotion(_SERVO_BRAKING, linear=True))

@@ -18,7 +18,7 @@ from drivers.errors import Aborted, DeadlineError, InterlockError, LimitError
 from drivers.interfaces import Frame, Identity, LinkStatistics
 from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import CameraSetup
-from sim_backends.models.camera import CameraModel
+from sim_backends.models.camera import CameraState
 from sim_backends.world.hardware import camera_spec
 from sim_backends.world.nominal import inverse
 from sim_backends.world.world import World
@@ -48,7 +48,7 @@ class DirectCamera:
         """`wire` draws when within a round trip the camera answers."""
         self.name = name
         self.statistics = LinkStatistics()
-        self.model = CameraModel(camera_spec(world.scene, camera))
+        self.model = CameraState(camera_spec(world.scene, camera))
         self.clock = clock
         self.late = 0.0
         """By how many seconds each latch comes later than the camera answers."""
@@ -148,7 +148,7 @@ class DirectCamera:
         stamp = 1e-9 * spec.device_ns(begin + spec.latency)
         image = self._world.render(self._camera, begin + 0.5 * exposure, exposure)
         self.shots[frame_id] = self._shot(begin + 0.5 * exposure)
-        return Frame(image, frame_id, exposure, stamp, self._map.host_time(stamp), self.clock.now())
+        return Frame(image, frame_id, exposure, stamp, host_time=self._map.host_time(stamp), received=self.clock.now())
 
     def _compare_clocks(self) -> None:
         self._require_answer()

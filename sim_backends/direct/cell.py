@@ -13,7 +13,7 @@ from sim_backends.direct import faults
 from sim_backends.direct.arm import DirectArm
 from sim_backends.direct.camera import DirectCamera
 from sim_backends.direct.clock import VirtualClock
-from sim_backends.direct.product import Setup
+from sim_backends.direct.product import DirectSetup
 from sim_backends.direct.rail import DirectRail
 from sim_backends.direct.vehicle import DirectVehicle
 from sim_backends.world.drawing import STOCK, Drawing
@@ -42,7 +42,7 @@ class Ticking(Protocol):
 class DirectCell:
     """The world of one seed and level, with its devices."""
 
-    def __init__(self, setup: Setup, seed: int, level: str = "nominal", drawing: Drawing = STOCK) -> None:
+    def __init__(self, setup: DirectSetup, seed: int, level: str = "nominal", drawing: Drawing = STOCK) -> None:
         """Raises ValueError for an unknown level, or what `World` says of the drawing."""
         self._time = SteppedClock()
         self.world = World(seed, level, drawing=drawing, clock=self._time)
@@ -51,8 +51,8 @@ class DirectCell:
         self.arm = DirectArm("arm", self.world.arm, self.clock, setup.arm)
         self.rail = DirectRail("rail", self.world.rail, self.clock, setup.rail, wire)
         self.vehicle = DirectVehicle("vehicle", self.world.vehicle, self.clock, setup.vehicle)
-        self.scan_camera = DirectCamera("scan_camera", "scan", self.world, self.clock, setup.camera, wire)
-        self.target_camera = DirectCamera("target_camera", "target", self.world, self.clock, setup.camera, wire)
+        self.scan_camera = DirectCamera("scan_camera", "scan", self.world, self.clock, setup=setup.camera, wire=wire)
+        self.target_camera = DirectCamera("target_camera", "target", self.world, self.clock, setup.camera, wire=wire)
         self._ticking: tuple[Ticking, ...] = (self.arm, self.vehicle)
 
     def truth(self) -> dict[str, Any]:

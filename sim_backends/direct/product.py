@@ -15,7 +15,7 @@ from drivers.errors import DeviceFault, LimitError
 from drivers.interfaces import Vector
 
 
-class EvenMotion(Protocol):
+class SweepLine(Protocol):
     """The line through the readings of a sweep; see `Sweep` in `drivers.interfaces` for the figures."""
 
     @property
@@ -37,7 +37,7 @@ class EvenMotion(Protocol):
         """Host time in s at a position in m."""
 
 
-class ClockMap(Protocol):
+class HostTimeMap(Protocol):
     """The way from a device's clock to the host's, from latches (host before, device, host after), s."""
 
     def add(self, latches: Iterable[Any]) -> None:
@@ -62,7 +62,7 @@ class Odometry(Protocol):
         """Take both counters in mm; a jump of more than `farthest` m is not counted."""
 
 
-class ArmLimits(Protocol):
+class ArmLimitChecks(Protocol):
     """What the arm may be asked; each check raises `LimitError` and gives back what it was given."""
 
     def check_joints(self, device: str, joints: Vector) -> Vector:
@@ -88,12 +88,12 @@ class ArmLimits(Protocol):
 class ArmSetup:
     """The arm's limits, the words of its faults (device, code, text), and the outputs that are off after a recovery."""
 
-    limits: ArmLimits
+    limits: ArmLimitChecks
     fault: Callable[[str, str, str], DeviceFault]
     safe_off: tuple[int, ...]
 
 
-class CarriageWatch(Protocol):
+class CarriageCheck(Protocol):
     """Whether the carriage goes where it is sent."""
 
     def __call__(self, position: float, left: bool, right: bool, stalled: Callable[[], bool]) -> None:
@@ -117,8 +117,8 @@ class RailSetup:
     max_speed: float
     acceleration: float
     reversed: bool
-    even: Callable[[Vector, Vector, Vector], EvenMotion]
-    watch: Callable[[str, Any, float | None], CarriageWatch]
+    even: Callable[[Vector, Vector, Vector], SweepLine]
+    watch: Callable[[str, Any, float | None], CarriageCheck]
     check: Callable[..., Callable[[], bool]]
     serial: str | None = None
 
@@ -144,12 +144,12 @@ class VehicleSetup:
 class CameraSetup:
     """`clock_map` makes an empty map for one camera, `latch` what is added to it."""
 
-    clock_map: Callable[[], ClockMap]
+    clock_map: Callable[[], HostTimeMap]
     latch: Callable[[float, float, float], Any]
 
 
 @dataclass(frozen=True)
-class Setup:
+class DirectSetup:
     """Everything that the devices are given."""
 
     arm: ArmSetup

@@ -11,7 +11,7 @@ import numpy as np
 from drivers.errors import DeviceFault, InterlockError
 from drivers.interfaces import LONGEST_NUDGE_M, Identity, LinkStatistics, RailState
 from sim_backends.direct.clock import VirtualClock
-from sim_backends.direct.product import CarriageWatch, RailSetup, within
+from sim_backends.direct.product import CarriageCheck, RailSetup, within
 from sim_backends.direct.rail_motion import POLL_S, DirectSweep, RailMove
 from sim_backends.models.rail import RailModel
 
@@ -106,7 +106,7 @@ class DirectRail:
 
     def nudge(self, distance: float, speed: float) -> RailMove:
         """Move by `distance` m, whether homed or not."""
-        within(self.name, "distance of a nudge", distance, -LONGEST_NUDGE_M, LONGEST_NUDGE_M, "m")
+        within(self.name, "distance of a nudge", distance, low=-LONGEST_NUDGE_M, high=LONGEST_NUDGE_M, unit="m")
         self._require_free()
         now = self.clock.now()
         target = self.model.position(now) + round(distance * self._counts)
@@ -197,7 +197,7 @@ class DirectRail:
 
     # --- inside ---
 
-    def _watch(self, length: float | None) -> CarriageWatch:
+    def _watch(self, length: float | None) -> CarriageCheck:
         return self.setup.watch(self.name, self.clock, length)
 
     def _set_up(self) -> None:
@@ -226,7 +226,7 @@ class DirectRail:
         return begin, within(self.name, "sweep stop plus its run-out", stop + ramp, *self.travel, "m")
 
     def _checked(self, speed: float) -> float:
-        return within(self.name, "speed", speed, 1e-9, self.setup.max_speed, "m/s")
+        return within(self.name, "speed", speed, low=1e-9, high=self.setup.max_speed, unit="m/s")
 
     def _start(self, position: float, speed: float) -> int:
         """Send it there; the target in counts."""

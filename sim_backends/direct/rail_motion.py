@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError
 from drivers.interfaces import Vector
-from sim_backends.direct.product import CarriageWatch, EvenMotion
+from sim_backends.direct.product import CarriageCheck, SweepLine
 
 if TYPE_CHECKING:
     from sim_backends.direct.rail import DirectRail
@@ -28,7 +28,7 @@ class RailMove:
         self,
         rail: DirectRail,
         target: int | None,
-        watch: CarriageWatch | None = None,
+        watch: CarriageCheck | None = None,
         asked: Callable[[], bool] | None = None,
     ) -> None:
         self._rail = rail
@@ -144,7 +144,7 @@ class DirectSweep(RailMove):
         super().__init__(rail, target)
         self._start, self._stop = start, stop
         self._readings: list[tuple[float, float]] = []
-        self._motion: EvenMotion | None = None
+        self._motion: SweepLine | None = None
 
     @property
     def samples(self) -> Vector:
@@ -177,7 +177,7 @@ class DirectSweep(RailMove):
         """Median distance in m of the readings from an even motion; see `drivers.interfaces.Sweep`."""
         return self._even().unevenness
 
-    def _even(self) -> EvenMotion:
+    def _even(self) -> SweepLine:
         if not self.done:
             raise InterlockError(self._rail.name, "the sweep still runs. wait() first")
         if self._error is not None:

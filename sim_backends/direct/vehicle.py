@@ -8,7 +8,7 @@ from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError
 from drivers.interfaces import Identity, LinkStatistics, VehicleState
 from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import VehicleSetup, within
-from sim_backends.models.vehicle import Mode, State, VehicleModel
+from sim_backends.models.vehicle import ChassisState, Mode, VehicleModel
 
 KEEP_ALIVE_S = 0.020
 DEAD_MAN_S = 0.5
@@ -58,7 +58,7 @@ class DirectVehicle:
             yaw_rate=round(feedback.yaw_rate, 3),
             command_mode=feedback.mode is Mode.CAN,
             braked=self._braked,
-            emergency_stop=feedback.state is State.EMERGENCY_STOP,
+            emergency_stop=feedback.state is ChassisState.EMERGENCY_STOP,
             error_bits=feedback.errors,
             battery_volts=round(feedback.volts, 1),
             trouble=self._setup.trouble(feedback.errors),
@@ -68,7 +68,7 @@ class DirectVehicle:
         """Raise the `DeviceFault` that the vehicle shows now. Nobody else commands it here."""
         now = self._clock.now()
         feedback = self.model.feedback(now)
-        if feedback.state is State.EMERGENCY_STOP:
+        if feedback.state is ChassisState.EMERGENCY_STOP:
             raise DeviceFault(
                 self.name,
                 "vehicle.emergency_stop",
@@ -76,7 +76,7 @@ class DirectVehicle:
                 recoverable=False,
                 hint="Release the button when it is safe, then enable() the vehicle.",
             )
-        if feedback.state is not State.OK:
+        if feedback.state is not ChassisState.OK:
             driven = now - self._driven < REST_AFTER_S
             raise self._setup.error(self.name, feedback.errors, self._setup.trouble(feedback.errors), driven)
 
@@ -94,8 +94,8 @@ class DirectVehicle:
     def drive(self, speed: float, yaw_rate: float) -> None:
         """Set the velocity that is kept alive for 0.5 s; `InterlockError` when braked or not enabled."""
         limit, turn = self._setup.max_speed, self._setup.max_yaw_rate
-        speed = within(self.name, "speed", speed, -limit, limit, "m/s")
-        yaw_rate = within(self.name, "yaw rate", yaw_rate, -turn, turn, "rad/s")
+        speed = within(self.name, "speed", speed, low=-limit, high=limit, unit="m/s")
+        yaw_rate = within(self.name, "yaw rate", yaw_rate, low=-turn, high=turn, unit="rad/s")
         self.check()
         if self._stopping:
             raise Aborted(f"{self.name}: a stop is under way")

@@ -20,7 +20,7 @@ import numpy as np
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm_joints import GRAVITY, JointErrors
 from sim_backends.models.arm_kinematics import TABLES, UR10E_DH, Kinematics, Matrix, Vector
-from sim_backends.models.arm_motion import Drive, Motion, MotionError, Stop
+from sim_backends.models.arm_motion import JointDrives, MotionError, SimulatedMotion, StopMotion
 from sim_backends.models.arm_truth import TruePose
 
 Contact = Callable[[Matrix], Vector]
@@ -106,7 +106,7 @@ class ArmModel:
         self.params = params
         self.kinematics = Kinematics(params.dh)
         self._drawn = Kinematics(TABLES[params.model])
-        self.drive = Drive(self.kinematics, params.speed_limits, np.array(params.initial_q, float), np.zeros(6))
+        self.drive = JointDrives(self.kinematics, params.speed_limits, np.array(params.initial_q, float), np.zeros(6))
         self.power = Power.RUNNING
         self.safety = Safety.NORMAL
         self.reduced = False
@@ -124,9 +124,9 @@ class ArmModel:
         self._speed_limits = (1.02 * params.speed_limits).tolist()
         self._rng = rng
         self._lock = threading.RLock()
-        self._queue: deque[Motion] = deque()
+        self._queue: deque[SimulatedMotion] = deque()
         self._begun = False
-        self._suspended: list[Motion] = []
+        self._suspended: list[SimulatedMotion] = []
         self._stopped_at = -math.inf
         self._rest_since = self.time
         self._force_zero = np.zeros(6)
@@ -200,7 +200,7 @@ class ArmModel:
                 self.safety = Safety.EMERGENCY_STOP
                 self.fault_text = "emergency stop pressed"
                 self._suspended = []
-                self._replace(Stop(_BRAKE))
+                self._replace(StopMotion(_BRAKE))
         elif name == "reduced_mode":
             self.reduced = True
         elif name == "local_control":
@@ -230,7 +230,7 @@ class ArmModel:
         return 2 if self.reduced and self.safety is Safety.NORMAL else self.safety.value
 
     @property
-    def motion(self) -> Motion | None:
+    def motion(self) -> SimulatedMotion | None:
         """The motion under way."""
         return self._queue[0] if self._queue else None
 
@@ -239,7 +239,7 @@ class ArmModel:
         """True when no motion is under way."""
         return not self._queue
 
-    def pending(self, motion: Motion) -> bool:
+    def pending(self, motion: SimulatedMotion) -> bool:
         """True until `motion` has ended or something else has taken its place."""
         return any(one is motion for one in self._queue)
 
@@ -261,7 +261,7 @@ class ArmModel:
         """
         return self.wrench + self._untold_weight() - self._force_zero
 
-    def start(self, motion: Motion) -> None:
+    def start(self, motion: SimulatedMotion) -> None:
         """Begin `motion` in place of any other; one that begins from rest is preceded by a stop if need be."""
         with self._lock:
             self._replace(motion)
@@ -270,8 +270,8 @@ class ArmModel:
         """Stop in such a way that `resume` continues the motion."""
         with self._lock:
             if not self._suspended:
-                self._suspended = [m for m in self._queue if not isinstance(m, Stop)]
-            self._replace(Stop(_BRAKE))
+                self._suspended = [m for m in self._queue if not isinstance(m, StopMotion)]
+            self._replace(StopMotion(_BRAKE))
 
     def resume(self) -> None:
         """Continue the suspended motion, if there is one."""
@@ -285,7 +285,7 @@ class ArmModel:
         """Stop and forget every motion."""
         with self._lock:
             self._suspended = []
-            self._replace(Stop(_BRAKE))
+            self._replace(StopMotion(_BRAKE))
 
     def zero_force(self) -> None:
         """Take the present wrench as zero."""
@@ -361,10 +361,10 @@ class ArmModel:
         true = Kinematics(table + params.dh_error)
         bends = params.harmonics.any() or params.compliance > 0.0
         joints = JointErrors(true, params.harmonics, params.compliance, params.carried) if bends else None
-        return TruePose(true, params.repeatability, params.blend_time, self._rng, joints, params.memory)
+        return TruePose(true, params.repeatability, params.blend_time, self._rng, joints=joints, memory=params.memory)
 
-    def _replace(self, motion: Motion) -> None:
-        self._queue = deque([Stop(_BRAKE), motion] if motion.from_rest and self.moving else [motion])
+    def _replace(self, motion: SimulatedMotion) -> None:
+        self._queue = deque([StopMotion(_BRAKE), motion] if motion.from_rest and self.moving else [motion])
         self._begun = False
 
     def _advance(self, dt: float) -> None:
@@ -404,7 +404,7 @@ class ArmModel:
                 drive.q, drive.qd = before, np.zeros(6)
                 self.protective_stop(f"joint {joint} at its limit of ±{math.degrees(params.joint_limit):.0f}°")
                 return
-            if abs(qd[joint]) > self._speed_limits[joint] and not isinstance(self.motion, Stop):
+            if abs(qd[joint]) > self._speed_limits[joint] and not isinstance(self.motion, StopMotion):
                 drive.q = before
                 drive.qd = np.clip(drive.qd, -params.speed_limits, params.speed_limits)
                 self.protective_stop(f"joint {joint} faster than its limit of {params.speed_limits[joint]:.2f} rad/s")

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from sim_backends.models.arm_kinematics import Matrix, Vector, rotation_matrix
-from sim_backends.models.arm_motion import Drive, LinearMove, MotionError, Trapezoid
+from sim_backends.models.arm_motion import JointDrives, LinearMove, MotionError, Trapezoid
 
 
 class ArcMove(LinearMove):
@@ -22,7 +22,7 @@ class ArcMove(LinearMove):
         self._fixed = fixed
         self._axis: Vector | None = None
 
-    def begin(self, drive: Drive) -> None:
+    def begin(self, drive: JointDrives) -> None:
         """Find the circle, or go on along it; MotionError when the three points lie on a line."""
         super().begin(drive)
         here = self._start[:3, 3]

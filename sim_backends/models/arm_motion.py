@@ -1,7 +1,7 @@
 """Motions of the simulated arm that end by themselves: each plans from where the arm is and is stepped with time.
 
-A motion changes `Drive.q` and `Drive.qd`; it knows nothing of safety, programs or bytes. Moves follow a trapezoidal
-speed profile. Motions that are streamed are in `arm_streams`. Units: rad, m, s, N.
+A motion changes `JointDrives.q` and `JointDrives.qd`; it knows nothing of safety, programs or bytes. Moves follow a
+trapezoidal speed profile. Motions that are streamed are in `arm_streams`. Units: rad, m, s, N.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class MotionError(Exception):
 
 
 @dataclass
-class Drive:
+class JointDrives:
     """The six joints and what a motion needs to know of the arm: joint angles, speeds, tool and felt wrench."""
 
     kinematics: Kinematics
@@ -85,21 +85,21 @@ class Trapezoid:
         return self._speed * (t - 0.5 * self._ramp), self._speed
 
 
-class Motion(ABC):
+class SimulatedMotion(ABC):
     """One motion; `from_rest` ones have to begin with the arm standing, `feels_force` ones are stepped finely."""
 
     from_rest = False
     feels_force = False
 
-    def begin(self, drive: Drive) -> None:  # noqa: B027  (most motions need no plan)
+    def begin(self, drive: JointDrives) -> None:  # noqa: B027  (most motions need no plan)
         """Plan from the present state; called again when the motion is resumed after a stop."""
 
     @abstractmethod
-    def step(self, drive: Drive, dt: float) -> bool:
+    def step(self, drive: JointDrives, dt: float) -> bool:
         """Advance by `dt` seconds; True once the motion has ended."""
 
 
-class JointMove(Motion):
+class JointMove(SimulatedMotion):
     """Straight in joint space to `target` (6,) with all joints arriving together; `speed` is the leading joint's."""
 
     from_rest = True
@@ -109,7 +109,7 @@ class JointMove(Motion):
         self._speed = speed
         self._acceleration = acceleration
 
-    def begin(self, drive: Drive) -> None:
+    def begin(self, drive: JointDrives) -> None:
         """Plan the profile of the leading joint, slowed where another joint would exceed its limit."""
         self._start = drive.q
         self._way = self._target - drive.q
@@ -120,7 +120,7 @@ class JointMove(Motion):
             speed = min(speed, float((drive.speed_limits * lead / np.maximum(np.abs(self._way), 1e-12)).min()))
         self._profile = Trapezoid(lead, speed, self._acceleration)
 
-    def step(self, drive: Drive, dt: float) -> bool:
+    def step(self, drive: JointDrives, dt: float) -> bool:
         """Advance along the profile."""
         self._time += dt * drive.speed_fraction
         if self._time >= self._profile.duration:
@@ -133,7 +133,7 @@ class JointMove(Motion):
         return False
 
 
-class LinearMove(Motion):
+class LinearMove(SimulatedMotion):
     """Tool straight to `target` (4, 4) while turning about one axis.
 
     `speed` and `acceleration` bound translation in m/s, m/s² and rotation by the same numbers in rad/s, rad/s². One
@@ -149,7 +149,7 @@ class LinearMove(Motion):
         self._acceleration = acceleration
         self._slows = slows
 
-    def begin(self, drive: Drive) -> None:
+    def begin(self, drive: JointDrives) -> None:
         """Plan the straight line from the present tool pose."""
         self._start = drive.base_from_tcp()
         self._way = self._target[:3, 3] - self._start[:3, 3]
@@ -159,7 +159,7 @@ class LinearMove(Motion):
         lead = max(math.hypot(*self._way), math.hypot(*self._turn))
         self._profile = Trapezoid(lead, self._speed, self._acceleration)
 
-    def step(self, drive: Drive, dt: float) -> bool:
+    def step(self, drive: JointDrives, dt: float) -> bool:
         """Advance along the line and solve the joints for it; MotionError where they cannot follow."""
         step = dt * drive.speed_fraction
         q = self._joints(drive, self._time + step, dt)
@@ -172,7 +172,7 @@ class LinearMove(Motion):
         drive.q = q
         return done
 
-    def _joints(self, drive: Drive, time: float, dt: float) -> Vector:
+    def _joints(self, drive: JointDrives, time: float, dt: float) -> Vector:
         """The joint angles at `time` of the profile, `dt` from now."""
         distance, _ = self._profile.at(time)
         fraction = distance / self._profile.length if self._profile.length > 0 else 1.0
@@ -189,14 +189,14 @@ class LinearMove(Motion):
         return pose
 
 
-class Stop(Motion):
+class StopMotion(SimulatedMotion):
     """Brake along the present direction: `rate` is of the leading joint in rad/s², or of the tool in m/s²."""
 
     def __init__(self, rate: float, linear: bool = False) -> None:
         self._rate = max(rate, 0.1)
         self._linear = linear
 
-    def begin(self, drive: Drive) -> None:
+    def begin(self, drive: JointDrives) -> None:
         """Take the present speed as the one to be braked."""
         self._from = drive.qd
         if self._linear:
@@ -207,7 +207,7 @@ class Stop(Motion):
         self._duration = speed / self._rate
         self._time = 0.0
 
-    def step(self, drive: Drive, dt: float) -> bool:
+    def step(self, drive: JointDrives, dt: float) -> bool:
         """Brake."""
         left = max(0.0, min(dt, self._duration - self._time))
         self._time += dt

@@ -10,20 +10,20 @@ import math
 import numpy as np
 
 from sim_backends.models.arm_kinematics import Matrix, Vector
-from sim_backends.models.arm_motion import Drive, Motion, MotionError
+from sim_backends.models.arm_motion import JointDrives, MotionError, SimulatedMotion
 
 _FORCE_GAIN = np.array([2e-3, 2e-3, 2e-3, 2e-2, 2e-2, 2e-2])
 """Speed per force error of force mode: m/s per N, rad/s per N·m; stable against 1e5 N/m at 4 ms steps."""
 
 
-class Servo(Motion):
+class Servo(SimulatedMotion):
     """Follow a streamed joint target (6,) like a critically damped second-order system that lags a ramp by `lag` s."""
 
     def __init__(self, target: Vector, lag: float) -> None:
         self.target = target
         self.lag = lag
 
-    def step(self, drive: Drive, dt: float) -> bool:
+    def step(self, drive: JointDrives, dt: float) -> bool:
         """Exact solution over `dt` for a target that stays: stable for any step."""
         rate = 2.0 / self.lag
         error = drive.q - self.target
@@ -38,38 +38,38 @@ class Servo(Motion):
         return False
 
 
-class JointSpeed(Motion):
+class JointSpeed(SimulatedMotion):
     """Change to joint speeds `target` (6,) rad/s with `acceleration` rad/s² of the leading joint and keep them."""
 
     def __init__(self, target: Vector, acceleration: float) -> None:
         self.target = target
         self.acceleration = acceleration
 
-    def step(self, drive: Drive, dt: float) -> bool:
+    def step(self, drive: JointDrives, dt: float) -> bool:
         """Ramp, then cruise."""
         drive.move_with(_ramped(drive.qd, self.target, self.acceleration * dt), dt)
         return False
 
 
-class LinearSpeed(Motion):
+class LinearSpeed(SimulatedMotion):
     """Change to tool velocity `target` (6,) m/s, rad/s in base axes with `acceleration` and keep it."""
 
     def __init__(self, target: Vector, acceleration: float) -> None:
         self.target = target
         self.acceleration = acceleration
 
-    def begin(self, drive: Drive) -> None:
+    def begin(self, drive: JointDrives) -> None:
         """Take over the present tool velocity."""
         self._twist = drive.tcp_jacobian().dot(drive.qd)
 
-    def step(self, drive: Drive, dt: float) -> bool:
+    def step(self, drive: JointDrives, dt: float) -> bool:
         """Ramp, then cruise; near a singularity the joint speeds grow until the arm's limits stop it."""
         self._twist = _ramped(self._twist, self.target, self.acceleration * dt)
         drive.move_with(_joint_speeds(drive, self._twist), dt)
         return False
 
 
-class ForceMode(Motion):
+class ForceMode(SimulatedMotion):
     """Compliant along selected axes of `task` (4, 4): moves until the tool presses with `wrench` (6,) there.
 
     `selection` (6,) is 1 for compliant axes, which move at most with `limits` (6,) m/s, rad/s; the others hold.
@@ -83,7 +83,7 @@ class ForceMode(Motion):
         self.wrench = wrench
         self.limits = limits
 
-    def step(self, drive: Drive, dt: float) -> bool:
+    def step(self, drive: JointDrives, dt: float) -> bool:
         """Admittance: speed proportional to the difference of wanted and felt force."""
         turn = self.task[:3, :3]
         felt = np.concatenate((turn.T.dot(drive.wrench[:3]), turn.T.dot(drive.wrench[3:])))
@@ -99,7 +99,7 @@ def _ramped(now: Vector, target: Vector, change: float) -> Vector:
     return target.copy() if lead <= change else now + difference * (change / lead)
 
 
-def _joint_speeds(drive: Drive, twist: Vector) -> Vector:
+def _joint_speeds(drive: JointDrives, twist: Vector) -> Vector:
     try:
         speeds: Vector = np.asarray(np.linalg.solve(drive.tcp_jacobian(), twist), dtype=np.float64)
     except np.linalg.LinAlgError as error:

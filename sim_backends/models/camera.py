@@ -37,7 +37,7 @@ class CameraSpec:
         return round((self.epoch + t * self.rate) * 1e9)
 
 
-class CameraModel:
+class CameraState:
     """The state of one camera; safe between threads. `exposure` in s and `frame_rate` in Hz are those in force."""
 
     def __init__(self, spec: CameraSpec) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from sim_backends.models.arm import ArmModel
 from sim_backends.models.arm_kinematics import Kinematics, Matrix, Vector
 from sim_backends.models.rail import RailModel, RailParams
-from sim_backends.models.vehicle import Feedback, Mode, State, VehicleModel, VehicleParams
+from sim_backends.models.vehicle import ChassisState, Mode, VehicleModel, VehicleParams, VehicleReadings
 
 
 class Track:
@@ -182,7 +182,18 @@ class FollowedVehicle(VehicleModel):
         """Pose (4, 4) of the vehicle frame at world time `t`."""
         return np.asarray(self.shift @ self._history.at(t))
 
-    def feedback(self, t: float) -> Feedback:
+    def feedback(self, t: float) -> VehicleReadings:
         """What the real vehicle has told last."""
         speed, yaw_rate, braked = self._told
-        return Feedback(State.OK, Mode.CAN, 0, braked, 0, self.params.battery_volts, speed, yaw_rate, 0.0, 0.0)
+        return VehicleReadings(
+            ChassisState.OK,
+            Mode.CAN,
+            0,
+            braked=braked,
+            errors=0,
+            volts=self.params.battery_volts,
+            speed=speed,
+            yaw_rate=yaw_rate,
+            left=0.0,
+            right=0.0,
+        )

@@ -154,7 +154,7 @@ class RailModel:
             if speed == 0.0:
                 self._follow(ramp.to_velocity(t, x, v, 0.0, self._acceleration()))
             else:
-                self._follow(ramp.to_position(t, x, v, goal, speed, self._slopes()))
+                self._follow(ramp.to_position(t, x, v, target=goal, speed=speed, slopes=self._slopes()))
 
     def rotate(self, t: float, velocity: int) -> None:
         """Turn at `velocity` (microsteps per second, sign is direction) until told otherwise; 0 stops on the ramp."""

@@ -33,9 +33,9 @@ def to_velocity(t: float, x: float, v: float, target: float, acceleration: float
     """Change from velocity `v` to `target` at `acceleration` > 0, then keep it."""
     pieces: list[Piece] = []
     if v * target < 0.0:
-        t, x = _change(pieces, t, x, v, 0.0, acceleration)
+        t, x = _change(pieces, t, x, v=v, target=0.0, acceleration=acceleration)
         v = 0.0
-    t, x = _change(pieces, t, x, v, target, acceleration)
+    t, x = _change(pieces, t, x, v=v, target=target, acceleration=acceleration)
     return [*pieces, Piece(t, x, target, 0.0)]
 
 
@@ -69,22 +69,22 @@ def to_position(t: float, x: float, v: float, target: float, speed: float, slope
     standstill = x + math.copysign(slopes.fall(abs(v)), v)
     direction = math.copysign(1.0, target - standstill)
     if direction * v < 0.0:
-        t, x = _brake(pieces, t, x, v, 0.0, slopes)
+        t, x = _brake(pieces, t, x, v=v, end=0.0, slopes=slopes)
         v = 0.0
     distance, start = (target - x) * direction, v * direction
     if start > speed:
-        t, x = _brake(pieces, t, x, v, direction * speed, slopes)
+        t, x = _brake(pieces, t, x, v=v, end=direction * speed, slopes=slopes)
         distance, start = (target - x) * direction, speed
     peak = _peak(distance, start, speed, slopes)
     for end in _corners(start, peak, slopes.first_speed):
         up = slopes.first_up if end <= slopes.first_speed else slopes.up
-        t, x = _change(pieces, t, x, direction * start, direction * end, up)
+        t, x = _change(pieces, t, x, v=direction * start, target=direction * end, acceleration=up)
         start = end
     cruise = (target - x) * direction - slopes.fall(peak)
     if cruise > 0.0 and peak > 0.0:
         pieces.append(Piece(t, x, direction * peak, 0.0))
         t, x = t + cruise / peak, x + direction * cruise
-    t, _ = _brake(pieces, t, x, direction * peak, 0.0, slopes)
+    t, _ = _brake(pieces, t, x, v=direction * peak, end=0.0, slopes=slopes)
     return pieces + rest(t, target)
 
 
@@ -125,7 +125,7 @@ def _brake(pieces: list[Piece], t: float, x: float, v: float, end: float, slopes
     for speed in _corners(abs(v), abs(end), slopes.first_speed):
         slope = slopes.down if abs(v) > slopes.first_speed else slopes.last_down
         goal = math.copysign(speed, v)
-        t, x = _change(pieces, t, x, v, goal, slope)
+        t, x = _change(pieces, t, x, v=v, target=goal, acceleration=slope)
         v = goal
     return t, x
 

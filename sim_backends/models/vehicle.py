@@ -26,7 +26,7 @@ DRIVER_FAULT, DRIVER_OVERLOAD = 0x20, 0x04
 MOTORS = 4
 
 
-class State(IntEnum):
+class ChassisState(IntEnum):
     """Vehicle state as reported."""
 
     OK = 0
@@ -69,13 +69,13 @@ class VehicleParams:
 
 
 @dataclass(frozen=True)
-class Feedback:
+class VehicleReadings:
     """What the vehicle knows of itself: speeds in m/s and rad/s of the wheels, odometers of both sides in m.
 
     `drivers` is the status of each motor's driver.
     """
 
-    state: State
+    state: ChassisState
     mode: Mode
     motion_mode: int
     braked: bool
@@ -145,22 +145,22 @@ class VehicleModel:
 
     # --- what the controller sees and does ---
 
-    def feedback(self, t: float) -> Feedback:
+    def feedback(self, t: float) -> VehicleReadings:
         """What the vehicle reports at world time `t`."""
         with self._lock:
             self._advance(t)
-            return Feedback(
+            return VehicleReadings(
                 self._state(),
                 self._mode,
                 self._motion_mode,
-                self._braked,
-                self._errors,
-                self.params.battery_volts,
-                self._speed,
-                self._yaw_rate,
-                self._left,
-                self._right,
-                tuple(self._drivers),
+                braked=self._braked,
+                errors=self._errors,
+                volts=self.params.battery_volts,
+                speed=self._speed,
+                yaw_rate=self._yaw_rate,
+                left=self._left,
+                right=self._right,
+                drivers=tuple(self._drivers),
             )
 
     def set_mode(self, t: float, mode: Mode) -> None:
@@ -231,10 +231,10 @@ class VehicleModel:
         self._errors = 0
         self._drivers = [0] * MOTORS
 
-    def _state(self) -> State:
+    def _state(self) -> ChassisState:
         if self._emergency:
-            return State.EMERGENCY_STOP
-        return State.EXCEPTION if self._errors else State.OK
+            return ChassisState.EMERGENCY_STOP
+        return ChassisState.EXCEPTION if self._errors else ChassisState.OK
 
     def _advance(self, t: float) -> None:
         while self._t < t:
@@ -249,7 +249,7 @@ class VehicleModel:
 
     def _wanted(self, t: float) -> tuple[float, float]:
         silent = t - self._commanded_at >= self.params.command_timeout
-        if silent or self._braked or self._mode is not Mode.CAN or self._state() is not State.OK:
+        if silent or self._braked or self._mode is not Mode.CAN or self._state() is not ChassisState.OK:
             return 0.0, 0.0
         return self._command
 

@@ -41,11 +41,11 @@ def separable_blur(image: Image, kernel: Image) -> None:
                 out,
                 kernel[k : k + 3],
                 line[k : k + cols],
-                line[far : far + cols],
-                line[k + 1 : k + 1 + cols],
-                line[far - 1 : far - 1 + cols],
-                line[k + 2 : k + 2 + cols],
-                line[far - 2 : far - 2 + cols],
+                b=line[far : far + cols],
+                c=line[k + 1 : k + 1 + cols],
+                d=line[far - 1 : far - 1 + cols],
+                e=line[k + 2 : k + 2 + cols],
+                f=line[far - 2 : far - 2 + cols],
             )
     for v in range(rows):
         out = image[v]
@@ -56,11 +56,11 @@ def separable_blur(image: Image, kernel: Image) -> None:
                 out,
                 kernel[k : k + 3],
                 across[max(0, v - reach)],
-                across[min(rows - 1, v + reach)],
-                across[max(0, v - reach + 1)],
-                across[min(rows - 1, v + reach - 1)],
-                across[max(0, v - reach + 2)],
-                across[min(rows - 1, v + reach - 2)],
+                b=across[min(rows - 1, v + reach)],
+                c=across[max(0, v - reach + 1)],
+                d=across[min(rows - 1, v + reach - 1)],
+                e=across[max(0, v - reach + 2)],
+                f=across[min(rows - 1, v + reach - 2)],
             )
 
 

@@ -63,7 +63,16 @@ def render_rectangle(
     if window is None:
         return
     edges = draw(
-        image, x, y, inverse, pattern, np.array(window), offset, optics.fx, level, gain_parameters(optics, light)
+        image,
+        x,
+        y,
+        inverse=inverse,
+        pattern=pattern,
+        window=np.array(window),
+        offset=offset,
+        focal_px=optics.fx,
+        level=level,
+        gain=gain_parameters(optics, light),
     )
     if edges:
         blur_window(image, window, float(optics.blur_px(_distance(pose, pattern))))
@@ -139,7 +148,7 @@ def draw(
                 line[u] = light[u] * albedo[u]
             elif albedo[u] == EDGE:
                 edges += 1
-                cover, shade = edge_pixel(ray_x, ray_y, u + u0, v, inverse, pattern)
+                cover, shade = edge_pixel(ray_x, ray_y, u + u0, v=v, inverse=inverse, pattern=pattern)
                 line[u] = line[u] * (1.0 - cover) + light[u] * cover * shade
     return edges
 
@@ -186,7 +195,7 @@ def edge_pixel(ray_x: Image, ray_y: Image, u: int, v: int, inverse: Vector, patt
         to_y = min(abs(by - pattern[6]), abs(by - pattern[7])) / tall
         if (abs(bxu) < abs(bxv)) if to_x < to_y else (abs(byu) < abs(byv)):
             bxu, byu, bxv, byv = bxv, byv, bxu, byu
-        return rectangle_share(bx, by, bxu, byu, bxv, byv, pattern), pattern[8]
+        return rectangle_share(bx, by, bxu, yu=byu, xv=bxv, yv=byv, pattern=pattern), pattern[8]
     kind = int(pattern[0])
     if kind == PLAIN:
         return 1.0, pattern[8]
@@ -196,12 +205,12 @@ def edge_pixel(ray_x: Image, ray_y: Image, u: int, v: int, inverse: Vector, patt
         to_y = abs(by - p * np.floor(by / p + 0.5)) / tall
         if (abs(bxu) < abs(bxv)) if to_x < to_y else (abs(byu) < abs(byv)):
             bxu, byu, bxv, byv = bxv, byv, bxu, byu
-        return 1.0, chess_share(bx, by, bxu, byu, bxv, byv, pattern)
+        return 1.0, chess_share(bx, by, bxu, yu=byu, xv=bxv, yv=byv, pattern=pattern)
     dot_x, dot_y, ring = nearest_dot(bx, by, pattern)
     dx, dy = bx - dot_x, by - dot_y
     if abs(dx * bxu + dy * byu) < abs(dx * bxv + dy * byv):
         bxu, byu, bxv, byv = bxv, byv, bxu, byu
-    dark = disc_share(dx, dy, bxu, byu, bxv, byv, pattern[10])
+    dark = disc_share(dx, dy, bxu, yu=byu, xv=bxv, yv=byv, radius=pattern[10])
     if ring:
-        dark -= disc_share(dx, dy, bxu, byu, bxv, byv, pattern[11])
+        dark -= disc_share(dx, dy, bxu, yu=byu, xv=bxv, yv=byv, radius=pattern[11])
     return 1.0, pattern[8] + dark * (pattern[9] - pattern[8])

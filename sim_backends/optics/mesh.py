@@ -55,7 +55,7 @@ class Mesh:
         while True:
             segments = np.empty((capacity, 2, 3))
             normals = np.empty((capacity, 3))
-            count = cut(self.corners, self.low, self.high, normal, distance, segments, normals)
+            count = cut(self.corners, self.low, self.high, normal, distance, segments=segments, normals=normals)
             if count <= capacity:
                 return segments[:count], normals[:count]
             capacity = count
@@ -65,7 +65,7 @@ class Mesh:
 
         Hits nearer than `start` (m) to the point do not count; a negative `start` makes a touching mesh count.
         """
-        shadow(self.corners, self.low, self.high, np.ascontiguousarray(points), eye, start, seen)
+        shadow(self.corners, self.low, self.high, points=np.ascontiguousarray(points), eye=eye, start=start, seen=seen)
 
 
 def _tree_order(centres: Vector) -> NDArray[np.int64]:

@@ -216,8 +216,8 @@ def rectangle_share(x: float, y: float, xu: float, yu: float, xv: float, yv: flo
     total = 0.0
     for line in range(LINES):
         t = (line + 0.5) / LINES - 0.5
-        start, end = covered(x + t * xv, xu, pattern[4], pattern[5], -0.5, 0.5)
-        start, end = covered(y + t * yv, yu, pattern[6], pattern[7], start, end)
+        start, end = covered(x + t * xv, xu, pattern[4], high=pattern[5], start=-0.5, end=0.5)
+        start, end = covered(y + t * yv, yu, pattern[6], high=pattern[7], start=start, end=end)
         total += max(0.0, end - start)
     return total / LINES
 

@@ -29,7 +29,7 @@ def render(
     light: Light | None = None,
 ) -> NDArray[np.uint8]:
     """Picture (height, width) uint8 that the camera takes of `scene` with `exposure` seconds; `laser` None is off."""
-    return sensor(expected_image(optics, scene, laser, exposure, rng, light), optics, rng)
+    return sensor(expected_image(optics, scene, laser, exposure=exposure, rng=rng, light=light), optics, rng)
 
 
 def expected_image(
@@ -59,7 +59,7 @@ def expected_image(
     if laser is not None:
         stripe = np.zeros_like(image)
         touched = render_stripe(stripe, optics, laser, list(scene), exposure)
-        add_speckled(image, stripe, touched, laser.speckle_contrast, laser.speckle_px, rng)
+        add_speckled(image, stripe, touched, contrast=laser.speckle_contrast, grain_px=laser.speckle_px, rng=rng)
     return image
 
 

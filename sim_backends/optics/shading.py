@@ -43,7 +43,7 @@ def render_mesh(image: Image, optics: CameraOptics, instance: MeshInstance, ligh
     cell_of = columns // np.int32(cell)
     share_of = (columns / cell - cell_of).astype(np.float32)
     gain = gain_parameters(optics, light)
-    spread(image, cover, relative, cell, cell_of, share_of, level, gain)
+    spread(image, cover, relative, cell=cell, cell_of=cell_of, share_of=share_of, level=level, gain=gain)
 
 
 @compiled

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sim_backends.peers.server import TcpServer
-from sim_backends.world.following import Following
+from sim_backends.world.following import WorldFollowing
 from sim_backends.world.world import World
 
 _LONGEST = 4 * 1024 * 1024
@@ -26,7 +26,7 @@ _LONGEST = 4 * 1024 * 1024
 class FollowingPeer:
     """Serves at `address` (`127.0.0.1:port`)."""
 
-    def __init__(self, world: World, following: Following) -> None:
+    def __init__(self, world: World, following: WorldFollowing) -> None:
         self._world, self._following = world, following
         self._server = TcpServer("following", self._serve)
         self.address = self._server.address

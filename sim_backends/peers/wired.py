@@ -39,13 +39,13 @@ def rail_peer(world: World) -> TmclPeer | ModbusPeer:
         return TmclPeer(world.rail, world.clock)
     try:
         # Only who simulates such a drive needs the library.
-        from sim_backends.peers.rail.modbus_drive import ModbusDrive, ModbusPeer
+        from sim_backends.peers.rail.modbus_drive import ModbusDriveServer, ModbusPeer
     except ImportError as error:
         raise ValueError(
             f"a rail on Modbus is simulated with pymodbus, which is not installed ({error}): pip install "
             "'assembly-cell[modbus]'"
         ) from error
-    return ModbusPeer(ModbusDrive(world.rail, world.clock, wire), wire["unit"])
+    return ModbusPeer(ModbusDriveServer(world.rail, world.clock, wire), wire["unit"])
 
 
 def switch_peers(world: World) -> tuple[list[Peer], dict[str, dict[str, Any]]]:

@@ -103,7 +103,7 @@ class Cameras:
             objects += self._witness(camera_from_flange)
         with self._busy[camera]:
             lit = self.laser(warm) if laser and camera == "scan" else None
-            return render(optics, objects, lit, exposure, self._rng[camera], self._sunny(camera_from_world, t))
+            return render(optics, objects, lit, exposure, self._rng[camera], light=self._sunny(camera_from_world, t))
 
     def _witness(self, camera_from_flange: Pose) -> list[SceneObject]:
         """The plate on the claw, if the camera sees any of it."""

@@ -35,7 +35,7 @@ class NotFollowed(Exception):
     """There is no picture, because where something was at its moment is not known."""
 
 
-class Following:
+class WorldFollowing:
     """The world's view of the `devices` that are real."""
 
     def __init__(self, world: World, devices: Sequence[str]) -> None:
@@ -174,7 +174,7 @@ class Following:
         vehicle = self._world.vehicle
         assert isinstance(vehicle, FollowedVehicle)
         x, y, yaw, speed, yaw_rate, braked = (float(v) for v in values)
-        vehicle.follow(t, x, y, yaw, speed, yaw_rate, bool(braked))
+        vehicle.follow(t, x, y, yaw=yaw, speed=speed, yaw_rate=yaw_rate, braked=bool(braked))
         return []
 
     def _take_laser(self, t: float, values: NDArray[np.float64]) -> list[float]:
@@ -189,12 +189,12 @@ class Following:
 
 
 _LENGTHS = {"arm": 8, "rail": 1, "vehicle": 6, "laser": 1, "claw": 1}
-_TAKERS: dict[str, Callable[[Following, float, NDArray[np.float64]], list[float]]] = {
-    "arm": Following._take_arm,
-    "rail": Following._take_rail,
-    "vehicle": Following._take_vehicle,
-    "laser": Following._take_laser,
-    "claw": Following._take_claw,
+_TAKERS: dict[str, Callable[[WorldFollowing, float, NDArray[np.float64]], list[float]]] = {
+    "arm": WorldFollowing._take_arm,
+    "rail": WorldFollowing._take_rail,
+    "vehicle": WorldFollowing._take_vehicle,
+    "laser": WorldFollowing._take_laser,
+    "claw": WorldFollowing._take_claw,
 }
 
 

@@ -173,12 +173,6 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
     cell, station = drawing.cell, drawing.station
     normal, distance, origin = _light_plane(d, sigma, cell)
     world_from_place = pose((0.0, 0.0, station.height), (1, 0, 0), (0, 0, 1))
-    start = world_from_place @ station.place_from_start
-    # A station is brought to a fixed frame against stops.
-    loose = DOCKED if cell.fixed else 1.0
-    start[:2, 3] += loose * d.vector("start.translation", sigma.start_translation, 2)
-    turned = loose * d.scalar("start.rotation", sigma.start_rotation)
-    start[:3, :3] = rotation(np.array([0.0, 0.0, turned])) @ start[:3, :3]
     surface = d.moved(
         "station", world_from_place @ station.place_from_surface, sigma.station_translation, sigma.station_rotation
     )
@@ -190,7 +184,7 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
         drawing=drawing,
         deviations=sigma,
         effects=effects,
-        world_from_vehicle_start=start,
+        world_from_vehicle_start=_start(d, sigma, drawing, world_from_place),
         vehicle_from_base=cell.vehicle_from_base,
         world_from_place=world_from_place,
         world_from_table=surface @ inverse(station.place_from_surface),
@@ -226,6 +220,18 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
         target_clock=_clock(d, "target_clock", sigma, effects),
         workshop=_workshop(d, effects),
     )
+
+
+def _start(d: _Draws, sigma: Deviations, drawing: Drawing, world_from_place: Pose) -> Pose:
+    """Where the vehicle starts, W from V."""
+    start = world_from_place @ drawing.station.place_from_start
+    # A station is brought to a fixed frame against stops.
+    loose = DOCKED if drawing.cell.fixed else 1.0
+    start[:2, 3] += loose * d.vector("start.translation", sigma.start_translation, 2)
+    turned = loose * d.scalar("start.rotation", sigma.start_rotation)
+    start[:3, :3] = rotation(np.array([0.0, 0.0, turned])) @ start[:3, :3]
+    made: Pose = start
+    return made
 
 
 def _light_plane(d: _Draws, sigma: Deviations, cell: CellDrawing) -> tuple[Vector, float, Vector]:

@@ -20,10 +20,6 @@ def truth(world: World) -> dict[str, Any]:
     """Everything true about `world` now; see the keys."""
     t = world.clock.now()
     scene = world.scene
-    world_from_base = world.world_from_base(t)
-    base_from_world = inverse(world_from_base)
-    base_from_flange = world.arm.base_from_flange(t)
-    world_from_part = world.part.part_pose(world_from_base @ base_from_flange)
     vehicle = world.vehicle.feedback(t)
     shape = world.station.ground
     outputs = world.arm.digital_outputs
@@ -34,25 +30,7 @@ def truth(world: World) -> dict[str, Any]:
         "time": t,
         "assumed_noise": assumed_noise(scene.level),
         "surface": {"name": shape.name, "half_x": shape.half_x, "half_y": shape.half_y, "unit": "m"},
-        "poses": {
-            name: _nested(pose)
-            for name, pose in {
-                "world_from_vehicle": world.vehicle.world_from_vehicle(t),
-                "world_from_base": world_from_base,
-                "world_from_surface": scene.world_from_surface,
-                "world_from_board": scene.world_from_board,
-                "base_from_surface": base_from_world @ scene.world_from_surface,
-                "base_from_board": base_from_world @ scene.world_from_board,
-                "base_from_flange": base_from_flange,
-                "base_from_fine_board": scene.base_from_fine_board,
-                "base_from_deck_board": scene.base_from_deck_board,
-                "flange_from_scan_camera": scene.flange_from_scan_camera,
-                "flange_from_target_camera": scene.flange_from_target_camera,
-                "flange_from_part": scene.flange_from_part,
-                "base_from_part": base_from_world @ world_from_part,
-                "surface_from_part": inverse(scene.world_from_surface) @ world_from_part,
-            }.items()
-        },
+        "poses": {name: _nested(pose) for name, pose in _poses(world, t).items()},
         "scan_lens": _lens(world.lens("scan", t)),
         "target_lens": _lens(world.lens("target", t)),
         "light_plane": world.light_plane(t),
@@ -81,6 +59,31 @@ def truth(world: World) -> dict[str, Any]:
         },
         "collisions": [asdict(collision) for collision in world.collisions.found],
         "rail_moving": world.rail.velocity(t) != 0,
+    }
+
+
+def _poses(world: World, t: float) -> dict[str, Pose]:
+    """Every pose (4, 4), m, by its name."""
+    scene = world.scene
+    world_from_base = world.world_from_base(t)
+    base_from_world = inverse(world_from_base)
+    base_from_flange = world.arm.base_from_flange(t)
+    world_from_part = world.part.part_pose(world_from_base @ base_from_flange)
+    return {
+        "world_from_vehicle": world.vehicle.world_from_vehicle(t),
+        "world_from_base": world_from_base,
+        "world_from_surface": scene.world_from_surface,
+        "world_from_board": scene.world_from_board,
+        "base_from_surface": base_from_world @ scene.world_from_surface,
+        "base_from_board": base_from_world @ scene.world_from_board,
+        "base_from_flange": base_from_flange,
+        "base_from_fine_board": scene.base_from_fine_board,
+        "base_from_deck_board": scene.base_from_deck_board,
+        "flange_from_scan_camera": scene.flange_from_scan_camera,
+        "flange_from_target_camera": scene.flange_from_target_camera,
+        "flange_from_part": scene.flange_from_part,
+        "base_from_part": base_from_world @ world_from_part,
+        "surface_from_part": inverse(scene.world_from_surface) @ world_from_part,
     }
 
 

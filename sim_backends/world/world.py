@@ -155,7 +155,14 @@ class World:
         lit = self.laser.at(t)
         camera_from_flange = inverse(self.flange_from_camera(camera, t))
         return self._cameras.picture(
-            camera, world_from_camera, world_from_base, lit, exposure, self.warmth(t), t, camera_from_flange
+            camera,
+            world_from_camera,
+            world_from_base,
+            laser=lit,
+            exposure=exposure,
+            warm=self.warmth(t),
+            t=t,
+            camera_from_flange=camera_from_flange,
         )
 
     def warmth(self, t: float) -> float:

@@ -28,7 +28,7 @@ from cell.procedures.steps.workplace import Workplace
 from cell.run.faults import classify
 from cell.run.files.folder import new_run
 from cell.run.report.report import make_report
-from cell.run.report.truth import Witness, pose_of
+from cell.run.report.truth import TruthRecorder, pose_of
 from cell.run.resumption import job_source
 from drivers.errors import CellError
 from lab.bench.job.whole_job import JobRecord
@@ -134,7 +134,7 @@ def of_placed(record: JobRecord, root: Path, faults: tuple[FaultRecord, ...] = (
     if not simulated:
         return reported(folder, CONFIG, job, nominal, work, result, frames, None, simulated=False)
     at_end = record.at_end
-    witness = Witness(lambda: at_end)
+    witness = TruthRecorder(lambda: at_end)
     witness.at_sweep = record.at_sweep
     return reported(folder, CONFIG, job, nominal, work, result, frames, witness)
 
@@ -169,7 +169,7 @@ def reported(
     work: Workplace,
     result: RunResult,
     frames: FrameStore,
-    witness: Witness | None,
+    witness: TruthRecorder | None,
     *,
     simulated: bool = True,
 ) -> Ended:
@@ -285,5 +285,5 @@ def crippled(record: JobRecord, root: Path) -> Ended:
         (folder / "frames").write_text("no folder", encoding="utf-8")
         frames.keep("stripe", record.results["laser_sweep"].middle)
     result = RunResult(Outcome.PLACED, "all steps done", "", records(None), record.results)
-    witness = Witness(partial(ask_truth, "127.0.0.1:1"))
+    witness = TruthRecorder(partial(ask_truth, "127.0.0.1:1"))
     return reported(folder, CONFIG, job, nominal, work, result, frames, witness)

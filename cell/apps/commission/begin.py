@@ -8,11 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cell.apps.commission.check import Check, Result
+from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.person import Person
 from cell.apps.commission.progress import Progress
 from cell.apps.commission.sequence import Commissioning
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.config.cell_config import CONFIGURATION, load_config, require_confirm
 from cell.config.job import job_path
 from cell.run.session.supervisor import Cell
@@ -24,7 +24,7 @@ FOLDER = "commissioning"
 def begin(
     config: Path | None,
     person: Person,
-    show: Callable[[Check, str, Result | None], None],
+    show: Callable[[CommissionCheck, str, Result | None], None],
     *,
     job: str,
     sim: str | None = None,
@@ -58,7 +58,7 @@ def begin(
         world = "" if truth is None else hashlib.sha256(truth.read_bytes()).hexdigest()[:12]
         which |= {"seed": seed, "level": level, "clock": clock, "world": world}
     folder = path.resolve().parent / FOLDER
-    desk = Desk(path, partial(Cell.open, path, **options), person, folder, job, simulated)
+    desk = CommissionWorkplace(path, partial(Cell.open, path, **options), person, folder, job, simulated=simulated)
     return Commissioning(desk, Progress(folder, which, desk.job), path, show)
 
 

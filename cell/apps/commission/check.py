@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 from drivers.interfaces import Reading
 
 if TYPE_CHECKING:
-    from cell.apps.commission.workplace import Desk
+    from cell.apps.commission.workplace import CommissionWorkplace
 
 
-class Verdict(StrEnum):
+class CheckVerdict(StrEnum):
     """How a check ended."""
 
     GOOD = "good"
@@ -53,7 +53,7 @@ class Finding:
 class Result:
     """What a check has found out; filled while it goes on, so that what was measured before a failure is kept."""
 
-    verdict: Verdict = Verdict.GOOD
+    verdict: CheckVerdict = CheckVerdict.GOOD
     readings: list[Reading] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -70,10 +70,10 @@ class Result:
         remedy: str = "",
     ) -> Reading:
         """Note a figure with its limits; one outside makes the check wrong."""
-        reading = Reading(what, float(value), unit, least, most, remedy)
+        reading = Reading(what, float(value), unit, least=least, most=most, remedy=remedy)
         self.readings.append(reading)
         if not reading.ok:
-            self.verdict = Verdict.WRONG
+            self.verdict = CheckVerdict.WRONG
             shown = f"{what}: {value:.4g} {unit}".strip() + f", allowed {bounds(reading)} {unit}".rstrip()
             self.notes.append(f"{shown}. {remedy}".strip())
         return reading
@@ -81,7 +81,7 @@ class Result:
     def find(self, finding: Finding) -> None:
         """Note a finding; the check is wrong then."""
         self.findings.append(finding)
-        self.verdict = Verdict.WRONG
+        self.verdict = CheckVerdict.WRONG
 
     def as_dict(self) -> dict[str, Any]:
         """JSON-ready."""
@@ -95,7 +95,7 @@ class Result:
 
 
 @dataclass(frozen=True)
-class Check:
+class CommissionCheck:
     """One check: `moves` what, how `far`, how `fast`; `limit` what has to hold; `keys` of the configuration that it
     rests on (tables, or dotted keys); `needs` the checks that have to be good before; `work` does it.
 
@@ -110,7 +110,7 @@ class Check:
     limit: str
     keys: tuple[str, ...]
     needs: tuple[str, ...]
-    work: Callable[[Desk, Result], None]
+    work: Callable[[CommissionWorkplace, Result], None]
     recorded: bool = True
 
 

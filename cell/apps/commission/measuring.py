@@ -13,8 +13,8 @@ import pinocchio as pin
 
 from cell.apps.commission.check import Result
 from cell.apps.commission.mounting import Axes, RoughMounting, axes_from_shifts, solve_mounting
-from cell.apps.commission.seeing import Eye, Seen, find_view, see
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.seeing import Eye, SeenBoard, find_view, see
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision.board.spec import centre_of
 from drivers.errors import CellError, DeviceFault, RefusedError
@@ -24,7 +24,7 @@ LEAST_TURNED = 4
 """Views with turns that a mounting is solved from, besides those with shifts."""
 
 
-def measure(desk: Desk, result: Result, eye: Eye) -> tuple[Axes, RoughMounting]:
+def measure(desk: CommissionWorkplace, result: Result, eye: Eye) -> tuple[Axes, RoughMounting]:
     """How the camera's axes lie on the flange, then where it sits, and how large the board is by the arm's measure.
 
     Raises `RefusedError` when the board is lost, or the views do not agree on one mounting.
@@ -50,7 +50,7 @@ def measure(desk: Desk, result: Result, eye: Eye) -> tuple[Axes, RoughMounting]:
     return axes, found
 
 
-def _views(desk: Desk, eye: Eye, goals: Iterable[pin.SE3]) -> list[Seen]:
+def _views(desk: CommissionWorkplace, eye: Eye, goals: Iterable[pin.SE3]) -> list[SeenBoard]:
     """What is seen from these places; those that cannot be reached, or do not show the board, are left out."""
     mover = desk.mover()
     made = []
@@ -66,11 +66,11 @@ def _views(desk: Desk, eye: Eye, goals: Iterable[pin.SE3]) -> list[Seen]:
     return made
 
 
-def _axes(seen: Sequence[Seen]) -> Axes:
+def _axes(seen: Sequence[SeenBoard]) -> Axes:
     return axes_from_shifts([one.base_from_flange for one in seen], [one.camera_from_board for one in seen])
 
 
-def _turned(eye: Eye, first: Seen, hand: pin.SE3, scale: float, turn: float) -> list[pin.SE3]:
+def _turned(eye: Eye, first: SeenBoard, hand: pin.SE3, scale: float, turn: float) -> list[pin.SE3]:
     """base_from_flange that look at the middle of the board from the first view, turned about each of its axes.
 
     `hand` is flange_from_camera as far as it is known, `scale` the board's.
@@ -88,7 +88,7 @@ def _turned(eye: Eye, first: Seen, hand: pin.SE3, scale: float, turn: float) -> 
     return made
 
 
-def _solved(seen: Sequence[Seen], axes: Axes) -> RoughMounting:
+def _solved(seen: Sequence[SeenBoard], axes: Axes) -> RoughMounting:
     return solve_mounting(
         [one.base_from_flange for one in seen],
         [one.camera_from_board for one in seen],

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from cell.apps.commission.check import Check, Result, Verdict
+from cell.apps.commission.check import CheckVerdict, CommissionCheck, Result
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.run.files.folder import write_json
@@ -57,7 +57,7 @@ class Progress:
         found: list[dict[str, Any]] = self._data["mended"]
         return found
 
-    def standing(self, check: Check, config: CellConfig) -> str:
+    def standing(self, check: CommissionCheck, config: CellConfig) -> str:
         """How it stands: "open" (never done), "stale" (what it rests on has changed), or its verdict."""
         stored = self.result(check.name)
         if stored is None:
@@ -66,7 +66,7 @@ class Progress:
             return "stale"
         return str(stored["verdict"])
 
-    def keep(self, check: Check, config: CellConfig, result: Result, seconds: float, run: str) -> None:
+    def keep(self, check: CommissionCheck, config: CellConfig, result: Result, seconds: float, run: str) -> None:
         """Store a result, and write the file."""
         stored = {
             **result.as_dict(), "when": time.strftime("%Y-%m-%d %H:%M:%S"), "seconds": round(seconds, 1), "run": run,
@@ -75,7 +75,7 @@ class Progress:
         self._data["results"][check.name] = stored
         self._write()
 
-    def keep_mended(self, check: Check, finding: dict[str, Any], backup: str) -> None:
+    def keep_mended(self, check: CommissionCheck, finding: dict[str, Any], backup: str) -> None:
         """Store that a finding was written into the configuration, and where its old text is."""
         entry = {"check": check.name, "when": time.strftime("%Y-%m-%d %H:%M:%S"), "backup": backup, **finding}
         self._data["mended"].append(entry)
@@ -87,7 +87,7 @@ class Progress:
             self._data["results"].pop(name, None)
         self._write()
 
-    def _rests_on(self, check: Check, config: CellConfig) -> str:
+    def _rests_on(self, check: CommissionCheck, config: CellConfig) -> str:
         """A hash of all that the result of a check rests on."""
         dumped = {**config.model_dump(mode="json"), "job": self._job}
         before = {name: (self.result(name) or {}).get("rests_on") for name in check.needs}
@@ -101,7 +101,7 @@ class Progress:
 
 def done_well(standing: str) -> bool:
     """Whether a check that stands so needs not be done again."""
-    return standing == Verdict.GOOD
+    return standing == CheckVerdict.GOOD
 
 
 def _at(tables: dict[str, Any], key: str) -> Any:

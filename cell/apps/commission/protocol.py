@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from cell.apps.commission.check import Check, bounds
+from cell.apps.commission.check import CommissionCheck, bounds
 from cell.apps.commission.progress import Progress
 from cell.base.version import release
 from cell.config.cell_config import CellConfig
@@ -28,7 +28,7 @@ figure { display: inline-block; margin: 0 } figcaption { font-size: 9pt }
 """
 
 
-def write_protocol(progress: Progress, checks: Sequence[Check], config: CellConfig) -> Path:
+def write_protocol(progress: Progress, checks: Sequence[CommissionCheck], config: CellConfig) -> Path:
     """Write the page beside the record of the progress; returns its path."""
     parts = [*_head(progress, checks, config), *_mended(progress.mended)]
     for check in checks:
@@ -44,7 +44,7 @@ def write_protocol(progress: Progress, checks: Sequence[Check], config: CellConf
     return path
 
 
-def _head(progress: Progress, checks: Sequence[Check], config: CellConfig) -> Iterable[str]:
+def _head(progress: Progress, checks: Sequence[CommissionCheck], config: CellConfig) -> Iterable[str]:
     yield f"<h1>Commissioning of {escape(config.cell.name)}</h1>"
     cell = progress.cell
     if cell.get("simulated"):
@@ -80,7 +80,7 @@ def _mended(mended: Sequence[Mapping[str, Any]]) -> Iterable[str]:
     yield f"<table><tr>{head}</tr>{''.join(rows)}</table>"
 
 
-def _check(progress: Progress, check: Check, standing: str) -> Iterable[str]:
+def _check(progress: Progress, check: CommissionCheck, standing: str) -> Iterable[str]:
     yield f"<section id='{check.name}'><h2>{escape(check.title)}</h2>"
     moves = "nothing" if check.moves == "nothing" else f"{check.moves}; {check.far}; {check.fast}"
     yield f"<p><b>Moves:</b> {escape(moves)}.<br><b>Limit:</b> {escape(check.limit)}.</p>"

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.apps.commission.check import Result
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CameraConfig
 from cell.makes.records import PlateConfig
@@ -59,7 +59,7 @@ class Eye:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenBoard:
     """A picture of the board: `base_from_flange` as the arm told it, `camera_from_board` with the board as named."""
 
     base_from_flange: pin.SE3
@@ -68,28 +68,28 @@ class Seen:
     frame: Frame
 
 
-def eye_of(desk: Desk, name: str) -> Eye:
+def eye_of(desk: CommissionWorkplace, name: str) -> Eye:
     """The eye "scan_camera" or "target_camera" of the cell."""
     config = desk.config
     if name == "scan_camera":
-        return Eye(name, config.scan_camera, config.calibration.fine, "calibration.fine", 0.130, 0.005)
-    return Eye(name, config.target_camera, config.calibration.large, "calibration.large", 0.650, 0.030)
+        return Eye(name, config.scan_camera, config.calibration.fine, key="calibration.fine", depth=0.130, step=0.005)
+    return Eye(name, config.target_camera, config.calibration.large, key="calibration.large", depth=0.650, step=0.030)
 
 
-def camera_of(desk: Desk, eye: Eye) -> Camera:
+def camera_of(desk: CommissionWorkplace, eye: Eye) -> Camera:
     """Its device."""
     devices = desk.devices
     return devices.scan_camera if eye.name == "scan_camera" else devices.target_camera
 
 
-def take(desk: Desk, eye: Eye) -> Frame:
+def take(desk: CommissionWorkplace, eye: Eye) -> Frame:
     """A photograph at the configured exposure."""
     camera = camera_of(desk, eye)
     camera.configure(eye.config.photo_exposure, PHOTO_RATE)
     return camera.grab()
 
 
-def see(desk: Desk, eye: Eye) -> Seen:
+def see(desk: CommissionWorkplace, eye: Eye) -> SeenBoard:
     """The board from where the arm stands; `RefusedError` when it is not seen."""
     frame = take(desk, eye)
     try:
@@ -97,10 +97,10 @@ def see(desk: Desk, eye: Eye) -> Seen:
         pose = board_pose(view, eye.model)
     except RefusedError as refused:
         raise refused.showing(seen={"frame": frame}) from refused
-    return Seen(from_ur(desk.devices.arm.state().flange), pose.camera_from_board, view, frame)
+    return SeenBoard(from_ur(desk.devices.arm.state().flange), pose.camera_from_board, view, frame)
 
 
-def find_view(desk: Desk, result: Result, eye: Eye) -> Seen:
+def find_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
     """Go where the camera sees its board: where it did last, where it is drawn to, or as if its bracket were turned.
 
     Where a part of something bright is in the picture, the camera goes on towards it. Raises `RefusedError` when the
@@ -145,7 +145,9 @@ def find_view(desk: Desk, result: Result, eye: Eye) -> Seen:
     )
 
 
-def _nearer_the_middle(desk: Desk, eye: Eye, seen: Seen, goal: pin.SE3, hand: pin.SE3) -> tuple[Seen, pin.SE3]:
+def _nearer_the_middle(
+    desk: CommissionWorkplace, eye: Eye, seen: SeenBoard, goal: pin.SE3, hand: pin.SE3
+) -> tuple[SeenBoard, pin.SE3]:
     """The view with the board nearer to the picture's middle, if the camera sits as `hand` has it; else as it is."""
     way = _off_middle(seen)
     if np.linalg.norm(way) < CENTRED_SHARE * eye.config.width:
@@ -164,7 +166,7 @@ def _nearer_the_middle(desk: Desk, eye: Eye, seen: Seen, goal: pin.SE3, hand: pi
     return see(desk, eye), goal
 
 
-def _off_middle(seen: Seen) -> Array:
+def _off_middle(seen: SeenBoard) -> Array:
     """From the picture's middle to that of the board's points, (2,) px."""
     width, height = seen.view.size
     low, high = seen.view.pixels.min(axis=0), seen.view.pixels.max(axis=0)
@@ -187,7 +189,7 @@ def towards_bright(image: Image) -> Array | None:
     return way if np.linalg.norm(way) > LEAST_WAY_SHARE * image.shape[1] else None
 
 
-def _candidates(desk: Desk, eye: Eye) -> Iterator[tuple[str, pin.SE3, pin.SE3]]:
+def _candidates(desk: CommissionWorkplace, eye: Eye) -> Iterator[tuple[str, pin.SE3, pin.SE3]]:
     """Places of the flange to try, with words for each, and flange_from_camera as it would be then."""
     drawn = eye.config.flange_from_camera.se3()
     if eye.name in desk.last_views:
@@ -217,7 +219,7 @@ def _words(what: str, quarters: int, eye: Eye, rail: float) -> str:
     return f"{words}, rail near {1e3 * rail:.0f} mm" if eye.name == "scan_camera" else words
 
 
-def _rail_places(desk: Desk, eye: Eye) -> list[float]:
+def _rail_places(desk: CommissionWorkplace, eye: Eye) -> list[float]:
     """Where the carriage may stand, m, the middle first."""
     if eye.name != "scan_camera":
         return [0.0]
@@ -230,7 +232,7 @@ def _rail_places(desk: Desk, eye: Eye) -> list[float]:
     return sorted(places, key=lambda place: abs(place - 0.5 * (low + high)))
 
 
-def centred_view(desk: Desk, result: Result, eye: Eye) -> Seen:
+def centred_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
     """As `find_view`, with the middle of the board in the middle of the picture, at the eye's depth.
 
     For a camera whose axes lie as they are drawn.

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from cell.apps.commission.check import Check, Result, Verdict
+from cell.apps.commission.check import CheckVerdict, CommissionCheck, Result
 from cell.apps.commission.checks import arm as arm_checks
 from cell.apps.commission.checks import cameras as camera_checks
 from cell.apps.commission.checks import closing as closing_checks
@@ -21,13 +21,13 @@ from cell.apps.commission.checks import stops as stop_checks
 from cell.apps.commission.checks import vehicle as vehicle_checks
 from cell.apps.commission.progress import Progress, done_well
 from cell.apps.commission.toml_edit import write_changes
-from cell.apps.commission.workplace import Declined, Desk, told
+from cell.apps.commission.workplace import CommissionWorkplace, Declined, told
 from cell.config.job import job_path
 from cell.run.recorded_work import Hands
 from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, RefusedError
 from drivers.interfaces import Frame
 
-CHECKS: tuple[Check, ...] = (
+CHECKS: tuple[CommissionCheck, ...] = (
     *link_checks.CHECKS,
     *arm_checks.CHECKS,
     *camera_checks.CHECKS,
@@ -46,12 +46,12 @@ MENDS = 3
 class Commissioning:
     """Goes through the checks at a `desk`. `path` is cell.toml; `show(check, verdict, result)` is called after each."""
 
-    desk: Desk
+    desk: CommissionWorkplace
     progress: Progress
     path: Path
-    show: Callable[[Check, str, Result | None], None]
+    show: Callable[[CommissionCheck, str, Result | None], None]
 
-    def go(self, checks: Sequence[Check]) -> bool:
+    def go(self, checks: Sequence[CommissionCheck]) -> bool:
         """Do these checks in their order; True when all of them are good."""
         good = True
         for check in checks:
@@ -69,20 +69,20 @@ class Commissioning:
     def _good(self, name: str) -> bool:
         return done_well(self.progress.standing(by_name(name), self.desk.config))
 
-    def _until_good(self, check: Check) -> bool:
+    def _until_good(self, check: CommissionCheck) -> bool:
         """Do a check, mend what it found, and do it again, as often as that helps."""
         mended = 0
         while True:
             result = self._once(check)
             self.show(check, result.verdict.value, result)
-            if result.verdict is Verdict.GOOD:
+            if result.verdict is CheckVerdict.GOOD:
                 return True
             if mended < MENDS and self._mend(check, result):
                 mended += 1
             elif not self._again(check, result):
                 return False
 
-    def _once(self, check: Check) -> Result:
+    def _once(self, check: CommissionCheck) -> Result:
         result, begun = Result(), time.monotonic()
         desk, run = self.desk, ""
         try:
@@ -91,12 +91,12 @@ class Commissioning:
             else:
                 check.work(desk, result)
         except Declined as declined:
-            result.verdict = Verdict.DECLINED
+            result.verdict = CheckVerdict.DECLINED
             result.notes.append(str(declined))
         except Aborted:
             raise
         except CellError as error:
-            result.verdict = Verdict.FAILED
+            result.verdict = CheckVerdict.FAILED
             result.notes.append(told(error))
             if isinstance(error, RefusedError) and isinstance(frame := error.seen.get("frame"), Frame):
                 desk.keep(result, f"{check.name}-refused", frame)
@@ -106,7 +106,7 @@ class Commissioning:
         self.progress.keep(check, desk.config, result, time.monotonic() - begun, run)
         return result
 
-    def _recorded(self, check: Check, result: Result) -> str:
+    def _recorded(self, check: CommissionCheck, result: Result) -> str:
         """Do it as a run, so that it is in `cell runs` and hears `cell abort`; returns the run's name."""
         desk = self.desk
         name: list[str] = []
@@ -129,7 +129,7 @@ class Commissioning:
             desk.hands = None
         return name[0] if name else ""
 
-    def _mend(self, check: Check, result: Result) -> bool:
+    def _mend(self, check: CommissionCheck, result: Result) -> bool:
         """Write what was found into the configuration, if a person agrees; True when something was written."""
         changes: dict[str, str] = {}
         in_job: dict[str, str] = {}
@@ -162,14 +162,14 @@ class Commissioning:
             ) from error
         return True
 
-    def _again(self, check: Check, result: Result) -> bool:
+    def _again(self, check: CommissionCheck, result: Result) -> bool:
         """Whether a person has changed something and wants the check done again."""
-        if result.verdict is Verdict.DECLINED:
+        if result.verdict is CheckVerdict.DECLINED:
             return False
         return self.desk.person.again(f"{check.title}: {result.verdict.value}. Mend it and measure again now?")
 
 
-def by_name(name: str) -> Check:
+def by_name(name: str) -> CommissionCheck:
     """The check of that name; `ConfigError` that lists them."""
     for check in CHECKS:
         if check.name == name:
@@ -177,7 +177,7 @@ def by_name(name: str) -> Check:
     raise ConfigError(f'there is no check "{name}"; they are {", ".join(check.name for check in CHECKS)}')
 
 
-def chosen(only: Sequence[str], until: str | None) -> list[Check]:
+def chosen(only: Sequence[str], until: str | None) -> list[CommissionCheck]:
     """The checks named, or all, up to and with `until`."""
     picked = [check for check in CHECKS if not only or check in [by_name(name) for name in only]]
     if until is not None:

@@ -68,7 +68,7 @@ class Declined(Exception):
 
 
 @dataclass
-class Desk:
+class CommissionWorkplace:
     """`path` is the configuration's file, `open_cell` connects the cell as it now says. `folder` takes pictures.
 
     `simulated`: all of its devices are, and their world can be told what to do.
@@ -183,7 +183,7 @@ class Desk:
             }
         )
         config = config.model_copy(update={"arm": slow})
-        return SlowMover(devices.arm, devices.clock, config, self.job, self.look_around, devices.interlocks)
+        return SlowMover(devices.arm, devices.clock, config, self.job, self.look_around, interlocks=devices.interlocks)
 
     def fold(self) -> None:
         """The arm to its folded posture above the deck, unless it is there."""

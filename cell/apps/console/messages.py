@@ -17,7 +17,7 @@ MOST_STOPS = 2
 
 
 @dataclass(frozen=True)
-class Setup:
+class ServerSetup:
     """How the server works; the first that it is told. `fd` is the socket that is bound for it already.
 
     `lasting` is the token of a file; `cert` and `key` are files for TLS. `cell` is what `/api/cell` answers.
@@ -118,7 +118,7 @@ class Happened:
 
 
 @dataclass(frozen=True)
-class Picture:
+class ShownPicture:
     """A grey picture that is to be compressed and shown."""
 
     header: Mapping[str, Any]
@@ -137,7 +137,7 @@ class CloudPart:
 
 
 @dataclass(frozen=True)
-class Stop:
+class StopCell:
     """Stop the cell; answered by `Stopped` of the same number."""
 
     number: int

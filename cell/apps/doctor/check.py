@@ -9,7 +9,7 @@ State = Literal["ok", "wrong", "not needed"]
 
 
 @dataclass(frozen=True)
-class Check:
+class DoctorCheck:
     """`what` was looked at, what was `found`, and what a person types where it is wrong."""
 
     what: str
@@ -22,8 +22,8 @@ class Check:
         return asdict(self)
 
 
-def judged(what: str, problem: str, found: str, mend: str = "", *, needed: bool = True) -> Check:
+def judged(what: str, problem: str, found: str, mend: str = "", *, needed: bool = True) -> DoctorCheck:
     """A check that is ok without a `problem`; with one it is wrong where it is `needed`, else told all the same."""
     if not problem:
-        return Check(what, "ok", found)
-    return Check(what, "wrong" if needed else "not needed", problem, mend)
+        return DoctorCheck(what, "ok", found)
+    return DoctorCheck(what, "wrong" if needed else "not needed", problem, mend)

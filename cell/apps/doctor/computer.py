@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from cell.apps.doctor.check import Check, judged
+from cell.apps.doctor.check import DoctorCheck, judged
 from cell.run.files.folder import list_runs
 
 ROOM_BYTES = 2_000_000_000
@@ -26,18 +26,18 @@ STEP_S = 0.005
 _UNSYNCHRONISED = 0x40
 
 
-def python_check() -> Check:
+def python_check() -> DoctorCheck:
     """Python's version."""
     here = ".".join(map(str, sys.version_info[:3]))
     old = sys.version_info < (3, 11)
     return judged("Python", f"{here}, 3.11 or newer is needed" if old else "", here, "install Python 3.11")
 
 
-def disk_check(runs: Path, wanted: int = ROOM_BYTES) -> Check:
+def disk_check(runs: Path, wanted: int = ROOM_BYTES) -> DoctorCheck:
     """Room for runs and calibrations, `wanted` bytes, and whether they can be written."""
     folder = next(path for path in (runs, *runs.parents) if path.is_dir())
     if not os.access(folder, os.W_OK | os.X_OK):
-        return Check("disk", "wrong", f"{folder} cannot be written", f"sudo chown $USER {folder}")
+        return DoctorCheck("disk", "wrong", f"{folder} cannot be written", f"sudo chown $USER {folder}")
     free = shutil.disk_usage(folder).free
     told = f"{free / 1e9:.1f} GB free at {folder}, about {free // RUN_BYTES} runs"
     oldest = list_runs(runs)[:1]
@@ -45,7 +45,7 @@ def disk_check(runs: Path, wanted: int = ROOM_BYTES) -> Check:
     return judged("disk", f"{told}; {wanted / 1e9:g} GB are wanted" if free < wanted else "", told, mend)
 
 
-def date_check(synchronised: bool | None, needed: bool) -> Check:
+def date_check(synchronised: bool | None, needed: bool) -> DoctorCheck:
     """Whether the date is kept by a time server (None: not told): a calibration's age is told by it."""
     told = "kept by a time server"
     problem = "the date is kept by no time server; runs and calibrations may be dated wrongly"
@@ -68,7 +68,7 @@ def clock_synchronised() -> bool | None:
     return not status & _UNSYNCHRONISED
 
 
-def clock_check(root: Path, needed: bool) -> Check:
+def clock_check(root: Path, needed: bool) -> DoctorCheck:
     """The clock that everything is stamped with: its source, and whether date and clock go together now."""
     try:
         source = (root / "sys/devices/system/clocksource/clocksource0/current_clocksource").read_text().strip()
@@ -98,7 +98,7 @@ def _apart() -> float:
     return abs(time.time() - time.monotonic() - before)
 
 
-def scheduling_check(root: Path, needed: bool, most: float = LATE_S) -> Check:
+def scheduling_check(root: Path, needed: bool, most: float = LATE_S) -> DoctorCheck:
     """How late a sleeping thread wakes: devices that are fed by time cannot wait longer than a period, `most` s."""
     late = sorted(_nap() for _ in range(NAPS))
     p99 = late[int(0.99 * NAPS) - 1]
@@ -117,7 +117,7 @@ def _nap() -> float:
     return time.monotonic() - begun - NAP_S
 
 
-def browser_check() -> Check:
+def browser_check() -> DoctorCheck:
     """A browser for the operator's screen and for the pages of runs; any other computer's does as well."""
     found = next((name for name in BROWSERS if shutil.which(name)), "")
     problem = "" if found else "none found; the pages of runs open on any other computer"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cell.apps.doctor.check import Check
+from cell.apps.doctor.check import DoctorCheck
 from cell.apps.doctor.computer import (
     browser_check,
     clock_check,
@@ -25,17 +25,17 @@ EXTRA_OF_DRIVER = {"canopen": "canopen"}
 OTHER_EXTRAS = ("e57", "step", "canopen", "modbus")
 
 
-def examine_computer(path: Path | None, root: Path = ROOT) -> list[Check]:
+def examine_computer(path: Path | None, root: Path = ROOT) -> list[DoctorCheck]:
     """How this computer is, for the cell that is configured, or for simulated ones where none is."""
     source = find_config(path, simulated=True)
-    rows: list[Check] = []
+    rows: list[DoctorCheck] = []
     config = None
     if source is not None:
         try:
             config = load_config(source)
-            rows.append(Check("configuration", "ok", str(source)))
+            rows.append(DoctorCheck("configuration", "ok", str(source)))
         except ConfigError as error:
-            rows.append(Check("configuration", "wrong", " ".join(str(error).split()), f"cell check -c {source}"))
+            rows.append(DoctorCheck("configuration", "wrong", " ".join(str(error).split()), f"cell check -c {source}"))
     whole = config is None or bool(config.cell.truth)
     simulated = tuple(DEVICES) if whole or config is None else config.cell.sim
     real = [name for name in DEVICES if name not in simulated]
@@ -49,9 +49,9 @@ def examine_computer(path: Path | None, root: Path = ROOT) -> list[Check]:
         scheduling_check(root, bool(real)),
     ]
     if config is None:
-        rows.append(Check("devices", "not needed", "no cell.toml here: simulated cells need no port"))
+        rows.append(DoctorCheck("devices", "not needed", "no cell.toml here: simulated cells need no port"))
     elif whole:
-        rows.append(Check("devices", "not needed", "all are simulated"))
+        rows.append(DoctorCheck("devices", "not needed", "all are simulated"))
     else:
         rows += link_checks(config, simulated, root)
     return [*rows, browser_check()]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
-from cell.apps.doctor.check import Check, judged
+from cell.apps.doctor.check import DoctorCheck, judged
 from cell.config.cell_config import DEVICES, CellConfig
 from cell.devices.diagnosis.local_devices import barred, opened_by
 from cell.makes.records import DeviceConfig
@@ -15,12 +15,12 @@ LEAST_BUFFER = 4_000_000
 """Bytes of a GigE camera's packets that the driver asks the system to keep."""
 
 
-def link_checks(config: CellConfig, simulated: Collection[str], root: Path) -> Iterator[Check]:
+def link_checks(config: CellConfig, simulated: Collection[str], root: Path) -> Iterator[DoctorCheck]:
     """A row for each configured device that needs something of this computer; `simulated` ones need nothing."""
     for name in DEVICES:
         record, make = config.device(name), config.make(name)
         if name in simulated:
-            yield Check(name, "not needed", "is simulated")
+            yield DoctorCheck(name, "not needed", "is simulated")
             continue
         if missing := make.missing():
             yield _told(f"{name}, {make.name}", missing)
@@ -29,23 +29,23 @@ def link_checks(config: CellConfig, simulated: Collection[str], root: Path) -> I
         elif device := _file(record):
             problem = barred(device) or opened_by(device, root)
             what = f"{name}, port {device}"
-            yield _told(what, problem) if problem else Check(what, "ok", "may be opened")
+            yield _told(what, problem) if problem else DoctorCheck(what, "ok", "may be opened")
         if make.name == "gige":
             yield _buffer_check(name, root)
 
 
-def can_check(name: str, record: DeviceConfig, about: CanInterface | None) -> Check:
+def can_check(name: str, record: DeviceConfig, about: CanInterface | None) -> DoctorCheck:
     """A CAN interface of Linux against what the configuration says of the bus."""
     what, wanted = f"{name}, CAN {record.place}", int(getattr(record, "bitrate", 500_000))
     up = f"sudo ip link set {record.place} up type can bitrate {wanted}"
     if about is None:
-        return Check(what, "wrong", "there is no such interface, or no `ip` to ask", f"plug the adapter in; {up}")
+        return DoctorCheck(what, "wrong", "there is no such interface, or no `ip` to ask", f"plug the adapter in; {up}")
     if not about.up:
-        return Check(what, "wrong", "is down", up)
+        return DoctorCheck(what, "wrong", "is down", up)
     if about.bitrate not in (None, wanted):
         found = f"runs at {(about.bitrate or 0) / 1e3:g} kbit/s, the configuration says {wanted / 1e3:g} kbit/s"
-        return Check(what, "wrong", found, f"sudo ip link set {record.place} down; {up}")
-    return Check(what, "ok", "up" if about.bitrate is None else f"up, {about.bitrate / 1e3:g} kbit/s")
+        return DoctorCheck(what, "wrong", found, f"sudo ip link set {record.place} down; {up}")
+    return DoctorCheck(what, "ok", "up" if about.bitrate is None else f"up, {about.bitrate / 1e3:g} kbit/s")
 
 
 def _file(record: DeviceConfig) -> str:
@@ -54,17 +54,17 @@ def _file(record: DeviceConfig) -> str:
     return place if place.startswith("/dev/") else ""
 
 
-def _buffer_check(name: str, root: Path) -> Check:
+def _buffer_check(name: str, root: Path) -> DoctorCheck:
     try:
         most = int((root / "proc/sys/net/core/rmem_max").read_text())
     except (OSError, ValueError):
-        return Check(f"{name}, receive buffer", "not needed", "not told by this system")
+        return DoctorCheck(f"{name}, receive buffer", "not needed", "not told by this system")
     problem = f"at most {most} bytes, {LEAST_BUFFER} are wanted" if most < LEAST_BUFFER else ""
     mend = f"sudo sysctl -w net.core.rmem_max={LEAST_BUFFER}"
     return judged(f"{name}, receive buffer", problem, f"up to {most} bytes", mend)
 
 
-def _told(what: str, problem: str) -> Check:
+def _told(what: str, problem: str) -> DoctorCheck:
     """A problem in words that end with what mends it, behind a colon."""
     found, _, mend = problem.partition(": ")
-    return Check(what, "wrong", found, mend)
+    return DoctorCheck(what, "wrong", found, mend)

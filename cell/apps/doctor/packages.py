@@ -10,7 +10,7 @@ from pathlib import Path
 
 from packaging.requirements import Requirement
 
-from cell.apps.doctor.check import Check, judged
+from cell.apps.doctor.check import DoctorCheck, judged
 from cell.base.version import DISTRIBUTION
 
 ALWAYS = ""
@@ -22,7 +22,7 @@ OWN = ("cell", "drivers", "statemachine", "sim_backends")
 
 def shadow_check(
     installed: Callable[[], Mapping[str, list[str]]] = packages_distributions, root: Path = Path(__file__).parents[3]
-) -> Check:
+) -> DoctorCheck:
     """Whether another distribution or another folder has a package of the same name as one of ours.
 
     `installed` gives the distributions by package; `root` is the folder that holds our packages.
@@ -38,7 +38,7 @@ def shadow_check(
         if spec is not None and spec.origin and Path(spec.origin).parents[1] != root:
             problem = f"{name} is imported from {spec.origin}, not from {root}"
             return judged("package names", problem, "", "start Python in another folder, or unset PYTHONPATH")
-    return Check("package names", "ok", f"{', '.join(OWN)} are this program's")
+    return DoctorCheck("package names", "ok", f"{', '.join(OWN)} are this program's")
 
 
 def asked_for(extras: Iterable[str]) -> dict[str, list[Requirement]]:
@@ -65,13 +65,13 @@ def asked_for(extras: Iterable[str]) -> dict[str, list[Requirement]]:
 
 def package_checks(
     needed: Iterable[str], others: Iterable[str], installed: Callable[[str], str] = version
-) -> list[Check]:
+) -> list[DoctorCheck]:
     """A row for all that is always asked for, and one for each extra: those that the cell needs, and others."""
     needed, others = list(needed), list(others)
     try:
         asked = asked_for([*needed, *others])
     except PackageNotFoundError:
-        return [Check("packages", "wrong", f"{DISTRIBUTION} is not installed", "pip install -e .")]
+        return [DoctorCheck("packages", "wrong", f"{DISTRIBUTION} is not installed", "pip install -e .")]
     rows = []
     for extra, requirements in asked.items():
         if not requirements:

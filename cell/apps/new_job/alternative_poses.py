@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.apps.new_job.rays import Array
-from cell.apps.new_job.sweeps import Seen
+from cell.apps.new_job.sweeps import SeenSurface
 from cell.config.job import Job
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.alternative_poses import settled, told
@@ -28,7 +28,7 @@ OVER = 0.6
 GATE = 0.002
 
 
-def rivals(seen: Sequence[Seen], nominal: NominalSurface, job: Job) -> list[tuple[Array, float]]:
+def rivals(seen: Sequence[SeenSurface], nominal: NominalSurface, job: Job) -> list[tuple[Array, float]]:
     """Shifts (3,) m of the surface's middle, and turns, rad, of other places that fit as well, the nearest first.
 
     Looked for within six standard deviations of the prior, at most 10 mm across: the surface may lie at one end of the
@@ -41,7 +41,7 @@ def rivals(seen: Sequence[Seen], nominal: NominalSurface, job: Job) -> list[tupl
     shift, turn = min(6 * job.surface.prior_sigma, MOST_SHIFT), 6 * job.surface.prior_sigma_angle
     information = sum((each.information(each.solid) for each in seen), np.zeros((6, 6)))
     found: list[tuple[Array, float]] = []
-    for start in candidates(pin.SE3.Identity(), points, nominal, shift, turn, MOST_PLACES):
+    for start in candidates(pin.SE3.Identity(), points, nominal, shift=shift, turn=turn, most=MOST_PLACES):
         where = settled(start, points, nominal)
         turned = float(np.linalg.norm(pin.log3(where.rotation)))
         middle = where.act(nominal.centre) - nominal.centre

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.new_job.mesh_file import Body, Drawn
+from cell.apps.new_job.mesh_file import Drawn, MeshBody
 from cell.apps.new_job.overlap import overlapping
 from cell.apps.new_job.questions import Asker, checked, choice, pose, pose_words, three
 from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, raised, turned_over
@@ -59,7 +59,7 @@ def laid_mesh(asker: Asker, drawn: Drawn) -> tuple[Laid, str]:
     return centred(laid), unit
 
 
-def _bodies(asker: Asker, drawn: Drawn) -> list[Body]:
+def _bodies(asker: Asker, drawn: Drawn) -> list[MeshBody]:
     for note in drawn.notes:
         asker.tell(f"mesh: {note}")
     if len(drawn.bodies) == 1:
@@ -73,7 +73,7 @@ def _bodies(asker: Asker, drawn: Drawn) -> list[Body]:
             f"  {one + 1} and {other + 1} overlap: what lies inside is no surface, and what lies double counts once"
         )
 
-    def parse(text: str) -> list[Body]:
+    def parse(text: str) -> list[MeshBody]:
         if text.strip() == "all":
             return list(drawn.bodies)
         try:
@@ -109,7 +109,7 @@ def _unit(asker: Asker, drawn: Drawn, longest: float) -> tuple[str, str]:
     return unit, why if unit == default and asker.given.get("unit") is None else words
 
 
-def _lowest(bodies: list[Body]) -> float:
+def _lowest(bodies: list[MeshBody]) -> float:
     return min(float(body.vertices[:, 2].min()) for body in bodies)
 
 

@@ -68,11 +68,11 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         return next(iter(sweep_problems(tried, config, laid.box)), None)
 
     asker.tell("choosing sweeps …")
-    proposal = propose(laid, job, config, step, reachable, asker.progress)
+    proposal = propose(laid, job, config, step=step, reachable=reachable, tell=asker.progress)
     if proposal.open and asker.given.get("turn") is None:
         # The light comes aslant from behind: from the other side it falls on other flanks.
         asker.tell("choosing sweeps from the other side as well …")
-        other = propose(about(laid), job, config, step, reachable, asker.progress)
+        other = propose(about(laid), job, config, step=step, reachable=reachable, tell=asker.progress)
         if not other.open:
             laid, proposal = (
                 about(laid),
@@ -102,10 +102,10 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         targets[0],
         targets[1],
         targets[2],
-        name,
-        proposal.share,
-        found,
-        (*proposal.notes, *notes, *told_by_few(proposal.seen, nominal)),
+        name=name,
+        seen=proposal.share,
+        place=found,
+        notes=(*proposal.notes, *notes, *told_by_few(proposal.seen, nominal)),
     )
 
 

@@ -33,7 +33,7 @@ LEAST_SHARE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class MeshBody:
     """One connected body: `vertices` (n, 3) in the file's unit, `triangles` (m, 3), and whether it is `closed`."""
 
     vertices: Array
@@ -52,7 +52,7 @@ class Drawn:
     wrong and was put right, or is as it is."""
 
     path: Path
-    bodies: tuple[Body, ...]
+    bodies: tuple[MeshBody, ...]
     unit: str | None
     notes: tuple[str, ...]
 
@@ -130,7 +130,7 @@ def _parts(faces: Faces, corners: int) -> list[Faces]:
     return np.split(faces[order], np.flatnonzero(np.diff(mine[order])) + 1)
 
 
-def _turned(vertices: Array, faces: Faces, notes: list[str]) -> Body:
+def _turned(vertices: Array, faces: Faces, notes: list[str]) -> MeshBody:
     """A body whose triangles all face the same way, outwards where it is closed."""
     used, renumbered = np.unique(faces, return_inverse=True)
     corners, before = vertices[used], renumbered.reshape(-1, 3)
@@ -146,7 +146,7 @@ def _turned(vertices: Array, faces: Faces, notes: list[str]) -> Body:
         notes.append(f"open: {lone} edges belong to one triangle only" + _as_expected(lone, len(count)))
     if crowded:
         notes.append(f"{crowded} edges belong to more than two triangles: bodies meet there, or walls lie inside")
-    return Body(corners, np.where(over[:, None], before[:, ::-1], before), lone == 0)
+    return MeshBody(corners, np.where(over[:, None], before[:, ::-1], before), lone == 0)
 
 
 def _turned_over(ways: Faces, edge: Faces, count: Faces, faces: int) -> NDArray[np.bool_]:

@@ -11,11 +11,11 @@ import numpy as np
 import pinocchio as pin
 
 from cell.apps.new_job.rays import Array
-from cell.apps.new_job.sweeps import Seen, as_cloud
+from cell.apps.new_job.sweeps import SeenSurface, as_cloud
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
-from cell.measure.inversion.observability import FREE, Verdict, judge
+from cell.measure.inversion.observability import FREE, PoseVerdict, judge
 from cell.measure.reconstruction import flange_motions
 
 OVER = 1e-4
@@ -38,7 +38,7 @@ def shared_by_all(config: CellConfig) -> Array:
     return np.diag([arm.kinematic_sigma**2] * 3 + [arm.kinematic_sigma_angle**2] * 3)
 
 
-def verdict(information: Array, points: int, radius: float, job: Job, config: CellConfig) -> Verdict:
+def verdict(information: Array, points: int, radius: float, job: Job, config: CellConfig) -> PoseVerdict:
     """What a scan of this information (6, 6) in `points` points leaves open. A motion that the scan hardly determines
     is left to the board altogether: what there is of it may be noise, or the drawing's facets."""
     length = np.array([1.0] * 3 + [radius] * 3)
@@ -49,10 +49,10 @@ def verdict(information: Array, points: int, radius: float, job: Job, config: Ce
     known = np.linalg.inv(information + np.linalg.inv(prior_of(job)))
     gain = known @ information
     covariance = known + gain @ shared_by_all(config) @ gain.T
-    return judge(covariance, information, variance, points, radius, _tolerance(job))
+    return judge(covariance, information, variance, points=points, radius=radius, tolerance=_tolerance(job))
 
 
-def known(seen: Sequence[Seen], surface: NominalSurface, job: Job, config: CellConfig) -> Verdict:
+def known(seen: Sequence[SeenSurface], surface: NominalSurface, job: Job, config: CellConfig) -> PoseVerdict:
     """What these sweeps leave open, by the points that the inversion uses: those over `surface`, not at its borders."""
     used = [each.valid for each in seen]
     for mask, each in zip(used, seen, strict=True):
@@ -64,7 +64,7 @@ def known(seen: Sequence[Seen], surface: NominalSurface, job: Job, config: CellC
     return verdict(information, sum(int(mask.sum()) for mask in used), surface.radius, job, config)
 
 
-def told_by_few(seen: Sequence[Seen], surface: NominalSurface) -> list[str]:
+def told_by_few(seen: Sequence[SeenSurface], surface: NominalSurface) -> list[str]:
     """A line for x and for y where few points alone tell how the surface lies along it: those on upright faces."""
     points = np.concatenate([each.points[each.valid] for each in seen])
     normals = np.concatenate([each.normals[each.valid] for each in seen])
@@ -81,7 +81,7 @@ def told_by_few(seen: Sequence[Seen], surface: NominalSurface) -> list[str]:
     return notes
 
 
-def place_from(seen: Sequence[Seen], nominal: NominalSurface, job: Job, config: CellConfig) -> PlacePose:
+def place_from(seen: Sequence[SeenSurface], nominal: NominalSurface, job: Job, config: CellConfig) -> PlacePose:
     """The place as the job's own inversion would tell it from these sweeps, without noise.
 
     Raises `NotObservable` that names the motion which surface and sweeps leave open, `RefusedError` when they cover

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from cell.apps.new_job.mesh_file import Body
+from cell.apps.new_job.mesh_file import MeshBody
 from cell.apps.new_job.rays import ABOVE, Array, Faces, Rays
 
 APART = 1e-4
 """Share of a body's size by which another has to reach into it to overlap: bodies that touch do not."""
 
 
-def overlapping(bodies: Sequence[Body]) -> list[tuple[int, int]]:
+def overlapping(bodies: Sequence[MeshBody]) -> list[tuple[int, int]]:
     """Pairs of numbers of bodies that reach into each other, or of which one lies inside the other."""
     pairs = [
         pair
@@ -37,7 +37,7 @@ def _boxes_meet(one: Array, other: Array) -> bool:
     return bool((one.min(axis=0) <= other.max(axis=0)).all() and (other.min(axis=0) <= one.max(axis=0)).all())
 
 
-def _enters(body: Body, other: Body, rays: Rays) -> bool:
+def _enters(body: MeshBody, other: MeshBody, rays: Rays) -> bool:
     """Whether `body` has places of its surface inside `other`, which `rays` meet; where that is open, crosses it."""
     apart = APART * float(other.size.max())
     corners = body.vertices[body.triangles]

@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from cell.apps.new_job.proposal import SEEN_WITHIN, Proposal
 from cell.apps.new_job.rays import Array
-from cell.apps.new_job.sweeps import Seen
+from cell.apps.new_job.sweeps import SeenSurface
 from cell.check.reach import nominal_scan, station_planner
 from cell.config.cell_config import CellConfig
 from cell.config.job import SwathSection
@@ -88,7 +88,7 @@ def _draw_map(figure: Figure, axes: Axes, made: Proposal, nominal: NominalSurfac
     figure.colorbar(shown, ax=axes, label="height in mm", shrink=0.8, pad=0.02)
 
 
-def _outline(seen: Seen) -> Array:
+def _outline(seen: SeenSurface) -> Array:
     """Around what a sweep sees, (n, 2) m, closed."""
     points = seen.points[seen.valid][:, :2]
     if len(points) < 4:

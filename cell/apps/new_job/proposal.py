@@ -16,7 +16,7 @@ import pinocchio as pin
 from cell.apps.new_job.observability import verdict
 from cell.apps.new_job.rays import ABOVE, Array, Rays
 from cell.apps.new_job.surface import Laid, open_side
-from cell.apps.new_job.sweeps import FARTHEST, NEAREST, Seen, look
+from cell.apps.new_job.sweeps import FARTHEST, NEAREST, SeenSurface, look
 from cell.check.fit import RAMP_MARGIN
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
 from cell.config.job import Job, ScanSection, SwathSection
@@ -55,7 +55,7 @@ class Proposal:
 
     job: Job
     surface: Laid
-    seen: tuple[Seen, ...]
+    seen: tuple[SeenSurface, ...]
     notes: tuple[str, ...] = field(default=())
     open: bool = False
     """Whether a motion of the surface stays open, as far as the choice between sweeps tells."""
@@ -171,7 +171,7 @@ class _Search:
     reachable: Callable[[Job], str | None]
     tell: Callable[[str], None]
 
-    def tilted(self, job: Job, seen: list[Seen]) -> tuple[Job, list[Seen], list[str], float]:
+    def tilted(self, job: Job, seen: list[SeenSurface]) -> tuple[Job, list[SeenSurface], list[str], float]:
         """With tilted sweeps added as long as each makes the worst known motion better known by a third, or sees more
         of the surface; in words what was added and what was not; and the worst known motion, in tolerances."""
         worst, missed = self._excess(job, seen), self._missed(seen)
@@ -207,16 +207,16 @@ class _Search:
         told = f"tilted ones added ({'; '.join(added)})" if added else "tilted ones tell no more"
         return job, seen, [f"{why}: {told}", *refused[:2]], worst
 
-    def _one(self, job: Job, roll: float, pitch: float) -> Seen:
+    def _one(self, job: Job, roll: float, pitch: float) -> SeenSurface:
         """What the tilted sweep alone sees."""
         swath = _and_tilted(job.scan, roll, pitch).swath[-1:]
         return look(self.config, _with(job, job.scan.model_copy(update={"swath": swath})), self.rays)[0]
 
-    def _missed(self, seen: Sequence[Seen]) -> float:
+    def _missed(self, seen: Sequence[SeenSurface]) -> float:
         """Share of the surface's area, 0 … 1, that no sweep sees."""
         return 1.0 - seen_share(self.top, seen)
 
-    def _excess(self, job: Job, seen: Sequence[Seen]) -> float:
+    def _excess(self, job: Job, seen: Sequence[SeenSurface]) -> float:
         """3σ of the least known motion, in tolerances."""
         used = [each.solid for each in seen]
         if (points := sum(int(mask.sum()) for mask in used)) < LEAST_POINTS:
@@ -242,7 +242,7 @@ def way(swath: SwathSection) -> Array:
     return np.asarray(pin.rpy.rpyToMatrix(swath.roll, swath.pitch, 0.0) @ ABOVE)
 
 
-def seen_share(surface: NominalSurface, seen: Sequence[Seen]) -> float:
+def seen_share(surface: NominalSurface, seen: Sequence[SeenSurface]) -> float:
     """Share of the surface's area that has a point of a sweep near it."""
     points = np.concatenate([each.points[each.valid] for each in seen])
     return surface.coverage(points, SEEN_WITHIN) if len(points) else 0.0

@@ -9,7 +9,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.apps.new_job.rays import Array
-from cell.apps.new_job.sweeps import Seen
+from cell.apps.new_job.sweeps import SeenSurface
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.config.mounting import mounted
@@ -24,7 +24,7 @@ MARGIN = 0.002
 """How much larger the part is taken to be on each side, m."""
 
 
-def sight_problems(job: Job, config: CellConfig, seen: Sequence[Seen]) -> Iterator[str]:
+def sight_problems(job: Job, config: CellConfig, seen: Sequence[SeenSurface]) -> Iterator[str]:
     """A line for each view that the part in the claw, as drawn, hides."""
     part = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3(), mounted(config))[-1]
     sides = " x ".join(f"{1e3 * side:g}" for side in job.grasp.size)
@@ -54,7 +54,7 @@ def sight_problems(job: Job, config: CellConfig, seen: Sequence[Seen]) -> Iterat
             return
 
 
-def _hidden_share(seen: Seen, part: Body) -> float:
+def _hidden_share(seen: SeenSurface, part: Body) -> float:
     lines, rows = seen.valid.nonzero()
     if not len(lines):
         return 0.0

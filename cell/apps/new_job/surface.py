@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.new_job.mesh_file import Body
+from cell.apps.new_job.mesh_file import MeshBody
 from cell.apps.new_job.overlap import before
 from cell.apps.new_job.rays import ABOVE, NEAR, Array, Faces, Rays
 from cell.apps.new_job.units import METRES
@@ -53,7 +53,7 @@ class Laid:
         return used.min(axis=0), used.max(axis=0)
 
 
-def lay(bodies: Sequence[Body], unit: str, up: str, turn: float | None) -> Laid:
+def lay(bodies: Sequence[MeshBody], unit: str, up: str, turn: float | None) -> Laid:
     """The bodies with the axis `up` of their file up, turned by `turn` rad about it; without it the longer side lies
     along x, the way of the sweep."""
     vertices = METRES[unit] * np.concatenate([body.vertices for body in bodies])
@@ -132,7 +132,7 @@ def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,), tell: Callable[[str]
         share = np.zeros(len(pieces))
         for k in np.unique(body):
             mine = body == k
-            share[mine] = _seen_share(pieces[mine], normals[mine], rays, earlier[k], towards, finest)
+            share[mine] = _seen_share(pieces[mine], normals[mine], rays, earlier=earlier[k], ways=towards, step=finest)
         longest = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2).max(axis=1)
         mixed = (share > 0.0) & (share < 1.0) & (longest > finest)
         kept.append(pieces[~mixed & (share > 0.5)])

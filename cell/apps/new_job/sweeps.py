@@ -36,7 +36,7 @@ GRAZING = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SeenSurface:
     """What one sweep sees: `points` (lines, rows, 3) m and their `normals`, NaN where there is none, `spread` (lines,
     rows, 3) m by the stripe's noise, the `flanges` (lines, 4, 4), the `rail` (lines,), m, and the way of the sweep.
 
@@ -81,14 +81,14 @@ def _alike(normals: Array, others: Array) -> NDArray[np.bool_]:
     return np.asarray(np.einsum("lri,lri->lr", normals, others) > SMOOTH)
 
 
-def look(config: CellConfig, job: Job, rays: Rays) -> list[Seen]:
+def look(config: CellConfig, job: Job, rays: Rays) -> list[SeenSurface]:
     """What each of the job's sweeps sees of the surface that `rays` meet, as drawn."""
     return [
         _sweep(config, job, plan, rays) for plan in scan_plans(config, job, pin.SE3.Identity(), nominal_scan(config))
     ]
 
 
-def _sweep(config: CellConfig, job: Job, plan: ScanPlan, rays: Rays) -> Seen:
+def _sweep(config: CellConfig, job: Job, plan: ScanPlan, rays: Rays) -> SeenSurface:
     head = nominal_scan(config)
     count = max(12, int(job.scan.length / LINE_STEP) + 1)
     shares = np.linspace(0.0, 1.0, count)
@@ -124,13 +124,13 @@ def _sweep(config: CellConfig, job: Job, plan: ScanPlan, rays: Rays) -> Seen:
     for values, into in zip((points[keep], normals[keep], spread), made, strict=True):
         into[met[keep]] = values
     shape = (count, ROWS, 3)
-    return Seen(
+    return SeenSurface(
         made[0].reshape(shape), made[1].reshape(shape), made[2].reshape(shape),
-        np.array([flange.homogeneous for flange in flanges]), rail, turns[0][:, 0], eyes, lamps,
+        np.array([flange.homogeneous for flange in flanges]), rail=rail, along=turns[0][:, 0], eyes=eyes, lamps=lamps,
     )  # fmt: skip
 
 
-def as_cloud(seen: list[Seen], rail_sigma: float) -> Cloud:
+def as_cloud(seen: list[SeenSurface], rail_sigma: float) -> Cloud:
     """The sweeps as the cloud that they would make without noise, in the surface frame."""
     lines = [len(each.rail) for each in seen]
     points = np.concatenate([each.points for each in seen])

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.apps.recordings.consistency import odd_turns, orders, turn_votes, weighted_median
-from cell.apps.recordings.conventions import FORM, TRIED, Reading, readings_of, why_not
+from cell.apps.recordings.conventions import FORM, TRIED, PoseReading, readings_of, why_not
 from cell.apps.recordings.series import Series
 from cell.measure.calibration.solve.hand_eye import park_martin
 from cell.measure.geometry.camera import Array
@@ -54,7 +54,7 @@ class Fit:
     """
 
     series: Series
-    reading: Reading
+    reading: PoseReading
     setup: str
     unit: str
     turn: float
@@ -208,7 +208,7 @@ def _same(a: Fit, b: Fit, boards: dict[int, list[pin.SE3]]) -> bool:
     )  # fmt: skip
 
 
-def _fits_of(one: Series, reading: Reading, boards: dict[int, list[pin.SE3]], setup: str | None) -> list[Fit]:
+def _fits_of(one: Series, reading: PoseReading, boards: dict[int, list[pin.SE3]], setup: str | None) -> list[Fit]:
     """The fits of a reading, one for each set-up; none where too few frames have a pose in it.
 
     Raises RefusedError where the turns tell nothing.

@@ -17,7 +17,7 @@ from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision.board.board import board_pose
 from cell.measure.vision.pictures import PictureRefused, Reason
-from cell.measure.vision.stripe.planes import Laser
+from cell.measure.vision.stripe.planes import LaserChannel
 from drivers.errors import ConfigError, RefusedError
 
 LEAST_POSES, FARTHEST_M = 3, 20.0
@@ -40,7 +40,7 @@ class Options:
     plan: bool = False
     camera: CameraModel | None = None
     hold_camera: bool = False
-    laser: Laser | None = Laser.AUTO
+    laser: LaserChannel | None = LaserChannel.AUTO
 
 
 @dataclass

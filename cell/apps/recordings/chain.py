@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cell.apps.recordings import result as form
 from cell.apps.recordings.frames import RecordedFrame
 from cell.measure.calibration.judge.board_shape import moved_by_bend
-from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.judge.flatness import flatness, leave_one_out
 from cell.measure.calibration.judge.hand_eye_checks import hand_eye_checks
 from cell.measure.calibration.judge.plane_checks import (
@@ -50,7 +50,7 @@ Found = TypeVar("Found")
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class CalibrationChain:
     """What frames with poses give. `stripes` says why a frame's stripe is not used, by the frame's place.
 
     `pictures` is the camera of the pictures, its deviation with what the arm says of it.
@@ -78,7 +78,7 @@ class Chain:
 
 def solve_chain(
     frames: Sequence[RecordedFrame], pictures: Intrinsics, known: str | None = None, hold_camera: bool = False
-) -> Chain:
+) -> CalibrationChain:
     """Closed form and joint solution with the camera on the flange, or before it, whichever fits; `known` says which.
 
     Raises RefusedError when there are too few frames, or they do not determine a hand-eye.
@@ -109,7 +109,17 @@ def solve_chain(
         plane = replace(plane, place=math.hypot(plane.place, (scale.value - 1) * reach))
     best, closed = (replace(s, unsure=np.abs(unsure)) for s in (choice.best, choice.closed))
     choice = replace(choice, best=best, closed=closed)
-    return Chain(setup, observations, staged, pictures, choice, stripes, no_plane, plane, scale)
+    return CalibrationChain(
+        setup,
+        observations,
+        staged,
+        pictures=pictures,
+        choice=choice,
+        stripes=stripes,
+        no_plane=no_plane,
+        plane_known=plane,
+        scale=scale,
+    )
 
 
 def _refuse_strangers(staged: Staged, scale: Scale | None, reach: float) -> None:
@@ -215,7 +225,7 @@ def _with_plane(
         return staged, wrong, str(error)
 
 
-def check_chain(chain: Chain, pictures: Intrinsics) -> list[Check]:
+def check_chain(chain: CalibrationChain, pictures: Intrinsics) -> list[QualityCheck]:
     """The absolute checks of hand-eye and light plane."""
     made = hand_eye_checks(chain.choice, chain.staged.camera_from_board, pictures)
     if chain.scale is not None:
@@ -227,15 +237,15 @@ def check_chain(chain: Chain, pictures: Intrinsics) -> list[Check]:
     cloud = np.concatenate(points_on_boards(staged, chain.observations))
     lit = sum(len(rows) > 0 for rows in staged.plane.rows)
     rms = max(staged.plane.rms, adjusted.stripe_rms_m)
-    made += plane_checks(rms, chain.noise, cloud, lit, known, len(chain.stripes))
+    made += plane_checks(rms, chain.noise, cloud, frames=lit, known=known, left_out=len(chain.stripes))
     apart = math.degrees(math.acos(min(1.0, abs(float(plane.n @ staged.plane.plane.n)))))
     name, tilt = "plane with the arm against plane of the pictures", math.degrees(known.tilt)
     text = "the arm's poses and the board's in the pictures do not agree about it"
-    made.append(Check("light_plane", name, apart, max(1.0, 4 * tilt), max(4.0, 8 * tilt), "deg", text))
+    made.append(QualityCheck("light_plane", name, apart, max(1.0, 4 * tilt), max(4.0, 8 * tilt), unit="deg", says=text))
     return made
 
 
-def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> None:
+def report_chain(chain: CalibrationChain, pictures: Intrinsics, result: dict[str, Any]) -> None:
     """Put camera, hand-eye, light plane, noise and flatness into the result, lengths in mm."""
     best, choice, staged, names = chain.choice.best, chain.choice, chain.staged, [o.name for o in chain.observations]
     adjusted, state, sigma = best.adjusted, best.adjusted.state, best.sigma
@@ -289,7 +299,7 @@ def report_chain(chain: Chain, pictures: Intrinsics, result: dict[str, Any]) -> 
     depths = form.seen_depths(state.plane, state.camera, [v.stripe for v in best.views if len(v.stripe)])
     checked = None if staged.paper is None else form.finite(1e3 * staged.paper.cross_ratio_m)
     result["light_plane"] = {
-        **form.plane_dict(best.name, state.plane, adjusted.stripe_rms_m, chain.noise, chain.plane_known, depths),
+        **form.plane_dict(best.name, state.plane, adjusted.stripe_rms_m, chain.noise, chain.plane_known, depths=depths),
         "sigma_distance_mm": 1e3 * float(sigma[PLANE][2]),
         "staged": {**form.normal_dict(staged.plane.plane, staged.plane.rms), "cross_ratio_check_mm": checked},
     }

@@ -122,5 +122,5 @@ def _from_frames(
     if found is not None and options.plan:
         agreeing(frames, found[0].camera)
     elif found is not None:
-        solve_frames(frames, found, result, understood.setup, options.camera, options.hold_camera)
+        solve_frames(frames, found, result, understood.setup, given=options.camera, hold_camera=options.hold_camera)
         note_perhaps_no_laser(frames, result)

@@ -38,7 +38,7 @@ SEQUENCES = {"rpy": "xyz", "abc": "ZYX", "zyz": "ZYZ"}
 
 
 @dataclass(frozen=True)
-class Reading:
+class PoseReading:
     """A meaning of `count` numbers by its name for --poses."""
 
     name: str
@@ -77,14 +77,14 @@ def _matrix(whole: Array) -> pin.SE3:
     return from_matrix(np.vstack([whole[:3], [0.0, 0.0, 0.0, 1.0]]))
 
 
-def readings_of(count: int, named: str, wanted: str | None) -> list[Reading]:
+def readings_of(count: int, named: str, wanted: str | None) -> list[PoseReading]:
     """The readings of so many numbers, those that the names beside them allow, or the one that was asked for.
 
     `named` is a record's: "quaternion" or "rotation" (position first), or empty.
     """
     if wanted is None and named == "quaternion":
         wanted = "xyz+quaternion-xyzw"
-    return [r for r in map(Reading, TRIED if wanted is None else (wanted,)) if r.count == count]
+    return [r for r in map(PoseReading, TRIED if wanted is None else (wanted,)) if r.count == count]
 
 
 def check_reading(name: str | None) -> None:

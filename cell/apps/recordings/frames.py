@@ -20,14 +20,14 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.apps.recordings.series import Listing, frame_key
-from cell.apps.recordings.stripes import Channel, ReadStripe, Source, calmest, choose_channel, read_on_board
+from cell.apps.recordings.stripes import ChosenChannel, ReadStripe, Source, calmest, choose_channel, read_on_board
 from cell.apps.recordings.texts import PICTURES
 from cell.measure.geometry.poses import difference, mean
 from cell.measure.vision.board.board import find_board
 from cell.measure.vision.board.spec import BoardSpec
 from cell.measure.vision.board.view import BoardView
 from cell.measure.vision.pictures import PictureRefused, Reason, read_picture
-from cell.measure.vision.stripe.extract import Laser, StripeProfile
+from cell.measure.vision.stripe.extract import LaserChannel, StripeProfile
 from cell.measure.vision.stripe.planes import read_colours
 from drivers.errors import ConfigError
 
@@ -108,9 +108,9 @@ def read_frames(
     listing: Listing,
     spec: BoardSpec,
     links: Sequence[dict[str, str]] = (),
-    laser: Laser | None = Laser.AUTO,
+    laser: LaserChannel | None = LaserChannel.AUTO,
     quick: bool = False,
-) -> tuple[list[RecordedFrame], Channel]:
+) -> tuple[list[RecordedFrame], ChosenChannel]:
     """Every picture of a listing, with board and stripe, or refused with a reason; and where the laser was read.
 
     `links` are pictures that a table names together; `laser` None looks for no stripe; a `quick` search for boards is
@@ -326,7 +326,9 @@ def _paired(a: BoardView, b: BoardView) -> NDArray[np.float64] | None:
     return None if few else np.linalg.norm(a.pixels[here] - b.pixels[there], axis=1)
 
 
-def _read_stripes(frames: Sequence[RecordedFrame], places: Sequence[_Place], laser: Laser | None) -> Channel:
+def _read_stripes(
+    frames: Sequence[RecordedFrame], places: Sequence[_Place], laser: LaserChannel | None
+) -> ChosenChannel:
     """Read the stripe of each board in its own picture or in another of its place, and set the others aside."""
     sources = [place.sources() for place in places]
     boards = {id(f) for place in places for f in (place.board, *place.others)}
@@ -341,7 +343,7 @@ def _read_stripes(frames: Sequence[RecordedFrame], places: Sequence[_Place], las
     return channel
 
 
-def _read_place(place: _Place, sources: Sequence[tuple[RecordedFrame, Source]], channel: Channel) -> None:
+def _read_place(place: _Place, sources: Sequence[tuple[RecordedFrame, Source]], channel: ChosenChannel) -> None:
     """The stripe of a place, from the picture that is named after the laser or shows it."""
     board = place.board
     reads = [(frame, source, read_on_board(source, channel)) for frame, source in sources]

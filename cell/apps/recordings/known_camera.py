@@ -92,7 +92,7 @@ def _camera(data: Mapping[str, Any]) -> CameraModel:
     for name, value in further.items():
         if value != 0.0:
             raise ConfigError(f"{name} is {value:g}: the lens here has k1, k2, p1, p2 and k3 only; {NEXT}")
-    camera = CameraModel(width, height, 1.0, 1.0, 0.0, 0.0).with_parameters(values)
+    camera = CameraModel(width, height, 1.0, fy=1.0, cx=0.0, cy=0.0).with_parameters(values)
     longer, inf = max(width, height), math.inf
     focal = tuple(limit * longer for limit in FOCAL_RANGE)
     allowed = {"fx": focal, "fy": focal, "cx": (-OUTSIDE * width, (1 + OUTSIDE) * width)}

@@ -15,7 +15,7 @@ from cell.apps.recordings.consistency import misplacements, odd_turns
 from cell.apps.recordings.frames import SAME_M, SAME_RAD, counted, grouped, near
 from cell.apps.recordings.result import closed_form_dict, empty_result, hand_eye_dict, setup_note
 from cell.apps.recordings.solution import apply_checks
-from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.judge.scale import metric_scale
 from cell.measure.calibration.solve.hand_eye import HandEye, refine_hand_eye, solve_hand_eye
 from cell.measure.geometry.camera import Array
@@ -111,7 +111,7 @@ def calibrate_pairs(pairs: Sequence[Pair]) -> dict[str, Any]:
     share, sigmas = 0.1 / reach, float(np.max(np.abs(apart) / np.maximum(sigma, 1e-9)))
     most = 6.0 if share * far > 3.0 else math.inf
     checks = [
-        Check("hand_eye", name, value, doubt, refused, unit, text)
+        QualityCheck("hand_eye", name, value, doubt=doubt, refuse=refused, unit=unit, says=text)
         for name, value, doubt, refused, unit, text in (
             ("σ of its place", share * place, 1.0, 5.0, "% of the board's distance", f"{place:.1f} mm {advice}"),
             ("σ of its turn", math.degrees(float(sigma[3:].max())), 0.6, 3.0, "deg", advice),

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.recordings.conventions import Reading
-from cell.apps.recordings.texts import NEEDED, PICTURES, Content, Record, join_halves, read_content
+from cell.apps.recordings.conventions import PoseReading
+from cell.apps.recordings.texts import NEEDED, PICTURES, Content, PoseRecord, join_halves, read_content
 from cell.measure.vision.pictures import Reason
 from drivers.errors import ConfigError
 
@@ -113,13 +113,13 @@ class Series:
     """
 
     name: str
-    records: list[Record]
-    of: dict[int, Record] = field(default_factory=dict)
+    records: list[PoseRecord]
+    of: dict[int, PoseRecord] = field(default_factory=dict)
     by: str = ""
-    alone: list[Record] = field(default_factory=list)
-    doubled: dict[int, list[Record]] = field(default_factory=dict)
+    alone: list[PoseRecord] = field(default_factory=list)
+    doubled: dict[int, list[PoseRecord]] = field(default_factory=dict)
 
-    def poses(self, reading: Reading) -> dict[int, pin.SE3]:
+    def poses(self, reading: PoseReading) -> dict[int, pin.SE3]:
         """Poses by picture in the unit of the file, without those that the reading makes no pose of."""
         found = {}
         for k, record in self.of.items():
@@ -150,7 +150,7 @@ def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], l
             unread.append((name, f"it holds {what} t_gripper2base.txt"))
         elif not (content.records or content.links or content.halves):
             unread.append((name, f"no pose is in it ({NEEDED} numbers)"))
-    groups: dict[tuple[str, str, int], list[Record]] = {}
+    groups: dict[tuple[str, str, int], list[PoseRecord]] = {}
     for record in joined:
         groups.setdefault((listing.name(record.path), record.field, len(record.numbers)), []).append(record)
     alike = Counter((path.parent, _series_name(path.name)) for path in listing.texts)
@@ -175,13 +175,13 @@ def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], l
     return [s for s in found if len(s.records) >= LEAST], links, unread
 
 
-def _kinds(place: str, count: int, records: list[Record]) -> list[tuple[str, list[Record]]]:
+def _kinds(place: str, count: int, records: list[PoseRecord]) -> list[tuple[str, list[PoseRecord]]]:
     """Records of one place, those that hold several kinds of poses taken apart.
 
     Of one picture there may be link1 to link8, and only one is the flange. Twelve numbers that are no matrix are two
     times six: joint angles and a pose, in either order.
     """
-    kinds: dict[str, list[Record]] = {}
+    kinds: dict[str, list[PoseRecord]] = {}
     if len({(r.path, r.label) for r in records}) < len(records):
         for record in records:
             kinds.setdefault(record.exact, []).append(record)

@@ -22,7 +22,7 @@ from cell.apps.recordings.consistency import refuse_misplaced, refuse_odd_ones, 
 from cell.apps.recordings.frames import RecordedFrame, by_stop, counted, merged, used
 from cell.apps.recordings.result import CAMERAS, intrinsics_dict, plane_dict, seen_depths
 from cell.measure.calibration.judge.camera_checks import camera_checks
-from cell.measure.calibration.judge.checks import Check, refused_parts
+from cell.measure.calibration.judge.checks import QualityCheck, refused_parts
 from cell.measure.calibration.judge.foreign_pictures import FOREIGN, foreign_view, parted_at
 from cell.measure.calibration.judge.given_camera import against_pictures
 from cell.measure.calibration.judge.plane_checks import PlaneKnown, plane_checks, planes_of_cameras, planes_without_one
@@ -180,8 +180,8 @@ def solve_frames(
             "the place of the board or of the arm's base, changed in between? Then calibrate each part by itself"
         )  # fmt: skip
         share = 100 * left_out / told
-        checks = [Check("hand_eye", name, share, 25.0, 40.0, "%", text)]
-        checks.append(Check("intrinsics", name, share, 25.0, math.inf, "%", text))
+        checks = [QualityCheck("hand_eye", name, share, doubt=25.0, refuse=40.0, unit="%", says=text)]
+        checks.append(QualityCheck("intrinsics", name, share, doubt=25.0, refuse=math.inf, unit="%", says=text))
     if len(used(frames)) < len(chosen.view_rms):
         try:
             chosen, plain = camera_of(frames, given)
@@ -234,7 +234,7 @@ def note_perhaps_no_laser(frames: Sequence[RecordedFrame], result: dict[str, Any
     )
 
 
-def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
+def apply_checks(checks: Sequence[QualityCheck], result: dict[str, Any]) -> None:
     """Write the checks into the result, say what is doubtful, and take out what is refused.
 
     What was found of a refused part stays beside the reason, under `refused_values`, where nobody takes it unawares.
@@ -258,7 +258,7 @@ def apply_checks(checks: Sequence[Check], result: dict[str, Any]) -> None:
         result["flatness"] = None
 
 
-def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result: dict[str, Any]) -> list[Check]:
+def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result: dict[str, Any]) -> list[QualityCheck]:
     """The light plane from pictures alone, when the stripe is in them, and its checks."""
     camera, views, wrong = pictures.camera, _views(frames), dict[int, str]()
     profiles = [f.profile for f in frames]
@@ -290,6 +290,6 @@ def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result:
     known = PlaneKnown.of(plane.plane, planes_without_one(clouds), cloud, moved)
     own = float(np.sqrt(np.mean(noise))) * float(np.median(cloud[:, 2])) / camera.fx
     depths = seen_depths(plane.plane, camera, [stripe_pixels(p, r) for p, r in both])
-    result["light_plane"] = plane_dict("fit on the board's poses", plane.plane, plane.rms, own, known, depths)
+    result["light_plane"] = plane_dict("fit on the board's poses", plane.plane, plane.rms, own, known, depths=depths)
     result["stripe_points"] = {f.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}
-    return plane_checks(plane.rms, own, cloud, len(both), known, len(wrong))
+    return plane_checks(plane.rms, own, cloud, frames=len(both), known=known, left_out=len(wrong))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cell.measure.geometry.camera import Array
 from cell.measure.vision.board.view import BoardView
 from cell.measure.vision.pictures import PictureRefused
-from cell.measure.vision.stripe.extract import Laser, Mark, StripeProfile, StripeSettings, extract, subtracted
+from cell.measure.vision.stripe.extract import LaserChannel, Mark, StripeProfile, StripeSettings, extract, subtracted
 from cell.measure.vision.stripe.planes import MIXES, Picture, read_colours
 
 Shot = NDArray[np.uint8] | NDArray[np.uint16]
@@ -85,35 +85,35 @@ class ReadStripe:
 
 
 @dataclass(frozen=True)
-class Channel:
+class ChosenChannel:
     """In what the laser is read: what was `asked`, what was `chosen`, and how many of the pictures that were
     `looked` at stood out in each mix of colours."""
 
-    asked: Laser | None
-    chosen: Laser | None
+    asked: LaserChannel | None
+    chosen: LaserChannel | None
     looked: int = 0
     votes: dict[str, int] = field(default_factory=dict)
     reads: dict[Path, ReadStripe] = field(default_factory=dict)
     """What was read in it already, by the picture."""
 
 
-def choose_channel(sources: Sequence[Source], laser: Laser | None) -> Channel:
+def choose_channel(sources: Sequence[Source], laser: LaserChannel | None) -> ChosenChannel:
     """What the laser is read in, in all pictures: as asked, or in what it stands out in most of those looked at.
 
     Where none of them shows it there was no laser.
     """
-    if laser is not Laser.AUTO or not sources:
-        return Channel(laser, laser)
+    if laser is not LaserChannel.AUTO or not sources:
+        return ChosenChannel(laser, laser)
     some = [sources[k] for k in np.unique(np.linspace(0, len(sources) - 1, LOOKED_AT).astype(int))]
     # Most such recordings are of the board alone; to look for a line in every mix of colours takes seconds each.
     lit = [source for source in some if source.off is not None or _may_show_line(source)]
-    reads = {source.path: read_on_board(source, Channel(laser, laser)) for source in lit}
+    reads = {source.path: read_on_board(source, ChosenChannel(laser, laser)) for source in lit}
     votes = Counter(_mix(read.profile) for read in reads.values() if read.profile is not None)
     if not votes:
-        return Channel(laser, None, len(some), {}, reads)
+        return ChosenChannel(laser, None, len(some), {}, reads)
     chosen = votes.most_common(1)[0][0]
     again = {path: read for path, read in reads.items() if read.profile is not None and _mix(read.profile) == chosen}
-    return Channel(laser, Laser(chosen), len(some), dict(votes.most_common()), again)
+    return ChosenChannel(laser, LaserChannel(chosen), len(some), dict(votes.most_common()), again)
 
 
 def _may_show_line(source: Source) -> bool:
@@ -144,7 +144,7 @@ def _mix(profile: StripeProfile) -> str:
     return profile.learned.mix if profile.learned is not None else "grey"
 
 
-def read_on_board(source: Source, channel: Channel) -> ReadStripe:
+def read_on_board(source: Source, channel: ChosenChannel) -> ReadStripe:
     """The stripe on the board of a picture, along rows or columns, whichever shows more of it."""
     if source.path in channel.reads or channel.chosen is None:
         return channel.reads.get(source.path, ReadStripe())

@@ -49,7 +49,7 @@ HALVES = re.compile(
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class PoseRecord:
     """Numbers (n,) that may be a pose; `field` is their place in the file, `label` the picture or number they name.
 
     `named`: "quaternion" (x, y, z, qx, qy, qz, qw) or "rotation" (x, y, z, then three angles) where names said so.
@@ -72,7 +72,7 @@ class Content:
     Halves are rotations (n, 9), (n, 4) or (n, 3), or positions (n, 3), with their place in the file.
     """
 
-    records: list[Record] = field(default_factory=list)
+    records: list[PoseRecord] = field(default_factory=list)
     links: list[dict[str, str]] = field(default_factory=list)
     halves: list[tuple[Path, str, Array]] = field(default_factory=list)
 
@@ -97,7 +97,7 @@ def read_content(path: Path) -> Content:
     if suffix not in STRUCTURED and not (content.records or content.links or content.halves):
         moves = [[float(v) for v in found.split(",")] for found in MOVE.findall(text)]
         content.records += [
-            Record(path, "row", f"[{k}]", np.array(m), "rotation") for k, m in enumerate(moves) if len(m) == 6
+            PoseRecord(path, "row", f"[{k}]", np.array(m), "rotation") for k, m in enumerate(moves) if len(m) == 6
         ]
         if not content.records:
             _read_table(path, text, content)
@@ -228,11 +228,13 @@ def _is_pose(array: Array) -> bool:
     return array.shape in ((4, 4), (3, 4)) or (array.size in counts and max(array.shape, default=0) == array.size)
 
 
-def _record(path: Path, place: list[str], label: str | None, numbers: Array, named: str = "") -> Record:
+def _record(path: Path, place: list[str], label: str | None, numbers: Array, named: str = "") -> PoseRecord:
     label = label or next((p for p in reversed(place) if re.search(r"\d", p)), None)
     pattern, exact = ("/".join(re.sub(old, new, p) for p in place) for old, new in ((r"\d+", "N"), (r"\[\d+\]", "[N]")))
     time = float(numbers[0]) if len(numbers) not in COUNTS else None
-    return Record(path, pattern, label, _squared(numbers if time is None else numbers[1:]), named, time, exact)
+    return PoseRecord(
+        path, pattern, label, _squared(numbers if time is None else numbers[1:]), named=named, time=time, exact=exact
+    )
 
 
 def _array(data: Any) -> Array | None:
@@ -365,7 +367,7 @@ def _read_table(path: Path, text: str, content: Content) -> None:
             pose = np.array(found)
             if len(pose) not in COUNTS:
                 raise ValueError(f"line {k + 1} of its table holds {len(found)} numbers; {NEEDED}")
-        content.records.append(Record(path, "row", label or f"[{k}]", _squared(pose), named, time))
+        content.records.append(PoseRecord(path, "row", label or f"[{k}]", _squared(pose), named=named, time=time))
 
 
 def _cells(line: str) -> list[str]:
@@ -398,7 +400,7 @@ def _half_of(array: Array) -> Array | None:
     return rows if len(rows) >= LEAST_HALVES and (matrices or unit or rows.shape[1] == 3) else None
 
 
-def join_halves(halves: Sequence[tuple[Path, str, Array]]) -> tuple[list[Record], set[Path]]:
+def join_halves(halves: Sequence[tuple[Path, str, Array]]) -> tuple[list[PoseRecord], set[Path]]:
     """The poses of halves that belong together by their names or are the only two, and the files they were in."""
     kinds: tuple[list[Any], list[Any]] = ([], [])
     for path, where, rows in halves:
@@ -406,7 +408,7 @@ def join_halves(halves: Sequence[tuple[Path, str, Array]]) -> tuple[list[Record]
         roles = [found for word in words if (found := HALVES.fullmatch(word))]
         turns = rows.shape[1] != 3 or (bool(roles) and not any(found[1] for found in roles))
         kinds[not turns].append((path, where, rows, [word for word in words if not HALVES.fullmatch(word)]))
-    records: list[Record] = []
+    records: list[PoseRecord] = []
     used: set[Path] = set()
     for path, where, turns, rest in kinds[0]:
         near = [place for place in kinds[1] if len(place[2]) == len(turns) and place[0].parent == path.parent]
@@ -417,6 +419,6 @@ def join_halves(halves: Sequence[tuple[Path, str, Array]]) -> tuple[list[Record]
             matrices, field_name = turns.shape[1] == 9, f"{where}+{named[0][1]}" if where else "row"
             both = np.hstack([turns, named[0][2]] if matrices else [named[0][2], turns])
             said = "rotation" if turns.shape[1] == 3 else ""
-            records += [Record(path, field_name, f"[{k}]", _squared(row), said) for k, row in enumerate(both)]
+            records += [PoseRecord(path, field_name, f"[{k}]", _squared(row), said) for k, row in enumerate(both)]
             used |= {path, named[0][0]}
     return records, used

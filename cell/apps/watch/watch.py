@@ -56,7 +56,7 @@ class _Watched:
     asked: float = 0.0
 
 
-class Watch:
+class CellWatch:
     """The devices of `config` and the runs in `runs`; made by `watching`."""
 
     def __init__(self, config: CellConfig, runs: Path, devices: dict[str, _Watched], undo: ExitStack) -> None:
@@ -105,7 +105,7 @@ class Watch:
 
 
 @contextmanager
-def watching(config: CellConfig, runs: Path, whole: bool, given: bool = True) -> Iterator[Watch]:
+def watching(config: CellConfig, runs: Path, whole: bool, given: bool = True) -> Iterator[CellWatch]:
     """Look at the cell; with `whole` also what has one user only, which nobody else can use then.
 
     No device is asked where the configuration is not one that somebody has `given`.
@@ -127,7 +127,7 @@ def watching(config: CellConfig, runs: Path, whole: bool, given: bool = True) ->
             elif not shared(config, name):
                 undo.enter_context(CellLock(config, (name,)))
             devices[name] = _Watched(connect)
-        yield Watch(config, runs, devices, undo)
+        yield CellWatch(config, runs, devices, undo)
 
 
 def _not_asked(why: str) -> Any:

@@ -17,7 +17,7 @@ from cell.config.calibrations.validation import require_valid
 from cell.config.cell_config import CameraConfig, CellConfig
 from cell.measure.calibration import Priors, ScanCalibration, ScanObservation, TargetCalibration, TargetObservation
 from cell.measure.calibration.archive import SUFFIX, Observations, write_archive
-from cell.measure.calibration.drift.reference_plate import Witness
+from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.calibration.judge.faults import refuse_wrong_lead
 from cell.measure.calibration.solve.cameras import adjust_scan, adjust_target
 from cell.measure.calibration.solve.joint import Joint
@@ -64,10 +64,10 @@ class CellCalibration:
         identities: dict[str, str],
         config: CellConfig,
         kinematics: str = "",
-        witness: Witness | None = None,
+        witness: PlateLine | None = None,
     ) -> CellCalibration:
         """From the observations; raises `RefusedError` when they do not determine it."""
-        return solve_observations(gathered(scan, target, identities, config, kinematics, witness)).calibration
+        return solve_observations(gathered(scan, target, identities, config, kinematics, witness=witness)).calibration
 
     def __str__(self) -> str:
         return f"calibration of {self.date}, hash {self.hash()}"
@@ -172,7 +172,7 @@ def gathered(
     identities: dict[str, str],
     config: CellConfig,
     kinematics: str = "",
-    witness: Witness | None = None,
+    witness: PlateLine | None = None,
 ) -> Observations:
     """The observations with all else that their solution depends on, as of now."""
     priors = Priors(
@@ -204,7 +204,9 @@ def solve_observations(observations: Observations) -> Solved:
     target = adjust_target(o.target, o.target_camera, o.priors)
     if target.size is not None:
         head = replace(head, notes=(*head.notes, *target.size.notes))
-    made = CellCalibration(head, TargetCalibration.of(target), o.identities, o.configuration, o.made, o.kinematics)
+    made = CellCalibration(
+        head, TargetCalibration.of(target), o.identities, o.configuration, made=o.made, kinematics=o.kinematics
+    )
     return Solved(made, scan, target)
 
 
@@ -212,7 +214,7 @@ def nominal_camera(config: CameraConfig) -> CameraModel:
     """The camera as the configuration draws it: no distortion, principal point in the middle."""
     focal = config.focal_length / config.pixel
     return CameraModel(
-        config.width, config.height, focal, focal, (config.width - 1) / 2, (config.height - 1) / 2, (0.0,) * 5
+        config.width, config.height, focal, focal, (config.width - 1) / 2, cy=(config.height - 1) / 2, dist=(0.0,) * 5
     )
 
 
@@ -295,17 +297,17 @@ def _read(path: Path) -> tuple[CellCalibration, tuple[str, ...], bool]:
             scan,
             TargetCalibration.from_dict(data["target"]),
             {str(name): str(serial) for name, serial in data["identities"].items()},
-            str(data["configuration"]),
-            float(data["made"]),
-            str(data.get("kinematics", "")),
-            tuple(
+            configuration=str(data["configuration"]),
+            made=float(data["made"]),
+            kinematics=str(data.get("kinematics", "")),
+            edits=tuple(
                 {
                     **{key: str(edit[key]) for key in ("who", "when", "why")},
                     "changed": [str(c) for c in edit["changed"]],
                 }
                 for edit in data.get("edits", ())
             ),
-            stored.sealed,
+            sealed=stored.sealed,
         )
         require_valid(made)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:

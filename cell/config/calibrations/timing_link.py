@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from cell.config.cell_config import CellConfig
 from cell.makes.records import CameraConfig, DeviceConfig, RailConfig
-from cell.measure.calibration.timing import Timing
+from cell.measure.calibration.timing import StampTiming
 
 LINKED: dict[str, type[DeviceConfig]] = {"scan_camera": CameraConfig, "rail": RailConfig}
 """The devices whose times are compared. What their makes ask for beyond this is how they are linked and set up."""
@@ -31,7 +31,7 @@ def changed(was: dict[str, str], now: dict[str, str]) -> str:
     return "; ".join(f"{name} was {was.get(name, 'not there')}, is {now.get(name, 'not there')}" for name in names)
 
 
-def doubt_of(timing: Timing, config: CellConfig) -> str:
+def doubt_of(timing: StampTiming, config: CellConfig) -> str:
     """Why it does not hold for the cell as it is configured now, for people; "" where it does."""
     if told := changed(timing.link, link_of(config)):
         return f"it was measured with other settings ({told})"

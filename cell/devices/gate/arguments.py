@@ -43,7 +43,7 @@ def checked_pose(device: str, flange: ArrayLike) -> Vector:
     array = _numbers(device, "flange pose", flange)
     if array.shape != (6,):
         raise LimitError(device, f"flange pose must be 6 numbers, got shape {array.shape}; nothing was sent")
-    check_range(device, "distance of the flange from the base", float(np.linalg.norm(array[:3])), 0.0, FAR_M, "m")
+    check_range(device, "distance of the flange from the base", float(np.linalg.norm(array[:3])), 0.0, FAR_M, unit="m")
     return array
 
 
@@ -59,5 +59,5 @@ def _numbers(device: str, what: str, values: ArrayLike) -> Vector:
 
 def _turns(device: str, joints: Vector) -> Vector:
     for value in (joints.min(), joints.max()):
-        check_range(device, "joint angle", float(value), -TURN_RAD, TURN_RAD, "rad")
+        check_range(device, "joint angle", float(value), low=-TURN_RAD, high=TURN_RAD, unit="rad")
     return joints

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from cell.devices.gate.gate import Gate, Gated
-from cell.devices.gate.interlocks import Command
+from cell.devices.gate.interlocks import DeviceCommand
 from drivers.interfaces import Camera, Frame, FrameStream
 
 
@@ -24,20 +24,20 @@ class GatedCamera(Gated[Camera]):
 
     def configure(self, exposure: float, frame_rate: float) -> None:
         """See `Camera.configure`."""
-        self.gate.asked(Command(self.name, "configure", {"exposure": exposure, "frame_rate": frame_rate}))
+        self.gate.asked(DeviceCommand(self.name, "configure", {"exposure": exposure, "frame_rate": frame_rate}))
         self.bare.configure(exposure, frame_rate)
 
     def grab(self, timeout: float = 2.0) -> Frame:
         """See `Camera.grab`."""
-        self.gate.asked(Command(self.name, "grab"))
+        self.gate.asked(DeviceCommand(self.name, "grab"))
         return self.bare.grab(timeout)
 
     @contextmanager
     def stream(self) -> Iterator[FrameStream]:
         """See `Camera.stream`."""
-        self.gate.asked(Command(self.name, "stream"))
+        self.gate.asked(DeviceCommand(self.name, "stream"))
         try:
             with self.bare.stream() as frames:
                 yield frames
         finally:
-            self.gate.asked(Command(self.name, "stream ended"))
+            self.gate.asked(DeviceCommand(self.name, "stream ended"))

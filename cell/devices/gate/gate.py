@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Generic, Protocol, TypeVar
 
-from cell.devices.gate.interlocks import Command, Interlocks
+from cell.devices.gate.interlocks import DeviceCommand, Interlocks
 from drivers.errors import Aborted, InterlockError
 from drivers.interfaces import Device, Identity
 from statemachine.cancel import CancelToken
@@ -28,7 +28,7 @@ Bare = TypeVar("Bare", bound=Device)
 class Listener(Protocol):
     """Is told what the cell's devices are asked to do, and what was read of them. Puts it aside, and never waits."""
 
-    def command(self, command: Command, refused: str | None) -> None:
+    def command(self, command: DeviceCommand, refused: str | None) -> None:
         """A command is passed on, or `refused` for this reason."""
 
     def reading(self, device: str, reading: object) -> None:
@@ -85,7 +85,7 @@ class Gate:
         """Bar all work that has entered so far. Comes before the devices are stopped."""
         self._stops += 1
 
-    def require(self, command: Command | None = None) -> None:
+    def require(self, command: DeviceCommand | None = None) -> None:
         """Raise when nothing may be begun by this thread, or when an interlock stands against the command.
 
         `Aborted` when this thread's work is to end or the cell was stopped since it entered; `InterlockError` when it
@@ -98,7 +98,7 @@ class Gate:
             raise
         self.asked(command)
 
-    def asked(self, command: Command | None, refused: str | None = None) -> None:
+    def asked(self, command: DeviceCommand | None, refused: str | None = None) -> None:
         """Tell the listener that a command is passed on, or was refused."""
         if self.listener is not None and command is not None:
             self._tell(lambda listener: listener.command(command, refused))
@@ -117,7 +117,7 @@ class Gate:
             self.listener = None
             log.warning("what listened at the gate failed and is told nothing more: %s", error)
 
-    def _require(self, command: Command | None) -> None:
+    def _require(self, command: DeviceCommand | None) -> None:
         token: CancelToken | None = getattr(self._entered, "token", None)
         if token is not None and token.reason is not None:
             raise Aborted(f"{token.reason}; nothing new is begun")
@@ -133,7 +133,7 @@ class Gate:
         if command is not None:
             self.interlocks.require(command)
 
-    def begin(self, command: Command, start: Callable[[], Made], undo: Callable[[], None]) -> Made:
+    def begin(self, command: DeviceCommand, start: Callable[[], Made], undo: Callable[[], None]) -> Made:
         """`start()`, if the command may pass; undone at once when the cell is stopped meanwhile."""
         with self._beginning:
             self.require(command)
@@ -167,7 +167,7 @@ class Gated(Generic[Bare]):
 
     def stop(self) -> None:
         """See `Device.stop`."""
-        self.gate.asked(Command(self.name, "stop"))
+        self.gate.asked(DeviceCommand(self.name, "stop"))
         self.bare.stop()
 
     def close(self) -> None:

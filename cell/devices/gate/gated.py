@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, TypeVar
 from cell.devices.contact import GuardedMotion
 from cell.devices.gate.arguments import checked_joints, checked_pose, checked_way
 from cell.devices.gate.gate import Gate, Gated
-from cell.devices.gate.interlocks import Command
+from cell.devices.gate.interlocks import DeviceCommand
 from drivers.clock_map import Latch
 from drivers.errors import CellError, InterlockError
 from drivers.interfaces import (
@@ -90,17 +90,17 @@ class GatedArm(Gated[Arm]):
             slowed = situation.slowed(self.bare.state(PATIENCE_S).joints, goal, speed, situation.held)
             return self.bare.move_joints(joints, slowed, acceleration)
 
-        return self._move(Command("arm", "move_joints", {"joints": goal}), start)
+        return self._move(DeviceCommand("arm", "move_joints", {"joints": goal}), start)
 
     def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMotion:
         """See `Arm.move_linear`."""
-        command = Command("arm", "move_linear", {"flange": checked_pose(self.name, flange)})
+        command = DeviceCommand("arm", "move_linear", {"flange": checked_pose(self.name, flange)})
         return self._move(command, lambda: self.bare.move_linear(flange, speed, acceleration))
 
     def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMotion:
         """See `Arm.follow`."""
         way = checked_way(self.name, joints)
-        command = Command("arm", "follow", {"joints": way, "force_limit": force_limit})
+        command = DeviceCommand("arm", "follow", {"joints": way, "force_limit": force_limit})
         if force_limit is None:
             return self._move(command, lambda: self.bare.follow(times, joints))
 
@@ -112,7 +112,7 @@ class GatedArm(Gated[Arm]):
 
         return self._move(command, start)
 
-    def _move(self, command: Command, start: Callable[[], ArmMotion]) -> ArmMotion:
+    def _move(self, command: DeviceCommand, start: Callable[[], ArmMotion]) -> ArmMotion:
         situation = self.gate.interlocks.situation
 
         def begin() -> ArmMotion:
@@ -126,19 +126,19 @@ class GatedArm(Gated[Arm]):
 
     def zero_force(self) -> None:
         """See `Arm.zero_force`."""
-        self.gate.require(Command("arm", "zero_force"))
+        self.gate.require(DeviceCommand("arm", "zero_force"))
         self.bare.zero_force()
         if self.touch is not None:
             self.touch.zero()
 
     def set_payload(self, mass: float, centre: Vector) -> None:
         """See `Arm.set_payload`."""
-        self.gate.require(Command("arm", "set_payload"))
+        self.gate.require(DeviceCommand("arm", "set_payload"))
         self.bare.set_payload(mass, centre)
 
     def set_digital_output(self, index: int, value: bool) -> None:
         """See `Arm.set_digital_output`. A laser, or what may be one, is switched off also after a stop."""
-        command = Command("arm", "set_digital_output", {"index": index, "value": value})
+        command = DeviceCommand("arm", "set_digital_output", {"index": index, "value": value})
         if value or not self.gate.interlocks.may_be_laser(index):
             self.gate.require(command)
         self.bare.set_digital_output(index, value)
@@ -154,7 +154,7 @@ class GatedArm(Gated[Arm]):
             self.gate.interlocks.situation.last = None
             self.bare.recover(confirmed=confirmed)
 
-        self.gate.begin(Command("arm", "recover"), begin, self.bare.stop)
+        self.gate.begin(DeviceCommand("arm", "recover"), begin, self.bare.stop)
 
 
 class GatedRail(Gated[Rail]):
@@ -174,11 +174,11 @@ class GatedRail(Gated[Rail]):
 
     def home(self) -> Motion:
         """See `Rail.home`."""
-        return self._begin(Command("rail", "home"), self.bare.home)
+        return self._begin(DeviceCommand("rail", "home"), self.bare.home)
 
     def move_to(self, position: float, speed: float | None = None) -> Motion:
         """See `Rail.move_to`."""
-        command = Command("rail", "move_to", {"position": position})
+        command = DeviceCommand("rail", "move_to", {"position": position})
         return self._begin(command, lambda: self.bare.move_to(position, speed))
 
     def nudge(self, distance: float, speed: float) -> Motion:
@@ -186,7 +186,7 @@ class GatedRail(Gated[Rail]):
         bare = self.bare
         if not isinstance(bare, Nudged):
             raise InterlockError(self.name, "this make of rail moves only when it is homed; home it first")
-        command = Command("rail", "nudge", {"distance": distance})
+        command = DeviceCommand("rail", "nudge", {"distance": distance})
         return self.gate.begin(command, lambda: bare.nudge(distance, speed), self.bare.stop)
 
     def check_zero(self) -> Motion | None:
@@ -194,20 +194,20 @@ class GatedRail(Gated[Rail]):
         bare = self.bare
         if not isinstance(bare, ChecksZero):
             return None
-        motion = self.gate.begin(Command("rail", "move_to", {"position": 0.0}), bare.check_zero, bare.stop)
+        motion = self.gate.begin(DeviceCommand("rail", "move_to", {"position": 0.0}), bare.check_zero, bare.stop)
         self.motion = motion or self.motion
         return motion
 
     def sweep(self, start: float, stop: float, speed: float) -> Sweep:
         """See `Rail.sweep`."""
-        command = Command("rail", "sweep", {"start": start, "stop": stop})
+        command = DeviceCommand("rail", "sweep", {"start": start, "stop": stop})
         return self._begin(command, lambda: self.bare.sweep(start, stop, speed))
 
     def sweep_start(self, start: float, stop: float, speed: float) -> float:
         """See `Rail.sweep_start`."""
         return self.bare.sweep_start(start, stop, speed)
 
-    def _begin(self, command: Command, start: Callable[[], Begun]) -> Begun:
+    def _begin(self, command: DeviceCommand, start: Callable[[], Begun]) -> Begun:
         motion = self.gate.begin(command, start, self.bare.stop)
         self.motion = motion
         return motion
@@ -234,15 +234,15 @@ class GatedVehicle(Gated[Vehicle]):
             self.bare.enable()
             self.gate.interlocks.stand_before(())
 
-        self.gate.begin(Command("vehicle", "enable"), begin, self.bare.brake)
+        self.gate.begin(DeviceCommand("vehicle", "enable"), begin, self.bare.brake)
 
     def recover(self) -> None:
         """See `Vehicle.recover`."""
-        self.gate.begin(Command("vehicle", "recover"), self.bare.recover, self.bare.brake)
+        self.gate.begin(DeviceCommand("vehicle", "recover"), self.bare.recover, self.bare.brake)
 
     def drive(self, speed: float, yaw_rate: float) -> None:
         """See `Vehicle.drive`. One that is refused also ends the velocity that was set before."""
-        command = Command("vehicle", "drive", {"speed": speed, "yaw_rate": yaw_rate})
+        command = DeviceCommand("vehicle", "drive", {"speed": speed, "yaw_rate": yaw_rate})
         try:
             self.gate.begin(command, lambda: self.bare.drive(speed, yaw_rate), self.bare.stop)
         except CellError:
@@ -252,7 +252,7 @@ class GatedVehicle(Gated[Vehicle]):
 
     def brake(self) -> None:
         """See `Vehicle.brake`."""
-        self.gate.asked(Command("vehicle", "brake"))
+        self.gate.asked(DeviceCommand("vehicle", "brake"))
         self.bare.brake()
 
 
@@ -269,7 +269,7 @@ class GatedClaw(Gated[Claw]):
         self.gate.interlocks.carry(())
 
     def _begin(self, name: str, start: Callable[[], None]) -> None:
-        self.gate.require(Command("claw", name))
+        self.gate.require(DeviceCommand("claw", name))
         # The rules may have waited for a reading, and a stop have come meanwhile.
         self.gate.require()
         start()

@@ -24,7 +24,7 @@ PURPOSES = ("sweep", "calibration", "test")
 
 
 @dataclass(frozen=True, eq=False)
-class Command:
+class DeviceCommand:
     """A command to a device before it is passed on: `arm.move_joints` with its arguments by name."""
 
     device: str
@@ -55,7 +55,7 @@ class Situation:
     laser: Laser | None
     claw: Claw | None
     outputs: Mapping[int, str]
-    clear: Callable[[Vector, Command, Sequence[Body]], Sequence[tuple[str, str]]]
+    clear: Callable[[Vector, DeviceCommand, Sequence[Body]], Sequence[tuple[str, str]]]
     forward: Callable[[Vector], pin.SE3]
     postures: Mapping[str, Vector]
     configuration: str
@@ -92,7 +92,7 @@ class Rule:
     name: str
     commands: tuple[str, ...]
     condition: str
-    check: Callable[[Situation, Command], str | None] | None
+    check: Callable[[Situation, DeviceCommand], str | None] | None
     liftable: bool = True
 
 
@@ -105,7 +105,7 @@ class Interlocks:
         self._lifted: list[frozenset[str]] = []
         self._tried: list[int] = []
 
-    def require(self, command: Command) -> None:
+    def require(self, command: DeviceCommand) -> None:
         """Raise `InterlockError`, which names the rule, when one stands against the command; nothing was sent then."""
         lifted = self.names_lifted
         for rule in self._rules:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
 from cell.devices.gate.gate import Gate, Gated
-from cell.devices.gate.interlocks import Command
+from cell.devices.gate.interlocks import DeviceCommand
 from drivers.clock import Clock
 from drivers.errors import InterlockError
 from drivers.interfaces import Laser
@@ -33,8 +33,8 @@ class GatedLaser(Gated[Laser]):
     def lit(self) -> Iterator[None]:
         """See `Laser.lit`. Goes off, and raises `InterlockError` at the end, when it is not renewed every 20 s."""
         with ExitStack() as held:
-            held.callback(lambda: self.gate.asked(Command("laser", "off")))
-            self.gate.begin(Command("laser", "lit"), lambda: held.enter_context(self.bare.lit()), held.close)
+            held.callback(lambda: self.gate.asked(DeviceCommand("laser", "off")))
+            self.gate.begin(DeviceCommand("laser", "lit"), lambda: held.enter_context(self.bare.lit()), held.close)
             self._renewed, self._slept, self._off = self._clock.now(), False, False
             with self._clock.alarm(self._limit, self._look):
                 yield

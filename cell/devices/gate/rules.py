@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.devices.contact import GuardedMotion
-from cell.devices.gate.interlocks import PURPOSES, Command, Rule, Situation
+from cell.devices.gate.interlocks import PURPOSES, DeviceCommand, Rule, Situation
 from cell.devices.gate.laser import UNATTENDED_S
 from cell.measure.geometry.poses import from_ur
 from drivers.errors import DeadlineError
@@ -38,7 +38,7 @@ or as calibrated, which differ."""
 MOVES = ("arm.move_joints", "arm.move_linear", "arm.follow")
 
 
-def _parked(now: Situation, command: Command) -> str | None:
+def _parked(now: Situation, command: DeviceCommand) -> str | None:
     if now.vehicle is None:
         return "the vehicle is not connected, so nobody knows whether it is parked. Open the cell with it"
     state = _newest(now, now.vehicle)
@@ -83,7 +83,7 @@ def _moves(now: Situation, state: ArmState) -> str | None:
     return None
 
 
-def _still(now: Situation, command: Command) -> str | None:
+def _still(now: Situation, command: DeviceCommand) -> str | None:
     if now.arm is None:
         return None
     if (against := _moves(now, now.arm.state(PATIENCE_S))) is not None:
@@ -93,7 +93,7 @@ def _still(now: Situation, command: Command) -> str | None:
     return None
 
 
-def _stowed(now: Situation, command: Command) -> str | None:
+def _stowed(now: Situation, command: DeviceCommand) -> str | None:
     if not any(command.arguments.values()):
         return None
     if now.arm is None:
@@ -117,7 +117,7 @@ def _stowed(now: Situation, command: Command) -> str | None:
     )
 
 
-def _dark(now: Situation, command: Command) -> str | None:
+def _dark(now: Situation, command: DeviceCommand) -> str | None:
     driving = command.name == "drive"
     if now.laser is None or (driving and not any(command.arguments.values())):
         return None
@@ -129,13 +129,13 @@ def _dark(now: Situation, command: Command) -> str | None:
     return "the laser is on. Switch it off first" if lit else None
 
 
-def _purpose(now: Situation, command: Command) -> str | None:
+def _purpose(now: Situation, command: DeviceCommand) -> str | None:
     if now.purpose is None:
         return f"nobody said what the laser is lit for. Light it inside interlocks.purpose(…): {', '.join(PURPOSES)}"
     return None
 
 
-def _contact(now: Situation, command: Command) -> str | None:
+def _contact(now: Situation, command: DeviceCommand) -> str | None:
     if now.claw is not None and not now.claw.holding:
         return None
     motion = now.last
@@ -155,7 +155,7 @@ def _contact(now: Situation, command: Command) -> str | None:
     )
 
 
-def _calibrated(now: Situation, command: Command) -> str | None:
+def _calibrated(now: Situation, command: DeviceCommand) -> str | None:
     if str(command) == "arm.follow" and command.arguments["force_limit"] is None:
         return None
     if now.calibrated is None:
@@ -168,7 +168,7 @@ def _calibrated(now: Situation, command: Command) -> str | None:
     return None
 
 
-def _clear(now: Situation, command: Command) -> str | None:
+def _clear(now: Situation, command: DeviceCommand) -> str | None:
     if now.arm is None:
         return None
     pairs = now.clear(now.arm.state(PATIENCE_S).joints, command, (*now.held, *now.station))
@@ -177,7 +177,7 @@ def _clear(now: Situation, command: Command) -> str | None:
     return f"{', '.join(f'{a} and {b}' for a, b in pairs)} would collide on the way. Go another way, or plan it"
 
 
-def _kinematics(now: Situation, command: Command) -> str | None:
+def _kinematics(now: Situation, command: DeviceCommand) -> str | None:
     if now.arm is None:
         return None
     state = now.arm.state(PATIENCE_S)
@@ -198,7 +198,7 @@ def _kinematics(now: Situation, command: Command) -> str | None:
     )
 
 
-def _own_switch(now: Situation, command: Command) -> str | None:
+def _own_switch(now: Situation, command: DeviceCommand) -> str | None:
     index, value = command.arguments["index"], command.arguments["value"]
     owner = now.outputs.get(index)
     if owner is None or (owner == "laser" and not value):

@@ -15,7 +15,7 @@ import pinocchio as pin
 from cell.config.cell_config import CellConfig
 from cell.config.mounting import deck_plates, mounted
 from cell.config.obstacles import vehicle_obstacles
-from cell.devices.gate.interlocks import Command
+from cell.devices.gate.interlocks import DeviceCommand
 from cell.measure.geometry.poses import from_ur
 from cell.motion.arm_models import arm_kinematics
 from cell.motion.bodies import TOUCHES, Body, arm_bodies, tool_bodies, vehicle_bodies
@@ -56,7 +56,7 @@ class Ways:
         with self._looking:
             return self._standing.fk(joints)
 
-    def clear(self, start: Vector, command: Command, others: Sequence[Body] = ()) -> list[Pair]:
+    def clear(self, start: Vector, command: DeviceCommand, others: Sequence[Body] = ()) -> list[Pair]:
         """The pairs that come closer than 2 mm on the way from `start`, (6,) rad, with these `others` about.
 
         What is closer at the beginning may part, but not come nearer. With a force limit the part may be set down.
@@ -80,7 +80,7 @@ class Ways:
             bound = PointSpeed(self.kinematics, points, self._config.arm.max_tool_speed)
             return min(speed, way * bound.fraction_speed(np.asarray(start), np.asarray(goal)))
 
-    def _way(self, start: Joints, command: Command) -> Iterator[Joints]:
+    def _way(self, start: Joints, command: DeviceCommand) -> Iterator[Joints]:
         arguments = command.arguments
         match command.name:
             case "move_joints":

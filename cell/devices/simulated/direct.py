@@ -31,7 +31,7 @@ from drivers.vehicle.faults import system_trouble, vehicle_error
 from drivers.vehicle.odometry import PlanarOdometry
 from sim_backends.direct import faults
 from sim_backends.direct.cell import DirectCell
-from sim_backends.direct.product import ArmSetup, CameraSetup, RailSetup, Setup, VehicleSetup
+from sim_backends.direct.product import ArmSetup, CameraSetup, DirectSetup, RailSetup, VehicleSetup
 from sim_backends.direct.switches import DirectClaw, DirectLaser
 
 AGILEX_COUNT_M = 0.001
@@ -71,7 +71,15 @@ class VirtualCell(DirectCell):
         laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
         vehicle = self.vehicle if config.vehicle.DRIVES else connect_one(config, "vehicle", self.clock)
         self.devices: Devices = behind_gate(
-            config, self.clock, self.arm, self.rail, vehicle, self.scan_camera, self.target_camera, laser, claw
+            config,
+            self.clock,
+            self.arm,
+            rail=self.rail,
+            vehicle=vehicle,
+            scan_camera=self.scan_camera,
+            target_camera=self.target_camera,
+            laser=laser,
+            claw=claw,
         )
 
     def _switch(self, name: str, direct: type[DirectLaser | DirectClaw]) -> Any:
@@ -101,11 +109,11 @@ class VirtualCell(DirectCell):
         """The world ends with this object."""
 
 
-def setup_of(config: CellConfig) -> Setup:
+def setup_of(config: CellConfig) -> DirectSetup:
     """What the devices are given: the configuration's values and the drivers' logic."""
     count = config.vehicle.wheels().count_length if isinstance(config.vehicle, CanopenVehicleConfig) else AGILEX_COUNT_M
     arm, rail, vehicle = config.arm, config.rail, config.vehicle
-    return Setup(
+    return DirectSetup(
         ArmSetup(
             ArmLimits(
                 joint_speeds=(arm.max_joint_speed,) * 6,
@@ -133,10 +141,10 @@ def setup_of(config: CellConfig) -> Setup:
             vehicle.max_speed,
             vehicle.max_yaw_rate,
             PlanarOdometry(vehicle.track, count),
-            lambda bits: system_trouble(bits, commanded=True),
-            lambda name, bits, trouble, driven: vehicle_error(name, bits, trouble, driven=driven),
-            _VEHICLES.get(vehicle.driver, vehicle.driver),
-            count,
+            trouble=lambda bits: system_trouble(bits, commanded=True),
+            error=lambda name, bits, trouble, driven: vehicle_error(name, bits, trouble, driven=driven),
+            make=_VEHICLES.get(vehicle.driver, vehicle.driver),
+            count=count,
         ),
         CameraSetup(ClockMap, Latch),
     )

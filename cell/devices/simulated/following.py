@@ -35,7 +35,7 @@ _KEPT = 30_000
 log = logging.getLogger(__name__)
 
 
-class Following:
+class DeviceFollowing:
     """The real devices `followed` of a cell, told to the world that has the devices `simulated`."""
 
     def __init__(

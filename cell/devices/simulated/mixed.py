@@ -14,7 +14,7 @@ from cell.devices.gate.gated import GatedArm
 from cell.devices.lock import CellLock
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.followed_camera import FollowedCamera
-from cell.devices.simulated.following import Following
+from cell.devices.simulated.following import DeviceFollowing
 from cell.devices.simulated.mix import beware, followed, require_possible
 from cell.devices.simulated.process import SimulatedCell, on_gige, with_endpoints
 from cell.devices.simulated.touch import SimulatedTouch
@@ -42,7 +42,7 @@ class MixedCell:
     ) -> None:
         """Simulate these of the `needed` devices and connect the others; what is to be undone goes to `undo`.
 
-        Raises `ConfigError` for a mix that physics does not allow, else as `connect` and `Following`.
+        Raises `ConfigError` for a mix that physics does not allow, else as `connect` and `DeviceFollowing`.
         """
         require_possible(config, simulated, needed)
         real = followed(config, simulated, needed)
@@ -71,7 +71,7 @@ class MixedCell:
         self.devices = connect(self.config, needed, otherwise)
         undo.callback(self.devices.close)
         if link is not None:
-            following = Following(link, self.devices, config, real, simulated)
+            following = DeviceFollowing(link, self.devices, config, real, simulated)
             self.devices.following = following
             arm = self.devices.arm if "arm" in real else None
             if isinstance(arm, GatedArm) and "scan_camera" in simulated:

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cell.devices.simulated.following import Following
+from cell.devices.simulated.following import DeviceFollowing
 from drivers.errors import Aborted, CellError
 from drivers.interfaces import ArmMotion, ArmState, Vector
 
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 class SimulatedTouch:
     """Adds the simulated wrench to a real arm's, and ends its guarded motions at it."""
 
-    def __init__(self, following: Following) -> None:
+    def __init__(self, following: DeviceFollowing) -> None:
         self._following = following
         self._zero: Vector = np.zeros(6)
 
@@ -50,7 +50,7 @@ class SimulatedTouch:
 class _Guarded:
     """A motion that ends at its own contact or at a simulated one; see `drivers.interfaces.ArmMotion`."""
 
-    def __init__(self, motion: ArmMotion, limit: float, stop: Callable[[], None], following: Following) -> None:
+    def __init__(self, motion: ArmMotion, limit: float, stop: Callable[[], None], following: DeviceFollowing) -> None:
         self._motion, self._limit, self._stop, self._following = motion, limit, stop, following
         self._touched = False
         self._start = following.wrench()[:3]

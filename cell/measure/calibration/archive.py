@@ -19,7 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.base.storage import DIGEST, replacing, require_date, require_unchanged, sealed_arrays
-from cell.measure.calibration.drift.reference_plate import Witness, read_edge
+from cell.measure.calibration.drift.reference_plate import PlateLine, read_edge
 from cell.measure.calibration.observations import ScanObservation, TargetObservation
 from cell.measure.calibration.solve.adjustment import Priors
 from cell.measure.geometry.camera import Array, CameraModel
@@ -55,7 +55,7 @@ class Observations:
     configuration: str
     made: float
     kinematics: str = ""
-    witness: Witness | None = None
+    witness: PlateLine | None = None
 
 
 def write_archive(path: Path, observations: Observations) -> None:
@@ -113,7 +113,7 @@ def read_archive(path: Path) -> Observations:
         require_date("made", float(about["made"]))
         found = Observations(
             [
-                ScanObservation(view, profile, flange, float(rail), name, bool(same))
+                ScanObservation(view, profile, flange, rail_position=float(rail), name=name, same_rest=bool(same))
                 for (view, flange, name), profile, rail, same in zip(scan, profiles, rails, same_rest, strict=True)
             ],
             [
@@ -122,14 +122,14 @@ def read_archive(path: Path) -> Observations:
                 if view is not None
             ],
             _camera(about["scan_camera"]),
-            _camera(about["target_camera"]),
-            priors,
-            _positive(about, "rail_lead"),
-            {str(name): str(serial) for name, serial in about["identities"].items()},
-            str(about["configuration"]),
-            float(about["made"]),
-            str(about.get("kinematics", "")),
-            _read_witness(data, about),
+            target_camera=_camera(about["target_camera"]),
+            priors=priors,
+            rail_lead=_positive(about, "rail_lead"),
+            identities={str(name): str(serial) for name, serial in about["identities"].items()},
+            configuration=str(about["configuration"]),
+            made=float(about["made"]),
+            kinematics=str(about.get("kinematics", "")),
+            witness=_read_witness(data, about),
         )
         # Last: what is wrong with a figure says more than that something was changed.
         if about["format"] == FORMAT or DIGEST in data:
@@ -143,13 +143,13 @@ def read_archive(path: Path) -> Observations:
         raise ConfigError(f"{path} cannot be solved: {error}; {advice}") from error
 
 
-def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> Witness | None:
+def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> PlateLine | None:
     if "witness_rail" not in about:
         return None
     columns, sigma = (np.asarray(data[name], dtype=np.float64) for name in ("witness_columns", "witness_sigma"))
     if columns.ndim != 1 or columns.shape != sigma.shape or not (sigma[np.isfinite(columns)] > 0).all():
         raise ValueError("the witness needs a deviation above 0 for each of its columns")
-    return Witness(float(about["witness_rail"]), columns, sigma, read_edge(about.get("witness_edge")))
+    return PlateLine(float(about["witness_rail"]), columns, sigma, read_edge(about.get("witness_edge")))
 
 
 def _views(camera: str, views: Sequence[tuple[BoardView | None, pin.SE3, str]]) -> dict[str, Any]:
@@ -194,7 +194,15 @@ def _read_views(data: Mapping[str, Any], camera: str) -> list[tuple[BoardView | 
             if count and not 0 <= int(ids[part].min()) <= int(ids[part].max()) < len(spec.points()):
                 raise ValueError(f"{camera}_ids of {name} lie outside 0 to {len(spec.points()) - 1} of {spec.name}")
             size = (int(sizes[k, 0]), int(sizes[k, 1]))
-            view = BoardView(spec, size, ids[part], pixels[part], sigma[part], bool(assumed[k]), float(radii[k]))
+            view = BoardView(
+                spec,
+                size,
+                ids[part],
+                pixels=pixels[part],
+                sigma=sigma[part],
+                order_assumed=bool(assumed[k]),
+                dot_radius=float(radii[k]),
+            )
             start, k = start + count, k + 1
         made.append((view, _pose(flange, str(name)), str(name)))
     return made
@@ -259,7 +267,7 @@ def _camera_dict(camera: CameraModel) -> dict[str, Any]:
 
 
 def _camera(data: Mapping[str, Any]) -> CameraModel:
-    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, 1.0, 0.0, 0.0)
+    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, fy=1.0, cx=0.0, cy=0.0)
     made = model.with_parameters(data["parameters"])
     if not np.isfinite(made.parameters).all() or made.fx <= 0 or made.fy <= 0:
         raise ValueError("a nominal camera needs finite parameters and focal lengths above 0 px")

@@ -42,7 +42,7 @@ class Shutter:
 
 
 @dataclass(frozen=True)
-class Timing:
+class StampTiming:
     """The camera's stamps come `late` ± `sigma` s after the exposures that the rail's positions are told for.
 
     `play` ± `play_sigma` m is by how much the carriage stands otherwise when it came from the other side; `readout` ±
@@ -65,7 +65,7 @@ class Timing:
         return dict(vars(self))
 
     @classmethod
-    def read(cls, data: dict[str, Any] | None) -> Timing | None:
+    def read(cls, data: dict[str, Any] | None) -> StampTiming | None:
         """From storage; KeyError, TypeError, AttributeError or ValueError when it is none."""
         if data is None:
             return None

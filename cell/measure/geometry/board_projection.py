@@ -110,7 +110,7 @@ def seen_points(
         u, v, _, _, _ = distorted(lens, (px + share * nx * nz) / z, (py + share * ny * nz) / z)
         pixels[i, 0], pixels[i, 1] = lens[0] * u + lens[2], lens[1] * v + lens[3]
         if radius > 0:
-            right, down = lens_shift(lens, px / pz, py / pz, nx, ny, nz, radius / pz)
+            right, down = lens_shift(lens, px / pz, py / pz, nx=nx, ny=ny, nz=nz, size=radius / pz)
             pixels[i, 0] += right
             pixels[i, 1] += down
 

@@ -2,8 +2,8 @@
 
 from cell.measure.inversion.demands import Demands, fit_figures
 from cell.measure.inversion.nominal import NominalSurface
-from cell.measure.inversion.observability import Tolerance, Verdict
+from cell.measure.inversion.observability import PoseVerdict, Tolerance
 from cell.measure.inversion.place_pose import PlacePose, invert_pose
 from cell.measure.inversion.registration import Prior
 
-__all__ = ["Demands", "NominalSurface", "PlacePose", "Prior", "Tolerance", "Verdict", "fit_figures", "invert_pose"]
+__all__ = ["Demands", "NominalSurface", "PlacePose", "PoseVerdict", "Prior", "Tolerance", "fit_figures", "invert_pose"]

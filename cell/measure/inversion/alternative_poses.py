@@ -51,7 +51,7 @@ def require_alone(scan: Scan, pose: pin.SE3, nominal: NominalSurface, prior: Pri
     spread = np.sqrt(np.diag(prior.covariance))
     shift = min(float(np.sqrt(TOLD_APART) * spread[:3].max() + np.linalg.norm(off[:3])), MOST_SHIFT)
     turn = float(np.sqrt(TOLD_APART) * spread[3:].max() + np.linalg.norm(off[3:]))
-    for start in candidates(pose, some.points, nominal, shift, turn, MOST_PLACES):
+    for start in candidates(pose, some.points, nominal, shift=shift, turn=turn, most=MOST_PLACES):
         other = settled(start, some.points, nominal)
         moved = pose.inverse() * other
         middle = moved.act(nominal.centre) - nominal.centre

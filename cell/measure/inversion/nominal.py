@@ -96,13 +96,13 @@ class NominalSurface:
             p,
             float(within),
             grid.low,
-            grid.cell,
-            grid.owner,
-            self._corners,
-            self.normals,
-            walk.corner_of,
-            walk.start,
-            walk.fan,
+            cell=grid.cell,
+            owner=grid.owner,
+            corners=self._corners,
+            normals=self.normals,
+            corner_of=walk.corner_of,
+            start=walk.start,
+            fan=walk.fan,
         )
         if self._border is not None:
             doubtful = np.flatnonzero(self._maybe_rim[hit])

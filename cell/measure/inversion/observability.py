@@ -39,7 +39,7 @@ class Tolerance:
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class SmallMotion:
     """A small motion of the surface: `shift` (3,) m of its origin and `turn` (3,) rad, in the surface frame, at three
     standard deviations; `excess` is its size in units of the tolerance; `words` name it.
     """
@@ -56,7 +56,7 @@ class Motion:
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class PoseVerdict:
     """What is known of the pose.
 
     worst: the least certain motion, in units of the tolerance. weak: the motions beyond tolerance, worst first.
@@ -64,8 +64,8 @@ class Verdict:
     of the scan's information per point, with the surface's rms radius as unit of length, rising.
     """
 
-    worst: Motion
-    weak: tuple[Motion, ...]
+    worst: SmallMotion
+    weak: tuple[SmallMotion, ...]
     unseen: tuple[str, ...]
     spectrum: Array
 
@@ -102,7 +102,7 @@ def determined(rows: Array, radius: float) -> tuple[Array, Array]:
 
 def judge(
     covariance: Array, scan_information: Array, mean_variance: float, points: int, radius: float, tolerance: Tolerance
-) -> Verdict:
+) -> PoseVerdict:
     """Judge a 6×6 `covariance` (translation, rotation; surface frame) against `tolerance`.
 
     `scan_information` is the 6×6 information of the scan alone in the same frame, made of `points` points of variance
@@ -128,10 +128,10 @@ def judge(
     spectrum, ways = np.linalg.eigh(scan_information / np.outer(length, length) * (mean_variance / max(1, points)))
     free = ways[:, spectrum < FREE] / length[:, None]
     unseen = tuple(name(way, radius) for way in sorted_out(free, radius)) if free.size else ()
-    return Verdict(worst, tuple(weak), unseen, np.asarray(spectrum))
+    return PoseVerdict(worst, tuple(weak), unseen, np.asarray(spectrum))
 
 
-def _sized(way: Array, covariance: Array, tolerance: Tolerance, radius: float) -> Motion:
+def _sized(way: Array, covariance: Array, tolerance: Tolerance, radius: float) -> SmallMotion:
     """The motion along `way` (6,), a unit shift or a unit turn, at three of its standard deviations."""
     turn = float(np.linalg.norm(way[3:]))
     pure = turn * radius <= 0.2 * float(np.linalg.norm(way[:3]))
@@ -140,10 +140,10 @@ def _sized(way: Array, covariance: Array, tolerance: Tolerance, radius: float) -
     allowed, shown = (tolerance.translation, "mm") if pure else (tolerance.rotation, "mrad")
     motion = way * (size / (float(np.linalg.norm(way[:3])) if pure else turn))
     words = f"{name(motion, radius)} is not determined: 3σ {_against(1e3 * size, 1e3 * allowed, shown)}"
-    return Motion(motion[:3], motion[3:], size / allowed, words)
+    return SmallMotion(motion[:3], motion[3:], size / allowed, words)
 
 
-def _motion(motion: Array, excess: float, tolerance: Tolerance, radius: float) -> Motion:
+def _motion(motion: Array, excess: float, tolerance: Tolerance, radius: float) -> SmallMotion:
     shift, turn = motion[:3], motion[3:]
     parts = []
     size, angle = float(np.linalg.norm(shift)), float(np.linalg.norm(turn))
@@ -152,7 +152,7 @@ def _motion(motion: Array, excess: float, tolerance: Tolerance, radius: float) -
     if size > 0.2 * angle * radius:
         parts.append(_against(1e3 * size, 1e3 * tolerance.translation, "mm"))
     state = "is not determined" if excess > 1.0 else "is known"
-    return Motion(shift, turn, excess, f"{name(motion, radius)} {state}: 3σ {' and '.join(parts)}")
+    return SmallMotion(shift, turn, excess, f"{name(motion, radius)} {state}: 3σ {' and '.join(parts)}")
 
 
 def _against(value: float, allowed: float, unit: str) -> str:

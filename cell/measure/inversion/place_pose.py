@@ -25,7 +25,7 @@ from cell.measure.inversion.demands import (
 )
 from cell.measure.inversion.disagreement import dissent
 from cell.measure.inversion.nominal import NominalSurface
-from cell.measure.inversion.observability import Tolerance, Verdict, determined, judge
+from cell.measure.inversion.observability import PoseVerdict, Tolerance, determined, judge
 from cell.measure.inversion.registration import Prior, register
 from cell.measure.inversion.sweeps import balance
 from cell.measure.reconstruction.cloud import Cloud
@@ -51,7 +51,7 @@ class PlacePose:
     random: Array
     systematic: Array
     covariance: Array
-    verdict: Verdict
+    verdict: PoseVerdict
     rms: float
     chi2_per_dof: float
     n_points: int
@@ -161,9 +161,9 @@ def invert_pose(
         turn @ covariance @ turn.T,
         told,
         float(1.0 / np.mean(1.0 / found.sigmas**2)),
-        len(found.used),
-        nominal.radius,
-        tolerance,
+        points=len(found.used),
+        radius=nominal.radius,
+        tolerance=tolerance,
     )
     with _shown(pose, *numbers):
         verdict.require()

@@ -239,7 +239,7 @@ def _fine(pose: pin.SE3, scan: Scan, nominal: NominalSurface, prior: Prior) -> R
     _require_points(rows, scan)
     sigmas = sigmas_along(scan, rows)
     scale = robust_scale(rows.heights / sigmas)
-    return _result(pose, scan, nominal, prior, rows, sigmas * scale, CHI_GATE)
+    return _result(pose, scan, nominal, prior=prior, rows=rows, sigmas=sigmas * scale, gate=CHI_GATE)
 
 
 def _result(

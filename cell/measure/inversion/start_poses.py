@@ -48,7 +48,7 @@ def candidates(
     turns = np.stack([pin.exp3(-angle * normal) for angle in angles])
     grid = nominal.grid
     offset = nominal.centre - grid.low
-    scores = _scores(local, turns, steps, sides, offset, grid.cell, grid.distance)
+    scores = _scores(local, turns, steps, sides=sides, offset=offset, cell=grid.cell, distance=grid.distance)
     poses: list[pin.SE3] = []
     best = float(scores.max())
     while len(poses) < most and scores.max() > max(0.0, WORTH * best):

@@ -62,8 +62,18 @@ def _pass(values: Array, kept: Array, noise: Array, level: float, settled: Mask)
     supported = settled.copy()
     middle = len(values) // 2
     with ThreadPoolExecutor(1, "outliers") as pool:
-        other = pool.submit(_judge, values, kept, noise, level, middle, len(values), supported, outliers)
-        _judge(values, kept, noise, level, 0, middle, supported, outliers)
+        other = pool.submit(
+            _judge,
+            values,
+            kept,
+            noise,
+            level=level,
+            first=middle,
+            last=len(values),
+            supported=supported,
+            outliers=outliers,
+        )
+        _judge(values, kept, noise, level=level, first=0, last=middle, supported=supported, outliers=outliers)
         other.result()
     return outliers, supported
 
@@ -175,7 +185,7 @@ def _sampled(values: Array, noise: Array, stride: int) -> Array:
     for i in range(0, values.shape[0], stride):
         for j in range(0, values.shape[1], stride):
             if not np.isnan(values[i, j]):
-                result[i // stride, j // stride] = _deviation(values, values, noise, i, j, buffer)
+                result[i // stride, j // stride] = _deviation(values, values, noise, line=i, row=j, buffer=buffer)
     return result
 
 
@@ -216,7 +226,7 @@ def _quiet_around(values: Array, kept: Array, noise: Array, most: float, line: i
     for i in range(max(0, line - 2), min(values.shape[0], line + 3)):
         for j in range(max(0, row - 2), min(values.shape[1], row + 3)):
             if (i != line or j != row) and not np.isnan(kept[i, j]):
-                near += _supported(kept, kept, most * noise[i, j], i, j, buffer)
+                near += _supported(kept, kept, most * noise[i, j], line=i, row=j, buffer=buffer)
                 if near > present // 4:
                     return True
     return False
@@ -233,14 +243,16 @@ def _judge(
         for row in range(values.shape[1]):
             if supported[line, row] or np.isnan(values[line, row]):
                 continue
-            if _supported(values, kept, THRESHOLD * level * noise[line, row], line, row, buffer):
+            if _supported(values, kept, THRESHOLD * level * noise[line, row], line=line, row=row, buffer=buffer):
                 supported[line, row] = True
                 continue
-            own = _deviation(values, kept, noise, line, row, buffer)
+            own = _deviation(values, kept, noise, line=line, row=row, buffer=buffer)
             if np.isnan(own):
                 outliers[line, row] = True
                 continue
-            if _quiet_around(values, kept, noise, abs(own) / (THRESHOLD * SCALE_OF_QUARTILE), line, row, buffer):
+            if _quiet_around(
+                values, kept, noise, most=abs(own) / (THRESHOLD * SCALE_OF_QUARTILE), line=line, row=row, buffer=buffer
+            ):
                 outliers[line, row] = abs(own) > THRESHOLD * level
                 continue
             count = 0
@@ -249,7 +261,7 @@ def _judge(
                     if (i == line and j == row) or np.isnan(kept[i, j]):
                         continue
                     if known[i - first + 2, j] == np.inf:
-                        known[i - first + 2, j] = abs(_deviation(kept, kept, noise, i, j, buffer))
+                        known[i - first + 2, j] = abs(_deviation(kept, kept, noise, line=i, row=j, buffer=buffer))
                     if not np.isnan(known[i - first + 2, j]):
                         sizes[count] = known[i - first + 2, j]
                         count += 1

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from cell.measure.vision.board.spec import BoardSpec, parse_board
     from cell.measure.vision.board.view import BoardView
     from cell.measure.vision.pictures import PictureRefused, Reason, check_picture, read_picture
-    from cell.measure.vision.stripe.extract import Laser, Mark, StripeProfile, StripeSettings, extract
+    from cell.measure.vision.stripe.extract import LaserChannel, Mark, StripeProfile, StripeSettings, extract
     from cell.measure.vision.stripe.planes import read_colours
     from cell.measure.vision.stripe.read import read_stripe
     from cell.measure.vision.stripe.stream import StripeStream
@@ -23,7 +23,7 @@ __all__ = [
     "BoardPose",
     "BoardSpec",
     "BoardView",
-    "Laser",
+    "LaserChannel",
     "Mark",
     "PictureRefused",
     "Reason",
@@ -45,7 +45,7 @@ _ROOMS = {
     "board.spec": ("BoardSpec", "parse_board"),
     "board.view": ("BoardView",),
     "pictures": ("PictureRefused", "Reason", "check_picture", "read_picture"),
-    "stripe.extract": ("Laser", "Mark", "StripeProfile", "StripeSettings", "extract"),
+    "stripe.extract": ("LaserChannel", "Mark", "StripeProfile", "StripeSettings", "extract"),
     "stripe.planes": ("read_colours",),
     "stripe.read": ("read_stripe",),
     "stripe.stream": ("StripeStream",),

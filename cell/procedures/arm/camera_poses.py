@@ -35,7 +35,7 @@ class ScanPlan:
 
 
 @dataclass(frozen=True)
-class View:
+class CalibrationView:
     """A calibration view: the flange's pose in the base and, for the camera on the rail, the rail's position."""
 
     base_from_flange: pin.SE3
@@ -104,27 +104,31 @@ def scan_plans(
     return plans
 
 
-def scan_calibration_views(config: CellConfig, board: BoardSpec) -> list[View]:
+def scan_calibration_views(config: CellConfig, board: BoardSpec) -> list[CalibrationView]:
     """Views of the fine deck board for the scan camera: depths, tilts, turns, all of the field and of the rail."""
     base_from_board = config.calibration.fine.base_from_board.se3()
     views = []
     for k in range(len(_SCAN_VIEWS)):
         rail = _scan_rail(config, k)
         flange_from_camera = config.scan_camera.flange_from_camera.se3() * from_parts((rail, 0.0, 0.0))
-        views.append(View(_looking(base_from_board, board, _SCAN_VIEWS[k]) * flange_from_camera.inverse(), rail))
+        views.append(
+            CalibrationView(_looking(base_from_board, board, _SCAN_VIEWS[k]) * flange_from_camera.inverse(), rail)
+        )
     return views
 
 
-def target_calibration_views(config: CellConfig, board: BoardSpec) -> list[View]:
+def target_calibration_views(config: CellConfig, board: BoardSpec) -> list[CalibrationView]:
     """Views of the large deck board for the target camera: several distances and tilts, and all of the field."""
     base_from_board = config.calibration.large.base_from_board.se3()
     camera_from_flange = config.target_camera.flange_from_camera.se3().inverse()
-    return [View(_looking(base_from_board, board, drawn) * camera_from_flange, 0.0) for drawn in _TARGET_VIEWS]
+    return [
+        CalibrationView(_looking(base_from_board, board, drawn) * camera_from_flange, 0.0) for drawn in _TARGET_VIEWS
+    ]
 
 
 def verification_views(
     config: CellConfig, fine: BoardSpec, large: BoardSpec, scan: ScanCalibration, target: TargetCalibration
-) -> tuple[View, View]:
+) -> tuple[CalibrationView, CalibrationView]:
     """One of the scan camera's calibration views and one of the target camera's, aimed with what the calibration found.
 
     Mounts and boards stand some millimetres from where they are drawn. From the drawn poses a board may lie half out
@@ -141,13 +145,17 @@ def verification_views(
     base_from_scan = _looking(scan.reference.base_from_board, fine, _SCAN_VIEWS[SCAN_VERIFICATION])
     base_from_target = _looking(target.reference.base_from_board, large, _TARGET_VIEWS[TARGET_VERIFICATION])
     return (
-        View(base_from_scan * scan.flange_from_camera_at(rail).inverse(), rail),
-        View(base_from_target * target.flange_from_camera.inverse(), 0.0),
+        CalibrationView(base_from_scan * scan.flange_from_camera_at(rail).inverse(), rail),
+        CalibrationView(base_from_target * target.flange_from_camera.inverse(), 0.0),
     )
 
 
 def rail_ends(
-    scan: ScanCalibration, base_from_board: pin.SE3, view: View, board: BoardSpec, travel: tuple[float, float]
+    scan: ScanCalibration,
+    base_from_board: pin.SE3,
+    view: CalibrationView,
+    board: BoardSpec,
+    travel: tuple[float, float],
 ) -> tuple[float, float]:
     """The rail positions farthest either way of a view at which the picture shows the rings and half of the dots.
 

@@ -37,7 +37,7 @@ UNDERSIDE = 400
 
 
 @dataclass(frozen=True)
-class Touch:
+class TouchHeight:
     """A height of the part above its place along the surface's normal, m, and one standard deviation of it."""
 
     height: float
@@ -48,8 +48,8 @@ class Touch:
 class TouchCheck:
     """Where the part touched as `felt`, and where it was `expected` to."""
 
-    felt: Touch
-    expected: Touch
+    felt: TouchHeight
+    expected: TouchHeight
 
     @property
     def off(self) -> float:
@@ -104,7 +104,7 @@ class TouchCheck:
         )
 
 
-def expected_touch(job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vector) -> Touch:
+def expected_touch(job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vector) -> TouchHeight:
     """Where the part touches first with all that is stated: of the pose, of the grasp, and (`placing`, (6, 6), base
     axes) of the flange each time the arm comes to rest.
 
@@ -130,10 +130,10 @@ def expected_touch(job: Job, nominal: NominalSurface, pose: PlacePose, placing: 
     arms = nominal.samples[::every][ground] - job.place.surface_from_part.se3().translation
     gaps = steps[:, :3] @ slopes.T + steps[:, 3:] @ np.cross(arms, slopes).T
     heights = -np.concatenate([gaps.min(axis=1), gaps.mean(axis=1)])
-    return Touch(float(heights.mean()), float(heights.std()))
+    return TouchHeight(float(heights.mean()), float(heights.std()))
 
 
-def felt_touch(states: Sequence[ArmState], origin: Vector, normal: Vector) -> Touch | None:
+def felt_touch(states: Sequence[ArmState], origin: Vector, normal: Vector) -> TouchHeight | None:
     """Where the force began, from the `states` of a guarded descent; None from too few of them.
 
     Heights are those of the flange over `origin` (3,), m, along `normal` (3,), which points up from the surface, both
@@ -157,7 +157,7 @@ def felt_touch(states: Sequence[ArmState], origin: Vector, normal: Vector) -> To
     weights = np.exp(-0.5 * (left - left[best]) / noise)
     mean = float(weights @ tried / weights.sum())
     spread = float(weights @ (tried - mean) ** 2 / weights.sum())
-    return Touch(mean, float(np.sqrt(spread + FELT_M**2)))
+    return TouchHeight(mean, float(np.sqrt(spread + FELT_M**2)))
 
 
 def _repeats(left: Vector) -> float:

@@ -16,7 +16,7 @@ from cell.measure.calibration.solve.hand_eye import solve_hand_eye
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.poses import from_parts, mean
 from cell.measure.vision import BoardView, board_pose
-from cell.procedures.arm.camera_poses import View
+from cell.procedures.arm.camera_poses import CalibrationView
 from drivers.errors import RefusedError
 
 SEARCH_M = 0.009
@@ -46,7 +46,7 @@ class Aim:
             self._flanges.append(base_from_flange)
             self._rails.append(rail)
 
-    def instead_of(self, view: View) -> list[View]:
+    def instead_of(self, view: CalibrationView) -> list[CalibrationView]:
         """Views to try, in this order, when `view` does not show the board."""
         along = from_parts((view.rail_position, 0.0, 0.0))
         base_from_camera = view.base_from_flange * self._drawn_hand * along
@@ -55,11 +55,13 @@ class Aim:
             camera_from_board = base_from_camera.inverse() * self._drawn_board
             flange_from_camera = hand * from_parts(view.rail_position * direction)
             aimed = board * camera_from_board.inverse() * flange_from_camera.inverse()
-            return [View(aimed, view.rail_position)]
+            return [CalibrationView(aimed, view.rail_position)]
         flange_from_camera = self._drawn_hand * along
         shifts = [np.array([x, y, 0.0]) for x in (0.0, 1.0, -1.0) for y in (0.0, 1.0, -1.0) if x or y]
         return [
-            View(base_from_camera * from_parts(SEARCH_M * shift) * flange_from_camera.inverse(), view.rail_position)
+            CalibrationView(
+                base_from_camera * from_parts(SEARCH_M * shift) * flange_from_camera.inverse(), view.rail_position
+            )
             for shift in shifts
         ]
 

@@ -13,7 +13,7 @@ from cell.measure.calibration import ScanObservation, TargetObservation
 from cell.measure.geometry.poses import from_ur
 from cell.measure.vision import BoardSpec, BoardView, extract, find_board, parse_board
 from cell.motion.arm_models import HOME
-from cell.procedures.arm.camera_poses import View, scan_calibration_views, target_calibration_views
+from cell.procedures.arm.camera_poses import CalibrationView, scan_calibration_views, target_calibration_views
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.aiming import Aim
 from drivers.errors import DeviceFault, RefusedError
@@ -127,7 +127,7 @@ def collect_target(
     return _enough(made, views, refusals)
 
 
-def move_to_view(devices: Devices, mover: Mover, view: View, k: int) -> None:
+def move_to_view(devices: Devices, mover: Mover, view: CalibrationView, k: int) -> None:
     """To a view; after a stop that a program may clear, once more."""
     try:
         mover.to(view.base_from_flange, f"calibration view {k + 1}")
@@ -138,7 +138,7 @@ def move_to_view(devices: Devices, mover: Mover, view: View, k: int) -> None:
         mover.to(view.base_from_flange, f"calibration view {k + 1}")
 
 
-def _can_move(devices: Devices, mover: Mover, view: View, k: int) -> bool:
+def _can_move(devices: Devices, mover: Mover, view: CalibrationView, k: int) -> bool:
     """To a view that was not planned; False when it cannot be reached, or not without touching something."""
     try:
         move_to_view(devices, mover, view, k)
@@ -160,7 +160,7 @@ def look_for(camera: Camera, board: BoardSpec, refusals: Counter[str], keep: Kee
     return seen
 
 
-def _enough(made: list[Made], views: list[View], refusals: Counter[str]) -> list[Made]:
+def _enough(made: list[Made], views: list[CalibrationView], refusals: Counter[str]) -> list[Made]:
     if len(made) < LEAST_SHARE * len(views):
         raise RefusedError(
             f"only {len(made)} of {len(views)} calibration views show the board; check its place, the light and the "

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
-from cell.measure.calibration.drift.reference_plate import Edge, Witness
+from cell.measure.calibration.drift.reference_plate import Edge, PlateLine
 from cell.measure.geometry.camera import Array
 from cell.procedures.calibrate.reference_plate import RATES_HZ, configure_fast
 from drivers.errors import Measured, RefusedError
@@ -62,8 +62,8 @@ def with_edge(
 
 
 def require_edge(
-    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], before: Witness, now: Witness
-) -> Witness:
+    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], before: PlateLine, now: PlateLine
+) -> PlateLine:
     """`now` with the edge that the calibration saw `before`; `RefusedError` where it is not about there."""
     assert before.edge is not None
     edge = look_at_edge(config, devices, keep, now, before.edge.place)
@@ -78,7 +78,7 @@ def require_edge(
 
 
 def look_at_edge(
-    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], witness: Witness, near: float | None
+    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], witness: PlateLine, near: float | None
 ) -> Edge | None:
     """The plate's edge by the rail, m, as both ways over it show it; it is searched where no place `near` is given.
 
@@ -123,7 +123,7 @@ def _whole(passed: Callable[[], tuple[Array, Array]]) -> tuple[Array, Array]:
 
 
 def _passed(
-    devices: Devices, keep: Callable[[str, Frame], None], witness: Witness, ends: tuple[float, float], speed: float
+    devices: Devices, keep: Callable[[str, Frame], None], witness: PlateLine, ends: tuple[float, float], speed: float
 ) -> tuple[Array, Array]:
     """Places (n,) of the rail, m, rising, and the share (n,) of the line's light on the plate."""
     rail, camera, laser = devices.rail, devices.scan_camera, devices.laser
@@ -176,7 +176,7 @@ def _require_fixed_gain(dark: Array) -> None:
         )
 
 
-def _light(image: NDArray[np.generic], witness: Witness) -> Array:
+def _light(image: NDArray[np.generic], witness: PlateLine) -> Array:
     """The line's light (rows,) where the witness has it, over what is beside it."""
     rows = witness.rows
     offsets = np.arange(-OUTER_PX, OUTER_PX + 1)

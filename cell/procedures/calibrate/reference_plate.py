@@ -9,7 +9,7 @@ import numpy as np
 
 from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
-from cell.measure.calibration.drift.reference_plate import LEAST_ROWS, Witness
+from cell.measure.calibration.drift.reference_plate import LEAST_ROWS, PlateLine
 from cell.measure.vision import extract
 from drivers.errors import DeviceFault, LimitError, RefusedError
 from drivers.interfaces import Frame
@@ -19,7 +19,7 @@ RATES_HZ = 30.0, 15.0, 10.0
 """The first that the camera can."""
 
 
-def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> Witness | None:
+def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> PlateLine | None:
     """The witness now, the carriage left there; None where the cell has none or it is not in the picture."""
     position = config.laser.witness
     if position is None:
@@ -37,7 +37,7 @@ def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, F
     sigma = np.array([profile.sigma for profile in profiles])
     seen = np.isfinite(columns).all(axis=0)
     mean = np.where(seen, columns.mean(axis=0), np.nan)
-    found = Witness(float(devices.rail.state().position), mean, np.sqrt((sigma**2).mean(axis=0) / PICTURES))
+    found = PlateLine(float(devices.rail.state().position), mean, np.sqrt((sigma**2).mean(axis=0) / PICTURES))
     return _on_the_plate(found)
 
 
@@ -59,7 +59,7 @@ def configure_fast(devices: Devices, exposure: float, rates: Sequence[float] = R
     return rates[-1]
 
 
-def require_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> Witness:
+def require_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> PlateLine:
     """The witness now, for a calibration that has seen it; `RefusedError` when there is none to see."""
     if config.laser.witness is None:
         raise RefusedError(
@@ -74,7 +74,7 @@ def require_witness(config: CellConfig, devices: Devices, keep: Callable[[str, F
     return seen
 
 
-def _on_the_plate(seen: Witness) -> Witness | None:
+def _on_the_plate(seen: PlateLine) -> PlateLine | None:
     """Only the longest run of rows without a step: what lies behind the plate moves with the arm."""
     rows = seen.rows
     if len(rows) < LEAST_ROWS:

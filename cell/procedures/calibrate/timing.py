@@ -21,7 +21,7 @@ from cell.measure.calibration.drift.timing_fit import (
     refuse_rolling,
     roughly_late,
 )
-from cell.measure.calibration.timing import Timing
+from cell.measure.calibration.timing import StampTiming
 from cell.measure.geometry.poses import from_ur
 from cell.measure.vision import BoardSpec, find_board, parse_board
 from cell.motion.arm_models import HOME
@@ -55,7 +55,7 @@ def collect_timing(
     check: Check,
     progress: Progress,
     keep: Keep,
-) -> Timing:
+) -> StampTiming:
     """Sweep over the fine board to and fro, fast and slowly, and say how late the stamps are.
 
     Raises what `find_timing` raises, and `RefusedError` when the board is not seen.
@@ -71,7 +71,7 @@ def collect_timing(
         check()
         progress(k / count, f"fine board, sweep {k + 1} of {count}")
 
-    base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs, tell, keep)
+    base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs=pairs, tell=tell, keep=keep)
     given = most_late(config), config.rail.lead, link_of(config)
     return find_timing(calibration.scan, base_from_flange, sweeps, *given)
 
@@ -96,7 +96,9 @@ def look_at_shutter(
     scan = calibration.scan
     devices.interlocks.work_with(calibration.configuration)
     try:
-        base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs, lambda k, count: check(), keep)
+        base_from_flange, sweeps = _sweeps(
+            config, devices, mover, calibration=calibration, pairs=pairs, tell=lambda k, count: check(), keep=keep
+        )
         shutter = find_shutter(scan, base_from_flange, sweeps, link_of(config))
         late, sigma = roughly_late(scan, base_from_flange, sweeps)
     except (RefusedError, LimitError) as unseen:
@@ -140,7 +142,7 @@ def _sweeps(
         # Pictures at other places each time: an error of the screw that they share would pass for lateness.
         inner = STAGGER_M * (k * GOLDEN % 1.0)
         between = (ends[0] + inner, ends[1] - STAGGER_M + inner)[::way]
-        sweeps.append(_swept(devices, fine, between, speed, exposure, keep, f"timing-{k + 1:02d}"))
+        sweeps.append(_swept(devices, fine, between, speed, exposure=exposure, keep=keep, what=f"timing-{k + 1:02d}"))
     moved = float(np.linalg.norm(from_ur(devices.arm.state().flange).translation - base_from_flange.translation))
     if moved > MOST_MOVED_M:
         raise DeviceFault(

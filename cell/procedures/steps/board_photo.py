@@ -14,7 +14,7 @@ from cell.procedures.arm.camera_poses import photo_pose
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.drive.settled import swing_covariance, words
-from cell.procedures.steps.drive_to_target import Arrival
+from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.step import JobStep
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, Workplace
 from statemachine.policy import Step
@@ -77,11 +77,11 @@ def photographed(here: Workplace, goal: pin.SE3, progress: Callable[[float, str]
     here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
     vehicle = here.config.arm.vehicle_from_base.se3().inverse()
     count, wait = here.job.photo.count, here.devices.clock.sleep
-    return board_photo(goal, vehicle, here.mover, lambda: here.photograph(count), wait, progress)
+    return board_photo(goal, vehicle, here.mover, lambda: here.photograph(count), wait=wait, progress=progress)
 
 
 def _at(here: Workplace, context: StepContext) -> BoardFix:
-    arrival, job = context.made(Arrival), here.job
+    arrival, job = context.made(VehicleArrival), here.job
     here.mover.meet_station(arrival.base_from_place, job, here.board, here.nominal.extent)
     goal = photo_pose(job, here.board, arrival.fix.base_from_board, here.calibration.target.flange_from_camera)
     fix = photographed(here, goal, context.progress)
@@ -90,4 +90,4 @@ def _at(here: Workplace, context: StepContext) -> BoardFix:
     return fix
 
 
-STEP = JobStep(Step("board_photo", 60.0, 2, ("DeadlineError",)), _at, BoardFix, needs=(Arrival,))
+STEP = JobStep(Step("board_photo", 60.0, 2, ("DeadlineError",)), _at, BoardFix, needs=(VehicleArrival,))

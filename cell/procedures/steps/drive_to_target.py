@@ -36,7 +36,7 @@ late let it drive on, which the later ones tell."""
 
 
 @dataclass(frozen=True, eq=False)
-class Arrival:
+class VehicleArrival:
     """Where the vehicle came to stand, and the last photograph that shows it. Errors in m and rad.
 
     `driven` is false for an arm on a fixed frame, which was only looked at.
@@ -82,7 +82,7 @@ def drive_to_target(
     hold: Callable[[], None] = lambda: None,
     carried: Sequence[Body] = (),
     pace: Pace | None = None,
-) -> Arrival:
+) -> VehicleArrival:
     """Bring the vehicle to the job's target to within its tolerance and brake it there.
 
     The arm stands in its looking pose already and the vehicle is enabled. On odometry alone it goes no further than the
@@ -131,7 +131,7 @@ def drive_to_target(
         hold()
         way.require_line(goal)
         speed = approach.speed * (1.0 if pace is None else pace.share)
-        drive_line(vehicle, whereabouts, goal, speed, clock, check)
+        drive_line(vehicle, whereabouts, goal, speed=speed, clock=clock, check=check)
 
     approach = job.approach
     staging, target = Planar.of(approach.staging.se3()), Planar.of(approach.target.se3())
@@ -156,7 +156,7 @@ def drive_to_target(
         near = abs(error.x) < 0.8 * approach.tolerance and abs(error.y) < 0.8 * approach.tolerance
         if near and abs(error.yaw) < 0.5 * approach.tolerance_angle:
             vehicle.brake()
-            return Arrival(base_from_place, fix, error.x, error.y, error.yaw, count)
+            return VehicleArrival(base_from_place, fix, error.x, error.y, error_yaw=error.yaw, photographs=count)
         if near:
             hold()
             way.require_turn(target.yaw)
@@ -177,12 +177,12 @@ def drive_to_target(
             "from photograph to photograph: see whether warm air shimmers before the camera, a fan blows, or board or "
             "camera are loose; the wheels are not the cause"
         )
-    raise _off_target(error, job, fix, "the vehicle", f" after {count} photographs", remedy)
+    raise _off_target(error, job, fix, who="the vehicle", after=f" after {count} photographs", remedy=remedy)
 
 
 def stand_at_target(
     job: Job, vehicle_from_base: pin.SE3, vehicle: Vehicle, whereabouts: Whereabouts, photograph: Callable[[], BoardFix]
-) -> Arrival:
+) -> VehicleArrival:
     """What `drive_to_target` is for an arm on a fixed frame: look whether the station stands where the job has it.
 
     Raises `RefusedError` with how far it is off when that is more than the job's tolerance.
@@ -201,10 +201,10 @@ def stand_at_target(
     most, most_angle = job.approach.tolerance, job.approach.tolerance_angle
     if not (abs(error.x) <= most and abs(error.y) <= most and abs(error.yaw) <= most_angle):
         raise _off_target(
-            error, job, fix, "the arm, on its fixed frame,", "", "move the station, or correct approach.target"
+            error, job, fix, "the arm, on its fixed frame,", "", remedy="move the station, or correct approach.target"
         )
     vehicle.brake()
-    return Arrival(base_from_place, fix, error.x, error.y, error.yaw, 1, driven=False)
+    return VehicleArrival(base_from_place, fix, error.x, error.y, error_yaw=error.yaw, photographs=1, driven=False)
 
 
 def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, remedy: str) -> RefusedError:
@@ -219,7 +219,7 @@ def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, re
     ).showing(seen={"frame": fix.frames[-1], "view": fix.views[-1]} if fix.frames else None)
 
 
-def _at(here: Workplace, context: StepContext) -> Arrival:
+def _at(here: Workplace, context: StepContext) -> VehicleArrival:
     """The arm to its looking pose first, with the vehicle braked."""
     context.progress(0.0, "arm to the looking pose")
     if here.needs_part and not here.devices.claw.holding:
@@ -252,16 +252,16 @@ def _at(here: Workplace, context: StepContext) -> Arrival:
         here.job,
         here.config.arm.vehicle_from_base.se3(),
         vehicle,
-        here.whereabouts,
-        here.photograph,
-        here.devices.clock,
-        context.check,
-        context.progress,
-        lambda text: context.note(text=text),
-        context.safe_point,
-        here.mover.solids(),
-        here.mover.pace,
+        whereabouts=here.whereabouts,
+        photograph=here.photograph,
+        clock=here.devices.clock,
+        check=context.check,
+        progress=context.progress,
+        note=lambda text: context.note(text=text),
+        hold=context.safe_point,
+        carried=here.mover.solids(),
+        pace=here.mover.pace,
     )
 
 
-STEP = JobStep(Step("drive_to_target", 180.0, 1, ("DeadlineError",)), _at, Arrival)
+STEP = JobStep(Step("drive_to_target", 180.0, 1, ("DeadlineError",)), _at, VehicleArrival)

@@ -28,7 +28,7 @@ from statemachine.runner import StepContext
 
 
 @dataclass(frozen=True, eq=False)
-class Lines:
+class LineTimes:
     """When each line of the cloud was taken, (lines,) in s, what the arm's base stands on, and the scan head that a
     rail carried, None where the arm did.
 
@@ -46,7 +46,7 @@ def invert_pose(
     job: Job,
     nominal: NominalSurface,
     kinematic: Vector,
-    taken: Lines | None = None,
+    taken: LineTimes | None = None,
 ) -> PlacePose:
     """Where the surface is, in the arm base, with the covariance that stripe, rail, calibration and arm leave it with.
 
@@ -103,7 +103,7 @@ def invert_pose(
     times, vehicle, hz = taken.times, taken.base_from_vehicle, rocking.hz
 
     def by_poses(lines: Indices, rows: Indices) -> Vector:
-        shaken = rocking_motions(scan.cloud, lines, rows, vehicle, times, hz)
+        shaken = rocking_motions(scan.cloud, lines, rows, base_from_vehicle=vehicle, times=times, hz=hz)
         return np.concatenate([scan.by_poses(lines, rows), shaken], axis=2)
 
     unknown = rocking_covariance(rocking, vehicle, expected.translation)
@@ -124,9 +124,9 @@ def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: Boa
     if here.job.scan.mode == "rail":
         known, travel = here.calibration.scan, here.config.rail.travel[1]
         head = Head.of(scan.cloud, sweep.base_from_flange, known.flange_from_camera, known.rail_direction, travel)
-    taken = Lines(sweep.times, here.config.arm.vehicle_from_base.se3().inverse(), head)
+    taken = LineTimes(sweep.times, here.config.arm.vehicle_from_base.se3().inverse(), head)
     try:
-        return invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken)
+        return invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken=taken)
     except NotObservable as refused:
         if not sweep.notes:
             raise

@@ -17,7 +17,7 @@ from cell.procedures.steps.workplace import Workplace
 from drivers.errors import ConfigError
 from statemachine.policy import Policy
 from statemachine.runner import StepContext
-from statemachine.sequence import Sequence, State
+from statemachine.sequence import JobState, Sequence
 
 GROUP = "assembly_cell.kinds"
 
@@ -49,7 +49,7 @@ class Kind:
 
     def sequence(self) -> Sequence:
         """A sequence at its start; it ends placed only where a step places."""
-        return Sequence(self.names, State.PLACED if self.places else State.DONE)
+        return Sequence(self.names, JobState.PLACED if self.places else JobState.DONE)
 
     def policy(self, *, simulated_person: bool = False) -> Policy:
         """How each step is watched."""

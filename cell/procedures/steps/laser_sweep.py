@@ -13,10 +13,10 @@ from cell.config.cell_config import CellConfig
 from cell.config.job import ScanSection
 from cell.devices.devices import Devices
 from cell.measure.calibration import ScanCalibration
-from cell.measure.calibration.drift.reference_plate import Pointing, Witness
+from cell.measure.calibration.drift.reference_plate import PlateLine, Pointing
 from cell.measure.calibration.drift.reference_plate import pointing as pointing_since
 from cell.measure.calibration.drift.slip import Slip, slip_since
-from cell.measure.calibration.timing import Timing
+from cell.measure.calibration.timing import StampTiming
 from cell.measure.reconstruction import ScanGeometry
 from cell.procedures.arm.camera_poses import ScanPlan, scan_plans
 from cell.procedures.arm.moves import Mover
@@ -29,7 +29,7 @@ from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.arm_sweep import arm_sweep
 from cell.procedures.sweep.rail_sweep import rail_sweep
 from cell.procedures.sweep.stored_sweep import FILE, save_sweep
-from cell.procedures.sweep.swath import MAX_LOST_FRACTION, Collector, SweepErrors, rehearse
+from cell.procedures.sweep.swath import MAX_LOST_FRACTION, SweepCollector, SweepErrors, rehearse
 from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.errors import CalibrationStale
 from drivers.interfaces import Frame
@@ -57,7 +57,7 @@ def laser_sweep(
     keep_frame: Callable[[Frame], None],
     check: Callable[[], None],
     progress: Callable[[float, str], None],
-    sweeping: Callable[[Collector], None] = lambda collector: None,
+    sweeping: Callable[[SweepCollector], None] = lambda collector: None,
 ) -> SweepRecord:
     """Sweep the scan head over every planned strip, by the rail or by the arm as `scan.mode` says.
 
@@ -76,7 +76,7 @@ def laser_sweep(
             progress((k + fraction) / len(plans), f"{name}: {text}" if len(plans) > 1 else text)
 
         tell(0.02, "arm to the scan pose")
-        collector = Collector(geometry, scan, keep_frame, tell)
+        collector = SweepCollector(geometry, scan, keep_frame, tell)
         sweeping(collector)
         swaths.append(sweep(plan, mover, devices, errors, collector))
     return SweepRecord(tuple(swaths), doubts=() if scan.mode == "arm" else _counted(devices, progress))
@@ -132,7 +132,7 @@ def swept(
     keep_frame: Callable[[Frame], None],
     check: Callable[[], None],
     progress: Callable[[float, str], None],
-    sweeping: Callable[[Collector, pin.SE3], None] = lambda collector, base_from_surface: None,
+    sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None,
     most_lost: float = MAX_LOST_FRACTION,
 ) -> SweepRecord:
     """`laser_sweep` where a job is done, over the strips of `scan`; raises what it raises.
@@ -147,21 +147,21 @@ def swept(
         scan_plans(here.config, here.job.model_copy(update={"scan": scan}), base_from_surface, head),
         scan,
         head.geometry(),
-        SweepErrors(
+        errors=SweepErrors(
             here.repeatability,
             here.config.calibration.rail_sigma,
             SHIFT_SHARE * here.job.place.tolerance,
-            devices.clock.rate,
-            math.hypot(here.config.scan_camera.late, here.config.rail.late),
-            times_known(here.calibration.scan, here.config)[0],
-            most_lost,
+            rate=devices.clock.rate,
+            late=math.hypot(here.config.scan_camera.late, here.config.rail.late),
+            timing=times_known(here.calibration.scan, here.config)[0],
+            lost=most_lost,
         ),
-        here.mover,
-        devices,
-        keep_frame,
-        check,
-        progress,
-        lambda collector: sweeping(collector, base_from_surface),
+        mover=here.mover,
+        devices=devices,
+        keep_frame=keep_frame,
+        check=check,
+        progress=progress,
+        sweeping=lambda collector: sweeping(collector, base_from_surface),
     )
 
 
@@ -176,11 +176,11 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
         here,
         fix,
         head,
-        unhurried(here.job.scan, context.attempt),
-        lambda frame: here.frames.keep("stripe", frame),
-        context.check,
-        context.progress,
-        here.sweeping,
+        scan=unhurried(here.job.scan, context.attempt),
+        keep_frame=lambda frame: here.frames.keep("stripe", frame),
+        check=context.check,
+        progress=context.progress,
+        sweeping=here.sweeping,
     )
     rest = here.devices.interlocks.situation.last if here.job.scan.mode == "rail" else None
     doubts = (*record.doubts, *unwatched(head.witness), *doubts, *here.notes)
@@ -196,7 +196,7 @@ def _home(here: Workplace, progress: Callable[[float, str], None]) -> None:
         here.devices.rail.home().wait(60.0)
 
 
-def times_known(head: ScanCalibration, config: CellConfig) -> tuple[Timing | None, tuple[str, ...]]:
+def times_known(head: ScanCalibration, config: CellConfig) -> tuple[StampTiming | None, tuple[str, ...]]:
     """How late the camera's stamps come, if that was measured with the settings of now; and for people what of the
     camera's times is not known."""
     timing, doubts = head.timing, list(head.unread)
@@ -215,7 +215,7 @@ def times_known(head: ScanCalibration, config: CellConfig) -> tuple[Timing | Non
     return timing, tuple(doubts)
 
 
-def unwatched(witness: Witness | None) -> tuple[str, ...]:
+def unwatched(witness: PlateLine | None) -> tuple[str, ...]:
     """For people, what a look at the plate on the claw cannot tell, of which the calibration saw this."""
     if witness is None:
         return (
@@ -239,7 +239,9 @@ def _seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | No
         return None, None
     context.progress(0.0, "looking where the laser points")
     seen = require_witness(config, devices, keep)
-    pointing = pointing_since(before, seen, head.camera, head.light_plane, config.laser.exit_point, head.confirmed)
+    pointing = pointing_since(
+        before, seen, head.camera, plane=head.light_plane, exit_point=config.laser.exit_point, confirmed=head.confirmed
+    )
     if before.edge is None:
         return pointing, None
     context.progress(0.005, "looking whether the scan head has slipped")

@@ -19,7 +19,7 @@ from cell.motion.bodies import TOUCHES
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.part import PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.arm.touch import Touch, TouchCheck, expected_touch, felt_touch
+from cell.procedures.arm.touch import TouchCheck, TouchHeight, expected_touch, felt_touch
 from cell.procedures.drive.station_check import require_unmoved
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -76,7 +76,7 @@ class PlaceResult:
 def place(
     job: Job,
     base_from_surface: pin.SE3,
-    expected: Touch,
+    expected: TouchHeight,
     mover: Mover,
     arm: Arm,
     claw: Claw,
@@ -186,13 +186,13 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         here.job,
         pose.base_from_surface,
         expected,
-        here.mover,
-        here.devices.arm,
-        here.devices.claw,
-        here.part,
-        context.check,
-        context.progress,
-        lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
+        mover=here.mover,
+        arm=here.devices.arm,
+        claw=here.devices.claw,
+        part=here.part,
+        check=context.check,
+        progress=context.progress,
+        note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
     )
     done = replace(done, look=look, pose=pose)
     for note in done.notes:
@@ -229,7 +229,7 @@ def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> Sec
     lies = here.job.place.surface_from_part.se3()
     found = highest_standing(scan.cloud, here.nominal, pose.base_from_surface, lies, here.job.grasp.size)
     require_bare(found, here.job.place.tolerance)
-    return require_in_place(here, fix, sweep, scan, pose, context)
+    return require_in_place(here, fix, sweep, scan=scan, pose=pose, context=context)
 
 
 # A part that may have touched the surface is not placed a second time by itself. The second look takes as long as a

@@ -23,7 +23,7 @@ from cell.measure.reconstruction import (
 )
 from cell.measure.reconstruction.cloud import Array, Indices
 from cell.measure.reconstruction.seams import Motions
-from cell.procedures.observed import Lines
+from cell.procedures.observed import TimedCloud
 from cell.procedures.steps.step import JobStep
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.sweep_record import SweepRecord
@@ -80,7 +80,7 @@ def reconstruct(
     covariances = [swath.covariance for swath in sweep.swaths]
 
     def by_calibration(lines: Indices, rows: Indices) -> Array:
-        return calibration_motions(cloud, lines, rows, None, geometry, variants)
+        return calibration_motions(cloud, lines, rows, base_from_flange=None, geometry=geometry, variants=variants)
 
     def by_poses(lines: Indices, rows: Indices) -> Array:
         leaning = lean_motions(cloud, lines, rows, base_from_vehicle, lean_sigma)
@@ -104,17 +104,17 @@ def reconstructed(here: Workplace, sweep: SweepRecord) -> Reconstruction:
         sweep,
         head if sweep.pointing is None else head.pointed(sweep.pointing, here.config.laser.exit_point),
         here.job.scan.largest_hole,
-        path,
-        here.config.arm.vehicle_from_base.se3().inverse(),
-        here.config.vehicle.lean_sigma,
-        here.config.cell.sim,
+        path=path,
+        base_from_vehicle=here.config.arm.vehicle_from_base.se3().inverse(),
+        lean_sigma=here.config.vehicle.lean_sigma,
+        simulated=here.config.cell.sim,
     )
 
 
 def _at(here: Workplace, context: StepContext) -> Reconstruction:
     sweep = context.made(SweepRecord)
     made = reconstructed(here, sweep)
-    here.devices.gate.seen("scan_camera", Lines(made.cloud, sweep.times))
+    here.devices.gate.seen("scan_camera", TimedCloud(made.cloud, sweep.times))
     return made
 
 

@@ -24,7 +24,7 @@ from cell.procedures.drive.settled import APART_S
 from cell.procedures.drive.whereabouts import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.pace import Pace
-from cell.procedures.sweep.swath import Collector
+from cell.procedures.sweep.swath import SweepCollector
 from drivers.interfaces import Vector
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Workplace:
     whereabouts: Whereabouts
     earlier: StoredSweep | None = None
     needs_part: bool = True
-    sweeping: Callable[[Collector, pin.SE3], None] = lambda collector, base_from_surface: None
+    sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None
     registered: Callable[[pin.SE3], None] = lambda base_from_surface: None
     part: PartProgress = field(default_factory=PartProgress)
     pace: Pace = field(default_factory=Pace)
@@ -137,12 +137,12 @@ class Workplace:
             self.devices.arm,
             self.devices.target_camera,
             self.calibration.target,
-            self.board,
-            self.job.photo,
-            self.repeatability,
-            count,
-            lambda frame: self.frames.keep(what, frame),
-            lambda: self.devices.clock.sleep(APART_S),
+            spec=self.board,
+            limits=self.job.photo,
+            repeatability=self.repeatability,
+            count=count,
+            keep=lambda frame: self.frames.keep(what, frame),
+            pause=lambda: self.devices.clock.sleep(APART_S),
         )
         self.frames.found = fix.frames[-1], fix.views[-1].pixels
         if self.devices.following is not None:

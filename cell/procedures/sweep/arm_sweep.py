@@ -16,7 +16,7 @@ from cell.measure.geometry.poses import from_parts
 from cell.motion.track import LONGEST_GAP_S, FlangeTrack
 from cell.procedures.arm.camera_poses import ScanPlan
 from cell.procedures.arm.moves import Mover
-from cell.procedures.sweep.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
+from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors, TimeBound, shift_by_times
 from drivers.clock_map import ClockMap
 from drivers.errors import CellError, DeviceFault
 
@@ -29,7 +29,7 @@ JITTER_S = 0.0003
 """The same from one line to the next."""
 
 
-def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: Collector) -> Swath:
+def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: SweepCollector) -> Swath:
     """Move the scan head over the placement area and pair every profile with the flange's pose.
 
     Raises `DeviceFault` when more than `errors.lost` of the frames were lost, none came from the planned stretch, the

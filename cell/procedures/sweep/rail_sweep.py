@@ -10,7 +10,7 @@ from cell.measure.geometry.poses import from_ur
 from cell.procedures.arm.camera_poses import ScanPlan
 from cell.procedures.arm.moves import Mover
 from cell.procedures.observed import RailPath
-from cell.procedures.sweep.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
+from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors, TimeBound, shift_by_times
 from drivers.errors import DeviceFault
 
 MAX_FLANGE_MOTION = 1e-4
@@ -18,7 +18,7 @@ MAX_RESIDUAL = 5.0
 """Median distance of the rail's readings from an even motion that a sweep may have, in σ of a rail position."""
 
 
-def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: Collector) -> Swath:
+def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: SweepCollector) -> Swath:
     """Sweep the scan head over the placement area and pair every profile with the rail's position.
 
     Raises `DeviceFault` when more than `errors.lost` of the frames were lost, none came from the constant-velocity

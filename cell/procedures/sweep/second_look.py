@@ -67,7 +67,7 @@ def require_in_place(
     Raises `RefusedError` when either has moved by more than chance brings, and what a sweep and a photograph raise.
     """
     place = here.job.place
-    found, creep = _swept_again(here, fix, sweep, scan, pose, context)
+    found, creep = _swept_again(here, fix, sweep, scan=scan, pose=pose, context=context)
     require_unmoved(found)
     tolerance = Tolerance(place.tolerance, place.tolerance_angle)
     hidden = tuple(found.hidden(pose.base_from_surface, tolerance, here.nominal.radius))
@@ -88,9 +88,9 @@ def _swept_again(
     # A camera of a few frame rates takes all the lines.
     rate = configure_fast(here.devices, few.exposure, (few.frame_rate, here.job.scan.frame_rate))
     again = swept(
-        here, fix, head, few.model_copy(update={"frame_rate": rate}),
-        lambda frame: here.frames.keep("second-look", frame), context.check,
-        lambda share, text: context.progress(0.04 * share, f"whether the surface lies where it did: {text}"),
+        here, fix, head, scan=few.model_copy(update={"frame_rate": rate}),
+        keep_frame=lambda frame: here.frames.keep("second-look", frame), check=context.check,
+        progress=lambda share, text: context.progress(0.04 * share, f"whether the surface lies where it did: {text}"),
         most_lost=MOST_LOST,
     )  # fmt: skip
     # What lens and light plane are off by cancels in the same strip only.

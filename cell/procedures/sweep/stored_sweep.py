@@ -26,7 +26,7 @@ from cell.measure.calibration.drift.slip import Slip
 from cell.measure.geometry.poses import difference, from_matrix
 from cell.measure.reconstruction import ScanGeometry
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.sweep.swath import Collector, Swath
+from cell.procedures.sweep.swath import Swath, SweepCollector
 from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.camera.folder import read_image
 from drivers.errors import CalibrationStale, CellError, RefusedError
@@ -187,10 +187,10 @@ def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeomet
     if not np.isfinite([lost, residual, shift]).all():
         raise ValueError(f"its figures are {lost}, {residual}, {shift}")
     shape = (geometry.camera.height, geometry.camera.width)
-    collector = Collector(geometry, scan, lambda frame: None, lambda fraction, text: None)
+    collector = SweepCollector(geometry, scan, lambda frame: None, lambda fraction, text: None)
     for frame_id in arrays["seen"]:
         image = read_image(frame_path(folder, int(frame_id)), shape)
-        collector.see(Frame(image, int(frame_id), scan.exposure, 0.0, 0.0, 0.0))
+        collector.see(Frame(image, int(frame_id), scan.exposure, device_time=0.0, host_time=0.0, received=0.0))
     lines = arrays["lines"]
     middle = collector.require_frames("stored sweep", lines)
     return Swath(

@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.config.job import ScanSection
-from cell.measure.calibration.timing import Timing
+from cell.measure.calibration.timing import StampTiming
 from cell.measure.geometry.poses import from_matrix
 from cell.measure.inversion import NominalSurface
 from cell.measure.reconstruction import ProfileBuilder, ScanGeometry
@@ -42,7 +42,7 @@ class SweepErrors:
     shift: float
     rate: float = 1.0
     late: float = 0.0
-    timing: Timing | None = None
+    timing: StampTiming | None = None
     lost: float = MAX_LOST_FRACTION
 
     @property
@@ -144,7 +144,7 @@ def rehearse(geometry: ScanGeometry) -> None:
 
 
 @dataclass(eq=False)
-class Collector:
+class SweepCollector:
     """Takes the frames of one sweep: keeps them, triangulates their profiles, remembers when they were exposed."""
 
     geometry: ScanGeometry
@@ -205,13 +205,13 @@ class Collector:
     def require_one_clock(self, camera: str, errors: SweepErrors) -> None:
         """Raise `DeviceFault` where the camera's clock stepped meanwhile."""
         allowed = STEP_SHARE * errors.shift
-        require_one_clock(camera, self.frame_ids, self.times, self.received, self.scan.speed, allowed)
+        require_one_clock(camera, self.frame_ids, self.times, self.received, speed=self.scan.speed, most=allowed)
 
 
 @dataclass(frozen=True, eq=False)
 class Sweeping:
     """Who takes its frames, where the surface is by the board before anything was registered, and the surface."""
 
-    collector: Collector
+    collector: SweepCollector
     base_from_surface: pin.SE3
     nominal: NominalSurface

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 
-from cell.measure.calibration.drift.decision import Verdict, verdict
-from cell.measure.calibration.drift.evidence import Look, dots_of, evidence
+from cell.measure.calibration.drift.decision import DriftVerdict, verdict
+from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of, evidence
 from cell.measure.calibration.drift.pointing import WitnessCheck
 from cell.measure.calibration.drift.reference import Reference
 from cell.measure.calibration.drift.reference_plate import Pointing
 from cell.measure.calibration.observations import ScanObservation, TargetObservation
-from cell.measure.calibration.solve.blocks import State, ViewData
+from cell.measure.calibration.solve.blocks import AdjustmentState, ViewData
 from cell.measure.calibration.solve.joint import STRIPE_POINTS
 from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
 from cell.measure.calibration.solve.starts import stripe_means
@@ -52,7 +52,7 @@ class CheckObservations:
     exit_point: Array = field(default_factory=lambda: np.zeros(3))
 
 
-def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservations) -> Verdict:
+def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservations) -> DriftVerdict:
     """Compare with what the calibration predicts.
 
     Raises `CalibrationStale` for a calibration that was stored without its reference, `RefusedError` when the sweep
@@ -65,7 +65,7 @@ def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservat
         )
     states = {
         "scan": _state(scan, scan.reference),
-        "target": State(
+        "target": AdjustmentState(
             target.camera, None, np.zeros(3), target.flange_from_camera, target.reference.base_from_board
         ),
     }  # fmt: skip
@@ -85,23 +85,23 @@ def check_witness(scan: ScanCalibration, seen: CheckObservations) -> WitnessChec
     return WitnessCheck.of(seen.pointing, seen.exit_point, state, weighed)
 
 
-def _state(scan: ScanCalibration, reference: Reference) -> State:
-    return State(
+def _state(scan: ScanCalibration, reference: Reference) -> AdjustmentState:
+    return AdjustmentState(
         scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, reference.base_from_board
     )  # fmt: skip
 
 
-def scan_looks(state: State, seen: CheckObservations) -> list[Look]:
+def scan_looks(state: AdjustmentState, seen: CheckObservations) -> list[PictureMeasurements]:
     """Dots of every photograph, and the sweep's stripe where it lies cleanly on the board."""
-    looks: list[Look] = []
+    looks: list[PictureMeasurements] = []
     for rest, photographs in enumerate(seen.photographs):
-        looks += [Look(dots_of(photo), rest, len(looks) + k) for k, photo in enumerate(photographs)]
+        looks += [PictureMeasurements(dots_of(photo), rest, len(looks) + k) for k, photo in enumerate(photographs)]
     rest, stop = len(seen.photographs) - 1, len(looks)
     near = seen.photographs[-1][0]
     assert near.view is not None
     pose = board_pose(near.view, state.camera).camera_from_board
     few = seen.sweep[:: max(1, len(seen.sweep) // SWEEP_PROFILES)]
-    lit = [look for profile in few if (look := _stripe(state, profile, near, pose, rest, stop)) is not None]
+    lit = [look for profile in few if (look := _stripe(state, profile, near, pose, rest=rest, stop=stop)) is not None]
     if len(lit) < LEAST_PROFILES:
         raise RefusedError(
             f"{len(lit)} of {len(few)} profiles of the sweep cross the fine board, at least {LEAST_PROFILES} are "
@@ -116,15 +116,15 @@ def scan_looks(state: State, seen: CheckObservations) -> list[Look]:
     return looks + lit
 
 
-def target_looks(views: Sequence[TargetObservation]) -> list[Look]:
+def target_looks(views: Sequence[TargetObservation]) -> list[PictureMeasurements]:
     """Dots of every view; each has its own approach."""
     same = [ScanObservation(o.view, None, o.base_from_flange) for o in views]
-    return [Look(dots_of(o), k) for k, o in enumerate(same)]
+    return [PictureMeasurements(dots_of(o), k) for k, o in enumerate(same)]
 
 
 def _stripe(
-    state: State, lit: ScanObservation, near: ScanObservation, pose: pin.SE3, rest: int, stop: int
-) -> Look | None:
+    state: AdjustmentState, lit: ScanObservation, near: ScanObservation, pose: pin.SE3, rest: int, stop: int
+) -> PictureMeasurements | None:
     """The stripe on the board, whose pose in the camera is known from a photograph `near`; None when it misses it."""
     assert lit.profile is not None
     assert near.view is not None
@@ -145,4 +145,4 @@ def _stripe(
         rail=lit.rail_position,
         stripe_axis=1 if lit.profile.axis == "columns" else 0,
     )
-    return Look(data, rest, stop, sweeping=True)
+    return PictureMeasurements(data, rest, stop, sweeping=True)

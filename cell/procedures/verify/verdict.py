@@ -15,7 +15,7 @@ import numpy as np
 from cell.base.notebook import table
 from cell.config.calibrations.store import CellCalibration
 from cell.config.job import Job
-from cell.measure.calibration.drift.decision import WORST_FIT, Suspect, Verdict
+from cell.measure.calibration.drift.decision import WORST_FIT, DriftVerdict, Suspect
 from cell.measure.calibration.drift.detectability import DETECTED
 from cell.measure.calibration.drift.place_effect import scan_effect, target_effect
 from cell.measure.calibration.drift.pointing import WitnessCheck
@@ -43,7 +43,7 @@ class Verification:
     believes the witness. A turn of the laser that both see is no change of the calibration, for jobs allow for it.
     """
 
-    verdict: Verdict
+    verdict: DriftVerdict
     effects: list[float]
     at_most: list[float]
     unseen: list[float]
@@ -70,11 +70,11 @@ class Verification:
             verdict,
             [effect(suspect.chain, suspect.change) for suspect in verdict.suspects],
             [at_most(suspect) for suspect in verdict.suspects],
-            unseen,
-            job.place.tolerance,
-            calibration.date,
-            witness,
-            0.0 if witness is None else effect("scan", witness.wrong),
+            unseen=unseen,
+            tolerance=job.place.tolerance,
+            date=calibration.date,
+            witness=witness,
+            misled=0.0 if witness is None else effect("scan", witness.wrong),
         )
 
     def __str__(self) -> str:

@@ -23,12 +23,12 @@ from cell.measure.geometry.poses import from_ur
 from cell.measure.reconstruction import ScanGeometry
 from cell.measure.vision import BoardSpec, BoardView, StripeProfile, parse_board
 from cell.motion.arm_models import HOME
-from cell.procedures.arm.camera_poses import ScanPlan, View, rail_ends, verification_views
+from cell.procedures.arm.camera_poses import CalibrationView, ScanPlan, rail_ends, verification_views
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.boards import PHOTO_RATE, Check, Keep, Progress, look_for, move_to_view
 from cell.procedures.calibrate.reference_plate import require_witness
 from cell.procedures.sweep.rail_sweep import rail_sweep
-from cell.procedures.sweep.swath import Collector, SweepErrors, rehearse
+from cell.procedures.sweep.swath import SweepCollector, SweepErrors, rehearse
 from cell.procedures.verify.looks import CheckObservations
 from drivers.errors import RefusedError
 from drivers.interfaces import Camera, Frame
@@ -80,15 +80,15 @@ def collect_verification(
                 config,
                 devices,
                 mover,
-                calibration.scan.geometry(),
-                scan_view,
-                ends,
-                lambda f, t: progress(0.3 + 0.2 * f, t),
-                lambda frame: keep("stripe", frame),
+                geometry=calibration.scan.geometry(),
+                view=scan_view,
+                ends=ends,
+                progress=lambda f, t: progress(0.3 + 0.2 * f, t),
+                keep_frame=lambda frame: keep("stripe", frame),
             )
         else:
             move_to_view(devices, mover, scan_view, k)
-        photographs.append(_photographs(config, devices, fine, ends, keep, f"fine-{k + 1}"))
+        photographs.append(_photographs(config, devices, fine, ends=ends, keep=keep, what=f"fine-{k + 1}"))
     target: list[TargetObservation] = []
     devices.target_camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)
     for k in range(TARGET_APPROACHES):
@@ -120,7 +120,7 @@ def _sweep(
     devices: Devices,
     mover: Mover,
     geometry: ScanGeometry,
-    view: View,
+    view: CalibrationView,
     ends: tuple[float, float],
     progress: Callable[[float, str], None],
     keep_frame: Callable[[Frame], None],
@@ -138,7 +138,7 @@ def _sweep(
     profiles: list[StripeProfile] = []
     plan = ScanPlan(view.base_from_flange, view.base_from_flange, *ends)
     errors = SweepErrors(np.zeros((6, 6)), config.calibration.rail_sigma, MAX_SHIFT, devices.clock.rate)
-    collector = Collector(geometry, section, keep_frame, progress, profiles.append)
+    collector = SweepCollector(geometry, section, keep_frame, progress, profiles.append)
     rehearse(geometry)
     swath = rail_sweep(plan, mover, devices, errors, collector)
     return [
@@ -158,9 +158,9 @@ def _found(camera: Camera, board: BoardSpec, name: str, keep: Keep, what: str) -
     return seen
 
 
-def _beside(view: View, turn: int) -> View:
+def _beside(view: CalibrationView, turn: int) -> CalibrationView:
     """A pose near a view, up and to another side each time."""
     side = 2.4 * turn
     away = np.array([BACK_M * np.cos(side), BACK_M * np.sin(side), BACK_M])
     moved = pin.SE3(view.base_from_flange.rotation, view.base_from_flange.translation + away)
-    return View(moved, view.rail_position)
+    return CalibrationView(moved, view.rail_position)

@@ -11,7 +11,7 @@ from typing import Any
 from cell.base.storage import EditedError, read_json
 from cell.run.files.folder import REPORT, when
 from drivers.errors import CellError, ConfigError
-from statemachine.journal import JournalError, Record, read
+from statemachine.journal import JournalError, JournalRecord, read
 
 
 def read_report(folder: Path) -> dict[str, Any]:
@@ -124,7 +124,7 @@ def awaited_word(folder: Path) -> Question | None:
         raise ConfigError(str(error)) from error
 
 
-def _awaited(record: Record) -> Question | None:
+def _awaited(record: JournalRecord) -> Question | None:
     kinds = ("confirm_needed", "confirmed", "state")
     last = next((event for event in reversed(record.events) if event.kind in kinds), None)
     if last is None or last.kind != "confirm_needed":

@@ -154,7 +154,7 @@ def _records(inside: BytesIO) -> Generator[tuple[int, bytes], None, int]:
 
 
 @dataclass(frozen=True)
-class Said:
+class StoredMessage:
     """A message as it lies in the file: its topic, its schema's name, its encoding, its time in ns, its bytes."""
 
     topic: str
@@ -172,7 +172,7 @@ class Said:
         return message
 
 
-def said(path: Path, told: Parts, topics: tuple[str, ...] = ("/",)) -> Iterator[Said]:
+def said(path: Path, told: Parts, topics: tuple[str, ...] = ("/",)) -> Iterator[StoredMessage]:
     """The messages of the topics that begin so, in the file's order, as far as the file goes; `told` as in `parts`.
 
     `ConfigError` without a file, `CellError` for one that is no record, or where a package for it is not installed.
@@ -188,7 +188,7 @@ def said(path: Path, told: Parts, topics: tuple[str, ...] = ("/",)) -> Iterator[
     with path.open("rb") as stream:
         for kind, content in parts(stream, told):
             data = ReadDataStream(BytesIO(content))
-            found: Said | None = None
+            found: StoredMessage | None = None
             with decoding(told):
                 if kind == SCHEMA:
                     schema = Schema.read(data)
@@ -200,7 +200,7 @@ def said(path: Path, told: Parts, topics: tuple[str, ...] = ("/",)) -> Iterator[
                     of = channels.get(int.from_bytes(content[:2], "little"))
                     if of is not None and of.schema_id in schemas and of.topic.startswith(topics):
                         message, name = Message.read(data, len(content)), schemas[of.schema_id].name
-                        found = Said(of.topic, name, of.message_encoding, message.log_time, message.data)
+                        found = StoredMessage(of.topic, name, of.message_encoding, message.log_time, message.data)
             if found is not None:
                 yield found
 

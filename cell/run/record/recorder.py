@@ -20,10 +20,10 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import DEVICES, CellConfig
 from cell.config.mounting import deck_plates, mounted
 from cell.devices.devices import Devices
-from cell.devices.gate.interlocks import Command
+from cell.devices.gate.interlocks import DeviceCommand
 from cell.motion.bodies import Body, arm_bodies, tool_bodies, vehicle_bodies
-from cell.procedures.frame_store import Picture
-from cell.procedures.observed import Lines, RailPath
+from cell.procedures.frame_store import FrameFile
+from cell.procedures.observed import RailPath, TimedCloud
 from cell.run.record.channels import CAMERAS, COMMANDED
 from cell.run.record.file import FILE, RecordFile, missing
 from cell.run.record.sketch import Sketch
@@ -144,7 +144,7 @@ class Recorder(logging.Handler):
             self._json("/sequence/state", at, data)
         self._json("/sequence/event", at, {"kind": event.kind, "step": event.step or "", "data": data})
 
-    def command(self, command: Command, refused: str | None) -> None:
+    def command(self, command: DeviceCommand, refused: str | None) -> None:
         """See `cell.devices.gate.gate.Listener`."""
         if command.device in COMMANDED:
             told = {"name": command.name, "arguments": dict(command.arguments), "refused": refused or ""}
@@ -157,7 +157,7 @@ class Recorder(logging.Handler):
                 at = self._times.of(stamp)
                 self._json("/rail/state", at, {"stamp": stamp, "position": position})
                 self._rail_at(at, position)
-        elif isinstance(reading, Lines):
+        elif isinstance(reading, TimedCloud):
             self._lines(reading)
         elif self._is_due(device, READINGS_S):
             stamp = getattr(reading, "stamp", None)
@@ -170,7 +170,7 @@ class Recorder(logging.Handler):
             elif isinstance(reading, RailState):
                 self._rail_at(at, reading.position)
 
-    def frame(self, what: str, frame: Frame, picture: Picture) -> None:
+    def frame(self, what: str, frame: Frame, picture: FrameFile) -> None:
         """A frame is kept, see `cell.procedures.frame_store.FrameStore`."""
         camera = self._camera_of(what, frame)
         at = self._times.of(frame.mid_exposure)
@@ -214,7 +214,7 @@ class Recorder(logging.Handler):
         self._put("/tf", at, partial(self._sketch.rail_at, position=position))
         self._put("/joints", at, self._sketch.rail_joint)
 
-    def _lines(self, lines: Lines) -> None:
+    def _lines(self, lines: TimedCloud) -> None:
         """Each line of the cloud, and once a second all so far; a place in it that is empty is NaN."""
         points, times, seen = lines.cloud.points.astype(np.float32), lines.times, lines.cloud.valid
         order = np.argsort(times, kind="stable")

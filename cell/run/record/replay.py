@@ -67,14 +67,15 @@ def replay(folder: Path, progress: Progress = lambda fraction, text: None) -> li
     with tempfile.TemporaryDirectory(prefix="cell-replay-") as name, FrameStore(Path(name) / "frames") as frames:
         nobody = behind_gate(config, Clock())
         here = Workplace(
-            config, job, nominal, calibration, nobody, frames, Path(name), Whereabouts(cast(Vehicle, None))
+            config, job, nominal, calibration=calibration, devices=nobody, frames=frames, folder=Path(name),
+            whereabouts=Whereabouts(cast(Vehicle, None))
         )  # fmt: skip
         progress(0.05, "photograph")
         fix = _photograph(here, folder, kept["photograph"])
         compared = [_compare_fix(fix, kept["photograph"])]
         progress(0.15, "sweep")
         sweep = _sweep(here, folder, fix, resumed=bool(kept["earlier_sweep"]))
-        compared += _perceive(here, folder, kept, sweep, fix, progress)
+        compared += _perceive(here, folder, kept, sweep=sweep, fix=fix, progress=progress)
     progress(0.95, "pictures of the record")
     return compared + _pictures(folder)
 
@@ -102,13 +103,23 @@ class _Kept:
     def state(self, max_age: float = 0.1) -> ArmState:
         """Where the flange was at the photograph."""
         nothing = np.zeros(6)
-        return ArmState(0.0, nothing, nothing, self._flange, nothing, ArmSafety.NORMAL, False, 0, 0)
+        return ArmState(
+            0.0,
+            nothing,
+            nothing,
+            flange=self._flange,
+            wrench=nothing,
+            safety=ArmSafety.NORMAL,
+            moving=False,
+            digital_inputs=0,
+            digital_outputs=0,
+        )
 
     def grab(self, timeout: float = 2.0) -> Frame:
         """The next of its pictures."""
         path = self._files[self._next]
         self._next += 1
-        return Frame(read_image(path, self._shape), self._next, 0.0, 0.0, 0.0, 0.0)
+        return Frame(read_image(path, self._shape), self._next, 0.0, device_time=0.0, host_time=0.0, received=0.0)
 
 
 def _photograph(here: Workplace, folder: Path, told: dict[str, Any]) -> BoardFix:
@@ -118,10 +129,10 @@ def _photograph(here: Workplace, folder: Path, told: dict[str, Any]) -> BoardFix
         cast(Arm, seen),
         cast(Camera, seen),
         here.calibration.target,
-        here.board,
-        here.job.photo,
-        here.repeatability,
-        len(told["files"]),
+        spec=here.board,
+        limits=here.job.photo,
+        repeatability=here.repeatability,
+        count=len(told["files"]),
     )
     return settled(fix, here.config.arm.vehicle_from_base.se3().inverse())
 

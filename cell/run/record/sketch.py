@@ -18,7 +18,7 @@ from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
 from cell.motion.arm_models import arm_kinematics
 from cell.motion.bodies import Body
-from cell.procedures.frame_store import Picture
+from cell.procedures.frame_store import FrameFile
 from cell.run.record.channels import CAMERAS
 from drivers.errors import CellError
 from drivers.interfaces import ArmState
@@ -91,7 +91,7 @@ class Sketch:
             return None
         return drawing.lens(at, camera, (found.scan if camera == "scan_camera" else found.target).camera)
 
-    def image(self, at: int, camera: str, picture: Picture) -> bytes | None:
+    def image(self, at: int, camera: str, picture: FrameFile) -> bytes | None:
         """A picture as its file has it; None where there is none."""
         from cell.run.record import small
 

@@ -6,14 +6,14 @@ import math
 import time
 
 from drivers.clock import Clock
-from statemachine.waiting import VirtualClock
+from statemachine.waiting import WaitableClock
 
 
 class Times:
     """Turns the times that others tell into those of a record; all in ns."""
 
     def __init__(self, clock: Clock) -> None:
-        self.virtual = isinstance(clock, VirtualClock)
+        self.virtual = isinstance(clock, WaitableClock)
         self.name = "virtual" if self.virtual else "wall"
         self._clock = clock
         self._begun, self._epoch = clock.now(), time.time_ns()

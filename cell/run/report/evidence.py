@@ -20,7 +20,7 @@ CLOUD = "cloud.ply"
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class RefusalEvidence:
     """`numbers` that a refusal rests on, first those that decided; `seen` what was looked at, by name (`frame` and
     `view` of the board, `cloud`, `pose` of the surface that was judged and not believed)."""
 
@@ -28,7 +28,7 @@ class Evidence:
     seen: Mapping[str, object]
 
     @classmethod
-    def of(cls, result: RunResult) -> Evidence:
+    def of(cls, result: RunResult) -> RefusalEvidence:
         """What the error behind the end of a run shows; nothing for other ends."""
         error = result.error
         if result.outcome is Outcome.REFUSED and isinstance(error, RefusedError):
@@ -48,7 +48,7 @@ def refusal(result: RunResult, folder: Path, frames: FrameStore) -> dict[str, An
     return {
         "step": ended_in(result),
         "reason": result.reason,
-        "numbers": [number.as_dict() for number in Evidence.of(result).numbers],
+        "numbers": [number.as_dict() for number in RefusalEvidence.of(result).numbers],
         "frames": last_frames(result, frames),
         "cloud": CLOUD if (folder / CLOUD).exists() else None,
     }
@@ -66,7 +66,7 @@ def measured(
 ) -> list[dict[str, Any]]:
     """Every figure that the run was or can be judged by, beside its limit: what decided a refusal comes first."""
     fix, pose, placed = (result.results.get(name) for name in ("board_photo", "invert_pose", "place"))
-    found = list(Evidence.of(result).numbers)
+    found = list(RefusalEvidence.of(result).numbers)
     tolerance = 1e3 * job.place.tolerance
     if truth is not None:
         found.append(Measured("place error, largest of 45 points", truth["error_mm"]["d"]["max"], "mm", most=tolerance))

@@ -21,10 +21,10 @@ from cell.measure.reconstruction import Cloud
 from cell.measure.vision import BoardView
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
-from cell.procedures.steps.drive_to_target import Arrival
+from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.sweep.sweep_record import SweepRecord
-from cell.run.report.evidence import Evidence, ended_in
+from cell.run.report.evidence import RefusalEvidence, ended_in
 from cell.run.report.figures import simulated_words
 from cell.run.report.panels import (
     BoardPanel,
@@ -57,7 +57,7 @@ def draw_run(
     path: Path, job: Job, nominal: NominalSurface, result: RunResult, report: Mapping[str, Any], frames: FrameStore
 ) -> None:
     """Draw a run's picture from what its steps made, from what its end shows, and from its report."""
-    evidence = Evidence.of(result)
+    evidence = RefusalEvidence.of(result)
     figure = Figure(figsize=(WIDTH, HEIGHT), dpi=110)
     title = f"{report['outcome'].upper()}: run {report['run']}, job {job.job.name}"
     if words := simulated_words(report["simulated"]):
@@ -88,7 +88,7 @@ def draw_run(
     figure.savefig(path, pil_kwargs={"compress_level": COMPRESSION})
 
 
-def _board(result: RunResult, evidence: Evidence, frames: FrameStore) -> BoardPanel | None:
+def _board(result: RunResult, evidence: RefusalEvidence, frames: FrameStore) -> BoardPanel | None:
     """The photograph that mattered last: the refused one, one of a step that broke off, or the one measured with."""
     frame, view = evidence.seen.get("frame"), evidence.seen.get("view")
     if isinstance(frame, Frame):
@@ -96,14 +96,14 @@ def _board(result: RunResult, evidence: Evidence, frames: FrameStore) -> BoardPa
     if frames.last is not None and frames.last[0].startswith("board") and ended_in(result) is not None:
         return BoardPanel(frames.last[1].image, None)
     fix, arrival = result.results.get("board_photo"), result.results.get("drive_to_target")
-    if not isinstance(fix, BoardFix) and isinstance(arrival, Arrival):
+    if not isinstance(fix, BoardFix) and isinstance(arrival, VehicleArrival):
         fix = arrival.fix
     if not isinstance(fix, BoardFix):
         return None
     return BoardPanel(fix.frames[-1].image, fix.views[-1] if fix.views else None, fix.residual_px)
 
 
-def _surface(job: Job, nominal: NominalSurface, result: RunResult, evidence: Evidence) -> SurfacePanel | None:
+def _surface(job: Job, nominal: NominalSurface, result: RunResult, evidence: RefusalEvidence) -> SurfacePanel | None:
     """The cloud in the surface's frame, with deviations where a pose was found, believed or not."""
     made, pose, fix = (result.results.get(name) for name in ("reconstruct", "invert_pose", "board_photo"))
     cloud = made.cloud if isinstance(made, Reconstruction) else evidence.seen.get("cloud")

@@ -25,7 +25,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.sweep.sweep_record import SweepRecord
 from cell.run.files.folder import REPORT, timeless, when
 from cell.run.report.evidence import last_frames, measured, refusal
-from cell.run.report.truth import Witness, expected_error, place_error, pose_error, sensor_error
+from cell.run.report.truth import TruthRecorder, expected_error, place_error, pose_error, sensor_error
 from drivers.interfaces import Vector
 from statemachine.runner import RunResult
 from statemachine.step import summary_of
@@ -42,7 +42,7 @@ def make_report(
     result: RunResult,
     info: dict[str, Any],
     started: float,
-    witness: Witness | None,
+    witness: TruthRecorder | None,
     frames: FrameStore,
 ) -> dict[str, Any]:
     """Everything about a run as JSON-ready data; also `report.json` and `picture.png` in its folder.
@@ -89,7 +89,7 @@ def make_report(
     _write(folder, sealed(strict(timeless(report))))
     if witness is not None:
         try:
-            _add_truth(report, job, nominal, repeatability, result, witness)
+            _add_truth(report, job, nominal, repeatability=repeatability, result=result, witness=witness)
         except Exception as error:
             report["truth_missing"] = f"{type(error).__name__}: {error}"
     report["measured"] = measured(result, job, report["truth"], report["place_bound_95"])
@@ -97,7 +97,7 @@ def make_report(
         # Drawing is the slowest thing to load, and a command that jogs or stops the cell does not draw.
         from cell.run.report.pictures import draw_run
 
-        draw_run(folder / "picture.png", job, nominal, result, report, frames)
+        draw_run(folder / "picture.png", job, nominal, result=result, report=report, frames=frames)
     except Exception as error:
         report["picture_missing"] = f"{type(error).__name__}: {error}"
     report = sealed(strict(timeless(report)))
@@ -197,7 +197,7 @@ def _add_truth(
     nominal: NominalSurface,
     repeatability: Vector,
     result: RunResult,
-    witness: Witness,
+    witness: TruthRecorder,
 ) -> None:
     """The comparison with the simulated world; raises when that does not answer any more."""
     now = witness.ask()
@@ -212,7 +212,7 @@ def _add_truth(
     truth = place_error(job, nominal, now)
     assert isinstance(sweep, SweepRecord)
     truth["bound_mm"] = expected_error(
-        job, nominal, pose, sweep.base_from_flange, len(sweep.swaths), repeatability, now
+        job, nominal, pose, sweep.base_from_flange, sweeps=len(sweep.swaths), configured=repeatability, truth=now
     )
     if isinstance(made, Reconstruction) and witness.at_sweep is not None:
         truth["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)

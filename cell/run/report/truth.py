@@ -19,7 +19,7 @@ from statemachine.runner import Event
 SENSOR_POINTS = 1000
 
 
-class Witness:
+class TruthRecorder:
     """Listens to a run and notes the truth right after the sweep, when the scanned surface was where it was scanned."""
 
     def __init__(self, ask: Callable[[], dict[str, Any]]) -> None:

@@ -82,7 +82,7 @@ def open_devices(
 
         if speed not in (None, loaded.cell.time_scale):
             raise ConfigError(f"speed={speed:g}: real devices keep the wall's time; leave that out")
-        mixed = MixedCell(undo, loaded, job, seed, level, beside_real, needed)
+        mixed = MixedCell(undo, loaded, job, seed=seed, level=level, simulated=beside_real, needed=needed)
         return Opened(mixed.config, folder, mixed.lock, mixed.devices, mixed.world)
     lock = undo.enter_context(CellLock(loaded, needed))
     devices = connect(loaded, needed)

@@ -59,7 +59,15 @@ class Opened:
 
     def mover(self, job: Job | None, hold: Callable[[], None] = lambda: None) -> Mover:
         """Planned moves of the arm; with a job, its part is in the claw. `hold` is called before each free motion."""
-        return Mover(self.devices.arm, self.devices.clock, self.config, job, hold, self.devices.interlocks, self.pace)
+        return Mover(
+            self.devices.arm,
+            self.devices.clock,
+            self.config,
+            job=job,
+            hold=hold,
+            interlocks=self.devices.interlocks,
+            pace=self.pace,
+        )
 
     @property
     def world(self) -> dict[str, Any]:
@@ -92,5 +100,5 @@ class Opened:
         """Do work outside a job in a run that was begun, and record it; raises what `RecordedWork.perform` does."""
         health = require_no_emergency_stop if kind in ("jog", "recovery") else require_healthy
         facts = {**self.facts, **(info or {})}
-        recorded = RecordedWork(run, kind, self.devices, self.runs_folder, facts, health, self.config)
+        recorded = RecordedWork(run, kind, self.devices, self.runs_folder, facts, health=health, config=self.config)
         return recorded.perform(work)

@@ -394,7 +394,7 @@ class Cell:
             if isinstance(error, CalibrationEdited) or not is_whole(self.simulated):
                 raise
         info |= {**self._here.world, **ready.info}
-        work = JobWork(self._here, job, ready, info, stored, before, inline, at_start)
+        work = JobWork(self._here, job, ready, info, stored=stored, before=before, inline=inline, at_start=at_start)
         return self.begin("job", work.perform, observer, stops)
 
     # --- calibration ---

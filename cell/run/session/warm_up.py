@@ -56,10 +56,10 @@ def compile_all() -> None:
     holed[LINES // 2, 3:-3] = np.nan
     find_outliers(holed[:, :, 2], np.full(x.shape, 1e-5))
     spread = np.zeros(points.shape, dtype=np.float32) + np.float32(1e-5)
-    fill_holes(Cloud(holed, spread, np.zeros((LINES, 3)), x, y[:, 0], np.zeros(x.shape, dtype=np.bool_)))
+    fill_holes(Cloud(holed, spread, np.zeros((LINES, 3)), x, rail=y[:, 0], rejected=np.zeros(x.shape, dtype=np.bool_)))
     flat, corners = points.reshape(-1, 3), np.arange(LINES**2).reshape(x.shape)[:-1, :-1].ravel()
     surface = NominalSurface(flat, np.stack([corners, corners + 1, corners + LINES], axis=1))
-    candidates(pin.SE3.Identity(), flat, surface, 0.002, 0.05, 1)
+    candidates(pin.SE3.Identity(), flat, surface, shift=0.002, turn=0.05, most=1)
     surface.feet(flat)
 
 

@@ -19,14 +19,14 @@ from drivers.arm.child.program import KICK_S, PERIOD, SETTLE_S, ControlProgram, 
 from drivers.arm.child.streaming import Streaming
 from drivers.arm.messages import (
     UNANSWERED,
+    ChildReply,
+    ChildRequest,
+    ChildSetup,
     Ended,
-    Pace,
-    Reply,
-    Request,
-    Setup,
     Snapshot,
+    StreamTiming,
 )
-from drivers.arm.motion import Trajectory, pose_difference
+from drivers.arm.motion import JointTrajectory, pose_difference
 from drivers.clock import Clock
 
 _PLACE_TOLERANCE, _TURN_TOLERANCE = 1e-3, 2e-3
@@ -37,10 +37,10 @@ class ControlThread:
 
     def __init__(
         self,
-        setup: Setup,
+        setup: ChildSetup,
         control: Any,
         latest: Callable[[], Snapshot],
-        send: Callable[[Reply | Ended], None],
+        send: Callable[[ChildReply | Ended], None],
         lose: Callable[[str], None],
     ) -> None:
         self._control = control
@@ -49,7 +49,7 @@ class ControlThread:
         self._clock = Clock()
         self._program = ControlProgram(setup, control, latest)
         self._streaming = Streaming(setup, control, self._program, latest)
-        self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[ChildRequest] = queue.SimpleQueue()
         self._cause: End | None = None
         self.finished = threading.Event()
         threading.Thread(target=self._run, name="arm control", daemon=True).start()
@@ -57,32 +57,32 @@ class ControlThread:
     def stop_because(self, code: str, text: str) -> None:
         """Stop what moves; its motion then ends with this fault."""
         self._cause = code, text
-        self.submit(Request(UNANSWERED, "stop"))
+        self.submit(ChildRequest(UNANSWERED, "stop"))
 
     @property
     def late(self) -> float:
         """See `ControlProgram.late`."""
         return self._program.late
 
-    def submit(self, request: Request) -> None:
+    def submit(self, request: ChildRequest) -> None:
         """Queue a request. A stop drops what waits and ends what runs."""
         if request.name in ("stop", "close"):
             self._program.to_stop.set()
-            kept: list[Request] = []
+            kept: list[ChildRequest] = []
             with suppress(queue.Empty):
                 while True:
                     dropped = self._requests.get_nowait()
                     if dropped.name in ("stop", "close"):
                         kept.append(dropped)
                     else:
-                        self._send(Reply(dropped.number, ("arm.stopped", "")))
+                        self._send(ChildReply(dropped.number, ("arm.stopped", "")))
             for stop in kept:
                 self._requests.put(stop)
         self._requests.put(request)
 
     def _run(self) -> None:
         while not self.finished.is_set():
-            request: Request | None
+            request: ChildRequest | None
             try:
                 request = self._requests.get(timeout=KICK_S)
             except queue.Empty:
@@ -98,11 +98,11 @@ class ControlThread:
             except RuntimeError as error:
                 self._lose(f"ur-rtde failed: {error}")
 
-    def _serve(self, request: Request) -> None:
+    def _serve(self, request: ChildRequest) -> None:
         match request.name:
             case "stop":
                 self._program.to_stop.clear()
-                self._send(Reply(request.number, self._program.brake()))
+                self._send(ChildReply(request.number, self._program.brake()))
                 self._cause = None
             case "close":
                 # Whoever never had the arm leaves it as it is.
@@ -123,17 +123,17 @@ class ControlThread:
             case "follow":
                 self._follow(request)
             case other:
-                self._send(Reply(request.number, ("arm.internal", f"unknown request '{other}'")))
+                self._send(ChildReply(request.number, ("arm.internal", f"unknown request '{other}'")))
 
-    def _answer(self, request: Request, act: Callable[[], bool]) -> None:
+    def _answer(self, request: ChildRequest, act: Callable[[], bool]) -> None:
         problem = self._program.problem()
         if problem is None and not act():
             problem = self._program.problem() or ("arm.refused", f"the controller did not accept '{request.name}'")
-        self._send(Reply(request.number, problem))
+        self._send(ChildReply(request.number, problem))
 
     # --- moves of the controller's own ---
 
-    def _move_joints(self, request: Request) -> None:
+    def _move_joints(self, request: ChildRequest) -> None:
         motion, target, speed, acceleration = request.arguments
 
         def missed(snapshot: Snapshot) -> str:
@@ -141,7 +141,7 @@ class ControlThread:
 
         self._move(request, motion, lambda: self._control.moveJ(list(target), speed, acceleration, True), missed)
 
-    def _move_linear(self, request: Request) -> None:
+    def _move_linear(self, request: ChildRequest) -> None:
         motion, target, speed, acceleration = request.arguments
 
         def missed(snapshot: Snapshot) -> str:
@@ -152,17 +152,17 @@ class ControlThread:
         self._move(request, motion, lambda: self._control.moveL(list(target), speed, acceleration, True), missed)
 
     def _move(
-        self, request: Request, motion: int, start: Callable[[], bool], missed: Callable[[Snapshot], str]
+        self, request: ChildRequest, motion: int, start: Callable[[], bool], missed: Callable[[Snapshot], str]
     ) -> None:
         problem = self._program.problem()
         before = self._program.operation()[0]
         if problem is None and not start():
             problem = self._program.problem() or ("arm.refused", "the controller did not accept the move")
-        self._send(Reply(request.number, problem))
+        self._send(ChildReply(request.number, problem))
         if problem is None:
             self._end(motion, *(self._watch(before) or self._program.settled(missed)))
 
-    def _end(self, motion: int, how: str, text: str, pace: Pace | None = None) -> None:
+    def _end(self, motion: int, how: str, text: str, pace: StreamTiming | None = None) -> None:
         if how == "stopped" and self._cause is not None:
             how, text = self._cause
         if how not in ("arrived", "contact", "stopped") and (problem := self._program.end()) is not None:
@@ -186,10 +186,10 @@ class ControlThread:
             self._program.kick()
             self._clock.sleep(PERIOD)
 
-    def _follow(self, request: Request) -> None:
+    def _follow(self, request: ChildRequest) -> None:
         motion, times, joints, force_limit = request.arguments
         problem = self._program.problem()
-        self._send(Reply(request.number, problem))
+        self._send(ChildReply(request.number, problem))
         if problem is None:
-            how, text = self._streaming.stream(Trajectory(times, joints), force_limit)
+            how, text = self._streaming.stream(JointTrajectory(times, joints), force_limit)
             self._end(motion, how, text, self._streaming.pace)

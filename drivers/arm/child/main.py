@@ -27,12 +27,22 @@ from rtde_control import RTDEControlInterface
 from rtde_io import RTDEIOInterface
 
 from drivers.arm.child.control import ControlThread
-from drivers.arm.child.outbox import Message, Outbox
+from drivers.arm.child.outbox import ChildOutbox, Message
 from drivers.arm.child.outputs import OFF_S, keep_low, make_safe, switch_output
 from drivers.arm.child.packets import Packets
 from drivers.arm.child.program import PERIOD
 from drivers.arm.dashboard import Dashboard
-from drivers.arm.messages import MODE_RUNNING, UNANSWERED, Ended, Lost, Reply, Request, Setup, Snapshot, safety_code
+from drivers.arm.messages import (
+    MODE_RUNNING,
+    UNANSWERED,
+    ChildReply,
+    ChildRequest,
+    ChildSetup,
+    Ended,
+    Lost,
+    Snapshot,
+    safety_code,
+)
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.last_words_child import FROZEN_S, LOOK_S, Owner, raise_priority
@@ -48,7 +58,7 @@ _LAST_WORDS_S = 0.5
 class Child:
     """Connects to the arm and serves the owner at the other end of `pipe`."""
 
-    def __init__(self, pipe: Connection, setup: Setup) -> None:
+    def __init__(self, pipe: Connection, setup: ChildSetup) -> None:
         self._pipe = pipe
         self._setup = setup
         self._safe_off = setup.safe_off
@@ -60,7 +70,7 @@ class Child:
             self._snapshot = self._packets.read()
             control = self._take_control() if setup.control else None
         # Nobody listens: the same as the end of the pipe, which the main thread may not have seen yet.
-        self._outbox = Outbox(pipe, lambda: os.kill(os.getpid(), signal.SIGTERM))
+        self._outbox = ChildOutbox(pipe, lambda: os.kill(os.getpid(), signal.SIGTERM))
         self._attended_until, self._silence = math.inf, 0.0
         self._control = ControlThread(setup, control, lambda: self._snapshot, self._send, self._lose)
         threading.Thread(target=self._watch_arm, name="arm state", daemon=True).start()
@@ -107,18 +117,18 @@ class Child:
     def serve(self) -> None:
         """Obey the owner until it asks for the end or is gone, then end the process."""
         self._send(self._snapshot)
-        self._send(Reply(0))
+        self._send(ChildReply(0))
         closing = 0
         with suppress(EOFError, OSError):
             while True:
-                request: Request = self._pipe.recv()
+                request: ChildRequest = self._pipe.recv()
                 if request.name == "close":
                     closing = request.number
                     break
                 if request.name == "output":
-                    self._send(Reply(request.number, self._switch(*request.arguments)))
+                    self._send(ChildReply(request.number, self._switch(*request.arguments)))
                 elif request.name == "safe_off":
-                    self._send(Reply(request.number, self._go_off_in_the_end(*request.arguments)))
+                    self._send(ChildReply(request.number, self._go_off_in_the_end(*request.arguments)))
                 elif request.name == "alive":
                     self._owner.beat()
                 elif request.name == "attend":
@@ -153,13 +163,13 @@ class Child:
         if self._setup.control:
             self._leave_safe()
         if closing:
-            self._send(Reply(closing))
+            self._send(ChildReply(closing))
             self._outbox.drain(_LAST_WORDS_S)
         # The destructors of ur-rtde may hang or abort: the kernel closes the sockets.
         os._exit(0)
 
     def _leave_safe(self) -> None:
-        self._control.submit(Request(0, "close"))
+        self._control.submit(ChildRequest(0, "close"))
         for index in self._safe_off:
             switch_output(self._io, index, False)
         if not self._control.finished.wait(3.0):
@@ -189,7 +199,7 @@ class Child:
             if silence > 0 and time.monotonic() > self._attended_until:
                 # Again and again: an owner that hung may begin a motion afterwards.
                 self._attended_until = time.monotonic() + silence
-                self._control.submit(Request(UNANSWERED, "stop"))
+                self._control.submit(ChildRequest(UNANSWERED, "stop"))
             if not self._packets.connected:
                 self._lose("the arm closed the connection")
             if os.getppid() != self._parent:
@@ -226,7 +236,7 @@ class Child:
         self._outbox.put(message)
 
 
-def _prepare(control: Any, setup: Setup) -> None:
+def _prepare(control: Any, setup: ChildSetup) -> None:
     mass, centre = setup.payload
     steps: list[tuple[str, Callable[[], bool]]] = [
         ("the zero tool centre point", lambda: control.setTcp([0.0] * 6)),
@@ -270,11 +280,11 @@ def _serve(descriptor: int) -> None:
     end.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("ll", 2, 0))
     pipe = Connection(end.detach())
     try:
-        setup: Setup = pipe.recv()
+        setup: ChildSetup = pipe.recv()
         child = Child(pipe, setup)
     except (RuntimeError, ValueError, EOFError, OSError) as error:
         with suppress(OSError):
-            pipe.send(Reply(0, ("arm.not_connected", str(error))))
+            pipe.send(ChildReply(0, ("arm.not_connected", str(error))))
         os._exit(2)
     child.serve()
 

@@ -11,12 +11,12 @@ import threading
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 
-from drivers.arm.messages import Ended, Lost, Reply, Snapshot
+from drivers.arm.messages import ChildReply, Ended, Lost, Snapshot
 
-Message = Reply | Ended | Snapshot | Lost
+Message = ChildReply | Ended | Snapshot | Lost
 
 
-class Outbox:
+class ChildOutbox:
     """Sends messages in the order in which they were put; `on_gone` is called once when nobody takes them any more."""
 
     def __init__(self, pipe: Connection, on_gone: Callable[[], None]) -> None:

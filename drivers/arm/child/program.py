@@ -11,7 +11,7 @@ from typing import Any
 
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.faults import LATE_S, late_words
-from drivers.arm.messages import MODE_RUNNING, PLAYING, STOPPED, Setup, Six, Snapshot, safety_code
+from drivers.arm.messages import MODE_RUNNING, PLAYING, STOPPED, ChildSetup, Six, Snapshot, safety_code
 from drivers.arm.motion import largest_difference
 from drivers.clock import Clock
 from drivers.errors import DeviceError
@@ -40,7 +40,7 @@ class ControlProgram:
     `to_stop` is set as long as whatever moves is to come to rest.
     """
 
-    def __init__(self, setup: Setup, interface: Any, latest: Callable[[], Snapshot]) -> None:
+    def __init__(self, setup: ChildSetup, interface: Any, latest: Callable[[], Snapshot]) -> None:
         self.to_stop = threading.Event()
         self._setup = setup
         self._control = interface

@@ -8,12 +8,13 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 from drivers.arm.child.program import BRAKING_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
-from drivers.arm.messages import Pace, Setup, Six, Snapshot
-from drivers.arm.motion import Trajectory
+from drivers.arm.messages import ChildSetup, Six, Snapshot, StreamTiming
+from drivers.arm.motion import JointTrajectory
 from drivers.clock import Clock
 
 _LOOKAHEAD, _GAIN = 0.05, 500
@@ -24,10 +25,31 @@ _AHEAD_S, _FEELING_S = 0.04, 0.02
 reaches the arm in one go after a halt of its computer is a jump of so much."""
 
 
+@dataclass
+class _Course:
+    """How far a stream has come.
+
+    Cycle 0 began at `start`, s of the machine's clock; the arm's clock showed `seen` when it was last looked at.
+    `cycle` counts points that went out, which run `lead` s ahead of the arm. `elapsed` s of the trajectory are sent;
+    time runs at `pace`, which becomes `slower` in each cycle of a stop, and that ends at `braked_by` at the latest.
+    """
+
+    start: float
+    seen: float
+    cycle: int = 0
+    lead: float = 0.0
+    elapsed: float = 0.0
+    pace: float = 1.0
+    slower: float = 0.0
+    braked_by: float = math.inf
+
+
 class Streaming:
     """Streams through ur-rtde's control `interface`, beside which `program` watches and stops the arm."""
 
-    def __init__(self, setup: Setup, interface: Any, program: ControlProgram, latest: Callable[[], Snapshot]) -> None:
+    def __init__(
+        self, setup: ChildSetup, interface: Any, program: ControlProgram, latest: Callable[[], Snapshot]
+    ) -> None:
         self._setup = setup
         self._control = interface
         self._program = program
@@ -36,13 +58,13 @@ class Streaming:
         self._sent: list[float] = []
 
     @property
-    def pace(self) -> Pace | None:
+    def pace(self) -> StreamTiming | None:
         """How regularly the points of the newest trajectory were sent."""
         return pace_of(self._sent)
 
     # --- streaming ---
 
-    def stream(self, trajectory: Trajectory, force_limit: float | None) -> End:
+    def stream(self, trajectory: JointTrajectory, force_limit: float | None) -> End:
         """Stream the trajectory, time running `rate` times as fast as the wall, then stand still.
 
         A stop slows time down to nothing, so that the arm brakes on its way: the controller's own stop takes all its
@@ -51,50 +73,67 @@ class Streaming:
         self._sent = []
         force_before = self._mean_force() if force_limit is not None else ()
         allowed = _AHEAD_S if force_limit is None else _FEELING_S
-        start = time.monotonic()
-        seen, lead = self._latest().device_time, 0.0
-        cycle, how, text = 0, "", ""
-        elapsed, pace, slower, braked_by = 0.0, 1.0, 0.0, math.inf
+        course = _Course(time.monotonic(), self._latest().device_time)
+        how, text = "", ""
         self._program.awake(math.inf)
         while not how:
-            due = start + cycle * PERIOD
-            self._clock.sleep(due - time.monotonic())
-            late = time.monotonic() - due
-            self._program.awake(PERIOD)
-            if late > _SLIP_S:
-                # The machine held this thread up. Going on where the arm is told to stand, not where it should have
-                # been by now: the latter would be a jump.
-                start += late
-            newest = self._latest().device_time
-            lead, seen = max(0.0, lead - (newest - seen) / self._setup.rate), newest
-            if self._program.to_stop.is_set() and not slower:
-                slower = PERIOD * self._setup.rate * _SERVO_BRAKING / max(trajectory.speed_at(elapsed), 1e-6)
-                braked_by = time.monotonic() + BRAKING_S
-            if lead > allowed:
+            self._wait_for_cycle(course)
+            self._begin_to_brake(course, trajectory)
+            if course.lead > allowed:
                 # The arm would go on unseen, and what is sent would pile up before it and before the next stop.
-                start += PERIOD
-                self._program.note_late(lead)
+                course.start += PERIOD
+                self._program.note_late(course.lead)
                 self._program.kick()
-            elif self._control.servoJ(list(trajectory.at(elapsed)), 0.0, 0.0, PERIOD, _LOOKAHEAD, _GAIN):
-                self._sent.append(time.monotonic())
-                cycle += 1
-                lead += PERIOD
-                elapsed += PERIOD * self._setup.rate * pace
-                pace = max(0.0, pace - slower)
-            else:
+            elif not self._send(course, trajectory):
                 how, text = self._program.problem() or ("arm.refused", "the controller did not accept a streamed point")
                 break
-            standing = pace == 0.0 and self._latest().at_rest
-            if self._program.to_stop.is_set() and (standing or lead > allowed or time.monotonic() > braked_by):
+            if self._program.to_stop.is_set() and self._braked(course, allowed):
                 how = "stopped"
             else:
-                how, text = self._over(trajectory, elapsed, force_before, force_limit)
+                how, text = self._over(trajectory, course.elapsed, force_before, force_limit)
         self._control.servoStop(_SERVO_BRAKING)
         if how == "arrived":
             return self._program.settled(lambda snapshot: _missed(snapshot, trajectory))
         return self._program.brake() or (how, text) if how in ("stopped", "contact") else (how, text)
 
-    def _over(self, trajectory: Trajectory, elapsed: float, before: Six, force_limit: float | None) -> End:
+    def _wait_for_cycle(self, course: _Course) -> None:
+        """Sleep until the next point is due, and see how far the arm has come."""
+        due = course.start + course.cycle * PERIOD
+        self._clock.sleep(due - time.monotonic())
+        late = time.monotonic() - due
+        self._program.awake(PERIOD)
+        if late > _SLIP_S:
+            # The machine held this thread up. Going on where the arm is told to stand, not where it should have
+            # been by now: the latter would be a jump.
+            course.start += late
+        newest = self._latest().device_time
+        course.lead = max(0.0, course.lead - (newest - course.seen) / self._setup.rate)
+        course.seen = newest
+
+    def _begin_to_brake(self, course: _Course, trajectory: JointTrajectory) -> None:
+        """After a stop, once: how much slower time becomes in each cycle."""
+        if self._program.to_stop.is_set() and not course.slower:
+            speed = max(trajectory.speed_at(course.elapsed), 1e-6)
+            course.slower = PERIOD * self._setup.rate * _SERVO_BRAKING / speed
+            course.braked_by = time.monotonic() + BRAKING_S
+
+    def _send(self, course: _Course, trajectory: JointTrajectory) -> bool:
+        """Send the next point; False when the controller does not take it."""
+        if not self._control.servoJ(list(trajectory.at(course.elapsed)), 0.0, 0.0, PERIOD, _LOOKAHEAD, _GAIN):
+            return False
+        self._sent.append(time.monotonic())
+        course.cycle += 1
+        course.lead += PERIOD
+        course.elapsed += PERIOD * self._setup.rate * course.pace
+        course.pace = max(0.0, course.pace - course.slower)
+        return True
+
+    def _braked(self, course: _Course, allowed: float) -> bool:
+        """Whether streaming may end for a stop: the arm stands, is not seen, or takes too long."""
+        standing = course.pace == 0.0 and self._latest().at_rest
+        return standing or course.lead > allowed or time.monotonic() > course.braked_by
+
+    def _over(self, trajectory: JointTrajectory, elapsed: float, before: Six, force_limit: float | None) -> End:
         """Whether streaming is over, and why; an empty reason to go on."""
         snapshot = self._latest()
         if (problem := self._program.problem()) is not None:
@@ -116,16 +155,16 @@ class Streaming:
         return tuple(sum(values) / len(samples) for values in zip(*samples, strict=True))
 
 
-def _missed(snapshot: Snapshot, trajectory: Trajectory) -> str:
+def _missed(snapshot: Snapshot, trajectory: JointTrajectory) -> str:
     return joints_off(snapshot, trajectory.end, "the trajectory's end")
 
 
-def pace_of(times: list[float]) -> Pace | None:
+def pace_of(times: list[float]) -> StreamTiming | None:
     """The pace of points that were sent at these times, s on the wall; None of less than three."""
     if len(times) < 3:
         return None
     gaps = sorted(after - before for before, after in pairwise(times))
     count = len(gaps)
-    return Pace(
+    return StreamTiming(
         len(times), count / (times[-1] - times[0]), gaps[count // 2], gaps[min(count - 1, count * 99 // 100)], gaps[-1]
     )

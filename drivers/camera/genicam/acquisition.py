@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.camera.genicam.aravis import Aravis, AravisError, Status
+from drivers.camera.genicam.aravis import Aravis, AravisError, BufferStatus
 from drivers.camera.genicam.device import GenicamDevice
 from drivers.camera.genicam.pixels import NAMES, to_grey
 from drivers.errors import CellError
@@ -31,7 +31,7 @@ _WRAP = 0xFFFF
 
 
 @dataclass(frozen=True)
-class Picture:
+class AcquiredPicture:
     """A complete picture; `device_ns` is the camera's time stamp, `count` counts its exposures in this acquisition."""
 
     image: Image
@@ -87,7 +87,7 @@ class Acquisition:
         device: GenicamDevice,
         network: Network | None,
         buffers: int,
-        take: Callable[[Picture], None],
+        take: Callable[[AcquiredPicture], None],
         failed: Callable[[], None],
         statistics: LinkStatistics,
     ) -> None:
@@ -189,9 +189,14 @@ class Acquisition:
 
     def _look_at(self, buffer: Any) -> None:
         library = self._library
-        status = Status(library.plain("arv_buffer_get_status", buffer))
-        if status is not Status.SUCCESS:
-            if status in (Status.TIMEOUT, Status.MISSING_PACKETS, Status.WRONG_PACKET_ID, Status.SIZE_MISMATCH):
+        status = BufferStatus(library.plain("arv_buffer_get_status", buffer))
+        if status is not BufferStatus.SUCCESS:
+            if status in (
+                BufferStatus.TIMEOUT,
+                BufferStatus.MISSING_PACKETS,
+                BufferStatus.WRONG_PACKET_ID,
+                BufferStatus.SIZE_MISMATCH,
+            ):
                 self.incomplete += 1
                 self._statistics.count("frames_incomplete")
                 self._failed()
@@ -199,7 +204,7 @@ class Acquisition:
         if (kind := library.plain("arv_buffer_get_payload_type", buffer)) != _IMAGE:
             raise ValueError(f"it sends payload type {kind} instead of plain pictures; switch chunks and multipart off")
         self._take(
-            Picture(
+            AcquiredPicture(
                 self._image(buffer),
                 self._ids.of(library.plain("arv_buffer_get_frame_id", buffer)),
                 library.plain("arv_buffer_get_timestamp", buffer),

@@ -114,7 +114,7 @@ _BASIC = {"int": 6 << 2, "uint": 7 << 2, "double": 15 << 2}
 """GObject's numbers of its basic types."""
 
 
-class Status(IntEnum):
+class BufferStatus(IntEnum):
     """How a buffer came back: `ArvBufferStatus`."""
 
     UNKNOWN = -1

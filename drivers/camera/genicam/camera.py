@@ -13,11 +13,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from drivers.camera.frame_queue import FrameQueue
-from drivers.camera.genicam.acquisition import Acquisition, Picture
-from drivers.camera.genicam.connection import Setup, connect
+from drivers.camera.genicam.acquisition import AcquiredPicture, Acquisition
+from drivers.camera.genicam.connection import GenicamSetup, connect
 from drivers.camera.genicam.device import GenicamDevice, Place
 from drivers.camera.genicam.settings import Wish, set_timing, set_trigger
-from drivers.camera.genicam.stamps import Stamps
+from drivers.camera.genicam.stamps import StampClock
 from drivers.clock import Clock
 from drivers.endings import in_the_end
 from drivers.errors import CellError, DeviceFault, InterlockError, NotConnectedError
@@ -36,7 +36,7 @@ class GenicamCamera:
     the camera or it refuses a setting, `LimitError` when a setting is outside its range.
     """
 
-    def __init__(self, name: str, place: Place, setup: Setup, *, clock: Clock, look: bool = False) -> None:
+    def __init__(self, name: str, place: Place, setup: GenicamSetup, *, clock: Clock, look: bool = False) -> None:
         self.name = name
         self.statistics = LinkStatistics()
         self.shape = (setup.region.height, setup.region.width)
@@ -134,7 +134,7 @@ class GenicamCamera:
         device, self._serial = connect(
             self.name, self._place, self._setup, self._wish, look=self._look, serial=self._serial
         )
-        self._device, self._stamps = device, Stamps(self.name, self._clock)
+        self._device, self._stamps = device, StampClock(self.name, self._clock)
         if not self._look:
             try:
                 self._stamps.compare(device)
@@ -196,7 +196,7 @@ class GenicamCamera:
         )
         base = self._count
 
-        def take(picture: Picture) -> None:
+        def take(picture: AcquiredPicture) -> None:
             self._count = base + picture.count
             frame = self._frame(picture, self._count)
             if (fault := self._stamps.impossible(frame)) is not None:
@@ -207,7 +207,7 @@ class GenicamCamera:
 
         network = self._setup.network if self._place.control else None
         buffers = max(4, min(64, _QUEUE_BYTES // max(1, self.shape[0] * self.shape[1])))
-        acquisition = Acquisition(device, network, buffers, take, queue.wake, self.statistics)
+        acquisition = Acquisition(device, network, buffers, take=take, failed=queue.wake, statistics=self.statistics)
         self._queue, self._acquisition = queue, acquisition
         try:
             with in_the_end(acquisition.stop):
@@ -230,7 +230,7 @@ class GenicamCamera:
                     return frame
                 self.statistics.count("stale_frames")
 
-    def _frame(self, picture: Picture, count: int) -> Frame:
+    def _frame(self, picture: AcquiredPicture, count: int) -> Frame:
         received = self._clock.now()
         if picture.image.shape != self.shape:
             height, width = picture.image.shape
@@ -238,7 +238,7 @@ class GenicamCamera:
         assert self._wish is not None
         device_time = picture.device_ns * 1e-9 if self._device.stamps else 0.0
         host_time = self._stamps.host_time(device_time, latest=received - self._wish.exposure)
-        return Frame(picture.image, count, self._wish.exposure, device_time, host_time, received)
+        return Frame(picture.image, count, self._wish.exposure, device_time, host_time=host_time, received=received)
 
     def _timing(self, device: GenicamDevice) -> Wish:
         """What is set; before the first `configure` whatever the camera has."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from drivers.camera.genicam.acquisition import Network
 from drivers.camera.genicam.aravis import AravisMissing, load
 from drivers.camera.genicam.device import GenicamDevice, Place
-from drivers.camera.genicam.settings import Region, Trigger, Wish, set_image, set_timing
+from drivers.camera.genicam.settings import ExposureTrigger, Region, Wish, set_image, set_timing
 from drivers.errors import CellError, DeviceFault, NotConnectedError
 
 _NO_RAW_SOCKETS = 1
@@ -15,18 +15,18 @@ _NEVER = 0
 
 
 @dataclass(frozen=True)
-class Setup:
+class GenicamSetup:
     """How the camera is to be set: the picture's format and region, gain in dB (None: as it is), trigger, network."""
 
     region: Region
     pixel_format: str = "Mono8"
     gain: float | None = None
-    trigger: Trigger = field(default_factory=Trigger)
+    trigger: ExposureTrigger = field(default_factory=ExposureTrigger)
     network: Network = field(default_factory=Network)
 
 
 def connect(
-    name: str, place: Place, setup: Setup, wish: Wish | None, *, look: bool, serial: str | None
+    name: str, place: Place, setup: GenicamSetup, wish: Wish | None, *, look: bool, serial: str | None
 ) -> tuple[GenicamDevice, str]:
     """The camera at `place`, set up unless it is only looked at, and its serial number.
 

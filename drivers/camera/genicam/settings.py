@@ -26,7 +26,7 @@ class Region:
 
 
 @dataclass(frozen=True)
-class Trigger:
+class ExposureTrigger:
     """What begins an exposure.
 
     "software": a photograph is triggered by a command, a stream runs free. "free": both run free. "line": both wait for
@@ -70,7 +70,7 @@ def set_image(device: GenicamDevice, region: Region, pixel_format: str, gain: fl
     _set_text(device, "PixelFormat", pixel_format, f"known here: {', '.join(FORMATS)}")
     if gain is not None:
         low, high = device.bounds("gain")
-        check_range(device.name, "gain", gain, low, high, "")
+        check_range(device.name, "gain", gain, low=low, high=high, unit="")
         device.call("set_gain", gain)
         _check_taken(device, "gain", gain, device.call("get_gain"), "")
 
@@ -85,7 +85,7 @@ def set_timing(device: GenicamDevice, wish: Wish | None, *, paced: bool) -> Wish
     if wish is None:
         return Wish(device.call("get_exposure_time") * 1e-6, device.call("get_frame_rate") if rated else 1.0)
     low, high = device.bounds("exposure_time")
-    check_range(device.name, "exposure", wish.exposure, low * 1e-6, high * 1e-6, "s")
+    check_range(device.name, "exposure", wish.exposure, low=low * 1e-6, high=high * 1e-6, unit="s")
     if rated:
         check_positive(device.name, "frame rate", wish.frame_rate, device.bounds("frame_rate")[1], "Hz")
     else:
@@ -109,7 +109,7 @@ def set_timing(device: GenicamDevice, wish: Wish | None, *, paced: bool) -> Wish
     return Wish(taken, wish.frame_rate)
 
 
-def set_trigger(device: GenicamDevice, trigger: Trigger, wish: Wish, *, photograph: bool) -> bool:
+def set_trigger(device: GenicamDevice, trigger: ExposureTrigger, wish: Wish, *, photograph: bool) -> bool:
     """Set what begins the exposures of a photograph, or of a stream; whether a command has to trigger them.
 
     Raises `DeviceFault` when the camera does not offer it.

@@ -21,7 +21,7 @@ _SLACK_S = 0.002
 """By how much a time stamp may leave the interval of its trigger beyond what the clocks are known to."""
 
 
-class Stamps:
+class StampClock:
     """The stamps of the camera `name` since it was connected."""
 
     def __init__(self, name: str, clock: Clock) -> None:

@@ -19,7 +19,7 @@ _STALL_FLAG = 1
 _DRIVER_FAULTS = {1: "driver too hot", 3: "short circuit in phase A", 4: "short circuit in phase B"}
 
 
-class Arrival:
+class ArrivalWatch:
     """Watches one positioning to `target` (microsteps; `counts` microsteps per m), appending readings to `samples`.
 
     `issued` is the count of stops it was commanded under. `zero` is asked whether the count still holds, and told when

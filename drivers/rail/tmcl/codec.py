@@ -23,7 +23,7 @@ STATUS_TEXT = {
 """What a module says when it refuses a command."""
 
 
-class Command(IntEnum):
+class TmclCommand(IntEnum):
     """Command numbers."""
 
     ROTATE_RIGHT = 1
@@ -65,7 +65,7 @@ class Axis(IntEnum):
     UNIT_MODE = 255
 
 
-class Reference(IntEnum):
+class ReferenceSearch(IntEnum):
     """Types of the reference-search command."""
 
     START = 0
@@ -78,7 +78,7 @@ class TelegramError(ValueError):
 
 
 @dataclass(frozen=True)
-class Request:
+class TmclRequest:
     """One command to a module; `value` is a signed 32-bit number."""
 
     address: int
@@ -97,7 +97,7 @@ class Request:
 
 
 @dataclass(frozen=True)
-class Reply:
+class TmclReply:
     """One answer; `value` is a signed 32-bit number."""
 
     host: int
@@ -112,7 +112,7 @@ def checksum(body: bytes) -> int:
     return sum(body) & 0xFF
 
 
-def decode_reply(data: bytes, request: Request) -> Reply:
+def decode_reply(data: bytes, request: TmclRequest) -> TmclReply:
     """Read the answer to `request`.
 
     Raises `TelegramError` when `data` is not nine bytes, fails its checksum, or comes from another module or from
@@ -122,7 +122,7 @@ def decode_reply(data: bytes, request: Request) -> Reply:
         raise TelegramError(f"{len(data)} bytes instead of {TELEGRAM_BYTES}")
     if checksum(data[:-1]) != data[-1]:
         raise TelegramError(f"checksum 0x{data[-1]:02x} instead of 0x{checksum(data[:-1]):02x}")
-    reply = Reply(*_BODY.unpack(data[:-1]))
+    reply = TmclReply(*_BODY.unpack(data[:-1]))
     if reply.module != request.address:
         raise TelegramError(f"answer of module {reply.module} instead of {request.address}")
     if reply.command != request.command:
@@ -131,7 +131,7 @@ def decode_reply(data: bytes, request: Request) -> Reply:
 
 
 def decode_firmware(data: bytes) -> str:
-    """Read the answer to `Command.FIRMWARE`, type 0: the host's address, then eight ASCII characters, no checksum."""
+    """The answer to `TmclCommand.FIRMWARE`, type 0: the host's address, then eight ASCII characters, no checksum."""
     text = data[1:]
     if len(data) != TELEGRAM_BYTES or not text.isascii() or not text.decode("ascii").isprintable():
         raise TelegramError(f"{data.hex(' ')} is not a firmware text")

@@ -23,11 +23,11 @@ from drivers.rail.tmcl.codec import (
     STATUS_TEXT,
     TELEGRAM_BYTES,
     Axis,
-    Command,
-    Reference,
-    Reply,
-    Request,
+    ReferenceSearch,
     TelegramError,
+    TmclCommand,
+    TmclReply,
+    TmclRequest,
     decode_firmware,
     decode_reply,
 )
@@ -46,7 +46,7 @@ _USER_BANK = 2
 _FENCE_TYPE = 1
 """Axis parameter 1 is the position; that a module has no such global parameter does not matter."""
 
-_STOPS = (Command.MOTOR_STOP, Command.REFERENCE_SEARCH)
+_STOPS = (TmclCommand.MOTOR_STOP, TmclCommand.REFERENCE_SEARCH)
 """Sent whatever happened before."""
 
 Answer = TypeVar("Answer")
@@ -95,8 +95,8 @@ class TmclLink:
                 name, f"port {url} cannot be opened: {error}. Check the address and that nothing else has it open"
             ) from error
         stops = (
-            Request(address, Command.REFERENCE_SEARCH, Reference.STOP, motor),
-            Request(address, Command.MOTOR_STOP, 0, motor),
+            TmclRequest(address, TmclCommand.REFERENCE_SEARCH, ReferenceSearch.STOP, motor),
+            TmclRequest(address, TmclCommand.MOTOR_STOP, 0, motor),
         )
         self._stop_words = [stop.encode() for stop in stops]
         self._last_words: LastWords | None = None
@@ -108,49 +108,49 @@ class TmclLink:
 
     def get(self, axis: Axis) -> int:
         """Read an axis parameter."""
-        return self._command(Command.GET_AXIS, axis).value
+        return self._command(TmclCommand.GET_AXIS, axis).value
 
     def get_stamped(self, axis: Axis) -> tuple[int, float, float]:
         """Read an axis parameter: value, host time of the middle of the round trip, round trip; in clock seconds."""
-        request = Request(self._address, Command.GET_AXIS, axis, self._motor)
+        request = TmclRequest(self._address, TmclCommand.GET_AXIS, axis, self._motor)
         return self._exchange(request, lambda data: self._checked(data, request).value, issued=None)
 
     def set(self, axis: Axis, value: int, *, issued: int | None = None) -> None:
         """Write an axis parameter."""
-        self._command(Command.SET_AXIS, axis, value, issued=issued)
+        self._command(TmclCommand.SET_AXIS, axis, value, issued=issued)
 
     def move_to(self, microsteps: int, *, issued: int) -> None:
         """Start a move to an absolute position, unless a stop came after `issued`."""
         self._stop_after_death()
-        self._command(Command.MOVE_TO, 0, microsteps, issued=issued)
+        self._command(TmclCommand.MOVE_TO, 0, microsteps, issued=issued)
 
     def reference_search(self, kind: int, *, issued: int | None = None) -> int:
         """Start, stop or query the reference search; the query's value is 0 once it is done."""
-        if kind == Reference.START:
+        if kind == ReferenceSearch.START:
             self._stop_after_death()
-        return self._command(Command.REFERENCE_SEARCH, kind, issued=issued).value
+        return self._command(TmclCommand.REFERENCE_SEARCH, kind, issued=issued).value
 
     def stop(self) -> None:
         """Stop the reference search, whoever began it, and the motor; commands issued earlier are refused."""
         self._stops += 1
         try:
-            self.reference_search(Reference.STOP)
+            self.reference_search(ReferenceSearch.STOP)
         finally:
-            self._command(Command.MOTOR_STOP, 0)
+            self._command(TmclCommand.MOTOR_STOP, 0)
 
     def firmware(self) -> str:
         """The module's firmware text, like 1241V123."""
-        request = Request(self._address, Command.FIRMWARE, 0, self._motor)
+        request = TmclRequest(self._address, TmclCommand.FIRMWARE, 0, self._motor)
         return self._exchange(request, decode_firmware, issued=None)[0]
 
     def user_variable(self, index: int) -> int:
         """The module's user variable `index` (global parameter bank 2)."""
-        request = Request(self._address, Command.GET_GLOBAL, index, _USER_BANK)
+        request = TmclRequest(self._address, TmclCommand.GET_GLOBAL, index, _USER_BANK)
         return self._exchange(request, lambda data: self._checked(data, request).value, issued=None)[0]
 
     def set_user_variable(self, index: int, value: int, *, issued: int | None = None) -> None:
         """Write the module's user variable `index`; those from 56 on are lost when the module is reset."""
-        request = Request(self._address, Command.SET_GLOBAL, index, _USER_BANK, value)
+        request = TmclRequest(self._address, TmclCommand.SET_GLOBAL, index, _USER_BANK, value)
         self._exchange(request, lambda data: self._checked(data, request), issued=issued)
 
     @property
@@ -177,11 +177,11 @@ class TmclLink:
             self._last_words = LastWords(self.name, port, self._stop_words)
         return self._last_words
 
-    def _command(self, command: Command, kind: int, value: int = 0, *, issued: int | None = None) -> Reply:
-        request = Request(self._address, command, kind, self._motor, value)
+    def _command(self, command: TmclCommand, kind: int, value: int = 0, *, issued: int | None = None) -> TmclReply:
+        request = TmclRequest(self._address, command, kind, self._motor, value)
         return self._exchange(request, lambda data: self._checked(data, request), issued=issued)[0]
 
-    def _checked(self, data: bytes, request: Request) -> Reply:
+    def _checked(self, data: bytes, request: TmclRequest) -> TmclReply:
         reply = decode_reply(data, request)
         if reply.status == WRONG_CHECKSUM:
             raise TelegramError("the module says that the request came with a wrong checksum")
@@ -195,7 +195,7 @@ class TmclLink:
         return reply
 
     def _exchange(
-        self, request: Request, decode: Callable[[bytes], Answer], *, issued: int | None
+        self, request: TmclRequest, decode: Callable[[bytes], Answer], *, issued: int | None
     ) -> tuple[Answer, float, float]:
         """The choke point: send `request`, return the decoded reply, the middle of the round trip and its length.
 
@@ -235,7 +235,7 @@ class TmclLink:
             f"rail.baud ({self._baud}; RS-485 and RS-232 of a new module have 9600) and the wiring",
         ) from failure
 
-    def _once(self, request: Request, decode: Callable[[bytes], Answer]) -> tuple[Answer, float, float]:
+    def _once(self, request: TmclRequest, decode: Callable[[bytes], Answer]) -> tuple[Answer, float, float]:
         if self._port.in_waiting:
             self._statistics.count("stale_input")
             self._drain()
@@ -272,15 +272,15 @@ class TmclLink:
         self._statistics.add_round_trip(self._clock.wall(after - before))
         return answer, 0.5 * (before + after), after - before
 
-    def _got_in_step(self, request: Request) -> bool:
+    def _got_in_step(self, request: TmclRequest) -> bool:
         """Whether the next reply will be that to `request`: after one that was missing or wrong it may still come.
 
         A reply names its command alone. So a harmless question of another command is asked: once its reply is there,
         none to an earlier one can follow. False when it does not come.
         """
         self._drain()
-        question = Command.GET_AXIS if request.command == Command.GET_GLOBAL else Command.GET_GLOBAL
-        fence = Request(self._address, question, _FENCE_TYPE, 0)
+        question = TmclCommand.GET_AXIS if request.command == TmclCommand.GET_GLOBAL else TmclCommand.GET_GLOBAL
+        fence = TmclRequest(self._address, question, _FENCE_TYPE, 0)
         sent = fence.encode()
         self._port.write(sent)
         end = time.monotonic() + _IN_STEP_S

@@ -14,8 +14,8 @@ from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.motion import RailMotion
 from drivers.rail.tmcl import health
-from drivers.rail.tmcl.arrival import Arrival
-from drivers.rail.tmcl.codec import Axis, Reference
+from drivers.rail.tmcl.arrival import ArrivalWatch
+from drivers.rail.tmcl.codec import Axis, ReferenceSearch
 from drivers.rail.tmcl.link import NO_SUCH_TYPE, CommandRefused, TmclLink
 from drivers.rail.tmcl.module import EXACT, SPEED, require_supported, set_checked, set_direction, set_ramp
 from drivers.rail.tmcl.zero import STALL_FLAG, ZeroMark
@@ -155,10 +155,10 @@ class TmclRail(RailAxis):
     def _begin_homing(self, issued: int) -> None:
         self._zero.searching(issued=issued)
         self._set_up()
-        self._link.reference_search(Reference.START, issued=issued)
+        self._link.reference_search(ReferenceSearch.START, issued=issued)
 
     def _home_found(self, issued: int) -> bool:
-        searching = self._link.reference_search(Reference.STATUS) != 0
+        searching = self._link.reference_search(ReferenceSearch.STATUS) != 0
         if self._link.stops != issued:
             raise Aborted(f"{self.name}: stopped while searching the reference switch")
         self._homing = searching
@@ -170,8 +170,8 @@ class TmclRail(RailAxis):
         set_checked(self._link, Axis.MAX_VELOCITY, self._pulses(speed), SPEED, issued=issued)
         self._link.move_to(round(position * self._counts), issued=issued)
 
-    def _arrival(self, position: float, issued: int, samples: Samples, *, homed: bool = True) -> Arrival:
-        return Arrival(
+    def _arrival(self, position: float, issued: int, samples: Samples, *, homed: bool = True) -> ArrivalWatch:
+        return ArrivalWatch(
             self._link,
             self._clock,
             target=round(position * self._counts),

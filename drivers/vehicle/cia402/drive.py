@@ -23,7 +23,7 @@ _KEPT = 4
 """Emergencies of which each is told."""
 
 
-class Drive:
+class SideDrive:
     """The drive of one side; filled through `take`, by whoever holds the lock. Times are host times in s."""
 
     def __init__(self, side: str, node: int) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics, VehicleState
-from drivers.vehicle.cia402.drive import Drive
+from drivers.vehicle.cia402.drive import SideDrive
 from drivers.vehicle.cia402.faults import command_lost, drive_error, wrong_units
 from drivers.vehicle.cia402.geometry import SIDES, WheelDrives
 from drivers.vehicle.cia402.objects import OPERATIONAL, STATUS
@@ -39,7 +39,7 @@ def patience(clock: Clock, seconds: float) -> float:
     return max(seconds, WALL_FLOOR_S * clock.rate)
 
 
-class Feedback:
+class DriveFeedback:
     """Both drives and the way of their wheels; `take` is called by the receive thread."""
 
     def __init__(
@@ -56,7 +56,7 @@ class Feedback:
         self._clock = clock
         self._wheels = wheels
         self._statistics = statistics
-        self.drives = tuple(Drive(side, node) for side, node in zip(SIDES, wheels.nodes, strict=True))
+        self.drives = tuple(SideDrive(side, node) for side, node in zip(SIDES, wheels.nodes, strict=True))
         self._by_node = {drive.node: drive for drive in self.drives}
         self._travel = Travel(
             clock,

@@ -8,7 +8,7 @@ import can
 
 from drivers.interfaces import Reading
 from drivers.vehicle.can_interface import can_interface
-from drivers.vehicle.cia402.drive import Drive
+from drivers.vehicle.cia402.drive import SideDrive
 from drivers.vehicle.health import MOST_LOAD, bus_readings, most_bits
 
 
@@ -17,7 +17,7 @@ def readings(
     seconds: float,
     bitrate: int,
     others: int,
-    drives: Sequence[Drive],
+    drives: Sequence[SideDrive],
     system_name: str | None,
     judged: bool,
 ) -> list[Reading]:

@@ -19,7 +19,7 @@ from drivers.vehicle.cia402 import objects as od
 from drivers.vehicle.cia402 import polling, states
 from drivers.vehicle.cia402.bus import CanopenBus
 from drivers.vehicle.cia402.faults import unguarded
-from drivers.vehicle.cia402.feedback import Feedback
+from drivers.vehicle.cia402.feedback import DriveFeedback
 from drivers.vehicle.cia402.geometry import WheelDrives
 from drivers.vehicle.cia402.last_words import last_words
 from drivers.vehicle.cia402.setup import Watchdog, lock, set_up
@@ -52,7 +52,7 @@ class Master:
         self,
         name: str,
         open_bus: Callable[[], CanopenBus],
-        feedback: Feedback,
+        feedback: DriveFeedback,
         wheels: WheelDrives,
         watchdog: Watchdog,
         clock: Clock,

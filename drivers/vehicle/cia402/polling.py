@@ -6,12 +6,12 @@ import struct
 
 from drivers.vehicle.cia402 import objects as od
 from drivers.vehicle.cia402.bus import Absent, CanopenBus
-from drivers.vehicle.cia402.drive import Drive
-from drivers.vehicle.cia402.feedback import Feedback
+from drivers.vehicle.cia402.drive import SideDrive
+from drivers.vehicle.cia402.feedback import DriveFeedback
 from drivers.vehicle.cia402.geometry import WheelDrives
 
 
-def ask(bus: CanopenBus, feedback: Feedback, wheels: WheelDrives) -> None:
+def ask(bus: CanopenBus, feedback: DriveFeedback, wheels: WheelDrives) -> None:
     """Bring `feedback` up to date. Raises what `CanopenBus.read` does; a value that a drive lacks is left out."""
     for drive in feedback.drives:
         motion = struct.pack("<i", bus.read(drive.node, od.VELOCITY))
@@ -27,13 +27,13 @@ def ask(bus: CanopenBus, feedback: Feedback, wheels: WheelDrives) -> None:
         feedback.take(drive.node, od.STATUS, struct.pack("<Hib", *told), in_pdo=False)
 
 
-def number(bus: CanopenBus, drive: Drive, entry: od.Entry) -> str:
+def number(bus: CanopenBus, drive: SideDrive, entry: od.Entry) -> str:
     """A number of the drive as text, "" where it has none."""
     told = _optional(bus, drive, entry)
     return "" if told is None else str(told)
 
 
-def _optional(bus: CanopenBus, drive: Drive, entry: od.Entry) -> int | None:
+def _optional(bus: CanopenBus, drive: SideDrive, entry: od.Entry) -> int | None:
     try:
         return bus.read(drive.node, entry)
     except Absent:

@@ -12,7 +12,7 @@ from typing import Literal
 from drivers.errors import ConfigError, DeviceFault
 from drivers.vehicle.cia402 import objects as od
 from drivers.vehicle.cia402.bus import Absent, CanopenBus
-from drivers.vehicle.cia402.drive import Drive
+from drivers.vehicle.cia402.drive import SideDrive
 from drivers.vehicle.cia402.faults import SETUP, unfit
 from drivers.vehicle.cia402.geometry import SI_UNITS, WheelDrives
 from drivers.vehicle.cia402.objects import Entry
@@ -41,7 +41,7 @@ class Watchdog:
         """Seconds on the wall from one sign of life to the next."""
         return self.seconds / HEARTBEATS_IN_TIME
 
-    def arm(self, bus: CanopenBus, drive: Drive) -> None:
+    def arm(self, bus: CanopenBus, drive: SideDrive) -> None:
         """From its next sign of life on the drive watches this program."""
         if self.guarding == "heartbeat":
             _set(bus, drive, od.CONSUMER_HEARTBEAT, self.own << 16 | round(1e3 * self.seconds))
@@ -49,12 +49,12 @@ class Watchdog:
             _set(bus, drive, od.LIFE_FACTOR, HEARTBEATS_IN_TIME)
             _set(bus, drive, od.GUARD_TIME, round(1e3 * self.period))
 
-    def disarm(self, bus: CanopenBus, drive: Drive) -> None:
+    def disarm(self, bus: CanopenBus, drive: SideDrive) -> None:
         """It does not watch any more: who stands with locked brake may be left alone."""
         _set(bus, drive, od.CONSUMER_HEARTBEAT if self.guarding == "heartbeat" else od.GUARD_TIME, 0)
 
 
-def set_up(bus: CanopenBus, drive: Drive, wheels: WheelDrives, watchdog: Watchdog) -> None:
+def set_up(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives, watchdog: Watchdog) -> None:
     """Bring a drive that stands to where it can be commanded over PDOs, operation not enabled.
 
     Raises `ConfigError` when it counts otherwise than configured, `DeviceFault` when it is no drive, moves, lacks what
@@ -88,7 +88,7 @@ def set_up(bus: CanopenBus, drive: Drive, wheels: WheelDrives, watchdog: Watchdo
     drive.configured = True
 
 
-def compare_units(bus: CanopenBus, drive: Drive, wheels: WheelDrives) -> None:
+def compare_units(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives) -> None:
     """`ConfigError` when the drive says that it counts, or measures speed, otherwise than configured."""
     counts, turns = (_told(bus, drive, entry) for entry in (od.ENCODER_INCREMENTS, od.ENCODER_TURNS))
     if counts and turns and abs(counts / turns - wheels.counts) > 0.5:
@@ -105,7 +105,7 @@ def compare_units(bus: CanopenBus, drive: Drive, wheels: WheelDrives) -> None:
         )
 
 
-def lock(bus: CanopenBus, drive: Drive, wheels: WheelDrives, *, locked: bool) -> None:
+def lock(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives, *, locked: bool) -> None:
     """Switch the output of the drive that its brake hangs on, and read it back."""
     assert wheels.brake_output is not None
     bit = 1 << wheels.brake_output
@@ -116,7 +116,7 @@ def lock(bus: CanopenBus, drive: Drive, wheels: WheelDrives, *, locked: bool) ->
     _set(bus, drive, od.OUTPUTS, now | bit if locked == wheels.brake_locks else now & ~bit)
 
 
-def _require_drive(bus: CanopenBus, drive: Drive) -> None:
+def _require_drive(bus: CanopenBus, drive: SideDrive) -> None:
     profile = bus.read(drive.node, od.DEVICE_TYPE) & 0xFFFF
     if profile != od.DRIVE_PROFILE:
         raise _unfit(bus, drive, f"is no drive: its profile is CiA {profile}, not {od.DRIVE_PROFILE}")
@@ -125,7 +125,7 @@ def _require_drive(bus: CanopenBus, drive: Drive) -> None:
         raise _unfit(bus, drive, f"has no profile velocity mode (object 6502h is {modes:08X}h)")
 
 
-def _require_rest(bus: CanopenBus, drive: Drive, wheels: WheelDrives) -> None:
+def _require_rest(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives) -> None:
     """A drive that somebody left enabled is switched off when it stands, and left alone when it turns."""
     if not may_turn(state_of(bus.read(drive.node, od.STATUSWORD))):
         return
@@ -141,17 +141,17 @@ def _require_rest(bus: CanopenBus, drive: Drive, wheels: WheelDrives) -> None:
     bus.write(drive.node, od.CONTROLWORD, DISABLE_VOLTAGE)
 
 
-def _map_all(bus: CanopenBus, drive: Drive, wheels: WheelDrives) -> None:
+def _map_all(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives) -> None:
     motion = [od.VELOCITY] if wheels.stop_input is None else [od.VELOCITY, od.INPUTS]
     health = [od.ERROR_CODE] if _told(bus, drive, od.DC_LINK) is None else [od.ERROR_CODE, od.DC_LINK]
-    _map(bus, drive, 0x1400, od.COMMAND, _AT_ONCE, [od.CONTROLWORD, od.TARGET_VELOCITY])
-    _map(bus, drive, 0x1800, od.STATUS, _EACH_SYNC, [od.STATUSWORD, od.POSITION, od.MODE_DISPLAY])
-    _map(bus, drive, 0x1801, od.MOTION, _EACH_SYNC, motion)
-    _map(bus, drive, 0x1802, od.HEALTH, _SELDOM, health)
+    _map(bus, drive, 0x1400, service=od.COMMAND, transmission=_AT_ONCE, entries=[od.CONTROLWORD, od.TARGET_VELOCITY])
+    _map(bus, drive, 0x1800, od.STATUS, transmission=_EACH_SYNC, entries=[od.STATUSWORD, od.POSITION, od.MODE_DISPLAY])
+    _map(bus, drive, 0x1801, service=od.MOTION, transmission=_EACH_SYNC, entries=motion)
+    _map(bus, drive, 0x1802, service=od.HEALTH, transmission=_SELDOM, entries=health)
 
 
 def _map(
-    bus: CanopenBus, drive: Drive, parameter: int, service: int, transmission: int, entries: Sequence[Entry]
+    bus: CanopenBus, drive: SideDrive, parameter: int, service: int, transmission: int, entries: Sequence[Entry]
 ) -> None:
     """Give a PDO its identifier, when it is sent, and what is in it. Mapped as CiA 301 has it, while it is invalid."""
     identifier = Entry(parameter, 1, "<I", "PDO, identifier")
@@ -167,7 +167,7 @@ def _map(
     _set(bus, drive, identifier, own)
 
 
-def _set(bus: CanopenBus, drive: Drive, entry: Entry, value: int, *, needed: bool = True) -> None:
+def _set(bus: CanopenBus, drive: SideDrive, entry: Entry, value: int, *, needed: bool = True) -> None:
     """Write and read back; what is not `needed` may be absent or refused, not different after it was taken."""
     try:
         bus.write(drive.node, entry, value)
@@ -183,7 +183,7 @@ def _set(bus: CanopenBus, drive: Drive, entry: Entry, value: int, *, needed: boo
         raise _unfit(bus, drive, f"took {entry} = {value} and keeps {kept}")
 
 
-def _told(bus: CanopenBus, drive: Drive, entry: Entry) -> int | None:
+def _told(bus: CanopenBus, drive: SideDrive, entry: Entry) -> int | None:
     """A value that not every drive has; None when this one has not."""
     try:
         return bus.read(drive.node, entry)
@@ -191,5 +191,5 @@ def _told(bus: CanopenBus, drive: Drive, entry: Entry) -> int | None:
         return None
 
 
-def _unfit(bus: CanopenBus, drive: Drive, what: str) -> DeviceFault:
+def _unfit(bus: CanopenBus, drive: SideDrive, what: str) -> DeviceFault:
     return unfit(bus.name, f"the {drive.side} drive (node {drive.node}) {what}")

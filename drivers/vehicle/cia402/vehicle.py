@@ -19,7 +19,7 @@ from drivers.vehicle.cia402 import health, polling
 from drivers.vehicle.cia402 import objects as od
 from drivers.vehicle.cia402.bus import CanopenBus
 from drivers.vehicle.cia402.faults import TOLD_ONCE
-from drivers.vehicle.cia402.feedback import Feedback
+from drivers.vehicle.cia402.feedback import DriveFeedback
 from drivers.vehicle.cia402.geometry import WheelDrives
 from drivers.vehicle.cia402.master import Master
 from drivers.vehicle.cia402.setup import Watchdog, compare_units
@@ -61,7 +61,7 @@ class CanopenVehicle:
         self._max_speed, self._max_yaw_rate = max_speed, max_yaw_rate
         self._clock = clock
         self._look = look
-        self._feedback = Feedback(
+        self._feedback = DriveFeedback(
             name, clock, wheels, max_speed=max_speed, max_yaw_rate=max_yaw_rate, statistics=self.statistics
         )
         self._in_command = False
@@ -86,7 +86,7 @@ class CanopenVehicle:
             statistics=self.statistics,
             alone=f"the drives stop by themselves {watchdog.seconds:g} s after the last sign of life",
         )
-        self._master = Master(name, open_bus, self._feedback, wheels, watchdog, clock, self.statistics)
+        self._master = Master(name, open_bus, self._feedback, wheels, watchdog, clock=clock, statistics=self.statistics)
         try:
             if look:
                 for drive in self._feedback.drives:
@@ -137,7 +137,9 @@ class CanopenVehicle:
         judged = self._clock.rate <= 1.0
         heard = [frame for _, frame in frames]
         drives = self._feedback.drives
-        return health.readings(heard, seconds, self._bitrate, others, drives, self._system_name, judged)
+        return health.readings(
+            heard, seconds, self._bitrate, others=others, drives=drives, system_name=self._system_name, judged=judged
+        )
 
     def state(self, max_age: float = 0.2) -> VehicleState:
         """The newest feedback, at most `max_age` s old, else `DeadlineError`."""
@@ -151,7 +153,7 @@ class CanopenVehicle:
         return self._feedback.state(max_age, braked, in_command)
 
     def check(self) -> None:
-        """Raise the `DeviceFault` that the drives show now; see `Feedback.check`. Returns at once otherwise.
+        """Raise the `DeviceFault` that the drives show now; see `DriveFeedback.check`. Returns at once otherwise.
 
         A vehicle that somebody else commands, or that does not obey, is out of command from then on, until it is
         enabled again.
@@ -213,8 +215,8 @@ class CanopenVehicle:
         Raises `LimitError`, `InterlockError` before `enable()`, `DeviceFault` as `check` does, `Aborted` while a stop
         is under way.
         """
-        speed = check_range(self.name, "speed", speed, -self._max_speed, self._max_speed, "m/s")
-        yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, "rad/s")
+        speed = check_range(self.name, "speed", speed, low=-self._max_speed, high=self._max_speed, unit="m/s")
+        yaw_rate = check_range(self.name, "yaw rate", yaw_rate, -self._max_yaw_rate, self._max_yaw_rate, unit="rad/s")
         self._bus.require_unspoken()
         self._check(driving=True)
         with self._master.command:

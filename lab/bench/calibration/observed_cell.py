@@ -20,7 +20,7 @@ from cell.measure.vision import BoardSpec, BoardView, parse_board
 from cell.measure.vision.stripe.extract import StripeProfile
 from cell.motion.arm_models import HOME, arm_kinematics
 from cell.motion.kinematics import Joints
-from cell.procedures.arm.camera_poses import View, scan_calibration_views, target_calibration_views
+from cell.procedures.arm.camera_poses import CalibrationView, scan_calibration_views, target_calibration_views
 from cell.procedures.calibrate.boards import RAIL_MOVE, RAIL_MOVE_VIEWS
 from drivers.link_table import LinkTable
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
@@ -201,7 +201,7 @@ class ObservedCell:
 
     # --- a calibration's observations ---
 
-    def collect_scan(self, views: Sequence[View] | None = None) -> list[ScanObservation]:
+    def collect_scan(self, views: Sequence[CalibrationView] | None = None) -> list[ScanObservation]:
         """What `cell.procedures.calibrate.boards.collect_scan` brings, at the same views."""
         made = []
         for k, view in enumerate(scan_calibration_views(self.config, self.fine) if views is None else views):

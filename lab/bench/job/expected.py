@@ -18,7 +18,7 @@ from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
-from cell.measure.calibration.solve.blocks import SHARED, State
+from cell.measure.calibration.solve.blocks import SHARED, AdjustmentState
 from cell.measure.calibration.solve.joint import solve_joint, solve_staged
 from cell.measure.geometry.covariance import covariance_root
 from cell.measure.geometry.poses import composition_jacobians, transform
@@ -173,7 +173,7 @@ class _Head:
 
     def _moved(self, steps: Vector, base_from_flange: pin.SE3 | None, hand: pin.SE3) -> Vector:
         c = self._calibration
-        state = State(c.camera, c.light_plane, c.rail_direction, hand, pin.SE3.Identity())
+        state = AdjustmentState(c.camera, c.light_plane, c.rail_direction, hand, pin.SE3.Identity())
         variants = []
         for step in steps.T:
             full = np.zeros(SHARED)

@@ -41,7 +41,7 @@ def bend(columns: Vector, points: Vector, normals: Vector, intrinsics: Vector, l
     axis, across, origin = _fan(laser)
     way = points - origin
     sag = laser.bow * (way @ across) ** 2 / (way @ axis)
-    slide(columns, points, normals, intrinsics, laser_frame(laser)[0], sag)
+    slide(columns, points, normals, intrinsics=intrinsics, plane=laser_frame(laser)[0], sag=sag)
 
 
 @compiled

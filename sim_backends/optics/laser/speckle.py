@@ -35,7 +35,7 @@ def add_speckled(
     kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / grain_px) ** 2)
     kernel /= np.sqrt((kernel**2).sum())
     spread = float(np.sqrt(np.log1p(contrast**2)))
-    apply(image, stripe, touched, spread, kernel, rng.integers(0, 2**63, dtype=np.uint64))
+    apply(image, stripe, touched, spread=spread, kernel=kernel, seed=rng.integers(0, 2**63, dtype=np.uint64))
 
 
 @compiled

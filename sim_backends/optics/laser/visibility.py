@@ -54,7 +54,7 @@ def lit(
             pose, pattern = appearance(other)
             bounds = np.ascontiguousarray(pattern[4:8])
             for eye in (np.zeros(3), origin):
-                hide_behind_rectangle(points, eye, np.ascontiguousarray(pose), bounds, TOUCH, seen)
+                hide_behind_rectangle(points, eye, np.ascontiguousarray(pose), bounds=bounds, start=TOUCH, seen=seen)
     return seen
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sim_backends.models.arm import ArmModel, Power, Safety
-from sim_backends.peers.arm.script.script import ControlProgram, RuntimeState
+from sim_backends.peers.arm.script.script import ProgramMemory, RuntimeState
 
 VERSION = (5, 15, 2, 1130077)
 """Controller version: major, minor, bug fix, build."""
@@ -45,13 +45,13 @@ _LOCAL = (
 _UNNAMED = "<unnamed>"
 
 
-class Dashboard:
+class DashboardServer:
     """Answers dashboard commands for one arm and its program; `programs` is where `load` finds its programs.
 
     A program NAME.urp is the URScript text of the file NAME.script there.
     """
 
-    def __init__(self, model: ArmModel, program: ControlProgram, programs: Path | None = None) -> None:
+    def __init__(self, model: ArmModel, program: ProgramMemory, programs: Path | None = None) -> None:
         self._model = model
         self._program = program
         self._programs = programs

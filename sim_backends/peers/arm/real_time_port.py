@@ -8,13 +8,13 @@ from __future__ import annotations
 import struct
 
 from sim_backends.models.arm import Power
-from sim_backends.peers.arm.rtde.registers import View
+from sim_backends.peers.arm.rtde.registers import RegisterView
 
 _PACKET = struct.Struct(">i152d")
 _SIX, _THREE = (0.0,) * 6, (0.0,) * 3
 
 
-def real_time_packet(view: View) -> bytes:
+def real_time_packet(view: RegisterView) -> bytes:
     """The packet for this cycle."""
     model, drive = view.model, view.model.drive
     q, qd = drive.q.tolist(), drive.qd.tolist()

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.camera import CameraModel
+from sim_backends.models.camera import CameraState
 from sim_backends.peers.camera.frame_wire import Rejected
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ Send = Callable[[Exposure, NDArray[np.uint8]], None]
 class FrameSession:
     """Acquisition from `start()` to `end()` and `join()`; `sending` is held while a picture is sent."""
 
-    def __init__(self, name: str, camera: CameraModel, clock: WorldClock, render: Render, send: Send) -> None:
+    def __init__(self, name: str, camera: CameraState, clock: WorldClock, render: Render, send: Send) -> None:
         self._name = name
         self._camera = camera
         self._clock = clock

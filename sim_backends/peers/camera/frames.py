@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.camera import FAULTS, CameraModel, CameraSpec
+from sim_backends.models.camera import FAULTS, CameraSpec, CameraState
 from sim_backends.peers.camera.frame_session import BACKLOG, Exposure, FrameSession, Render
 from sim_backends.peers.camera.frame_wire import Rejected, message, number, receive
 from sim_backends.peers.server import TcpServer
@@ -35,7 +35,7 @@ class FramePeer:
     def __init__(self, name: str, clock: WorldClock, render: Render, spec: CameraSpec) -> None:
         """`render` is called in the session's thread, once the exposure that it is to show is over."""
         self.name = name
-        self.camera = CameraModel(spec)
+        self.camera = CameraState(spec)
         self._clock = clock
         self._render = render
         self._server = TcpServer(name, self._serve)
@@ -52,7 +52,7 @@ class FramePeer:
         self._server.stop()
 
     def fault(self, name: str, count: int = 1) -> None:
-        """Cause a fault of `FAULTS` (see `CameraModel.fault`); ValueError for another name."""
+        """Cause a fault of `FAULTS` (see `CameraState.fault`); ValueError for another name."""
         self.camera.fault(name, count)
 
     def clear(self) -> None:
@@ -182,7 +182,7 @@ class FramePeer:
         return {"device_ns": self.camera.spec.device_ns(self._clock.now())}
 
     def _rate(self, request: dict[str, Any], key: str) -> float:
-        return number(request, key, self.camera.frame_rate, _SLOWEST, self.camera.spec.frame_rate_max, "Hz")
+        return number(request, key, self.camera.frame_rate, _SLOWEST, high=self.camera.spec.frame_rate_max, unit="Hz")
 
     def _set(self, exposure: float, frame_rate: float) -> None:
         if exposure * frame_rate > 1.0:

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.camera import CameraModel, CameraSpec
+from sim_backends.models.camera import CameraSpec, CameraState
 from sim_backends.peers.camera import gige_registers as memory
 from sim_backends.peers.camera.frame_session import Exposure, FrameSession, Render
 from sim_backends.peers.camera.frame_wire import Rejected
 from sim_backends.peers.camera.gige_memory import GigeMemory
 from sim_backends.peers.camera.gige_stream import GigeStream
-from sim_backends.peers.camera.gvcp import PORT, Command, Refused, Request, Status
+from sim_backends.peers.camera.gvcp import PORT, GvcpCommand, GvcpRefused, GvcpRequest, GvcpStatus
 
 __all__ = ["GigePeer"]
 
@@ -43,7 +43,7 @@ class GigePeer:
         sensor.
         """
         self.name = name
-        self.camera = CameraModel(spec)
+        self.camera = CameraState(spec)
         self._clock = clock
         self._control, self.address = _bound(host)
         self._memory = GigeMemory(spec, self.address)
@@ -71,7 +71,7 @@ class GigePeer:
         self._stream.close()
 
     def fault(self, name: str, count: int = 1) -> None:
-        """Cause a fault (see `CameraModel.fault`); ValueError for another name."""
+        """Cause a fault (see `CameraState.fault`); ValueError for another name."""
         self.camera.fault(name, count)
 
     def clear(self) -> None:
@@ -104,14 +104,14 @@ class GigePeer:
             except OSError:
                 return
             self._watch_heartbeat()
-            request = Request.of(packet)
+            request = GvcpRequest.of(packet)
             if request is None or self.camera.silent:
                 continue
             if client == self._controller:
                 self._heard = time.monotonic()
             try:
                 answer = request.reply(self._answer(request, client))
-            except Refused as refused:
+            except GvcpRefused as refused:
                 answer = request.reply(status=refused.status)
             if request.answered:
                 with contextlib.suppress(OSError):
@@ -128,23 +128,23 @@ class GigePeer:
         for address in (memory.CONTROL, memory.CONTROLLER_PORT, memory.CONTROLLER_ADDRESS):
             self._memory.set_word(address, 0)
 
-    def _answer(self, request: Request, client: Address) -> bytes:
-        if request.command == Command.DISCOVERY:
+    def _answer(self, request: GvcpRequest, client: Address) -> bytes:
+        if request.command == GvcpCommand.DISCOVERY:
             return self._memory.read(0, 0xF8)
-        if request.command == Command.READ_REGISTERS:
+        if request.command == GvcpCommand.READ_REGISTERS:
             return b"".join(self._memory.read(address, 4) for address in request.words())
-        if request.command == Command.READ_MEMORY:
+        if request.command == GvcpCommand.READ_MEMORY:
             address, size = struct.unpack(">II", request.data)
             return request.data[:4] + self._memory.read(address, size & 0xFFFF)
-        if request.command == Command.RESEND:
+        if request.command == GvcpCommand.RESEND:
             _, block_id, first, last = struct.unpack_from(">HHII", request.data)
             self._stream.send_again(block_id, first & 0xFFFFFF, last & 0xFFFFFF)
             return b""
-        if request.command not in (Command.WRITE_REGISTERS, Command.WRITE_MEMORY):
-            raise Refused(Status.NOT_IMPLEMENTED)
+        if request.command not in (GvcpCommand.WRITE_REGISTERS, GvcpCommand.WRITE_MEMORY):
+            raise GvcpRefused(GvcpStatus.NOT_IMPLEMENTED)
         if self._controller not in (None, client):
-            raise Refused(Status.ACCESS_DENIED)
-        if request.command == Command.WRITE_REGISTERS:
+            raise GvcpRefused(GvcpStatus.ACCESS_DENIED)
+        if request.command == GvcpCommand.WRITE_REGISTERS:
             words = request.words()
             for address, value in zip(words[::2], words[1::2], strict=True):
                 self._write(address, struct.pack(">I", value), client)
@@ -154,9 +154,9 @@ class GigePeer:
 
     def _write(self, address: int, data: bytes, client: Address) -> None:
         if self._controller is None and address != memory.CONTROL:
-            raise Refused(Status.ACCESS_DENIED)
+            raise GvcpRefused(GvcpStatus.ACCESS_DENIED)
         if self._session.running and address in (memory.WIDTH, memory.HEIGHT, memory.PIXEL_FORMAT):
-            raise Refused(Status.WRITE_PROTECT)
+            raise GvcpRefused(GvcpStatus.WRITE_PROTECT)
         value = struct.unpack(">I", data)[0] if len(data) == 4 else 0
         if address == memory.PACKET_SIZE and value & _FIRE:
             value &= ~_FIRE

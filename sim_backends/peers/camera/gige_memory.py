@@ -43,7 +43,7 @@ from sim_backends.peers.camera.gige_registers import (
     TRIGGER_SOURCE,
     WIDTH,
 )
-from sim_backends.peers.camera.gvcp import Refused, Status
+from sim_backends.peers.camera.gvcp import GvcpRefused, GvcpStatus
 
 _DESCRIPTION = 0x20000
 _TICKS_PER_SECOND = 10**9
@@ -82,9 +82,9 @@ class GigeMemory:
         self._count_payload()
 
     def read(self, address: int, size: int) -> bytes:
-        """`size` bytes from `address`; Refused outside the memory."""
+        """`size` bytes from `address`; `GvcpRefused` outside the memory."""
         if address % 4 or address + size > len(self._bytes) + 3:
-            raise Refused(Status.INVALID_ADDRESS)
+            raise GvcpRefused(GvcpStatus.INVALID_ADDRESS)
         return bytes(self._bytes[address : address + size]).ljust(size, b"\0")
 
     def word(self, address: int) -> int:
@@ -106,16 +106,16 @@ class GigeMemory:
         self._bytes[TIMESTAMP : TIMESTAMP + 8] = struct.pack(">Q", ticks)
 
     def write(self, address: int, data: bytes) -> None:
-        """What a client writes; Refused where it may not, or not this value."""
+        """What a client writes; `GvcpRefused` where it may not, or not this value."""
         if address in self._reals and len(data) == 8:
             low, high = self._reals[address]
             value = struct.unpack(">d", data)[0]
             if not (math.isfinite(value) and low * (1 - 1e-9) <= value <= high * (1 + 1e-9)):
-                raise Refused(Status.INVALID_PARAMETER)
+                raise GvcpRefused(GvcpStatus.INVALID_PARAMETER)
         elif address in _WRITABLE_WORDS and len(data) == 4:
             self._check_word(address, struct.unpack(">I", data)[0])
         else:
-            raise Refused(Status.WRITE_PROTECT)
+            raise GvcpRefused(GvcpStatus.WRITE_PROTECT)
         self._bytes[address : address + len(data)] = data
         self._count_payload()
 
@@ -133,7 +133,7 @@ class GigeMemory:
         if address == PACKET_SIZE:
             known = PACKET_SIZES[0] <= value & 0xFFFF <= PACKET_SIZES[1]
         if not (known and low <= value <= high):
-            raise Refused(Status.INVALID_PARAMETER)
+            raise GvcpRefused(GvcpStatus.INVALID_PARAMETER)
 
     def _count_payload(self) -> None:
         bits = ENCODERS[self.word(PIXEL_FORMAT)][1]

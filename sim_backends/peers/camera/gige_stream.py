@@ -64,7 +64,7 @@ class GigeStream:
         if gain := read.real(memory.GAIN):
             part = np.minimum(part * 10.0 ** (gain / 20.0), 255.0).astype(np.uint8)
         pixels = ENCODERS[code][2](np.ascontiguousarray(part))
-        leader = Leader(timestamp, code, width, height, left, top)
+        leader = Leader(timestamp, code, width, height=height, left=left, top=top)
         made = list(packets(block_id, leader, pixels, self._packet_size))
         with self._keeping:
             self._sent[block_id] = made

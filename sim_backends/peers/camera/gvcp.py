@@ -22,7 +22,7 @@ _LEADER, _TRAILER, _PAYLOAD = 1, 2, 3
 _IMAGE = 1
 
 
-class Command(IntEnum):
+class GvcpCommand(IntEnum):
     """What is asked; the answer's number is one more."""
 
     DISCOVERY = 0x02
@@ -33,7 +33,7 @@ class Command(IntEnum):
     WRITE_MEMORY = 0x86
 
 
-class Status(IntEnum):
+class GvcpStatus(IntEnum):
     """How an answer begins."""
 
     SUCCESS = 0x0000
@@ -44,16 +44,16 @@ class Status(IntEnum):
     ACCESS_DENIED = 0x8006
 
 
-class Refused(Exception):
+class GvcpRefused(Exception):
     """A request that is answered with an error."""
 
-    def __init__(self, status: Status) -> None:
+    def __init__(self, status: GvcpStatus) -> None:
         super().__init__(status.name)
         self.status = status
 
 
 @dataclass(frozen=True)
-class Request:
+class GvcpRequest:
     """A request: its command, data, id, and whether it is to be answered."""
 
     command: int
@@ -62,7 +62,7 @@ class Request:
     answered: bool
 
     @classmethod
-    def of(cls, packet: bytes) -> Request | None:
+    def of(cls, packet: bytes) -> GvcpRequest | None:
         """None for bytes that are no request."""
         if len(packet) < _COMMAND.size:
             return None
@@ -72,14 +72,14 @@ class Request:
             return None
         return cls(command, data, request_id, bool(flags & _ACKNOWLEDGE))
 
-    def reply(self, data: bytes = b"", status: Status = Status.SUCCESS) -> bytes:
+    def reply(self, data: bytes = b"", status: GvcpStatus = GvcpStatus.SUCCESS) -> bytes:
         """The answer's bytes."""
         return _REPLY.pack(status, self.command + 1, len(data), self.request_id) + data
 
     def words(self) -> tuple[int, ...]:
-        """The data as 32-bit numbers; Refused when they are not whole."""
+        """The data as 32-bit numbers; `GvcpRefused` when they are not whole."""
         if not self.data or len(self.data) % 4:
-            raise Refused(Status.INVALID_PARAMETER)
+            raise GvcpRefused(GvcpStatus.INVALID_PARAMETER)
         return struct.unpack(f">{len(self.data) // 4}I", self.data)
 
 

@@ -34,7 +34,7 @@ _ALARM_STALL = 0x0E0
 _READ, _READ_INPUT, _WRITE_ONE, _WRITE_SEVERAL = 3, 4, 6, 16
 
 
-class ModbusDrive:
+class ModbusDriveServer:
     """The drive of `rail`, described by `wire`: `unit`, `counts_per_turn` and `registers` as `cell.toml` has them."""
 
     def __init__(self, rail: RailModel, clock: WorldClock, wire: Mapping[str, Any]) -> None:
@@ -193,7 +193,7 @@ class ModbusDrive:
 class ModbusPeer(SerialServer):
     """Serves one drive over TCP, as behind a serial server, at `url`, and on request at the device file `pty`."""
 
-    def __init__(self, drive: ModbusDrive, unit: int, *, pty: bool = False, echo: bool = False) -> None:
+    def __init__(self, drive: ModbusDriveServer, unit: int, *, pty: bool = False, echo: bool = False) -> None:
         """With `echo` the line repeats what is sent, as an adapter to two wires does."""
         self.drive = drive
         self._unit = unit

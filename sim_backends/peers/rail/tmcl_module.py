@@ -40,7 +40,7 @@ FACTORY_RAMP: dict[str, Any] = {
 """How the ramp is when the module is switched on: no trapezium, as long as nobody makes it one."""
 
 
-class Refused(Exception):
+class TmclRefused(Exception):
     """A request is answered with the status code `status` instead of 100."""
 
     def __init__(self, status: int) -> None:
@@ -114,7 +114,7 @@ class TmclModule:
                 return bytes([self._globals[76]]) + f"{MODEL:04d}V{major:01d}{minor:02d}".encode("ascii")
             try:
                 return self._reply(OK, command, self._run(command, kind, motor, value))
-            except Refused as refusal:
+            except TmclRefused as refusal:
                 return self._reply(refusal.status, command, 0)
 
     def _reply(self, status: int, command: int, value: int) -> bytes:
@@ -124,11 +124,11 @@ class TmclModule:
     def _run(self, command: int, kind: int, motor: int, value: int) -> int:
         if command == 136:
             if kind != 1:
-                raise Refused(BAD_TYPE)
+                raise TmclRefused(BAD_TYPE)
             major, minor = self.rail.params.firmware
             return MODEL << 16 | major << 8 | minor
         if command not in self._commands:
-            raise Refused(BAD_COMMAND)
+            raise TmclRefused(BAD_COMMAND)
         if 1 <= command <= 8 or command == 13:
             _check(motor, 0, 0)
         return self._commands[command](kind, motor, value)
@@ -142,7 +142,7 @@ class TmclModule:
 
     def _move(self, kind: int, motor: int, value: int) -> int:
         if kind not in (0, 1):
-            raise Refused(BAD_TYPE)
+            raise TmclRefused(BAD_TYPE)
         t = self._clock.now()
         target = value if kind == 0 else self._base(t) + value
         _check(target, -(2**31), 2**31 - 1)
@@ -161,7 +161,7 @@ class TmclModule:
         elif kind == 2:
             return int(self.rail.searching(t))
         else:
-            raise Refused(BAD_TYPE)
+            raise TmclRefused(BAD_TYPE)
         return 0
 
     # --- axis parameters ---
@@ -193,7 +193,7 @@ class TmclModule:
             208: lambda: int(rail.stalled(t)) | (int(rail.velocity(t) == 0) << 7),
         }
         if kind not in readings:
-            raise Refused(BAD_TYPE)
+            raise TmclRefused(BAD_TYPE)
         return readings[kind]()
 
     def _set_axis(self, kind: int, motor: int, value: int) -> int:
@@ -202,7 +202,7 @@ class TmclModule:
             name, low, high = SETTINGS[kind]
             _check(value, low, high)
             if kind == 193 and value not in SEARCH_MODES:
-                raise Refused(BAD_VALUE)
+                raise TmclRefused(BAD_VALUE)
             setting: Any = 1 - value if kind in (12, 13) else value
             if isinstance(getattr(RailSettings, name), bool):
                 setting = bool(setting)
@@ -217,20 +217,20 @@ class TmclModule:
         elif kind == 2:
             self._rotate(0, motor, value)
         else:
-            raise Refused(BAD_TYPE)
+            raise TmclRefused(BAD_TYPE)
         return value
 
     def _store_axis(self, kind: int, motor: int, value: int) -> int:
         if self._locked:
-            raise Refused(LOCKED)
+            raise TmclRefused(LOCKED)
         if kind not in SETTINGS and kind not in PLAIN:
-            raise Refused(BAD_TYPE)
+            raise TmclRefused(BAD_TYPE)
         self._stored[kind] = self._get_axis(kind, motor, 0)
         return self._stored[kind]
 
     def _restore_axis(self, kind: int, motor: int, value: int) -> int:
         if kind not in self._stored:
-            raise Refused(BAD_TYPE)
+            raise TmclRefused(BAD_TYPE)
         return self._set_axis(kind, motor, self._stored[kind])
 
     # --- global parameters ---
@@ -242,7 +242,7 @@ class TmclModule:
             return int(self._clock.now() * 1000.0) & 0x7FFFFFFF
         if bank == 2:
             return self._variables[kind]
-        raise Refused(BAD_TYPE if bank == 0 else BAD_VALUE)
+        raise TmclRefused(BAD_TYPE if bank == 0 else BAD_VALUE)
 
     def _set_global(self, kind: int, bank: int, value: int) -> int:
         if bank == 2:
@@ -253,15 +253,15 @@ class TmclModule:
             if kind == EEPROM_LOCK and value in (LOCK, UNLOCK):
                 self._locked = value == LOCK
         else:
-            raise Refused(BAD_TYPE if bank == 0 else BAD_VALUE)
+            raise TmclRefused(BAD_TYPE if bank == 0 else BAD_VALUE)
         return value
 
     def _store_global(self, kind: int, bank: int, value: int) -> int:
         if self._locked:
-            raise Refused(LOCKED)
+            raise TmclRefused(LOCKED)
         if bank == 2:
             if kind >= STORED_VARIABLES:
-                raise Refused(BAD_TYPE)
+                raise TmclRefused(BAD_TYPE)
             self._stored_variables[kind] = self._variables[kind]
         return self._get_global(kind, bank, 0)
 
@@ -275,7 +275,7 @@ class TmclModule:
     def _set_output(self, kind: int, bank: int, value: int) -> int:
         _check(bank, 2, 2)
         if kind >= len(self._outputs):
-            raise Refused(BAD_TYPE)
+            raise TmclRefused(BAD_TYPE)
         _check(value, 0, 1)
         self._outputs[kind] = value
         return value
@@ -287,9 +287,9 @@ class TmclModule:
             return {0: 0, 8: 240, 9: 31}[kind]
         if bank == 2 and kind < len(self._outputs):
             return self._outputs[kind]
-        raise Refused(BAD_TYPE if bank in (0, 1, 2) else BAD_VALUE)
+        raise TmclRefused(BAD_TYPE if bank in (0, 1, 2) else BAD_VALUE)
 
 
 def _check(value: int, low: int, high: int) -> None:
     if not low <= value <= high:
-        raise Refused(BAD_VALUE)
+        raise TmclRefused(BAD_VALUE)

@@ -16,7 +16,7 @@ from dataclasses import replace
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import FAULTS as VEHICLE_FAULTS
-from sim_backends.models.vehicle import Feedback, Mode, VehicleModel, VehicleParams
+from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams, VehicleReadings
 from sim_backends.peers.vehicle.slcan import CanFrame, SlcanBus
 
 FOREIGN, SECOND = "can.foreign_commands", "can.second_vehicle"
@@ -37,7 +37,7 @@ _SECOND_AT_M = (12.0, 11.5)
 _SIDES = (1, -1, -1, 1)
 """Motors 1…4 are right front, left front, left rear, right rear: +1 right, −1 left."""
 
-_Encoder = Callable[[Feedback, VehicleParams, int], bytes]
+_Encoder = Callable[[VehicleReadings, VehicleParams, int], bytes]
 
 
 class AgilexPeer:
@@ -118,7 +118,7 @@ class AgilexPeer:
             if frames:
                 self._bus.send(frames)
 
-    def _of_others(self, cyclic: _Cyclic, feedback: Feedback) -> list[CanFrame]:
+    def _of_others(self, cyclic: _Cyclic, feedback: VehicleReadings) -> list[CanFrame]:
         """What others put on the bus beside this frame of the vehicle's."""
         frames = []
         if SECOND in self._others and cyclic.id in (SYSTEM_STATE, MOTION_STATE, ODOMETRY):
@@ -133,6 +133,12 @@ class AgilexPeer:
     def _receive(self, frame: CanFrame) -> None:
         if frame.extended or frame.remote or not frame.data:
             return
+        if frame.id in (VERSION_REQUEST, VERSION_TEXT):
+            self._tell_version(frame)
+        else:
+            self._obey(frame)
+
+    def _obey(self, frame: CanFrame) -> None:
         t, model, first = self._clock.now(), self.model, frame.data[0]
         if frame.id == MOTION_COMMAND and len(frame.data) >= 4:
             speed, yaw_rate = struct.unpack_from(">hh", frame.data)
@@ -145,10 +151,13 @@ class AgilexPeer:
             model.set_motion_mode(t, first)
         elif frame.id == CLEAR:
             model.clear_errors(t)
-        elif frame.id == VERSION_REQUEST and first == 1:
-            self._bus.send([CanFrame(VERSION_NUMBERS, struct.pack(">4H", *model.params.versions))])
-        elif frame.id == VERSION_TEXT and frame.data == b"\x01":
-            self._bus.send([CanFrame(VERSION_TEXT, part) for part in _version_text(model.params.versions)])
+
+    def _tell_version(self, asked: CanFrame) -> None:
+        versions = self.model.params.versions
+        if asked.id == VERSION_REQUEST and asked.data[0] == 1:
+            self._bus.send([CanFrame(VERSION_NUMBERS, struct.pack(">4H", *versions))])
+        elif asked.id == VERSION_TEXT and asked.data == b"\x01":
+            self._bus.send([CanFrame(VERSION_TEXT, part) for part in _version_text(versions)])
 
 
 def _version_text(versions: tuple[int, int, int, int]) -> list[bytes]:
@@ -177,28 +186,28 @@ class _Cyclic:
         return True
 
 
-def _system_state(f: Feedback, p: VehicleParams, count: int) -> bytes:
+def _system_state(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
     return struct.pack(">BBHHxB", f.state, f.mode, round(f.volts * 10.0), f.errors, count)
 
 
-def _motion_state(f: Feedback, p: VehicleParams, count: int) -> bytes:
+def _motion_state(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
     return struct.pack(">hhhh", _i16(f.speed * 1000.0), _i16(f.yaw_rate * 1000.0), 0, 0)
 
 
-def _motion_mode_state(f: Feedback, p: VehicleParams, count: int) -> bytes:
+def _motion_mode_state(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
     return bytes([f.motion_mode, 0])
 
 
-def _odometry(f: Feedback, p: VehicleParams, count: int) -> bytes:
+def _odometry(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
     return struct.pack(">ii", _i32(f.left * 1000.0), _i32(f.right * 1000.0))
 
 
-def _battery(f: Feedback, p: VehicleParams, count: int) -> bytes:
+def _battery(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
     return struct.pack(">BBhhh", 87, 100, round(f.volts * 10.0), _i16(10.0 * _amperes(f.speed)), 250)
 
 
 def _motor_motion(side: int) -> _Encoder:
-    def encode(f: Feedback, p: VehicleParams, count: int) -> bytes:
+    def encode(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
         rim = f.speed + side * 0.5 * p.track * f.yaw_rate
         turns = (f.right if side > 0 else f.left) / (2.0 * math.pi * p.wheel_radius)
         rpm = 60.0 * rim / (2.0 * math.pi * p.wheel_radius)
@@ -208,7 +217,7 @@ def _motor_motion(side: int) -> _Encoder:
 
 
 def _motor_driver(motor: int) -> _Encoder:
-    def encode(f: Feedback, p: VehicleParams, count: int) -> bytes:
+    def encode(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
         return struct.pack(">HhbBxx", round(f.volts * 10.0), 31, 33, _DRIVER_ENABLED | f.drivers[motor])
 
     return encode

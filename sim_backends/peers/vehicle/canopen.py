@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.vehicle import DRIVER_OVERLOAD, FAULTS, Mode, VehicleModel
-from sim_backends.models.vehicle import State as VehicleState
+from sim_backends.models.vehicle import DRIVER_OVERLOAD, FAULTS, ChassisState, Mode, VehicleModel
 from sim_backends.models.wheel_drive import WheelDrive
 from sim_backends.peers.vehicle.canopen_node import WRONG_VALUE, Abort, CanopenNode, Value
 from sim_backends.peers.vehicle.slcan import CanFrame, SlcanBus
@@ -128,7 +127,7 @@ class CanopenPeer:
         self.model.tick(t)
         told = self.model.feedback(t)
         for drive, motors in zip(self.drives, _MOTORS, strict=True):
-            drive.wheel.power(told.state is not VehicleState.EMERGENCY_STOP)
+            drive.wheel.power(told.state is not ChassisState.EMERGENCY_STOP)
             if bits := told.drivers[motors[0]] | told.drivers[motors[1]]:
                 drive.fault(BLOCKED if bits & DRIVER_OVERLOAD else CURRENT)
             drive.wheel.step(dt, told.speed + drive.side * 0.5 * self.model.params.track * told.yaw_rate)
@@ -199,7 +198,7 @@ class DriveNode:
 
             return Value("<I", round(0.5 / self._rim_per_unit), writable=True, write=write)
 
-        def option(form: str, value: int, *allowed: int, name: str = "") -> Value:
+        def option(form: str, value: int, allowed: tuple[int, ...], name: str = "") -> Value:
             def write(wanted: int) -> None:
                 if wanted not in allowed:
                     raise Abort(WRONG_VALUE)
@@ -215,14 +214,14 @@ class DriveNode:
             (0x1018, 2): Value("<I", 402),
             (0x1018, 3): Value("<I", 0x00010004),
             (0x1018, 4): Value("<I", 7000 + number),
-            (0x6007, 0): option("<h", 1, 0, 1, 2, 3, name="connection_lost_as"),
+            (0x6007, 0): option("<h", 1, (0, 1, 2, 3), name="connection_lost_as"),
             (0x603F, 0): Value("<H", mappable=True, read=lambda: self._code),
             (0x6040, 0): Value("<H", writable=True, mappable=True, write=self._control),
             (0x6041, 0): Value("<H", mappable=True, read=lambda: wheel.statusword),
-            (0x605A, 0): option("<h", 2, 1, 2, 5, 6, name="quick_stop_option"),
-            (0x605D, 0): option("<h", 1, 1, 2),
-            (0x605E, 0): option("<h", 2, 0, 1, 2),
-            (0x6060, 0): option("<b", 0, 0, 3, name="mode"),
+            (0x605A, 0): option("<h", 2, (1, 2, 5, 6), name="quick_stop_option"),
+            (0x605D, 0): option("<h", 1, (1, 2)),
+            (0x605E, 0): option("<h", 2, (0, 1, 2)),
+            (0x6060, 0): option("<b", 0, (0, 3), name="mode"),
             (0x6061, 0): Value("<b", mappable=True, read=lambda: wheel.mode),
             (0x6064, 0): Value("<i", mappable=True, read=self._position),
             (0x606C, 0): Value("<i", mappable=True, read=lambda: round(self._sign * wheel.speed / self._rim_per_unit)),

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.compiled import compiled
-from sim_backends.world.bodies.surfaces import Mesh, Surface
+from sim_backends.world.bodies.surfaces import Surface, SurfaceMesh
 
 Floats = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -36,7 +36,7 @@ class OwnSurface:
     vertices: Floats
     triangles: Faces
 
-    def walled(self, table: tuple[float, float, float]) -> Mesh:
+    def walled(self, table: tuple[float, float, float]) -> SurfaceMesh:
         """The mesh with sides from its open borders down to the table, z = a + b x + c y in S."""
         edges = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
         single, count = np.unique(edges, axis=0, return_counts=True)
@@ -51,7 +51,7 @@ class OwnSurface:
             first, second = border.T
             sides = [np.stack([first, below[:, 0], below[:, 1]], -1), np.stack([first, below[:, 1], second], -1)]
             vertices, faces = np.concatenate([vertices, feet]), np.concatenate([faces, *sides])
-        return Mesh(vertices, faces.astype(np.int32))
+        return SurfaceMesh(vertices, faces.astype(np.int32))
 
 
 def own_surface(path: str, unit: str) -> OwnSurface:
@@ -104,7 +104,7 @@ def _ground(name: str, vertices: Floats, faces: Faces) -> Surface:
 
     half, centre = 0.5 * (high - low), 0.5 * (high + low)
     return Surface(
-        name, relief, float(half[0]), float(half[1]), (float(centre[0]), float(centre[1])), float(high[2])
+        name, relief, float(half[0]), float(half[1]), centre=(float(centre[0]), float(centre[1])), top=float(high[2])
     )  # fmt: skip
 
 

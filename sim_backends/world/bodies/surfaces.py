@@ -27,7 +27,7 @@ HALF_Y = 0.018
 
 
 @dataclass(frozen=True)
-class Mesh:
+class SurfaceMesh:
     """Triangles of a surface: vertices (n, 3), m, frame S; triangles (m, 3), counter-clockwise from outside."""
 
     vertices: Floats
@@ -142,7 +142,7 @@ def surface(name: str) -> Surface:
 
 
 @cache
-def mesh(name: str, triangles: int = 80_000, walls: bool = True) -> Mesh:
+def mesh(name: str, triangles: int = 80_000, walls: bool = True) -> SurfaceMesh:
     """A regular grid mesh of the surface `name` with about `triangles` triangles, in S.
 
     `walls` adds the sides from the border down to the table, as seen by a camera. Raises ValueError for an unknown
@@ -161,7 +161,7 @@ def mesh(name: str, triangles: int = 80_000, walls: bool = True) -> Mesh:
     faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
     if walls:
         vertices, faces = _add_walls(vertices, faces, index)
-    return Mesh(vertices, faces.astype(np.int32))
+    return SurfaceMesh(vertices, faces.astype(np.int32))
 
 
 def _add_walls(vertices: Floats, faces: NDArray[np.intp], index: NDArray[np.intp]) -> tuple[Floats, NDArray[np.intp]]:
@@ -173,7 +173,7 @@ def _add_walls(vertices: Floats, faces: NDArray[np.intp], index: NDArray[np.intp
     return np.concatenate([vertices, foot]), np.concatenate([faces, sides])
 
 
-def write_stl(path: Path, surface_mesh: Mesh) -> None:
+def write_stl(path: Path, surface_mesh: SurfaceMesh) -> None:
     """Write `surface_mesh` as binary STL; coordinates in metres, frame S."""
     corners = surface_mesh.vertices[surface_mesh.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.apps.console.messages import CloudPart, Picture, Show
+from cell.apps.console.messages import CloudPart, Show, ShownPicture
 from lab.bench.wires.pages import cpu, looking
 from tests.support.console.server import Served, serving
 
@@ -43,6 +43,6 @@ def show(server: Served, picture: np.ndarray) -> None:
     for n in range(round(SECONDS / PERIOD_S)):
         server.process.tell(Show(json.dumps({"type": "state", "n": n, "fill": "x" * 3000})))
         if n % 2 == 0:
-            server.process.tell(Picture({"type": "picture", "camera": "scan_camera"}, np.roll(picture, n, 1)))
+            server.process.tell(ShownPicture({"type": "picture", "camera": "scan_camera"}, np.roll(picture, n, 1)))
             server.process.tell(CloudPart({"type": "cloud", "reset": n % 100 == 0}, b"\0" * 6400))
         time.sleep(max(0.0, begun + (n + 1) * PERIOD_S - time.monotonic()))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cell.apps.console.host.controller import SOON_S, Desk
+from cell.apps.console.host.controller import SOON_S, ConsoleController
 from cell.apps.console.host.observer import _figure
 from cell.apps.console.host.questions import Questions
 from cell.apps.console.server.mailbox import MOST_CLOUDS, Mailbox
@@ -32,21 +32,21 @@ STEPS = ("board_photo", "laser_sweep", "reconstruct")
 
 
 @pytest.fixture
-def desk(cell: Cell) -> Iterator[Desk]:
-    made = Desk(cell, "pot", lambda client, words: None)
+def desk(cell: Cell) -> Iterator[ConsoleController]:
+    made = ConsoleController(cell, "pot", lambda client, words: None)
     made.joined("c1")
     made.joined("c2")
     yield made
     made.close()
 
 
-def refusal(desk: Desk, client: str, **words: Any) -> CellError:
+def refusal(desk: ConsoleController, client: str, **words: Any) -> CellError:
     with pytest.raises(CellError) as refused:
         desk.do(client, words)
     return refused.value
 
 
-def test_one_holds_the_others_see(desk: Desk) -> None:
+def test_one_holds_the_others_see(desk: ConsoleController) -> None:
     assert "nobody" in str(refusal(desk, "c1", do="home"))
     assert desk.do("c1", {"do": "hold", "name": "  Ann\n\x07 "}) == {"ok": True, "text": "Ann holds the cell"}
     assert "Ann" in str(refusal(desk, "c2", do="hold", name="Bob"))
@@ -88,12 +88,12 @@ def test_one_holds_the_others_see(desk: Desk) -> None:
         ({"do": "dry_run", "seed": -1}, ConfigError),
     ],
 )
-def test_what_is_wrong_is_refused(desk: Desk, words: dict[str, Any], kind: type[CellError]) -> None:
+def test_what_is_wrong_is_refused(desk: ConsoleController, words: dict[str, Any], kind: type[CellError]) -> None:
     desk.do("c1", {"do": "hold", "name": "Ann"})
     assert type(refusal(desk, "c1", **words)) is kind
 
 
-def test_manual_mode_jogs_and_nothing_else_can_be_begun_meanwhile(cell: Cell, desk: Desk) -> None:
+def test_manual_mode_jogs_and_nothing_else_can_be_begun_meanwhile(cell: Cell, desk: ConsoleController) -> None:
     desk.do("c1", {"do": "hold", "name": "Ann"})
     desk.do("c1", {"do": "manual", "on": True})
     assert desk.manual.on
@@ -110,7 +110,7 @@ def test_manual_mode_jogs_and_nothing_else_can_be_begun_meanwhile(cell: Cell, de
     assert until(lambda: not desk.manual.on)
 
 
-def test_a_stop_ends_manual_mode_and_then_somebody_has_to_look(cell: Cell, desk: Desk) -> None:
+def test_a_stop_ends_manual_mode_and_then_somebody_has_to_look(cell: Cell, desk: ConsoleController) -> None:
     desk.do("c1", {"do": "hold", "name": "Ann"})
     desk.do("c1", {"do": "manual", "on": True})
     cell.stop()
@@ -123,7 +123,7 @@ def test_a_stop_ends_manual_mode_and_then_somebody_has_to_look(cell: Cell, desk:
 @pytest.mark.parametrize(("device", "axis"), [("arm", "z"), ("arm", "j1"), ("rail", "")])
 @pytest.mark.parametrize("end", ["release", "page gone", "another button", "manual off", "silence"])
 def test_what_ends_a_held_button_stops_the_motion(
-    cell: Cell, desk: Desk, monkeypatch: pytest.MonkeyPatch, device: str, axis: str, end: str
+    cell: Cell, desk: ConsoleController, monkeypatch: pytest.MonkeyPatch, device: str, axis: str, end: str
 ) -> None:
     """Virtual time passes here alone: what moves on after the end would be seen to."""
     cell.home("rail")
@@ -171,7 +171,7 @@ def test_holding_is_offered_only_where_something_beside_the_program_would_stop_i
 
 
 def test_what_takes_long_to_begin_is_answered_at_once_and_not_begun_twice(
-    cell: Cell, desk: Desk, monkeypatch: pytest.MonkeyPatch
+    cell: Cell, desk: ConsoleController, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told, slow = [], threading.Event()
 
@@ -195,7 +195,9 @@ def test_what_takes_long_to_begin_is_answered_at_once_and_not_begun_twice(
     assert "battery" in str(refusal(desk, "c1", do="start"))
 
 
-def test_a_stop_while_something_is_starting_ends_it(cell: Cell, desk: Desk, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stop_while_something_is_starting_ends_it(
+    cell: Cell, desk: ConsoleController, monkeypatch: pytest.MonkeyPatch
+) -> None:
     slow, begun = threading.Event(), list[Run[Any]]()
 
     def home(_: object) -> None:
@@ -405,7 +407,9 @@ def test_runs_of_the_archive_are_read_from_their_folders(tmp_path: Path) -> None
     assert archive.run(piped.name) is None and archive.run("20260103T000000-abcd") is None
 
 
-def test_jobs_are_named_never_addressed(desk: Desk, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_jobs_are_named_never_addressed(
+    desk: ConsoleController, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nothing of a file's text is told, and a pipe keeps nobody waiting."""
     elsewhere, here = tmp_path / "elsewhere", tmp_path / "here"
     for folder in (elsewhere, here):
@@ -442,7 +446,7 @@ def test_jobs_are_named_never_addressed(desk: Desk, tmp_path: Path, monkeypatch:
      {"device": "claw"}, {"axis": "x" * 900}, {"surplus": 1}],
     ids=str,
 )  # fmt: skip
-def test_a_beat_that_is_not_understood_moves_nothing(desk: Desk, wrong: dict[str, Any]) -> None:
+def test_a_beat_that_is_not_understood_moves_nothing(desk: ConsoleController, wrong: dict[str, Any]) -> None:
     beat = {"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1, "at": 1.0}
     with pytest.raises(ConfigError, match="not understood"):
         desk.beat("c1", beat | wrong)

@@ -14,7 +14,7 @@ import pytest
 
 from cell import Cell
 from cell.apps.cli import main
-from cell.apps.console.host.controller import Desk
+from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.view.run_view import RunView
 from cell.devices.simulated.direct import VirtualCell
 from cell.motion.arm_models import HOME
@@ -131,7 +131,7 @@ def test_a_jog_that_was_stopped_goes_on_to_its_goal_and_no_further(cell: Cell) -
 
 
 def test_manual_mode_asks_at_the_desk_takes_no_step_meanwhile_and_goes_on(cell: Cell) -> None:
-    desk = Desk(cell, "pot", lambda client, words: None)
+    desk = ConsoleController(cell, "pot", lambda client, words: None)
     desk.joined("c1")
     desk.do("c1", {"do": "hold", "name": "Ann"})
     desk.do("c1", {"do": "manual", "on": True})
@@ -159,7 +159,7 @@ def test_manual_mode_asks_at_the_desk_takes_no_step_meanwhile_and_goes_on(cell: 
 
 
 def test_an_arm_that_stopped_while_nothing_runs_is_unlocked_by_a_person_alone(cell: Cell) -> None:
-    desk = Desk(cell, "pot", lambda client, words: None)
+    desk = ConsoleController(cell, "pot", lambda client, words: None)
     desk.joined("c1")
     simulated(cell).fault("arm.protective_stop")
     with pytest.raises(InterlockError, match="does not hold it"):

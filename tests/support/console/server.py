@@ -16,7 +16,7 @@ from typing import Any
 from websockets.sync.client import ClientConnection, connect
 
 from cell.apps.console.host.link import ServerProcess
-from cell.apps.console.messages import Answer, AskCell, Do, Ready, Setup
+from cell.apps.console.messages import Answer, AskCell, Do, Ready, ServerSetup
 
 HOSTS = ("127.0.0.1", "localhost")
 
@@ -41,7 +41,7 @@ class Served:
         self.trouble: str | None = None
         facts = {"version": 1, "name": "test"}
         self.process = ServerProcess(
-            lambda fd: Setup(fd, self.port, HOSTS, lasting, None, None, str(runs), facts),
+            lambda fd: ServerSetup(fd, self.port, HOSTS, lasting, None, None, str(runs), facts),
             bound, self._hear, self._stop, lambda: None,
         )  # fmt: skip
         self._cookie = self._key = ""

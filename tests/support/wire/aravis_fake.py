@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from drivers.camera.genicam.acquisition import Network
 from drivers.camera.genicam.aravis import LIBRARIES
 from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import Setup
+from drivers.camera.genicam.connection import GenicamSetup
 from drivers.camera.genicam.device import GigePlace
 from drivers.camera.genicam.settings import Region
 from drivers.clock import Clock
@@ -74,7 +74,7 @@ def fake_camera(picture: Callable[[float], NDArray[np.uint8]], serial: str = "GV
 
 def opened(host: str, clock: Clock) -> GenicamCamera:
     """The driver on it, set to 640 x 480 pixels; what the camera sends in one go is not cut short on a busy machine."""
-    setup = Setup(Region(640, 480), network=Network(packet_size=8000, retention=2.0))
+    setup = GenicamSetup(Region(640, 480), network=Network(packet_size=8000, retention=2.0))
     return GenicamCamera("scan_camera", GigePlace(host), setup, clock=clock)
 
 

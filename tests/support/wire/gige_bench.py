@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from drivers.camera.genicam.aravis import AravisMissing, load
 from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import Setup
+from drivers.camera.genicam.connection import GenicamSetup
 from drivers.camera.genicam.device import GigePlace
 from drivers.camera.genicam.settings import Region
 from drivers.clock import Clock
@@ -51,10 +51,10 @@ class Bench:
     world: WorldClock
     clock: Clock
 
-    def open(self, setup: Setup | None = None, *, look: bool = False) -> GenicamCamera:
+    def open(self, setup: GenicamSetup | None = None, *, look: bool = False) -> GenicamCamera:
         """The driver, connected."""
         place = GigePlace(self.peer.address)
-        return GenicamCamera("scan_camera", place, setup or Setup(WHOLE), clock=self.clock, look=look)
+        return GenicamCamera("scan_camera", place, setup or GenicamSetup(WHOLE), clock=self.clock, look=look)
 
     def shown(self, frame: Frame) -> float:
         """Host time that the picture shows."""

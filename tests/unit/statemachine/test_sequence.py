@@ -7,49 +7,51 @@ import re
 import pytest
 
 from statemachine.policy import Policy, Step
-from statemachine.sequence import Sequence, SequenceError, State, Trigger, mermaid
+from statemachine.sequence import JobState, JobTrigger, Sequence, SequenceError, mermaid
 
 STEPS = ("drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose", "place")
-ENDS = (State.PLACED, State.REFUSED, State.FAULTED, State.ABORTED)
-STATES = [state for state in State if state is not State.DONE]
+ENDS = (JobState.PLACED, JobState.REFUSED, JobState.FAULTED, JobState.ABORTED)
+STATES = [state for state in JobState if state is not JobState.DONE]
 
 
 def at(state: str) -> Sequence:
     """A sequence that was led to `state` along its own transitions."""
     sequence = Sequence(STEPS)
-    if state is State.IDLE:
+    if state is JobState.IDLE:
         return sequence
-    if state is State.REFUSED:
-        sequence.fire(Trigger.REFUSE)
-    elif state is State.ABORTED:
-        sequence.fire(Trigger.ABORT)
+    if state is JobState.REFUSED:
+        sequence.fire(JobTrigger.REFUSE)
+    elif state is JobState.ABORTED:
+        sequence.fire(JobTrigger.ABORT)
     else:
-        sequence.fire(Trigger.START)
-    if state is State.PAUSED:
-        sequence.fire(Trigger.PAUSE)
-    elif state in (State.FAULTED, State.RECOVERING):
-        sequence.fire(Trigger.FAULT)
-    if state is State.RECOVERING:
+        sequence.fire(JobTrigger.START)
+    if state is JobState.PAUSED:
+        sequence.fire(JobTrigger.PAUSE)
+    elif state in (JobState.FAULTED, JobState.RECOVERING):
+        sequence.fire(JobTrigger.FAULT)
+    if state is JobState.RECOVERING:
         sequence.facts.recoverable, sequence.facts.retries_left = True, 1
-        sequence.fire(Trigger.RECOVER)
+        sequence.fire(JobTrigger.RECOVER)
     while sequence.state != state and sequence.state in STEPS:
         sequence.facts.done.add(sequence.state)
-        sequence.fire(Trigger.NEXT)
+        sequence.fire(JobTrigger.NEXT)
     assert sequence.state == state
     return sequence
 
 
 def test_the_steps_follow_each_other_to_placed():
     sequence = Sequence(STEPS)
-    walked = [sequence.fire(Trigger.START)]
+    walked = [sequence.fire(JobTrigger.START)]
     while sequence.state in STEPS:
         sequence.facts.done.add(sequence.state)
-        walked.append(sequence.fire(Trigger.NEXT))
+        walked.append(sequence.fire(JobTrigger.NEXT))
     assert walked == [*STEPS, "placed"]
 
 
 @pytest.mark.parametrize("state", [*STATES, *STEPS])
-@pytest.mark.parametrize(("trigger", "end"), [(Trigger.FAULT, State.FAULTED), (Trigger.ABORT, State.ABORTED)])
+@pytest.mark.parametrize(
+    ("trigger", "end"), [(JobTrigger.FAULT, JobState.FAULTED), (JobTrigger.ABORT, JobState.ABORTED)]
+)
 def test_fault_and_abort_lead_out_of_every_state(state, trigger, end):
     assert at(state).fire(trigger) == end
 
@@ -58,53 +60,53 @@ def test_fault_and_abort_lead_out_of_every_state(state, trigger, end):
 def test_no_step_is_left_before_it_is_done(step):
     sequence = at(step)
     with pytest.raises(SequenceError, match=r"held back.*not done"):
-        sequence.fire(Trigger.NEXT)
+        sequence.fire(JobTrigger.NEXT)
     assert sequence.state == step
 
 
 def test_a_job_with_done_steps_starts_at_the_first_open_one():
     sequence = Sequence(STEPS)
     sequence.facts.done |= {"drive_to_target", "board_photo"}
-    assert sequence.fire(Trigger.START) == "laser_sweep"
+    assert sequence.fire(JobTrigger.START) == "laser_sweep"
 
 
 @pytest.mark.parametrize("step", STEPS)
 def test_pause_and_recovery_come_back_to_the_step_they_left(step):
     sequence = at(step)
-    sequence.fire(Trigger.PAUSE)
-    assert sequence.fire(Trigger.RESUME) == step
+    sequence.fire(JobTrigger.PAUSE)
+    assert sequence.fire(JobTrigger.RESUME) == step
     sequence.facts.recoverable, sequence.facts.retries_left = True, 1
-    sequence.fire(Trigger.FAULT)
-    sequence.fire(Trigger.RECOVER)
-    assert sequence.fire(Trigger.RECOVERED) == step
+    sequence.fire(JobTrigger.FAULT)
+    sequence.fire(JobTrigger.RECOVER)
+    assert sequence.fire(JobTrigger.RECOVERED) == step
 
 
 @pytest.mark.parametrize(("recoverable", "retries"), [(False, 3), (True, 0)])
 def test_recovery_needs_a_recoverable_fault_and_a_retry_left(recoverable, retries):
     sequence = at("laser_sweep")
-    sequence.fire(Trigger.FAULT)
+    sequence.fire(JobTrigger.FAULT)
     sequence.facts.recoverable, sequence.facts.retries_left = recoverable, retries
     with pytest.raises(SequenceError, match="held back"):
-        sequence.fire(Trigger.RECOVER)
+        sequence.fire(JobTrigger.RECOVER)
 
 
 def test_a_trigger_that_leads_nowhere_is_an_error_that_names_both():
     with pytest.raises(SequenceError, match="'resume' leads nowhere from state 'idle'"):
-        Sequence(STEPS).fire(Trigger.RESUME)
+        Sequence(STEPS).fire(JobTrigger.RESUME)
 
 
 @pytest.mark.parametrize("end", ENDS)
 def test_every_end_can_be_reset_and_forgets_what_was_done(end):
     sequence = at(end)
-    assert sequence.fire(Trigger.RESET) == State.IDLE
-    assert sequence.fire(Trigger.START) == STEPS[0]
+    assert sequence.fire(JobTrigger.RESET) == JobState.IDLE
+    assert sequence.fire(JobTrigger.START) == STEPS[0]
 
 
 def test_changes_are_told_to_the_hook():
     told = []
     sequence = Sequence(STEPS, on_change=lambda *change: told.append(change))
-    sequence.fire(Trigger.START)
-    assert told == [(Trigger.START, State.IDLE, "drive_to_target")]
+    sequence.fire(JobTrigger.START)
+    assert told == [(JobTrigger.START, JobState.IDLE, "drive_to_target")]
 
 
 def test_the_machine_holds_exactly_the_table():
@@ -120,7 +122,7 @@ def test_the_diagram_shows_every_state_and_trigger():
     text = mermaid(Sequence(STEPS))
     edges = re.findall(r"(\S+) --> (\S+) : (\w+)", text)
     assert text.startswith("stateDiagram-v2\n")
-    assert {trigger for *_, trigger in edges} == {trigger.value for trigger in Trigger}
+    assert {trigger for *_, trigger in edges} == {trigger.value for trigger in JobTrigger}
     assert {name for edge in edges for name in edge[:2]} == {*map(str, STATES), *STEPS, "job", "any_state"}
     assert ("any_state", "faulted", "fault") in edges
     assert ("any_state", "aborted", "abort") in edges
@@ -156,12 +158,12 @@ def test_steps_have_names_of_their_own(steps):
 def test_a_chosen_step_is_done_again_with_all_that_follow_it():
     sequence = at("invert_pose")
     with pytest.raises(SequenceError, match=r"held back.*chosen step"):
-        sequence.fire(Trigger.AGAIN)
+        sequence.fire(JobTrigger.AGAIN)
     sequence.facts.chosen = "place"
     with pytest.raises(SequenceError, match="held back"):
-        sequence.fire(Trigger.AGAIN)
+        sequence.fire(JobTrigger.AGAIN)
     sequence.facts.chosen = "board_photo"
-    assert sequence.fire(Trigger.AGAIN) == "board_photo"
+    assert sequence.fire(JobTrigger.AGAIN) == "board_photo"
     assert sequence.facts.done == {"drive_to_target"}
     assert sequence.facts.chosen is None
 

@@ -23,7 +23,7 @@ from statemachine.control import RunControl
 from statemachine.journal import Journal, request
 from statemachine.policy import OnFailure, Policy, Step
 from statemachine.runner import Runner, RunResult, StepContext
-from statemachine.sequence import Sequence, State
+from statemachine.sequence import JobState, Sequence
 from statemachine.step import StepCall
 from statemachine.waiting import InLine, Threads, waiting_on
 
@@ -48,7 +48,7 @@ def run_step(
     journal = Journal(folder, "here")
     try:
         return Runner(
-            sequence=Sequence(("first", "second"), State.DONE),
+            sequence=Sequence(("first", "second"), JobState.DONE),
             steps={"first": first, "second": lambda context: None},
             policy=Policy((Step("first", 2.0, on_failure=OnFailure.STOP), Step("second", 2.0))),
             journal=journal,

@@ -24,7 +24,7 @@ from cell.apps.cli.options import (  # fmt: skip
 
 if TYPE_CHECKING:
     from cell.apps.recordings.attach import Options
-    from cell.measure.vision import Laser
+    from cell.measure.vision import LaserChannel
 
 
 def register(app: typer.Typer) -> None:
@@ -106,7 +106,9 @@ def calibrate(
         from cell.apps.recordings.known_camera import read_camera
 
         known = None if camera in (None, "pictures") else read_camera(Path(str(camera)))
-        options = Options(poses, pose_field, _setup(setup), plan, known, camera == "pictures", _laser(laser))
+        options = Options(
+            poses, pose_field, _setup(setup), plan, camera=known, hold_camera=camera == "pictures", laser=_laser(laser)
+        )
         _from_folder(source, board, options, json, details)
         return
     from cell.apps.cli.calibration.tables import print_examination
@@ -142,14 +144,14 @@ def _setup(text: str | None) -> str | None:
     return None if text is None else text.replace("-", "_")
 
 
-def _laser(text: str | None) -> Laser | None:
-    from cell.measure.vision import Laser
+def _laser(text: str | None) -> LaserChannel | None:
+    from cell.measure.vision import LaserChannel
     from drivers.errors import ConfigError
 
     allowed = ("none", "red", "green", "blue", "grey", "auto")
     if text not in (None, *allowed):
         raise ConfigError(f"--laser {text}: allowed are {', '.join(allowed)}")
-    return None if text == "none" else Laser(text or "auto")
+    return None if text == "none" else LaserChannel(text or "auto")
 
 
 def _from_folder(folder: Path, board: str | None, options: Options, json: bool, details: bool) -> None:

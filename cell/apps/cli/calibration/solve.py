@@ -39,7 +39,7 @@ def solve(
     loaded = load_config(find_config(config, simulated=True))
     if config is not None:
         o = observations
-        again = gathered(o.scan, o.target, o.identities, loaded, o.kinematics, o.witness)
+        again = gathered(o.scan, o.target, o.identities, config=loaded, kinematics=o.kinematics, witness=o.witness)
         observations = replace(again, made=o.made)
     solved = solve_observations(observations)
     summary = solved.calibration.summary()

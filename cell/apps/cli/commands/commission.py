@@ -24,7 +24,7 @@ from cell.apps.cli.options import (  # fmt: skip
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from cell.apps.commission.check import Check, Result
+    from cell.apps.commission.check import CommissionCheck, Result
     from cell.apps.commission.sequence import Commissioning
 
 
@@ -129,11 +129,11 @@ def _person(simulated: bool, console: Console) -> Any:
 class _Page:
     """Shows a check on the console once it has ended."""
 
-    def __init__(self, console: Console, checks: tuple[Check, ...]) -> None:
+    def __init__(self, console: Console, checks: tuple[CommissionCheck, ...]) -> None:
         self._console = console
         self._numbers = {check.name: k for k, check in enumerate(checks, 1)}
 
-    def __call__(self, check: Check, verdict: str, result: Result | None) -> None:
+    def __call__(self, check: CommissionCheck, verdict: str, result: Result | None) -> None:
         from rich.table import Table
         from rich.text import Text
 
@@ -160,7 +160,7 @@ class _Page:
             self._console.print(f"  {note}", style="dim" if verdict == "good" else "", markup=False)
 
 
-def _list(made: Commissioning, checks: list[Check], json: bool) -> None:
+def _list(made: Commissioning, checks: list[CommissionCheck], json: bool) -> None:
     from cell.config.cell_config import load_config
 
     config = load_config(made.path)

@@ -57,7 +57,7 @@ def console(
     from cell.run.session.supervisor import Cell
 
     require_installed()
-    address = Address(host, port, tuple(name or ()), token_file, certificate, key)
+    address = Address(host, port, tuple(name or ()), token_file=token_file, certificate=certificate, key=key)
     address.checked()
     # At the wall's pace unless told otherwise: a person holds the buttons.
     pace = speed if speed is not None else 1.0 if set(simulated_of(sim, config)) == set(DEVICES) else None

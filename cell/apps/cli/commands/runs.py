@@ -95,7 +95,7 @@ def confirm(
     if question is None and sys.stdin.isatty() and not typer.confirm("Have you looked, and may the run go on?"):
         raise typer.Exit(EXIT_FAILED)
     answer = f"told {{}} that question {waits.number} is confirmed"
-    _ask(str(folder), config, "confirm", by or getpass.getuser(), answer, waits.number)
+    _ask(str(folder), config, "confirm", reason=by or getpass.getuser(), answer=answer, number=waits.number)
 
 
 def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: str, number: int | None = None) -> None:

@@ -7,8 +7,8 @@ import math
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.commission.check import Check, Finding, Result
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.check import CommissionCheck, Finding, Result
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.measure.geometry.poses import from_ur
 from cell.motion.arm_models import HOME
 from drivers.errors import LimitError
@@ -25,7 +25,7 @@ MASS_OFF, CENTRE_OFF = 0.25, 0.025
 """kg and m by which a payload may differ from what the force tells."""
 
 
-def _axes(desk: Desk, result: Result) -> None:
+def _axes(desk: CommissionWorkplace, result: Result) -> None:
     arm = desk.devices.arm
     if not desk.devices.vehicle.state().braked:
         desk.devices.vehicle.recover()
@@ -68,7 +68,7 @@ def _axes(desk: Desk, result: Result) -> None:
     result.measure("a joint beyond its limit refused", refused, "", least=1.0)
 
 
-def _payload(desk: Desk, result: Result) -> None:
+def _payload(desk: CommissionWorkplace, result: Result) -> None:
     arm, config = desk.devices.arm, desk.config.arm
     desk.fold()
     mover = desk.mover()
@@ -105,7 +105,7 @@ def _payload(desk: Desk, result: Result) -> None:
                 f"{told:g} kg", f"{carried:.2f} kg with its centre at ({shown}) mm",
                 "Weigh tool and part, and write both; with a wrong one the arm stops for no reason, or feels contact "
                 "late.",
-                {
+                write={
                     "arm.payload": f'"{carried:.1f} kg"',
                     "arm.payload_centre": "[" + ", ".join(f'"{round(1e3 * float(v)):d} mm"' for v in centre) + "]",
                 },
@@ -142,16 +142,16 @@ def weigh(turns: Vector, wrenches: Vector) -> tuple[float, Vector, float]:
 
 
 CHECKS = [
-    Check(
+    CommissionCheck(
         "arm_axes", "Arm: each joint alone, direction and unit",
-        "one joint after the other", "2 deg and back", f"{math.degrees(SPEED):.0f} deg/s",
-        f"2 deg within {MOST_OFF_DEG} deg, no other joint, flange as the model has it; beyond a limit refused",
-        ("arm.model", "arm.address"), ("links",), _axes,
+        "one joint after the other", far="2 deg and back", fast=f"{math.degrees(SPEED):.0f} deg/s",
+        limit=f"2 deg within {MOST_OFF_DEG} deg, no other joint, flange as the model has it; beyond a limit refused",
+        keys=("arm.model", "arm.address"), needs=("links",), work=_axes,
     ),
-    Check(
+    CommissionCheck(
         "payload", "Arm: what it carries, by the force that it feels at rest",
-        "the arm to its folded posture, then two wrist joints", "up to 35 deg", "15 deg/s, 150 mm/s",
-        f"within {MASS_OFF} kg and {1e3 * CENTRE_OFF:.0f} mm of arm.payload and arm.payload_centre",
-        ("arm.payload", "arm.payload_centre"), ("arm_axes",), _payload,
+        "the arm to its folded posture, then two wrist joints", far="up to 35 deg", fast="15 deg/s, 150 mm/s",
+        limit=f"within {MASS_OFF} kg and {1e3 * CENTRE_OFF:.0f} mm of arm.payload and arm.payload_centre",
+        keys=("arm.payload", "arm.payload_centre"), needs=("arm_axes",), work=_payload,
     ),
 ]  # fmt: skip

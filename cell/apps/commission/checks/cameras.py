@@ -9,11 +9,11 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.commission.check import Check, Finding, Result
+from cell.apps.commission.check import CommissionCheck, Finding, Result
 from cell.apps.commission.measuring import measure
 from cell.apps.commission.mounting import RoughMounting, against_drawing
 from cell.apps.commission.seeing import Eye, eye_of, find_view
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.measure.vision import BoardSpec
 from drivers.interfaces import Image
 
@@ -29,7 +29,7 @@ LEAST_CONTRAST = 25.0
 MOST_SATURATED = 1.0
 
 
-def _look(name: str, desk: Desk, result: Result) -> None:
+def _look(name: str, desk: CommissionWorkplace, result: Result) -> None:
     eye = eye_of(desk, name)
     seen = find_view(desk, result, eye)
     desk.keep(result, f"{name}-focus", seen.frame, seen.view.pixels)
@@ -65,7 +65,7 @@ def picture_figures(result: Result, image: Image, points: object, eye: Eye) -> N
     )  # fmt: skip
 
 
-def _mounting(name: str, desk: Desk, result: Result) -> None:
+def _mounting(name: str, desk: CommissionWorkplace, result: Result) -> None:
     eye = eye_of(desk, name)
     axes, found = measure(desk, result, eye)
     drawn = eye.config.flange_from_camera.se3()
@@ -85,14 +85,14 @@ def _mounting(name: str, desk: Desk, result: Result) -> None:
         result.find(
             Finding(
                 f"{name}.flange_from_camera", turned.words, pose_words(drawn), pose_words(found.flange_from_camera),
-                "Have the configuration say so, or turn the camera as it is drawn.",
-                {f"{name}.flange_from_camera": pose_toml(turned.pose)},
+                remedy="Have the configuration say so, or turn the camera as it is drawn.",
+                write={f"{name}.flange_from_camera": pose_toml(turned.pose)},
             )
         )  # fmt: skip
     _board(eye, result, axes.across, axes.along, found)
 
 
-def _carriage(desk: Desk, name: str) -> tuple[float, float]:
+def _carriage(desk: CommissionWorkplace, name: str) -> tuple[float, float]:
     """Between which ways along its x axis the camera may be from where it is drawn, m: at rail position 0."""
     if name != "scan_camera":
         return 0.0, 0.0
@@ -109,9 +109,9 @@ def _board(eye: Eye, result: Result, across: float, along: float, found: RoughMo
             Finding(
                 f"{eye.name}.focal_length",
                 "ways along the optical axis are seen longer or shorter than ways across it",
-                f"{1e3 * eye.config.focal_length:.2f} mm", f"{1e3 * focal:.2f} mm",
-                "Read the focal length on the lens and the pixel's size in the camera's data sheet.",
-                {f"{eye.name}.focal_length": f'"{1e3 * focal:.1f} mm"'},
+                f"{1e3 * eye.config.focal_length:.2f} mm", found=f"{1e3 * focal:.2f} mm",
+                remedy="Read the focal length on the lens and the pixel's size in the camera's data sheet.",
+                write={f"{eye.name}.focal_length": f'"{1e3 * focal:.1f} mm"'},
             )
         )  # fmt: skip
         return
@@ -120,9 +120,9 @@ def _board(eye: Eye, result: Result, across: float, along: float, found: RoughMo
         result.find(
             Finding(
                 key, "the board has another pitch than its name says, by the ways of the arm",
-                f"{1e3 * eye.board.pitch:g} mm", f"{1e3 * eye.board.pitch * across:.2f} mm",
-                "Measure from the first to the last point with a ruler, and name the board so.",
-                {key: f'"{named}"'} if named != eye.board.name else {},
+                f"{1e3 * eye.board.pitch:g} mm", found=f"{1e3 * eye.board.pitch * across:.2f} mm",
+                remedy="Measure from the first to the last point with a ruler, and name the board so.",
+                write={key: f'"{named}"'} if named != eye.board.name else {},
             )
         )  # fmt: skip
         return
@@ -133,9 +133,9 @@ def _board(eye: Eye, result: Result, across: float, along: float, found: RoughMo
         key = f"{eye.key}.base_from_board"
         result.find(
             Finding(
-                key, "the board lies elsewhere on the deck", pose_words(drawn), pose_words(found.base_from_board),
-                "Put it where it is drawn, or have the configuration say where it is.",
-                {key: pose_toml(found.base_from_board)},
+                key, "the board lies elsewhere on the deck", pose_words(drawn), found=pose_words(found.base_from_board),
+                remedy="Put it where it is drawn, or have the configuration say where it is.",
+                write={key: pose_toml(found.base_from_board)},
             )
         )  # fmt: skip
 
@@ -171,23 +171,23 @@ def _numbers(pose: pin.SE3) -> tuple[list[float], list[float]]:
     return at, turned
 
 
-def _camera_check(name: str, other: tuple[str, ...]) -> list[Check]:
+def _camera_check(name: str, other: tuple[str, ...]) -> list[CommissionCheck]:
     kind = name.removesuffix("_camera")
     plate = "calibration.fine" if kind == "scan" else "calibration.large"
     depth = "130" if kind == "scan" else "650"
     keys = (name, plate, "arm.model", "arm.vehicle_from_base", "rail.travel")[: 5 if kind == "scan" else 4]
     return [
-        Check(
+        CommissionCheck(
             f"{kind}_picture", f"{name}: light, focus and board in the picture",
-            "the arm, in planned ways, until the board is seen", f"to {depth} mm above the board on the deck",
-            "15 deg/s, 150 mm/s", "board found; brightness, contrast and sharpness in their limits",
-            keys, other, partial(_look, name),
+            "the arm, in planned ways, until the board is seen", far=f"to {depth} mm above the board on the deck",
+            fast="15 deg/s, 150 mm/s", limit="board found; brightness, contrast and sharpness in their limits",
+            keys=keys, needs=other, work=partial(_look, name),
         ),
-        Check(
+        CommissionCheck(
             f"{kind}_mounting", f"{name}: its mounting, and the board's pitch, from shifted and turned views",
             "the flange by small steps before the board", "5 mm and 12 deg" if kind == "scan" else "30 mm and 12 deg",
-            "15 deg/s, 150 mm/s", "within 8 deg and 20 mm of the drawing, board within 2.5 % of its name",
-            keys, (f"{kind}_picture",), partial(_mounting, name),
+            fast="15 deg/s, 150 mm/s", limit="within 8 deg and 20 mm of the drawing, board within 2.5 % of its name",
+            keys=keys, needs=(f"{kind}_picture",), work=partial(_mounting, name),
         ),
     ]  # fmt: skip
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from functools import partial
 
-from cell.apps.commission.check import Check, Result
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.check import CommissionCheck, Result
+from cell.apps.commission.workplace import CommissionWorkplace
 from drivers.errors import CalibrationStale, RefusedError
 
 BEFORE_PLACING = "invert_pose"
 ALL = ("rail", "arm", "vehicle", "scan_camera", "target_camera", "laser", "claw", "calibration")
 
 
-def _calibrate(desk: Desk, result: Result) -> None:
+def _calibrate(desk: CommissionWorkplace, result: Result) -> None:
     desk.mover()
     desk.confirm("rail", "the carriage", "its whole travel", "its configured speed")
     desk.confirm("laser", "laser goggles on", "at each view", "on and off")
@@ -36,7 +36,7 @@ def _calibrate(desk: Desk, result: Result) -> None:
     )
 
 
-def _verify(desk: Desk, result: Result) -> None:
+def _verify(desk: CommissionWorkplace, result: Result) -> None:
     verification = desk.cell.verify(desk.heard, desk.job_file)
     summary = verification.summary()
     for row in summary["figures"]:
@@ -45,7 +45,7 @@ def _verify(desk: Desk, result: Result) -> None:
     result.measure("calibration is good today", float(verification.good), "", least=1.0, remedy=str(summary["reason"]))
 
 
-def _job(part: bool, desk: Desk, result: Result) -> None:
+def _job(part: bool, desk: CommissionWorkplace, result: Result) -> None:
     cell, name = desk.cell, desk.job.job.name
     desk.confirm("vehicle", "its wheels, to the station", "the job's whole way", "its configured speed")
     if not part:
@@ -69,24 +69,24 @@ def _job(part: bool, desk: Desk, result: Result) -> None:
 
 
 CHECKS = [
-    Check(
+    CommissionCheck(
         "calibration", "Calibration", "arm, rail and laser, over the two boards on the deck", "their whole reach there",
-        "as configured", "solved, and its own checks good",
-        ALL, ("station",), _calibrate, recorded=False,
+        fast="as configured", limit="solved, and its own checks good",
+        keys=ALL, needs=("station",), work=_calibrate, recorded=False,
     ),
-    Check(
+    CommissionCheck(
         "verification", "Verification of the calibration", "arm, rail and laser, one view of each board",
-        "their whole reach there", "as configured", "no part suspected at the job's tolerance",
-        ALL, ("calibration",), _verify, recorded=False,
+        far="their whole reach there", fast="as configured", limit="no part suspected at the job's tolerance",
+        keys=ALL, needs=("calibration",), work=_verify, recorded=False,
     ),
-    Check(
+    CommissionCheck(
         "job_empty", "First job, empty claw, up to the place pose", "everything: vehicle, arm, rail, laser",
-        "the whole job but placing", "as configured", "done",
-        (*ALL, "job"), ("verification",), partial(_job, False), recorded=False,
+        far="the whole job but placing", fast="as configured", limit="done",
+        keys=(*ALL, "job"), needs=("verification",), work=partial(_job, False), recorded=False,
     ),
-    Check(
-        "job_part", "First job with the part", "everything: vehicle, arm, rail, laser, claw", "the whole job",
-        "as configured", "placed",
-        (*ALL, "job"), ("job_empty",), partial(_job, True), recorded=False,
+    CommissionCheck(
+        "job_part", "First job with the part", "everything: vehicle, arm, rail, laser, claw", far="the whole job",
+        fast="as configured", limit="placed",
+        keys=(*ALL, "job"), needs=("job_empty",), work=partial(_job, True), recorded=False,
     ),
 ]  # fmt: skip

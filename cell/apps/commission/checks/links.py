@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cell.apps.commission.check import Check, Result
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.check import CommissionCheck, Result
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.config.cell_config import DEVICES
 from cell.devices.diagnosis.diagnosis import STATES, ask
 
@@ -13,7 +13,7 @@ WHERE = tuple(
 """What tells who is connected, and where, whatever the make."""
 
 
-def _links(desk: Desk, result: Result) -> None:
+def _links(desk: CommissionWorkplace, result: Result) -> None:
     devices, config = desk.devices, desk.cell.config
     for name in STATES:
         device = getattr(devices, name)
@@ -36,9 +36,9 @@ def _links(desk: Desk, result: Result) -> None:
 
 
 CHECKS = [
-    Check(
+    CommissionCheck(
         "links", "Links and identities: every device answers and is well",
-        "nothing", "", "", "identity, round trips and figures as in `cell diag`",
-        WHERE, (), _links,
+        "nothing", far="", fast="", limit="identity, round trips and figures as in `cell diag`",
+        keys=WHERE, needs=(), work=_links,
     ),
 ]  # fmt: skip

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.apps.commission.check import Check, Finding, Result
+from cell.apps.commission.check import CommissionCheck, Finding, Result
 from cell.apps.commission.seeing import camera_of, centred_view, eye_of
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.makes.built_in import OnArm
 from cell.measure.vision import extract
 from drivers.errors import RefusedError
@@ -48,7 +48,7 @@ def bright_rows(off: Image, on: Image) -> int:
     return int(((peak > 10.0 * noise) & narrow).sum())
 
 
-def _outputs(desk: Desk, result: Result) -> None:
+def _outputs(desk: CommissionWorkplace, result: Result) -> None:
     config = desk.config
     if not isinstance(config.laser, OnArm) or not isinstance(config.claw, OnArm):
         result.notes.append("laser or claw does not hang on the arm's outputs: each is tried as it is configured")
@@ -88,16 +88,16 @@ def _outputs(desk: Desk, result: Result) -> None:
             Finding(
                 "laser.output, claw.output",
                 "the outputs of laser and claw are swapped: the claw's output lights the laser",
-                f"laser {laser}, claw {claw}", f"laser {claw}, claw {laser}",
-                "Swap the two numbers, or the two wires.",
-                {"laser.output": str(claw), "claw.output": str(laser)},
+                f"laser {laser}, claw {claw}", found=f"laser {claw}, claw {laser}",
+                remedy="Swap the two numbers, or the two wires.",
+                write={"laser.output": str(claw), "claw.output": str(laser)},
             )
         )  # fmt: skip
     else:
         _no_light(desk, result, laser, claw, enough)
 
 
-def _no_light(desk: Desk, result: Result, laser: int, claw: int, enough: float) -> None:
+def _no_light(desk: CommissionWorkplace, result: Result, laser: int, claw: int, enough: float) -> None:
     """Neither of the two lights the laser, or both do: try the others, if a person agrees."""
     others = [output for output in range(OUTPUTS) if output not in (laser, claw)]
     lit: list[int] = []
@@ -115,12 +115,12 @@ def _no_light(desk: Desk, result: Result, laser: int, claw: int, enough: float) 
             str(laser), f"the laser is lit by output {lit[0]}" if lit else "no output lights it",
             "See that laser.output is the connector that the laser hangs on, that the laser has power and its shutter "
             "is open, and that calibration.stripe_exposure is long enough.",
-            {"laser.output": str(lit[0])} if lit else {},
+            write={"laser.output": str(lit[0])} if lit else {},
         )
     )  # fmt: skip
 
 
-def _switch(desk: Desk, output: int) -> Switched:
+def _switch(desk: CommissionWorkplace, output: int) -> Switched:
     """Switch an output on and off again, with a picture and the inputs before and while it is on."""
     arm, clock = desk.devices.arm, desk.devices.clock
     eye = eye_of(desk, "scan_camera")
@@ -139,7 +139,7 @@ def _switch(desk: Desk, output: int) -> Switched:
     return Switched(off, on, before ^ after)
 
 
-def _laser_alone(desk: Desk, result: Result) -> None:
+def _laser_alone(desk: CommissionWorkplace, result: Result) -> None:
     eye = eye_of(desk, "scan_camera")
     centred_view(desk, result, eye)
     desk.confirm("laser", "laser goggles on, nobody looks into the beam", "half a second", "on and off")
@@ -158,7 +158,7 @@ def _laser_alone(desk: Desk, result: Result) -> None:
     _stripe(desk, result, on)
 
 
-def _stripe(desk: Desk, result: Result, lit: Frame) -> None:
+def _stripe(desk: CommissionWorkplace, result: Result, lit: Frame) -> None:
     """How good the stripe is: how many rows, how wide, how bright."""
     profile = extract(lit.image)
     rows = profile.rows
@@ -184,7 +184,7 @@ def _stripe(desk: Desk, result: Result, lit: Frame) -> None:
         )  # fmt: skip
 
 
-def _claw(desk: Desk, result: Result) -> None:
+def _claw(desk: CommissionWorkplace, result: Result) -> None:
     """With a part in it the claw's input shows it, and shows it no more when it has opened."""
     claw = desk.devices.claw
     if not desk.person.does("Hold a part between the fingers: the claw closes on it.", desk.fill_claw):
@@ -205,11 +205,11 @@ def _claw(desk: Desk, result: Result) -> None:
 
 
 CHECKS = [
-    Check(
+    CommissionCheck(
         "outputs", "Outputs: laser and claw, each by what the camera and the inputs show",
-        "laser and claw, each by its own output; the arm to its view of the board", "half a second each",
-        "on and off", "a stripe with laser.output alone; claw.feedback follows claw.output",
-        ("laser", "claw", "scan_camera", "calibration.fine", "calibration.stripe_exposure"),
-        ("rail_direction",), _outputs,
+        "laser and claw, each by its own output; the arm to its view of the board", far="half a second each",
+        fast="on and off", limit="a stripe with laser.output alone; claw.feedback follows claw.output",
+        keys=("laser", "claw", "scan_camera", "calibration.fine", "calibration.stripe_exposure"),
+        needs=("rail_direction",), work=_outputs,
     ),
 ]  # fmt: skip

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from cell.apps.commission.check import Check, Finding, Result
+from cell.apps.commission.check import CommissionCheck, Finding, Result
 from cell.apps.commission.seeing import centred_view, eye_of, see
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.makes.records import RailConfig
 from drivers.errors import DeviceFault, LimitError, RefusedError
 from drivers.interfaces import Nudged, Vector
@@ -25,7 +25,7 @@ BEYOND = 0.006
 """How far beyond an end of the travel its limit switch is looked for, m."""
 
 
-def _direction(desk: Desk, result: Result) -> None:
+def _direction(desk: CommissionWorkplace, result: Result) -> None:
     rail = desk.devices.rail
     eye = eye_of(desk, "scan_camera")
     if not _nudged(desk) and not rail.state().homed_here:
@@ -86,7 +86,7 @@ def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
                 f"+{1e3 * abs(told):.1f} mm", f"{1e3 * moved[0] * np.sign(told):+.1f} mm along the camera's x axis",
                 "Have the module turn the motor the other way, or swap the two wires of one of its coils. If it was "
                 "seen by eye to go away from its home switch, the camera sits upside down on the carriage instead.",
-                {"rail.reversed": str(not now).lower()} if hasattr(rail, "reversed") else {},
+                write={"rail.reversed": str(not now).lower()} if hasattr(rail, "reversed") else {},
             )
         )  # fmt: skip
     ratio = way / abs(told)
@@ -97,14 +97,14 @@ def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
         result.find(
             Finding(
                 "rail.lead", f"the carriage goes {ratio:.2f} times as far as it is told",
-                f"{1e3 * rail.lead:g} mm a turn", f"{1e3 * lead:.2f} mm a turn",
-                "Read the lead on the screw; steps per turn (motor) and microsteps (module) count as well.",
-                {"rail.lead": f'"{1e3 * value:.4g} mm"'},
+                f"{1e3 * rail.lead:g} mm a turn", found=f"{1e3 * lead:.2f} mm a turn",
+                remedy="Read the lead on the screw; steps per turn (motor) and microsteps (module) count as well.",
+                write={"rail.lead": f'"{1e3 * value:.4g} mm"'},
             )
         )  # fmt: skip
 
 
-def _watched_homing(desk: Desk) -> None:
+def _watched_homing(desk: CommissionWorkplace) -> None:
     """The zero of a rail whose direction nobody has seen: a person watches it. Raises `RefusedError`."""
     desk.confirm(
         "rail", "it searches its home switch; watch whether it goes towards that, and stop it if not",
@@ -115,13 +115,13 @@ def _watched_homing(desk: Desk) -> None:
         raise RefusedError("the rail did not go to its home switch: have its drive turn the motor the other way")
 
 
-def _nudged(desk: Desk) -> bool:
+def _nudged(desk: CommissionWorkplace) -> bool:
     """Whether this make of rail moves by a little before it is homed."""
     rail = desk.devices.rail
     return isinstance(getattr(rail, "bare", rail), Nudged)
 
 
-def _nudge(desk: Desk, way: float) -> None:
+def _nudge(desk: CommissionWorkplace, way: float) -> None:
     """By a little; a make that moves only when it is homed has been homed."""
     rail, speed = desk.devices.rail, min(SPEED, desk.config.rail.max_speed)
     if abs(way) < 1e-6:
@@ -133,7 +133,7 @@ def _nudge(desk: Desk, way: float) -> None:
         rail.move_to(rail.state().position + way, speed).wait(30.0)
 
 
-def _limits(desk: Desk, result: Result) -> None:
+def _limits(desk: CommissionWorkplace, result: Result) -> None:
     rail, config, clock = desk.devices.rail, desk.config.rail, desk.devices.clock
     low, high = config.travel
     desk.fold()
@@ -170,7 +170,7 @@ def _limits(desk: Desk, result: Result) -> None:
     rail.move_to(0.5 * (low + high), speed).wait(60.0)
 
 
-def _switches(desk: Desk, result: Result, speed: float) -> None:
+def _switches(desk: CommissionWorkplace, result: Result, speed: float) -> None:
     """Slowly beyond each end of the travel, until its limit switch stops the carriage; then the zero is found anew."""
     rail, (low, high) = desk.devices.rail, desk.config.rail.travel
     if not _nudged(desk):
@@ -214,17 +214,17 @@ def _switches(desk: Desk, result: Result, speed: float) -> None:
 
 
 CHECKS = [
-    Check(
+    CommissionCheck(
         "rail_direction", "Rail: which way and how far it goes, seen by its camera",
-        "the carriage, before it was ever homed", "1 mm, then 5 mm, and back", "5 mm/s",
-        "along the camera's x axis within 15 deg, and as far as told within 5 %",
-        ("rail", "scan_camera", "calibration.fine"), ("scan_mounting",), _direction,
+        "the carriage, before it was ever homed", far="1 mm, then 5 mm, and back", fast="5 mm/s",
+        limit="along the camera's x axis within 15 deg, and as far as told within 5 %",
+        keys=("rail", "scan_camera", "calibration.fine"), needs=("scan_mounting",), work=_direction,
     ),
-    Check(
+    CommissionCheck(
         "rail_limits", "Rail: home switch, ends of the travel, limits",
-        "the carriage", "its whole travel, and 6 mm beyond each end",
-        "half of rail.max_speed to its switch, then 20 and 5 mm/s",
-        "home found; both ends reached without a switch; commands beyond refused; limit switches stop it",
-        ("rail",), ("rail_direction",), _limits,
+        "the carriage", far="its whole travel, and 6 mm beyond each end",
+        fast="half of rail.max_speed to its switch, then 20 and 5 mm/s",
+        limit="home found; both ends reached without a switch; commands beyond refused; limit switches stop it",
+        keys=("rail",), needs=("rail_direction",), work=_limits,
     ),
 ]  # fmt: skip

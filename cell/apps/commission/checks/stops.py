@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 
-from cell.apps.commission.check import Check, Result
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.check import CommissionCheck, Result
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.procedures.drive.approach import Planar, RelativeOdometry, drive_line
 from cell.run.recorded_work import Hands
 from drivers.errors import Aborted, CellError, InterlockError
@@ -30,7 +30,7 @@ KEPT_ALIVE_S = 0.5
 BY = "the commissioning, which had stopped the cell itself"
 
 
-def _stops(desk: Desk, result: Result) -> None:
+def _stops(desk: CommissionWorkplace, result: Result) -> None:
     desk.fold()
     desk.home_rail()
     stood = RelativeOdometry(desk.devices.vehicle)
@@ -38,7 +38,7 @@ def _stops(desk: Desk, result: Result) -> None:
         if name == "vehicle" and not desk.config.vehicle.DRIVES:
             continue
         for sign, cause, stop in ((1.0, "Cell.stop()", _by_program), (-1.0, "`cell abort`", _by_request)):
-            _measured(desk, result, name, cause, partial(start, sign), stop)
+            _measured(desk, result, name, cause=cause, start=partial(start, sign), stop=stop)
     _vehicle_unrenewed(desk, result)
     _laser(desk, result)
     _emergency(desk, result)
@@ -46,12 +46,12 @@ def _stops(desk: Desk, result: Result) -> None:
 
 
 def _measured(
-    desk: Desk,
+    desk: CommissionWorkplace,
     result: Result,
     name: str,
     cause: str,
-    start: Callable[[Desk], object],
-    stop: Callable[[Desk, Callable[[], None]], None],
+    start: Callable[[CommissionWorkplace], object],
+    stop: Callable[[CommissionWorkplace, Callable[[], None]], None],
 ) -> None:
     """Set the device in motion, stop it, and watch it until it rests."""
     _prepare(desk, name)
@@ -85,7 +85,7 @@ def _measured(
     )
 
 
-def _prepare(desk: Desk, name: str) -> None:
+def _prepare(desk: CommissionWorkplace, name: str) -> None:
     """Where the motion to be stopped begins."""
     if name == "rail":
         low, high = desk.config.rail.travel
@@ -105,13 +105,13 @@ def _prepare(desk: Desk, name: str) -> None:
         desk.devices.vehicle.enable()
 
 
-def _rail_moves(sign: float, desk: Desk) -> Motion:
+def _rail_moves(sign: float, desk: CommissionWorkplace) -> Motion:
     low, high = desk.config.rail.travel
     goal = 0.5 * (low + high) + sign * 0.4 * (high - low)
     return desk.devices.rail.move_to(goal, min(RAIL_SPEED, desk.config.rail.max_speed))
 
 
-def _arm_moves(sign: float, desk: Desk) -> Motion:
+def _arm_moves(sign: float, desk: CommissionWorkplace) -> Motion:
     arm = desk.devices.arm
     if not desk.devices.vehicle.state().braked:
         desk.devices.vehicle.recover()
@@ -120,11 +120,11 @@ def _arm_moves(sign: float, desk: Desk) -> Motion:
     return arm.move_joints(goal, ARM_SPEED, math.radians(40.0))
 
 
-def _vehicle_moves(sign: float, desk: Desk) -> None:
+def _vehicle_moves(sign: float, desk: CommissionWorkplace) -> None:
     desk.devices.vehicle.drive(sign * VEHICLE_SPEED, 0.0)
 
 
-def _drive_back(desk: Desk, stood: RelativeOdometry) -> None:
+def _drive_back(desk: CommissionWorkplace, stood: RelativeOdometry) -> None:
     """The vehicle to where it stood, by its wheels' counters."""
     if not desk.config.vehicle.DRIVES:
         return
@@ -132,12 +132,12 @@ def _drive_back(desk: Desk, stood: RelativeOdometry) -> None:
     vehicle = desk.devices.vehicle
     vehicle.enable()
     try:
-        drive_line(vehicle, stood, Planar(0.0, 0.0, 0.0), VEHICLE_SPEED, desk.devices.clock, desk.look_around)
+        drive_line(vehicle, stood, Planar(0.0, 0.0, 0.0), VEHICLE_SPEED, desk.devices.clock, check=desk.look_around)
     finally:
         vehicle.brake()
 
 
-def _place(desk: Desk, name: str) -> float:
+def _place(desk: CommissionWorkplace, name: str) -> float:
     devices = desk.devices
     if name == "rail":
         return devices.rail.state().position
@@ -147,13 +147,13 @@ def _place(desk: Desk, name: str) -> float:
     return float(math.hypot(state.x, state.y))
 
 
-def _by_program(desk: Desk, begin: Callable[[], None]) -> None:
+def _by_program(desk: CommissionWorkplace, begin: Callable[[], None]) -> None:
     begin()
     desk.cell.stop()
     desk.cell.clear_stop(BY)
 
 
-def _by_request(desk: Desk, begin: Callable[[], None]) -> None:
+def _by_request(desk: CommissionWorkplace, begin: Callable[[], None]) -> None:
     """The run is asked to end, as `cell abort` asks from another shell."""
 
     def work(hands: Hands) -> None:
@@ -171,7 +171,7 @@ def _by_request(desk: Desk, begin: Callable[[], None]) -> None:
     raise InterlockError("cell", "a run that was asked to end did not end")
 
 
-def _vehicle_unrenewed(desk: Desk, result: Result) -> None:
+def _vehicle_unrenewed(desk: CommissionWorkplace, result: Result) -> None:
     """A vehicle that hears nothing any more stops by itself."""
     if not desk.config.vehicle.DRIVES:
         return
@@ -194,7 +194,7 @@ def _vehicle_unrenewed(desk: Desk, result: Result) -> None:
         vehicle.brake()
 
 
-def _laser(desk: Desk, result: Result) -> None:
+def _laser(desk: CommissionWorkplace, result: Result) -> None:
     """The laser goes off with a stop, whoever holds it."""
     desk.confirm("laser", "laser goggles on, nobody looks into the beam", "half a second", "on and off")
     if not desk.devices.vehicle.state().braked:
@@ -211,7 +211,7 @@ def _laser(desk: Desk, result: Result) -> None:
     desk.cell.clear_stop(BY)
 
 
-def _emergency(desk: Desk, result: Result) -> None:
+def _emergency(desk: CommissionWorkplace, result: Result) -> None:
     """A person stops the arm with the button while it turns; afterwards nothing goes on by itself."""
     arm, clock = desk.devices.arm, desk.devices.clock
     simulated = desk.simulated
@@ -257,11 +257,13 @@ def _emergency(desk: Desk, result: Result) -> None:
 
 
 CHECKS = [
-    Check(
+    CommissionCheck(
         "stops", "Stops: from each cause, time and way",
         "rail, joint 1 and wheels, one after the other, each stopped on its way; the laser",
-        "rail 20 mm, joint 1 6 deg, wheels 100 mm at most", "20 mm/s, 5 deg/s, 100 mm/s",
-        f"at rest within {MOST_S:g} s, {MOST_WAY['rail']:g} mm, {MOST_WAY['arm']:g} deg, {MOST_WAY['vehicle']:g} mm",
-        ("rail", "arm.model", "vehicle", "laser"), ("rail_limits", "vehicle", "outputs"), _stops, recorded=False,
+        far="rail 20 mm, joint 1 6 deg, wheels 100 mm at most", fast="20 mm/s, 5 deg/s, 100 mm/s",
+        limit=f"at rest within {MOST_S:g} s, {MOST_WAY['rail']:g} mm, {MOST_WAY['arm']:g} deg, "
+        f"{MOST_WAY['vehicle']:g} mm",
+        keys=("rail", "arm.model", "vehicle", "laser"), needs=("rail_limits", "vehicle", "outputs"), work=_stops,
+        recorded=False,
     ),
 ]  # fmt: skip

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.commission.check import Check, Finding, Result
+from cell.apps.commission.check import CommissionCheck, Finding, Result
 from cell.apps.commission.checks.cameras import PITCH_OFF, renamed
 from cell.apps.commission.mounting import axes_from_shifts
-from cell.apps.commission.workplace import Desk
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.config.calibrations.store import nominal_camera
 from cell.config.job import job_path, ships
 from cell.measure.geometry.poses import from_parts, from_ur
@@ -33,7 +33,7 @@ LEAST_SEEN = 0.012
 PHOTO_RATE = 10.0
 
 
-def _wheels(desk: Desk, result: Result) -> None:
+def _wheels(desk: CommissionWorkplace, result: Result) -> None:
     config, devices = desk.config, desk.devices
     if not config.vehicle.DRIVES:
         result.notes.append("the vehicle is fixed: nothing drives")
@@ -43,10 +43,10 @@ def _wheels(desk: Desk, result: Result) -> None:
     devices.vehicle.enable()
     try:
         odometry = RelativeOdometry(devices.vehicle)
-        drive_line(devices.vehicle, odometry, Planar(WAY, 0.0, 0.0), SPEED, devices.clock, _look(desk))
+        drive_line(devices.vehicle, odometry, Planar(WAY, 0.0, 0.0), SPEED, clock=devices.clock, check=_look(desk))
         there = odometry.pose()
         seen = desk.person.sees(f"Did the vehicle go {1e3 * WAY:.0f} mm ahead, the way it goes to the station?")
-        drive_line(devices.vehicle, odometry, Planar(0.0, 0.0, 0.0), SPEED, devices.clock, _look(desk))
+        drive_line(devices.vehicle, odometry, Planar(0.0, 0.0, 0.0), SPEED, clock=devices.clock, check=_look(desk))
     finally:
         devices.vehicle.brake()
     back = odometry.pose()
@@ -58,7 +58,7 @@ def _wheels(desk: Desk, result: Result) -> None:
     result.measure("a person saw it go ahead", float(seen), "", least=1.0)
 
 
-def _station(desk: Desk, result: Result) -> None:
+def _station(desk: CommissionWorkplace, result: Result) -> None:
     """Nearer to the station in strides until its board is seen; then the arm measures the board, and it the wheels."""
     config, devices, job = desk.config, desk.devices, desk.job
     look = look_pose(config, job, parse_board(job.board.spec), config.target_camera.flange_from_camera.se3())
@@ -86,7 +86,7 @@ def _station(desk: Desk, result: Result) -> None:
             _drive(desk, odometry, 0.0)
 
 
-def _until_seen(desk: Desk, result: Result, odometry: RelativeOdometry) -> np.ndarray | None:
+def _until_seen(desk: CommissionWorkplace, result: Result, odometry: RelativeOdometry) -> np.ndarray | None:
     """The station's board (3,) in the base once it is seen; None when it is not before the vehicle is near."""
     approach = desk.job.approach
     way = (Planar.of(approach.start.se3()).inverse() * Planar.of(approach.target.se3())).x
@@ -104,7 +104,7 @@ def _until_seen(desk: Desk, result: Result, odometry: RelativeOdometry) -> np.nd
     return seen
 
 
-def _by_board(desk: Desk, result: Result, odometry: RelativeOdometry, before: np.ndarray) -> None:
+def _by_board(desk: CommissionWorkplace, result: Result, odometry: RelativeOdometry, before: np.ndarray) -> None:
     """The wheels' way against the board, which stands: what comes nearer is the way of the vehicle."""
     from_here = odometry.pose().x
     _drive(desk, odometry, from_here + WAY)
@@ -135,17 +135,17 @@ def _by_board(desk: Desk, result: Result, odometry: RelativeOdometry, before: np
     )  # fmt: skip
 
 
-def _drive(desk: Desk, odometry: RelativeOdometry, ahead: float) -> None:
+def _drive(desk: CommissionWorkplace, odometry: RelativeOdometry, ahead: float) -> None:
     """So far ahead of where the odometry began, m, and braked."""
     vehicle = desk.devices.vehicle
     vehicle.enable()
     try:
-        drive_line(vehicle, odometry, Planar(ahead, 0.0, 0.0), STRIDE_SPEED, desk.devices.clock, _look(desk))
+        drive_line(vehicle, odometry, Planar(ahead, 0.0, 0.0), STRIDE_SPEED, desk.devices.clock, check=_look(desk))
     finally:
         vehicle.brake()
 
 
-def _pitch(desk: Desk, result: Result, look: pin.SE3) -> None:
+def _pitch(desk: CommissionWorkplace, result: Result, look: pin.SE3) -> None:
     """How large the station's board is, by the ways of the arm before it; the arm is back at `look` afterwards."""
     board, mover = parse_board(desk.job.board.spec), desk.mover()
     flanges, boards = [], []
@@ -194,7 +194,7 @@ def judge_board(job: str, board: BoardSpec, across: float, result: Result) -> No
     )  # fmt: skip
 
 
-def _look(desk: Desk) -> Callable[[], None]:
+def _look(desk: CommissionWorkplace) -> Callable[[], None]:
     def look() -> None:
         desk.look_around()
         desk.cell.whereabouts.count()
@@ -202,7 +202,7 @@ def _look(desk: Desk) -> Callable[[], None]:
     return look
 
 
-def _board_at(desk: Desk, result: Result, name: str) -> np.ndarray | None:
+def _board_at(desk: CommissionWorkplace, result: Result, name: str) -> np.ndarray | None:
     """The station's board (3,) in the base, roughly; None when it is not seen."""
     config, devices = desk.config, desk.devices
     camera = devices.target_camera
@@ -222,19 +222,19 @@ def _board_at(desk: Desk, result: Result, name: str) -> np.ndarray | None:
 
 
 CHECKS = [
-    Check(
+    CommissionCheck(
         "vehicle", "Vehicle: its wheels, direction and unit",
-        "the wheels, with the arm folded", f"{1e3 * WAY:.0f} mm ahead and back", f"{1e3 * SPEED:.0f} mm/s",
-        f"{1e3 * WAY:.0f} mm within {MOST_OFF_MM:.0f} mm, straight, and seen to go ahead",
-        ("vehicle",), ("target_mounting", "outputs"), _wheels,
+        "the wheels, with the arm folded", far=f"{1e3 * WAY:.0f} mm ahead and back", fast=f"{1e3 * SPEED:.0f} mm/s",
+        limit=f"{1e3 * WAY:.0f} mm within {MOST_OFF_MM:.0f} mm, straight, and seen to go ahead",
+        keys=("vehicle",), needs=("target_mounting", "outputs"), work=_wheels,
     ),
 ]  # fmt: skip
 STATION_CHECKS = [
-    Check(
+    CommissionCheck(
         "station", "Station: its board by the arm's measure, the wheels by the board",
         "the arm to the job's looking pose; the wheels, until the board is seen, and back",
-        f"up to {LEAST_LEFT:g} m before the job's target", f"{1e3 * STRIDE_SPEED:.0f} mm/s",
-        f"board within {100 * PITCH_OFF:g} % of its name; {1e3 * WAY:.0f} mm of the wheels bring it nearer",
-        ("vehicle", "target_camera", "arm.vehicle_from_base", "job"), ("stops",), _station,
+        far=f"up to {LEAST_LEFT:g} m before the job's target", fast=f"{1e3 * STRIDE_SPEED:.0f} mm/s",
+        limit=f"board within {100 * PITCH_OFF:g} % of its name; {1e3 * WAY:.0f} mm of the wheels bring it nearer",
+        keys=("vehicle", "target_camera", "arm.vehicle_from_base", "job"), needs=("stops",), work=_station,
     ),
 ]  # fmt: skip

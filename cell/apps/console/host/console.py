@@ -17,10 +17,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from cell.apps.console.host.controller import Desk
+from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.host.link import ServerProcess
-from cell.apps.console.host.observer import Look
-from cell.apps.console.messages import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, Setup
+from cell.apps.console.host.observer import CellObserver
+from cell.apps.console.messages import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, ServerSetup
 from cell.apps.console.view.facts import cell_facts
 from cell.config.job import load_job
 from cell.procedures.steps.kinds import find_kind
@@ -116,13 +116,14 @@ class Console:
         self._working = threading.BoundedSemaphore(MOST_AT_ONCE)
         bound = _bound(address)
         self.port: int = bound.getsockname()[1]
-        self.desk = Desk(cell, job, self._say, lambda run, name: self._look.began(run, name))
-        self._look = Look(cell, self.desk, lambda message: self._server.tell(message))
+        self.desk = ConsoleController(cell, job, self._say, lambda run, name: self._look.began(run, name))
+        self._look = CellObserver(cell, self.desk, lambda message: self._server.tell(message))
         certificate, key = (None if path is None else str(path) for path in (address.certificate, address.key))
         facts = cell_facts(cell, job)
         self._server = ServerProcess(
-            lambda fd: Setup(
-                fd, self.port, address.hosts, token, certificate, key, str(cell.runs_folder.resolve()), facts
+            lambda fd: ServerSetup(
+                fd, self.port, address.hosts, lasting=token, cert=certificate, key=key,
+                runs=str(cell.runs_folder.resolve()), cell=facts
             ),
             bound, self._heard, self._stop, self._left_alone,
         )  # fmt: skip

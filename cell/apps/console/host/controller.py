@@ -41,7 +41,7 @@ Answer = dict[str, Any]
 log = logging.getLogger(__name__)
 
 
-class Desk:
+class ConsoleController:
     """One cell's desk. `say(client, message)` sends something to one page, `began(run, job)` hears of each run."""
 
     def __init__(
@@ -121,7 +121,7 @@ class Desk:
             self.presses.end(client, "this page does not hold the cell")
             self._say(client, {"type": "jog", "press": number, "state": "refused", "text": self._why_not(client)})
             return
-        press = self.presses.beat(client, number, held["device"], held["axis"], held["sign"], held["at"])
+        press = self.presses.beat(client, number, held["device"], held["axis"], sign=held["sign"], at_ms=held["at"])
         if press is not None:
             self.manual.press(press)
 
@@ -284,7 +284,7 @@ class Desk:
         if (run := self.cell.current) is None:
             raise InterlockError("cell", "nothing is going on that waits for a decision")
         by = self.holders.name(client) if words["by"] is None else words["by"]
-        return self.questions.decide(run, words["number"], words["choice"], words["step"], by, words["reason"])
+        return self.questions.decide(run, words["number"], words["choice"], words["step"], by, reason=words["reason"])
 
     def _clear_stop(self, client: str, words: Words) -> str:
         self.cell.clear_stop(words["by"])

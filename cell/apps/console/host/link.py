@@ -16,7 +16,18 @@ from collections.abc import Callable
 from contextlib import suppress
 from multiprocessing.connection import Connection
 
-from cell.apps.console.messages import MOST_STOPS, CloudPart, Happened, Picture, Ready, Say, Setup, Show, Stop, Stopped
+from cell.apps.console.messages import (
+    MOST_STOPS,
+    CloudPart,
+    Happened,
+    Ready,
+    Say,
+    ServerSetup,
+    Show,
+    ShownPicture,
+    StopCell,
+    Stopped,
+)
 from drivers.errors import CellError
 
 START_S = 30.0
@@ -26,7 +37,7 @@ MOST_EVENTS, MOST_CLOUDS, MOST_SAID = 200, 64, 200
 log = logging.getLogger(__name__)
 
 
-class Outbox:
+class ServerOutbox:
     """What waits for the server: of what is shown only the newest."""
 
     def __init__(self) -> None:
@@ -44,7 +55,7 @@ class Outbox:
             match message:
                 case Show():
                     self._newest["state"] = message
-                case Picture(header, _):
+                case ShownPicture(header, _):
                     self._newest[header["camera"]] = message
                 case Happened():
                     self._events.append(message)
@@ -81,7 +92,7 @@ class ServerProcess:
 
     def __init__(
         self,
-        setup: Callable[[int], Setup],
+        setup: Callable[[int], ServerSetup],
         bound: socket.socket,
         heard: Callable[[object], None],
         stop: Callable[[], str | None],
@@ -89,7 +100,7 @@ class ServerProcess:
     ) -> None:
         """Start it; `CellError` when it does not answer."""
         self._heard, self._stop, self._gone = heard, stop, gone
-        self._outbox = Outbox()
+        self._outbox = ServerOutbox()
         self._closing = False
         self._ready = threading.Event()
         pairs = socket.socketpair(), socket.socketpair()
@@ -166,7 +177,7 @@ class ServerProcess:
         with suppress(EOFError, OSError):
             while True:
                 with self._receiving:
-                    message: Stop = self._stops.recv()
+                    message: StopCell = self._stops.recv()
                 trouble = self._stop()
                 with self._answering:
                     self._stops.send(Stopped(message.number, trouble))

@@ -10,8 +10,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from cell.apps.console.host.controller import Desk
-from cell.apps.console.messages import CloudPart, Happened, Picture, Show
+from cell.apps.console.host.controller import ConsoleController
+from cell.apps.console.messages import CloudPart, Happened, Show, ShownPicture
 from cell.apps.console.view.archive import true_error_mm
 from cell.apps.console.view.pictures import GrowingCloud, Pictures
 from cell.apps.console.view.readings import Readings
@@ -37,10 +37,10 @@ RECENT_RUNS = 20
 log = logging.getLogger(__name__)
 
 
-class Look:
+class CellObserver:
     """Of one cell and its desk; `tell` gives a message to the server."""
 
-    def __init__(self, cell: Cell, desk: Desk, tell: Callable[[object], None]) -> None:
+    def __init__(self, cell: Cell, desk: ConsoleController, tell: Callable[[object], None]) -> None:
         self._cell, self._desk, self._tell = cell, desk, tell
         simulated = () if cell.simulated is None else cell.simulated.simulated
         # On the virtual clock the devices have no time of the wall, and are not to be looked at by another thread.
@@ -159,7 +159,7 @@ class Look:
     def _show(self, run: Run[Any]) -> None:
         newest = self._pictures.newest(run)
         if newest is not None:
-            self._tell(Picture(*newest))
+            self._tell(ShownPicture(*newest))
         arm = self._readings.arm
         flange = None if arm is None else from_ur(arm.flange).homogeneous
         rail = self._cell.devices.rail.motion if "rail" in self._cell.devices else None

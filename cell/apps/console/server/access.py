@@ -55,7 +55,7 @@ def _secret() -> str:
 
 
 @dataclass(eq=False)
-class Session:
+class PageSession:
     """One browser's page that has opened the link. `key` goes with each request and each live link; `ticket` stands in
     its place in the address of a picture or a report. What it may ask for is limited for each session by itself."""
 
@@ -80,24 +80,24 @@ class Access:
         self._secure = secure
         self._lasting = lasting
         self._links: list[str] = []
-        self._sessions: list[Session] = []
+        self._sessions: list[PageSession] = []
 
     def link(self) -> str:
         """A new token, which works once; those before it that nobody used work no more."""
         self._links = [_secret()]
         return self._links[0]
 
-    def enter(self, token: str) -> Session | None:
+    def enter(self, token: str) -> PageSession | None:
         """A session for whoever has the token, None for anybody else."""
         once = [known for known in self._links if _same(known, token)]
         if not once and not (self._lasting is not None and _same(self._lasting, token)):
             return None
         self._links = [known for known in self._links if known not in once]
-        session = Session()
+        session = PageSession()
         self._sessions = [*self._sessions[-MOST_SESSIONS + 1 :], session]
         return session
 
-    def set_cookie(self, session: Session) -> str:
+    def set_cookie(self, session: PageSession) -> str:
         """The header that gives its cookie to the browser."""
         secure = "; Secure" if self._secure else ""
         return f"{self.cookie}={session.cookie}; HttpOnly; SameSite=Strict; Path=/{secure}"
@@ -119,12 +119,12 @@ class Access:
             return 403, "another page may not talk to the cell"
         return None
 
-    def opened(self, key: str, ticket: str) -> Session | None:
+    def opened(self, key: str, ticket: str) -> PageSession | None:
         """The session of this key or, where one suffices, of this ticket. Its cookie is another's once the same
         browser has opened a second link."""
         return next((own for own in self._sessions if _same(own.key, key) or _same(own.ticket, ticket)), None)
 
-    def session(self, cookie: str) -> Session | None:
+    def session(self, cookie: str) -> PageSession | None:
         """The session whose cookie this header has."""
         if len(cookie) > MOST_COOKIE_BYTES:
             return None

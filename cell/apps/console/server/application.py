@@ -50,7 +50,7 @@ Ask = Callable[[str, Mapping[str, Any]], Awaitable[tuple[int, Mapping[str, Any]]
 """What a page, by its id, wants done: status and answer."""
 
 
-class Guard:
+class AccessGuard:
     """Stands before everything: who may not is told so here, and every answer has the headers of `access.HEADERS`."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
@@ -161,7 +161,9 @@ class Application:
             WebSocketRoute("/live", self._live),
             Mount("/static", PageFiles(directory=PAGE), middleware=small),
         ]
-        return Guard(Starlette(routes=routes, exception_handlers={HTTPException: _refused, 500: _failed}), self._access)
+        return AccessGuard(
+            Starlette(routes=routes, exception_handlers={HTTPException: _refused, 500: _failed}), self._access
+        )
 
     async def _index(self, request: Request) -> Response:
         return FileResponse(PAGE / "index.html", headers={"cache-control": "no-store"})

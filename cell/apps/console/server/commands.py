@@ -30,20 +30,20 @@ Clock = Annotated[float, Field(ge=0.0, le=1e15)]
 Device = Literal["rail", "arm", "vehicle"]
 
 
-class Said(BaseModel):
+class PageMessage(BaseModel):
     """Anything that a page says."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-def _said(**fields: Any) -> type[Said]:
+def _said(**fields: Any) -> type[PageMessage]:
     """A schema of these fields, each its type and its default (... where it has to be said)."""
-    return create_model("Said", __base__=Said, **fields)
+    return create_model("PageMessage", __base__=PageMessage, **fields)
 
 
 _OF_JOB = _said(job=(Text | None, None))
 
-COMMANDS: dict[str, type[Said]] = {
+COMMANDS: dict[str, type[PageMessage]] = {
     "hold": _said(name=(Name, "")),
     "leave": _said(),
     "hand_over": _said(to=(Client, ...)),
@@ -71,7 +71,7 @@ COMMANDS: dict[str, type[Said]] = {
 }  # fmt: skip
 """By `do`; `stop` is not among them: it is carried out whatever else is said with it."""
 
-MESSAGES: dict[str, type[Said]] = {
+MESSAGES: dict[str, type[PageMessage]] = {
     "jog": _said(
         press=(Count, ...), device=(Device, ...), axis=(Axis, ""), sign=(Literal[1, -1], ...), at=(Clock | None, None)
     ),
@@ -90,7 +90,7 @@ def checked_message(words: Mapping[str, Any]) -> dict[str, Any]:
     return _checked(MESSAGES, "type", words)
 
 
-def _checked(schemas: Mapping[str, type[Said]], kind: str, words: Mapping[str, Any]) -> dict[str, Any]:
+def _checked(schemas: Mapping[str, type[PageMessage]], kind: str, words: Mapping[str, Any]) -> dict[str, Any]:
     name = words.get(kind)
     schema = schemas.get(name) if isinstance(name, str) else None
     if schema is None:

@@ -36,12 +36,12 @@ from cell.apps.console.messages import (
     Do,
     Happened,
     Left,
-    Picture,
     Ready,
     Say,
-    Setup,
+    ServerSetup,
     Show,
-    Stop,
+    ShownPicture,
+    StopCell,
     Stopped,
 )
 from cell.apps.console.server.access import Access
@@ -89,7 +89,7 @@ class Patient(H11Protocol):
 class Server:
     """The two pipes, and the event loop between them and the pages."""
 
-    def __init__(self, pipe: Connection, stops: Connection, setup: Setup) -> None:
+    def __init__(self, pipe: Connection, stops: Connection, setup: ServerSetup) -> None:
         self._pipe, self._stops, self._setup = pipe, stops, setup
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[Answer]] = {}
@@ -108,10 +108,10 @@ class Server:
             self.access,
             self.pages,
             Archive(Path(self._setup.runs)),
-            self._setup.cell,
-            self._do,
-            self._stop,
-            self._of_job,
+            cell=self._setup.cell,
+            do=self._do,
+            stop=self._stop,
+            of_job=self._of_job,
         )
         config = uvicorn.Config(
             application.asgi() if self._setup.lasting is not None else _entering(application.asgi(), self._renew),
@@ -197,7 +197,7 @@ class Server:
             number = next(self._numbers)
             self._stopping[number] = self._loop.time(), self._next
             self._next = None
-            self._stops.send(Stop(number))
+            self._stops.send(StopCell(number))
         elif len(ages) < MOST_STOPS:
             self._loop.call_later(max(0.01, LASTS_S - min(ages)), self._send_next)
 
@@ -218,7 +218,7 @@ class Server:
     def _take(self, message: object) -> None:
         """In the pipe's thread: compressing is done here, beside the event loop."""
         match message:
-            case Picture(header, image):
+            case ShownPicture(header, image):
                 done, jpeg = cv2.imencode(".jpg", image, JPEG)
                 if done:
                     message = header["camera"], packed(header, np.asarray(jpeg).tobytes())
@@ -293,7 +293,7 @@ def main(pipe: int, stops: int) -> None:
     logging.getLogger("uvicorn.error").addFilter(lambda record: "graceful shutdown" not in str(record.msg))
     cv2.setNumThreads(1)
     ends = Connection(pipe), Connection(stops)
-    setup: Setup = ends[0].recv()
+    setup: ServerSetup = ends[0].recv()
     asyncio.run(Server(*ends, setup).run())
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.procedures.sweep.swath import Collector, Sweeping
+from cell.procedures.sweep.swath import SweepCollector, Sweeping
 from cell.run.run import Run
 from drivers.interfaces import Frame
 
@@ -58,7 +58,7 @@ class Pictures:
         return header, small
 
 
-def _stripe(collector: Collector, frame: Frame, step: int) -> list[list[float]] | None:
+def _stripe(collector: SweepCollector, frame: Frame, step: int) -> list[list[float]] | None:
     """Where the stripe was found in this frame, in pixels of the small picture."""
     try:
         line = collector.frame_ids.index(frame.frame_id, max(0, len(collector.frame_ids) - 8))

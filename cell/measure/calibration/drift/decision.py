@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 
 from cell.measure.calibration.drift.detectability import Detectable, detectable
-from cell.measure.calibration.drift.evidence import Evidence
+from cell.measure.calibration.drift.evidence import DriftEvidence
 from cell.measure.calibration.drift.hypotheses import Hypothesis, hypotheses, log_factor, log_mean
-from cell.measure.calibration.solve.blocks import BOARD, PLANE, RAIL, SHARED, State
+from cell.measure.calibration.solve.blocks import BOARD, PLANE, RAIL, SHARED, AdjustmentState
 from cell.measure.calibration.solve.results import PARAMETERS
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.covariance import covariance_root
@@ -64,7 +64,7 @@ class Figure:
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
+class DriftVerdict:
     """`statistic` is the logarithm of the mean Bayes factor for a change, `threshold` what chance reaches.
 
     `fit` holds RMS residuals over the calibration's own by kind; `suspects` come most probable first;
@@ -94,7 +94,7 @@ class Verdict:
         return not self.changed and not self.badly_fitting
 
 
-def verdict(evidences: Mapping[str, Evidence], states: Mapping[str, State]) -> Verdict:
+def verdict(evidences: Mapping[str, DriftEvidence], states: Mapping[str, AdjustmentState]) -> DriftVerdict:
     """Decide, by chain ("scan", "target"), from the evidence and the calibrated states that it was weighed against."""
     tests = [(name, h) for name in evidences for h in hypotheses(name, states[name].camera.fx)]
     found = np.array([log_factor(evidences[name], h, evidences[name].score[None])[0] for name, h in tests])
@@ -111,11 +111,15 @@ def verdict(evidences: Mapping[str, Evidence], states: Mapping[str, State]) -> V
         if np.isfinite(weighed.stripe):
             fit["stripe"] = weighed.stripe
     figures = [figure for name in evidences for figure in _figures(name, evidences[name], states[name])]
-    seen = detectable(evidences, states, tests, scores, drawn, threshold)
-    return Verdict(float(log_mean(found[None])[0]), threshold, fit, _suspects(evidences, tests, found), figures, seen)
+    seen = detectable(evidences, states, tests, scores=scores, factors=drawn, threshold=threshold)
+    return DriftVerdict(
+        float(log_mean(found[None])[0]), threshold, fit, _suspects(evidences, tests, found), figures, detectable=seen
+    )
 
 
-def _suspects(evidences: Mapping[str, Evidence], tests: list[tuple[str, Hypothesis]], found: Array) -> list[Suspect]:
+def _suspects(
+    evidences: Mapping[str, DriftEvidence], tests: list[tuple[str, Hypothesis]], found: Array
+) -> list[Suspect]:
     """Parts by probability, where each hypothesis is as probable as any other beforehand."""
     weight = np.exp(found - found.max())
     weight /= weight.sum()
@@ -136,7 +140,7 @@ def _suspects(evidences: Mapping[str, Evidence], tests: list[tuple[str, Hypothes
     return [s for k, s in enumerate(made) if k == 0 or s.probability >= LEAST_PROBABILITY]
 
 
-def _figures(name: str, weighed: Evidence, state: State) -> list[Figure]:
+def _figures(name: str, weighed: DriftEvidence, state: AdjustmentState) -> list[Figure]:
     """The board against where the calibration found it, and for the scan head light plane and rail, each by itself."""
     board = np.eye(SHARED)[:, BOARD]
     moved, covariance = weighed.change(board)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.measure.calibration.drift.evidence import Evidence
+from cell.measure.calibration.drift.evidence import DriftEvidence
 from cell.measure.calibration.drift.hypotheses import (
     SCAN_DEPTH,
     SHIFT,
@@ -24,7 +24,7 @@ from cell.measure.calibration.drift.hypotheses import (
     log_mean,
     quadratic,
 )
-from cell.measure.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, SHARED, State, tangents
+from cell.measure.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, SHARED, AdjustmentState, tangents
 from cell.measure.geometry.camera import Array
 
 DETECTED = 0.95
@@ -94,18 +94,24 @@ def _shown(size: float, unit: str) -> float:
     return 1e3 * size if unit == "m" else float(np.degrees(size))
 
 
-def changes(chain: str, state: State) -> list[Change]:
+def changes(chain: str, state: AdjustmentState) -> list[Change]:
     """Every kind of change of the "scan" or the "target" chain, for its calibrated state."""
     unit = np.eye(SHARED)
     mount, lens, *others = dict.fromkeys(h.part for h in hypotheses(chain, state.camera.fx))
     depth = SCAN_DEPTH if chain == "scan" else TARGET_DEPTH
     focal = unit[:, CAMERA][:, :4] * state.camera.fx
     made = [
-        Change(chain, mount, "shift", SHIFT, "m", unit[:, HAND][:, :3]),
-        Change(chain, mount, "turn", TURN, "rad", unit[:, HAND][:, 3:]),
-        Change(chain, lens, "principal point", TURN, "rad", focal[:, 2:]),
+        Change(chain, mount, "shift", wanted=SHIFT, unit="m", directions=unit[:, HAND][:, :3]),
+        Change(chain, mount, "turn", wanted=TURN, unit="rad", directions=unit[:, HAND][:, 3:]),
+        Change(chain, lens, "principal point", wanted=TURN, unit="rad", directions=focal[:, 2:]),
         Change(
-            chain, lens, "focal length", SHIFT, "m", (focal[:, :1] + focal[:, 1:2]) / depth, f" at {1e3 * depth:.0f} mm"
+            chain,
+            lens,
+            "focal length",
+            wanted=SHIFT,
+            unit="m",
+            directions=(focal[:, :1] + focal[:, 1:2]) / depth,
+            where=f" at {1e3 * depth:.0f} mm",
         ),
     ]
     if others:
@@ -115,17 +121,17 @@ def changes(chain: str, state: State) -> list[Change]:
         across = np.column_stack(tangents(along))
         lead = unit[:, RAIL] @ along[:, None] / LEAD_WAY
         made += [
-            Change(chain, plane, "turn", TURN, "rad", unit[:, PLANE][:, :2]),
-            Change(chain, plane, "shift", SHIFT, "m", unit[:, PLANE][:, 2:]),
-            Change(chain, rail, "turn", TURN, "rad", unit[:, RAIL] @ across * length),
-            Change(chain, rail, "lead", SHIFT, "m", lead, f" in {1e3 * LEAD_WAY:.0f} mm"),
+            Change(chain, plane, "turn", wanted=TURN, unit="rad", directions=unit[:, PLANE][:, :2]),
+            Change(chain, plane, "shift", wanted=SHIFT, unit="m", directions=unit[:, PLANE][:, 2:]),
+            Change(chain, rail, "turn", wanted=TURN, unit="rad", directions=unit[:, RAIL] @ across * length),
+            Change(chain, rail, "lead", wanted=SHIFT, unit="m", directions=lead, where=f" in {1e3 * LEAD_WAY:.0f} mm"),
         ]
     return made
 
 
 def detectable(
-    evidences: Mapping[str, Evidence],
-    states: Mapping[str, State],
+    evidences: Mapping[str, DriftEvidence],
+    states: Mapping[str, AdjustmentState],
     tests: Sequence[tuple[str, Hypothesis]],
     scores: Mapping[str, Array],
     factors: Array,

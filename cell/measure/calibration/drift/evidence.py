@@ -22,7 +22,7 @@ from cell.measure.calibration.solve.blocks import (
     FLANGE,
     POSITION,
     SHARED,
-    State,
+    AdjustmentState,
     ViewData,
     dots_block,
     stripe_block,
@@ -39,7 +39,7 @@ SWEEP_PICTURE_M = 5e-5
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class PictureMeasurements:
     """One picture's measurements; `rest` numbers the approach of the arm, `stop` that of the rail, each from 0.
 
     A `sweeping` rail is one stop: where it was then is as sure as the camera's clock is read, `SWEEP_RAIL_M`.
@@ -52,7 +52,7 @@ class Look:
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class DriftEvidence:
     """Score (27,) and information (27, 27) of a change of the shared parameters, in the order of the blocks.
 
     With the calibration as it was, the score has mean 0 and the information as its covariance. The parameters (k,) of
@@ -72,7 +72,7 @@ class Evidence:
         return np.asarray(inverse @ directions.T @ self.score), np.asarray(0.5 * (inverse + inverse.T))
 
 
-def evidence(state: State, reference: Reference, looks: Sequence[Look]) -> Evidence:
+def evidence(state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements]) -> DriftEvidence:
     """Weigh observations against a calibration whose `state` holds the calibrated values and the board.
 
     With residual r, derivative J of all parameters q and their prior covariance Σ the misfit's covariance is
@@ -114,7 +114,7 @@ def evidence(state: State, reference: Reference, looks: Sequence[Look]) -> Evide
     stripe = _misfit(
         kinds["stripe"], np.r_[BOARD], scipy.linalg.block_diag(*along) * SWEEP_PICTURE_M if along else None
     )
-    return Evidence(score[:SHARED], 0.5 * (shared + shared.T), dots, stripe)
+    return DriftEvidence(score[:SHARED], 0.5 * (shared + shared.T), dots, stripe)
 
 
 def dots_of(photo: ScanObservation) -> ViewData:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.measure.calibration.drift.evidence import Evidence
+from cell.measure.calibration.drift.evidence import DriftEvidence
 from cell.measure.calibration.solve.blocks import HAND, PLANE, RAIL
 from cell.measure.geometry.camera import Array
 
@@ -49,14 +49,14 @@ def hypotheses(chain: str, focal: float) -> list[Hypothesis]:
     return made
 
 
-def log_factor(weighed: Evidence, h: Hypothesis, scores: Array) -> Array:
+def log_factor(weighed: DriftEvidence, h: Hypothesis, scores: Array) -> Array:
     """Logarithms (n,) of the Bayes factor for a Gaussian change of size `h.size` against none, for scores (n, 27)."""
     gain, offset = quadratic(weighed, h)
     s = scores[:, list(h.index)]
     return np.asarray(0.5 * np.einsum("ni,ij,nj->n", s, gain, s, optimize=True) + offset, dtype=np.float64)
 
 
-def quadratic(weighed: Evidence, h: Hypothesis) -> tuple[Array, float]:
+def quadratic(weighed: DriftEvidence, h: Hypothesis) -> tuple[Array, float]:
     """The matrix A (k, k) and the number c for which ½ sᵀA s + c is that logarithm for the score s of `h.index`.
 
     With the change's covariance P and its information F these are (P⁻¹ + F)⁻¹ and −½ log det(1 + F P).

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.measure.calibration.solve.blocks import SHARED, State
+from cell.measure.calibration.solve.blocks import SHARED, AdjustmentState
 from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
 from cell.measure.geometry.camera import Array
 from cell.measure.reconstruction.build import ScanGeometry
@@ -18,7 +18,7 @@ def scan_effect(scan: ScanCalibration, change: Array, stand_off: float, rail: tu
 
     Over the picture's rows, depths of ± 10 mm about `stand_off` m in front of the camera, and the rail from end to end.
     """
-    state = State(
+    state = AdjustmentState(
         scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.flange_from_camera
     )  # fmt: skip
     moved = state.moved(np.asarray(change, dtype=np.float64)[:SHARED])
@@ -41,7 +41,7 @@ def scan_effect(scan: ScanCalibration, change: Array, stand_off: float, rail: tu
 
 def target_effect(target: TargetCalibration, change: Array, camera_from_place: Array) -> float:
     """How far in m a change (27,) of the calibration moves a place that lies at (3,) m in the target camera's frame."""
-    state = State(target.camera, None, np.zeros(3), target.flange_from_camera, target.flange_from_camera)
+    state = AdjustmentState(target.camera, None, np.zeros(3), target.flange_from_camera, target.flange_from_camera)
     moved = state.moved(np.asarray(change, dtype=np.float64)[:SHARED])
     before, after = target.camera, moved.camera
     # The same picture through the other lens: a shift of the principal point turns the rays, a focal length stretches

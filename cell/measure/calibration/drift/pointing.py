@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from cell.measure.calibration.drift.evidence import Evidence
+from cell.measure.calibration.drift.evidence import DriftEvidence
 from cell.measure.calibration.drift.reference_plate import LARGEST_RAD, NOTED_RAD, ConfirmedTurn, Pointing, turned
-from cell.measure.calibration.solve.blocks import HAND, PLANE, SHARED, State, tangents
+from cell.measure.calibration.solve.blocks import HAND, PLANE, SHARED, AdjustmentState, tangents
 from cell.measure.geometry.camera import Array
 
 APART = 3.5
@@ -33,7 +33,7 @@ class WitnessCheck:
     wrong: Array
 
     @classmethod
-    def of(cls, plate: Pointing, exit_point: Array, state: State, weighed: Evidence) -> WitnessCheck:
+    def of(cls, plate: Pointing, exit_point: Array, state: AdjustmentState, weighed: DriftEvidence) -> WitnessCheck:
         """From what the plate shows and the `weighed` evidence of the board against the calibrated `state`."""
         assert state.plane is not None
         there = turned(state.plane, exit_point, _STEP)

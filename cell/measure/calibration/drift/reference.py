@@ -42,10 +42,10 @@ class Reference:
             adjusted.state.base_from_board,
             adjusted.reliable_covariance,
             priors.arm_translation * excess["shift"],
-            priors.arm_rotation * excess["turn"],
-            priors.rail * excess["rail"],
-            priors.dots_scale,
-            priors.stripe_scale,
+            arm_rotation=priors.arm_rotation * excess["turn"],
+            rail=priors.rail * excess["rail"],
+            dots_scale=priors.dots_scale,
+            stripe_scale=priors.stripe_scale,
         )
 
     def as_dict(self) -> dict[str, Any]:
@@ -67,8 +67,8 @@ class Reference:
             from_matrix(data["base_from_board"]),
             np.array(data["covariance"], dtype=np.float64).reshape(SHARED, SHARED),
             float(sigma["arm_translation"]),
-            float(sigma["arm_rotation"]),
-            float(sigma["rail"]),
-            float(scale["dots"]),
-            float(scale["stripe"]),
+            arm_rotation=float(sigma["arm_rotation"]),
+            rail=float(sigma["rail"]),
+            dots_scale=float(scale["dots"]),
+            stripe_scale=float(scale["stripe"]),
         )

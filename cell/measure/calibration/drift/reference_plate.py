@@ -42,7 +42,7 @@ class Edge:
 
 
 @dataclass(frozen=True, eq=False)
-class Witness:
+class PlateLine:
     """The line on the plate with the rail at `rail` m: its column (height,) in px, NaN where it is not seen, and the
     standard deviation `sigma` (height,) of each; `edge` of the plate, where one was found."""
 
@@ -59,7 +59,7 @@ class Witness:
         return {"rail": self.rail, "height": len(self.columns), "rows": rows.tolist(), **values, "edge": edge}
 
     @classmethod
-    def read(cls, data: dict[str, Any] | None) -> Witness | None:
+    def read(cls, data: dict[str, Any] | None) -> PlateLine | None:
         """From storage; KeyError, TypeError, ValueError or IndexError when it is none."""
         if data is None:
             return None
@@ -176,8 +176,8 @@ def read_edge(data: dict[str, Any] | None) -> Edge | None:
 
 
 def pointing(
-    before: Witness,
-    now: Witness,
+    before: PlateLine,
+    now: PlateLine,
     camera: CameraModel,
     plane: LightPlane,
     exit_point: Array,
@@ -201,7 +201,7 @@ def pointing(
     return replace(min(ways, key=lambda way: way.sigma), roll=found.roll, roll_sigma=found.roll_sigma)
 
 
-def turn_seen(before: Witness, now: Witness, camera: CameraModel, plane: LightPlane, exit_point: Array) -> Pointing:
+def turn_seen(before: PlateLine, now: PlateLine, camera: CameraModel, plane: LightPlane, exit_point: Array) -> Pointing:
     """The turn of `plane` between two looks at the witness, about `exit_point` (3,), m, camera frame.
 
     Its deviation has the picture's noise and a plate that is off by `PLATE_M`. Raises `RefusedError` when the two looks

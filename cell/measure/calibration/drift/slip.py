@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.measure.calibration.drift.reference_plate import Witness
+from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane, triangulate
 from drivers.errors import Measured, RefusedError
@@ -95,7 +95,9 @@ class Slip:
             )
 
 
-def slip_since(before: Witness, now: Witness, camera: CameraModel, plane: LightPlane, rail_direction: Array) -> Slip:
+def slip_since(
+    before: PlateLine, now: PlateLine, camera: CameraModel, plane: LightPlane, rail_direction: Array
+) -> Slip:
     """Between two looks at the plate that both saw its edge, by the calibrated `camera`, light `plane` and the camera's
     motion (3,) per metre of the rail."""
     assert before.edge is not None and now.edge is not None

@@ -17,9 +17,9 @@ import pinocchio as pin
 
 from cell.measure.calibration.drift.evidence import dots_of
 from cell.measure.calibration.observations import ScanObservation
-from cell.measure.calibration.solve.blocks import BOARD, POSITION, State, dots_block
+from cell.measure.calibration.solve.blocks import BOARD, POSITION, AdjustmentState, dots_block
 from cell.measure.calibration.solve.results import ScanCalibration
-from cell.measure.calibration.timing import Shutter, Timing
+from cell.measure.calibration.timing import Shutter, StampTiming
 from cell.measure.geometry.camera import Array
 from cell.measure.vision import BoardView
 from drivers.errors import CalibrationStale, Measured, RefusedError
@@ -105,7 +105,7 @@ def find_timing(
     most_late: float,
     lead: float,
     link: dict[str, str],
-) -> Timing:
+) -> StampTiming:
     """From sweeps at two speeds and two exposures, to and fro, the arm standing at `base_from_flange`.
 
     The rail's screw moves the carriage by `lead` m a turn; camera and rail are set up as `link` says.
@@ -132,7 +132,7 @@ def find_timing(
     longer = np.column_stack([columns, velocities * (exposures - exposures.mean())])
     by_exposure, by_sigma = (float(v[3]) for v in _least_squares(longer, offsets, weights)[:2])
     found = float(late), float(sigma), float(play), float(play_sigma), *_readout(slopes, sweeps), by_exposure
-    made = Timing(*found, time.time(), link)
+    made = StampTiming(*found, time.time(), link)
     _require(made, by_sigma, most_late)
     return made
 
@@ -173,7 +173,7 @@ def _displacements(
         raise CalibrationStale(
             "the stored calibration holds no reference, an older program made it; run `cell calibrate`"
         )
-    state = State(
+    state = AdjustmentState(
         scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.reference.base_from_board
     )  # fmt: skip
     frames = [frame for sweep in sweeps for frame in sweep.frames]
@@ -209,7 +209,7 @@ def _least_squares(columns: Array, values: Array, weights: Array) -> tuple[Array
     return np.asarray(found), np.sqrt(np.diag(inverse) * noise), noise
 
 
-def _require(made: Timing, by_sigma: float, most_late: float) -> None:
+def _require(made: StampTiming, by_sigma: float, most_late: float) -> None:
     """Raise `RefusedError` for what no correction of the stamps mends."""
     refuse_rolling(made.readout, made.readout_sigma)
     if abs(made.by_exposure) > max(BY_EXPOSURE, SURE * by_sigma):

@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from cell.measure.calibration.judge.coverage import Coverage
 from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
-from cell.measure.calibration.solve.blocks import State, ViewData
+from cell.measure.calibration.solve.blocks import AdjustmentState, ViewData
 from cell.measure.calibration.solve.joint import Joint
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.circles import seen_centres
@@ -103,7 +103,7 @@ def _more_views(joint: Joint, board: BoardSpec, travel: tuple[float, float]) -> 
         ),
         "four more views, turned about the optical axis by 90 and 180 deg": made(
             [
-                square(0, 0, middle, rx, ry, rz)
+                square(0, 0, middle, rx=rx, ry=ry, rz=rz)
                 for rz, (rx, ry) in zip((np.pi / 2, -np.pi / 2, np.pi, np.pi), diagonal, strict=True)
             ],
             between,
@@ -145,16 +145,16 @@ def _view(joint: Joint, board: BoardSpec, at: Array, turn: Array, rail: float) -
         points[inside],
         pixels[inside],
         np.full(int(inside.sum()), sigma),
-        radius,
-        stripe,
-        np.full(len(stripe), stripe_sigma),
-        flange,
-        rail,
-        lit[0].stripe_axis,
+        dot_radius=radius,
+        stripe=stripe,
+        stripe_sigma=np.full(len(stripe), stripe_sigma),
+        base_from_flange=flange,
+        rail=rail,
+        stripe_axis=lit[0].stripe_axis,
     )
 
 
-def _stripe(state: State, board: BoardSpec, camera_from_board: pin.SE3, radius: float, count: int) -> Array:
+def _stripe(state: AdjustmentState, board: BoardSpec, camera_from_board: pin.SE3, radius: float, count: int) -> Array:
     """Pixels (n, 2), at most `count`, where light plane and board meet, in the picture and clear of the dots."""
     assert state.plane is not None
     normal = camera_from_board.rotation[:, 2]
@@ -176,7 +176,7 @@ def _stripe(state: State, board: BoardSpec, camera_from_board: pin.SE3, radius: 
     return np.asarray(pixels[thin], dtype=np.float64)
 
 
-def _inside(state: State, pixels: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+def _inside(state: AdjustmentState, pixels: Array) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
     camera = state.camera
     return np.asarray(
         ((pixels > EDGE_PX) & (pixels < (camera.width - EDGE_PX, camera.height - EDGE_PX))).all(axis=1), dtype=np.bool_

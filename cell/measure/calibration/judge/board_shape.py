@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.measure.calibration.solve.adjustment import Adjustment
-from cell.measure.calibration.solve.blocks import CAMERA, FLANGE, State
+from cell.measure.calibration.solve.blocks import CAMERA, FLANGE, AdjustmentState
 from cell.measure.geometry.camera import Array
 
 SHAPES = 3
@@ -40,7 +40,7 @@ class Bend:
         return self.height > SIGNIFICANT * self.sigma and self.certain > CERTAIN
 
 
-def bend_of(adjustment: Adjustment, state: State) -> Bend:
+def bend_of(adjustment: Adjustment, state: AdjustmentState) -> Bend:
     """The bend that the dots speak of, at the solution of an adjustment to pictures alone, lens and poses free."""
     whole, middle, half = _whole(adjustment)
     lens, information, gradient, parts, wide = _normal(adjustment, state)
@@ -73,7 +73,7 @@ def bend_of(adjustment: Adjustment, state: State) -> Bend:
     return Bend(size_m, float(np.hypot(spread[low], spread[high])), size_m / (2 * half), certain, camera)
 
 
-def untold_by_bend(adjustment: Adjustment, state: State) -> Array:
+def untold_by_bend(adjustment: Adjustment, state: AdjustmentState) -> Array:
     """What a bend that is not believed may have moved the camera's parameters, (4, 9): rows whose squares add up.
 
     At the solution of an adjustment to pictures alone. A board is bent by about as much as boards usually are, and the
@@ -101,7 +101,7 @@ def untold_by_bend(adjustment: Adjustment, state: State) -> Array:
 
 
 def _normal(
-    adjustment: Adjustment, state: State
+    adjustment: Adjustment, state: AdjustmentState
 ) -> tuple[NDArray[np.intp], Array, Array, list[tuple[Array, Array]], list[Array]]:
     """The free terms of the lens, normal equations of these and the three shapes, those of each view, and its rows.
 
@@ -129,7 +129,7 @@ def _normal(
     return lens, information, gradient, parts, wide
 
 
-def moved_by_bend(adjustment: Adjustment, state: State) -> Array:
+def moved_by_bend(adjustment: Adjustment, state: AdjustmentState) -> Array:
     """What the shared parameters (27,) would move if the board might be bent, at a solution with the arm's poses.
 
     One step from there, with what is free in the adjustment and the three shapes; what is held does not move.

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from cell.measure.calibration.judge.board_shape import USUAL
-from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.solve.adjustment import DISTORTION_PRIOR
 from cell.measure.calibration.solve.intrinsics import CENTRED_LENS, Intrinsics
 from cell.measure.geometry.camera import PARAMETER_NAMES, Array, CameraModel
@@ -27,7 +27,7 @@ STRONG_PULL = 4.0
 
 def camera_checks(
     found: Intrinsics, views: Sequence[BoardView], names: Sequence[str], *, given: bool = False
-) -> list[Check]:
+) -> list[QualityCheck]:
     """Checks of a camera from pictures: how well it is known, how it fits, what is systematic in what is left over.
 
     `names` are those of the views.
@@ -37,9 +37,9 @@ def camera_checks(
     off, board = _residuals(views, camera)
     rms = float(np.sqrt(np.mean(off**2))) * np.sqrt(2)
     made = [
-        Check(
-            "intrinsics", "RMS of the board's points", 1e3 * rms / width, 1.0, 5.0, "‰ of the picture",
-            f"{rms:.2f} px: board, lens model or pictures are not what they are taken for",
+        QualityCheck(
+            "intrinsics", "RMS of the board's points", 1e3 * rms / width, 1.0, refuse=5.0, unit="‰ of the picture",
+            says=f"{rms:.2f} px: board, lens model or pictures are not what they are taken for",
         ),
         _map(off, views, camera, board),
     ]  # fmt: skip
@@ -49,15 +49,15 @@ def camera_checks(
     centre = 100 * float(np.max(found.sigma[2:4])) / width
     advice = "tilt the board more, to several sides and up to 45°, and cover the whole picture"
     made.append(
-        Check(
-            "intrinsics", "σ of the focal length", focal, 2.0, 10.0, "%",
-            f"{len(views)} views give fx = {camera.fx:.0f} ± {found.sigma[0]:.0f} px; {advice}",
+        QualityCheck(
+            "intrinsics", "σ of the focal length", focal, doubt=2.0, refuse=10.0, unit="%",
+            says=f"{len(views)} views give fx = {camera.fx:.0f} ± {found.sigma[0]:.0f} px; {advice}",
         )
     )  # fmt: skip
     made.append(
-        Check(
-            "intrinsics", "σ of the principal point", centre, 3.0, 10.0, "% of the picture",
-            f"({camera.cx:.0f} ± {found.sigma[2]:.0f}, {camera.cy:.0f} ± {found.sigma[3]:.0f}) px; {advice}",
+        QualityCheck(
+            "intrinsics", "σ of the principal point", centre, doubt=3.0, refuse=10.0, unit="% of the picture",
+            says=f"({camera.cx:.0f} ± {found.sigma[2]:.0f}, {camera.cy:.0f} ± {found.sigma[3]:.0f}) px; {advice}",
         )
     )  # fmt: skip
     made.append(_tilt(views, camera))
@@ -66,54 +66,56 @@ def camera_checks(
         made.append(_pulls(found, names))
     if found.bend is not None and found.bend.believed:
         made.append(
-            Check(
-                "intrinsics", "bend of the board", 100 * found.bend.share, 100 * USUAL, 3.0, "% of its diagonal",
-                f"{1e3 * found.bend.height:.2f} ± {1e3 * found.bend.sigma:.2f} mm out of a plane, which moves fx by "
-                f"{abs(found.bend.camera[0]):.1f} px and the principal point by "
+            QualityCheck(
+                "intrinsics", "bend of the board", 100 * found.bend.share, 100 * USUAL, 3.0, unit="% of its diagonal",
+                says=f"{1e3 * found.bend.height:.2f} ± {1e3 * found.bend.sigma:.2f} mm out of a plane, which moves fx "
+                f"by {abs(found.bend.camera[0]):.1f} px and the principal point by "
                 f"{float(np.hypot(*found.bend.camera[2:4])):.1f} px; glue it to something flat",
             )
         )  # fmt: skip
     return made
 
 
-def _pulls(found: Intrinsics, names: Sequence[str]) -> Check:
+def _pulls(found: Intrinsics, names: Sequence[str]) -> QualityCheck:
     """How far one picture moves the camera of the others: a picture of another camera or focus does, fit as it may."""
     strong = [k for k in np.argsort(-found.pull) if found.pull[k] >= STRONG_PULL]
     said = ", ".join(names[k] for k in strong)
-    return Check(
-        "intrinsics", "what one picture does to the camera", float(found.pull.max()), STRONG_PULL, np.inf,
-        "(Cook's distance)",
-        f"without {said}, one at a time, focal length or principal point is another one, by more than the points' "
+    return QualityCheck(
+        "intrinsics", "what one picture does to the camera", float(found.pull.max()), doubt=STRONG_PULL, refuse=np.inf,
+        unit="(Cook's distance)",
+        says=f"without {said}, one at a time, focal length or principal point is another one, by more than the points' "
         "scatter allows: was one of them taken by another camera, with another focus or crop, or is the board bent? "
         "Calibrate without it and compare",
     )  # fmt: skip
 
 
-def _tilt(views: Sequence[BoardView], camera: CameraModel) -> Check:
+def _tilt(views: Sequence[BoardView], camera: CameraModel) -> QualityCheck:
     """How differently the board faces the camera: seen alike throughout, its form and the focal length look alike."""
     facing = np.array([board_pose(view, camera).camera_from_board.rotation[:, 2] for view in views])
     tilt = float(np.degrees(np.arccos(np.clip(facing @ facing.T, -1.0, 1.0)).max()))
-    return Check(
-        "intrinsics", "needed tilt of the board over what it had", LEAST_TILT_DEG / max(tilt, 0.1), 1.0, np.inf, "",
-        f"from one picture to another the board was tilted by {tilt:.0f}° at most, so that a board that is bent a "
+    return QualityCheck(
+        "intrinsics", "needed tilt of the board over what it had", LEAST_TILT_DEG / max(tilt, 0.1), doubt=1.0,
+        refuse=np.inf, unit="",
+        says=f"from one picture to another the board was tilted by {tilt:.0f}° at most, so that a board that is bent a "
         f"little, too little to be seen, moves fx = {camera.fx:.0f} px by more than is stated; tilt it by 45°, to "
         "several sides",
     )  # fmt: skip
 
 
-def _terms(found: Intrinsics) -> Check:
+def _terms(found: Intrinsics) -> QualityCheck:
     """The lens's largest term against what lenses have."""
     usual = np.array([*DISTORTION_PRIOR[:2], CENTRED_LENS, CENTRED_LENS, DISTORTION_PRIOR[4]])
     shift = np.abs(np.array(found.camera.dist)) / usual
     worst = int(np.argmax(shift))
-    return Check(
-        "intrinsics", f"{PARAMETER_NAMES[4 + worst]} against what lenses have", float(shift[worst]), 3.0, np.inf, "σ",
-        f"{found.camera.dist[worst]:.3g} where {usual[worst]:g} is usual: a lens of another kind (fisheye), a board "
-        "that is bent, or pictures that do not tell",
+    return QualityCheck(
+        "intrinsics", f"{PARAMETER_NAMES[4 + worst]} against what lenses have", float(shift[worst]), doubt=3.0,
+        refuse=np.inf, unit="σ",
+        says=f"{found.camera.dist[worst]:.3g} where {usual[worst]:g} is usual: a lens of another kind (fisheye), a "
+        "board that is bent, or pictures that do not tell",
     )  # fmt: skip
 
 
-def _map(off: Array, views: Sequence[BoardView], camera: CameraModel, board: Array) -> Check:
+def _map(off: Array, views: Sequence[BoardView], camera: CameraModel, board: Array) -> QualityCheck:
     """What repeats in the residuals, by place in the picture and by point of the board, and which of both it is."""
     pixels = np.concatenate([v.pixels for v in views])
     at = np.clip((pixels / (camera.width, camera.height) * CELLS).astype(int), 0, np.array(CELLS) - 1)
@@ -127,9 +129,9 @@ def _map(off: Array, views: Sequence[BoardView], camera: CameraModel, board: Arr
         )
     else:
         words = "by point of the board: the board is bent or not printed to size"
-    return Check(
+    return QualityCheck(
         "intrinsics", "what repeats in the residuals", largest, max(0.25, 0.8 * noise), max(3.0, 1e-3 * camera.width),
-        "px", f"{largest:.2f} px RMS of {noise:.2f} px repeat {words}",
+        unit="px", says=f"{largest:.2f} px RMS of {noise:.2f} px repeat {words}",
     )  # fmt: skip
 
 

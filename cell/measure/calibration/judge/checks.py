@@ -15,7 +15,7 @@ Verdict = Literal["ok", "doubt", "refused"]
 
 
 @dataclass(frozen=True)
-class Check:
+class QualityCheck:
     """One figure beside the value from which it is doubtful and that from which the part is refused."""
 
     part: Part
@@ -60,9 +60,9 @@ class Check:
         }
 
 
-def refused_parts(checks: Iterable[Check]) -> dict[str, list[Check]]:
+def refused_parts(checks: Iterable[QualityCheck]) -> dict[str, list[QualityCheck]]:
     """The checks that fail, by part."""
-    found: dict[str, list[Check]] = {}
+    found: dict[str, list[QualityCheck]] = {}
     for check in checks:
         if check.verdict == "refused":
             found.setdefault(check.part, []).append(check)

@@ -61,12 +61,12 @@ class Coverage:
             (state.camera.width, state.camera.height),
             np.concatenate([np.zeros((0, 2)), *dots]),
             np.concatenate([np.zeros((0, 2)), *off]),
-            np.concatenate([np.zeros((0, 2)), *stripe]),
-            np.concatenate([np.zeros(0), *away]),
-            np.concatenate([np.zeros(0), *reach]),
-            np.array(depth),
-            np.array(tilt).reshape(-1, 2),
-            np.asarray(state.rails),
+            stripe=np.concatenate([np.zeros((0, 2)), *stripe]),
+            stripe_off=np.concatenate([np.zeros(0), *away]),
+            stripe_depth=np.concatenate([np.zeros(0), *reach]),
+            depth=np.array(depth),
+            tilt=np.array(tilt).reshape(-1, 2),
+            rail=np.asarray(state.rails),
         )
 
     def cells(self, pixels: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

@@ -38,7 +38,7 @@ def refuse_exchanged(names: Sequence[str], flanges: Sequence[pin.SE3], boards: S
     Whatever the hand-eye, the flange turns between two views by the angle by which the board seems to turn.
     """
     count = len(flanges)
-    apart = np.array([[[_apart(flanges, boards, i, p, j, j) for j in range(count)] for p in range(count)]
+    apart = np.array([[[_apart(flanges, boards, i, p=p, j=j, q=j) for j in range(count)] for p in range(count)]
                       for i in range(count)])  # fmt: skip
     own = np.array([np.median(np.delete(apart[i, i], i)) for i in range(count)])
     odd = np.flatnonzero(own > LARGEST_TURN)
@@ -60,7 +60,7 @@ def refuse_exchanged(names: Sequence[str], flanges: Sequence[pin.SE3], boards: S
     for shift, words in ((1, "one late"), (-1, "one early")):
         order = [(i + shift) % count for i in range(count)]
         moved = np.array([
-            np.median([_apart(flanges, boards, i, order[i], j, order[j]) for j in range(count) if j != i])
+            np.median([_apart(flanges, boards, i, p=order[i], j=j, q=order[j]) for j in range(count) if j != i])
             for i in range(count)
         ])  # fmt: skip
         if np.mean(moved < LARGEST_TURN) > 0.7:

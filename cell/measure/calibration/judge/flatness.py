@@ -13,7 +13,7 @@ import numpy as np
 
 from cell.measure.calibration.observations import ScanObservation
 from cell.measure.calibration.solve.adjustment import Adjustment
-from cell.measure.calibration.solve.blocks import State
+from cell.measure.calibration.solve.blocks import AdjustmentState
 from cell.measure.calibration.solve.choice import Solution
 from cell.measure.calibration.solve.joint import Staged
 from cell.measure.calibration.solve.starts import stripe_pixels
@@ -36,7 +36,7 @@ class Flatness:
     per_frame: list[float]
 
 
-def flatness(state: State, observations: Sequence[ScanObservation], staged: Staged) -> Flatness | None:
+def flatness(state: AdjustmentState, observations: Sequence[ScanObservation], staged: Staged) -> Flatness | None:
     """Flatness of the board in the base over all frames with a stripe; None without any."""
     clouds = [_in_base(state, o, staged, k) for k, o in enumerate(observations)]
     if sum(len(c) > 0 for c in clouds) < 1:
@@ -67,7 +67,7 @@ def leave_one_out(observations: Sequence[ScanObservation], staged: Staged, solut
     return _summary(clouds, distances)
 
 
-def _in_base(state: State, observation: ScanObservation, staged: Staged, index: int) -> Array:
+def _in_base(state: AdjustmentState, observation: ScanObservation, staged: Staged, index: int) -> Array:
     """Stripe points (n, 3) of one frame in the base, at the reported flange pose."""
     rows = None if staged.plane is None else staged.plane.rows[index]
     if state.plane is None or observation.profile is None or rows is None or not len(rows):

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.solve.intrinsics import LEAST_LEFT_OUT, Intrinsics, beside_given
 from cell.measure.geometry.camera import PARAMETER_NAMES
 from cell.measure.vision.board.view import BoardView
@@ -23,7 +23,7 @@ USUAL_SHARE = 0.01
 """Of the focal length: by so much a camera may be off since it was calibrated (focus, warmth, another mode)."""
 
 
-def against_pictures(given: Intrinsics, views: Sequence[BoardView]) -> tuple[Intrinsics, list[Check]]:
+def against_pictures(given: Intrinsics, views: Sequence[BoardView]) -> tuple[Intrinsics, list[QualityCheck]]:
     """The given camera with the deviation that its difference from the pictures' camera makes likely, and the check.
 
     `views` are of different stops. With fewer than four, or where they give no camera, it is taken to be off by what
@@ -45,23 +45,23 @@ def against_pictures(given: Intrinsics, views: Sequence[BoardView]) -> tuple[Int
     covariance = given.covariance + np.outer(likely, likely)
     far = np.abs(apart) / focal > REFUSE_SHARE
     refuse = REFUSE_SIGMAS if np.any(far & (np.abs(apart) / sigma >= REFUSE_SIGMAS)) else np.inf
-    check = Check(
+    check = QualityCheck(
         "intrinsics", "given camera against that of the pictures", float(np.abs(apart[worst]) / sigma[worst]),
-        DOUBT_SIGMAS, refuse, "σ",
-        f"{PARAMETER_NAMES[worst]} is given as {given.camera.parameters[worst]:.1f} px, these pictures have "
+        doubt=DOUBT_SIGMAS, refuse=refuse, unit="σ",
+        says=f"{PARAMETER_NAMES[worst]} is given as {given.camera.parameters[worst]:.1f} px, these pictures have "
         f"{pictures.camera.parameters[worst]:.1f} ± {sigma[worst]:.1f} px: is it the file of another camera, focus, "
         "picture size or crop? Leave --camera out, or calibrate the camera anew",
     )  # fmt: skip
     return replace(given, sigma=np.sqrt(np.diag(covariance)), covariance=covariance), [check]
 
 
-def _unchecked(given: Intrinsics, why: str) -> tuple[Intrinsics, list[Check]]:
+def _unchecked(given: Intrinsics, why: str) -> tuple[Intrinsics, list[QualityCheck]]:
     """The given camera where nothing speaks for or against it."""
     covariance = given.covariance.copy()
     covariance[:4, :4] += np.diag((USUAL_SHARE * given.camera.parameters[[0, 1, 0, 1]]) ** 2)
-    check = Check(
-        "intrinsics", "given camera, not checked", 1.0, 0.5, np.inf, "",
-        f"{why}; focal length and principal point are taken to be off by {100 * USUAL_SHARE:.0f} % of the focal length "
-        f"since it was calibrated; take {LEAST_LEFT_OUT} stops or more, the board tilted to several sides",
+    check = QualityCheck(
+        "intrinsics", "given camera, not checked", 1.0, doubt=0.5, refuse=np.inf, unit="",
+        says=f"{why}; focal length and principal point are taken to be off by {100 * USUAL_SHARE:.0f} % of the focal "
+        f"length since it was calibrated; take {LEAST_LEFT_OUT} stops or more, the board tilted to several sides",
     )  # fmt: skip
     return replace(given, sigma=np.sqrt(np.diag(covariance)), covariance=covariance), [check]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.measure.calibration.solve.blocks import SHARED, State
+from cell.measure.calibration.solve.blocks import SHARED, AdjustmentState
 from cell.measure.calibration.solve.results import KEPT, PARAMETERS
 from cell.measure.geometry.camera import Array
 from cell.measure.reconstruction.build import ScanGeometry
@@ -36,7 +36,7 @@ class Places:
     rails: Array
     base_from_flange: pin.SE3
 
-    def measured(self, state: State) -> Array:
+    def measured(self, state: AdjustmentState) -> Array:
         """Points (n, 3) in the arm's base, m."""
         assert state.plane is not None
         head = ScanGeometry(state.camera, state.plane, state.rail_direction, state.flange_from_camera)
@@ -44,10 +44,10 @@ class Places:
         return np.asarray(points @ self.base_from_flange.rotation.T + self.base_from_flange.translation)
 
 
-def derivatives(state: State, covariance: Array, places: Places) -> Array:
+def derivatives(state: AdjustmentState, covariance: Array, places: Places) -> Array:
     """∂point/∂parameter (n, 3, 21) in the base, by differences of a tenth of each parameter's deviation."""
     made = np.zeros((len(places.pixels), 3, KEPT))
-    still = State(
+    still = AdjustmentState(
         state.camera, state.plane, state.rail_direction, state.flange_from_camera, state.base_from_board
     )  # without the views' own
     for k, sigma in enumerate(np.sqrt(np.maximum(np.diag(covariance)[:KEPT], 0.0))):

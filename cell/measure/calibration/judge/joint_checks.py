@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.judge.plane_checks import plane_fit_check
 from cell.measure.calibration.solve.blocks import stripe_block
 from cell.measure.calibration.solve.joint import Joint
@@ -18,7 +18,7 @@ from cell.measure.geometry.camera import PARAMETER_NAMES, CameraModel
 from cell.measure.geometry.poses import difference
 
 
-def joint_checks(joint: Joint, nominal: CameraModel) -> list[Check]:
+def joint_checks(joint: Joint, nominal: CameraModel) -> list[QualityCheck]:
     """Checks of an adjustment against its closed form, the drawing's camera, its priors and its own noise."""
     adjusted, state = joint.adjusted, joint.adjusted.state
     reach = float(np.median([np.linalg.norm(b.translation) for b in joint.staged.camera_from_board]))
@@ -29,21 +29,22 @@ def joint_checks(joint: Joint, nominal: CameraModel) -> list[Check]:
     worst = int(np.argmax(lens))
     excess = max(adjusted.excess.get("shift", 1.0), adjusted.excess.get("turn", 1.0))
     made = [
-        Check(
-            "hand_eye", "closed form against adjustment", shift / 10 / reach, 2.0, 8.0, "% of the board's distance",
-            f"{shift:.2f} mm and {turn:.3f}° apart; see whether the views turn the flange about two axes",
+        QualityCheck(
+            "hand_eye", "closed form against adjustment", shift / 10 / reach, doubt=2.0, refuse=8.0,
+            unit="% of the board's distance",
+            says=f"{shift:.2f} mm and {turn:.3f}° apart; see whether the views turn the flange about two axes",
         ),
-        Check(
-            "hand_eye", "the arm's scatter over what is configured", excess, 4.0, 9.9, "",
-            "the arm repeats worse than the configuration says, or something moved in between",
+        QualityCheck(
+            "hand_eye", "the arm's scatter over what is configured", excess, doubt=4.0, refuse=9.9, unit="",
+            says="the arm repeats worse than the configuration says, or something moved in between",
         ),
-        Check(
-            "intrinsics", "focal length against the drawing", focal, 6.0, 20.0, "%",
-            f"{state.camera.fx:.0f} px, drawn {nominal.fx:.0f} px: is it the lens that the configuration names?",
+        QualityCheck(
+            "intrinsics", "focal length against the drawing", focal, doubt=6.0, refuse=20.0, unit="%",
+            says=f"{state.camera.fx:.0f} px, drawn {nominal.fx:.0f} px: is it the lens that the configuration names?",
         ),
-        Check(
+        QualityCheck(
             "intrinsics", f"{PARAMETER_NAMES[4 + worst]} against what lenses have", float(lens[worst]), 3.0, math.inf,
-            "σ", f"{state.camera.dist[worst]:.3g}: is it the lens that the configuration names?",
+            unit="σ", says=f"{state.camera.dist[worst]:.3g}: is it the lens that the configuration names?",
         ),
     ]  # fmt: skip
     parts, noise = [], []

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.solve.intrinsics import Intrinsics
 from cell.measure.calibration.solve.starts import robust_plane, stripe_pixels
 from cell.measure.geometry.camera import Array, CameraModel
@@ -162,12 +162,12 @@ def planes_without_one(clouds: Sequence[Array]) -> list[LightPlane]:
     return [robust_plane(np.concatenate([clouds[j] for j in lit if j != k]))[0] for k in lit]
 
 
-def plane_fit_check(rms: float, own: float, cloud: Array) -> Check:
+def plane_fit_check(rms: float, own: float, cloud: Array) -> QualityCheck:
     """The RMS (m) of a plane's points (n, 3) against their span, beside the stripe's own σ (m)."""
     size = float(np.linalg.norm(np.ptp(cloud, axis=0)))
-    return Check(
-        "light_plane", "RMS of the stripe's points", 100 * rms / size, 0.8, 2.0, "% of the span they cover",
-        f"{1e3 * rms:.2f} mm over {1e3 * size:.0f} mm, where the stripe's own noise makes {1e3 * own:.3f} mm: the "
+    return QualityCheck(
+        "light_plane", "RMS of the stripe's points", 100 * rms / size, 0.8, refuse=2.0, unit="% of the span they cover",
+        says=f"{1e3 * rms:.2f} mm over {1e3 * size:.0f} mm, where the stripe's own noise makes {1e3 * own:.3f} mm: the "
         "points are not those of one plane; are there two lines, something else that shines, a stripe that is of "
         "another frame, or a laser that came on while the rows of a rolling shutter were exposed?",
     )  # fmt: skip
@@ -175,7 +175,7 @@ def plane_fit_check(rms: float, own: float, cloud: Array) -> Check:
 
 def plane_checks(
     rms: float, own: float, cloud: Array, frames: int, known: PlaneKnown, left_out: int = 0
-) -> list[Check]:
+) -> list[QualityCheck]:
     """Checks of a plane from its points' RMS (m), the stripe's own σ (m), the points (n, 3), and how it scatters.
 
     `left_out` stripes, beside those of the `frames`, are of no line in it.
@@ -184,25 +184,29 @@ def plane_checks(
     made = [plane_fit_check(rms, own, cloud)]
     if left_out:
         made.append(
-            Check(
-                "light_plane", "stripes that are left out", 100 * left_out / (frames + left_out), 25.0, 40.0, "%",
-                f"{left_out} of {frames + left_out} lie in no plane with the others, too many for slips: was the laser "
-                "or the camera moved in between, or are there several lines? Calibrate each part by itself",
+            QualityCheck(
+                "light_plane", "stripes that are left out", 100 * left_out / (frames + left_out), 25.0, 40.0, unit="%",
+                says=f"{left_out} of {frames + left_out} lie in no plane with the others, too many for slips: was the "
+                "laser or the camera moved in between, or are there several lines? Calibrate each part by itself",
             )
         )  # fmt: skip
     if frames < LEAST_CHECKED:
         made.append(
-            Check(
-                "light_plane", "frames that are missing", LEAST_CHECKED - frames, 0.5, np.inf, "",
-                f"{frames} frames show the stripe and check each other little; take {LEAST_CHECKED} or more",
+            QualityCheck(
+                "light_plane", "frames that are missing", LEAST_CHECKED - frames, doubt=0.5, refuse=np.inf, unit="",
+                says=f"{frames} frames show the stripe and check each other little; take {LEAST_CHECKED} or more",
             )
         )  # fmt: skip
     words = f"from {frames} frames, each left out in turn; take further frames at other distances and tilts"
     made.append(
-        Check(
-            "light_plane", "σ of its place where it was seen", 100 * known.place / reach, 0.5, 4.0,
-            "% of the distance", f"{1e3 * known.place:.2f} mm at {1e3 * reach:.0f} mm, {words}",
+        QualityCheck(
+            "light_plane", "σ of its place where it was seen", 100 * known.place / reach, doubt=0.5, refuse=4.0,
+            unit="% of the distance", says=f"{1e3 * known.place:.2f} mm at {1e3 * reach:.0f} mm, {words}",
         )
     )  # fmt: skip
-    made.append(Check("light_plane", "σ of its normal", float(np.degrees(known.tilt)), 1.0, 4.0, "deg", f"{words}"))
+    made.append(
+        QualityCheck(
+            "light_plane", "σ of its normal", float(np.degrees(known.tilt)), 1.0, 4.0, unit="deg", says=f"{words}"
+        )
+    )
     return made

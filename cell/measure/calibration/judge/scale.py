@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from cell.measure.calibration.judge.checks import Check
+from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.solve.hand_eye import park_martin
 from cell.measure.geometry.camera import Array
 from drivers.errors import RefusedError
@@ -64,7 +64,7 @@ class Scale:
         """The unit in which the arm's positions seem to be; None when it is the metre or none that is known."""
         return next((name for factor, name in UNITS.items() if abs(self.value / factor - 1) < UNIT_SHARE), None)
 
-    def check(self, others: Iterable[Check]) -> Check:
+    def check(self, others: Iterable[QualityCheck]) -> QualityCheck:
         """How far it is from 1; a doubt where it stands alone against the `others` of the hand-eye."""
         alone = self.explained < CLEARLY and all(c.verdict == "ok" for c in others if c.name in INDEPENDENT)
         share = 100 * self.sigma / max(abs(self.value), 1e-9)
@@ -76,9 +76,9 @@ class Scale:
                 f"by the arm's travel the board is {self.value:.4f} ± {self.sigma:.4f} times as large as its name "
                 "says: measure its pitch; if that is right, the poses are in another unit or of another arm"
             )
-        return Check(
-            "hand_eye", "arm's travel against the board's size", off, max(DOUBT, DOUBT_SIGMAS * share),
-            math.inf if alone and self.unit is None else max(REFUSE, REFUSE_SIGMAS * share), "%", says,
+        return QualityCheck(
+            "hand_eye", "arm's travel against the board's size", off, doubt=max(DOUBT, DOUBT_SIGMAS * share),
+            refuse=math.inf if alone and self.unit is None else max(REFUSE, REFUSE_SIGMAS * share), unit="%", says=says,
         )  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from cell.measure.calibration.solve.blocks import (
     PLANE,
     RAIL,
     SHARED,
-    State,
+    AdjustmentState,
     ViewData,
     dots_block,
     rests_of,
@@ -86,7 +86,7 @@ class Adjusted:
     sheet's, where one was found.
     """
 
-    state: State
+    state: AdjustmentState
     covariance: Array
     chi2_per_dof: float
     dots_rms_px: float
@@ -119,7 +119,7 @@ class Adjustment:
         self.own_free[6] = bool(free[RAIL].any())
         self.priors = priors
 
-    def solve(self, start: State, variance_rounds: int = VARIANCE_ROUNDS) -> Adjusted:
+    def solve(self, start: AdjustmentState, variance_rounds: int = VARIANCE_ROUNDS) -> Adjusted:
         """Levenberg–Marquardt, then variance components, alternating until the noise agrees with the residuals."""
         state = replace(
             start, flanges=[v.base_from_flange for v in self.views], rails=np.array([v.rail for v in self.views])
@@ -146,7 +146,7 @@ class Adjustment:
             {name: _scatter(normal, inverse, name) for name in ("shift", "turn", "rail")},
         )
 
-    def residual_rms(self, state: State) -> tuple[float, float]:
+    def residual_rms(self, state: AdjustmentState) -> tuple[float, float]:
         """RMS of the dots in px (per component) and of the stripe's distances from the board in m; NaN when unseen."""
         dots, stripe = [np.zeros(0)], [np.zeros(0)]
         for view, flange, rail in zip(self.views, state.flanges, state.rails, strict=True):
@@ -156,7 +156,7 @@ class Adjustment:
                 stripe.append(stripe_block(state, view, flange, float(rail))[0])
         return _rms(np.concatenate(dots)), _rms(np.concatenate(stripe))
 
-    def _minimise(self, state: State, normal: Normal, settled: float) -> tuple[State, Normal, int]:
+    def _minimise(self, state: AdjustmentState, normal: Normal, settled: float) -> tuple[AdjustmentState, Normal, int]:
         damping = 1e-6
         used = 0
         for _ in range(STEPS):
@@ -178,7 +178,7 @@ class Adjustment:
                     break
         return state, normal, used
 
-    def rows_of(self, k: int, state: State) -> list[tuple[str, Array, Array, float]]:
+    def rows_of(self, k: int, state: AdjustmentState) -> list[tuple[str, Array, Array, float]]:
         """Of view `k`: group, whitened rows (m, 34) and residuals (m,), robust weights included, and robust cost."""
         view, flange, rail = self.views[k], state.flanges[k], float(state.rails[k])
         made = []
@@ -198,14 +198,14 @@ class Adjustment:
             made.append(("stripe", jacobian * root[:, None], np.asarray(away * root), cost))
         return made
 
-    def normal_at(self, state: State) -> Normal:
+    def normal_at(self, state: AdjustmentState) -> Normal:
         """The normal equations at a state whose flanges and rails are those of the views, with the present priors."""
         normal = Normal(self.rests, self.free, self.own_free)
         settles = np.diff(self.rests, prepend=-1) > 0
         for k, (view, rail) in enumerate(zip(self.views, state.rails.tolist(), strict=True)):
             for name, rows, residual, cost in self.rows_of(k, state):
                 share = self.priors.stripe_share if name == "stripe" else 1.0
-                normal.add_view(name, k, rows, residual, cost, share)
+                normal.add_view(name, k, rows, residual=residual, cost=cost, share=share)
             if settles[k]:
                 white = self.arm_prior(k, state)[1]
                 normal.add_prior("shift", k, 0, white[:3], self.priors.arm_translation)
@@ -215,7 +215,7 @@ class Adjustment:
         normal.add_shared_rows("lens", *self.lens_prior(state))
         return normal
 
-    def lens_prior(self, state: State) -> tuple[Array, Array]:
+    def lens_prior(self, state: AdjustmentState) -> tuple[Array, Array]:
         """Whitened rows (m, 27) and residuals (m,) of what is known of any lens, for the terms that are free."""
         lens = np.arange(4, 9)[self.free[4:9]]
         rows = np.zeros((len(lens), SHARED))
@@ -228,7 +228,7 @@ class Adjustment:
             rows, residual = np.vstack([rows, tie]), np.append(residual, -tie[0, :9] @ camera)
         return rows, residual
 
-    def arm_prior(self, k: int, state: State) -> tuple[Array, Array]:
+    def arm_prior(self, k: int, state: AdjustmentState) -> tuple[Array, Array]:
         """Whitened rows (6, 34) and residuals (6,) of the reported flange pose of view `k`."""
         apart = -difference(state.flanges[k], self.views[k].base_from_flange)
         rows = np.zeros((6, COLUMNS))

@@ -54,7 +54,7 @@ def rests_of(views: Sequence[ViewData]) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class AdjustmentState:
     """Everything that the adjustment estimates. `rail_direction` (3,): camera travel per metre of rail reading."""
 
     camera: CameraModel
@@ -65,7 +65,7 @@ class State:
     flanges: list[pin.SE3] = field(default_factory=list)
     rails: Array = field(default_factory=lambda: np.zeros(0))
 
-    def moved(self, step: Array) -> State:
+    def moved(self, step: Array) -> AdjustmentState:
         """The state after a step (27 + 7 per view,)."""
         plane = self.plane
         if plane is not None:
@@ -73,14 +73,14 @@ class State:
             turned = LightPlane.of(plane.n + step[9] * a + step[10] * b, 1.0)
             plane = replace(plane, normal=turned.normal, distance=plane.distance + float(step[11]))
         own = step[SHARED:].reshape(-1, OWN)
-        return State(
+        return AdjustmentState(
             self.camera.with_parameters(self.camera.parameters + step[CAMERA]),
             plane,
             self.rail_direction + step[RAIL],
-            perturbed(self.flange_from_camera, step[HAND]),
-            perturbed(self.base_from_board, step[BOARD]),
-            [perturbed(pose, d[:6]) for pose, d in zip(self.flanges, own, strict=True)],
-            self.rails + own[:, 6],
+            flange_from_camera=perturbed(self.flange_from_camera, step[HAND]),
+            base_from_board=perturbed(self.base_from_board, step[BOARD]),
+            flanges=[perturbed(pose, d[:6]) for pose, d in zip(self.flanges, own, strict=True)],
+            rails=self.rails + own[:, 6],
         )
 
     def camera_from_board(self, flange: pin.SE3, rail: float) -> pin.SE3:
@@ -97,7 +97,7 @@ def tangents(normal: Array) -> tuple[Array, Array]:
     return first, cross(normal, first)
 
 
-def dots_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array]:
+def dots_block(state: AdjustmentState, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array]:
     """Measured minus predicted pixels (n, 2), and the derivative of the prediction (n, 2, COLUMNS)."""
     hand, board = state.flange_from_camera, state.base_from_board
     pixels, jacobian = np.empty(view.pixels.shape), np.empty((len(view.points), 2, COLUMNS))
@@ -105,19 +105,19 @@ def dots_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tu
         state.camera.parameters,
         board.rotation,
         flange.rotation,
-        hand.rotation,
-        np.array([board.translation, flange.translation, hand.translation]),
-        float(rail),
-        np.ascontiguousarray(state.rail_direction, dtype=np.float64),
-        np.ascontiguousarray(view.points),
-        float(view.dot_radius),
-        pixels,
-        jacobian,
+        hand=hand.rotation,
+        places=np.array([board.translation, flange.translation, hand.translation]),
+        rail=float(rail),
+        travel=np.ascontiguousarray(state.rail_direction, dtype=np.float64),
+        points=np.ascontiguousarray(view.points),
+        radius=float(view.dot_radius),
+        pixels=pixels,
+        jacobian=jacobian,
     )
     return view.pixels - pixels, jacobian
 
 
-def stripe_block(state: State, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array, Array]:
+def stripe_block(state: AdjustmentState, view: ViewData, flange: pin.SE3, rail: float) -> tuple[Array, Array, Array]:
     """Negative distance (m,) of the stripe points from the board's plane, derivative of the distance, σ (m,).
 
     All in m. The sign makes the block like that of the dots, where the residual is measured minus predicted.

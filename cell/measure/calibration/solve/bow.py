@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment
-from cell.measure.calibration.solve.blocks import SHARED, State
+from cell.measure.calibration.solve.blocks import SHARED, AdjustmentState
 from cell.measure.calibration.solve.extra_parameter import OneMore, one_more
 from cell.measure.geometry.camera import Array
 
@@ -69,7 +69,7 @@ def with_bow(problem: Adjustment, flat: Adjusted) -> Adjusted:
     return replace(found, covariance=covariance, bow=bow)
 
 
-def _asked(problem: Adjustment, state: State) -> OneMore:
+def _asked(problem: Adjustment, state: AdjustmentState) -> OneMore:
     """By how much more the sheet seems bowed at a minimum."""
     plane = state.plane
     assert plane is not None

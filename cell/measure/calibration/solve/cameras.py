@@ -29,7 +29,7 @@ def adjust_scan(
 ) -> Joint:
     """The joint adjustment of the scan head; observations of one rest share what the arm's repeatability made there."""
     staged = solve_staged(observations, nominal, rail_direction)
-    return _solve(observations, staged, priors, "scan", "fine", nominal)
+    return _solve(observations, staged, priors, camera="scan", board="fine", nominal=nominal)
 
 
 def calibrate_target(
@@ -42,7 +42,7 @@ def calibrate_target(
 def adjust_target(observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors) -> Joint:
     """The joint adjustment of a camera without laser and rail."""
     same = [ScanObservation(o.view, None, o.base_from_flange, 0.0, o.name) for o in observations]
-    return _solve(same, solve_staged(same, nominal, stripe=False), priors, "target", "large", nominal)
+    return _solve(same, solve_staged(same, nominal, stripe=False), priors, "target", board="large", nominal=nominal)
 
 
 def _solve(

@@ -118,7 +118,9 @@ def choose_solution(
         adjusted = adjustment.solve(start_state(staged), ROUNDS)
         name = f"joint adjustment, camera {'adjusted with the arm' if camera_free else 'as the pictures say'}"
         left = leave_out(adjustment, adjusted)
-        return Solution(name, adjusted, views, free, left, pictures.covariance, True, camera_free)
+        return Solution(
+            name, adjusted, views, free, left=left, pictures=pictures.covariance, joint=True, camera_free=camera_free
+        )
 
     plain = closed_form(observations, staged, views, held)
     weights = [(float(np.clip(t * arm[0], *ARM_RANGE)), float(np.clip(t * arm[1], *TURN_RANGE))) for t in TRUSTS]
@@ -134,7 +136,7 @@ def choose_solution(
     # All follow the camera in the same way, the closed form too.
     follow = replace(plain.left, by_held=first[best].left.by_held)
     closed = Solution(
-        "closed form (Park-Martin)", plain.adjusted, views, held, follow, pictures.covariance, joint=False
+        "closed form (Park-Martin)", plain.adjusted, views, held, left=follow, pictures=pictures.covariance, joint=False
     )
     sound = [closed, *(s for s in tried if not _bent(s, pictures))]
     return Choice(min(sound, key=_handicapped), closed, [closed, *tried], arm)

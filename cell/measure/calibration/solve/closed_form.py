@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from cell.measure.calibration.observations import ScanObservation
 from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment, Priors
-from cell.measure.calibration.solve.blocks import BOARD, HAND, PLANE, SHARED, State, ViewData, tangents
+from cell.measure.calibration.solve.blocks import BOARD, HAND, PLANE, SHARED, AdjustmentState, ViewData, tangents
 from cell.measure.calibration.solve.hand_eye import solve_hand_eye
 from cell.measure.calibration.solve.joint import Staged, start_state
 from cell.measure.calibration.solve.left_out import LeftOut, Mask, predicted
@@ -50,14 +50,16 @@ def closed_form(
         covariance = np.diag(np.full(SHARED, np.inf))
     dots_px, stripe_m, board_m, squares = figures.T
     known = [other or state for other in states]
-    left = LeftOut(known, dots_px, stripe_m, board_m, squares, covariance, np.zeros((SHARED, SHARED)))
+    left = LeftOut(
+        known, dots_px, stripe_m, board_m, squares=squares, covariance=covariance, by_held=np.zeros((SHARED, SHARED))
+    )
     seen = replace(state, flanges=[flange_seen(state, board) for board in boards])
     dots, stripe = Adjustment(views, free, Priors()).residual_rms(seen)
     nothing = np.zeros((SHARED, SHARED))
-    return ClosedForm(Adjusted(state, nothing, float("nan"), dots, stripe, Priors(), 0), left)
+    return ClosedForm(Adjusted(state, nothing, float("nan"), dots, stripe, priors=Priors(), iterations=0), left)
 
 
-def flange_seen(state: State, camera_from_board: pin.SE3) -> pin.SE3:
+def flange_seen(state: AdjustmentState, camera_from_board: pin.SE3) -> pin.SE3:
     """The flange pose at which the board would be seen where it is seen."""
     return state.base_from_board * (state.flange_from_camera * camera_from_board).inverse()
 
@@ -75,8 +77,8 @@ def points_on_boards(staged: Staged, observations: Sequence[ScanObservation]) ->
 
 
 def _without(
-    state: State, k: int, flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], clouds: Sequence[Array]
-) -> State | None:
+    state: AdjustmentState, k: int, flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], clouds: Sequence[Array]
+) -> AdjustmentState | None:
     """The closed form of all frames but one; None where the others give none."""
     rest = [j for j in range(len(flanges)) if j != k]
     try:
@@ -92,7 +94,7 @@ def _without(
     )
 
 
-def _step(whole: State, other: State) -> Array:
+def _step(whole: AdjustmentState, other: AdjustmentState) -> Array:
     """The step (27,) from one state to another: hand-eye, board and plane."""
     step = np.zeros(SHARED)
     step[HAND] = difference(other.flange_from_camera, whole.flange_from_camera)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cell.measure.calibration.solve.adjustment import Adjustment
-from cell.measure.calibration.solve.blocks import SHARED, State
+from cell.measure.calibration.solve.blocks import SHARED, AdjustmentState
 from cell.measure.geometry.camera import Array
 
 DAMPING = 1e-9
@@ -33,7 +33,7 @@ class OneMore:
         return 1.0 / float(np.sqrt(self.information)) if self.information > 0 else np.inf
 
 
-def one_more(problem: Adjustment, state: State, group: str, column: Callable[[int, Array], Array]) -> OneMore:
+def one_more(problem: Adjustment, state: AdjustmentState, group: str, column: Callable[[int, Array], Array]) -> OneMore:
     """Asked of the normal equations at a minimum `state`, with all else left free to take its part of it.
 
     `column` gives, of a view's number and the whitened rows (m, 34) of its `group`, the rows' derivatives (m,) by the

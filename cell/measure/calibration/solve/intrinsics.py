@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from cell.measure.calibration.judge.board_shape import Bend, bend_of, untold_by_bend
 from cell.measure.calibration.solve.adjustment import DISTORTION_PRIOR, Adjustment, Priors
-from cell.measure.calibration.solve.blocks import CAMERA, SHARED, State, ViewData
+from cell.measure.calibration.solve.blocks import CAMERA, SHARED, AdjustmentState, ViewData
 from cell.measure.calibration.solve.left_out import LeftOut, leave_out
 from cell.measure.calibration.solve.starts import zhang
 from cell.measure.geometry.camera import Array, CameraModel
@@ -102,7 +102,7 @@ class Intrinsics:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _LensFit:
     model: LensModel
     camera: CameraModel
     covariance: Array
@@ -173,7 +173,7 @@ def beside_given(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:
     return _intrinsics(_fitted(GIVEN, camera, _data(views, camera)), views, {})
 
 
-def _clearly_better(more: _Fit, less: _Fit) -> bool:
+def _clearly_better(more: _LensFit, less: _LensFit) -> bool:
     """True when a richer lens predicts the left-out views better, by more than a view or two may do by chance."""
     if more.left is None or less.left is None or not more.held_out < (1 - CLEARLY_BETTER) * less.held_out:
         return False
@@ -181,31 +181,33 @@ def _clearly_better(more: _Fit, less: _Fit) -> bool:
     return bool(gain.sum() > CLEAR_DEVIATIONS * np.sqrt(len(gain)) * gain.std(ddof=1))
 
 
-def adjustment_of(model: LensModel, start: CameraModel, views: Sequence[BoardView]) -> tuple[Adjustment, State]:
+def adjustment_of(
+    model: LensModel, start: CameraModel, views: Sequence[BoardView]
+) -> tuple[Adjustment, AdjustmentState]:
     """The adjustment of a camera with such a lens and of each view's pose, and where it starts."""
     return _adjustment(model, start, _data(views, start))
 
 
-def _adjustment(model: LensModel, start: CameraModel, data: list[ViewData]) -> tuple[Adjustment, State]:
+def _adjustment(model: LensModel, start: CameraModel, data: list[ViewData]) -> tuple[Adjustment, AdjustmentState]:
     free = np.zeros(SHARED, dtype=np.bool_)
     free[CAMERA] = model.free
-    at = State(model.held(start), None, np.zeros(3), pin.SE3.Identity(), pin.SE3.Identity())
+    at = AdjustmentState(model.held(start), None, np.zeros(3), pin.SE3.Identity(), pin.SE3.Identity())
     return Adjustment(data, free, model.priors(UNKNOWN)), at
 
 
-def _fitted(model: LensModel, start: CameraModel, data: list[ViewData]) -> _Fit:
+def _fitted(model: LensModel, start: CameraModel, data: list[ViewData]) -> _LensFit:
     adjustment, at = _adjustment(model, start, data)
     result = adjustment.solve(at, ROUNDS)
     left = leave_out(adjustment, result) if len(data) >= LEAST_LEFT_OUT else None
     bend = bend_of(adjustment, result.state) if left is not None else None
-    found = _Fit(model, result.state.camera, result.covariance[CAMERA, CAMERA], left, bend)
+    found = _LensFit(model, result.state.camera, result.covariance[CAMERA, CAMERA], left, bend)
     if bend is not None and bend.believed:
         return found
     return replace(found, untold=untold_by_bend(adjustment, result.state))
 
 
 def _intrinsics(
-    fit: _Fit, views: Sequence[BoardView], tried: dict[str, float], other: CameraModel | None = None
+    fit: _LensFit, views: Sequence[BoardView], tried: dict[str, float], other: CameraModel | None = None
 ) -> Intrinsics:
     """`other` is a camera that explains the views as well: how far it is away is not known better."""
     rms = np.array([board_pose(view, fit.camera).rms_px for view in views])
@@ -224,8 +226,9 @@ def _intrinsics(
             covariance = covariance + np.outer(moved, moved)
     sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     return Intrinsics(
-        fit.camera, rms, _mean(rms, views), fit.held_out, sigma, formal, covariance, fit.model, tried, fit.bend,
-        np.zeros(0) if fit.left is None else _pull(fit.camera, fit.left, fit.covariance),
+        fit.camera, rms, _mean(rms, views), held_out_px=fit.held_out, sigma=sigma, formal=formal,
+        covariance=covariance, model=fit.model, tried=tried, bend=fit.bend,
+        pull=np.zeros(0) if fit.left is None else _pull(fit.camera, fit.left, fit.covariance),
     )  # fmt: skip
 
 
@@ -239,8 +242,8 @@ def _data(views: Sequence[BoardView], camera: CameraModel) -> list[ViewData]:
     nothing = np.zeros(0)
     return [
         ViewData(
-            v.object_points, v.pixels, v.sigma, v.dot_radius, np.zeros((0, 2)), nothing,
-            board_pose(v, camera).camera_from_board.inverse(), 0.0,
+            v.object_points, v.pixels, v.sigma, dot_radius=v.dot_radius, stripe=np.zeros((0, 2)), stripe_sigma=nothing,
+            base_from_flange=board_pose(v, camera).camera_from_board.inverse(), rail=0.0,
         )
         for v in views
     ]  # fmt: skip

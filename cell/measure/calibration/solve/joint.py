@@ -16,7 +16,7 @@ from cell.measure.calibration.solve.blocks import (
     CAMERA,
     COLUMNS,
     HAND,
-    State,
+    AdjustmentState,
     ViewData,
     dots_block,
     rests_of,
@@ -113,7 +113,7 @@ def solve_staged(
             plane = replace(plane, plane=paper.plane, rms=paper.rms)
         rows, nothing = iter(plane.rows), np.empty(0, dtype=np.intp)
         plane = replace(plane, rows=[nothing if o.same_rest else next(rows) for o in every])
-    return Staged(camera, view_rms, poses, hand_eye, plane, paper)
+    return Staged(camera, view_rms, poses, hand_eye=hand_eye, plane=plane, paper=paper)
 
 
 def paper_plane_of(
@@ -154,9 +154,9 @@ def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> ViewData:
     )
 
 
-def start_state(staged: Staged) -> State:
+def start_state(staged: Staged) -> AdjustmentState:
     """The joint adjustment's start."""
-    return State(
+    return AdjustmentState(
         staged.camera,
         None if staged.plane is None else staged.plane.plane,
         staged.hand_eye.rail_direction,
@@ -185,7 +185,7 @@ def solve_joint(
     px, stripe = float("nan"), float("nan")
     if held_out and len(views) > FOLDS:
         px, stripe = _held_out(views, free, adjusted)
-    return Joint(staged, adjusted, views, px, stripe, free)
+    return Joint(staged, adjusted, views, held_out_px=px, held_out_stripe_m=stripe, free=free)
 
 
 def _held_out(views: list[ViewData], free: NDArray[np.bool_], adjusted: Adjusted) -> tuple[float, float]:
@@ -202,7 +202,7 @@ def _held_out(views: list[ViewData], free: NDArray[np.bool_], adjusted: Adjusted
     return _rms(np.concatenate(dots)), _rms(np.concatenate(stripe))
 
 
-def residuals_as_reported(state: State, view: ViewData) -> tuple[Array, Array]:
+def residuals_as_reported(state: AdjustmentState, view: ViewData) -> tuple[Array, Array]:
     """Residuals of the dots (n, 2) in px and of the stripe (m,) in m at the flange pose that the arm reports."""
     off, away = np.zeros((0, 2)), np.zeros(0)
     if len(view.points):

@@ -13,7 +13,16 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment
-from cell.measure.calibration.solve.blocks import CAMERA, FLANGE, OWN, SHARED, State, ViewData, dots_block, stripe_block
+from cell.measure.calibration.solve.blocks import (
+    CAMERA,
+    FLANGE,
+    OWN,
+    SHARED,
+    AdjustmentState,
+    ViewData,
+    dots_block,
+    stripe_block,
+)
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.poses import perturbed, transform
 
@@ -36,7 +45,7 @@ class LeftOut:
     parameters. `by_held` (27, 27) says by how much each free parameter follows (rows) where a held one is wrong.
     """
 
-    states: list[State]
+    states: list[AdjustmentState]
     dots_px: Array
     stripe_m: Array
     board_m: Array
@@ -87,10 +96,10 @@ def leave_out(adjustment: Adjustment, adjusted: Adjusted) -> LeftOut:
     )
     dots, stripe, board, squares = figures.T
     scatter = np.asarray((count - 1) / count * apart.T @ apart)
-    return LeftOut(states, dots, stripe, board, squares, scatter, by_held)
+    return LeftOut(states, dots, stripe, board_m=board, squares=squares, covariance=scatter, by_held=by_held)
 
 
-def _reduced(adjustment: Adjustment, k: int, state: State) -> tuple[Array, Array]:
+def _reduced(adjustment: Adjustment, k: int, state: AdjustmentState) -> tuple[Array, Array]:
     """Information (27, 27) and gradient (27,) that a view brings for the shared parameters, its own pose eliminated."""
     rows, right = [np.zeros((0, 34))], [np.zeros(0)]
     for _, jacobian, residual, _ in adjustment.rows_of(k, state):
@@ -104,7 +113,7 @@ def _reduced(adjustment: Adjustment, k: int, state: State) -> tuple[Array, Array
     return np.asarray(shared.T @ shared), np.asarray(shared.T @ measured)
 
 
-def predicted(view: ViewData, flange: pin.SE3, other: State) -> list[float]:
+def predicted(view: ViewData, flange: pin.SE3, other: AdjustmentState) -> list[float]:
     """RMS px at the best pose, stripe and board in m at the reported pose, and the sum of squares in px².
 
     By a calibration that has not seen the view; `flange` is about where the view itself puts the flange.

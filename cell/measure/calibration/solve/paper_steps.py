@@ -96,9 +96,9 @@ def paper_plane(
         plane,
         _rms(plane.distances(points[kept])),
         int(kept.sum()),
-        seen,
-        _rms(np.array(apart)),
-        _rms(np.linalg.norm(measured - points[kept], axis=1)),
+        views=seen,
+        cross_ratio_m=_rms(np.array(apart)),
+        measured_m=_rms(np.linalg.norm(measured - points[kept], axis=1)),
     )
 
 

@@ -10,12 +10,12 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.calibration.drift.reference import Reference
-from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing, Witness, turned
+from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, PlateLine, Pointing, turned
 from cell.measure.calibration.drift.roll import rolled
-from cell.measure.calibration.solve.blocks import HAND, SHARED, State
+from cell.measure.calibration.solve.blocks import HAND, SHARED, AdjustmentState
 from cell.measure.calibration.solve.bow import FLAT
 from cell.measure.calibration.solve.joint import Joint, effective_hand_eye_covariance
-from cell.measure.calibration.timing import Shutter, Timing
+from cell.measure.calibration.timing import Shutter, StampTiming
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.covariance import covariance_root
 from cell.measure.geometry.light_plane import LightPlane
@@ -50,7 +50,7 @@ class Quality:
         a = joint.adjusted
         lit = a.state.plane is not None
         stripe, held_out = (a.stripe_rms_m, joint.held_out_stripe_m) if lit else (None, None)
-        return cls(len(joint.views), a.chi2_per_dof, a.dots_rms_px, stripe, joint.held_out_px, held_out)
+        return cls(len(joint.views), a.chi2_per_dof, a.dots_rms_px, stripe, joint.held_out_px, held_out_stripe=held_out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +79,11 @@ class ScanCalibration:
     bow_sigma: float = 0.0
     bow_gain: Array = field(default_factory=lambda: np.zeros(KEPT))
     notes: tuple[str, ...] = ()
-    witness: Witness | None = None
+    witness: PlateLine | None = None
     pointing: Pointing | None = None
     exit_point: Array = field(default_factory=lambda: np.zeros(3))
     confirmed: ConfirmedTurn | None = None
-    timing: Timing | None = None
+    timing: StampTiming | None = None
     shutter: Shutter | None = None
     unread: tuple[str, ...] = ()
     refused: str = ""
@@ -97,13 +97,13 @@ class ScanCalibration:
             state.camera,
             state.plane,
             state.rail_direction,
-            state.flange_from_camera,
-            reference.covariance[:KEPT, :KEPT],
-            Quality.of(joint),
-            reference,
-            bow.sigma * joint.adjusted.inflation,
-            bow.gain[:KEPT],
-            (*((bow.words,) if bow.sigma else ()), *(joint.size.notes if joint.size else ())),
+            flange_from_camera=state.flange_from_camera,
+            covariance=reference.covariance[:KEPT, :KEPT],
+            quality=Quality.of(joint),
+            reference=reference,
+            bow_sigma=bow.sigma * joint.adjusted.inflation,
+            bow_gain=bow.gain[:KEPT],
+            notes=(*((bow.words,) if bow.sigma else ()), *(joint.size.notes if joint.size else ())),
         )
 
     def flange_from_camera_at(self, rail_position: float) -> pin.SE3:
@@ -121,14 +121,14 @@ class ScanCalibration:
 
     def variants(self) -> list[ScanGeometry]:
         """The geometry moved by one standard deviation along each independent direction of the covariance."""
-        state = State(
+        state = AdjustmentState(
             self.camera,
             self.light_plane,
             self.rail_direction,
-            self.flange_from_camera,
-            pin.SE3.Identity(),
-            [],
-            np.zeros(0),
+            flange_from_camera=self.flange_from_camera,
+            base_from_board=pin.SE3.Identity(),
+            flanges=[],
+            rails=np.zeros(0),
         )
         made = []
         by_bow = self.bow_sigma * self.bow_gain
@@ -191,7 +191,7 @@ class ScanCalibration:
                 return None
 
         again = "jobs go on with scan_camera.late until `cell calibrate timing` has measured it again"
-        timing = found("timing", Timing.read, again)
+        timing = found("timing", StampTiming.read, again)
         shutter = found("shutter", Shutter.read, "run `cell calibrate timing`, which looks at it again")
         alone = "jobs go by the plate on the claw alone until `cell calibrate verify` has seen the laser again"
         confirmed = found("confirmed", ConfirmedTurn.read, alone)
@@ -199,14 +199,14 @@ class ScanCalibration:
             _camera(data["camera"]),
             LightPlane.of(plane["normal"], float(plane["distance"])).bowed(float(plane.get("bow", 0.0))),
             np.array(data["rail_direction"], dtype=np.float64),
-            from_matrix(data["flange_from_camera"]),
-            np.array(data["covariance"], dtype=np.float64).reshape(KEPT, KEPT),
-            Quality(**data["quality"]),
-            Reference.read(data.get("reference")),
-            float(plane.get("bow_sigma", 0.0)),
-            np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
-            tuple(data.get("notes", ())),
-            Witness.read(data.get("witness")),
+            flange_from_camera=from_matrix(data["flange_from_camera"]),
+            covariance=np.array(data["covariance"], dtype=np.float64).reshape(KEPT, KEPT),
+            quality=Quality(**data["quality"]),
+            reference=Reference.read(data.get("reference")),
+            bow_sigma=float(plane.get("bow_sigma", 0.0)),
+            bow_gain=np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
+            notes=tuple(data.get("notes", ())),
+            witness=PlateLine.read(data.get("witness")),
             confirmed=confirmed,
             timing=timing,
             shutter=shutter,
@@ -269,5 +269,5 @@ def _camera_dict(camera: CameraModel) -> dict[str, Any]:
 
 
 def _camera(data: dict[str, Any]) -> CameraModel:
-    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, 1.0, 0.0, 0.0)
+    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, fy=1.0, cx=0.0, cy=0.0)
     return model.with_parameters(data["parameters"])

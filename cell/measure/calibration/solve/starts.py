@@ -61,7 +61,7 @@ def zhang(
     matrix = np.asarray(result[1], dtype=np.float64)
     dist = np.asarray(result[2], dtype=np.float64).ravel()[:5]
     per_view = np.asarray(result[7], dtype=np.float64).ravel()
-    camera = CameraModel(size[0], size[1], 1.0, 1.0, 0.0, 0.0).with_parameters(
+    camera = CameraModel(size[0], size[1], 1.0, fy=1.0, cx=0.0, cy=0.0).with_parameters(
         [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *dist]
     )
     if not 0.1 * max(size) < camera.fx < 100 * max(size):

@@ -198,7 +198,7 @@ class _Beside:
             feet @ pose.rotation,
             found.heights,
             -found.jacobian,
-            np.einsum("ni,nim->nm", found.normals, moved),
-            scan.lines[found.index],
-            len(found.index) / max(1, len(lines)),
+            by_poses=np.einsum("ni,nim->nm", found.normals, moved),
+            lines=scan.lines[found.index],
+            share=len(found.index) / max(1, len(lines)),
         )

@@ -118,7 +118,9 @@ def predict(camera: CameraModel, camera_from_board: pin.SE3, points: Array, dot_
     """Pixels (n, 2) where board points (n, 3) are measured: ellipse centres of dots, images of corners."""
     pixels = np.empty((len(points), 2))
     rotation, translation = camera_from_board.rotation, camera_from_board.translation
-    seen_points(camera.parameters, rotation, translation, np.ascontiguousarray(points), float(dot_radius), pixels)
+    seen_points(
+        camera.parameters, rotation, translation, np.ascontiguousarray(points), radius=float(dot_radius), pixels=pixels
+    )
     return pixels
 
 
@@ -142,7 +144,7 @@ def _starts(view: BoardView, camera: CameraModel) -> list[pin.SE3]:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fit:
+class _PoseFit:
     """A pose, the residuals (n, 2) in px and in σ, the weights (n,) and the normal matrix (6, 6) in units of σ."""
 
     pose: pin.SE3
@@ -172,7 +174,7 @@ class _Fit:
         return float(np.sum(np.minimum(lengths, OUTLYING) ** 2 + 2 * OUTLYING**2 * np.log(far)))
 
 
-def _robust(view: BoardView, camera: CameraModel, start: pin.SE3) -> _Fit:
+def _robust(view: BoardView, camera: CameraModel, start: pin.SE3) -> _PoseFit:
     """The pose nearest to `start`; points that the others contradict, as in a glint or a shadow's edge, count less."""
     fit = _refined(view, camera, start, np.ones(len(view.ids)))
     for _ in range(ROUNDS):
@@ -185,13 +187,13 @@ def _robust(view: BoardView, camera: CameraModel, start: pin.SE3) -> _Fit:
     return fit
 
 
-def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array) -> _Fit:
+def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array) -> _PoseFit:
     """Levenberg's method on the pose, the points weighted by `weights` (n,) over their variances."""
     points, pixels = np.ascontiguousarray(view.object_points), np.empty(view.pixels.shape)
     lens, radius, factor = camera.parameters, float(view.dot_radius), np.sqrt(weights) / view.sigma
 
     def residual_of(candidate: pin.SE3) -> tuple[Array, float]:
-        seen_points(lens, candidate.rotation, candidate.translation, points, radius, pixels)
+        seen_points(lens, candidate.rotation, candidate.translation, points=points, radius=radius, pixels=pixels)
         residual = view.pixels - pixels
         white = (factor[:, None] * residual).ravel()
         total = float(white @ white)
@@ -201,7 +203,9 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
     residual, squares = residual_of(pose)
     normal, right = np.eye(6), np.zeros(6)
     for _ in range(STEPS):
-        pose_equations(lens, pose.rotation, pose.translation, points, factor, residual, normal, right)
+        pose_equations(
+            lens, pose.rotation, pose.translation, points, factor=factor, residual=residual, normal=normal, right=right
+        )
         damped = normal.copy()
         damped.flat[::7] *= 1 + damping
         step = np.linalg.solve(damped, right)
@@ -217,4 +221,4 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
             damping *= 10
             if damping > 1e6:
                 break
-    return _Fit(pose, residual, residual / view.sigma[:, None], weights, normal)
+    return _PoseFit(pose, residual, residual / view.sigma[:, None], weights, normal)

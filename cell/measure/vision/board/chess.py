@@ -50,7 +50,7 @@ def find_chessboard(image: Image, spec: BoardSpec, quick: bool = False) -> Board
         views = []
         for index, places in corner_lattices(corners, least):
             try:
-                views.append(_view(image, lit, spec, corners, index, places, share))
+                views.append(_view(image, lit, spec, corners=corners, index=index, places=places, share=share))
             except PictureRefused as refused:
                 refusals.append(refused)
         if views:
@@ -98,7 +98,7 @@ def _view(
     check_chess_ends(image, spec, seen)
     ids = np.flatnonzero(good)
     size = (image.shape[1], image.shape[0])
-    return BoardView(spec, size, ids, measured[ids], np.hypot(sigma[ids], LEAST_SIGMA_PX), spec.symmetric)
+    return BoardView(spec, size, ids, measured[ids], np.hypot(sigma[ids], LEAST_SIGMA_PX), order_assumed=spec.symmetric)
 
 
 def _check_none_beyond(image: Image, spec: BoardSpec, plane: PlaneMap, contrast: float) -> None:

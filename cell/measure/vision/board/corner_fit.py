@@ -43,11 +43,11 @@ def fit_corners(
         np.ascontiguousarray(image),
         np.ascontiguousarray(starts, dtype=np.float64),
         np.ascontiguousarray(steps, dtype=np.float64),
-        np.ascontiguousarray(dark_first),
-        share,
-        places,
-        sigma,
-        contrast,
+        dark_first=np.ascontiguousarray(dark_first),
+        share=share,
+        places=places,
+        sigma=sigma,
+        contrast=contrast,
     )
     return places, sigma, contrast
 
@@ -72,7 +72,18 @@ def _fit(
         places[n, 0] = places[n, 1] = sigma[n] = contrast[n] = np.nan
         angle_1 = math.atan2(steps[n, 1, 0], steps[n, 0, 0])
         angle_2 = math.atan2(steps[n, 1, 1], steps[n, 0, 1])
-        _one(image, starts[n], reach, angle_1, angle_2, dark_first[n], n, places, sigma, contrast)
+        _one(
+            image,
+            starts[n],
+            reach,
+            angle_1=angle_1,
+            angle_2=angle_2,
+            dark=dark_first[n],
+            n=n,
+            places=places,
+            sigma=sigma,
+            contrast=contrast,
+        )
 
 
 @compiled
@@ -188,7 +199,7 @@ def _one(
     if math.sqrt(variance) > 0.3 * abs(best[7]) + 1.0 and scale > 0.3 * abs(best[7]) + 1.0:
         return
     places[n, 0], places[n, 1] = best[0] + u0, best[1] + v0
-    sigma[n] = _deviation(best, du[:count], dv[:count], grey[:count], weight > 0, OUTLYING * scale)
+    sigma[n] = _deviation(best, du[:count], dv[:count], grey=grey[:count], used=weight > 0, limit=OUTLYING * scale)
     contrast[n] = 2 * abs(best[7])
 
 

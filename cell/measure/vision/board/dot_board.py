@@ -65,7 +65,7 @@ def _attempt(
                 spec, _upright(places, dots.centres), np.where(np.isnan(sigma)[:, None], 0.0, scores)
             )
             known = np.asarray((board_places >= 0).all(axis=1), dtype=np.bool_)
-            views.append(_complete(image, spec, dots.take(known), board_places[known], assumed, scale))
+            views.append(_complete(image, spec, dots.take(known), board_places[known], assumed=assumed, scale=scale))
         except PictureRefused as refused:
             reasons.append(refused)
     if not views and not reasons:
@@ -145,7 +145,15 @@ def _complete(image: Image, spec: BoardSpec, dots: Blobs, places: Places, assume
     # One dot's rays are few: half of its variance is what the board's other dots say.
     own = np.square(sigma[good] / scale)
     deviation = np.sqrt(0.5 * (own + np.median(own)) + LEAST_SIGMA_PX**2)
-    return BoardView(spec, size, ids[good], pixels, deviation, assumed, spec.dot_radius or radius * spec.pitch)
+    return BoardView(
+        spec,
+        size,
+        ids[good],
+        pixels=pixels,
+        sigma=deviation,
+        order_assumed=assumed,
+        dot_radius=spec.dot_radius or radius * spec.pitch,
+    )
 
 
 def _radius(dots: Blobs, places: Places, jacobian: Array, lattice: Array) -> float:

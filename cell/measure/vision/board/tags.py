@@ -162,7 +162,7 @@ def _by_sides(image: Image, corners: Array) -> tuple[Array, Array]:
     off = reach * (2 * (share.sum(axis=-1) - 0.5) / (STEPS - 1) - 1)
     seen = step > 0.4 * np.median(step) + 3
     lines, spread = _lines(np.where(seen, off, np.nan), length)
-    return _meetings(begin, normal, unit, lines, spread, length)
+    return _meetings(begin, normal, unit, lines=lines, spread=spread, length=length)
 
 
 def _lines(off: Array, length: Array) -> tuple[Array, Array]:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from cell.measure.vision.stripe.careful.careful import read_carefully
 from cell.measure.vision.stripe.careful.competing_peaks import DOUBLE
 from cell.measure.vision.stripe.careful.neighbours import widen_what_departs
-from cell.measure.vision.stripe.ordinary.quick import Verdict, read_quickly, refuse_white
+from cell.measure.vision.stripe.ordinary.quick import QuickVerdict, read_quickly, refuse_white
 from cell.measure.vision.stripe.planes import FULL, Picture, as_picture
-from cell.measure.vision.stripe.planes import Laser as Laser
+from cell.measure.vision.stripe.planes import LaserChannel as LaserChannel
 from cell.measure.vision.stripe.profile import Array as Array
 from cell.measure.vision.stripe.profile import Axis as Axis
 from cell.measure.vision.stripe.profile import Image as Image
@@ -35,7 +35,7 @@ def extract(
     settings: StripeSettings | None = None,
     *,
     like: StripeProfile | None = None,
-    laser: Laser | str = Laser.AUTO,
+    laser: LaserChannel | str = LaserChannel.AUTO,
 ) -> StripeProfile:
     """Stripe centres of an image (h, w), (h, w, 3) or (h, w, 4), one per row (or per column with axis "columns").
 
@@ -48,22 +48,24 @@ def extract(
     frame of another size, an unknown laser, `PictureRefused` for a picture that is blinded.
     """
     settings = settings or StripeSettings()
-    laser = Laser(laser)
+    laser = LaserChannel(laser)
     _check(image, dark)
     if image.ndim != 2 or image.dtype != np.uint8:
         picture = as_picture(image, settings.saturation_dn)
         if not picture.plain:
-            return _carefully(picture, dark, axis, settings, laser, like, None)
+            return _carefully(picture, dark, axis, settings=settings, laser=laser, like=like, starts=None)
         dark = None if dark is None else _whole(_same_range(dark, picture, settings))
         image = _whole(picture)
     profile, verdict = read_quickly(image, dark, axis, settings, like)
     widen_what_departs(profile.centres, profile.sigma)
-    if verdict is Verdict.ORDINARY:
+    if verdict is QuickVerdict.ORDINARY:
         return profile
     starts = profile.centres if _trusted(profile) else None
-    careful = _carefully(as_picture(image, settings.saturation_dn), dark, axis, settings, laser, like, starts)
+    careful = _carefully(
+        as_picture(image, settings.saturation_dn), dark, axis, settings=settings, laser=laser, like=like, starts=starts
+    )
     # Clear peaks that make no line, such as those of a comb, are what they are.
-    alone = verdict is Verdict.UNMISTAKABLE and careful.valid.sum() < 0.5 * profile.valid.sum()
+    alone = verdict is QuickVerdict.UNMISTAKABLE and careful.valid.sum() < 0.5 * profile.valid.sum()
     return profile if alone else careful
 
 
@@ -77,7 +79,7 @@ def _trusted(profile: StripeProfile) -> bool:
 
 
 def _carefully(
-    picture: Picture, dark: Any, axis: Axis, settings: StripeSettings, laser: Laser, like: StripeProfile | None,
+    picture: Picture, dark: Any, axis: Axis, settings: StripeSettings, laser: LaserChannel, like: StripeProfile | None,
     starts: Array | None,
 ) -> StripeProfile:  # fmt: skip
     """The profile of a picture by the careful way."""
@@ -86,12 +88,13 @@ def _carefully(
     if axis == "columns":
         picture, off = picture.turned(), None if off is None else off.turned()
     taught = like.learned if like is not None else None
-    seen = read_carefully(picture, off, laser, settings, taught, starts)
+    seen = read_carefully(picture, off, laser, settings=settings, like=taught, starts=starts)
     widen_what_departs(seen.centres, seen.sigma)
     double = np.nan_to_num(seen.rival) > DOUBLE
     return StripeProfile(
-        axis, seen.centres, seen.sigma, seen.amplitude, seen.width, seen.saturated,
-        double & np.isfinite(seen.centres), None, None, seen.rival, seen.misfit, seen.learned,
+        axis, seen.centres, seen.sigma, amplitude=seen.amplitude, width=seen.width, saturated=seen.saturated,
+        double=double & np.isfinite(seen.centres), speckle=None, noise=None, rival=seen.rival, misfit=seen.misfit,
+        learned=seen.learned,
     )  # fmt: skip
 
 

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.vision.stripe.careful.follow import SCALES, Candidates, Chain, candidates, follow
+from cell.measure.vision.stripe.careful.follow import SCALES, Candidates, StripeChain, candidates, follow
 from cell.measure.vision.stripe.careful.learning import FREE_SCALE
 from cell.measure.vision.stripe.careful.shape import gaussian
 from cell.measure.vision.stripe.careful.shaped_fit import Noise, Plane, binned, fit_shape
 from cell.measure.vision.stripe.careful.surroundings import around, carried, surrounded
-from cell.measure.vision.stripe.planes import MIXES, Laser, Picture
+from cell.measure.vision.stripe.planes import MIXES, LaserChannel, Picture
 
 Array = NDArray[np.float64]
 
@@ -33,15 +33,15 @@ SURE = 3.5
 LEAST_SCORE = 0.35
 
 
-class Look(NamedTuple):
+class CoarseLines(NamedTuple):
     """What a coarse look at a plane gave: candidates, the chain through them, and by how many px rows were blurred."""
 
     found: Candidates
-    chain: Chain
+    chain: StripeChain
     along: float
 
 
-def coarse(value: NDArray[np.float32]) -> Look:
+def coarse(value: NDArray[np.float32]) -> CoarseLines:
     """Candidates and chain through some rows of a plane (lines, n), of at most COARSE_COLUMNS pixels.
 
     Where there is hardly a line to see, rows are blurred more: what is noisy is often straight.
@@ -53,7 +53,7 @@ def coarse(value: NDArray[np.float32]) -> Look:
     return further if further.chain.score > 1.2 * look.chain.score else look
 
 
-def _coarse(value: NDArray[np.float32], along: float) -> Look:
+def _coarse(value: NDArray[np.float32], along: float) -> CoarseLines:
     step = max(1, len(value) // COARSE_ROWS)
     calm = cv2.GaussianBlur(value, (1, 2 * int(2.5 * along) + 1), sigmaX=0.0, sigmaY=along)
     part: NDArray[np.float32] = np.ascontiguousarray(calm[::step], dtype=np.float32)
@@ -64,16 +64,16 @@ def _coarse(value: NDArray[np.float32], along: float) -> Look:
     found = candidates(part, np.arange(0, len(part)), SCALES, along=0.0)
     place = found.place * shrink + 0.5 * (shrink - 1)
     found = Candidates(found.rows * step, place, found.response, found.clear, found.scale * shrink)
-    return Look(found, follow(found, step), along)
+    return CoarseLines(found, follow(found, step), along)
 
 
-def choose_mix(picture: Picture, off: Picture | None, laser: Laser) -> str:
+def choose_mix(picture: Picture, off: Picture | None, laser: LaserChannel) -> str:
     """The mix of colours in which a line stands out best among `MIXES`, or the one that `laser` names.
 
     Of the mixes that show it about as well, the one in which its centres are known best: a channel in which the core is
     saturated, or the noise or the texture strong, gives way to another.
     """
-    if not picture.coloured or laser is not Laser.AUTO:
+    if not picture.coloured or laser is not LaserChannel.AUTO:
         return laser.value if picture.coloured else "grey"
     looks = {mix: coarse(difference(picture, off, mix)[0]) for mix in MIXES}
     best = max(look.chain.score for look in looks.values())
@@ -87,7 +87,7 @@ def choose_mix(picture: Picture, off: Picture | None, laser: Laser) -> str:
 
 def _knowledge(
     value: NDArray[np.float32], usable: NDArray[np.bool_], shade: NDArray[np.float32] | None, found: Candidates,
-    chain: Chain, mix: str,
+    chain: StripeChain, mix: str,
 ) -> float:  # fmt: skip
     """How much the lines of a chain say about their centres, in 1/px², the sum of all that are worth a fit."""
     rows, at = found.rows[chain.rows], found.place[chain.rows, chain.which]
@@ -95,7 +95,7 @@ def _knowledge(
     k = max(1, int(scale / BINNED_WIDTH))
     plane, at, width = binned(Plane(value, usable, shade), k), (at - 0.5 * (k - 1)) / k, scale / k
     noise = surrounded(plane, rows, at, 4 * width, Noise(0.1, 1 / 40 * float(np.abs(MIXES[mix]).sum())))
-    fitted = fit_shape(plane, rows, at, gaussian(width, 4 * width + 3), noise, FREE_SCALE)
+    fitted = fit_shape(plane, rows, at, shape=gaussian(width, 4 * width + 3), noise=noise, scale_prior=FREE_SCALE)
     good = fitted.good & (fitted.amplitude > SURE * fitted.amplitude_sigma)
     good &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
     variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), 4 * width)

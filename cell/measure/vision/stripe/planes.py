@@ -21,7 +21,7 @@ NEAR_FULL = 0.985
 """From this share of the range on a pixel is taken to be saturated; the coding of a JPEG moves it that much."""
 
 
-class Laser(StrEnum):
+class LaserChannel(StrEnum):
     """Where in the picture the laser is looked for: in what it stands out best, or where one says that it is."""
 
     AUTO = "auto"

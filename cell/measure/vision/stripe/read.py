@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from cell.measure.vision.stripe.careful.confidence import refuse_unsure
-from cell.measure.vision.stripe.extract import Axis, Laser, StripeProfile, StripeSettings, extract, subtracted
-from cell.measure.vision.stripe.overview import LEAST_SCORE, Look, choose_mix, coarse
+from cell.measure.vision.stripe.extract import Axis, LaserChannel, StripeProfile, StripeSettings, extract, subtracted
+from cell.measure.vision.stripe.overview import LEAST_SCORE, CoarseLines, choose_mix, coarse
 
 LEAST_POINTS = 30
 
 
 def read_stripe(
-    image: Any, off: Any = None, laser: Laser | str = Laser.AUTO, settings: StripeSettings | None = None
+    image: Any, off: Any = None, laser: LaserChannel | str = LaserChannel.AUTO, settings: StripeSettings | None = None
 ) -> StripeProfile | None:
     """The stripe of `image` (h, w), (h, w, 3) or (h, w, 4), red first, along rows or columns, whichever it follows.
 
@@ -20,9 +20,9 @@ def read_stripe(
     LEAST_POINTS points is found. Raises what `extract` raises, and PictureRefused where it is not sure which line is
     the laser's.
     """
-    settings, laser = settings or StripeSettings(), Laser(laser)
+    settings, laser = settings or StripeSettings(), LaserChannel(laser)
     picture, dark = subtracted(image, off, settings)
-    looks: dict[Axis, tuple[Look, str]] = {}
+    looks: dict[Axis, tuple[CoarseLines, str]] = {}
     for axis in ("rows", "columns"):
         part = picture if axis == "rows" else picture.turned()
         shade = None if dark is None else (dark if axis == "rows" else dark.turned())

@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from statemachine.journal import JournalError, Record, read
+from statemachine.journal import JournalError, JournalRecord, read
 
 WIDTH, ROW, LEFT, RIGHT = 900, 24, 150, 20
 """In px of the drawing; `LEFT` is the room of the steps' names."""
@@ -31,7 +31,7 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Mark:
+class TimelineMark:
     """Something that happened, in seconds of the run; `bad` for a fault."""
 
     at: float
@@ -44,7 +44,7 @@ class Timeline:
     """What is drawn, and which time it is told in."""
 
     bars: tuple[Bar, ...]
-    marks: tuple[Mark, ...]
+    marks: tuple[TimelineMark, ...]
     length: float
     clock: str
 
@@ -64,21 +64,21 @@ def timeline(folder: Path, report: Mapping[str, Any]) -> Timeline | None:
     return _virtual(record, report) if report.get("clock") == "virtual" else _wall(record, report)
 
 
-def _wall(record: Record, report: Mapping[str, Any]) -> Timeline:
+def _wall(record: JournalRecord, report: Mapping[str, Any]) -> Timeline:
     start = record.run.started
     last = max(
         [record.run.ended or start, *(step.ended or step.started for step in record.steps)]
         + [event.at for event in record.events]
     )
     bars = [Bar(s.name, s.attempt, s.started - start, (s.ended or last) - start, s.state) for s in record.steps]
-    marks = [Mark(e.at - start, _told(e.kind, e.data), False) for e in record.events if e.kind in SHOWN]
+    marks = [TimelineMark(e.at - start, _told(e.kind, e.data), False) for e in record.events if e.kind in SHOWN]
     for fault in report.get("faults") or ():
         at = datetime.fromisoformat(str(fault["at"])).timestamp() - start
-        marks.append(Mark(min(max(at, 0.0), last - start), _fault(fault), True))
+        marks.append(TimelineMark(min(max(at, 0.0), last - start), _fault(fault), True))
     return Timeline(tuple(bars), tuple(marks), max(last - start, 0.1), "on the wall")
 
 
-def _virtual(record: Record, report: Mapping[str, Any]) -> Timeline:
+def _virtual(record: JournalRecord, report: Mapping[str, Any]) -> Timeline:
     bars, now = [], 0.0
     for step in record.steps:
         length = step.duration_s or 0.0
@@ -86,7 +86,7 @@ def _virtual(record: Record, report: Mapping[str, Any]) -> Timeline:
         now += length
     ends = {(bar.step, bar.attempt): bar.end for bar in bars}
     marks = [
-        Mark(ends.get((fault["step"], fault["attempt"]), now), _fault(fault), True)
+        TimelineMark(ends.get((fault["step"], fault["attempt"]), now), _fault(fault), True)
         for fault in report.get("faults") or ()
     ]
     return Timeline(tuple(bars), tuple(marks), max(now, 0.1), "of the cell's clock")
@@ -133,6 +133,6 @@ def timeline_svg(course: Timeline) -> str:
     return "".join([*parts, "</svg>"])
 
 
-def mark_rows(marks: Sequence[Mark]) -> list[tuple[str, str, str]]:
+def mark_rows(marks: Sequence[TimelineMark]) -> list[tuple[str, str, str]]:
     """Number, time and words of each mark."""
     return [(str(number), f"{mark.at:.2f} s", mark.text) for number, mark in enumerate(marks, 1)]

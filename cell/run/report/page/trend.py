@@ -53,9 +53,9 @@ def _past(name: str, report: Mapping[str, Any]) -> Past:
         name,
         str(report.get("started") or "")[:16].replace("T", " "),
         str(report["outcome"]),
-        bool(report.get("simulated")),
-        None if truth is None else float(truth["error_mm"]["d"]["max"]),
-        None if bound is None else float(bound["d"]),
+        simulated=bool(report.get("simulated")),
+        true_mm=None if truth is None else float(truth["error_mm"]["d"]["max"]),
+        stated_mm=None if bound is None else float(bound["d"]),
     )
 
 

@@ -7,7 +7,7 @@ import struct
 from dataclasses import dataclass
 
 from sim_backends.models.arm import ArmModel
-from sim_backends.peers.arm.rtde.registers import Registers, View
+from sim_backends.peers.arm.rtde.registers import Registers, RegisterView
 from sim_backends.peers.arm.rtde.variables import FORMATS, INPUTS, Getter
 
 _COMMANDS = frozenset({"input_int_register_0", "input_int_register_24"})
@@ -85,7 +85,7 @@ class OutputRecipe:
     packer: struct.Struct
     getters: tuple[Getter, ...]
 
-    def packet(self, view: View) -> bytes:
+    def packet(self, view: RegisterView) -> bytes:
         """One data packet."""
         values: list[float] = []
         for getter in self.getters:

@@ -40,7 +40,7 @@ _SAFETY_BITS = {
 """By the number of the safety system's state."""
 
 
-class View:
+class RegisterView:
     """The arm's and the program's state as RTDE shows it, computed at most once per tick."""
 
     def __init__(self, model: ArmModel, registers: Registers) -> None:

@@ -22,12 +22,12 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.arm.controller_ports import Client, TcpPorts
-from sim_backends.peers.arm.dashboard import BANNER, Dashboard
+from sim_backends.peers.arm.dashboard import BANNER, DashboardServer
 from sim_backends.peers.arm.rtde.recipes import InputRecipe
-from sim_backends.peers.arm.rtde.registers import Registers, View
-from sim_backends.peers.arm.rtde.session import Session
+from sim_backends.peers.arm.rtde.registers import Registers, RegisterView
+from sim_backends.peers.arm.rtde.session import RtdeSession
 from sim_backends.peers.arm.script.clients import SCRIPT_PORTS, ScriptClients
-from sim_backends.peers.arm.script.script import ControlProgram
+from sim_backends.peers.arm.script.script import ProgramMemory
 
 PERIOD = 0.002
 """Seconds on the wall between two ticks and two packets."""
@@ -49,18 +49,18 @@ class RtdePeer:
     def __init__(
         self, model: ArmModel, clock: WorldClock, host: str | None = None, programs: Path | None = None
     ) -> None:
-        """Bind the ports on `host`, or on the first free address that `TcpPorts` finds; `programs` as for `Dashboard`.
+        """Bind the ports on `host`, or on the first free address of `TcpPorts`; `programs` as for `DashboardServer`.
 
         Raises OSError when an address or every address is taken.
         """
         self._model = model
         self._clock = clock
         self._registers = Registers()
-        self._view = View(model, self._registers)
-        self._program = ControlProgram(model, self._registers)
-        self._dashboard = Dashboard(model, self._program, programs)
-        self._owners: dict[str, Session] = {}
-        self._sessions: dict[Client, Session] = {}
+        self._view = RegisterView(model, self._registers)
+        self._program = ProgramMemory(model, self._registers)
+        self._dashboard = DashboardServer(model, self._program, programs)
+        self._owners: dict[str, RtdeSession] = {}
+        self._sessions: dict[Client, RtdeSession] = {}
         self._scripts = ScriptClients(model, self._program, self._view)
         self._lines: dict[Client, bytes] = {}
         self._ports = TcpPorts((RTDE_PORT, DASHBOARD_PORT, *SCRIPT_PORTS), host)
@@ -100,7 +100,7 @@ class RtdePeer:
         """Take away the fault."""
         self._late = 0
 
-    def claim(self, name: str, session: Session) -> bool:
+    def claim(self, name: str, session: RtdeSession) -> bool:
         """Give an input variable to a connection; False when another one holds it."""
         return self._owners.setdefault(name, session) is session
 
@@ -155,7 +155,7 @@ class RtdePeer:
             self._owners = {name: owner for name, owner in self._owners.items() if owner is not session}
             return
         if client not in self._sessions:
-            self._sessions[client] = Session(self, client)
+            self._sessions[client] = RtdeSession(self, client)
         self._sessions[client].feed(data)
 
     def _serve_dashboard(self, client: Client, data: bytes | None) -> None:

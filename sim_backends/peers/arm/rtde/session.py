@@ -14,7 +14,7 @@ from typing import Protocol
 from sim_backends.peers.arm.controller_ports import Client
 from sim_backends.peers.arm.dashboard import VERSION
 from sim_backends.peers.arm.rtde.recipes import InputRecipe, OutputRecipe
-from sim_backends.peers.arm.rtde.registers import View
+from sim_backends.peers.arm.rtde.registers import RegisterView
 from sim_backends.peers.arm.rtde.variables import FORMATS, INPUTS, OUTPUTS
 
 _HEADER = struct.Struct(">HB")
@@ -27,14 +27,14 @@ _FLOOD = 65536
 class Controller(Protocol):
     """What a connection needs of the controller."""
 
-    def claim(self, name: str, session: Session) -> bool:
+    def claim(self, name: str, session: RtdeSession) -> bool:
         """Give an input variable to a connection; False when another one holds it."""
 
     def input_recipe(self, names: list[str]) -> InputRecipe:
         """A recipe that writes to this controller's inputs."""
 
 
-class Session:
+class RtdeSession:
     """One RTDE connection: its recipes and whether it has been started."""
 
     def __init__(self, controller: Controller, client: Client) -> None:
@@ -73,7 +73,7 @@ class Session:
             if left == 0 and len(self._buffer) < _FLOOD:
                 return
 
-    def send_state(self, view: View, tick: int, late: int = 0) -> None:
+    def send_state(self, view: RegisterView, tick: int, late: int = 0) -> None:
         """Send a data packet for every output recipe that is due at this tick, `late` ticks after this one.
 
         A client that does not keep up misses packets, as it does on a controller.
@@ -153,7 +153,7 @@ class Session:
         if recipe is not None:
             recipe.apply(payload)
 
-    _HANDLERS: dict[str, Callable[[Session, bytes], None]] = {  # noqa: RUF012
+    _HANDLERS: dict[str, Callable[[RtdeSession, bytes], None]] = {  # noqa: RUF012
         "V": _on_protocol,
         "v": _on_version,
         "O": _on_outputs,

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 
 from sim_backends.models.arm import Power
-from sim_backends.peers.arm.rtde.registers import BITS, REGISTERS, View
+from sim_backends.peers.arm.rtde.registers import BITS, REGISTERS, RegisterView
 
 FORMATS = {
     "BOOL": "?",
@@ -25,10 +25,10 @@ FORMATS = {
 }
 """`struct` code of every RTDE type; numbers are big-endian on the wire."""
 
-Getter = Callable[[View], Iterable[float]]
+Getter = Callable[[RegisterView], Iterable[float]]
 
 
-def _momentum(view: View) -> float:
+def _momentum(view: RegisterView) -> float:
     return 5.0 * math.hypot(*view.tcp_speed()[:3])
 
 
@@ -53,14 +53,14 @@ OUTPUTS: dict[str, tuple[str, Getter]] = {
     "actual_current_window": ("VECTOR6D", _SIX),
     "actual_current_as_torque": ("VECTOR6D", _SIX),
     "joint_control_output": ("VECTOR6D", _SIX),
-    "actual_TCP_pose": ("VECTOR6D", View.tcp_pose),
-    "actual_TCP_speed": ("VECTOR6D", View.tcp_speed),
+    "actual_TCP_pose": ("VECTOR6D", RegisterView.tcp_pose),
+    "actual_TCP_speed": ("VECTOR6D", RegisterView.tcp_speed),
     "actual_TCP_acceleration": ("VECTOR6D", _SIX),
     "actual_TCP_force": ("VECTOR6D", lambda v: v.model.felt.tolist()),
-    "target_TCP_pose": ("VECTOR6D", View.tcp_pose),
-    "target_TCP_speed": ("VECTOR6D", View.tcp_speed),
+    "target_TCP_pose": ("VECTOR6D", RegisterView.tcp_pose),
+    "target_TCP_speed": ("VECTOR6D", RegisterView.tcp_speed),
     "target_TCP_acceleration": ("VECTOR6D", _SIX),
-    "tcp_offset": ("VECTOR6D", View.tcp_offset),
+    "tcp_offset": ("VECTOR6D", RegisterView.tcp_offset),
     "actual_digital_input_bits": ("UINT64", lambda v: (v.model.digital_inputs,)),
     "actual_configurable_digital_input_bits": ("UINT64", lambda v: (v.model.digital_inputs >> 8 & 255,)),
     "joint_temperatures": ("VECTOR6D", _always(*[30.0] * 6)),
@@ -111,7 +111,7 @@ OUTPUTS: dict[str, tuple[str, Getter]] = {
     "joint_position_deviation_ratio": ("DOUBLE", _ZERO),
     "collision_detection_ratio": ("DOUBLE", _ZERO),
     "time_scale_source": ("INT32", _ZERO),
-    "ft_raw_wrench": ("VECTOR6D", View.raw_wrench),
+    "ft_raw_wrench": ("VECTOR6D", RegisterView.raw_wrench),
     "wrench_calc_from_currents": ("VECTOR6D", _SIX),
     "payload": ("DOUBLE", lambda v: (v.model.payload[0],)),
     "payload_cog": ("VECTOR3D", lambda v: v.model.payload[1].tolist()),

@@ -10,10 +10,10 @@ from sim_backends.models.arm import ArmModel, Power, Safety
 from sim_backends.peers.arm.controller_ports import Client
 from sim_backends.peers.arm.dashboard import VERSION
 from sim_backends.peers.arm.real_time_port import real_time_packet
-from sim_backends.peers.arm.rtde.registers import View
+from sim_backends.peers.arm.rtde.registers import RegisterView
 from sim_backends.peers.arm.script.port import message, robot_state, safety_message, version_message
-from sim_backends.peers.arm.script.script import Announcement, ControlProgram
-from sim_backends.peers.arm.urscript.words import Collector
+from sim_backends.peers.arm.script.script import Announcement, ProgramMemory
+from sim_backends.peers.arm.urscript.words import ScriptCollector
 
 _PRIMARY, _SECONDARY, _REAL_TIME = (30001, 30011), (30002, 30012), (30003, 30013)
 _READ_ONLY = (30011, 30012, 30013)
@@ -25,11 +25,11 @@ _REPORT_EVERY = 50
 class ScriptClients:
     """All connections to `SCRIPT_PORTS` of one controller."""
 
-    def __init__(self, model: ArmModel, program: ControlProgram, view: View) -> None:
+    def __init__(self, model: ArmModel, program: ProgramMemory, view: RegisterView) -> None:
         self._model = model
         self._program = program
         self._view = view
-        self._texts: dict[Client, Collector] = {}
+        self._texts: dict[Client, ScriptCollector] = {}
         self._ports: dict[Client, int] = {}
         self._safety_mode = model.safety_mode
 
@@ -44,7 +44,7 @@ class ScriptClients:
             if port not in _REAL_TIME:
                 client.send(version_message(VERSION))
         if port not in _READ_ONLY:
-            for text in self._texts.setdefault(client, Collector()).feed(data):
+            for text in self._texts.setdefault(client, ScriptCollector()).feed(data):
                 self._take(text)
 
     def tick(self, count: int) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sim_backends.models.arm import ArmModel
 from sim_backends.models.arm_kinematics import Matrix, Vector, invert, matrix_from_pose
-from sim_backends.models.arm_motion import Motion
+from sim_backends.models.arm_motion import SimulatedMotion
 from sim_backends.peers.arm.rtde.registers import Registers
 
 Job = Generator[None, None, None]
@@ -108,7 +108,7 @@ class Context:
 
     # --- who moves the arm ---
 
-    def wait(self, motion: Motion) -> Job:
+    def wait(self, motion: SimulatedMotion) -> Job:
         """Start `motion` and wait for its end."""
         self.model.start(motion)
         while not self.model.idle:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sim_backends.models.arm_kinematics import Matrix, Vector, matrix_from_pose
-from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
+from sim_backends.models.arm_motion import JointMove, LinearMove, StopMotion
 from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
 from sim_backends.peers.arm.script.context import Context, Job
 
@@ -58,7 +58,7 @@ def _stop_move(c: Context) -> Job | None:
     # Once an asynchronous stop was asked for, the script brakes linearly, whichever of the two commands comes.
     if c.integer(1) == 1:
         c.stop_is_linear = True
-    return c.sync_or_async(c.wait(Stop(c.double(0), linear=c.stop_is_linear)))
+    return c.sync_or_async(c.wait(StopMotion(c.double(0), linear=c.stop_is_linear)))
 
 
 # --- streams ---
@@ -94,7 +94,7 @@ def _servo_c(c: Context) -> None:
 
 def _servo_stop(c: Context) -> Job:
     c.thread = None
-    return c.wait(Stop(c.double(0), linear=True))
+    return c.wait(StopMotion(c.double(0), linear=True))
 
 
 def _speed_j(c: Context) -> None:
@@ -118,7 +118,7 @@ def _speed(c: Context, thread: str, wanted: JointSpeed | LinearSpeed) -> None:
 
 def _speed_stop(c: Context) -> Job:
     c.thread = None
-    return c.wait(Stop(c.double(0), linear=c.speed_is_linear))
+    return c.wait(StopMotion(c.double(0), linear=c.speed_is_linear))
 
 
 def _jog_start(c: Context) -> None:
@@ -134,7 +134,7 @@ def _jog_start(c: Context) -> None:
 
 def _jog_stop(c: Context) -> Job:
     c.thread = None
-    return c.wait(Stop(1.2, linear=True))
+    return c.wait(StopMotion(1.2, linear=True))
 
 
 # --- compliance and contact ---
@@ -172,7 +172,7 @@ def _move_until_contact(c: Context) -> Job:
 
 
 def _back_to(c: Context, q: Vector) -> Job:
-    yield from c.wait(Stop(3.0, linear=True))
+    yield from c.wait(StopMotion(3.0, linear=True))
     yield from c.wait(LinearMove(c.forward(q), 0.25, 1.2))
 
 
@@ -197,7 +197,7 @@ MOTION_COMMANDS: dict[int, Callable[[Context], Job | None]] = {
     3: _move_l,
     4: _move_l_fk,
     6: _force_mode,
-    7: lambda c: c.wait(Stop(10.0, linear=True)),
+    7: lambda c: c.wait(StopMotion(10.0, linear=True)),
     9: _speed_j,
     10: _speed_l,
     11: _servo_j,

@@ -62,7 +62,7 @@ class RuntimeState(IntEnum):
     RESUMING = 5
 
 
-class ControlProgram:
+class ProgramMemory:
     """The controller's program memory: at most one program, and what its outputs do while none runs."""
 
     def __init__(self, model: ArmModel, registers: Registers) -> None:

@@ -19,7 +19,7 @@ from sim_backends.models.arm_kinematics import (
     rotation_vector,
 )
 from sim_backends.peers.arm.urscript.environment import Environment
-from sim_backends.peers.arm.urscript.values import MOST_ELEMENTS, List, Pose, Struct, shown
+from sim_backends.peers.arm.urscript.values import MOST_ELEMENTS, List, ScriptPose, Struct, shown
 
 
 def matrix(pose: Any) -> Matrix:
@@ -27,9 +27,9 @@ def matrix(pose: Any) -> Matrix:
     return matrix_from_pose(np.array(pose, float))
 
 
-def as_pose(base_from_tool: Matrix) -> Pose:
+def as_pose(base_from_tool: Matrix) -> ScriptPose:
     """(4, 4) as a script's pose."""
-    return Pose(pose_from_matrix(base_from_tool).tolist())
+    return ScriptPose(pose_from_matrix(base_from_tool).tolist())
 
 
 def numbers(values: Any) -> List:
@@ -49,7 +49,7 @@ def _turn_between(a: Any, b: Any) -> float:
     return math.hypot(*rotation_vector(matrix(a)[:3, :3].T.dot(matrix(b)[:3, :3])))
 
 
-def _interpolate(a: Any, b: Any, share: float) -> Pose:
+def _interpolate(a: Any, b: Any, share: float) -> ScriptPose:
     start, end = matrix(a), matrix(b)
     turn = rotation_vector(start[:3, :3].T.dot(end[:3, :3]))
     between = np.eye(4)
@@ -58,7 +58,7 @@ def _interpolate(a: Any, b: Any, share: float) -> Pose:
     return as_pose(between)
 
 
-def _pose_add(a: Any, b: Any) -> Pose:
+def _pose_add(a: Any, b: Any) -> ScriptPose:
     sum_ = np.eye(4)
     sum_[:3, :3] = matrix(a)[:3, :3].dot(matrix(b)[:3, :3])
     sum_[:3, 3] = matrix(a)[:3, 3] + matrix(b)[:3, 3]

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from sim_backends.models.arm_motion import Motion, Stop
+from sim_backends.models.arm_motion import SimulatedMotion, StopMotion
 from sim_backends.models.arm_streams import ForceMode
 from sim_backends.peers.arm.script.context import CYCLE, Context, Job, ProgramError
 from sim_backends.peers.arm.script.outputs import HeldOutputs
@@ -36,7 +36,7 @@ class Environment:
         self.held_up = False
         """This cycle is made up for: the host did not let the controller run in time, and perhaps no client either."""
         self._reads = 0
-        self.watches: list[Watch] = []
+        self.watches: list[InputWatchdog] = []
         self._numbers = itertools.count(1)
         self._mover: int | None = None
         self._stream_ends: int | None = None
@@ -64,7 +64,7 @@ class Environment:
 
     # --- moving ---
 
-    def move(self, motion: Motion) -> Job:
+    def move(self, motion: SimulatedMotion) -> Job:
         """Start `motion` and wait for its end. Raises `ProgramError` while another thread moves the arm."""
         model = self.context.model
         with self._moving():
@@ -73,7 +73,7 @@ class Environment:
             while model.pending(motion):
                 yield
 
-    def stream(self, motion: Motion, seconds: float, lasting: bool = False) -> Job:
+    def stream(self, motion: SimulatedMotion, seconds: float, lasting: bool = False) -> Job:
         """Have `motion` go on for `seconds`, one cycle at least; it dries up then, unless it is `lasting`."""
         model = self.context.model
         with self._moving():
@@ -91,7 +91,7 @@ class Environment:
         model = self.context.model
         if self._stream_ends is not None and self.cycles > self._stream_ends:
             self._stream_ends = None
-            model.start(Stop(_BRAKE))
+            model.start(StopMotion(_BRAKE))
         if self.force is not None and model.idle:
             model.start(self.force)
         for watch in self.watches:
@@ -106,13 +106,13 @@ class Environment:
         try:
             yield
         except GeneratorExit:
-            self.context.model.start(Stop(_BRAKE))
+            self.context.model.start(StopMotion(_BRAKE))
             raise
         finally:
             self._mover = None
 
 
-class Watch:
+class InputWatchdog:
     """An input that a client has to write to at least every `seconds`, or `act` is done; `writes` counts."""
 
     def __init__(self, seconds: float, writes: Callable[[], int], act: Callable[[], object]) -> None:

@@ -14,7 +14,7 @@ from sim_backends.peers.arm.script.context import Context, Job, ProgramError
 from sim_backends.peers.arm.urscript import arithmetic, motions, sensing, settings, sockets
 from sim_backends.peers.arm.urscript.environment import Environment
 from sim_backends.peers.arm.urscript.translate import translate
-from sim_backends.peers.arm.urscript.values import List, Pose, own
+from sim_backends.peers.arm.urscript.values import List, ScriptPose, own
 from sim_backends.peers.arm.urscript.words import ScriptError
 
 Thread = Generator[None, None, Any]
@@ -60,7 +60,7 @@ class Machine:
         self._names: dict[str, Any] = known | {
             "__builtins__": {"bool": bool},
             "List": List,
-            "Pose": Pose,
+            "Pose": ScriptPose,
             "own": self._own,
             "turn": self._turn,
             "halt": _halt,

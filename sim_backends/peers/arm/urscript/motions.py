@@ -7,20 +7,20 @@ every way point.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from sim_backends.models.arm_circle import ArcMove
 from sim_backends.models.arm_kinematics import Matrix, Vector
-from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
+from sim_backends.models.arm_motion import JointMove, LinearMove, StopMotion
 from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
 from sim_backends.peers.arm.script.context import CYCLE, Job, ProgramError
 from sim_backends.peers.arm.script.motion import tool_contact
 from sim_backends.peers.arm.urscript.arithmetic import matrix
 from sim_backends.peers.arm.urscript.environment import Environment
-from sim_backends.peers.arm.urscript.values import Pose
+from sim_backends.peers.arm.urscript.values import ScriptPose
 
 _MOST_ACCELERATION = 8.0
 """rad/s², of which the moves that plan for themselves take a share."""
@@ -38,16 +38,15 @@ def _timed(length: float, t: float, speed: float, acceleration: float) -> tuple[
 
 def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     """By name; those that take time are generator functions."""
-    e = environment
+    parts = (_moves, _optimized_moves, _stops, _streams, _compliance, _waits)
+    return {name: command for part in parts for name, command in part(environment).items()}
 
-    def joints(target: Any) -> Vector:
-        return e.context.solve(matrix(target)) if isinstance(target, Pose) else _six(target)
 
-    def tool(target: Any) -> Matrix:
-        return matrix(target) if isinstance(target, Pose) else e.context.forward(_six(target))
+def _moves(e: Environment) -> dict[str, Callable[..., Any]]:
+    """Moves to a target at a speed."""
 
     def movej(q: Any, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Job:
-        goal = joints(q)
+        goal = _joints(e, q)
         limit = e.context.model.params.joint_limit
         farthest = int(np.abs(goal).argmax())
         if abs(goal[farthest]) > limit:
@@ -56,7 +55,7 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
         yield from e.move(JointMove(goal, *_timed(length, t, v, a)))
 
     def movel(pose: Any, a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Job:
-        goal, here = tool(pose), e.context.model.drive.base_from_tcp()
+        goal, here = _tool(e, pose), e.context.model.drive.base_from_tcp()
         length = math.dist(goal[:3, 3], here[:3, 3])
         yield from e.move(LinearMove(goal, *_timed(length, t, v, a), slows=True))
 
@@ -64,25 +63,44 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
         yield from movel(pose, a, v)
 
     def movec(pose_via: Any, pose_to: Any, a: float = 1.2, v: float = 0.25, r: float = 0, mode: float = 0) -> Job:
-        yield from e.move(ArcMove(tool(pose_via)[:3, 3], tool(pose_to), v, a, fixed=mode == 1))
+        yield from e.move(ArcMove(_tool(e, pose_via)[:3, 3], _tool(e, pose_to), v, a, fixed=mode == 1))
+
+    return {"movej": movej, "movel": movel, "movep": movep, "movec": movec}
+
+
+def _optimized_moves(e: Environment) -> dict[str, Callable[..., Any]]:
+    """Moves that plan for themselves: `a` and `v` are shares of the most."""
+    moves = _moves(e)
 
     def optimovej(q: Any, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
-        yield from movej(q, a * _MOST_ACCELERATION, v * _leading(e))
+        yield from moves["movej"](q, a * _MOST_ACCELERATION, v * _leading(e))
 
     def optimovel(pose: Any, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
-        yield from movel(pose, 2.5 * a, v)
+        yield from moves["movel"](pose, 2.5 * a, v)
+
+    return {"optimovej": optimovej, "optimovel": optimovel}
+
+
+def _stops(e: Environment) -> dict[str, Callable[..., Any]]:
+    """Stops of what moves."""
 
     def stopj(a: float = 2.0) -> Job:
-        yield from e.move(Stop(a))
+        yield from e.move(StopMotion(a))
 
     def stopl(a: float = 1.2, aRot: float = 0) -> Job:
-        yield from e.move(Stop(a, linear=True))
+        yield from e.move(StopMotion(a, linear=True))
+
+    return {"stopj": stopj, "stopl": stopl}
+
+
+def _streams(e: Environment) -> dict[str, Callable[..., Any]]:
+    """Targets and speeds that are sent anew in each cycle."""
 
     def servoj(
         q: Any, a: float = 0, v: float = 0, t: float = CYCLE, lookahead_time: float = 0.1, gain: float = 300
     ) -> Job:
         lag = max(e.context.model.params.tracking_lag, lookahead_time * 300.0 / max(gain, 1.0))
-        motion, target = e.context.model.motion, joints(q)
+        motion, target = e.context.model.motion, _joints(e, q)
         if isinstance(motion, Servo):
             motion.target, motion.lag = target, lag
         else:
@@ -95,16 +113,28 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     def speedl(xd: Any, a: float = 1.2, t: float = 0, aRot: float = 0) -> Job:
         yield from _speed(e, LinearSpeed(_six(xd), a), t)
 
+    return {"servoj": servoj, "speedj": speedj, "speedl": speedl}
+
+
+def _compliance(e: Environment) -> dict[str, Callable[..., Any]]:
+    """Force mode, and what touches the tool."""
+
     def force_mode(task_frame: Any, selection_vector: Any, wrench: Any, type: float, limits: Any) -> None:
         e.force = ForceMode(matrix(task_frame), _six(selection_vector), _six(wrench), _six(limits))
 
     def end_force_mode() -> Job:
         if e.force is not None:
             e.force = None
-            yield from e.move(Stop(10.0, linear=True))
+            yield from e.move(StopMotion(10.0, linear=True))
 
-    def tool_contact_(direction: Any = (0.0,) * 6) -> int:
+    def contact(direction: Any = (0.0,) * 6) -> int:
         return tool_contact(e.context, _six(direction))
+
+    return {"force_mode": force_mode, "end_force_mode": end_force_mode, "tool_contact": contact}
+
+
+def _waits(_: Environment) -> dict[str, Callable[..., Any]]:
+    """Cycles that pass."""
 
     def sleep(t: float) -> Job:
         for _ in range(round(t / CYCLE)):
@@ -113,12 +143,15 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     def sync() -> Job:
         yield
 
-    moving: dict[str, Callable[..., Generator[None, None, Any]]] = {
-        "movej": movej, "movel": movel, "movep": movep, "movec": movec, "optimovej": optimovej,
-        "optimovel": optimovel, "stopj": stopj, "stopl": stopl, "servoj": servoj, "speedj": speedj, "speedl": speedl,
-        "end_force_mode": end_force_mode, "sleep": sleep, "sync": sync,
-    }  # fmt: skip
-    return {**moving, "force_mode": force_mode, "tool_contact": tool_contact_}
+    return {"sleep": sleep, "sync": sync}
+
+
+def _joints(e: Environment, target: Any) -> Vector:
+    return e.context.solve(matrix(target)) if isinstance(target, ScriptPose) else _six(target)
+
+
+def _tool(e: Environment, target: Any) -> Matrix:
+    return matrix(target) if isinstance(target, ScriptPose) else e.context.forward(_six(target))
 
 
 def _speed(e: Environment, wanted: JointSpeed | LinearSpeed, t: float) -> Job:

@@ -15,16 +15,47 @@ from sim_backends.peers.arm.urscript.arithmetic import as_pose, matrix, numbers
 from sim_backends.peers.arm.urscript.environment import Environment
 from sim_backends.peers.arm.urscript.values import List
 
+_ZEROS = [0.0] * 6
+
 
 def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     """By name; actual and target are one, as on an arm that follows exactly."""
-    e = environment
+    return {**_of_joints(environment), **_of_tool(environment), **_of_load(environment), **_kinematics(environment)}
+
+
+def _of_joints(e: Environment) -> dict[str, Callable[..., Any]]:
+    """Where the joints are, and whether they may be there."""
 
     def joints() -> List:
         return numbers(e.context.model.drive.q)
 
     def speeds() -> List:
         return numbers(e.context.model.drive.qd)
+
+    def within_limits(q: Any) -> bool:
+        target = np.array(q if len(q) == 6 else [], float)
+        return bool((np.abs(target) <= e.context.model.params.joint_limit).all())
+
+    def history(steps: int = 0) -> List:
+        return numbers(e.context.joints_before(int(steps)))
+
+    return {
+        "get_actual_joint_positions": joints, "get_joint_positions": joints, "get_target_joint_positions": joints,
+        "get_actual_joint_speeds": speeds, "get_target_joint_speeds": speeds, "get_joint_speeds": speeds,
+        "get_target_joint_accelerations": lambda: List(_ZEROS),
+        "get_actual_joint_positions_history": history,
+        "get_joint_temp": lambda joint: 30.0,
+        "get_controller_temp": lambda: 30.0,
+        "get_steptime": lambda: CYCLE,
+        "is_steady": lambda: e.context.model.steady,
+        "is_within_safety_limits": within_limits,
+        "is_robot_stopped": lambda: not e.context.model.moving,
+        "is_in_protective_stop": lambda: e.context.model.safety is Safety.PROTECTIVE_STOP,
+    }  # fmt: skip
+
+
+def _of_tool(e: Environment) -> dict[str, Callable[..., Any]]:
+    """Where tool and flange are, and how fast."""
 
     def tool() -> List:
         return as_pose(e.context.model.drive.base_from_tcp())
@@ -35,6 +66,37 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     def tool_speed() -> List:
         drive = e.context.model.drive
         return numbers(drive.tcp_jacobian().dot(drive.qd))
+
+    return {
+        "get_actual_tcp_pose": tool, "get_target_tcp_pose": tool, "get_tcp_pose": tool,
+        "get_actual_tool_flange_pose": flange, "get_target_tool_flange_pose": flange,
+        "get_actual_tcp_speed": tool_speed, "get_target_tcp_speed": tool_speed,
+        "get_tcp_offset": lambda: as_pose(e.context.model.drive.flange_from_tcp),
+        "get_tool_current": lambda: 0.0,
+        "get_target_waypoint": tool,
+    }  # fmt: skip
+
+
+def _of_load(e: Environment) -> dict[str, Callable[..., Any]]:
+    """What the tool weighs, and what it feels."""
+
+    def torques() -> List:
+        model = e.context.model
+        return numbers(model.drive.tcp_jacobian().T.dot(model.felt))
+
+    return {
+        "get_tcp_force": lambda: numbers(e.context.model.felt),
+        "force": lambda: math.hypot(*e.context.model.felt[:3]),
+        "get_joint_torques": torques,
+        "get_target_payload": lambda: e.context.model.payload[0],
+        "get_target_payload_mass": lambda: e.context.model.payload[0],
+        "get_target_payload_cog": lambda: numbers(e.context.model.payload[1]),
+        "get_target_payload_inertia": lambda: List(_ZEROS),
+    }
+
+
+def _kinematics(e: Environment) -> dict[str, Callable[..., Any]]:
+    """From joints to poses and back."""
 
     def inverse(x: Any, qnear: Any, tcp: Any) -> Vector:
         near = None if qnear is None else np.array(qnear, float)
@@ -64,43 +126,7 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
         place: Matrix = e.context.model.kinematics.forward(drive.q if q is None else np.array(q, float))
         return as_pose(place.dot(drive.flange_from_tcp if tcp is None else matrix(tcp)))
 
-    def within_limits(q: Any) -> bool:
-        target = np.array(q if len(q) == 6 else [], float)
-        return bool((np.abs(target) <= e.context.model.params.joint_limit).all())
-
-    def history(steps: int = 0) -> List:
-        return numbers(e.context.joints_before(int(steps)))
-
-    def torques() -> List:
-        model = e.context.model
-        return numbers(model.drive.tcp_jacobian().T.dot(model.felt))
-
-    zeros = [0.0] * 6
     return {
-        "get_actual_joint_positions": joints, "get_joint_positions": joints, "get_target_joint_positions": joints,
-        "get_actual_joint_speeds": speeds, "get_target_joint_speeds": speeds, "get_joint_speeds": speeds,
-        "get_target_joint_accelerations": lambda: List(zeros),
-        "get_actual_joint_positions_history": history,
-        "get_actual_tcp_pose": tool, "get_target_tcp_pose": tool, "get_tcp_pose": tool,
-        "get_actual_tool_flange_pose": flange, "get_target_tool_flange_pose": flange,
-        "get_actual_tcp_speed": tool_speed, "get_target_tcp_speed": tool_speed,
-        "get_tcp_offset": lambda: as_pose(e.context.model.drive.flange_from_tcp),
-        "get_tcp_force": lambda: numbers(e.context.model.felt),
-        "force": lambda: math.hypot(*e.context.model.felt[:3]),
-        "get_joint_torques": torques,
-        "get_joint_temp": lambda joint: 30.0,
-        "get_controller_temp": lambda: 30.0,
-        "get_tool_current": lambda: 0.0,
-        "get_target_payload": lambda: e.context.model.payload[0],
-        "get_target_payload_mass": lambda: e.context.model.payload[0],
-        "get_target_payload_cog": lambda: numbers(e.context.model.payload[1]),
-        "get_target_payload_inertia": lambda: List(zeros),
-        "get_target_waypoint": tool,
         "get_inverse_kin": get_inverse_kin, "get_inverse_kin_has_solution": has_solution,
         "get_forward_kin": get_forward_kin,
-        "get_steptime": lambda: CYCLE,
-        "is_steady": lambda: e.context.model.steady,
-        "is_within_safety_limits": within_limits,
-        "is_robot_stopped": lambda: not e.context.model.moving,
-        "is_in_protective_stop": lambda: e.context.model.safety is Safety.PROTECTIVE_STOP,
     }  # fmt: skip

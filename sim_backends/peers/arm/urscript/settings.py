@@ -13,7 +13,7 @@ import numpy as np
 from sim_backends.peers.arm.rtde.registers import REGISTERS
 from sim_backends.peers.arm.script.context import Job, ProgramError
 from sim_backends.peers.arm.urscript.arithmetic import matrix
-from sim_backends.peers.arm.urscript.environment import Environment, Watch
+from sim_backends.peers.arm.urscript.environment import Environment, InputWatchdog
 from sim_backends.peers.arm.urscript.values import shown
 
 _KINDS = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}
@@ -137,7 +137,7 @@ def _registers(e: Environment) -> dict[str, Callable[..., Any]]:
         act = acts.get(action.lower())
         if act is None or not minFrequency > 0:
             raise ProgramError(f"rtde_set_watchdog: {action!r} at {minFrequency:g} Hz")
-        e.watches.append(Watch(1.0 / minFrequency, lambda: registers.written[variableName], act))
+        e.watches.append(InputWatchdog(1.0 / minFrequency, lambda: registers.written[variableName], act))
 
     return {
         "read_input_integer_register": reader("int_in"),

@@ -106,9 +106,31 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     """By name; those that take time are generator functions."""
     links = _Connections(environment)
     environment.on_close(links.close_all)
+    return {**_sending(links), **_reading_numbers(links), **_reading_text(links)}
+
+
+def _sending(links: _Connections) -> dict[str, Callable[..., Any]]:
+    """To open, to close and to send."""
 
     def socket_open(address: str, port: int, socket_name: str = _NAME) -> Generator[None, None, bool]:
         return (yield from links.open(address, port, socket_name))
+
+    def send(text: Any, socket_name: str = _NAME) -> bool:
+        return links.send(socket_name, shown(text).encode())
+
+    return {
+        "socket_open": socket_open,
+        "socket_close": lambda socket_name=_NAME: links.close(socket_name),
+        "socket_set_var": lambda name, value, socket_name=_NAME: send(f"SET {name} {shown(value)}\n", socket_name),
+        "socket_send_string": send,
+        "socket_send_line": lambda text, socket_name=_NAME: send(shown(text) + "\n", socket_name),
+        "socket_send_int": lambda value, socket_name=_NAME: links.send(socket_name, struct.pack(">i", int(value))),
+        "socket_send_byte": lambda value, socket_name=_NAME: links.send(socket_name, bytes([int(value) & 255])),
+    }
+
+
+def _reading_numbers(links: _Connections) -> dict[str, Callable[..., Any]]:
+    """To read numbers."""
 
     def read_integers(number: int, socket_name: str = _NAME, timeout: float = 2) -> Generator[None, None, List]:
         return (yield from _numbers(links, socket_name, int(number), timeout, ">i"))
@@ -125,6 +147,16 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
         with suppress(ValueError):
             values = [float(part) for part in text.strip().strip("()").split(",")][: int(number)]
         return List([len(values), *values, *[math.nan] * (int(number) - len(values))])
+
+    return {
+        "socket_read_binary_integer": read_integers,
+        "socket_read_byte_list": read_bytes,
+        "socket_read_ascii_float": read_floats,
+    }
+
+
+def _reading_text(links: _Connections) -> dict[str, Callable[..., Any]]:
+    """To read text, and to ask a server for one of its variables."""
 
     def read_line(socket_name: str = _NAME, timeout: float = 2) -> Generator[None, None, str]:
         line = yield from links.take(socket_name, lambda data: data.find(b"\n") + 1, timeout)
@@ -149,24 +181,7 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
         words = (yield from read_line(socket_name)).split()
         return int(words[-1]) if words else 0
 
-    def send(text: Any, socket_name: str = _NAME) -> bool:
-        return links.send(socket_name, shown(text).encode())
-
-    return {
-        "socket_open": socket_open,
-        "socket_close": lambda socket_name=_NAME: links.close(socket_name),
-        "socket_read_binary_integer": read_integers,
-        "socket_read_byte_list": read_bytes,
-        "socket_read_ascii_float": read_floats,
-        "socket_read_line": read_line,
-        "socket_read_string": read_string,
-        "socket_get_var": get_var,
-        "socket_set_var": lambda name, value, socket_name=_NAME: send(f"SET {name} {shown(value)}\n", socket_name),
-        "socket_send_string": send,
-        "socket_send_line": lambda text, socket_name=_NAME: send(shown(text) + "\n", socket_name),
-        "socket_send_int": lambda value, socket_name=_NAME: links.send(socket_name, struct.pack(">i", int(value))),
-        "socket_send_byte": lambda value, socket_name=_NAME: links.send(socket_name, bytes([int(value) & 255])),
-    }
+    return {"socket_read_line": read_line, "socket_read_string": read_string, "socket_get_var": get_var}
 
 
 def _numbers(links: _Connections, name: str, count: int, timeout: float, code: str) -> Generator[None, None, List]:

@@ -174,13 +174,7 @@ class _Translator:
         if word in ("def", "thread"):
             self._define()
         elif word == "while":
-            self._take()
-            self._write(f"while {self._condition()}:")
-            self._indent += 1
-            self._write("turn()")
-            self._indent -= 1
-            self._block("end")
-            self._take()
+            self._while()
         elif word == "if":
             self._if()
         elif word == "switch":
@@ -200,15 +194,27 @@ class _Translator:
             self._take()
             self._write(("yield from " if word == "join" else "") + f"{word}({self._expression()})")
         elif word in ("global", "local"):
-            self._take()
-            name = self._name()
-            if word == "local":
-                self._function.mine.add(name)
-            self._assign(name, f"u_{name}")
+            self._declare(own=word == "local")
         else:
             self._assign_or_act()
         if self._now.kind != "end" and self._now.text not in ("end", "elif", "else", "case", "default"):
             raise self._error(f"has {self._now.text!r} after a statement")
+
+    def _while(self) -> None:
+        self._take()
+        self._write(f"while {self._condition()}:")
+        self._indent += 1
+        self._write("turn()")
+        self._indent -= 1
+        self._block("end")
+        self._take()
+
+    def _declare(self, *, own: bool) -> None:
+        self._take()
+        name = self._name()
+        if own:
+            self._function.mine.add(name)
+        self._assign(name, f"u_{name}")
 
     def _assign_or_act(self) -> None:
         name = self._now.text

@@ -72,7 +72,7 @@ class List(list[Any]):
         self.clear()
 
 
-class Pose(List):
+class ScriptPose(List):
     """Place in m and rotation vector in rad: p[x, y, z, rx, ry, rz]."""
 
     def __init__(self, values: Iterable[Any]) -> None:
@@ -129,7 +129,7 @@ def shown(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list):
-        return ("p" if isinstance(value, Pose) else "") + "[" + ", ".join(map(shown, value)) + "]"
+        return ("p" if isinstance(value, ScriptPose) else "") + "[" + ", ".join(map(shown, value)) + "]"
     if isinstance(value, Struct):
         return "struct(" + ", ".join(f"{name}={shown(one)}" for name, one in value.members().items()) + ")"
     return str(value)

@@ -76,7 +76,7 @@ _OPENS = re.compile(r"^[ \t]*(?:def|sec|thread|if|while|switch)\b")
 _CLOSES = re.compile(r"^[ \t]*end[ \t\r]*(?:#.*)?$")
 
 
-class Collector:
+class ScriptCollector:
     """Collects the bytes of one script connection into complete texts: programs, and single lines beside them."""
 
     def __init__(self, longest: int = 1 << 20) -> None:

@@ -15,10 +15,10 @@ from cell.devices.contracts import Bench as ContractBench
 from cell.devices.contracts.camera import CameraContract
 from drivers.camera.genicam.acquisition import BlockCount, Network
 from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import Setup
+from drivers.camera.genicam.connection import GenicamSetup
 from drivers.camera.genicam.device import GigePlace
 from drivers.camera.genicam.pixels import FORMATS
-from drivers.camera.genicam.settings import Region, Trigger
+from drivers.camera.genicam.settings import ExposureTrigger, Region
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
 from drivers.interfaces import Camera
@@ -106,7 +106,7 @@ def test_a_picture_out_of_turn_is_no_new_beginning_of_the_block_ids() -> None:
     "name", ["Mono8", "Mono10", "Mono10Packed", "Mono10p", "Mono12", "Mono12Packed", "Mono12p", "BayerRG8", "RGB8"]
 )
 def test_every_pixel_format_comes_as_the_grey_that_was_sent(bench: Bench, name: str) -> None:
-    camera = bench.open(Setup(WHOLE, name))
+    camera = bench.open(GenicamSetup(WHOLE, name))
     camera.configure(0.004, 50.0)
     image = camera.grab().image
     camera.close()
@@ -116,7 +116,7 @@ def test_every_pixel_format_comes_as_the_grey_that_was_sent(bench: Bench, name: 
 
 
 def test_region_gain_and_packet_size_are_set(bench: Bench) -> None:
-    camera = bench.open(Setup(Region(32, 16, 32, 32), gain=6.0206, network=Network(packet_size=576)))
+    camera = bench.open(GenicamSetup(Region(32, 16, 32, 32), gain=6.0206, network=Network(packet_size=576)))
     camera.configure(0.004, 50.0)
     image = camera.grab().image
     camera.close()
@@ -127,18 +127,18 @@ def test_region_gain_and_packet_size_are_set(bench: Bench) -> None:
 
 def test_what_the_camera_has_not_is_refused_with_what_it_has(bench: Bench) -> None:
     with pytest.raises(LimitError, match=r"Width 80 is none .*allowed: 16 to 64 in steps of 1"):
-        bench.open(Setup(Region(80, 48)))
+        bench.open(GenicamSetup(Region(80, 48)))
     with pytest.raises(LimitError, match="OffsetX 80 is none"):
-        bench.open(Setup(Region(32, 16, 80, 0)))
+        bench.open(GenicamSetup(Region(32, 16, 80, 0)))
     with pytest.raises(DeviceFault, match="no PixelFormat Mono16, it stays Mono8"):
-        bench.open(Setup(WHOLE, "Mono16"))
+        bench.open(GenicamSetup(WHOLE, "Mono16"))
     with pytest.raises(LimitError, match="gain 90"):
-        bench.open(Setup(WHOLE, gain=90.0))
+        bench.open(GenicamSetup(WHOLE, gain=90.0))
     bench.open().close()
 
 
 def test_a_line_triggers_streams_and_photographs(bench: Bench) -> None:
-    camera = bench.open(Setup(WHOLE, trigger=Trigger("line")))
+    camera = bench.open(GenicamSetup(WHOLE, trigger=ExposureTrigger("line")))
     camera.configure(0.004, 50.0)
     with camera.stream() as frames:
         with pytest.raises(DeadlineError):
@@ -151,7 +151,7 @@ def test_a_line_triggers_streams_and_photographs(bench: Bench) -> None:
 
 
 def test_a_photograph_can_come_from_a_free_run(bench: Bench) -> None:
-    camera = bench.open(Setup(WHOLE, trigger=Trigger("free")))
+    camera = bench.open(GenicamSetup(WHOLE, trigger=ExposureTrigger("free")))
     camera.configure(0.004, 20.0)
     called = bench.clock.now()
     assert bench.shown(camera.grab()) > called
@@ -162,7 +162,7 @@ def test_a_photograph_can_come_from_a_free_run(bench: Bench) -> None:
 
 
 def test_lost_packets_come_again(bench: Bench) -> None:
-    camera = bench.open(Setup(WHOLE, network=Network(packet_size=576)))
+    camera = bench.open(GenicamSetup(WHOLE, network=Network(packet_size=576)))
     camera.configure(0.004, 20.0)
     bench.peer.lose_packets(lambda number: number in (2, 3))
     with camera.stream() as frames:
@@ -174,7 +174,7 @@ def test_lost_packets_come_again(bench: Bench) -> None:
 
 
 def test_without_resending_a_picture_with_a_hole_is_lost_and_never_handed_out(bench: Bench) -> None:
-    camera = bench.open(Setup(WHOLE, network=Network(packet_size=576, resend=False, retention=0.05)))
+    camera = bench.open(GenicamSetup(WHOLE, network=Network(packet_size=576, resend=False, retention=0.05)))
     camera.configure(0.004, 20.0)
     lose = iter([True, False, True] + [False] * 1000)
     bench.peer.lose_packets(lambda number: number == 3 and next(lose))
@@ -280,7 +280,7 @@ def test_another_camera_at_the_address_is_not_taken_for_the_lost_one() -> None:
 
 
 def test_stop_ends_a_stream_that_waits(bench: Bench) -> None:
-    camera = bench.open(Setup(WHOLE, trigger=Trigger("line")))
+    camera = bench.open(GenicamSetup(WHOLE, trigger=ExposureTrigger("line")))
     camera.configure(0.004, 50.0)
     with camera.stream() as frames:
         stopper = threading.Timer(0.1, camera.stop)
@@ -296,7 +296,7 @@ def test_stop_ends_a_stream_that_waits(bench: Bench) -> None:
 def test_an_address_without_a_camera_is_named_with_a_remedy() -> None:
     require_aravis()
     with pytest.raises(NotConnectedError, match=r"127\.1\.255\.254.*Remedy: check power and cable"):
-        GenicamCamera("scan_camera", GigePlace("127.1.255.254"), Setup(WHOLE), clock=Clock())
+        GenicamCamera("scan_camera", GigePlace("127.1.255.254"), GenicamSetup(WHOLE), clock=Clock())
 
 
 # --- formats, by the standard's own pictures of the bytes ---

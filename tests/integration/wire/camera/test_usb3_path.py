@@ -16,7 +16,7 @@ from cell.devices.contracts import Bench
 from cell.devices.contracts.camera import CameraContract
 from drivers.camera.genicam.aravis import LIBRARIES, Aravis
 from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import Setup
+from drivers.camera.genicam.connection import GenicamSetup
 from drivers.camera.genicam.settings import Region
 from drivers.clock import Clock
 from drivers.interfaces import Camera
@@ -43,7 +43,7 @@ class TestUsb3(CameraContract):
         require_aravis()
         clock = Clock()
         made: Bench[Camera] = Bench(
-            lambda: GenicamCamera("scan_camera", InProcess(), Setup(Region(512, 512)), clock=clock), clock
+            lambda: GenicamCamera("scan_camera", InProcess(), GenicamSetup(Region(512, 512)), clock=clock), clock
         )
         yield made
         made.over()

@@ -32,7 +32,7 @@ from drivers.rail.modbus.rail import ModbusRail
 from drivers.rail.modbus.registers import Action
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
-from sim_backends.peers.rail.modbus_drive import ModbusDrive, ModbusPeer
+from sim_backends.peers.rail.modbus_drive import ModbusDriveServer, ModbusPeer
 from tests.support.modbus_maps import EDGES, PATHS, RAIL
 
 pytestmark = pytest.mark.wire
@@ -58,7 +58,7 @@ class Drive:
         world = WorldClock(SPEED)
         params = RailParams(steps_per_turn=record.counts_per_turn, serial=4711)
         model = RailModel(params, np.random.default_rng(1))
-        drive = ModbusDrive(model, world, record.model_dump(mode="json"))
+        drive = ModbusDriveServer(model, world, record.model_dump(mode="json"))
         peer = ModbusPeer(drive, UNIT, pty=pty, echo=echo)
         peer.start()
         return cls(record, model, peer, Clock(SPEED))

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError
 from drivers.vehicle.cia402.last_words import last_words
-from sim_backends.models.wheel_drive import State
+from sim_backends.models.wheel_drive import WheelState
 from sim_backends.peers.vehicle.canopen_node import WRONG_VALUE, Abort
 from tests.support.canopen_bench import RATE, SETTINGS, WATCHDOG_S, WHEELS, Bench, at_bench, frame, with_output_brake
 
@@ -82,7 +82,7 @@ def test_the_drives_stop_by_themselves_when_this_program_is_gone(guarding: str) 
         bench.until(lambda: bench.speed() == 0.0)
         assert time.monotonic() - gone < WATCHDOG_S + RAMP_WALL_S + 0.2
         bench.until(bench.braked)
-        assert [drive.wheel.state for drive in bench.peer.drives] == [State.FAULT] * 2
+        assert [drive.wheel.state for drive in bench.peer.drives] == [WheelState.FAULT] * 2
         # Nothing is left of it that could be closed.
         bench.vehicle._master.bus.close()
         bench.vehicle._closed.set()
@@ -109,7 +109,7 @@ def test_one_wheel_alone_never_drives(bench: Bench) -> None:
     fault = fault_of(bench)
     assert fault.code == "vehicle.silent"
     assert "left drive" in str(fault)
-    bench.until(lambda: bench.peer.drives[1].wheel.state is not State.ENABLED, 0.1)
+    bench.until(lambda: bench.peer.drives[1].wheel.state is not WheelState.ENABLED, 0.1)
     bench.until(lambda: bench.speed() == 0.0)
     with pytest.raises(DeviceFault, match="left drive"):
         bench.vehicle.check()
@@ -243,7 +243,7 @@ def test_what_is_said_when_this_program_is_killed_stops_both_and_locks_their_bra
         bench.vehicle._master._keeper.join()
         for identifier, data in last_words(wheels):
             other.send(frame(identifier, data))
-        bench.until(lambda: all(drive.wheel.state is not State.ENABLED for drive in bench.peer.drives), 0.15)
+        bench.until(lambda: all(drive.wheel.state is not WheelState.ENABLED for drive in bench.peer.drives), 0.15)
         assert {drive._outputs >> 17 for drive in bench.peer.drives} == {1}
         bench.until(lambda: bench.speed() == 0.0)
         bench.vehicle._master.bus.close()
@@ -265,7 +265,7 @@ def test_a_value_that_is_not_needed_may_be_refused_and_one_that_is_may_not(apart
 def test_a_drive_that_was_switched_off_is_set_up_again_and_its_counts_are_not_trusted(bench: Bench) -> None:
     bench.drive_until_fast()
     node = bench.peer.drives[0].node
-    bench.peer.drives[0].wheel.state = State.DISABLED
+    bench.peer.drives[0].wheel.state = WheelState.DISABLED
     node._values[0x1800, 1].value |= 1 << 31
     node.boot()
     assert fault_of(bench).code == "vehicle.command_lost"

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.vehicle import Mode, State, VehicleModel, VehicleParams
+from sim_backends.models.vehicle import ChassisState, Mode, VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
 from tests.support import ROOT
 from tests.support.wire.clocks import until
@@ -119,7 +119,7 @@ def test_brake_and_emergency_stop_stop_hard_and_hold() -> None:
         drive(model, 2.0, 4.0, 0.5)
         assert model.planar(4.0)[0] - x == pytest.approx(0.5**2 / (2 * 2.5), abs=2e-3)
         model.clear_errors(4.0)
-        assert model.feedback(4.0).state is (State.OK if act == "brake" else State.EMERGENCY_STOP)
+        assert model.feedback(4.0).state is (ChassisState.OK if act == "brake" else ChassisState.EMERGENCY_STOP)
         model.set_brake(4.0, False)
         model.clear(4.0)
         drive(model, 4.0, 5.0, 0.5)

@@ -17,7 +17,7 @@ from drivers.arm.faults import fault, unlock
 from drivers.arm.feed import StateFeed
 from drivers.arm.limits import ArmLimits
 from drivers.arm.messages import Snapshot, safety_code
-from drivers.arm.motion import Trajectory, UrMotion, pose_difference
+from drivers.arm.motion import JointTrajectory, UrMotion, pose_difference
 from drivers.arm.wrong_arm import flange_agrees, require_same_flange, same_payload
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, LimitError, NotConnectedError
@@ -114,7 +114,7 @@ def test_a_trajectory_that_cannot_be_driven_is_refused(times, joints, message):
 
 
 def test_a_trajectory_is_straight_between_its_points_and_ends_at_its_last():
-    trajectory = Trajectory([0.0, 1.0, 3.0], [(0.0,) * 6, (1.0,) * 6, (5.0,) * 6])
+    trajectory = JointTrajectory([0.0, 1.0, 3.0], [(0.0,) * 6, (1.0,) * 6, (5.0,) * 6])
     assert trajectory.at(-1.0) == (0.0,) * 6
     assert trajectory.at(0.25) == pytest.approx((0.25,) * 6)
     assert trajectory.at(2.0) == pytest.approx((3.0,) * 6)
@@ -339,7 +339,7 @@ def test_another_payload_is_told_by_its_mass_and_by_its_centre(mass, centre, sam
 
 
 def test_a_trajectory_knows_its_speed_for_a_stop_on_the_way():
-    trajectory = Trajectory([0.0, 1.0, 3.0], [(0.0,) * 6, (1.0,) * 6, (5.0, *(1.0,) * 5)])
+    trajectory = JointTrajectory([0.0, 1.0, 3.0], [(0.0,) * 6, (1.0,) * 6, (5.0, *(1.0,) * 5)])
     assert [trajectory.speed_at(time) for time in (-1.0, 0.5, 2.0, 3.0)] == [0.0, 1.0, 2.0, 0.0]
 
 

@@ -17,7 +17,7 @@ from cell.makes.make import Surroundings
 from cell.makes.table import installed, make_of
 from drivers.camera.genicam import aravis
 from drivers.camera.recording import RecordedCamera
-from drivers.camera.v4l2_pictures import Timing, to_grey
+from drivers.camera.v4l2_pictures import ExposureTiming, to_grey
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault, LimitError, NotConnectedError, RefusedError
 from drivers.interfaces import Camera
@@ -199,4 +199,4 @@ def test_what_a_driver_hands_over_becomes_grey() -> None:
 
 
 def test_a_uvc_stamp_leaves_a_frame_and_the_exposure_open() -> None:
-    assert Timing(0.02, 10.0).open_s == pytest.approx(0.12)
+    assert ExposureTiming(0.02, 10.0).open_s == pytest.approx(0.12)

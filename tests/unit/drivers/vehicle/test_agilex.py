@@ -11,7 +11,7 @@ import can
 import numpy as np
 import pytest
 
-from cell.devices.gate.interlocks import Command, Interlocks, Situation
+from cell.devices.gate.interlocks import DeviceCommand, Interlocks, Situation
 from cell.devices.gate.rules import RULES
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError
@@ -191,7 +191,7 @@ def test_a_parked_vehicle_whose_feedback_is_late_holds_nothing_up_and_one_that_i
         None, bench.vehicle, None, None, {}, lambda joints, command: (), lambda joints: None, {}, "", clock=bench.clock
     )
     interlocks = Interlocks(nothing, RULES)
-    move = Command("arm", "move_joints")
+    move = DeviceCommand("arm", "move_joints")
     bench.vehicle.brake()
     interlocks.require(move)
     bench.bus.talking = False
@@ -211,7 +211,7 @@ def test_a_vehicle_whose_brake_is_open_is_not_taken_as_parked_by_an_old_reading(
     bench.bus.talking = False
     time.sleep(0.6)
     with pytest.raises(DeadlineError):
-        Interlocks(nothing, RULES).require(Command("arm", "move_joints"))
+        Interlocks(nothing, RULES).require(DeviceCommand("arm", "move_joints"))
 
 
 def test_a_restart_is_noticed_although_another_node_keeps_talking(bench: Bench) -> None:

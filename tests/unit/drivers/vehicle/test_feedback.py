@@ -7,7 +7,7 @@ import pytest
 from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.faults import driver_trouble, system_trouble
-from drivers.vehicle.feedback import CAN_MODE, STILL_FRAMES, Feedback
+from drivers.vehicle.feedback import CAN_MODE, STILL_FRAMES, MessageFeedback
 from drivers.vehicle.version import VersionAnswer
 from tests.support.inner_bus import Hand
 
@@ -15,7 +15,7 @@ from tests.support.inner_bus import Hand
 class Bench:
     def __init__(self) -> None:
         self.clock = Hand()
-        self.feedback = Feedback(
+        self.feedback = MessageFeedback(
             "vehicle", self.clock, track=0.58, max_speed=0.5, max_yaw_rate=0.5, statistics=LinkStatistics()
         )
         self.tell(0, 0)

@@ -17,7 +17,7 @@ from sim_backends.models.arm_kinematics import (
     pose_from_matrix,
     rotation_vector,
 )
-from sim_backends.models.arm_motion import JointMove, LinearMove, Stop
+from sim_backends.models.arm_motion import JointMove, LinearMove, StopMotion
 from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
 
 TICK = 0.002
@@ -192,7 +192,7 @@ def test_speed_commands_ramp_up_hold_and_stop(tick: float) -> None:
     run(arm, 1.6, tick)
     assert arm.drive.qd[5] == pytest.approx(0.5)
     assert arm.drive.q[5] - before[5] == pytest.approx(0.5 * 1.6 - 0.5 * 0.5 * 0.5, abs=2e-3)
-    arm.start(Stop(2.0))
+    arm.start(StopMotion(2.0))
     finish(arm)
     assert arm.drive.q[5] - before[5] == pytest.approx(0.5 * 1.6 - 0.125 + 0.5**2 / 4, abs=2e-2)
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.vision.stripe.careful.follow import CANDIDATES, SCALES, Candidates, Chain, candidates, follow
+from cell.measure.vision.stripe.careful.follow import CANDIDATES, SCALES, Candidates, StripeChain, candidates, follow
 from cell.measure.vision.stripe.careful.learning import FREE_SCALE, learn_profile
 from cell.measure.vision.stripe.careful.segments import fill_gaps
 from cell.measure.vision.stripe.careful.shape import Shape
@@ -21,7 +21,7 @@ from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, 
 from cell.measure.vision.stripe.careful.surroundings import around, carried, surrounded, wander
 from cell.measure.vision.stripe.careful.validation import MISFIT_SIGMAS
 from cell.measure.vision.stripe.overview import ALONG, BINNED_WIDTH, LEAST_SCORE, SURE, choose_mix, coarse, difference
-from cell.measure.vision.stripe.planes import MIXES, Laser, Picture
+from cell.measure.vision.stripe.planes import MIXES, LaserChannel, Picture
 
 if TYPE_CHECKING:
     from cell.measure.vision.stripe.profile import StripeSettings
@@ -65,7 +65,7 @@ class Careful:
 
 
 def read_carefully(
-    picture: Picture, off: Picture | None, laser: Laser, settings: StripeSettings, like: Learned | None = None,
+    picture: Picture, off: Picture | None, laser: LaserChannel, settings: StripeSettings, like: Learned | None = None,
     starts: Array | None = None,
 ) -> Careful:  # fmt: skip
     """The stripe of `picture`, whose rows it crosses; `off` is the same view without the laser.
@@ -73,17 +73,17 @@ def read_carefully(
     `starts` (lines,) in px, NaN where there is none, spare the following. Pieces of another width are read where the
     picture itself teaches the profile.
     """
-    line = _of_one_width(picture, off, laser, settings, like, starts)
+    line = _of_one_width(picture, off, laser, settings=settings, like=like, starts=starts)
     if like is None:
         fill_gaps(
             line,
-            lambda rows: _of_one_width(picture.rows(rows), off and off.rows(rows), laser, settings, None, None),
+            lambda rows: _of_one_width(picture.rows(rows), off and off.rows(rows), laser, settings, None, starts=None),
         )
     return line
 
 
 def _of_one_width(
-    picture: Picture, off: Picture | None, laser: Laser, settings: StripeSettings, like: Learned | None,
+    picture: Picture, off: Picture | None, laser: LaserChannel, settings: StripeSettings, like: Learned | None,
     starts: Array | None,
 ) -> Careful:  # fmt: skip
     """`read_carefully` without what differs in width from the rest by more than twice."""
@@ -111,30 +111,33 @@ def _of_one_width(
         shape, spread, noise = learn_profile(plane, rows, at, scale / k, noise)
         if shape.width * k > WIDEST:
             return _nothing(lines)
-        learned = Learned(mix, shape.width * k, k, shape, spread, noise, along)
+        learned = Learned(mix, shape.width * k, k, shape=shape, spread=spread, noise=noise, along=along)
     else:
         learned = like
     shape, noise = learned.shape, learned.noise
-    fitted = fit_shape(plane, rows, at, shape, noise, max(learned.spread, 0.002) if shape.learned else FREE_SCALE)
+    fitted = fit_shape(
+        plane, rows, at, shape, noise=noise, scale_prior=max(learned.spread, 0.002) if shape.learned else FREE_SCALE
+    )
     variance, correlation, _ = around(plane, rows, np.where(fitted.good, fitted.centre, at), shape.reach)
     sigma = carried(fitted, variance, correlation)
-    out = _believed(fitted, sigma, at, shape, k, lines, plane, noise)
+    out = _believed(fitted, sigma, at, shape=shape, k=k, lines=lines, plane=plane, noise=noise)
     # A surface may be rough: lines that wander tell of errors only where something is there to make them.
     unquiet = noise.contrast > 0.02 or (correlation[1:] != 0).any()
     factor = min(wander(out.centres, out.sigma), MOST_WANDER) if unquiet else 1.0
     return Careful(
-        out.centres, out.sigma * factor, out.amplitude, out.width, out.saturated, rival, out.misfit, learned
+        out.centres, out.sigma * factor, out.amplitude, width=out.width, saturated=out.saturated, rival=rival,
+        misfit=out.misfit, learned=learned
     )  # fmt: skip
 
 
-def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, Chain, float, float]:
+def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, StripeChain, float, float]:
     """Candidates and chain in all rows, the scale in px that answers most, and by how many px rows were blurred."""
     scales = np.asarray(SCALES)
     typical, along = (like.scale, like.along) if like is not None else (0.0, ALONG)
     if not typical:
         found, chain, along = coarse(value)
         if not len(chain.rows) or chain.score < LEAST_SCORE:
-            return found, Chain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0, along
+            return found, StripeChain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0, along
         # What a shrunken picture answers at may be wider than any stripe that is looked for.
         typical = float(np.median(found.scale[chain.rows, chain.which]))
     typical = min(typical, SCALES[-1])
@@ -160,7 +163,7 @@ def _bridge(place: Array) -> Array:
     return filled
 
 
-def _rivals(found: Candidates, chain: Chain) -> Array:
+def _rivals(found: Candidates, chain: StripeChain) -> Array:
     """Response of the best candidate beside the chain over the chain's, of each row (m,), 0 where none is clear."""
     rival = np.zeros(len(found.rows))
     own = found.response[chain.rows, chain.which]
@@ -171,7 +174,7 @@ def _rivals(found: Candidates, chain: Chain) -> Array:
     return np.maximum(rival, _second_line(found, chain))
 
 
-def _second_line(found: Candidates, chain: Chain) -> Array:
+def _second_line(found: Candidates, chain: StripeChain) -> Array:
     """Response of a second line that runs beside the chain over the chain's (m,): its mean in rows where it hides."""
     scale = float(np.median(found.scale[chain.rows, chain.which]))
     own = np.interp(np.arange(len(found.rows)), chain.rows, found.place[chain.rows, chain.which])
@@ -228,10 +231,13 @@ def _believed(
     inside = (np.abs(fitted.x) < width) & np.isinf(fitted.variance)
     saturated[rows] = inside[keep].any(axis=1)
     return Careful(
-        out["centres"], out["sigma"], out["amplitude"], out["width"], saturated, np.zeros(lines), out["misfit"], None
+        out["centres"], out["sigma"], out["amplitude"], width=out["width"], saturated=saturated, rival=np.zeros(lines),
+        misfit=out["misfit"], learned=None
     )  # fmt: skip
 
 
 def _nothing(lines: int) -> Careful:
     none, no = np.full(lines, np.nan), np.zeros(lines, np.bool_)
-    return Careful(none, none.copy(), none.copy(), none.copy(), no, np.zeros(lines), none.copy(), None)
+    return Careful(
+        none, none.copy(), none.copy(), none.copy(), no, rival=np.zeros(lines), misfit=none.copy(), learned=None
+    )

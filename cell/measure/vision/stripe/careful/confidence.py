@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from cell.measure.vision.pictures import PictureRefused, Reason
-from cell.measure.vision.stripe.careful.follow import LEAST, MOST, Candidates, Chain, follow
-from cell.measure.vision.stripe.overview import Look
+from cell.measure.vision.stripe.careful.follow import LEAST, MOST, Candidates, StripeChain, follow
+from cell.measure.vision.stripe.overview import CoarseLines
 
 CLEAR = 10.0
 """A line that says this much for itself, over noise and what else is in the picture, a row on average, is taken."""
@@ -17,7 +17,7 @@ APART = 4.0
 """Widths beside the line from which on another one begins."""
 
 
-def rivalry(look: Look) -> float:
+def rivalry(look: CoarseLines) -> float:
     """What the next best line of a picture says for itself, over what the one that was followed says."""
     found, chain = look.found, look.chain
     if not len(chain.rows):
@@ -29,7 +29,7 @@ def rivalry(look: Look) -> float:
     return _said(rest, follow(rest)) / max(_said(found, chain), 1e-6)
 
 
-def refuse_unsure(look: Look, mix: str) -> None:
+def refuse_unsure(look: CoarseLines, mix: str) -> None:
     """Refuse a picture whose line is neither clear nor without a rival; `mix` is what it was looked for in."""
     rival = rivalry(look)
     if look.chain.score >= CLEAR or rival <= MOST_RIVAL:
@@ -42,5 +42,5 @@ def refuse_unsure(look: Look, mix: str) -> None:
     )
 
 
-def _said(found: Candidates, chain: Chain) -> float:
+def _said(found: Candidates, chain: StripeChain) -> float:
     return float(np.sum(np.minimum(found.clear[chain.rows, chain.which], MOST) - LEAST))

@@ -54,7 +54,7 @@ class Candidates:
 
 
 @dataclass(frozen=True)
-class Chain:
+class StripeChain:
     """The line that was followed: `rows` (k,), indices of those of the candidates, `which` of them, and the `piece`
     each belongs to. `score` is what it says for itself, a row on average, less what in the picture says otherwise."""
 
@@ -73,7 +73,7 @@ def respond(picture: NDArray[np.float32], scale: float, along: float) -> NDArray
     rows = cv2.getGaussianKernel(2 * int(2.5 * along) + 1, along or 1.0)
     smooth = cv2.sepFilter2D(picture, cv2.CV_32F, across, rows, borderType=cv2.BORDER_REPLICATE)
     away = max(2, round(SIDES * scale))
-    padded = cv2.copyMakeBorder(smooth, 0, 0, away, away, cv2.BORDER_REPLICATE)
+    padded = cv2.copyMakeBorder(smooth, 0, 0, away, away, borderType=cv2.BORDER_REPLICATE)
     n = picture.shape[1]
     return np.asarray(smooth - np.maximum(padded[:, :n], padded[:, 2 * away :]), dtype=np.float32)
 
@@ -93,7 +93,7 @@ def candidates(
         if 6 * scale > n:
             continue
         response = respond(part, scale, along)
-        _take_better(response, np.float32(_noise(response)), k, best, answer, of)
+        _take_better(response, np.float32(_noise(response)), k, best=best, answer=answer, of=of)
     edge = 2
     peak = np.zeros(part.shape, np.bool_)
     peak[:, edge:-edge] = (best[:, edge:-edge] >= best[:, edge - 1 : -edge - 1]) & (
@@ -128,7 +128,7 @@ def _noise(response: NDArray[np.float32]) -> float:
     return max(float(middle - low) / 0.5244, 0.05)
 
 
-def follow(found: Candidates, spacing: float = 1.0) -> Chain:
+def follow(found: Candidates, spacing: float = 1.0) -> StripeChain:
     """The chain through `found` whose rows are `spacing` px apart on average."""
     m = len(found.rows)
     # Of two lines that are clear alike the one with more light; not so much that a dark spot makes the chain jump.
@@ -136,7 +136,7 @@ def follow(found: Candidates, spacing: float = 1.0) -> Chain:
     share = light / np.maximum(light.max(axis=1, keepdims=True), 1e-9)
     gain = np.minimum(found.clear, MOST) * (1 - BY_LIGHT * (1 - share)) - LEAST * (found.clear > 0)
     best, back_row, back_which, opens = _chain(
-        found.rows.astype(np.float64), found.place, gain, found.clear > 0, found.scale, float(spacing)
+        found.rows.astype(np.float64), found.place, gain, found.clear > 0, scale=found.scale, spacing=float(spacing)
     )
     rows, which, fresh = [], [], []
     end = int(best.argmax())
@@ -152,10 +152,10 @@ def follow(found: Candidates, spacing: float = 1.0) -> Chain:
     return _believed(found, order, chosen, piece)
 
 
-def _believed(found: Candidates, rows: Any, which: Any, piece: Any) -> Chain:
+def _believed(found: Candidates, rows: Any, which: Any, piece: Any) -> StripeChain:
     """Without the pieces that noise may have made."""
     if not len(rows):
-        return Chain(rows, which, piece, 0.0)
+        return StripeChain(rows, which, piece, 0.0)
     said = np.minimum(found.clear[rows, which], MOST) - LEAST
     keep = np.zeros(len(rows), np.bool_)
     scale = found.scale[rows, which]
@@ -172,7 +172,7 @@ def _believed(found: Candidates, rows: Any, which: Any, piece: Any) -> Chain:
     rows, which, piece, said = rows[keep], which[keep], piece[keep], said[keep]
     rivals = np.clip(others.max(axis=1) - 2 * LEAST, 0.0, MOST).sum()
     score = float(said.sum() - JUMP * len(np.unique(piece)) - AGAINST * rivals)
-    return Chain(rows, which, piece, score / len(found.rows))
+    return StripeChain(rows, which, piece, score / len(found.rows))
 
 
 @compiled

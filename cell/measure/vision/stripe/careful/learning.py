@@ -40,7 +40,7 @@ def learn_profile(
         lines, starts = lines[some], starts[some]
     plain = gaussian(width, REACH * width + 2)
     for _ in range(3):
-        fitted = fit_shape(plane, lines, starts, plain, noise, FREE_SCALE)
+        fitted = fit_shape(plane, lines, starts, shape=plain, noise=noise, scale_prior=FREE_SCALE)
         clear = _clear(fitted, plane)
         if clear.sum() < min(LEAST_LINES, 8):
             return plain, FREE_SCALE, noise
@@ -59,9 +59,9 @@ def learn_profile(
     taught_by = np.arange(len(lines)) // RUN % 2 == 0
     if taught_by.all():
         taught_by[len(lines) // 2 :] = False
-    taught, _, _ = _rounds(plane, lines[taught_by], starts[taught_by], width, reach, noise)
+    taught, _, _ = _rounds(plane, lines[taught_by], starts[taught_by], width=width, reach=reach, noise=noise)
     of_taught, of_plain = (
-        fit_shape(plane, lines[~taught_by], starts[~taught_by], shape, noise, SHARED_SCALE)
+        fit_shape(plane, lines[~taught_by], starts[~taught_by], shape=shape, noise=noise, scale_prior=SHARED_SCALE)
         for shape in (taught, gaussian(width, reach))
     )
     if not _better(of_taught, of_plain):
@@ -69,11 +69,11 @@ def learn_profile(
     # What a Gaussian misfits by looked like speckle: with the profile's own residuals once more, from none on.
     noise = Noise(noise.floor, noise.gain)
     for _ in range(2):
-        shape, fitted, clear = _rounds(plane, lines, starts, width, reach, noise)
+        shape, fitted, clear = _rounds(plane, lines, starts, width=width, reach=reach, noise=noise)
         noise = speckled(fitted, clear, noise, shape)
         if noise.contrast < FAINT_SPECKLE:
             break
-    freely = fit_shape(plane, lines, starts, shape, noise, FREE_SCALE)
+    freely = fit_shape(plane, lines, starts, shape=shape, noise=noise, scale_prior=FREE_SCALE)
     return shape, _spread(freely, clear & _clear(freely, plane)), noise
 
 
@@ -82,7 +82,7 @@ def _rounds(
 ) -> tuple[Shape, Fitted, NDArray[np.bool_]]:
     shape, prior = gaussian(width, reach), FREE_SCALE
     for _ in range(ROUNDS):
-        fitted = fit_shape(plane, lines, starts, shape, noise, prior)
+        fitted = fit_shape(plane, lines, starts, shape=shape, noise=noise, scale_prior=prior)
         clear = _clear(fitted, plane)
         if clear.sum() < LEAST_LINES // 4:
             break
@@ -97,7 +97,7 @@ def _rounds(
         width = shape.width
         starts = np.where(fitted.good, fitted.centre, starts)
         prior = SHARED_SCALE
-    fitted = fit_shape(plane, lines, starts, shape, noise, prior)
+    fitted = fit_shape(plane, lines, starts, shape=shape, noise=noise, scale_prior=prior)
     return shape, fitted, _clear(fitted, plane)
 
 

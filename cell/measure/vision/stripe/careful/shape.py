@@ -62,7 +62,7 @@ def gaussian(width: float, reach: float | None = None) -> Shape:
     count = int(np.ceil(reach / step))
     z = np.arange(-count, count + 1) * (step / width)
     value = np.exp(-0.5 * z * z)
-    return Shape(-count * step, step, value, -value * z / width, width, False)
+    return Shape(-count * step, step, value, slope=-value * z / width, width=width, learned=False)
 
 
 def learn(x: Array, value: Array, weight: Array, width: float, reach: float) -> Shape:
@@ -145,4 +145,4 @@ def _settled(grid: Array, table: Array, step: float, width: float) -> Shape:
     table = table * fade * fade * (3 - 2 * fade)
     table = np.interp(grid + centre, grid, table, left=0.0, right=0.0)
     table = table / max(float(table.max()), 1e-9)
-    return Shape(float(grid[0]), step, table, np.gradient(table, step), width, True)
+    return Shape(float(grid[0]), step, table, slope=np.gradient(table, step), width=width, learned=True)

@@ -98,14 +98,12 @@ def fit_shape(
     Unknown are centre, amplitude, scale and a linear background.
     """
     n = plane.value.shape[1]
-    width = shape.width
     half = int(np.ceil(shape.reach)) + 1
     offset = np.arange(-half, half + 1)
     origin = np.rint(starts).astype(np.intp)
     column = origin[:, None] + offset
     inside = (column >= 0) & (column < n)
-    column = np.clip(column, 0, n - 1)
-    at = lines[:, None], column
+    at = lines[:, None], np.clip(column, 0, n - 1)
     value = plane.value[at].astype(np.float64)
     usable = inside & plane.usable[at]
     shade, albedo = (
@@ -117,22 +115,23 @@ def fit_shape(
     expected = np.zeros(len(lines)) if log_scales is None else log_scales
     ramp = np.broadcast_to(offset / half, value.shape)
     centre = starts - origin
-    amplitude, level, slope = _linear_start(value, usable, offset, centre, expected, shape, ramp)
+    amplitude, level, slope = _linear_start(value, usable, offset, centre, log_scale=expected, shape=shape, ramp=ramp)
     found = np.stack([centre, amplitude, expected, level, slope], axis=1)
     good = usable.sum(axis=1) > LEAST_PIXELS
-    precision = scale_prior**-2
-    limit = LARGEST_STEP * width
     going = good.copy()
     inverses = np.zeros((len(lines), PARAMETERS, PARAMETERS))
     # Most lines settle in a few steps, a few take all of them: one that has settled is looked at once more and left.
     left = np.arange(len(lines))
     table = shape.first, shape.step, np.ascontiguousarray(shape.value), np.ascontiguousarray(shape.slope)
     pixels = value, usable, shade, albedo, speckle, offset / half
-    limits = precision, limit, float(half)
+    limits = scale_prior**-2, LARGEST_STEP * shape.width, float(half)
     expected = np.ascontiguousarray(expected, dtype=np.float64)
     for _ in range(STEPS):
         began = going[left]
-        _improve(left, table, pixels, (noise.floor, noise.gain), expected, limits, found, good, going, inverses)
+        _improve(
+            left, table, pixels, noise=(noise.floor, noise.gain), expected=expected, limits=limits, found=found,
+            good=good, going=going, inverses=inverses,
+        )  # fmt: skip
         left = left[began]
         if not going.any():
             break
@@ -144,10 +143,11 @@ def fit_shape(
     influence = np.einsum("mp,mpk->mk", inverses[:, 0], jacobian * weight[:, None, :])
     freedom = np.maximum(usable.sum(axis=1) - PARAMETERS, 1)
     return Fitted(
-        lines, origin + centre, amplitude, np.sqrt(inverses[:, 1, 1]), level, slope / half, log_scale,
-        np.sqrt(inverses[:, 2, 2]), np.sum(weight * residual**2, axis=1) / freedom, np.sqrt(inverses[:, 0, 0]),
-        good & (amplitude > 0), (offset - centre[:, None]) * np.exp(-log_scale)[:, None], residual, stripe,
-        np.where(usable, variance, np.inf), influence,
+        lines, origin + centre, amplitude, np.sqrt(inverses[:, 1, 1]), level, slope=slope / half, log_scale=log_scale,
+        scale_sigma=np.sqrt(inverses[:, 2, 2]), chi2=np.sum(weight * residual**2, axis=1) / freedom,
+        fisher=np.sqrt(inverses[:, 0, 0]), good=good & (amplitude > 0),
+        x=(offset - centre[:, None]) * np.exp(-log_scale)[:, None], residual=residual, stripe=stripe,
+        variance=np.where(usable, variance, np.inf), influence=influence,
     )  # fmt: skip
 
 

@@ -110,8 +110,8 @@ def _residuals(
     errors = np.zeros((2, image.shape[1]))
     used = 0
     for r in pairs:
-        low, high = _whitened(image, dark, r, fitted, noise2, gain, contrast2, errors[0])
-        low1, high1 = _whitened(image, dark, r + 1, fitted, noise2, gain, contrast2, errors[1])
+        low, high = _whitened(image, dark, r, fitted, noise2=noise2, gain=gain, contrast2=contrast2, errors=errors[0])
+        low1, high1 = _whitened(image, dark, r + 1, fitted, noise2, gain=gain, contrast2=contrast2, errors=errors[1])
         if high == 0 or high1 == 0:
             continue
         power, product, shared = 0.0, 0.0, 0.0
@@ -140,7 +140,7 @@ def _typical(table: NDArray[np.float64]) -> _Seen:
     mean_power, product, shared = table[:3, kept].mean(axis=1).tolist()
     width, amplitude, level = _medians(table[3:, kept])
     pairs, scatter = int(np.count_nonzero(kept)), float(power[kept].std())
-    return _Seen(pairs, mean_power, product, shared, scatter, width, amplitude, level)
+    return _Seen(pairs, mean_power, product, shared, scatter=scatter, width=width, amplitude=amplitude, level=level)
 
 
 def _medians(rows: NDArray[np.float64]) -> list[float]:
@@ -193,7 +193,7 @@ def measure_speckle(
     such as the texture of the surface, counts as speckle.
     """
     table = np.empty((6, len(pairs)))
-    used = _residuals(image, dark, pairs, fitted, noise2, gain, contrast**2, table)
+    used = _residuals(image, dark, pairs, fitted=fitted, noise2=noise2, gain=gain, contrast2=contrast**2, table=table)
     if used < LEAST_PAIRS:
         return None
     seen = _typical(table[:, :used])

@@ -180,7 +180,7 @@ def find_line(
     place = first_at(seen, r, top)
     # As written, 0 and 1 would be two types, and each compiled by itself.
     first, second = np.intp(0), np.intp(1)
-    found = _measure(image, dark, r, place, saturation, least_peak, window, start, first)
+    found = _measure(image, dark, r, place, saturation, least_peak=least_peak, window=window, start=start, k=first)
     low = high = place
     for _ in range(TRIES - 1):
         if found:
@@ -189,7 +189,7 @@ def find_line(
         place = _prominent(row, low, high, rises)
         if place < 0:
             return False
-        found = _measure(image, dark, r, place, saturation, least_peak, window, start, first)
+        found = _measure(image, dark, r, place, saturation, least_peak=least_peak, window=window, start=start, k=first)
     if not found:
         return False
     reach = reach_of(start[r, 0, WIDTH], int(start[r, 0, CORE]))
@@ -197,7 +197,9 @@ def find_line(
     if largest_outside(seen, r, low, high) < rival_limit(start[r, 0, BACKGROUND], start[r, 0, HEIGHT], least_peak):
         return False
     place = _prominent(row, low, high, rises)
-    if place < 0 or not _measure(image, dark, r, place, saturation, least_peak, window, start, second):
+    if place < 0 or not _measure(
+        image, dark, r, place=place, saturation=saturation, least_peak=least_peak, window=window, start=start, k=second
+    ):
         return False
     if start[r, 1, ENERGY] > start[r, 0, ENERGY]:
         for k in range(START):

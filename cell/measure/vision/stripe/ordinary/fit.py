@@ -116,7 +116,7 @@ def fit_lines(
         for j in range(LANES):
             # Lanes to spare repeat the last line.
             lines[j] = which[first + min(j, size - 1)]
-        half = _begin(s, start, widths, log_widths, lines, image.shape[1], origins)
+        half = _begin(s, start, widths, log_widths=log_widths, lines=lines, n=image.shape[1], origins=origins)
         for j in range(LANES):
             in_cut[j] = origins[j] - cut_at[lines[j]]
         if in_cut.min() > half and in_cut.max() + half < CUT:
@@ -128,7 +128,7 @@ def fit_lines(
             _gather(dark, lines, origins, half, shade)
             _darken(shade, half, dark_noise, values, variance)
         for _ in range(steps):
-            lane.accumulate(s, values, variance, half, noise2, gain, contrast2)
+            lane.accumulate(s, values, variance, half=half, noise2=noise2, gain=gain, contrast2=contrast2)
             if lane.step_on(s) == 0.0:
                 break
         for j in range(LANES):
@@ -136,7 +136,7 @@ def fit_lines(
             fitted_width[j] = lane.exponential(s[lane.LOG_WIDTH + j])
         correlated = len(rho) > 0 and contrast2 > 0.0
         if correlated:
-            lane.influence(s, variance, half, noise2, gain, contrast2, rho, moved)
+            lane.influence(s, variance, half, noise2=noise2, gain=gain, contrast2=contrast2, rho=rho, moved=moved)
         for j in range(size):
             used = s[lane.USED + j]
             if used <= PARAMETERS or not s[lane.GOOD + j] > lane.SINGULAR:

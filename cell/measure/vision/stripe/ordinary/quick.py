@@ -43,7 +43,7 @@ MISTAKABLE = 0.02
 """Share of the lines with a second peak from which the quick search may have followed the wrong one."""
 
 
-class Verdict(Enum):
+class QuickVerdict(Enum):
     """What the quick way says of its own result."""
 
     ORDINARY = "nothing more to be said"
@@ -53,7 +53,7 @@ class Verdict(Enum):
 
 def read_quickly(
     image: Image, dark: Any, axis: Axis, settings: StripeSettings, like: StripeProfile | None
-) -> tuple[StripeProfile, Verdict]:
+) -> tuple[StripeProfile, QuickVerdict]:
     """The profile by search and fit of a Gaussian, and whether this is enough for the picture."""
     work, shade = _lines(image, axis), _lines(dark, axis)
     seen = work if dark is None else _above(work, shade)
@@ -62,7 +62,9 @@ def read_quickly(
     least = max(settings.least_peak_dn, 5 * sqrt(whole))
     start = np.zeros((len(work), find.CANDIDATES, find.START))
     cut, cut_at = np.empty((len(work), find.CUT), np.uint8), np.full(len(work), find.NOWHERE)
-    several = stripe_search.find_lines(work, seen, shade, settings.saturation_dn, least, start, cut, cut_at)
+    several = stripe_search.find_lines(
+        work, seen, shade, saturation=settings.saturation_dn, least_peak=least, start=start, cut=cut, cut_at=cut_at
+    )
     double = choose(start) if several else np.zeros(len(start), np.bool_)
     low, high = settings.width_range_px
     found, widths = survey(start, low, high)
@@ -73,8 +75,9 @@ def read_quickly(
 
     def run(which: NDArray[np.intp], contrast: float, rho: Any) -> None:
         fit.fit_lines(
-            work, cut, cut_at, shade, start, widths, np.log(widths), which, settings.saturation_dn,
-            (noise2, gain, contrast), of_dark, rho, settings.steps, fitted,
+            work, cut, cut_at, dark=shade, start=start, widths=widths, log_widths=np.log(widths), which=which,
+            saturation=settings.saturation_dn,
+            noise=(noise2, gain, contrast), dark_noise=of_dark, rho=rho, steps=settings.steps, out=fitted,
         )  # fmt: skip
 
     speckle = like.speckle if like is not None else None
@@ -83,7 +86,9 @@ def read_quickly(
         if speckle is None:
             pairs = neighbours(start, double, SPECKLE_PAIRS)
             run(np.concatenate([pairs, pairs + 1]), ASSUMED_CONTRAST, NO_LAGS)
-            speckle = measure_speckle(work, shade, pairs, widths, fitted, noise2, gain, ASSUMED_CONTRAST)
+            speckle = measure_speckle(
+                work, shade, pairs, widths=widths, fitted=fitted, noise2=noise2, gain=gain, contrast=ASSUMED_CONTRAST
+            )
         seen_contrast, seen_grain, widening = speckle or (ASSUMED_CONTRAST, ASSUMED_GRAIN, 1.0)
         widths = np.minimum(np.maximum(widths * widening, low), high)
         contrast = seen_contrast if contrast is None else contrast
@@ -92,13 +97,25 @@ def read_quickly(
     run(found, contrast, rho)
     saturated = np.empty(len(work), np.bool_)
     excess = 1 + SECOND_ORDER * contrast**2
-    believe(fitted, start, work.shape[1], low, high, 0.5 * least, excess, double, saturated)
+    believe(
+        fitted, start, work.shape[1], low, high, least=0.5 * least, excess=excess, double=double, saturated=saturated
+    )
     centres, sigma, amplitude, width = (fitted[k] for k in (fit.FIT_CENTRE, fit.SIGMA, fit.AMPLITUDE, fit.WIDTH))
-    profile = StripeProfile(axis, centres, sigma, amplitude, width, saturated, double, speckle, (noise2, whole))
+    profile = StripeProfile(
+        axis,
+        centres,
+        sigma,
+        amplitude=amplitude,
+        width=width,
+        saturated=saturated,
+        double=double,
+        speckle=speckle,
+        noise=(noise2, whole),
+    )
     if like is not None and like.speckle is not None:
-        return profile, Verdict.ORDINARY
+        return profile, QuickVerdict.ORDINARY
     if like is not None and max(profile.valid.mean(), like.valid.mean()) < HARDLY_ANY:
-        return profile, Verdict.ORDINARY
+        return profile, QuickVerdict.ORDINARY
     ordinary = (
         is_line_whole(fitted, start)
         and not is_too_wide(fitted, start)
@@ -109,9 +126,9 @@ def read_quickly(
         and not is_textured(seen)
     )
     if ordinary:
-        return profile, Verdict.ORDINARY
+        return profile, QuickVerdict.ORDINARY
     second = float(np.mean(start[profile.valid, 1, find.ENERGY] > 0)) if profile.valid.any() else 1.0
-    return profile, Verdict.UNMISTAKABLE if second < MISTAKABLE else Verdict.NOT_ORDINARY
+    return profile, QuickVerdict.UNMISTAKABLE if second < MISTAKABLE else QuickVerdict.NOT_ORDINARY
 
 
 def _lines(part: Any, axis: Axis) -> Any:

@@ -187,12 +187,22 @@ def find_lines(
     for first in range(0, len(image), LANES):
         size = min(LANES, len(image) - first)
         _note_brightest(seen, first, size, least_peak, notes)
-        _keep(image, dark, first, size, notes, window, cut, cut_at)
+        _keep(image, dark, first, size=size, notes=notes, window=window, cut=cut, cut_at=cut_at)
         _sum_windows(window, sums)
         _look_beside(window, sums)
-        _take(image, first, size, saturation, least_peak, notes, window, sums, start)
+        _take(image, first, size, saturation, least_peak=least_peak, notes=notes, window=window, s=sums, start=start)
         for j in range(size):
             if notes[_OPEN, j]:
-                found_two = find_line(image, seen, dark, first + j, saturation, least_peak, line, rises, start)
+                found_two = find_line(
+                    image,
+                    seen,
+                    dark,
+                    r=first + j,
+                    saturation=saturation,
+                    least_peak=least_peak,
+                    window=line,
+                    rises=rises,
+                    start=start,
+                )
                 several = several or found_two
     return several

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.apps.commission.check import Check, Result
+from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.checks.arm import GRAVITY, weigh
 from cell.apps.commission.checks.outputs import bright_rows
 from cell.apps.commission.checks.rail import judge
@@ -251,7 +251,7 @@ def changed(camera: CameraConfig) -> CameraConfig:
 def test_every_check_says_what_moves_and_needs_only_earlier_ones() -> None:
     before: set[str] = set()
     for check in CHECKS:
-        assert isinstance(check, Check)
+        assert isinstance(check, CommissionCheck)
         assert check.title and check.limit and check.moves
         assert check.moves == "nothing" or (check.far and check.fast)
         assert set(check.needs) <= before, check.name

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cell.apps.commission.begin import begin
-from cell.apps.commission.check import Check, Result
+from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.checks.vehicle import judge_board
 from cell.apps.commission.person import PersonAtTheConsole, SimulatedPerson
 from cell.apps.commission.protocol import write_protocol
@@ -34,7 +34,7 @@ class Shown:
     def __init__(self) -> None:
         self.rows: list[tuple[str, str, Result | None]] = []
 
-    def __call__(self, check: Check, verdict: str, result: Result | None) -> None:
+    def __call__(self, check: CommissionCheck, verdict: str, result: Result | None) -> None:
         self.rows.append((check.name, verdict, result))
 
     @property

@@ -15,7 +15,7 @@ from cell.apps.recordings.consistency import odd_turns
 from cell.apps.recordings.frames import RecordedFrame
 from cell.apps.recordings.pairs import calibrate_pairs, read_pose_pairs
 from cell.apps.recordings.series import Series
-from cell.apps.recordings.texts import Record
+from cell.apps.recordings.texts import PoseRecord
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.vision.board.board import board_pose
 from drivers.errors import ConfigError
@@ -87,7 +87,7 @@ def test_views_that_do_not_turn_carry_no_vote(seed):
     assert all(f["used"] for f in result["frames"])
     off = np.linalg.norm(np.array(result["hand_eye"]["translation_mm"]) - 1e3 * FLANGE_FROM_CAMERA.translation)
     assert off < 3 * np.linalg.norm(result["hand_eye"]["sigma_mm"])
-    one = Series("poses", [Record(Path("poses"), "row", "", f.homogeneous.ravel()) for f, _ in pairs])
+    one = Series("poses", [PoseRecord(Path("poses"), "row", "", f.homogeneous.ravel()) for f, _ in pairs])
     one.of = dict(enumerate(one.records))
     decision = decide([one], {k: [b] for k, (_, b) in enumerate(pairs)}, 0.018)
     assert decision.best.reading.name == "matrix-4x4"

@@ -22,7 +22,7 @@ from cell.apps.recordings.frames import RecordedFrame, read_frames
 from cell.apps.recordings.series import in_order_of_views, list_folder, match_series, read_series
 from cell.apps.recordings.solution import agreeing
 from cell.measure.geometry.camera import CameraModel
-from cell.measure.vision import Laser, parse_board, read_colours
+from cell.measure.vision import LaserChannel, parse_board, read_colours
 from cell.measure.vision.board.board import find_board
 from cell.measure.vision.pictures import read_picture
 from drivers.errors import ConfigError
@@ -652,13 +652,13 @@ def test_a_red_laser_on_white_paper_is_read_in_colour_and_never_wrongly_in_grey(
     for path in sorted(pictures.iterdir())[:2]:
         cv2.imwrite(str(tmp_path / path.name), lit(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) * 0.8, 60))
     frames, channel = read_frames(list_folder(tmp_path), BOARD)
-    assert channel.chosen is not Laser.GREY
+    assert channel.chosen is not LaserChannel.GREY
     assert sum(channel.votes.values()) == 2
     for frame in frames:
         assert frame.profile is not None, frame.stripe_text
         rows = frame.profile.rows
         assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 0.3
-    in_grey, _ = read_frames(list_folder(tmp_path), BOARD, laser=Laser.GREY)
+    in_grey, _ = read_frames(list_folder(tmp_path), BOARD, laser=LaserChannel.GREY)
     for frame in in_grey:
         if frame.profile is not None:
             rows = frame.profile.rows

@@ -9,11 +9,11 @@ from types import SimpleNamespace
 import pytest
 
 from cell.devices.gate.gate import Gate
-from cell.devices.gate.interlocks import Command, Interlocks, Rule, Situation
+from cell.devices.gate.interlocks import DeviceCommand, Interlocks, Rule, Situation
 from drivers.errors import Aborted, InterlockError
 from statemachine.cancel import CancelToken
 
-MOVE = Command("rail", "move_to", {"position": 0.0})
+MOVE = DeviceCommand("rail", "move_to", {"position": 0.0})
 
 
 def open_gate() -> Gate:

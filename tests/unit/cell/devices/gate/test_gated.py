@@ -7,7 +7,7 @@ import pytest
 
 from cell.config.cell_config import load_config
 from cell.devices.devices import Devices
-from cell.devices.gate.interlocks import Command, Rule, Situation
+from cell.devices.gate.interlocks import DeviceCommand, Rule, Situation
 from cell.devices.simulated.direct import VirtualCell
 from cell.motion.arm_models import HOME
 from drivers.errors import Aborted, InterlockError
@@ -70,7 +70,7 @@ def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: 
 def test_a_stop_that_comes_while_a_rule_of_the_claw_waits_leaves_the_part_held() -> None:
     """What a claw does cannot be undone without dropping the part, so it is looked again before it is told."""
 
-    def waits(now: Situation, command: Command) -> None:
+    def waits(now: Situation, command: DeviceCommand) -> None:
         devices.gate.shut()
 
     devices = VirtualCell(CONFIG, seed=4, level="ideal").devices

@@ -17,7 +17,7 @@ import pytest
 from cell.config.cell_config import load_config
 from cell.config.job import job_path
 from cell.devices.devices import Devices
-from cell.devices.gate.interlocks import Command
+from cell.devices.gate.interlocks import DeviceCommand
 from cell.devices.gate.laser import UNATTENDED_S
 from cell.devices.gate.rules import RULES, markdown
 from cell.devices.gate.ways import LINE_STEP_RAD, Ways
@@ -280,9 +280,11 @@ def test_two_commands_that_exclude_each_other_do_not_both_pass(devices: Devices)
         go_on.wait(5)
         order.append("first begun")
 
-    first = threading.Thread(target=lambda: gate.begin(Command("vehicle", "enable"), slowly, lambda: None))
+    first = threading.Thread(target=lambda: gate.begin(DeviceCommand("vehicle", "enable"), slowly, lambda: None))
     second = threading.Thread(
-        target=lambda: gate.begin(Command("vehicle", "enable"), lambda: order.append("second begun"), lambda: None)
+        target=lambda: gate.begin(
+            DeviceCommand("vehicle", "enable"), lambda: order.append("second begun"), lambda: None
+        )
     )
     first.start()
     assert inside.wait(5)
@@ -304,7 +306,7 @@ def test_a_stop_does_not_wait_for_what_is_being_begun(devices: Devices) -> None:
 
     def begin() -> None:
         with pytest.raises(InterlockError, match="after_a_stop"):
-            devices.gate.begin(Command("vehicle", "enable"), slowly, undone.set)
+            devices.gate.begin(DeviceCommand("vehicle", "enable"), slowly, undone.set)
         said.append("refused")
 
     beginner = threading.Thread(target=begin)
@@ -343,7 +345,7 @@ class Fixed:
 
 def test_driving_is_judged_by_the_newest_state_without_waiting_for_another(devices: Devices) -> None:
     situation = devices.interlocks.situation
-    drive = Command("vehicle", "drive", {"speed": 0.1, "yaw_rate": 0.0})
+    drive = DeviceCommand("vehicle", "drive", {"speed": 0.1, "yaw_rate": 0.0})
     now = devices.arm.state()
     shaken = dataclasses.replace(now, joint_speeds=np.full(6, 0.02), moving=True)
     situation.arm = Fixed("arm", shaken)
@@ -411,7 +413,9 @@ def test_a_straight_line_is_checked_all_the_way_in_even_steps_as_it_turns() -> N
     goal = from_parts(
         begin.translation + np.array([0.0, -0.03, 0.08]), pin.exp3(np.array([0.0, 0.3, 0.0])) @ begin.rotation
     )
-    line = [ways.forward(joints) for joints in ways._way(HOME, Command("arm", "move_linear", {"flange": to_ur(goal)}))]
+    line = [
+        ways.forward(joints) for joints in ways._way(HOME, DeviceCommand("arm", "move_linear", {"flange": to_ur(goal)}))
+    ]
     assert len(line) >= 0.3 / LINE_STEP_RAD
     for k, pose in enumerate(line, start=1):
         share = k / len(line)

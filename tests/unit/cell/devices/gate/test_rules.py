@@ -13,15 +13,15 @@ import pinocchio as pin
 import pytest
 
 from cell.devices.contact import GuardedMotion
-from cell.devices.gate.interlocks import Command, Interlocks, Situation
+from cell.devices.gate.interlocks import DeviceCommand, Interlocks, Situation
 from cell.devices.gate.rules import LATE_S, LOOK_M, LOOK_RAD, RULES
 from cell.measure.geometry.poses import to_ur
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError
 from drivers.interfaces import ArmSafety, ArmState, VehicleState
 
-MOVE = Command("arm", "move_joints", {"joints": np.zeros(6)})
-DRIVE = Command("vehicle", "drive", {"speed": 0.1, "yaw_rate": 0.0})
+MOVE = DeviceCommand("arm", "move_joints", {"joints": np.zeros(6)})
+DRIVE = DeviceCommand("vehicle", "drive", {"speed": 0.1, "yaw_rate": 0.0})
 POSTURE = np.zeros(6)
 LOOK = pin.SE3(np.eye(3), np.array([0.4, 0.0, 0.6]))
 STANDS = VehicleState(
@@ -99,7 +99,7 @@ def test_an_arm_that_turns_any_joint_either_way_is_not_stowed(joint: int, speed:
     with pytest.raises(InterlockError, match=r"the arm moves.*arm_stowed"):
         rules(arm=turning).require(DRIVE)
     with pytest.raises(InterlockError, match=r"the arm moves.*arm_still"):
-        rules(arm=turning).require(Command("vehicle", "enable"))
+        rules(arm=turning).require(DeviceCommand("vehicle", "enable"))
 
 
 def test_an_arm_whose_motion_is_not_over_is_not_stowed_though_it_stands() -> None:
@@ -179,7 +179,7 @@ def test_nothing_drives_by_an_old_state_of_the_arm() -> None:
     old = arm_state(stamp=Clock().now() - LATE_S - 0.1)
     with pytest.raises(DeadlineError, match="newest state is"):
         rules(arm=old).require(DRIVE)
-    rules(arm=old).require(Command("vehicle", "drive", {"speed": 0.0, "yaw_rate": 0.0}))
+    rules(arm=old).require(DeviceCommand("vehicle", "drive", {"speed": 0.0, "yaw_rate": 0.0}))
 
 
 @pytest.mark.parametrize(
@@ -188,7 +188,7 @@ def test_nothing_drives_by_an_old_state_of_the_arm() -> None:
 )
 def test_of_the_outputs_of_others_the_lasers_alone_may_be_switched_off(index: int, value: bool, refused: bool) -> None:
     interlocks = rules(outputs={0: "laser", 1: "claw"})
-    command = Command("arm", "set_digital_output", {"index": index, "value": value})
+    command = DeviceCommand("arm", "set_digital_output", {"index": index, "value": value})
     if not refused:
         interlocks.require(command)
         return
@@ -230,14 +230,14 @@ def test_a_contact_at_which_nobody_saw_the_arm_stand_opens_no_claw() -> None:
     guarded = GuardedMotion(ended, Told("arm", arm_state()))  # type: ignore[arg-type]
     interlocks = rules(claw=claw, last=guarded)
     with pytest.raises(InterlockError, match=r"nobody has seen where the arm stood.*claw_at_contact"):
-        interlocks.require(Command("claw", "release"))
+        interlocks.require(DeviceCommand("claw", "release"))
     guarded.wait(1.0)
-    interlocks.require(Command("claw", "release"))
+    interlocks.require(DeviceCommand("claw", "release"))
 
 
 def test_what_the_laser_is_lit_for_holds_inside_its_context_only() -> None:
     interlocks = rules()
-    light = Command("laser", "lit")
+    light = DeviceCommand("laser", "lit")
     with interlocks.purpose("sweep"), ThreadPoolExecutor(1) as other:
         with interlocks.purpose("test"):
             pass
@@ -262,4 +262,4 @@ def test_a_lit_laser_bars_driving_and_not_the_end_of_it() -> None:
     lit.is_on = True
     with pytest.raises(InterlockError, match="laser_off_to_drive"):
         rules(laser=lit).require(DRIVE)
-    rules(laser=lit).require(Command("vehicle", "drive", {"speed": 0.0, "yaw_rate": 0.0}))
+    rules(laser=lit).require(DeviceCommand("vehicle", "drive", {"speed": 0.0, "yaw_rate": 0.0}))

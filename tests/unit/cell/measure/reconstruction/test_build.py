@@ -171,10 +171,10 @@ def test_a_half_that_could_not_be_judged_is_an_error_and_never_left_unfiltered(
     whole = outliers._judge
     middle = 20
 
-    def judge(*arguments: Any) -> None:
-        if (arguments[4] >= middle) == bool(half):
+    def judge(*arguments: Any, first: int, **others: Any) -> None:
+        if (first >= middle) == bool(half):
             raise MemoryError("no room")
-        whole(*arguments)
+        whole(*arguments, first=first, **others)
 
     monkeypatch.setattr(outliers, "_judge", judge)
     depth = np.zeros((2 * middle, 30))

@@ -11,8 +11,8 @@ import pytest
 from cell.config.cell_config import load_config
 from cell.config.job import Job, load_job
 from cell.measure.inversion import NominalSurface, PlacePose
-from cell.measure.inversion.observability import Motion, Verdict
-from cell.procedures.arm.touch import FELT_M, Touch, TouchCheck, expected_touch, felt_touch
+from cell.measure.inversion.observability import PoseVerdict, SmallMotion
+from cell.procedures.arm.touch import FELT_M, TouchCheck, TouchHeight, expected_touch, felt_touch
 from drivers.errors import RefusedError
 from drivers.interfaces import ArmSafety, ArmState
 from lab.bench.job.whole_job import JobRecord, run_whole_job
@@ -81,10 +81,10 @@ def test_an_arm_that_tells_next_to_nothing_is_no_witness(still: ArmState) -> Non
 
 
 def test_a_touch_is_noted_before_it_is_refused() -> None:
-    check = TouchCheck(Touch(-0.3e-3, 0.0), Touch(0.0, 0.1e-3))
+    check = TouchCheck(TouchHeight(-0.3e-3, 0.0), TouchHeight(0.0, 0.1e-3))
     check.require()
     assert "0.300 mm lower than the scan says" in check.notes[0]
-    assert TouchCheck(Touch(-0.2e-3, 0.0), Touch(0.0, 0.1e-3)).notes == ()
+    assert TouchCheck(TouchHeight(-0.2e-3, 0.0), TouchHeight(0.0, 0.1e-3)).notes == ()
 
 
 def test_a_part_that_may_be_tilted_is_expected_to_touch_early(placed_pot: JobRecord) -> None:
@@ -126,7 +126,7 @@ def test_a_part_that_is_put_down_aslant_touches_along_its_own_way() -> None:
     corners = 0.02 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     flat = NominalSurface(corners, [[0, 1, 2], [0, 2, 3]])
     made, none = np.diag([1e-8] * 3 + [0.0] * 3), np.zeros((6, 6))
-    verdict = Verdict(Motion(np.zeros(3), np.zeros(3), 0.0, ""), (), (), np.ones(6))
+    verdict = PoseVerdict(SmallMotion(np.zeros(3), np.zeros(3), 0.0, ""), (), (), np.ones(6))
     pose = PlacePose(pin.SE3.Identity(), made, none, made, verdict, 0.0, 1.0, 1000, 1.0, 1.0, 0.0, np.zeros(6), 0.0)
     known = replaced_grasp(1e-9, 1e-9)
 

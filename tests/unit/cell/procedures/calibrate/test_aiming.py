@@ -10,7 +10,7 @@ from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import load_config
 from cell.measure.geometry.poses import difference, from_parts, perturbed
 from cell.measure.vision import BoardView, parse_board
-from cell.procedures.arm.camera_poses import View, scan_calibration_views
+from cell.procedures.arm.camera_poses import CalibrationView, scan_calibration_views
 from cell.procedures.calibrate.aiming import SEARCH_M, Aim
 
 CONFIG = load_config(None)
@@ -22,12 +22,12 @@ HAND = perturbed(DRAWN_HAND, (0.006, -0.008, 0.004, 0.03, -0.02, 0.04))
 PLACE = perturbed(DRAWN_BOARD, (-0.007, 0.005, 0.003, 0.02, 0.01, -0.03))
 
 
-def seen_from(view: View, hand: pin.SE3, board: pin.SE3) -> pin.SE3:
+def seen_from(view: CalibrationView, hand: pin.SE3, board: pin.SE3) -> pin.SE3:
     """camera_from_board at a view."""
     return (view.base_from_flange * hand * from_parts((view.rail_position, 0, 0))).inverse() * board
 
 
-def show(aim: Aim, view: View) -> None:
+def show(aim: Aim, view: CalibrationView) -> None:
     """Let the true camera see the true board there."""
     points = BOARD.points()
     pixels = CAMERA.project(np.array([seen_from(view, HAND, PLACE).act(p) for p in points]))

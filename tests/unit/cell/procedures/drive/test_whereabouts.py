@@ -18,7 +18,7 @@ from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.drive.approach import Planar, RelativeOdometry, drive_line, turn_to, wrap
 from cell.procedures.drive.way import TURN_DRIFT, Way, distance
 from cell.procedures.drive.whereabouts import Whereabouts
-from cell.procedures.steps.drive_to_target import Arrival, drive_to_target
+from cell.procedures.steps.drive_to_target import VehicleArrival, drive_to_target
 from drivers.errors import RefusedError
 from drivers.interfaces import VehicleState
 from sim_backends.world.nominal import inverse
@@ -50,7 +50,7 @@ class Site:
             raise RefusedError("no board found")
         return BoardFix(from_matrix(base_from_board), 1e-8 * np.eye(6), 0.1, 0.0, ())
 
-    def run(self, job: Job = JOB) -> Arrival:
+    def run(self, job: Job = JOB) -> VehicleArrival:
         self.vehicle.enable()
         self.whereabouts.enter(job)
         return drive_to_target(

@@ -19,7 +19,7 @@ from cell.motion.arm_models import HOME
 from cell.motion.collision import CollisionError
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.part import PartProgress, PartState
-from cell.procedures.arm.touch import Touch
+from cell.procedures.arm.touch import TouchHeight
 from cell.procedures.drive.whereabouts import Whereabouts
 from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
@@ -36,7 +36,7 @@ from statemachine.runner import StepContext
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")
-STATED = Touch(0.0, 0.06e-3)
+STATED = TouchHeight(0.0, 0.06e-3)
 """Where the part is to touch first: as sure as a job that knows its grasp well is of it."""
 NOMINAL = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
 

@@ -15,7 +15,7 @@ from cell.motion.arm_models import HOME
 from cell.procedures.arm.camera_poses import ScanPlan
 from cell.procedures.arm.moves import Mover
 from cell.procedures.sweep.arm_sweep import LATENCY_S, arm_sweep
-from cell.procedures.sweep.swath import Collector, Swath
+from cell.procedures.sweep.swath import Swath, SweepCollector
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame
 from sim_backends.direct.arm import DirectArm
@@ -51,7 +51,7 @@ def sweep(
         if 18 < len(taken) <= 28:
             meddle(arm)
 
-    collector = Collector(GEOMETRY, SCAN, keep, lambda fraction, text: None)
+    collector = SweepCollector(GEOMETRY, SCAN, keep, lambda fraction, text: None)
     swath = arm_sweep(ScanPlan(start, end, 0.03, 0.03), mover, devices, ERRORS, collector)
     truth = np.array([camera.shots[int(k)].base_from_flange[:3, 3] for k in swath.frame_ids])
     return swath, float(np.abs(swath.flanges[:, :3, 3] - truth).max())

@@ -28,7 +28,7 @@ from cell.procedures.steps.laser_sweep import UNCHECKED, _home, laser_sweep
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.frame_times import step_of_clock
 from cell.procedures.sweep.rail_sweep import rail_sweep
-from cell.procedures.sweep.swath import Collector, Swath, SweepErrors, TimeBound, shift_by_times
+from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors, TimeBound, shift_by_times
 from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame, Motion, Rail, RailState
@@ -79,7 +79,7 @@ def sweep(
         if len(taken) == 10:
             meddle(cell)
 
-    collector = Collector(GEOMETRY, scan, keep, lambda fraction, text: None)
+    collector = SweepCollector(GEOMETRY, scan, keep, lambda fraction, text: None)
     return rail_sweep(ScanPlan(pose, pose, 0.03, 0.05), mover, devices, errors, collector)
 
 

@@ -17,10 +17,10 @@ from cell.measure.calibration.drift.decision import Figure, Suspect
 from cell.measure.calibration.drift.pointing import WitnessCheck
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing
 from cell.measure.calibration.drift.slip import Slip
-from cell.measure.calibration.timing import Shutter, Timing
+from cell.measure.calibration.timing import Shutter, StampTiming
 from cell.measure.reconstruction.seams import Seam
-from cell.procedures.arm.touch import Touch, TouchCheck
-from cell.procedures.steps.drive_to_target import Arrival
+from cell.procedures.arm.touch import TouchCheck, TouchHeight
+from cell.procedures.steps.drive_to_target import VehicleArrival
 from lab.bench.job.whole_job import JobRecord
 
 SPREAD = np.diag(np.square([0.1e-3, 0.2e-3, 0.3e-3, 0.4e-3, 0.5e-3, 0.6e-3]))
@@ -44,7 +44,7 @@ def test_an_arrivals_figures(placed_pot: JobRecord) -> None:
     )
     shown(arrival.summary(), {"error_along_mm": 3.0, "error_across_mm": -2.0, "error_yaw_deg": 0.5})
     assert "driven" not in arrival.summary()
-    still = Arrival(pin.SE3.Identity(), arrival.fix, 3e-3, -2e-3, math.radians(0.5), 1, driven=False)
+    still = VehicleArrival(pin.SE3.Identity(), arrival.fix, 3e-3, -2e-3, math.radians(0.5), 1, driven=False)
     assert still.summary()["driven"] is False
     assert "3.0 mm along, -2.0 mm across and 0.50 deg" in still.told()
 
@@ -91,7 +91,7 @@ def test_a_clouds_and_a_places_figures(placed_pot: JobRecord) -> None:
 
 
 def test_what_the_part_felt(placed_pot: JobRecord) -> None:
-    touch = TouchCheck(Touch(0.05e-3, 0.03e-3), Touch(-0.01e-3, 0.04e-3))
+    touch = TouchCheck(TouchHeight(0.05e-3, 0.03e-3), TouchHeight(-0.01e-3, 0.04e-3))
     assert touch.as_dict() == {"felt_mm": 0.05, "expected_mm": -0.01, "off_mm": 0.06, "sigma_mm": 0.05}
     result = replace(placed_pot.results["place"], depth_error=-0.02e-3, touch=touch)
     shown(result.summary(), {"contact": True, "depth_error_mm": -0.02, "touch": touch.as_dict()})
@@ -103,7 +103,7 @@ def test_what_the_part_felt(placed_pot: JobRecord) -> None:
 def test_what_is_known_of_times_and_of_the_laser() -> None:
     link = {"scan_camera.driver": "stream"}
     assert Shutter(0.5e-3, 0.01e-3, link).summary() == {"readout_ms": 0.5, "sigma_ms": 0.01}
-    shown(Timing(1.5e-3, 0.05e-3, 8e-6, 1e-6, 0.4e-3, 0.02e-3, 0.25, 0.0, link).summary(), {
+    shown(StampTiming(1.5e-3, 0.05e-3, 8e-6, 1e-6, 0.4e-3, 0.02e-3, 0.25, 0.0, link).summary(), {
         "late_ms": 1.5, "sigma_ms": 0.05, "play_um": 8.0, "play_sigma_um": 1.0, "readout_ms": 0.4,
         "readout_sigma_ms": 0.02, "late_per_exposure": 0.25,
     })  # fmt: skip

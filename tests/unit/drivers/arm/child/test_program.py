@@ -13,7 +13,7 @@ import pytest
 from cell.run.faults import classify
 from drivers.arm.child import program
 from drivers.arm.child.program import ControlProgram, joints_off
-from drivers.arm.messages import Setup, Snapshot
+from drivers.arm.messages import ChildSetup, Snapshot
 from drivers.errors import (
     Aborted,
     CalibrationStale,
@@ -25,7 +25,7 @@ from drivers.errors import (
 )
 from statemachine.policy import Outcome
 
-SETUP = Setup("127.255.0.9", 1.0, (), (0.0, (0.0, 0.0, 0.0)), 0.15, 4.0)
+SETUP = ChildSetup("127.255.0.9", 1.0, (), (0.0, (0.0, 0.0, 0.0)), 0.15, 4.0)
 STILL = (0.0,) * 6
 
 

@@ -16,7 +16,7 @@ from cell.makes.vehicles import CanopenVehicleConfig
 from drivers.errors import ConfigError, DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.cia402.emergencies import meaning
-from drivers.vehicle.cia402.feedback import Feedback
+from drivers.vehicle.cia402.feedback import DriveFeedback
 from drivers.vehicle.cia402.geometry import WheelDrives
 from drivers.vehicle.cia402.objects import HEARTBEAT, MOTION, STATUS
 from drivers.vehicle.cia402.states import DriveState, leads_to_enabled, leads_to_switched_on, may_turn, state_of
@@ -77,7 +77,7 @@ def test_metres_a_second_become_numbers_of_the_drives() -> None:
 def test_readings_of_two_different_moments_are_not_one_pose() -> None:
     """One drive's reading is lost: each later pair is of one SYNC again, not left of one and right of the next."""
     clock = Hand()
-    feedback = Feedback("vehicle", clock, WHEELS, max_speed=0.5, max_yaw_rate=0.8, statistics=LinkStatistics())
+    feedback = DriveFeedback("vehicle", clock, WHEELS, max_speed=0.5, max_yaw_rate=0.8, statistics=LinkStatistics())
 
     def tell(node: int, count: int) -> None:
         clock.time += 0.001
@@ -102,7 +102,7 @@ class Told:
 
     def __init__(self, wheels: WheelDrives = WHEELS) -> None:
         self.clock = Hand()
-        self.feedback = Feedback(
+        self.feedback = DriveFeedback(
             "vehicle", self.clock, wheels, max_speed=0.5, max_yaw_rate=0.8, statistics=LinkStatistics()
         )
         for drive in self.feedback.drives:

@@ -17,7 +17,7 @@ from cell.motion.kinematics import ArmKinematics
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm import Safety
 from sim_backends.models.arm_motion import JointMove, LinearMove
-from sim_backends.models.vehicle import MOTOR_FAULT, Mode, State
+from sim_backends.models.vehicle import MOTOR_FAULT, ChassisState, Mode
 from sim_backends.world import nominal
 from sim_backends.world.bodies.arm_points import BODIES
 from sim_backends.world.bodies.collisions import DECK, Collisions
@@ -58,7 +58,7 @@ def test_a_vehicle_that_drives_into_the_table_stays_before_it_and_reports_an_exc
     advance(world, 10.0, speed=0.4)
     assert outline(world)[:, 0].max() == pytest.approx(-nominal.TABLE_HALF, abs=0.003)
     feedback = world.vehicle.feedback(world.clock.now())
-    assert feedback.state is State.EXCEPTION
+    assert feedback.state is ChassisState.EXCEPTION
     assert feedback.errors & MOTOR_FAULT
     assert all(feedback.drivers)
     met = truth(world)["collisions"]
@@ -74,11 +74,11 @@ def test_cleared_of_its_error_it_can_go_back_and_not_ahead(world: World) -> None
     world.vehicle.clear_errors(world.clock.now())
     advance(world, 1.0, speed=0.2)
     assert world.vehicle.planar(world.clock.now())[0] == pytest.approx(stood, abs=0.002)
-    assert world.vehicle.feedback(world.clock.now()).state is State.EXCEPTION
+    assert world.vehicle.feedback(world.clock.now()).state is ChassisState.EXCEPTION
     world.vehicle.clear_errors(world.clock.now())
     advance(world, 2.0, speed=-0.2)
     assert world.vehicle.planar(world.clock.now())[0] < stood - 0.2
-    assert world.vehicle.feedback(world.clock.now()).state is State.OK
+    assert world.vehicle.feedback(world.clock.now()).state is ChassisState.OK
 
 
 def test_a_vehicle_may_stand_a_millimetre_before_the_table_and_not_one_in_it() -> None:

@@ -11,7 +11,7 @@ import pytest
 from cell.apps.cli import main
 from cell.apps.cli.progress import ProgressDisplay
 from cell.run.files.folder import new_run
-from statemachine.journal import Journal, Request
+from statemachine.journal import Journal, RunRequest
 from statemachine.step import Event
 
 
@@ -50,7 +50,7 @@ def test_a_word_for_an_earlier_question_is_refused_and_the_present_one_is_shown(
     assert "does not wait for question 1 but for question 2: stopped while placing" in said
     assert waiting.take_requests() == []
     assert confirm(monkeypatch, "--question", "2") == 0
-    assert waiting.take_requests() == [Request("confirm", "Bob", 2)]
+    assert waiting.take_requests() == [RunRequest("confirm", "Bob", 2)]
 
 
 def test_without_a_number_the_question_that_waits_now_is_shown_and_that_one_is_answered(
@@ -58,7 +58,7 @@ def test_without_a_number_the_question_that_waits_now_is_shown_and_that_one_is_a
 ) -> None:
     assert confirm(monkeypatch) == 0
     assert "question 2: stopped while placing" in capsys.readouterr().out
-    assert waiting.take_requests() == [Request("confirm", "Bob", 2)]
+    assert waiting.take_requests() == [RunRequest("confirm", "Bob", 2)]
 
 
 @pytest.mark.parametrize(("typed", "code"), [("n\n", 1), ("y\n", 0)])

@@ -18,10 +18,10 @@ from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.measure.calibration.drift.decision import verdict
 from cell.measure.calibration.drift.detectability import detectable
-from cell.measure.calibration.drift.evidence import Evidence, evidence
+from cell.measure.calibration.drift.evidence import DriftEvidence, evidence
 from cell.measure.calibration.drift.hypotheses import SHIFT, hypotheses, log_factor
 from cell.measure.calibration.drift.reference import Reference
-from cell.measure.calibration.solve.blocks import BOARD, HAND, SHARED, State
+from cell.measure.calibration.solve.blocks import BOARD, HAND, SHARED, AdjustmentState
 from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.covariance import covariance_root
@@ -44,23 +44,27 @@ def calibrated():
     return cell, CellCalibration.solve(cell.collect_scan(), cell.collect_target(), {"arm": "1"}, CONFIG)
 
 
-def true_state(cell: ObservedCell, calibration: CellCalibration, chain: str) -> State:
+def true_state(cell: ObservedCell, calibration: CellCalibration, chain: str) -> AdjustmentState:
     t = cell.truth
     if chain == "target":
         lens = calibration.target.camera.with_parameters(t.target_lens)
-        return State(lens, None, np.zeros(3), from_matrix(t.flange_from_target), from_matrix(t.base_from_large))
+        return AdjustmentState(
+            lens, None, np.zeros(3), from_matrix(t.flange_from_target), from_matrix(t.base_from_large)
+        )
     lens, plane = calibration.scan.camera.with_parameters(t.scan_lens), LightPlane.of(t.plane_normal, t.plane_distance)
-    return State(lens, plane, t.rail_direction, from_matrix(t.flange_from_scan), from_matrix(t.base_from_fine))
+    return AdjustmentState(
+        lens, plane, t.rail_direction, from_matrix(t.flange_from_scan), from_matrix(t.base_from_fine)
+    )
 
 
 def test_the_least_shift_is_that_of_the_noncentral_chi_square():
     # One hypothesis of three equally well known parameters: its statistic is a monotone function of a χ² of three.
     camera = CameraModel(1280, 1024, 1500.0, 1500.0, 639.5, 511.5, (0.0,) * 5)
-    state = State(camera, None, np.zeros(3), from_matrix(np.eye(4)), from_matrix(np.eye(4)))
+    state = AdjustmentState(camera, None, np.zeros(3), from_matrix(np.eye(4)), from_matrix(np.eye(4)))
     information = np.zeros((SHARED, SHARED))
     index, known = np.arange(HAND.start, HAND.start + 3), 1 / (0.1 * SHIFT) ** 2
     information[index, index] = known
-    weighed = Evidence(np.zeros(SHARED), information, 1.0, float("nan"))
+    weighed = DriftEvidence(np.zeros(SHARED), information, 1.0, float("nan"))
     shift = hypotheses("target", camera.fx)[0]
     rng = np.random.default_rng(4)
     scores = np.zeros((8000, SHARED))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.measure.calibration.drift.reference_plate import LARGEST_RAD, Pointing, Witness, pointing, turned
+from cell.measure.calibration.drift.reference_plate import LARGEST_RAD, PlateLine, Pointing, pointing, turned
 from cell.measure.calibration.drift.roll import rolled
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane, triangulate
@@ -45,7 +45,7 @@ def seen(
     rows: int = 480,
     off: float = 0.0,
     laser: LaserOptics | None = None,
-) -> Witness:
+) -> PlateLine:
     """The line on a plate 85 mm away and `off` m more, tilted by 3°, with noise, the whole picture `shift` px aside."""
     plate = np.eye(4)
     plate[:3, 3] = -0.0107, 0.0, 0.085 + off
@@ -56,7 +56,7 @@ def seen(
     columns = np.full(480, np.nan)
     columns[found.rows] = found.columns + shift + SIGMA * np.random.default_rng(seed).standard_normal(len(found.rows))
     columns[rows:] = np.nan
-    return Witness(0.0, columns, np.full(480, SIGMA))
+    return PlateLine(0.0, columns, np.full(480, SIGMA))
 
 
 @pytest.mark.parametrize("angle", [0.5e-3, -0.2e-3, 0.0])
@@ -128,10 +128,10 @@ def test_a_witness_that_is_covered_is_refused() -> None:
 
 def test_it_is_kept_with_the_calibration() -> None:
     witness = seen(0.0, 9)
-    again = Witness.read(witness.as_dict())
+    again = PlateLine.read(witness.as_dict())
     assert again is not None
     assert np.array_equal(again.columns, witness.columns, equal_nan=True)
-    assert Witness.read(None) is None
+    assert PlateLine.read(None) is None
     assert "mrad" in Pointing(0.4e-3, 0.02e-3).words
 
 

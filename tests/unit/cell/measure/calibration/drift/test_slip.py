@@ -10,7 +10,7 @@ import pytest
 
 from cell.config.cell_config import load_config
 from cell.devices.simulated.direct import VirtualCell
-from cell.measure.calibration.drift.reference_plate import Witness
+from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.calibration.drift.slip import LARGEST_LAG_S, LARGEST_M, NOTED_M, Slip, slip_since
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
@@ -27,7 +27,7 @@ def let_go(what: str, frame: Frame) -> None:
     """No picture is kept."""
 
 
-def looked(cell: VirtualCell, before: Witness | None = None) -> Witness:
+def looked(cell: VirtualCell, before: PlateLine | None = None) -> PlateLine:
     now = require_witness(CONFIG, cell.devices, let_go)
     if before is not None:
         return require_edge(CONFIG, cell.devices, let_go, before, now)
@@ -35,7 +35,7 @@ def looked(cell: VirtualCell, before: Witness | None = None) -> Witness:
 
 
 @pytest.fixture(scope="module")
-def cell() -> tuple[VirtualCell, Witness, Callable[[Witness], Slip]]:
+def cell() -> tuple[VirtualCell, PlateLine, Callable[[PlateLine], Slip]]:
     """A simulated cell, what it shows of the plate, and how a later look is held against that."""
     cell = VirtualCell(CONFIG, 3, "nominal")
     cell.devices.vehicle.brake()
@@ -137,7 +137,7 @@ def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell) -> None:
     virtual, before, since = cell
     camera, seen = virtual.scan_camera.model, []
 
-    def lose(after: Callable[[int], bool]) -> Witness:
+    def lose(after: Callable[[int], bool]) -> PlateLine:
         def keep(what: str, frame: Frame) -> None:
             if what == "witness-edge":
                 seen.append(frame)
@@ -209,5 +209,5 @@ def test_a_job_says_what_its_plate_does_not_show(cell) -> None:
 
 def test_it_is_kept_with_the_calibration(cell) -> None:
     before = cell[1]
-    again = Witness.read(before.as_dict())
+    again = PlateLine.read(before.as_dict())
     assert again is not None and again.edge == before.edge

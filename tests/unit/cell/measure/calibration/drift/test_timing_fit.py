@@ -31,7 +31,7 @@ from cell.measure.calibration.drift.timing_fit import (
     roughly_late,
 )
 from cell.measure.calibration.solve.results import KEPT, Quality, TargetCalibration
-from cell.measure.calibration.timing import Shutter, Timing
+from cell.measure.calibration.timing import Shutter, StampTiming
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.inversion import NominalSurface
@@ -52,7 +52,7 @@ CAMERA = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)
 BOARD = parse_board("chessboard:9x7:3mm")
 FAR_MM = 130.0
 MOST_LATE_S, LEAD_M = 2e-3, 2e-3
-FOUND = Timing(1.4e-3, 0.05e-3, 10e-6, 2e-6, 0.0, 1e-5, 0.0, 1e9, link_of(CONFIG))
+FOUND = StampTiming(1.4e-3, 0.05e-3, 10e-6, 2e-6, 0.0, 1e-5, 0.0, 1e9, link_of(CONFIG))
 
 
 def calibration() -> ScanCalibration:
@@ -232,7 +232,7 @@ def test_it_is_stored_with_the_calibration() -> None:
     assert ScanCalibration.from_dict(head.as_dict()).timing == FOUND
     assert "timing" not in calibration().as_dict()
     with pytest.raises(ValueError, match="time stamps"):
-        Timing.read(FOUND.as_dict() | {"sigma": 0.0})
+        StampTiming.read(FOUND.as_dict() | {"sigma": 0.0})
 
 
 SPOILT = [{"sigma": 0.0}, {"late": float("nan")}, {"late": "much"}, {"link": None}, {"made": None}]
@@ -285,12 +285,12 @@ def test_a_sweep_puts_late_stamps_back_and_is_surer_of_its_place() -> None:
     assert shares[1] < 0.005e-3
 
 
-def measured(made: CellCalibration, seed: int, level: str, folder: Path) -> Timing:
+def measured(made: CellCalibration, seed: int, level: str, folder: Path) -> StampTiming:
     """What the simulated cell of `seed` finds."""
     cell = VirtualCell(CONFIG, seed, level)
     job, _ = load_job("pot")
 
-    def look(hands: Hands) -> Timing:
+    def look(hands: Hands) -> StampTiming:
         cell.devices.interlocks.work_with(made.configuration)
         cell.devices.vehicle.brake()
         mover = Mover(cell.devices.arm, cell.clock, CONFIG, job, hands.safe_point)

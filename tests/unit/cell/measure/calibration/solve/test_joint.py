@@ -12,7 +12,7 @@ import pytest
 
 from cell.measure.calibration import Priors, ScanObservation, TargetObservation, calibrate_scan, calibrate_target
 from cell.measure.calibration.solve.adjustment import Adjustment, shared_mask
-from cell.measure.calibration.solve.blocks import COLUMNS, OWN, SHARED, State, dots_block, stripe_block
+from cell.measure.calibration.solve.blocks import COLUMNS, OWN, SHARED, AdjustmentState, dots_block, stripe_block
 from cell.measure.calibration.solve.hand_eye import refine_hand_eye, solve_hand_eye
 from cell.measure.calibration.solve.joint import solve_joint, solve_staged, start_state, view_data
 from cell.measure.calibration.solve.results import PARAMETERS, ScanCalibration
@@ -108,7 +108,7 @@ def test_block_jacobians_are_those_of_finite_differences():
     state = replace(start_state(staged), flanges=[view.base_from_flange], rails=np.array([0.03]))
 
     def residuals(step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        s: State = state.moved(step)
+        s: AdjustmentState = state.moved(step)
         dots = dots_block(s, view, s.flanges[0], float(s.rails[0]))[0].ravel()
         return dots, stripe_block(s, view, s.flanges[0], float(s.rails[0]))[0]
 

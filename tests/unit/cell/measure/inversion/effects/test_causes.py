@@ -11,7 +11,7 @@ import pytest
 
 from cell.measure.inversion.effects.causes import Cause, find_causes, likeliest
 from cell.measure.reconstruction import Cloud
-from cell.procedures.steps.invert_pose import Lines
+from cell.procedures.steps.invert_pose import LineTimes
 from cell.procedures.steps.invert_pose import invert_pose as step
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord, run_whole_job
@@ -97,7 +97,7 @@ def causes(record: JobRecord, cloud: Cloud) -> tuple[list[Cause], str]:
     try:
         scan = replace(made["reconstruct"], cloud=cloud)
         pose = step(
-            scan, made["board_photo"], job, nominal, record.kinematic, Lines(sweep.times, VEHICLE)
+            scan, made["board_photo"], job, nominal, record.kinematic, LineTimes(sweep.times, VEHICLE)
         ).base_from_surface
     except RefusedError as refused:
         pose, text = refused.seen["pose"], str(refused)

@@ -11,7 +11,7 @@ from cell.measure.geometry.poses import difference
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.effects.droop import Droop, Head
 from cell.measure.reconstruction.cloud import Cloud
-from cell.procedures.steps.invert_pose import Lines
+from cell.procedures.steps.invert_pose import LineTimes
 from cell.procedures.steps.invert_pose import invert_pose as step
 from drivers.errors import NotObservable
 from lab.bench.job.whole_job import JobRecord
@@ -34,7 +34,7 @@ def inverted(record: JobRecord, sag: float) -> PlacePose:
     points[lines, rows] -= Droop(sag, 0.0, head_of(record, cloud)).motions(cloud, lines, rows).sum(axis=2)
     bent = replace(cloud, points=points)
     vehicle = CONFIG.arm.vehicle_from_base.se3().inverse()
-    taken = Lines(sweep.times, vehicle, head_of(record, bent))
+    taken = LineTimes(sweep.times, vehicle, head_of(record, bent))
     assert record.kinematic is not None
     return step(replace(made["reconstruct"], cloud=bent), made["board_photo"], job, nominal, record.kinematic, taken)
 

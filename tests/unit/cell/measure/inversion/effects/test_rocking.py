@@ -21,7 +21,7 @@ from cell.measure.inversion.effects.rocking import (
 )
 from cell.measure.reconstruction.cloud import Cloud, merge
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.steps.invert_pose import Lines
+from cell.procedures.steps.invert_pose import LineTimes
 from cell.procedures.steps.invert_pose import invert_pose as step
 from cell.procedures.steps.reconstruct import Reconstruction
 from drivers.errors import RefusedError
@@ -196,4 +196,4 @@ def inverted(cloud: Cloud) -> PlacePose:
         return np.zeros((len(lines), 3, 1))
 
     scan = Reconstruction(cloud, (), still, still)
-    return step(scan, fix, JOB, NOMINAL, np.zeros((6, 6)), Lines(TIMES, VEHICLE))
+    return step(scan, fix, JOB, NOMINAL, np.zeros((6, 6)), LineTimes(TIMES, VEHICLE))

@@ -12,7 +12,7 @@ from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.arm.rtde.registers import Registers
 from sim_backends.peers.arm.script.port import robot_mode, robot_state, version_message
-from sim_backends.peers.arm.script.script import ControlProgram, RuntimeState
+from sim_backends.peers.arm.script.script import ProgramMemory, RuntimeState
 
 TICK = 0.002
 GOAL = [1.0, -1.57, -1.57, -1.57, 1.57, 0.0]
@@ -27,7 +27,7 @@ class Controller:
     def __init__(self) -> None:
         self.model = ArmModel(ArmParams(), np.random.default_rng(1), WorldClock())
         self.registers = Registers()
-        self.program = ControlProgram(self.model, self.registers)
+        self.program = ProgramMemory(self.model, self.registers)
 
     def run(self, seconds: float, held_up: bool = False) -> None:
         for _ in range(round(seconds / TICK)):

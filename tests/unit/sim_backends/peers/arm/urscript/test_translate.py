@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.peers.arm.rtde.registers import Registers
-from sim_backends.peers.arm.script.script import ControlProgram, RuntimeState
-from sim_backends.peers.arm.urscript.words import Collector
+from sim_backends.peers.arm.script.script import ProgramMemory, RuntimeState
+from sim_backends.peers.arm.urscript.words import ScriptCollector
 
 TICK = 0.002
 
@@ -24,7 +24,7 @@ class Controller:
     def __init__(self) -> None:
         self.model = ArmModel(ArmParams(), np.random.default_rng(1), WorldClock())
         self.registers = Registers()
-        self.program = ControlProgram(self.model, self.registers)
+        self.program = ProgramMemory(self.model, self.registers)
 
     def cycles(self, count: int) -> None:
         for _ in range(count):
@@ -393,10 +393,10 @@ def test_a_script_talks_with_a_server_and_only_on_loopback(controller: Controlle
 
 def test_texts_are_taken_whole_however_they_arrive() -> None:
     text = "def a():\n  def b():\n  if True:\n sync()\nend\nend\nb()\nend\n"
-    collector = Collector()
+    collector = ScriptCollector()
     whole = [one for byte in (text + "movej([0])\n").encode() for one in collector.feed(bytes([byte]))]
     assert whole == [text, "movej([0])\n"]
-    assert Collector(longest=100).feed(b"def a():\n" + b"x" * 200) == []
+    assert ScriptCollector(longest=100).feed(b"def a():\n" + b"x" * 200) == []
 
 
 def test_actual_values_are_those_of_the_arm(controller: Controller) -> None:

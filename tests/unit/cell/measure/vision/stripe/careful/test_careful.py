@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from cell.measure.vision import Laser, Mark, PictureRefused, read_colours, read_picture, read_stripe
+from cell.measure.vision import LaserChannel, Mark, PictureRefused, read_colours, read_picture, read_stripe
 from cell.measure.vision.stripe.careful.careful import Careful
 from cell.measure.vision.stripe.careful.segments import fill_gaps
 from cell.measure.vision.stripe.extract import extract
@@ -109,7 +109,7 @@ def test_a_core_that_is_saturated_in_one_channel_is_read_in_another():
     profile = extract(image)
     assert not profile.saturated.any()
     assert np.sqrt(np.nanmean((profile.centres - centres) ** 2)) < 0.02
-    assert extract(image, laser=Laser.RED).saturated.all()
+    assert extract(image, laser=LaserChannel.RED).saturated.all()
 
 
 def test_alpha_is_left_out_and_equal_channels_are_grey():
