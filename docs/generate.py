@@ -207,7 +207,8 @@ def command_line() -> str:
     text = "# Command line\n\n" + NOTE
     text += "Exit codes: 0 success, 1 a refused or failed run, 2 a wrong command line, configuration or job, "
     text += "130 an interrupt.\n"
-    text += "`cell COMMAND --help` prints the same.\n\n"
+    text += "`cell COMMAND --help` prints the same. `cell --version` names the version. `cell --install-completion` "
+    text += "completes commands, runs, jobs, devices, steps and faults in your shell.\n\n"
     for path, command in commands(typer.main.get_command(app), "cell "):
         text += f"## {path}\n\n" + re.sub(r"\s*\n\s*", " ", (command.help or "").split("\f")[0].strip()) + "\n\n"
         shown = [each for each in command.params if not getattr(each, "hidden", False) and each.name != "help"]
