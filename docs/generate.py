@@ -305,6 +305,8 @@ def add(found: Causes, code: str, what: str, recoverable: ast.AST | None, hint: 
 
 def faults() -> str:
     """The page of fault codes."""
+    from cell.run.faults import CONFIRMED_BY_A_PERSON
+
     text = "# Fault codes\n\n" + NOTE
     text += "The texts are those of the source; … stands for a value. "
     text += "[Recover from a fault](../how-to/recover.md) says how.\n\n"
@@ -313,6 +315,7 @@ def faults() -> str:
         text += f"## {device}\n\n" + table("code", "what happened", "recovered by", "what to do")
         for code in sorted(code for code in found if code.split(".")[0] == device):
             what, who, hint = ("<br>".join(sorted(each)) for each in found[code])
+            who = "the program, after a person confirms" if code in CONFIRMED_BY_A_PERSON else who
             text += row(f"`{code}`", what or "see the message", who, hint)
         text += "\n"
     return text

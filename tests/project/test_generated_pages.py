@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import re
 from typing import Any
 
 import pytest
 
+import cell
 from tests.support import ROOT
 
 
@@ -33,3 +35,14 @@ def test_fault_codes_have_what_happened_and_what_to_do() -> None:
     assert {"rail.reset", "arm.protective_stop", "camera.late_readings", "laser.relay"} <= faults.keys()
     what, who, hint = faults["rail.reset"]
     assert any("lost its zero" in text for text in what) and who == {"the program"} and any("Home" in h for h in hint)
+
+
+def test_a_protective_stop_is_not_cleared_without_a_person() -> None:
+    (row,) = [line for line in generator().faults().splitlines() if line.startswith("| `arm.protective_stop`")]
+    assert "after a person confirms" in row
+
+
+def test_the_page_of_the_public_python_has_every_name_of_the_door() -> None:
+    page = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^::: cell\.(\w+)$", page, re.MULTILINE)) == sorted(cell.__all__)
+    assert len(cell.__all__) <= 60
