@@ -1,16 +1,41 @@
-"""The cell: configuration, geometry, vision, calibration, reconstruction, inversion, motion, steps, supervisor.
+"""The public door of the cell: `from cell import Cell` is the supervisor's way in.
 
-`from cell import Cell` is the supervisor's way in, and `from cell import RefusedError` gets any error of the one tree
-in `drivers.errors`; both are imported when they are first asked for.
+Each name is imported when it is first asked for: the supervisor, runs and their events, scripts, steps and kinds of
+jobs, makes of devices, and the errors of the one tree in `drivers.errors`.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cell.run.job_run import RunOutcome as RunOutcome
-    from cell.run.session.supervisor import Cell as Cell
+    from cell.base.units import quantity, whole
+    from cell.makes.built_in import ArmOutputClawConfig, OnArm
+    from cell.makes.make import Make, Surroundings
+    from cell.makes.records import ArmConfig, CameraConfig, ClawConfig, LaserConfig, RailConfig, VehicleConfig
+    from cell.procedures.arm.photograph import BoardFix
+    from cell.procedures.steps.kinds import PLACE, Kind
+    from cell.procedures.steps.step import JobStep
+    from cell.run.events import (
+        Confirmed,
+        ConfirmNeeded,
+        FaultMet,
+        GoesOn,
+        Held,
+        Noted,
+        RunEnded,
+        RunEvent,
+        SafeStopped,
+        StateChanged,
+        StepDone,
+        StepFailed,
+        StepProgress,
+        StepStarted,
+    )
+    from cell.run.job_run import RunOutcome
+    from cell.run.run import Run
+    from cell.run.session.supervisor import Cell
     from drivers.errors import (
         Aborted,
         CalibrationStale,
@@ -26,49 +51,92 @@ if TYPE_CHECKING:
         NotObservable,
         RefusedError,
     )
-    from statemachine.script import Again as Again
-    from statemachine.script import Script as Script
+    from statemachine.policy import Step
+    from statemachine.script import Again, Script
+
+_PLACES = {
+    "cell.run.session.supervisor": ("Cell",),
+    "cell.run.job_run": ("RunOutcome",),
+    "cell.run.run": ("Run",),
+    "cell.run.events": (
+        "ConfirmNeeded", "Confirmed", "FaultMet", "GoesOn", "Held", "Noted", "RunEnded", "RunEvent", "SafeStopped",
+        "StateChanged", "StepDone", "StepFailed", "StepProgress", "StepStarted",
+    ),
+    "statemachine.script": ("Again", "Script"),
+    "statemachine.policy": ("Step",),
+    "cell.procedures.steps.step": ("JobStep",),
+    "cell.procedures.steps.kinds": ("Kind", "PLACE"),
+    "cell.procedures.arm.photograph": ("BoardFix",),
+    "cell.makes.built_in": ("ArmOutputClawConfig", "OnArm"),
+    "cell.makes.make": ("Make", "Surroundings"),
+    "cell.makes.records": (
+        "ArmConfig", "CameraConfig", "ClawConfig", "LaserConfig", "RailConfig", "VehicleConfig",
+    ),
+    "cell.base.units": ("quantity", "whole"),
+    "drivers.errors": (
+        "Aborted", "CalibrationStale", "CellError", "ConfigError", "DeadlineError", "DeviceError", "DeviceFault",
+        "InterlockError", "Interrupted", "LimitError", "NotConnectedError", "NotObservable", "RefusedError",
+    ),
+}  # fmt: skip
 
 __all__ = [
+    "PLACE",
     "Aborted",
     "Again",
+    "ArmConfig",
+    "ArmOutputClawConfig",
+    "BoardFix",
     "CalibrationStale",
+    "CameraConfig",
     "Cell",
     "CellError",
+    "ClawConfig",
     "ConfigError",
+    "ConfirmNeeded",
+    "Confirmed",
     "DeadlineError",
     "DeviceError",
     "DeviceFault",
+    "FaultMet",
+    "GoesOn",
+    "Held",
     "InterlockError",
     "Interrupted",
+    "JobStep",
+    "Kind",
+    "LaserConfig",
     "LimitError",
+    "Make",
     "NotConnectedError",
     "NotObservable",
+    "Noted",
+    "OnArm",
+    "RailConfig",
     "RefusedError",
+    "Run",
+    "RunEnded",
+    "RunEvent",
     "RunOutcome",
+    "SafeStopped",
     "Script",
+    "StateChanged",
+    "Step",
+    "StepDone",
+    "StepFailed",
+    "StepProgress",
+    "StepStarted",
+    "Surroundings",
+    "VehicleConfig",
+    "quantity",
+    "whole",
 ]
 
 
 def __getattr__(name: str) -> object:
-    if name not in __all__:
-        raise AttributeError(f"module 'cell' has no attribute {name!r}")
-    match name:
-        case "Cell":
-            from cell.run.session.supervisor import Cell
-
-            return Cell
-        case "RunOutcome":
-            from cell.run.job_run import RunOutcome
-
-            return RunOutcome
-        case "Again" | "Script":
-            from statemachine import script
-
-            return getattr(script, name)
-    from drivers import errors
-
-    return getattr(errors, name)
+    for place, names in _PLACES.items():
+        if name in names:
+            return getattr(import_module(place), name)
+    raise AttributeError(f"module 'cell' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:

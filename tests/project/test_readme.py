@@ -1,4 +1,4 @@
-"""What the README shows is what the project does."""
+"""What the README and the pages of docs/ show is what the project does."""
 
 from __future__ import annotations
 
@@ -9,31 +9,56 @@ from typing import Any
 import pytest
 import typer
 
+import cell
 import lab.cli
 from cell.apps.cli.app import app
 from cell.procedures.steps.kinds import PLACE
 from statemachine.sequence import mermaid
 from tests.support import ROOT
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md"))]
 
 
-def block(language: str) -> str:
+def blocks(language: str, page: str = "README.md") -> list[str]:
+    """The fenced blocks of a language, of the README or of another page; indented ones as well."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    return re.findall(rf"^ *```{language}\n(.*?)^ *```", text, re.DOTALL | re.MULTILINE)
+
+
+def block(language: str, page: str = "README.md") -> str:
     """The first fenced block of a language."""
-    found = re.search(rf"```{language}\n(.*?)```", README, re.DOTALL)
-    assert found is not None
-    return found.group(1)
+    return blocks(language, page)[0]
 
 
 def command_lines() -> list[str]:
-    """Every `cell …` of the shell blocks, without comments and optional brackets."""
-    text = "\n".join(re.findall(r"```sh\n(.*?)```", README, re.DOTALL))
+    """Every `cell …` of the shell blocks, each once, without comments and optional brackets."""
+    text = "\n".join(part for page in PAGES for part in blocks("sh", page))
     parts = re.split(r"[;\n]|&&", re.sub(r"#.*", "", text))
-    return [re.sub(r"[\[\]]", "", part).strip() for part in parts if part.strip().startswith("cell ")]
+    return sorted({re.sub(r"[\[\]]", "", part).strip() for part in parts if part.strip().startswith("cell ")})
 
 
 def test_the_diagram_is_current() -> None:
-    assert block("mermaid").strip() == mermaid(PLACE.sequence()).strip()
+    assert block("mermaid", "docs/explanation/sequence.md").strip() == mermaid(PLACE.sequence()).strip()
+
+
+def test_the_readme_is_short() -> None:
+    text = (ROOT / "README.md").read_bytes()
+    assert len(text.splitlines()) <= 150
+    assert len(text) <= 9000
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if page == "README.md" or page.startswith("docs/tutorials/")])
+def test_a_beginner_imports_from_the_public_door_alone(page: str) -> None:
+    code = "\n".join([*blocks("py", page), *blocks("python", page)])
+    assert re.findall(r"^\s*(?:from|import) cell\.\w+", code, re.MULTILINE) == []
+    for names in re.findall(r"^\s*from cell import (.+)$", code, re.MULTILINE):
+        assert {name.strip() for name in names.split(",")} <= set(cell.__all__)
+
+
+def test_the_relative_links_of_the_readme_lead_somewhere() -> None:
+    links = re.findall(r"\]\((?!http)([^)#]+)", (ROOT / "README.md").read_text(encoding="utf-8"))
+    assert len(links) > 20
+    assert [link for link in links if not (ROOT / link).exists()] == []
 
 
 @pytest.mark.parametrize("line", command_lines())
