@@ -21,7 +21,7 @@ from cell.devices.gated_laser import UNATTENDED_S
 from cell.devices.interlocks import Command
 from cell.devices.jogging import jog, parse_jog
 from cell.devices.rules import RULES, markdown
-from cell.devices.ways import LINE_STEP_RAD, Ways
+from cell.devices.ways import LINE_STEP_M, LINE_STEP_RAD, Ways
 from cell.geometry.poses import from_parts, from_ur, to_ur
 from cell.job import job_path
 from cell.motion.bodies import BASE, FLANGE, block, tool_bodies
@@ -403,19 +403,18 @@ def test_a_raw_move_into_the_cells_own_bodies_is_refused(world: VirtualCell, dev
     assert world.world.collisions.found == ()
 
 
-def test_a_straight_line_is_checked_all_the_way_in_even_steps_as_it_turns() -> None:
+@pytest.mark.parametrize("turn", [0.3, 0.0])
+def test_a_straight_line_is_checked_all_the_way_in_even_steps_as_it_turns(turn: float) -> None:
     """Its poses lie on the line and turn evenly about one axis, no farther apart than a collision check may skip."""
-    ways = Ways(CONFIG)
+    ways, shift = Ways(CONFIG), np.array([0.0, -0.03, 0.08])
     begin = ways.forward(HOME)
-    goal = from_parts(
-        begin.translation + np.array([0.0, -0.03, 0.08]), pin.exp3(np.array([0.0, 0.3, 0.0])) @ begin.rotation
-    )
+    goal = from_parts(begin.translation + shift, pin.exp3(np.array([0.0, turn, 0.0])) @ begin.rotation)
     line = [ways.forward(joints) for joints in ways._way(HOME, Command("arm", "move_linear", {"flange": to_ur(goal)}))]
-    assert len(line) >= 0.3 / LINE_STEP_RAD
+    assert len(line) >= max(turn / LINE_STEP_RAD, np.linalg.norm(shift) / LINE_STEP_M)
     for k, pose in enumerate(line, start=1):
         share = k / len(line)
-        np.testing.assert_allclose(pose.translation, begin.translation + share * np.array([0, -0.03, 0.08]), atol=1e-5)
-        np.testing.assert_allclose(pin.log3(pose.rotation @ begin.rotation.T), [0.0, 0.3 * share, 0.0], atol=1e-5)
+        np.testing.assert_allclose(pose.translation, begin.translation + share * shift, atol=1e-5)
+        np.testing.assert_allclose(pin.log3(pose.rotation @ begin.rotation.T), [0.0, turn * share, 0.0], atol=1e-5)
 
 
 def test_raw_moves_are_checked_against_the_station_until_the_vehicle_may_drive(devices: Devices) -> None:

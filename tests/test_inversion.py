@@ -19,6 +19,7 @@ from cell.inversion import Demands, NominalSurface, PlacePose, Prior, Tolerance,
 from cell.inversion.correspondences import Scan
 from cell.inversion.motions import name as motion_name
 from cell.inversion.motions import sorted_out
+from cell.inversion.observability import judge
 from cell.inversion.registration import register
 from cell.lab.bench.inversion_parts import PARTS
 from cell.lab.bench.inversion_parts import nominal as part_surface
@@ -447,6 +448,22 @@ def test_a_screw_is_named_with_its_pitch() -> None:
     assert words == "rotation about the z axis of the surface frame with +20.0 mm/rad along it"
 
 
+def test_a_verdict_names_what_is_known_worst_with_three_of_its_deviations() -> None:
+    sigmas = np.array([0.1e-3, 0.15e-3, 0.1e-3, 1e-3, 1e-3, 1e-3])
+    known = judge(np.diag(sigmas**2), 1e9 * np.eye(6), 1.0, 1, 0.02, JOB)
+    assert known.observable
+    assert known.worst.words.startswith("translation along the y axis of the surface frame is known: 3σ 0.45 mm ≤ 0.6")
+    sigmas[[1, 5]] = 0.5e-3, 4e-3
+    verdict = judge(np.diag(sigmas**2), 1e9 * np.eye(6), 1.0, 1, 0.02, JOB)
+    assert [motion.words for motion in verdict.weak] == [
+        "translation along the y axis of the surface frame is not determined: 3σ 1.5 mm > 0.6 mm",
+        "rotation about the z axis of the surface frame is not determined: 3σ 12 mrad > 6 mrad",
+    ]
+    assert [motion.excess for motion in verdict.weak] == pytest.approx([2.5, 2.0])
+    for motion in verdict.weak:
+        assert (motion.shift.shape, motion.turn.shape) == ((3,), (3,))
+
+
 def test_motions_mixed_at_will_are_sorted_into_plain_ones() -> None:
     plain = np.zeros((6, 3))
     plain[0, 0] = plain[1, 1] = plain[5, 2] = 1.0
@@ -455,6 +472,7 @@ def test_motions_mixed_at_will_are_sorted_into_plain_ones() -> None:
     expected = {0: 1.0, 1: 1.0, 5: 1.0}
     assert len(found) == 3
     for motion in found:
+        assert motion.shape == (6,)
         axis = int(np.argmax(np.abs(motion)))
         assert abs(motion[axis]) == pytest.approx(expected.pop(axis), abs=1e-9)
         assert np.abs(np.delete(motion, axis)).max() < 1e-9

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cell.geometry.poses import difference
 from cell.inversion import Prior, invert_pose
 from cell.inversion.correspondences import Scan
-from cell.inversion.dissent import Dissent, dissent
+from cell.inversion.dissent import Dissent, _beyond_noise, dissent
 from cell.inversion.registration import register
 from cell.lab.bench.inversion import task
 from cell.lab.bench.inversion_parts import PARTS, nominal
@@ -44,6 +44,14 @@ def test_a_quarter_that_is_tilted_is_found_with_its_angle() -> None:
     assert found.turn == pytest.approx(0.006, rel=0.1)
     assert found.shift == pytest.approx(0.006 * -EDGE, rel=0.15)
     assert found.middle[0] < EDGE
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_motion_along_any_axis_counts_beyond_three_sigma(axis: int) -> None:
+    allowed = TOLERANCE.translation if axis < 3 else TOLERANCE.rotation
+    motion, spread = np.zeros(6), np.zeros((6, 1))
+    motion[axis], spread[axis] = 2.0 * allowed, 0.25 * allowed
+    assert _beyond_noise(motion, spread, TOLERANCE) == pytest.approx(2.0 - 3 * 0.25)
 
 
 def test_noise_alone_is_no_dissent() -> None:
