@@ -16,6 +16,7 @@ from cell.inversion import NominalSurface
 from cell.job import load_job
 from cell.lab.bench.whole_job import NoFrames
 from cell.motion.collision import CollisionError
+from cell.motion.trajectory import Trajectory
 from cell.run.resumption import UnfinishedRun
 from cell.steps import drive_to_target
 from cell.steps.kinds import PLACE
@@ -142,6 +143,24 @@ def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat() 
     clear = int(np.argmax(up[rise] > 0.8 * JOB.place.approach))
     beside = way[rise][:clear] - np.outer(up[rise][:clear], normal())
     assert np.linalg.norm(beside, axis=1).max() < 1e-3, "straight up from the part before the arm folds"
+    np.testing.assert_allclose(site.mover.joints, HOME, atol=2e-3)
+
+
+def test_a_straight_line_gains_its_speed_gently() -> None:
+    """At most by its speed in a third of a second, planned beforehand or not."""
+    mover, speed = Site().mover, 0.05
+    lines: list[Trajectory] = []
+    mover.follow = lambda line, force_limit=None: bool(lines.append(line))  # type: ignore[method-assign]
+    start = mover.kinematics.fk(mover.joints)
+    goal = from_parts((0.0, 0.0, 0.03)) * start
+    mover.line(goal, speed)
+    for line in (*lines, mover.plan_line(start, goal, speed)[1]):
+        times = np.linspace(0.0, line.duration, 200)
+        joints = [np.interp(times, line.times, line.joints[:, k]) for k in range(6)]
+        way = np.array([mover.kinematics.fk(each).translation for each in np.transpose(joints)])
+        fast = np.linalg.norm(np.diff(way, axis=0), axis=1) / np.diff(times)
+        assert fast.max() == pytest.approx(speed, rel=0.02)
+        assert times[np.argmax(fast > 0.9 * speed)] > 0.9 / 3
 
 
 def test_what_the_force_sensor_showed_before_the_descent_is_no_touch() -> None:

@@ -25,7 +25,7 @@ from cell.lab.bench.whole_job import JobRecord, NoFrames, run_whole_job
 from cell.reconstruction import Cloud, flange_motions, merge
 from cell.reconstruction.cloud import Filled
 from cell.steps.kinds import PLACE
-from cell.steps.second_look import LINES, SecondLook, require_in_place, require_points, sparse
+from cell.steps.second_look import LINES, SecondLook, by_times, require_in_place, require_points, sparse
 from cell.steps.swath import MAX_LOST_FRACTION
 from cell.steps.touch import felt_touch
 from drivers.errors import CellError, DeviceFault, LimitError, RefusedError
@@ -208,6 +208,14 @@ def test_what_late_replies_and_the_lines_leave_open_is_known(placed_pot: JobReco
     (note,) = site.look_again().notes
     assert len(site.cell.target_camera.shots) > taken
     assert re.search(r"translation along the x axis of the surface frame shows from 0\.\d+ mm on.* nobody touch", note)
+
+
+def test_what_late_replies_leave_open_lies_along_the_sweep_and_is_even(placed_pot: JobRecord) -> None:
+    (swath,) = placed_pot.results["laser_sweep"].swaths
+    along = 0.15e-3 * swath.builder.sweep_direction(swath.base_from_flange)
+    expected = np.zeros((6, 6))
+    expected[:3, :3] = np.outer(along, along) / 3
+    np.testing.assert_allclose(by_times(replace(swath, shift=0.15e-3)), expected)
 
 
 def test_after_a_pause_it_is_looked_at_anew(placed_pot: JobRecord, tmp_path: Path) -> None:
