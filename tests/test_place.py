@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -20,13 +21,14 @@ from cell.motion.trajectory import Trajectory
 from cell.run.resumption import UnfinishedRun
 from cell.steps import drive_to_target
 from cell.steps.kinds import PLACE
-from cell.steps.moves import HOME, Mover
+from cell.steps.moves import HOME, PLACED, Mover
 from cell.steps.part import PartProgress, PartState
 from cell.steps.place import PlaceResult, place
 from cell.steps.touch import Touch
 from cell.steps.whereabouts import Whereabouts
 from cell.steps.workplace import Workplace
 from cell.vision import parse_board
+from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
 from sim_backends.world.nominal import inverse
@@ -144,6 +146,13 @@ def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat() 
     beside = way[rise][:clear] - np.outer(up[rise][:clear], normal())
     assert np.linalg.norm(beside, axis=1).max() < 1e-3, "straight up from the part before the arm folds"
     np.testing.assert_allclose(site.mover.joints, HOME, atol=2e-3)
+
+
+def test_who_leaves_a_placed_part_may_be_near_that_and_nothing_else() -> None:
+    near = [("claw", PLACED), ("claw", "table")]
+    mover = Mover(VirtualCell(CONFIG, seed=1).devices.arm, Clock(), CONFIG, JOB)
+    mover._planner = cast(Any, SimpleNamespace(collisions=SimpleNamespace(touching=lambda start: near)))
+    assert mover._leaving(HOME) == (("claw", PLACED),)
 
 
 def test_a_straight_line_gains_its_speed_gently() -> None:

@@ -192,6 +192,7 @@ def test_what_late_replies_and_the_lines_leave_open_is_known(placed_pot: JobReco
     job, nominal = pot()
     site = Site(placed_pot, tmp_path, changed(job, "place", tolerance=2e-3), nominal)
     site.sweep_here()
+    assert {"table", "board"} <= {body.name for body in site.work.mover._station}, "met as the board was seen"
     slid(site.cell, (0.25e-3, 0.0))
     with pytest.raises(RefusedError, match=r"has moved by 0\.2\d mm .* times as far as chance brings"):
         site.look_again()
