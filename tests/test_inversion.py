@@ -21,6 +21,7 @@ from cell.inversion.motions import name as motion_name
 from cell.inversion.motions import sorted_out
 from cell.inversion.observability import judge
 from cell.inversion.registration import register
+from cell.inversion.sweeps import balance
 from cell.lab.bench.inversion_parts import PARTS
 from cell.lab.bench.inversion_parts import nominal as part_surface
 from cell.lab.bench.inversion_refusals import judge_case
@@ -237,6 +238,15 @@ def test_a_prior_that_is_sharper_than_the_scan_is_followed() -> None:
     board = perturbed(TRUE, [2e-5, -1e-5, 0, 0, 0, 1e-4])
     found = register(Scan.of(scanned(freeform, 1), 3000), nominal(freeform), Prior(board, sharp))
     assert np.abs(difference(found.base_from_surface, board)).max() < 1e-6
+
+
+def test_sweeps_that_can_have_no_error_leave_the_pose_where_board_and_scan_have_it() -> None:
+    prior = Prior(perturbed(TRUE, [2e-5, -1e-5, 1e-5, 0, 0, 1e-4]), np.diag([2e-6**2] * 3 + [1e-4**2] * 3))
+    seen = Scan.of(scanned(freeform, 1), 3000)
+    found = register(seen, nominal(freeform), prior)
+    again = balance(found, seen, np.zeros((len(found.used), 3, 1)), prior)
+    assert np.abs(difference(again.base_from_surface, found.base_from_surface)).max() < 1e-6
+    np.testing.assert_allclose(np.diag(again.covariance), np.diag(found.covariance), rtol=0.05)
 
 
 def test_an_uncertainty_that_all_points_share_is_added() -> None:

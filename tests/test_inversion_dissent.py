@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cell.geometry.poses import difference
 from cell.inversion import Prior, invert_pose
 from cell.inversion.correspondences import Scan
+from cell.inversion.demands import _squares
 from cell.inversion.dissent import Dissent, _beyond_noise, dissent
 from cell.inversion.registration import register
 from cell.lab.bench.inversion import task
@@ -52,6 +53,18 @@ def test_a_motion_along_any_axis_counts_beyond_three_sigma(axis: int) -> None:
     motion, spread = np.zeros(6), np.zeros((6, 1))
     motion[axis], spread[axis] = 2.0 * allowed, 0.25 * allowed
     assert _beyond_noise(motion, spread, TOLERANCE) == pytest.approx(2.0 - 3 * 0.25)
+
+
+def test_how_much_of_the_area_lies_off_is_told_by_squares() -> None:
+    cloud = scan(PARTS["pot"], np.random.default_rng(3), height=lambda x, y: POT(x, y) + 0.001 * (x < EDGE))
+    seen = Scan.of(cloud)
+    medians = _squares(seen, TRUE, nominal("pot"))
+    raised = ((seen.points - TRUE.translation) @ TRUE.rotation)[:, 0] < EDGE
+    assert len(medians) > 50
+    assert np.mean(np.abs(medians) > 0.5e-3) == pytest.approx(raised.mean(), abs=0.1)
+    away = TRUE.copy()
+    away.translation = away.translation + 1.0
+    assert len(_squares(seen, away, nominal("pot"))) == 0
 
 
 def test_noise_alone_is_no_dissent() -> None:

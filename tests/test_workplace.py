@@ -1,7 +1,8 @@
-"""What is stated of the arm where a job is done: as configured, or as much more as the calibration found."""
+"""Where a job is done: what is stated of the arm, what is told of a sweep, and what of an earlier one is left."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -10,8 +11,14 @@ import numpy as np
 import pytest
 
 from cell.config import load_config
+from cell.devices.direct import VirtualCell
 from cell.job import load_job
+from cell.lab.bench.whole_job import JobRecord, NoFrames
+from cell.steps import reconstruct
+from cell.steps.invert_pose import inverted
 from cell.steps.workplace import CHANCE_SCATTER, Workplace
+from drivers.errors import NotObservable
+from tests.report_runs import changed, pot, work_of
 
 CONFIG = load_config(None)
 JOB = load_job("pot")[0]
@@ -64,3 +71,36 @@ def test_an_arm_scatters_as_configured_or_as_much_more_as_was_found(
     assert sigmas(here.settling) == pytest.approx((ARM.repeatability, ARM.repeatability_angle))
     assert bool(here.notes) == (times != 1.0)
     assert all(f"scattered {times:.1f} times as much" in note for note in here.notes)
+
+
+# --- the steps after the sweep ---
+
+
+def at_work(record: JobRecord, folder: Path, **place: object) -> Workplace:
+    job, nominal = pot()
+    cell = VirtualCell(CONFIG, record.seed, record.level)
+    return work_of(cell, changed(job, "place", **place), nominal, record, NoFrames(), folder)
+
+
+@pytest.mark.parametrize("doubts", [(), ("nobody looked where the laser points",)])
+def test_where_the_place_is_known_too_little_what_was_noted_of_the_sweep_is_told(
+    placed_pot: JobRecord, tmp_path: Path, doubts: tuple[str, ...]
+) -> None:
+    here, made = at_work(placed_pot, tmp_path, tolerance=0.05e-3), placed_pot.results
+    sweep = replace(made["laser_sweep"], doubts=doubts)
+    with pytest.raises(NotObservable) as caught:
+        inverted(here, sweep, made["reconstruct"], made["board_photo"])
+    assert ("Before: nobody looked where the laser points" in str(caught.value)) == bool(doubts)
+
+
+def test_the_cloud_of_an_earlier_sweep_is_gone_whatever_becomes_of_this_one(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*given: object) -> None:
+        raise MemoryError("too many points")
+
+    (tmp_path / "cloud.ply").write_text("of the sweep before")
+    monkeypatch.setattr(reconstruct, "build_cloud", fails)
+    with pytest.raises(MemoryError):
+        reconstruct.reconstructed(at_work(placed_pot, tmp_path), placed_pot.results["laser_sweep"])
+    assert not (tmp_path / "cloud.ply").exists()
