@@ -18,6 +18,7 @@ import cell.steps.place as place_step
 from cell.devices.direct import VirtualCell
 from cell.geometry.poses import difference
 from cell.inversion import NominalSurface, PlacePose
+from cell.inversion.creep import Creep
 from cell.inversion.moved import SurfaceMotion, surface_motion
 from cell.job import Job
 from cell.lab.bench.scan_errors import own_base
@@ -102,7 +103,10 @@ def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path: 
     assert not found.moved and found.times < 0.9
     assert found.matched == pytest.approx(1.0, abs=0.1)
     # What the run itself saw is in its journal.
-    result = placed_pot.results["place"].summary()["surface_moved"]
+    placing = placed_pot.results["place"]
+    result = placing.summary()["surface_moved"]
+    sigmas = np.sqrt(np.diag(placing.look.moved.covariance))
+    np.testing.assert_allclose(result["sigma_mm"], 1e3 * sigmas[:3], atol=1e-4)
     assert np.abs(result["mm"]).max() < 0.2 and np.abs(result["mrad"]).max() < 0.5
 
 
@@ -312,3 +316,35 @@ def test_a_vehicle_that_creeps_is_seen_and_the_place_carried_on(
         return float(off @ np.linalg.solve(pose.covariance, off))
 
     assert distance(placing.pose) < chi2.ppf(0.95, 6) < distance(record.results["invert_pose"])
+
+
+def test_what_is_not_known_of_a_rate_grows_with_the_time(placed_pot: JobRecord) -> None:
+    made = placed_pot.results
+    pose, cloud, times = made["invert_pose"], made["reconstruct"].cloud, made["laser_sweep"].times
+    unsure = np.diag([1e-6**2, 0.0, 0.0, 0.0, 0.0, 2e-6**2])
+    creep = Creep(np.array([3e-6, 0, 0, 0, 0, 0]), unsure, pose.base_from_surface.translation, times[0] + 1.0)
+    later = creep.carried(pose, times[0] + 4.0)
+    np.testing.assert_allclose(later.covariance - pose.covariance, 9.0 * unsure, atol=1e-16)
+    np.testing.assert_allclose(later.systematic - pose.systematic, 9.0 * unsure, atol=1e-16)
+    np.testing.assert_allclose(
+        difference(later.base_from_surface, pose.base_from_surface), 3.0 * creep.rate, atol=1e-12
+    )
+    lines, rows = (each[::997] for each in np.nonzero(cloud.valid))
+    moved = creep.motions(cloud, lines, rows, times)
+    arms, seconds = cloud.points[lines, rows] - creep.origin, (times[lines] - creep.since)[:, None]
+    turned = np.cross([0.0, 0.0, 2e-6], arms)
+    expected = np.einsum("ni,nj->nij", seconds * [1e-6, 0, 0], seconds * [1e-6, 0, 0])
+    expected += np.einsum("ni,nj->nij", seconds * turned, seconds * turned)
+    np.testing.assert_allclose(np.einsum("nim,njm->nij", moved, moved), expected, atol=1e-18)
+
+
+def test_a_place_that_creeps_is_carried_on_to_the_time_of_the_contact(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, until = Site(placed_pot, tmp_path, *pot()), []
+    monkeypatch.setattr(Creep, "carried", lambda creep, pose, time: until.append(time))
+    made = (site.made[name] for name in ("laser_sweep", "reconstruct", "board_photo"))
+    place_step.carried_on(site.work, *made, Creep(np.zeros(6), 1e-16 * np.eye(6), np.zeros(3), 0.0))
+    plan, now = site.job.place, site.cell.clock.now()
+    descent = plan.approach / plan.speed + plan.contact_travel / plan.contact_speed
+    assert until == [pytest.approx(now + place_step.APPROACH_S + descent)]
