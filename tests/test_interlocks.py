@@ -251,6 +251,15 @@ def test_a_retreat_that_failed_as_it_began_leaves_no_contact_behind(world: Virtu
     assert devices.claw.holding
 
 
+def test_the_way_of_a_path_is_known_while_the_arm_follows_it_and_of_no_other_motion(devices: Devices) -> None:
+    stood, situation = devices.arm.state().joints, devices.interlocks.situation
+    way = np.array([stood, stood + 0.001])
+    devices.arm.follow(np.array([0.0, 1.0]), way).wait(30.0)
+    np.testing.assert_array_equal(situation.way, way)
+    devices.arm.move_joints(stood, 0.5, 1.0).wait(30.0)
+    assert situation.way is None
+
+
 def test_a_recovery_leaves_no_contact_behind(world: VirtualCell, devices: Devices) -> None:
     at_contact(world, devices)
     devices.arm.recover()

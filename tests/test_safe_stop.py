@@ -98,6 +98,8 @@ def test_a_device_that_does_not_confirm_is_named_and_the_others_are_stopped(tmp_
 def test_a_cell_that_was_opened_without_a_device_stops_the_others(cell: VirtualCell, name: str) -> None:
     setattr(cell.devices, f"_{name}", None)
     assert name not in cell.devices
+    require_healthy(cell.devices)
+    require_no_emergency_stop(cell.devices)
     assert cell.devices.stop() == []
 
 

@@ -15,8 +15,10 @@ from cell.devices.direct import VirtualCell
 from cell.job import load_job
 from cell.lab.bench.whole_job import JobRecord, NoFrames
 from cell.steps import reconstruct
+from cell.steps.board_photo import photographed
 from cell.steps.invert_pose import inverted
-from cell.steps.workplace import CHANCE_SCATTER, Workplace
+from cell.steps.unmoved import require_unmoved
+from cell.steps.workplace import CHANCE_SCATTER, PHOTO_RATE_HZ, Workplace
 from drivers.errors import NotObservable
 from tests.report_runs import changed, pot, work_of
 
@@ -80,6 +82,26 @@ def at_work(record: JobRecord, folder: Path, **place: object) -> Workplace:
     job, nominal = pot()
     cell = VirtualCell(CONFIG, record.seed, record.level)
     return work_of(cell, changed(job, "place", **place), nominal, record, NoFrames(), folder)
+
+
+def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Taken(Exception):
+        """The camera was asked."""
+
+    def photograph(count: int = 1) -> None:
+        raise Taken
+
+    here, fix, asked = at_work(placed_pot, tmp_path), placed_pot.results["board_photo"], []
+    monkeypatch.setattr(here, "photograph", photograph)
+    monkeypatch.setattr(here, "mover", SimpleNamespace(to=lambda *given: None))
+    monkeypatch.setattr(here.devices.target_camera, "configure", lambda *given: asked.append(given))
+    with pytest.raises(Taken):
+        photographed(here, fix.base_from_board, lambda share, text: None)
+    with pytest.raises(Taken):
+        require_unmoved(here, fix, "before the sweep", lambda share, text: None)
+    assert asked == [(CONFIG.target_camera.photo_exposure, PHOTO_RATE_HZ)] * 2
 
 
 @pytest.mark.parametrize("doubts", [(), ("nobody looked where the laser points",)])
