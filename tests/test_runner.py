@@ -928,6 +928,12 @@ def test_a_script_goes_back_only_in_a_cell_that_is_known_to_stand(tmp_path):
     assert bench.log.count("board_photo") == 1
 
 
+def test_a_script_that_looks_or_decides_is_not_idle():
+    assert Script().idle
+    assert not Script(after={"place": print}).idle
+    assert not Script(on_refusal=lambda step, failure: None).idle
+
+
 def test_a_failure_that_cannot_be_classified_is_a_fault(tmp_path):
     def classify(error):
         raise KeyError("no such kind")
@@ -959,8 +965,10 @@ def test_after_a_recovery_the_cell_has_to_be_known_to_stand_before_the_step_is_t
 def test_a_word_about_an_earlier_fault_does_not_count_for_the_next():
     control = RunControl()
     first = control.ask("protective stop in the sweep")
+    assert control.question == (first, "protective stop in the sweep")
     assert control.confirm("Ann", first)
     control.asked_no_more()
+    assert control.question is None
     second = control.ask("protective stop while placing")
     assert not control.confirm("a listener that is late", first)
     assert control.answer() is None
