@@ -175,6 +175,14 @@ def test_points_beside_the_surface_have_no_deviation() -> None:
     assert np.all(np.isnan(nominal(freeform).deviations(beside)))
 
 
+def test_the_rim_of_a_large_triangle_is_left_out() -> None:
+    corners = [[0.0, 0.0, 0.0], [0.04, 0.0, 0.0], [0.04, 0.04, 0.0], [0.0, 0.04, 0.0]]
+    plate = NominalSurface(corners, [[0, 1, 2], [0, 2, 3]])
+    found = plate.deviations([[0.02, 0.0003, 1e-4], [0.02, 0.001, 1e-4]])
+    assert np.isnan(found[0])
+    assert found[1] == pytest.approx(1e-4)
+
+
 def test_a_mesh_is_read_in_its_unit_and_refused_in_the_wrong_one(tmp_path: Path) -> None:
     import trimesh
 
@@ -501,6 +509,7 @@ def test_no_surface_that_is_not_the_nominal_one_leads_outside_the_tolerance(case
 def test_points_are_thinned_out_of_step_with_the_rows() -> None:
     cloud = scanned(freeform, 1)
     few = Scan.of(cloud, 400)
+    assert len(few.points) == 400
     local = (few.points - TRUE.translation) @ TRUE.rotation
     occupied = np.histogram(local[:, 1], bins=20, range=(-0.021, 0.019))[0]
     assert occupied.min() >= 5
