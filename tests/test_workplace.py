@@ -10,17 +10,21 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from cell.calibration.witness import Pointing
 from cell.config import load_config
 from cell.devices.direct import VirtualCell
 from cell.job import load_job
 from cell.lab.bench.whole_job import JobRecord, NoFrames
+from cell.reconstruction import Cloud
 from cell.steps import reconstruct
 from cell.steps.board_photo import photographed
 from cell.steps.invert_pose import inverted
+from cell.steps.stored_sweep import FILE
+from cell.steps.sweep_record import SweepRecord
 from cell.steps.unmoved import require_unmoved
 from cell.steps.workplace import CHANCE_SCATTER, PHOTO_RATE_HZ, Workplace
-from drivers.errors import NotObservable
-from tests.report_runs import changed, pot, work_of
+from drivers.errors import NotObservable, RefusedError
+from tests.report_runs import changed, pot, with_few_lines, work_of
 
 CONFIG = load_config(None)
 JOB = load_job("pot")[0]
@@ -126,3 +130,33 @@ def test_the_cloud_of_an_earlier_sweep_is_gone_whatever_becomes_of_this_one(
     with pytest.raises(MemoryError):
         reconstruct.reconstructed(at_work(placed_pot, tmp_path), placed_pot.results["laser_sweep"])
     assert not (tmp_path / "cloud.ply").exists()
+
+
+def test_the_cloud_is_built_with_the_laser_where_it_pointed(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, sweep, given = at_work(placed_pot, tmp_path), placed_pot.results["laser_sweep"], []
+    monkeypatch.setattr(reconstruct, "reconstruct", lambda sweep, head, *rest: given.append(head))
+    turned, head = Pointing(1e-3, 1e-5, 0.0), here.calibration.scan
+    for pointing in (None, turned):
+        reconstruct.reconstructed(here, replace(sweep, pointing=pointing))
+    expected = head.pointed(turned, CONFIG.laser.exit_point).geometry().light_plane
+    assert given[0] is head
+    np.testing.assert_array_equal(given[1].geometry().light_plane.normal, expected.normal)
+    assert not np.allclose(expected.normal, head.geometry().light_plane.normal, atol=1e-4)
+
+
+def test_a_sweep_is_kept_and_its_cloud_shown_also_where_it_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
+    assert placed_pot.folder is not None and (placed_pot.folder / FILE).is_file()
+    here, told = at_work(placed_pot, tmp_path), []
+    here.devices.gate.listener = cast(Any, SimpleNamespace(reading=lambda device, reading: told.append(device)))
+    few = with_few_lines(placed_pot, 2).results["laser_sweep"]
+    for sweep in (placed_pot.results["laser_sweep"], few):
+        context = cast(Any, SimpleNamespace(made={SweepRecord: sweep}.get))
+        if sweep is few:
+            with pytest.raises(RefusedError) as caught:
+                reconstruct.STEP.work(here, context)
+            assert isinstance(caught.value.seen["cloud"], Cloud)
+        else:
+            reconstruct.STEP.work(here, context)
+    assert told == ["scan_camera"]
