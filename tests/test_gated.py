@@ -42,7 +42,7 @@ def test_who_listens_hears_what_a_camera_is_asked_for() -> None:
     devices.scan_camera.grab()
     with devices.scan_camera.stream() as frames:
         frames.next(1.0)
-    assert heard == ["scan_camera.configure", "scan_camera.grab", "scan_camera.stream"]
+    assert heard == [f"scan_camera.{asked}" for asked in ("configure", "grab", "stream", "stream ended")]
 
 
 def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: Devices) -> None:

@@ -509,7 +509,7 @@ def test_no_surface_that_is_not_the_nominal_one_leads_outside_the_tolerance(case
 def test_points_are_thinned_out_of_step_with_the_rows() -> None:
     cloud = scanned(freeform, 1)
     few = Scan.of(cloud, 400)
-    assert len(few.points) == 400
+    assert (len(few.points), len(few.thinned(100).points)) == (400, 100)
     local = (few.points - TRUE.translation) @ TRUE.rotation
     occupied = np.histogram(local[:, 1], bins=20, range=(-0.021, 0.019))[0]
     assert occupied.min() >= 5
