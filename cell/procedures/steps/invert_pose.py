@@ -46,7 +46,7 @@ def invert_pose(
     job: Job,
     nominal: NominalSurface,
     kinematic: Vector,
-    taken: LineTimes | None = None,
+    taken: LineTimes,
 ) -> PlacePose:
     """Where the surface is, in the arm base, with the covariance that stripe, rail, calibration and arm leave it with.
 
@@ -78,14 +78,12 @@ def invert_pose(
         found = registered(scan.by_poses, kinematic)
     except RefusedError as refused:
         pose = refused.seen.get("pose")
-        if taken is None or not isinstance(pose, pin.SE3) or isinstance(refused, NotObservable):
+        if not isinstance(pose, pin.SE3) or isinstance(refused, NotObservable):
             raise
         # Never accepted for it: the next likely looks much the same, and the pose would be wrong.
         text = likeliest(find_causes(scan.cloud, nominal, pose, taken.times, taken.base_from_vehicle))
         told = type(refused)(f"{refused}{text and '. '}{text}".replace("?.", "?"), *refused.numbers)
         raise told.showing(seen=refused.seen) from refused
-    if taken is None:
-        return found
     droop = None if taken.head is None else find_droop(scan.cloud, nominal, found.base_from_surface, taken.head)
 
     def by_calibration(lines: Indices, rows: Indices) -> Vector:

@@ -130,6 +130,41 @@ def test_a_resumed_run_is_read_as_the_newest(tmp_path):
     second.close()
 
 
+def older(folder, change="", *values):
+    """A journal without CRC and process, as older versions wrote it."""
+    journal = Journal(folder, "r1", {"seed": 7})
+    journal.step_ended(journal.step_started("board_photo", 1), 1.5, {"residual_px": 0.08})
+    journal.close()
+    with sqlite3.connect(folder / FILE_NAME) as base:
+        for table in ("runs", "steps", "events"):
+            base.execute(f"ALTER TABLE {table} DROP COLUMN crc")
+        base.execute("ALTER TABLE runs DROP COLUMN pid")
+        if change:
+            base.execute(change, values)
+    base.close()
+
+
+def test_a_journal_of_an_older_version_is_read(tmp_path):
+    older(tmp_path)
+    record = read(tmp_path)
+    assert (record.run.id, record.run.pid, record.done) == ("r1", None, {"board_photo": {"residual_px": 0.08}})
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "words"),
+    [
+        ("name", b"\x07", "is no text"),
+        ("duration_s", float("inf"), "'inf' is no number"),
+        ("started", "long ago", "'long ago' is no number"),
+        ("result", "[1]", "is no table"),
+    ],
+)
+def test_what_is_no_text_or_number_in_a_row_without_crc_is_damage(tmp_path, column, value, words):
+    older(tmp_path, f"UPDATE steps SET {column} = ?", value)
+    with pytest.raises(JournalError, match=f"is damaged: .*{words}"):
+        read(tmp_path)
+
+
 def test_a_missing_or_foreign_file_is_a_clear_error(tmp_path):
     with pytest.raises(JournalError, match="there is no journal"):
         read(tmp_path)

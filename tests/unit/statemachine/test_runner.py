@@ -17,9 +17,10 @@ from statemachine.cancel import Cancelled, CancelToken
 from statemachine.control import RunControl
 from statemachine.journal import FILE_NAME, Journal, read, request
 from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
-from statemachine.runner import Runner
+from statemachine.runner import Runner, StepContext
 from statemachine.script import Again, Script
 from statemachine.sequence import Sequence
+from statemachine.watch import SignalWatch
 
 NAMES = ["drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose", "place"]
 POLICY = Policy(
@@ -327,6 +328,7 @@ def test_a_paused_run_waits_before_its_next_step_and_goes_on(tmp_path):
     bench.runner.observer = observe
     assert bench.run().outcome is Outcome.PLACED
     assert bench.log[:4] == ["drive_to_target", "board_photo", "paused", "laser_sweep"]
+    assert [event.data["text"] for event in bench.record.events if event.kind == "going_on"] == ["goes on"]
 
 
 def test_a_paused_run_can_be_aborted(tmp_path):
@@ -336,7 +338,8 @@ def test_a_paused_run_can_be_aborted(tmp_path):
 
     bench = Bench(tmp_path, board_photo=lambda context: bench.runner.control.pause())
     bench.runner.observer = observe
-    assert bench.run().outcome is Outcome.ABORTED
+    result = bench.run()
+    assert (result.outcome, result.faults) == (Outcome.ABORTED, ())
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
@@ -434,6 +437,8 @@ def test_a_fault_while_the_run_is_held_is_recovered_and_the_run_is_held_again(tm
     assert log == [0, 0], "nothing began while the run was to be held"
     assert [(fault.step, fault.remedy) for fault in result.faults] == [("laser_sweep", "recovered")]
     assert sum(event.kind == "paused" for event in bench.events) == 2
+    texts = [event.data["text"] for event in bench.events if event.kind == "going_on"]
+    assert texts == ["held no longer: protective stop", "goes on"]
 
 
 def test_a_summary_that_fails_does_not_undo_what_was_done(tmp_path):
@@ -474,10 +479,44 @@ def test_who_asks_for_the_end_just_as_the_run_has_it_is_late():
     assert control.late
 
 
+def test_who_asks_for_the_end_after_the_last_step_and_before_the_end_is_late(tmp_path):
+    def observe(event):
+        if event.data.get("to") == "placed":
+            bench.runner.control.abort("Cell.stop()")
+
+    bench = Bench(tmp_path)
+    bench.runner.observer = observe
+    assert bench.run().outcome is Outcome.PLACED
+    assert bench.runner.control.late
+
+
+def test_the_signal_that_ended_a_run_is_told_whoever_asks_afterwards():
+    control = RunControl()
+    control.abort("terminated", signal.SIGTERM)
+    control.abort("interrupted from the keyboard", signal.SIGINT)
+    assert control.signal == signal.SIGTERM
+    control = RunControl()
+    control.abort("Cell.stop()")
+    control.abort("interrupted from the keyboard", signal.SIGINT)
+    assert control.signal is None
+
+
 def test_who_ended_a_run_did_not_come_late(tmp_path):
     bench = Bench(tmp_path, board_photo=lambda context: bench.runner.control.abort("enough"))
     assert bench.run().outcome is Outcome.ABORTED
     assert not bench.runner.control.late
+
+
+def test_outside_the_main_thread_signals_are_left_alone():
+    def work():
+        with SignalWatch() as watch:
+            seen.append(watch.reason)
+
+    seen = []
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join(5)
+    assert seen == [None]
 
 
 def test_ctrl_c_aborts_and_a_second_one_does_not_cut_the_safe_stop_short(tmp_path):
@@ -519,6 +558,12 @@ def test_a_safe_stop_that_ends_too_late_makes_the_run_faulted(tmp_path):
     result = bench.runner.run()
     assert result.outcome is Outcome.FAULTED
     assert "did not end within 0.2 s" in result.reason
+
+
+def test_a_safe_stop_that_takes_its_time_is_waited_for(tmp_path):
+    bench = Bench(tmp_path)
+    bench.on_stop = lambda: time.sleep(0.4)
+    assert bench.run().outcome is Outcome.PLACED
 
 
 def test_a_resumed_run_does_only_what_is_open(tmp_path):
@@ -721,6 +766,11 @@ def test_held_work_ends_with_its_own_token_though_the_run_stays_paused():
     assert 0.0 < control.held_s < 1.0
 
 
+def test_past_its_deadline_a_step_has_no_time_left():
+    context = StepContext(POLICY.of("place"), 1, 0.0, {}, Clock(), lambda event: None)
+    assert context.remaining() == 0.0
+
+
 def test_what_begins_after_its_run_was_ended_is_ended_as_it_begins():
     run, told = CancelToken(), []
     run.cancel("enough")
@@ -878,6 +928,12 @@ def test_a_script_goes_back_only_in_a_cell_that_is_known_to_stand(tmp_path):
     assert bench.log.count("board_photo") == 1
 
 
+def test_a_script_that_looks_or_decides_is_not_idle():
+    assert Script().idle
+    assert not Script(after={"place": print}).idle
+    assert not Script(on_refusal=lambda step, failure: None).idle
+
+
 def test_a_failure_that_cannot_be_classified_is_a_fault(tmp_path):
     def classify(error):
         raise KeyError("no such kind")
@@ -909,8 +965,10 @@ def test_after_a_recovery_the_cell_has_to_be_known_to_stand_before_the_step_is_t
 def test_a_word_about_an_earlier_fault_does_not_count_for_the_next():
     control = RunControl()
     first = control.ask("protective stop in the sweep")
+    assert control.question == (first, "protective stop in the sweep")
     assert control.confirm("Ann", first)
     control.asked_no_more()
+    assert control.question is None
     second = control.ask("protective stop while placing")
     assert not control.confirm("a listener that is late", first)
     assert control.answer() is None

@@ -140,6 +140,22 @@ def test_held_work_hears_that_it_is_to_end_although_no_time_passes(cell: Virtual
     assert cell.clock.now() - before < 0.5
 
 
+def test_work_that_was_told_to_end_has_its_grace_to_do_so(cell: VirtualCell) -> None:
+    def tidy() -> None:
+        try:
+            cell.clock.sleep(100.0)
+        finally:
+            for _ in range(10):
+                cell.clock.sleep(0.1)
+            tidied.append(cell.clock.now() - begun)
+
+    tidied: list[float] = []
+    begun = cell.clock.now()
+    call = InLine(cell.clock).do("work", tidy, lambda: "enough", 3.0)
+    assert isinstance(call.error, Cancelled)
+    assert tidied == [pytest.approx(1.0, abs=0.3)]
+
+
 def test_time_that_another_thread_lets_pass_ends_nothing_there(cell: VirtualCell) -> None:
     waiting = InLine(cell.clock)
     seen: list[str] = []

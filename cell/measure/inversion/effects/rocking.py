@@ -58,8 +58,6 @@ def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.S
     of = scan.lines[rows.index]
     count = np.bincount(of, minlength=cloud.shape[0])
     good = count >= 8
-    if np.count_nonzero(good) < LEAST_LINES:
-        return None
     mean = np.bincount(of, rows.heights, minlength=cloud.shape[0])[good] / count[good]
     sums = [np.bincount(of, scan.points[rows.index, axis], minlength=len(good)) for axis in range(3)]
     places = np.column_stack(sums)[good] / count[good, None]

@@ -94,6 +94,15 @@ def test_a_device_that_does_not_confirm_is_named_and_the_others_are_stopped(tmp_
     assert stays(cell, lambda: cell.arm.state().joints)
 
 
+@pytest.mark.parametrize("name", ["laser", "vehicle", "rail", "arm"])
+def test_a_cell_that_was_opened_without_a_device_stops_the_others(cell: VirtualCell, name: str) -> None:
+    setattr(cell.devices, f"_{name}", None)
+    assert name not in cell.devices
+    require_healthy(cell.devices)
+    require_no_emergency_stop(cell.devices)
+    assert cell.devices.stop() == []
+
+
 def test_who_closes_the_cell_closes_each_device_and_the_arm_last(cell: VirtualCell) -> None:
     """Laser and claw hang on the arm's outputs."""
     names = [device.name for device in cell.devices]

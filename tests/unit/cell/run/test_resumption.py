@@ -26,7 +26,7 @@ from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.laser_sweep import STEP, SweepRecord
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep import stored_sweep
-from cell.procedures.sweep.stored_sweep import FILE, StoredSweep, save_sweep
+from cell.procedures.sweep.stored_sweep import FILE, UNSEALED, StoredSweep, save_sweep
 from cell.run.files.folder import is_going
 from cell.run.files.reading import run_row
 from cell.run.resumption import UnfinishedRun, job_hash
@@ -319,7 +319,8 @@ def test_a_sweep_is_not_read_once_a_figure_was_edited_or_two_of_its_frames_are_e
     # These pictures show no stripe.
     monkeypatch.setattr(stored_sweep, "_swath", lambda *given: taken)
     given = CALIBRATION.scan, load_job("pot")[0].scan, CONFIG.laser.exit_point
-    assert len(StoredSweep.load(tmp_path, *given).sweep.swaths) == 1
+    StoredSweep.load(tmp_path, *given).copy_to(tmp_path / "later")
+    assert len(StoredSweep.load(tmp_path / "later", *given).sweep.swaths) == 1
     one, other = sorted((tmp_path / "frames").iterdir())[3:5]
     pictures = one.read_bytes(), other.read_bytes()
     one.write_bytes(pictures[1])
@@ -331,6 +332,12 @@ def test_a_sweep_is_not_read_once_a_figure_was_edited_or_two_of_its_frames_are_e
     np.savez(tmp_path / FILE, **{**data, "rail_0": data["rail_0"] + 1e-6})
     with pytest.raises(RefusedError, match="was changed after it was written: rail_0"):
         StoredSweep.load(tmp_path, *given)
+    # Who looks at an old run reads it as it is.
+    np.savez(tmp_path / FILE, **{**data, "format": np.array(UNSEALED)})
+    assert len(StoredSweep.load(tmp_path, *given, as_written=False).sweep.swaths) == 1
+    np.savez(tmp_path / FILE, **{**data, "format": np.array(UNSEALED - 1)})
+    with pytest.raises(RefusedError, match=f"format {UNSEALED - 1}, this program reads"):
+        StoredSweep.load(tmp_path, *given, as_written=False)
 
 
 @pytest.mark.parametrize("name", ["rail", "times", "flanges", "line_spread", "covariance"])

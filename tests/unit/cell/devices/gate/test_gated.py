@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 
@@ -30,6 +33,16 @@ def test_before_the_stop_the_devices_do_what_they_are_asked(devices: Devices) ->
     with devices.interlocks.purpose("test"), devices.laser.lit():
         assert devices.laser.is_on
     assert not devices.laser.is_on
+
+
+def test_who_listens_hears_what_a_camera_is_asked_for() -> None:
+    devices, heard = VirtualCell(CONFIG, seed=4, level="ideal").devices, []
+    devices.gate.listener = cast(Any, SimpleNamespace(command=lambda command, refused: heard.append(str(command))))
+    devices.scan_camera.configure(0.002, 50.0)
+    devices.scan_camera.grab()
+    with devices.scan_camera.stream() as frames:
+        frames.next(1.0)
+    assert heard == [f"scan_camera.{asked}" for asked in ("configure", "grab", "stream", "stream ended")]
 
 
 def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: Devices) -> None:

@@ -20,7 +20,7 @@ from cell.devices.devices import Devices
 from cell.devices.gate.interlocks import DeviceCommand
 from cell.devices.gate.laser import UNATTENDED_S
 from cell.devices.gate.rules import RULES, markdown
-from cell.devices.gate.ways import LINE_STEP_RAD, Ways
+from cell.devices.gate.ways import LINE_STEP_M, LINE_STEP_RAD, Ways
 from cell.devices.lock import CellLock
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur, to_ur
@@ -252,6 +252,15 @@ def test_a_retreat_that_failed_as_it_began_leaves_no_contact_behind(world: Virtu
     assert devices.claw.holding
 
 
+def test_the_way_of_a_path_is_known_while_the_arm_follows_it_and_of_no_other_motion(devices: Devices) -> None:
+    stood, situation = devices.arm.state().joints, devices.interlocks.situation
+    way = np.array([stood, stood + 0.001])
+    devices.arm.follow(np.array([0.0, 1.0]), way).wait(30.0)
+    np.testing.assert_array_equal(situation.way, way)
+    devices.arm.move_joints(stood, 0.5, 1.0).wait(30.0)
+    assert situation.way is None
+
+
 def test_a_recovery_leaves_no_contact_behind(world: VirtualCell, devices: Devices) -> None:
     at_contact(world, devices)
     devices.arm.recover()
@@ -406,21 +415,19 @@ def test_a_raw_move_into_the_cells_own_bodies_is_refused(world: VirtualCell, dev
     assert world.world.collisions.found == ()
 
 
-def test_a_straight_line_is_checked_all_the_way_in_even_steps_as_it_turns() -> None:
+@pytest.mark.parametrize("turn", [0.3, 0.0])
+def test_a_straight_line_is_checked_all_the_way_in_even_steps_as_it_turns(turn: float) -> None:
     """Its poses lie on the line and turn evenly about one axis, no farther apart than a collision check may skip."""
-    ways = Ways(CONFIG)
+    ways, shift = Ways(CONFIG), np.array([0.0, -0.03, 0.08])
     begin = ways.forward(HOME)
-    goal = from_parts(
-        begin.translation + np.array([0.0, -0.03, 0.08]), pin.exp3(np.array([0.0, 0.3, 0.0])) @ begin.rotation
-    )
-    line = [
-        ways.forward(joints) for joints in ways._way(HOME, DeviceCommand("arm", "move_linear", {"flange": to_ur(goal)}))
-    ]
-    assert len(line) >= 0.3 / LINE_STEP_RAD
+    goal = from_parts(begin.translation + shift, pin.exp3(np.array([0.0, turn, 0.0])) @ begin.rotation)
+    command = DeviceCommand("arm", "move_linear", {"flange": to_ur(goal)})
+    line = [ways.forward(joints) for joints in ways._way(HOME, command)]
+    assert len(line) >= max(turn / LINE_STEP_RAD, np.linalg.norm(shift) / LINE_STEP_M)
     for k, pose in enumerate(line, start=1):
         share = k / len(line)
-        np.testing.assert_allclose(pose.translation, begin.translation + share * np.array([0, -0.03, 0.08]), atol=1e-5)
-        np.testing.assert_allclose(pin.log3(pose.rotation @ begin.rotation.T), [0.0, 0.3 * share, 0.0], atol=1e-5)
+        np.testing.assert_allclose(pose.translation, begin.translation + share * shift, atol=1e-5)
+        np.testing.assert_allclose(pin.log3(pose.rotation @ begin.rotation.T), [0.0, turn * share, 0.0], atol=1e-5)
 
 
 def test_raw_moves_are_checked_against_the_station_until_the_vehicle_may_drive(devices: Devices) -> None:

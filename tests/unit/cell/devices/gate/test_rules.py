@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -227,12 +228,23 @@ def test_a_contact_at_which_nobody_saw_the_arm_stand_opens_no_claw() -> None:
     claw.holding = True
     ended = Ended(True)
     ended.contact = True
-    guarded = GuardedMotion(ended, Told("arm", arm_state()))  # type: ignore[arg-type]
+    arm = Told("arm", arm_state())
+    guarded = GuardedMotion(ended, arm)  # type: ignore[arg-type]
     interlocks = rules(claw=claw, last=guarded)
     with pytest.raises(InterlockError, match=r"nobody has seen where the arm stood.*claw_at_contact"):
         interlocks.require(DeviceCommand("claw", "release"))
     guarded.wait(1.0)
     interlocks.require(DeviceCommand("claw", "release"))
+    # Moved by hand from there, whoever waits for the motion again.
+    arm.newest = arm_state(joints=POSTURE + 0.1)
+    guarded.wait(1.0)
+    np.testing.assert_array_equal(guarded.rest, POSTURE)
+
+
+def test_a_motion_that_felt_nothing_ends_nowhere_at_contact() -> None:
+    free = GuardedMotion(Ended(True), Told("arm", arm_state()))  # type: ignore[arg-type]
+    free.wait(1.0)
+    assert (free.contact, free.rest) == (False, None)
 
 
 def test_what_the_laser_is_lit_for_holds_inside_its_context_only() -> None:
@@ -255,6 +267,24 @@ def test_an_output_is_tried_inside_its_context_only() -> None:
             pass
         assert [interlocks.may_be_laser(output) for output in range(4)] == [True, False, True, False]
     assert [interlocks.may_be_laser(output) for output in range(4)] == [True, False, False, False]
+
+
+def test_an_arm_that_can_hears_which_output_is_tried() -> None:
+    """Should this process be killed, the server switches that output off."""
+    heard: list[str] = []
+
+    class Trying(Told):
+        @contextmanager
+        def trying(self, output: int) -> Iterator[None]:
+            heard.append(f"begin {output}")
+            yield
+            heard.append(f"end {output}")
+
+    interlocks = rules()
+    interlocks.situation.arm = Trying("arm", arm_state())  # type: ignore[assignment]
+    with interlocks.tried(2):
+        assert heard == ["begin 2"]
+    assert heard == ["begin 2", "end 2"]
 
 
 def test_a_lit_laser_bars_driving_and_not_the_end_of_it() -> None:

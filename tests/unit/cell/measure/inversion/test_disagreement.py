@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import Prior, invert_pose
 from cell.measure.inversion.correspondences import Scan
-from cell.measure.inversion.disagreement import Dissent, dissent
+from cell.measure.inversion.demands import _squares
+from cell.measure.inversion.disagreement import Dissent, _beyond_noise, dissent
 from cell.measure.inversion.registration import register
 from cell.measure.reconstruction import Cloud
 from lab.bench.inversion.campaign import task
@@ -44,6 +45,26 @@ def test_a_quarter_that_is_tilted_is_found_with_its_angle() -> None:
     assert found.turn == pytest.approx(0.006, rel=0.1)
     assert found.shift == pytest.approx(0.006 * -EDGE, rel=0.15)
     assert found.middle[0] < EDGE
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_a_motion_along_any_axis_counts_beyond_three_sigma(axis: int) -> None:
+    allowed = TOLERANCE.translation if axis < 3 else TOLERANCE.rotation
+    motion, spread = np.zeros(6), np.zeros((6, 1))
+    motion[axis], spread[axis] = 2.0 * allowed, 0.25 * allowed
+    assert _beyond_noise(motion, spread, TOLERANCE) == pytest.approx(2.0 - 3 * 0.25)
+
+
+def test_how_much_of_the_area_lies_off_is_told_by_squares() -> None:
+    cloud = scan(PARTS["pot"], np.random.default_rng(3), height=lambda x, y: POT(x, y) + 0.001 * (x < EDGE))
+    seen = Scan.of(cloud)
+    medians = _squares(seen, TRUE, nominal("pot"))
+    raised = ((seen.points - TRUE.translation) @ TRUE.rotation)[:, 0] < EDGE
+    assert len(medians) > 50
+    assert np.mean(np.abs(medians) > 0.5e-3) == pytest.approx(raised.mean(), abs=0.1)
+    away = TRUE.copy()
+    away.translation = away.translation + 1.0
+    assert len(_squares(seen, away, nominal("pot"))) == 0
 
 
 def test_noise_alone_is_no_dissent() -> None:

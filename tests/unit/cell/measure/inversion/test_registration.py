@@ -19,7 +19,9 @@ from cell.measure.inversion import Demands, NominalSurface, PlacePose, Prior, To
 from cell.measure.inversion.correspondences import Scan
 from cell.measure.inversion.motions import name as motion_name
 from cell.measure.inversion.motions import sorted_out
+from cell.measure.inversion.observability import judge
 from cell.measure.inversion.registration import register
+from cell.measure.inversion.sweeps import balance
 from cell.measure.reconstruction import Cloud, merge
 from drivers.errors import ConfigError, NotObservable, RefusedError
 from lab.bench.inversion.parts import PARTS
@@ -173,6 +175,14 @@ def test_points_beside_the_surface_have_no_deviation() -> None:
     assert np.all(np.isnan(nominal(freeform).deviations(beside)))
 
 
+def test_the_rim_of_a_large_triangle_is_left_out() -> None:
+    corners = [[0.0, 0.0, 0.0], [0.04, 0.0, 0.0], [0.04, 0.04, 0.0], [0.0, 0.04, 0.0]]
+    plate = NominalSurface(corners, [[0, 1, 2], [0, 2, 3]])
+    found = plate.deviations([[0.02, 0.0003, 1e-4], [0.02, 0.001, 1e-4]])
+    assert np.isnan(found[0])
+    assert found[1] == pytest.approx(1e-4)
+
+
 def test_a_mesh_is_read_in_its_unit_and_refused_in_the_wrong_one(tmp_path: Path) -> None:
     import trimesh
 
@@ -236,6 +246,15 @@ def test_a_prior_that_is_sharper_than_the_scan_is_followed() -> None:
     board = perturbed(TRUE, [2e-5, -1e-5, 0, 0, 0, 1e-4])
     found = register(Scan.of(scanned(freeform, 1), 3000), nominal(freeform), Prior(board, sharp))
     assert np.abs(difference(found.base_from_surface, board)).max() < 1e-6
+
+
+def test_sweeps_that_can_have_no_error_leave_the_pose_where_board_and_scan_have_it() -> None:
+    prior = Prior(perturbed(TRUE, [2e-5, -1e-5, 1e-5, 0, 0, 1e-4]), np.diag([2e-6**2] * 3 + [1e-4**2] * 3))
+    seen = Scan.of(scanned(freeform, 1), 3000)
+    found = register(seen, nominal(freeform), prior)
+    again = balance(found, seen, np.zeros((len(found.used), 3, 1)), prior)
+    assert np.abs(difference(again.base_from_surface, found.base_from_surface)).max() < 1e-6
+    np.testing.assert_allclose(np.diag(again.covariance), np.diag(found.covariance), rtol=0.05)
 
 
 def test_an_uncertainty_that_all_points_share_is_added() -> None:
@@ -447,6 +466,22 @@ def test_a_screw_is_named_with_its_pitch() -> None:
     assert words == "rotation about the z axis of the surface frame with +20.0 mm/rad along it"
 
 
+def test_a_verdict_names_what_is_known_worst_with_three_of_its_deviations() -> None:
+    sigmas = np.array([0.1e-3, 0.15e-3, 0.1e-3, 1e-3, 1e-3, 1e-3])
+    known = judge(np.diag(sigmas**2), 1e9 * np.eye(6), 1.0, 1, 0.02, JOB)
+    assert known.observable
+    assert known.worst.words.startswith("translation along the y axis of the surface frame is known: 3σ 0.45 mm ≤ 0.6")
+    sigmas[[1, 5]] = 0.5e-3, 4e-3
+    verdict = judge(np.diag(sigmas**2), 1e9 * np.eye(6), 1.0, 1, 0.02, JOB)
+    assert [motion.words for motion in verdict.weak] == [
+        "translation along the y axis of the surface frame is not determined: 3σ 1.5 mm > 0.6 mm",
+        "rotation about the z axis of the surface frame is not determined: 3σ 12 mrad > 6 mrad",
+    ]
+    assert [motion.excess for motion in verdict.weak] == pytest.approx([2.5, 2.0])
+    for motion in verdict.weak:
+        assert (motion.shift.shape, motion.turn.shape) == ((3,), (3,))
+
+
 def test_motions_mixed_at_will_are_sorted_into_plain_ones() -> None:
     plain = np.zeros((6, 3))
     plain[0, 0] = plain[1, 1] = plain[5, 2] = 1.0
@@ -455,6 +490,7 @@ def test_motions_mixed_at_will_are_sorted_into_plain_ones() -> None:
     expected = {0: 1.0, 1: 1.0, 5: 1.0}
     assert len(found) == 3
     for motion in found:
+        assert motion.shape == (6,)
         axis = int(np.argmax(np.abs(motion)))
         assert abs(motion[axis]) == pytest.approx(expected.pop(axis), abs=1e-9)
         assert np.abs(np.delete(motion, axis)).max() < 1e-9
@@ -473,6 +509,7 @@ def test_no_surface_that_is_not_the_nominal_one_leads_outside_the_tolerance(case
 def test_points_are_thinned_out_of_step_with_the_rows() -> None:
     cloud = scanned(freeform, 1)
     few = Scan.of(cloud, 400)
+    assert (len(few.points), len(few.thinned(100).points)) == (400, 100)
     local = (few.points - TRUE.translation) @ TRUE.rotation
     occupied = np.histogram(local[:, 1], bins=20, range=(-0.021, 0.019))[0]
     assert occupied.min() >= 5

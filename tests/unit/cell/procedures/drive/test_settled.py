@@ -11,7 +11,7 @@ import pytest
 
 from cell.measure.vision import BoardView, parse_board
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.drive.settled import APART_S, swing
+from cell.procedures.drive.settled import APART_S, swing, swing_covariance
 from cell.procedures.steps.board_photo import WAIT_S, WAITS, until_quiet
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord
@@ -84,6 +84,12 @@ def test_one_that_does_not_is_stated_and_noted() -> None:
         "the vehicle rocks, or the board swings: after 4 s of waiting it still goes to and fro by ±0." in fix.notes[0]
     )
     assert np.sqrt(np.diag(fix.covariance)[:3]) == pytest.approx([0.1e-3 / np.sqrt(2)] * 3, rel=0.5)
+
+
+def test_what_is_stated_of_a_board_that_swings_is_its_mean_square_and_the_angle_about_the_vehicle() -> None:
+    away = float(np.linalg.norm(BASE_FROM_BOARD.translation - VEHICLE.translation))
+    stated = swing_covariance(1e-4, BASE_FROM_BOARD, VEHICLE)
+    np.testing.assert_allclose(stated, np.diag([0.5e-8] * 3 + [0.5e-8 / away**2] * 3))
 
 
 def test_one_that_rocks_too_much_is_refused_by_name() -> None:

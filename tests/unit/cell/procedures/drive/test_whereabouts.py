@@ -147,6 +147,8 @@ def test_a_target_that_is_not_met_is_refused_with_the_vehicle_braked(shimmers: b
     with pytest.raises(RefusedError, match=rf"mm across and .* from its target after 9 photographs.*{cause}"):
         site.run()
     assert model.feedback(site.cell.clock.now()).braked
+    # One before it drives, nine on the way and two that are compared with each other.
+    assert len(first) == 12
 
 
 class LateVehicle:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -17,7 +18,8 @@ from cell.measure.inversion import NominalSurface
 from cell.measure.vision import parse_board
 from cell.motion.arm_models import HOME
 from cell.motion.collision import CollisionError
-from cell.procedures.arm.moves import Mover
+from cell.motion.trajectory import Trajectory
+from cell.procedures.arm.moves import PLACED, Mover
 from cell.procedures.arm.part import PartProgress, PartState
 from cell.procedures.arm.touch import TouchHeight
 from cell.procedures.drive.whereabouts import Whereabouts
@@ -26,6 +28,7 @@ from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.place import PlaceResult, place
 from cell.procedures.steps.workplace import Workplace
 from cell.run.resumption import UnfinishedRun
+from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
 from lab.bench.job.whole_job import NoFrames
@@ -143,6 +146,31 @@ def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat() 
     clear = int(np.argmax(up[rise] > 0.8 * JOB.place.approach))
     beside = way[rise][:clear] - np.outer(up[rise][:clear], normal())
     assert np.linalg.norm(beside, axis=1).max() < 1e-3, "straight up from the part before the arm folds"
+    np.testing.assert_allclose(site.mover.joints, HOME, atol=2e-3)
+
+
+def test_who_leaves_a_placed_part_may_be_near_that_and_nothing_else() -> None:
+    near = [("claw", PLACED), ("claw", "table")]
+    mover = Mover(VirtualCell(CONFIG, seed=1).devices.arm, Clock(), CONFIG, JOB)
+    mover._planner = cast(Any, SimpleNamespace(collisions=SimpleNamespace(touching=lambda start: near)))
+    assert mover._leaving(HOME) == (("claw", PLACED),)
+
+
+def test_a_straight_line_gains_its_speed_gently() -> None:
+    """At most by its speed in a third of a second, planned beforehand or not."""
+    mover, speed = Site().mover, 0.05
+    lines: list[Trajectory] = []
+    mover.follow = lambda line, force_limit=None: bool(lines.append(line))  # type: ignore[method-assign]
+    start = mover.kinematics.fk(mover.joints)
+    goal = from_parts((0.0, 0.0, 0.03)) * start
+    mover.line(goal, speed)
+    for line in (*lines, mover.plan_line(start, goal, speed)[1]):
+        times = np.linspace(0.0, line.duration, 200)
+        joints = [np.interp(times, line.times, line.joints[:, k]) for k in range(6)]
+        way = np.array([mover.kinematics.fk(each).translation for each in np.transpose(joints)])
+        fast = np.linalg.norm(np.diff(way, axis=0), axis=1) / np.diff(times)
+        assert fast.max() == pytest.approx(speed, rel=0.02)
+        assert times[np.argmax(fast > 0.9 * speed)] > 0.9 / 3
 
 
 def test_what_the_force_sensor_showed_before_the_descent_is_no_touch() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -14,8 +15,8 @@ from cell.measure.geometry.poses import from_parts, from_ur
 from cell.motion.arm_models import HOME
 from cell.procedures.arm.camera_poses import ScanPlan
 from cell.procedures.arm.moves import Mover
-from cell.procedures.sweep.arm_sweep import LATENCY_S, arm_sweep
-from cell.procedures.sweep.swath import Swath, SweepCollector
+from cell.procedures.sweep.arm_sweep import JITTER_S, LATENCY_S, arm_sweep
+from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame
 from sim_backends.direct.arm import DirectArm
@@ -29,7 +30,10 @@ def nothing(arm: DirectArm) -> None:
 
 
 def sweep(
-    late: float = 0.0, meddle: Callable[[DirectArm], None] = nothing, made: VirtualCell | None = None
+    late: float = 0.0,
+    meddle: Callable[[DirectArm], None] = nothing,
+    made: VirtualCell | None = None,
+    errors: SweepErrors = ERRORS,
 ) -> tuple[Swath, float]:
     """Sweep 20 mm at 20 mm/s, each state of the arm `late` s late; and how far off the lines truly lie, m.
 
@@ -52,7 +56,7 @@ def sweep(
             meddle(arm)
 
     collector = SweepCollector(GEOMETRY, SCAN, keep, lambda fraction, text: None)
-    swath = arm_sweep(ScanPlan(start, end, 0.03, 0.03), mover, devices, ERRORS, collector)
+    swath = arm_sweep(ScanPlan(start, end, 0.03, 0.03), mover, devices, errors, collector)
     truth = np.array([camera.shots[int(k)].base_from_flange[:3, 3] for k in swath.frame_ids])
     return swath, float(np.abs(swath.flanges[:, :3, 3] - truth).max())
 
@@ -93,13 +97,15 @@ def test_states_that_are_all_late_are_refused_with_what_they_leave_open(late: fl
     assert "allowed are 0.150 mm" in str(caught.value)
 
 
-def test_lateness_that_is_allowed_is_in_the_budget() -> None:
+@pytest.mark.parametrize("rate", [1.0, 3.0])
+def test_lateness_that_is_allowed_is_in_the_budget(rate: float) -> None:
     late = 0.01
-    swath, off = sweep(late)
+    swath, off = sweep(late, errors=replace(ERRORS, rate=rate))
     # The trap: the states lie on a perfect line, and the sweep is half of the lateness off.
     assert swath.residual < 10e-6
     # From tick to tick the simulated arm's speed differs by a tenth from that of the sweep.
     assert off == pytest.approx(0.5 * late * SCAN.speed, rel=0.15)
     assert off <= swath.shift < 0.15e-3
     stated = np.sqrt(np.trace(swath.covariance[:3, :3]))
-    assert stated == pytest.approx(np.hypot(swath.shift / np.sqrt(3), LATENCY_S * SCAN.speed), rel=0.1)
+    assert stated == pytest.approx(np.hypot(swath.shift / np.sqrt(3), rate * LATENCY_S * SCAN.speed), rel=0.1)
+    np.testing.assert_allclose(np.linalg.norm(swath.line_spread, axis=1), rate * JITTER_S * SCAN.speed)

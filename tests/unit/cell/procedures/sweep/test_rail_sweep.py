@@ -83,6 +83,13 @@ def sweep(
     return rail_sweep(ScanPlan(pose, pose, 0.03, 0.05), mover, devices, errors, collector)
 
 
+def test_the_picture_of_a_sweep_is_from_its_middle() -> None:
+    swath = sweep()
+    taken = swath.seen.tolist()
+    assert taken.index(swath.middle.frame_id) == pytest.approx(SCAN.length / SCAN.speed * SCAN.frame_rate / 2, abs=1)
+    assert len(taken) > SCAN.length / SCAN.speed * SCAN.frame_rate * 0.9
+
+
 @pytest.mark.parametrize(("fault", "mode"), [("", 5), ("rail.lost_steps", 5), ("", 1)])
 def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
     fault: str, mode: int, monkeypatch: pytest.MonkeyPatch

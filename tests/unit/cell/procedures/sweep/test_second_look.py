@@ -18,13 +18,14 @@ from cell.config.job import Job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import NominalSurface, PlacePose
+from cell.measure.inversion.effects.creep import Creep
 from cell.measure.inversion.effects.moved import SurfaceMotion, surface_motion
 from cell.measure.reconstruction import Cloud, flange_motions, merge
 from cell.measure.reconstruction.cloud import Filled
 from cell.procedures.arm.touch import felt_touch
 from cell.procedures.steps import place as place_step
 from cell.procedures.steps.kinds import PLACE
-from cell.procedures.sweep.second_look import LINES, SecondLook, require_in_place, require_points, sparse
+from cell.procedures.sweep.second_look import LINES, SecondLook, by_times, require_in_place, require_points, sparse
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION
 from drivers.errors import CellError, DeviceFault, LimitError, RefusedError
 from lab.bench.job.scan_errors import own_base
@@ -102,7 +103,10 @@ def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path: 
     assert not found.moved and found.times < 0.9
     assert found.matched == pytest.approx(1.0, abs=0.1)
     # What the run itself saw is in its journal.
-    result = placed_pot.results["place"].summary()["surface_moved"]
+    placing = placed_pot.results["place"]
+    result = placing.summary()["surface_moved"]
+    sigmas = np.sqrt(np.diag(placing.look.moved.covariance))
+    np.testing.assert_allclose(result["sigma_mm"], 1e3 * sigmas[:3], atol=1e-4)
     assert np.abs(result["mm"]).max() < 0.2 and np.abs(result["mrad"]).max() < 0.5
 
 
@@ -192,6 +196,7 @@ def test_what_late_replies_and_the_lines_leave_open_is_known(placed_pot: JobReco
     job, nominal = pot()
     site = Site(placed_pot, tmp_path, changed(job, "place", tolerance=2e-3), nominal)
     site.sweep_here()
+    assert {"table", "board"} <= {body.name for body in site.work.mover._station}, "met as the board was seen"
     slid(site.cell, (0.25e-3, 0.0))
     with pytest.raises(RefusedError, match=r"has moved by 0\.2\d mm .* times as far as chance brings"):
         site.look_again()
@@ -208,6 +213,14 @@ def test_what_late_replies_and_the_lines_leave_open_is_known(placed_pot: JobReco
     (note,) = site.look_again().notes
     assert len(site.cell.target_camera.shots) > taken
     assert re.search(r"translation along the x axis of the surface frame shows from 0\.\d+ mm on.* nobody touch", note)
+
+
+def test_what_late_replies_leave_open_lies_along_the_sweep_and_is_even(placed_pot: JobRecord) -> None:
+    (swath,) = placed_pot.results["laser_sweep"].swaths
+    along = 0.15e-3 * swath.builder.sweep_direction(swath.base_from_flange)
+    expected = np.zeros((6, 6))
+    expected[:3, :3] = np.outer(along, along) / 3
+    np.testing.assert_allclose(by_times(replace(swath, shift=0.15e-3)), expected)
 
 
 def test_after_a_pause_it_is_looked_at_anew(placed_pot: JobRecord, tmp_path: Path) -> None:
@@ -303,3 +316,35 @@ def test_a_vehicle_that_creeps_is_seen_and_the_place_carried_on(
         return float(off @ np.linalg.solve(pose.covariance, off))
 
     assert distance(placing.pose) < chi2.ppf(0.95, 6) < distance(record.results["invert_pose"])
+
+
+def test_what_is_not_known_of_a_rate_grows_with_the_time(placed_pot: JobRecord) -> None:
+    made = placed_pot.results
+    pose, cloud, times = made["invert_pose"], made["reconstruct"].cloud, made["laser_sweep"].times
+    unsure = np.diag([1e-6**2, 0.0, 0.0, 0.0, 0.0, 2e-6**2])
+    creep = Creep(np.array([3e-6, 0, 0, 0, 0, 0]), unsure, pose.base_from_surface.translation, times[0] + 1.0)
+    later = creep.carried(pose, times[0] + 4.0)
+    np.testing.assert_allclose(later.covariance - pose.covariance, 9.0 * unsure, atol=1e-16)
+    np.testing.assert_allclose(later.systematic - pose.systematic, 9.0 * unsure, atol=1e-16)
+    np.testing.assert_allclose(
+        difference(later.base_from_surface, pose.base_from_surface), 3.0 * creep.rate, atol=1e-12
+    )
+    lines, rows = (each[::997] for each in np.nonzero(cloud.valid))
+    moved = creep.motions(cloud, lines, rows, times)
+    arms, seconds = cloud.points[lines, rows] - creep.origin, (times[lines] - creep.since)[:, None]
+    turned = np.cross([0.0, 0.0, 2e-6], arms)
+    expected = np.einsum("ni,nj->nij", seconds * [1e-6, 0, 0], seconds * [1e-6, 0, 0])
+    expected += np.einsum("ni,nj->nij", seconds * turned, seconds * turned)
+    np.testing.assert_allclose(np.einsum("nim,njm->nij", moved, moved), expected, atol=1e-18)
+
+
+def test_a_place_that_creeps_is_carried_on_to_the_time_of_the_contact(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, until = Site(placed_pot, tmp_path, *pot()), []
+    monkeypatch.setattr(Creep, "carried", lambda creep, pose, time: until.append(time))
+    made = (site.made[name] for name in ("laser_sweep", "reconstruct", "board_photo"))
+    place_step.carried_on(site.work, *made, Creep(np.zeros(6), 1e-16 * np.eye(6), np.zeros(3), 0.0))
+    plan, now = site.job.place, site.cell.clock.now()
+    descent = plan.approach / plan.speed + plan.contact_travel / plan.contact_speed
+    assert until == [pytest.approx(now + place_step.APPROACH_S + descent)]

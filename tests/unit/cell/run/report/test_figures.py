@@ -64,6 +64,12 @@ def test_a_sweeps_figures(placed_pot: JobRecord) -> None:
         "laser_confirmed_mrad": 0.15, "head_slipped_um": [40.0, -30.0], "pictures_later_ms": 2.0,
     })  # fmt: skip
     assert sweep.slip is not None and sweep.slip.size == pytest.approx(0.05e-3)
+    hidden = replace(sweep, slip=replace(sweep.slip, hidden=True))
+    assert any("across the rail is not seen" in note for note in hidden.notes)
+    unseen = replace(sweep, pointing=None, slip=None, doubts=("nobody looked",))
+    assert unseen.notes == ("nobody looked",)
+    shown(unseen.summary(), dict.fromkeys(("laser_turned_mrad", "laser_confirmed_mrad", "head_slipped_um"), None))
+    assert unseen.summary()["pictures_later_ms"] is None
     assert "+0.200 ± 0.010 mrad" in sweep.pointing.words and "+0.150 mrad were seen" in sweep.pointing.words
 
 

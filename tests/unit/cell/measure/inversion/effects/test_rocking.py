@@ -15,6 +15,7 @@ from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance, 
 from cell.measure.inversion.effects.rocking import (
     LARGEST_RAD,
     Rocking,
+    _Sweep,
     find_rocking,
     rocking_covariance,
     rocking_motions,
@@ -143,6 +144,21 @@ def test_sweeps_that_lie_on_each_other_by_a_step_do_not_rock() -> None:
 
 def test_times_that_tell_no_lines_apart_tell_of_no_rocking() -> None:
     assert find_rocking(scanned(0.0, 1e-4, 4.0), NOMINAL, SURFACE, np.zeros(LINES)) is None
+
+
+@pytest.mark.parametrize("kept", [0, 20])
+def test_few_lines_tell_of_no_rocking(kept: int) -> None:
+    cloud = scanned(0.0, 1e-4, 4.0)
+    cloud.points[kept:] = np.nan
+    assert find_rocking(cloud, NOMINAL, SURFACE, TIMES) is None
+
+
+@pytest.mark.parametrize("times", [2, 3])
+def test_an_overtone_is_told_by_its_size(times: int) -> None:
+    heights = 1e-5 * (np.sin(2 * np.pi * 2.0 * TIMES) + 0.4 * np.sin(2 * np.pi * 2.0 * times * TIMES + 0.3))
+    sweep = _Sweep.of(TIMES, heights, np.outer(TIMES, [0.015, 0.0, 0.0]))
+    assert sweep is not None
+    assert sweep.overtones(2.0) == pytest.approx(0.4, abs=0.02)
 
 
 def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square() -> None:
