@@ -10,6 +10,7 @@ import os
 from pathlib import Path
 
 import pytest
+from xdist.scheduler import LoadFileScheduling
 
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
@@ -73,6 +74,7 @@ GROUPS = (
         "unit/cell/measure/inversion/effects/test_droop.py",
         "unit/cell/measure/inversion/effects/test_causes.py",
         "unit/cell/measure/inversion/test_obstruction.py",
+        "unit/cell/procedures/steps/test_workplace.py",
         "unit/cell/measure/calibration/drift/test_timing_fit.py",
         "unit/drivers/vehicle/test_fixed.py",
         "unit/cell/run/record/test_recorder.py",
@@ -113,9 +115,8 @@ def place(file: Path) -> tuple[int, int]:
     return (0, len(GROUPS[0])) if file.is_relative_to(WIRES) else (len(GROUPS), 0)
 
 
-@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Begin with what lasts longest, a group of files on one worker.
+    """Begin with what lasts longest.
 
     Devices keep deadlines on the wall, which more workers than cores cannot always: a failure there is looked at again
     a little later, and listed. What is wrong fails each time.
@@ -123,10 +124,22 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items.sort(key=lambda item: place(item.path))
     again = config.pluginmanager.hasplugin("rerunfailures")
     for item in items:
-        group, _ = place(item.path)
-        item.add_marker(pytest.mark.xdist_group(str(item.path) if group == len(GROUPS) else f"group {group}"))
         if again and any(item.path.is_relative_to(folder) for folder in ON_THE_WALL):
             item.add_marker(pytest.mark.flaky(reruns=3, reruns_delay=5))
+
+
+class Grouped(LoadFileScheduling):
+    """Gives a worker a whole group of files at a time."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = super()._split_scope(nodeid)
+        group, _ = place(self.config.rootpath / file)
+        return file if group == len(GROUPS) else f"group {group}"
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: object) -> LoadFileScheduling | None:
+    """Files by their groups where the tests are distributed by file."""
+    return Grouped(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -35,14 +35,20 @@ _TABLES = (
 
 
 def plain_report(folder: Path) -> str:
-    """The text of the report without the run's name and its dates."""
-    return _DATED.sub(r'"\1": ""', (folder / "report.json").read_text(encoding="utf-8"))
+    """The text of the report without the run's name, its dates, and its own digest, which covers the mesh's path."""
+    report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    report.pop("sha256", None)
+    return _DATED.sub(r'"\1": ""', json.dumps(report))
 
 
 def plain_journal(folder: Path) -> list[Any]:
-    """All rows of the journal without the run's id, its process and all times."""
+    """All rows of the journal without the run's id, its process, all times and dates."""
     with closing(sqlite3.connect(folder / "journal.sqlite")) as base:
-        return [base.execute(table).fetchall() for table in _TABLES]
+        rows = [base.execute(table).fetchall() for table in _TABLES]
+    return [
+        [[_DATED.sub(r'"\1": ""', value) if isinstance(value, str) else value for value in row] for row in table]
+        for table in rows
+    ]
 
 
 def hashes(seeds: list[int]) -> Iterator[tuple[str, str]]:

@@ -136,7 +136,7 @@ def test_the_cloud_is_built_with_the_laser_where_it_pointed(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here, sweep, given = at_work(placed_pot, tmp_path), placed_pot.results["laser_sweep"], []
-    monkeypatch.setattr(reconstruct, "reconstruct", lambda sweep, head, *rest: given.append(head))
+    monkeypatch.setattr(reconstruct, "reconstruct", lambda sweep, head, *_, **__: given.append(head))
     turned, head = Pointing(1e-3, 1e-5, 0.0), here.calibration.scan
     for pointing in (None, turned):
         reconstruct.reconstructed(here, replace(sweep, pointing=pointing))
