@@ -12,11 +12,19 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from cell.base.units import quantity, whole
     from cell.makes.built_in import ArmOutputClawConfig, OnArm
-    from cell.makes.make import Make, Surroundings
-    from cell.makes.records import ArmConfig, CameraConfig, ClawConfig, LaserConfig, RailConfig, VehicleConfig
+    from cell.makes.make import (
+        ArmConfig,
+        CameraConfig,
+        ClawConfig,
+        LaserConfig,
+        Make,
+        RailConfig,
+        Surroundings,
+        VehicleConfig,
+    )
     from cell.procedures.arm.photograph import BoardFix
     from cell.procedures.steps.kinds import PLACE, Kind
-    from cell.procedures.steps.step import JobStep
+    from cell.procedures.steps.workplace import JobStep
     from cell.run.events import (
         Confirmed,
         ConfirmNeeded,
@@ -34,7 +42,7 @@ if TYPE_CHECKING:
         StepStarted,
     )
     from cell.run.job_run import RunOutcome
-    from cell.run.run import Run
+    from cell.run.runs import Run
     from cell.run.session.supervisor import Cell
     from drivers.errors import (
         Aborted,
@@ -51,25 +59,25 @@ if TYPE_CHECKING:
         NotObservable,
         RefusedError,
     )
-    from statemachine.policy import Step
-    from statemachine.script import Again, Script
+    from statemachine.runner import Again, Script
+    from statemachine.step import Step
 
 _PLACES = {
     "cell.run.session.supervisor": ("Cell",),
     "cell.run.job_run": ("RunOutcome",),
-    "cell.run.run": ("Run",),
+    "cell.run.runs": ("Run",),
     "cell.run.events": (
         "ConfirmNeeded", "Confirmed", "FaultMet", "GoesOn", "Held", "Noted", "RunEnded", "RunEvent", "SafeStopped",
         "StateChanged", "StepDone", "StepFailed", "StepProgress", "StepStarted",
     ),
-    "statemachine.script": ("Again", "Script"),
-    "statemachine.policy": ("Step",),
-    "cell.procedures.steps.step": ("JobStep",),
+    "statemachine.runner": ("Again", "Script"),
+    "statemachine.step": ("Step",),
+    "cell.procedures.steps.workplace": ("JobStep",),
     "cell.procedures.steps.kinds": ("Kind", "PLACE"),
     "cell.procedures.arm.photograph": ("BoardFix",),
     "cell.makes.built_in": ("ArmOutputClawConfig", "OnArm"),
-    "cell.makes.make": ("Make", "Surroundings"),
-    "cell.makes.records": (
+    "cell.makes.make": (
+        "Make", "Surroundings",
         "ArmConfig", "CameraConfig", "ClawConfig", "LaserConfig", "RailConfig", "VehicleConfig",
     ),
     "cell.base.units": ("quantity", "whole"),

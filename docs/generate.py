@@ -147,7 +147,7 @@ def cell_toml() -> str:
     """The page of `cell.toml`."""
     from cell.config.cell_config import DEVICES, CellConfig, CellSection, default_toml
     from cell.makes.built_in import BUILT_IN
-    from cell.makes.records import CalibrationConfig
+    from cell.makes.make import CalibrationConfig
 
     told = comments(default_toml())
     text = "# cell.toml\n\n" + NOTE
@@ -305,7 +305,7 @@ def add(found: Causes, code: str, what: str, recoverable: ast.AST | None, hint: 
 
 def faults() -> str:
     """The page of fault codes."""
-    from cell.run.faults import CONFIRMED_BY_A_PERSON
+    from cell.run.recorded_work import CONFIRMED_BY_A_PERSON
 
     text = "# Fault codes\n\n" + NOTE
     text += "The texts are those of the source; … stands for a value. "

@@ -13,8 +13,7 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from drivers.clock import Clock
-from drivers.endings import in_the_end
-from drivers.errors import DeviceFault, InterlockError
+from drivers.errors import DeviceFault, InterlockError, in_the_end
 from drivers.interfaces import Identity, LinkStatistics
 
 _POLL_S = 0.01

@@ -34,17 +34,15 @@ from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.arm.rtde.server import PERIOD, RtdePeer
 from sim_backends.peers.camera.frames import FramePeer
 from sim_backends.peers.camera.gige import GigePeer
-from sim_backends.peers.following import FollowingPeer
-from sim_backends.peers.truth import TruthPeer
-from sim_backends.peers.vehicle.wired_vehicle import vehicle_peer
+from sim_backends.peers.truth import FollowingPeer, TruthPeer
+from sim_backends.peers.vehicle.agilex import vehicle_peer
 from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.world.bodies.surfaces import SURFACES
 from sim_backends.world.drawing import STOCK, read
 from sim_backends.world.following import FOLLOWED, WorldFollowing
 from sim_backends.world.hardware import camera_spec
 from sim_backends.world.levels import LEVELS
-from sim_backends.world.truth import truth
-from sim_backends.world.world import World
+from sim_backends.world.world import World, truth
 
 SPEEDS = (0.05, 50.0)
 """World seconds per wall second that can be asked for."""

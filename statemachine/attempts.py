@@ -1,13 +1,18 @@
-"""One try at a step, from its row in the journal to its result; and what came of all tries so far."""
+"""One try at a step, from its row in the journal to its result; and what came of all tries so far.
+
+What a run waits for while the cell stands: that it goes on after a pause, and a person's word after a fault.
+
+Doing a step until it succeeds: repeating it, and clearing faults meanwhile, confirmed by a person where needed."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-from statemachine.policy import Failure, Step
-from statemachine.step import Event, StepCall, StepContext, StepRecord, summary_of
+from statemachine.control import CancelToken
+from statemachine.sequence import JobTrigger, Sequence
+from statemachine.step import Event, Failure, OnFailure, Outcome, Step, StepCall, StepContext, StepRecord, summary_of
 from statemachine.watchman import Watchman
 
 
@@ -91,3 +96,126 @@ class Attempts:
         if self._watchman.health is not None:
             self._watchman.health()
         return self._steps[context.step.name](context)
+
+
+def hold(sequence: Sequence, watchman: Watchman) -> tuple[Failure | None, Exception | None]:
+    """Stay paused for as long as it is asked for and the cell is well.
+
+    Why the run is to end, or None; and what ails the cell, which fails the next attempt.
+    """
+    end, ailment = watchman.asked(), None
+    control, tell = watchman.control, watchman.teller.tell
+    if end is None and control.paused():
+        step = sequence.state
+        sequence.fire(JobTrigger.PAUSE)
+        tell(Event("paused", step, {"text": f"held before {step}"}))
+        while end is None and control.paused() and ailment is None:
+            end = watchman.wait_briefly()
+            ailment = watchman.examine()
+        if end is None:
+            sequence.fire(JobTrigger.RESUME)
+            text = "goes on" if ailment is None else f"held no longer: {ailment}"
+            tell(Event("going_on", step, {"text": text}))
+    return end, ailment
+
+
+def await_word(step: Step, end: Failure, watchman: Watchman) -> tuple[Failure | None, str | None]:
+    """Wait until a person has confirmed the fault `end`: why that ended the run, or None; and who it was.
+
+    A fault that no recovery can clear, such as an emergency stop, ends the wait and the run.
+    """
+    policy, control, tell = watchman.policy, watchman.control, watchman.teller.tell
+    if policy.simulated_person:
+        by = "the simulated person"
+    else:
+        number = control.ask(end.reason)
+        tell(Event("confirm_needed", step.name, {"reason": end.reason, "code": end.code, "number": number}))
+        try:
+            until = time.monotonic() + policy.confirm_deadline_s
+            while (found := control.answer()) is None:
+                if (worse := watchman.wait_briefly() or _worse(watchman)) is not None:
+                    return worse, None
+                if time.monotonic() > until:
+                    text = f"{end.reason}; nobody confirmed within {policy.confirm_deadline_s:g} s"
+                    return replace(end, outcome=Outcome.FAULTED, reason=text), None
+            by = found
+        finally:
+            control.asked_no_more()
+    tell(Event("confirmed", step.name, {"by": by, "reason": end.reason}))
+    return None, by
+
+
+def _worse(watchman: Watchman) -> Failure | None:
+    """What ails the cell and no recovery can clear; the fault that a person is asked about can be cleared."""
+    if (error := watchman.examine()) is None or watchman.classified(error).recoverable:
+        return None
+    watchman.error = error
+    return watchman.judge(error)
+
+
+Recover = Callable[[BaseException, CancelToken, bool], None]
+"""Clears the fault behind an exception, begins nothing once the token is cancelled; told whether a person confirmed."""
+
+
+def performed(
+    step: Step,
+    attempts: Attempts,
+    recover: Recover | None,
+    sequence: Sequence,
+    watchman: Watchman,
+    hold: Callable[[], Failure | None] = lambda: None,
+) -> Failure | None:
+    """Do one step, with its repetitions; None when it has succeeded. `hold()` waits while the run is paused."""
+    attempt = 1
+    while (end := attempts.attempt(step, attempt)) is not None:
+        left = step.max_retries + 1 - attempt
+        error = watchman.error
+        if left == 0 or error is None or watchman.abandoned or end.outcome is Outcome.ABORTED:
+            return end
+        sequence.facts.retries_left = left
+        sequence.facts.recoverable = end.recoverable
+        if step.retries(error):
+            if (unsafe := watchman.halt_before(f"before {step.name} is tried again", end)) is not None:
+                return unsafe
+            watchman.teller.failed(step.name, attempt, end, "tried again")
+            sequence.fire(JobTrigger.RETRY)
+        elif end.recoverable and step.on_failure is OnFailure.RECOVER and recover is not None:
+            failed, by = recovered(step, end, error, recover=recover, sequence=sequence, watchman=watchman)
+            if failed is not None:
+                return failed
+            watchman.teller.failed(step.name, attempt, end, f"confirmed by {by}, recovered" if by else "recovered")
+        else:
+            return end
+        if (asked := hold()) is not None:
+            return asked
+        attempt += 1
+    return None
+
+
+def recovered(
+    step: Step, end: Failure, error: BaseException, recover: Recover, sequence: Sequence, watchman: Watchman
+) -> tuple[Failure | None, str | None]:
+    """Clear the fault `end` of a step: why that ended the run, or None; and who has confirmed it, where needed."""
+    sequence.fire(JobTrigger.FAULT)
+    # The failed attempt was stopped already. A device that is to be recovered may not have confirmed it; after the
+    # recovery all have to.
+    by = None
+    if end.needs_person:
+        refused, by = await_word(step, end, watchman)
+        if refused is not None:
+            return refused, None
+    sequence.fire(JobTrigger.RECOVER)
+    token = CancelToken(watchman.control.token)
+    deadline = watchman.clock.now() + watchman.policy.recovery_deadline_s
+    call, failed = watchman.watch("the recovery", lambda: recover(error, token, by is not None), deadline, token)
+    if failed is None and call.error is not None:
+        watchman.error = call.error
+        failed = watchman.asked()
+    if failed is None and call.error is not None:
+        judged = watchman.judge(call.error)
+        failed = replace(judged, outcome=Outcome.FAULTED, reason=f"{error}; the recovery failed: {judged.reason}")
+    if failed is None:
+        failed = watchman.halt_before(f"recovered, before {step.name} is tried again", end)
+    if failed is None:
+        sequence.fire(JobTrigger.RECOVERED)
+    return failed, by

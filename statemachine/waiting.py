@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from typing import Protocol, runtime_checkable
 
-from statemachine.cancel import Cancelled
+from statemachine.control import Cancelled
 from statemachine.watch import Call, RunClock, begin
 
 POLL_S = 0.02

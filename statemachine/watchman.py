@@ -1,21 +1,75 @@
 """Looks around while a run's work goes on, ends it when it has to end, and brings the cell to rest.
 
 What ends work: a request of a person or a program, a signal, its deadline, the cell's health.
-"""
+
+Tells what happens in a run: its journal, its observer, and the list of its faults for the report."""
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from statemachine.cancel import CancelToken
-from statemachine.control import RunControl
+from statemachine.control import CancelToken, RunControl
 from statemachine.journal import Journal, JournalError
-from statemachine.policy import Failure, Outcome, Policy
-from statemachine.step import StepOverrun
-from statemachine.telling import Teller
+from statemachine.sequence import JobTrigger
+from statemachine.step import Event, Failure, FaultRecord, Observer, Outcome, Policy, StepOverrun
 from statemachine.waiting import POLL_S, Waiting
 from statemachine.watch import Call, RunClock, SignalWatch
+
+JOURNALLED = frozenset(
+    ("state", "safe_stop", "note", "fault", "confirm_needed", "confirmed", "paused", "going_on", "decided")
+)
+"""The kinds of events that are written to the journal; steps have a table of their own there."""
+
+
+class Teller:
+    """What happens in one run is told here, from any thread; `faults` are all that were told, in their order."""
+
+    def __init__(self, journal: Journal, observer: Observer | None, state: Callable[[], str]) -> None:
+        """`state()` is where the sequence is."""
+        self.faults: list[FaultRecord] = []
+        self._journal = journal
+        self._observer = observer
+        self._state = state
+
+    def tell(self, event: Event) -> None:
+        """Write to the journal what is not in its steps table, and tell the observer."""
+        if event.kind in JOURNALLED:
+            self._journal.event(event.kind, event.step, event.data)
+        if event.kind == "fault":
+            attempt, code, reason = (event.data[key] for key in ("attempt", "code", "reason"))
+            remedy = str(event.data.get("remedy", "noted"))
+            assert isinstance(attempt, int)
+            self.faults.append(FaultRecord(event.at, event.step or "", attempt, str(code), str(reason), remedy=remedy))
+        observer = self._observer
+        if observer is not None:
+            try:
+                observer(event)
+            # A display that fails must not end the job; it is told nothing more.
+            except Exception as error:
+                self._observer = None
+                self._journal.event("observer_failed", event.step, {"error": f"{type(error).__name__}: {error}"})
+
+    def changed(self, trigger: JobTrigger, source: str, target: str) -> None:
+        """The sequence went from one state to another."""
+        self.tell(Event("state", None, {"trigger": trigger.value, "from": str(source), "to": str(target)}))
+
+    def stopped(self, reason: str, trouble: str | None) -> None:
+        """The cell was brought to rest; `trouble` is what could not be confirmed."""
+        self.tell(Event("safe_stop", None, {"reason": reason, "trouble": trouble}))
+
+    def failed(self, step: str, attempt: int, end: Failure, remedy: str) -> None:
+        """What went wrong and what was done about it, for the report; an end that was asked for is no fault."""
+        if end.outcome is Outcome.ABORTED:
+            return
+        self.tell(Event("fault", step, {"attempt": attempt, "code": end.code, "reason": end.reason, "remedy": remedy}))
+
+    def trace(self, error: BaseException) -> None:
+        """Where an exception came from, for the journal alone."""
+        text = "".join(traceback.format_exception(error))
+        self._journal.event("traceback", self._state(), {"text": text})
+
 
 REQUEST_POLLS = 10
 """The journal's requests are looked at every so many polls."""

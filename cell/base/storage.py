@@ -2,7 +2,8 @@
 
 The digest is a SHA-256. It shows accidents and edits by hand; it protects from no attacker. Names and dates of runs
 (`UNDATED`) do not count: the same seed gives the same digest.
-"""
+
+Results in a notebook: a short table, every word escaped."""
 
 from __future__ import annotations
 
@@ -13,9 +14,10 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from html import escape
 from pathlib import Path
 from typing import IO, Any
 
@@ -196,3 +198,17 @@ def require_date(name: str, seconds: float) -> None:
             f"{name} lies {ahead / 3600:.1f} hours in the future, so its age is not known (allowed: "
             f"{CLOCK_SLACK_S / 3600:g} h); set this machine's clock"
         )
+
+
+LONGEST = 240
+"""Characters of a cell; a reason can be long, and the report has all of it."""
+
+
+def table(title: str, rows: Iterable[tuple[str, str]]) -> str:
+    """An HTML table of names and values under a title."""
+    lines = "".join(f"<tr><th style='text-align:left'>{_safe(n)}</th><td>{_safe(v)}</td></tr>" for n, v in rows)
+    return f"<table><caption>{_safe(title)}</caption>{lines}</table>"
+
+
+def _safe(text: str) -> str:
+    return escape(text if len(text) <= LONGEST else text[: LONGEST - 2] + " …")

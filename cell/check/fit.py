@@ -11,18 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-from cell.check.contact import contact_problems
-from cell.check.place import mesh_box, place_problems, surface_problems, way_problems
+from cell.check.place import contact_problems, mesh_box, place_problems, surface_problems, way_problems
 from cell.check.reach import reach_problems
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
 from cell.config.job import Job
-from cell.makes.records import CameraConfig
+from cell.makes.make import CameraConfig
 from cell.measure.geometry.poses import transform
 from cell.measure.vision import BoardSpec, parse_board
-from cell.measure.vision.board.spec import centre_of
-from cell.motion.bodies import tool_bodies, vehicle_bodies
-from cell.procedures.arm.camera_poses import look_pose
+from cell.measure.vision.board.view import centre_of
+from cell.motion.collision import tool_bodies, vehicle_bodies
+from cell.procedures.arm.photograph import look_pose
 from cell.procedures.steps.kinds import find_kind
 from drivers.errors import ConfigError
 

@@ -8,22 +8,28 @@ import numpy as np
 import pinocchio as pin
 
 from cell.config.calibrations.store import nominal_camera
-from cell.config.cell_config import CellConfig
+from cell.config.cell_config import CellConfig, deck_plates, mounted, station_obstacles, vehicle_obstacles
 from cell.config.job import Job
-from cell.config.mounting import deck_plates, mounted
-from cell.config.obstacles import station_obstacles, vehicle_obstacles
 from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.solve.results import PARAMETERS, Quality
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision import parse_board
-from cell.measure.vision.board.spec import centre_of
-from cell.motion.arm_models import HOME, arm_kinematics
-from cell.motion.bodies import TOUCHES, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
-from cell.motion.collision import CollisionError, CollisionModel, Pair
-from cell.motion.kinematics import Unreachable
+from cell.measure.vision.board.view import centre_of
+from cell.motion.collision import (
+    TOUCHES,
+    CollisionError,
+    CollisionModel,
+    Pair,
+    arm_bodies,
+    station_bodies,
+    tool_bodies,
+    vehicle_bodies,
+)
+from cell.motion.kinematics import HOME, Unreachable, arm_kinematics
 from cell.motion.planning import Planner
-from cell.procedures.arm.camera_poses import (
+from cell.procedures.arm.moves import ROOM_ABOVE
+from cell.procedures.arm.photograph import (
     base_from_place_at_target,
     look_pose,
     photo_pose,
@@ -31,8 +37,7 @@ from cell.procedures.arm.camera_poses import (
     scan_plans,
     target_calibration_views,
 )
-from cell.procedures.arm.moves import ROOM_ABOVE
-from cell.procedures.sweep.arm_sweep import RUN_UP_S
+from cell.procedures.sweep.sweeping import RUN_UP_S
 from drivers.interfaces import Vector
 
 Goal = tuple[str, pin.SE3, tuple[Pair, ...]]

@@ -2,40 +2,92 @@
 
 Every value carries its unit and is checked against its range here, once. Unknown keys are refused. The hash of what a
 calibration depends on ties stored calibrations to the configuration that they were made under.
-"""
+
+What else is in the way: boxes that a configuration (on the vehicle) or a job (at the station) names.
+
+The planner keeps the arm away from them, the gate every other command, and the way of the vehicle leaves room for them.
+
+What the configuration draws on flange and deck, as bodies: the scan head, the target camera, the boards."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import tomllib
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
+import pinocchio as pin
 from pydantic import AfterValidator, SerializeAsAny, WrapValidator, model_validator
 
 from cell.base.addresses import Folder, Name, checked_endpoint, checked_folder, is_example
 from cell.base.toml_file import Table, read_toml, validate
-from cell.base.units import number, shown
+from cell.base.units import number, quantity, shown
 from cell.config.files import CONFIGURATION, DEVICES, RUNS, beside, find_config, runs_folder
-from cell.config.obstacles import VehicleObstacle, once_each
 from cell.makes.built_in import BUILT_IN
-from cell.makes.make import AnyMake
-from cell.makes.records import (
+from cell.makes.make import (
+    AnyMake,
     ArmConfig,
     CalibrationConfig,
     CameraConfig,
     ClawConfig,
     DeviceConfig,
     LaserConfig,
+    Pose,
     RailConfig,
     VehicleConfig,
 )
 from cell.makes.switches import line_problems
 from cell.makes.table import make_of, record_of
+from cell.measure.geometry.poses import from_parts
+from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import centre_of
+from cell.motion.collision import BASE, Body, Mounted, box
 from drivers.errors import ConfigError
+
+Side = Annotated[float, quantity("mm", 1, 10_000)]
+
+
+class Obstacle(Table):
+    """A box with edges `size` along the axes of its pose, which is that of its middle."""
+
+    name: Annotated[str, Name]
+    size: tuple[Side, Side, Side]
+
+
+class VehicleObstacle(Obstacle):
+    """One that goes with the vehicle: a control box, a rack."""
+
+    base_from_centre: Pose
+
+
+class StationObstacle(Obstacle):
+    """One that stands at the station: a fixture, a neighbour's machine."""
+
+    place_from_centre: Pose
+
+
+def once_each(obstacles: Sequence[Obstacle]) -> None:
+    """Raise `ValueError` when two have one name."""
+    names = [obstacle.name for obstacle in obstacles]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"obstacle {', '.join(twice)} is there twice; give each a name of its own")
+
+
+def vehicle_obstacles(obstacles: Iterable[VehicleObstacle]) -> list[Body]:
+    """The bodies of those on the vehicle, fixed to the arm's base."""
+    return [box(f"obstacle {o.name}", BASE, o.base_from_centre.se3(), o.size) for o in obstacles]
+
+
+def station_obstacles(obstacles: Iterable[StationObstacle], base_from_place: pin.SE3) -> list[Body]:
+    """The bodies of those at the station, by the place frame's pose in the arm base."""
+    return [
+        box(f"station obstacle {o.name}", BASE, base_from_place * o.place_from_centre.se3(), o.size) for o in obstacles
+    ]
+
 
 __all__ = [
     "CONFIGURATION",
@@ -203,3 +255,24 @@ def config_to_open(
     if not simulated:
         require_confirm(config)
     return source, config
+
+
+PLATE_THICKNESS = 0.01
+"""Of a calibration board, m."""
+
+
+def mounted(config: CellConfig) -> Mounted:
+    """What the flange carries beside the claw, where the configuration has it."""
+    scan, target = (camera.flange_from_camera.se3() for camera in (config.scan_camera, config.target_camera))
+    return Mounted(scan, target, config.laser.baseline, config.rail.travel)
+
+
+def deck_plates(config: CellConfig) -> list[tuple[str, pin.SE3, tuple[float, float, float]]]:
+    """The calibration boards on the deck: name, base_from_centre and size, m."""
+    plates = []
+    for name, plate in (("fine plate", config.calibration.fine), ("large board", config.calibration.large)):
+        board = parse_board(plate.board)
+        width, height = np.ptp(board.points()[:, :2], axis=0) + 2 * board.pitch
+        below = from_parts(centre_of(board) + np.array([0.0, 0.0, PLATE_THICKNESS / 2]))
+        plates.append((name, plate.base_from_board.se3() * below, (width, height, PLATE_THICKNESS)))
+    return plates

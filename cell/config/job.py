@@ -18,8 +18,8 @@ from pydantic import AfterValidator, Field, model_validator
 from cell.base.addresses import Name
 from cell.base.toml_file import Table, below, read_toml, validate
 from cell.base.units import number, quantity, shown, whole
-from cell.config.obstacles import StationObstacle, once_each
-from cell.makes.records import Exposure, Mounting, Pose, checked_board
+from cell.config.cell_config import StationObstacle, once_each
+from cell.makes.make import Exposure, Mounting, Pose, checked_board
 from drivers.errors import ConfigError
 
 LEAST_LINES, MOST_LINES = 10, 20_000

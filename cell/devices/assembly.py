@@ -8,17 +8,15 @@ from typing import Any
 
 from cell.config.cell_config import DEVICES, CellConfig
 from cell.devices.devices import Devices
-from cell.devices.gate.camera import GatedCamera
 from cell.devices.gate.gate import Gate
 from cell.devices.gate.gated import GatedArm, GatedClaw, GatedRail, GatedVehicle
 from cell.devices.gate.interlocks import Interlocks, Situation
-from cell.devices.gate.laser import GatedLaser
-from cell.devices.gate.rules import RULES
-from cell.devices.gate.ways import Ways
+from cell.devices.gate.laser import GatedCamera, GatedLaser
+from cell.devices.gate.rules import RULES, Ways
 from cell.makes.built_in import OnArm
 from cell.makes.make import Surroundings
 from cell.measure.geometry.poses import to_ur
-from cell.motion.arm_models import HOME, arm_kinematics
+from cell.motion.kinematics import HOME, arm_kinematics
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from drivers.interfaces import Arm, Camera, Claw, Laser, Rail, Vector, Vehicle

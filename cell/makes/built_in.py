@@ -13,18 +13,20 @@ from pydantic import StrictBool, model_validator
 from cell.base.addresses import Endpoint, Host, Port
 from cell.base.units import quantity, whole
 from cell.makes.cameras import FOLDER, GIGE, OPTICS, USB3, V4L2
-from cell.makes.make import AnyMake, Make, Surroundings
-from cell.makes.rails import MODBUS
-from cell.makes.records import (
+from cell.makes.make import (
     MOST_PAYLOAD,
+    AnyMake,
     ArmConfig,
     CameraConfig,
     ClawConfig,
     DeviceConfig,
     LaserConfig,
+    Make,
     RailConfig,
+    Surroundings,
     VehicleConfig,
 )
+from cell.makes.rails import MODBUS
 from cell.makes.switches import SWITCH_MAKES
 from cell.makes.vehicles import CANOPEN, CanVehicleConfig
 from drivers.packages import lacking
@@ -171,8 +173,8 @@ def _rail(name: str, config: TmclRailConfig, around: Surroundings) -> TmclRail:
 
 
 def _arm(name: str, config: UrArmConfig, around: Surroundings) -> UrArm:
-    from cell.motion.arm_models import MODELS
-    from drivers.arm.limits import ArmLimits
+    from cell.motion.kinematics import MODELS
+    from drivers.arm.motion import ArmLimits
     from drivers.arm.ur import UrArm
 
     return UrArm(

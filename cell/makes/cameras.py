@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import AfterValidator, StringConstraints
 
 from cell.base.units import number, quantity, whole
-from cell.makes.make import AnyMake, Make, Surroundings
-from cell.makes.records import CameraConfig
+from cell.makes.make import AnyMake, CameraConfig, Make, Surroundings
 
 if TYPE_CHECKING:
+    from drivers.camera.folder import RecordedCamera
     from drivers.camera.genicam.camera import GenicamCamera
     from drivers.camera.genicam.device import Place
-    from drivers.camera.recording import RecordedCamera
     from drivers.camera.v4l2 import V4l2Camera
 
 OPTICS = frozenset(("width", "height", "pixel", "focal_length", "flange_from_camera"))
@@ -104,8 +103,7 @@ class FolderCameraConfig(CameraConfig):
 def _genicam(name: str, config: GenicamConfig, place: Place, around: Surroundings) -> GenicamCamera:
     from drivers.camera.genicam.acquisition import Network
     from drivers.camera.genicam.camera import GenicamCamera
-    from drivers.camera.genicam.connection import GenicamSetup
-    from drivers.camera.genicam.settings import ExposureTrigger, Region
+    from drivers.camera.genicam.connection import ExposureTrigger, GenicamSetup, Region
 
     left, top = config.offset
     network = Network()
@@ -145,7 +143,7 @@ def _v4l2(name: str, config: V4l2CameraConfig, around: Surroundings) -> V4l2Came
 
 
 def _folder(name: str, config: FolderCameraConfig, around: Surroundings) -> RecordedCamera:
-    from drivers.camera.recording import RecordedCamera
+    from drivers.camera.folder import RecordedCamera
 
     return RecordedCamera(name, Path(config.folder), clock=around.clock, shape=(config.height, config.width))
 

@@ -1,18 +1,262 @@
 """What a make is: everything that the cell has to know to work with one product behind one of its devices.
 
 A package brings a make by an entry point of the group `assembly_cell.devices`, named KIND.NAME, that leads to a `Make`.
-"""
+
+What the cell has to know of each kind of device, whatever its make: how it is mounted and what it may do.
+
+A make's record adds where the device is and how it is set up: `cell.makes.built_in` has those of the makes that come
+with the cell. Ranges are those of the devices, so that what passes here can be asked of them."""
 
 from __future__ import annotations
 
+import math
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 
-from cell.makes.records import ArmConfig, CameraConfig, ClawConfig, DeviceConfig, LaserConfig, RailConfig, VehicleConfig
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+from pydantic import AfterValidator, ValidationInfo, field_validator, model_validator
+
+from cell.base.toml_file import Table
+from cell.base.units import number, quantity, whole
 from drivers.clock import Clock
+from drivers.errors import ConfigError
 from drivers.interfaces import Arm, Device, Vector
 from drivers.link_table import LinkTable
+
+Length = Annotated[float, quantity("mm", -20_000, 20_000)]
+Offset = Annotated[float, quantity("mm", -1_000, 1_000)]
+Angle = Annotated[float, quantity("deg", -360, 360)]
+Pixels = Annotated[int, whole(64, 8192)]
+Exposure = Annotated[float, quantity("ms", 0.01, 1000)]
+PhotoExposure = Annotated[float, quantity("ms", 0.01, 100)]
+"""Of a photograph, which is taken at 10 Hz."""
+Scatter = Annotated[float, quantity("mm", 0.0001, 2)]
+AngleScatter = Annotated[float, quantity("mrad", 0.0001, 10)]
+
+
+class Pose(Table):
+    """A pose as translation and roll-pitch-yaw about the fixed axes x, y, z (R = Rz Ry Rx)."""
+
+    translation: tuple[Length, Length, Length]
+    rotation: tuple[Angle, Angle, Angle]
+
+    def se3(self) -> pin.SE3:
+        """The pose as `pin.SE3`, m."""
+        return pin.SE3(pin.rpy.rpyToMatrix(*self.rotation), np.array(self.translation))
+
+
+class Mounting(Pose):
+    """The pose of something that is screwed on: no more than a metre away."""
+
+    translation: tuple[Offset, Offset, Offset]
+
+
+def real_path(address: str) -> str:
+    """A device file by the name of what it is, whichever link to it the configuration names; others as they are."""
+    return os.path.realpath(address) if address.startswith("/") else address
+
+
+class DeviceConfig(Table):
+    """A device's table: `driver` names its make, `ADDRESS` is the key that says where the device is.
+
+    `CAUTION` is what a person has to know of devices of this make before relying on them; `cell check` says it.
+    """
+
+    ADDRESS: ClassVar[str] = "address"
+    CAUTION: ClassVar[str] = ""
+
+    driver: str
+
+    @property
+    def place(self) -> str:
+        """Where the device is: no other device of the cell is there."""
+        return str(getattr(self, self.ADDRESS))
+
+    @property
+    def held(self) -> str:
+        """What this computer knows the device by: one program at a time holds it."""
+        return real_path(self.place)
+
+
+OfMake = TypeVar("OfMake", bound=DeviceConfig)
+
+
+def of_make(record: DeviceConfig, kind: type[OfMake]) -> OfMake:
+    """The record as that of one make; `ConfigError` when it is another's."""
+    if not isinstance(record, kind):
+        raise ConfigError(f'driver = "{record.driver}" does not work here: a device of {kind.__name__} is needed')
+    return record
+
+
+Travel = Annotated[float, quantity("mm", -100, 2_000)]
+
+
+Late = Annotated[float, quantity("ms", 0, 100)]
+
+
+class RailConfig(DeviceConfig):
+    """A rail; `lead` is the travel per turn of its motor.
+
+    `late`: by how much older a position may be than the moment at which it was asked for; nobody can see that from
+    outside.
+    """
+
+    lead: Annotated[float, quantity("mm", 0.1, 50)]
+    travel: tuple[Travel, Travel]
+    max_speed: Annotated[float, quantity("mm/s", 0.1, 500)]
+    acceleration: Annotated[float, quantity("mm/s^2", 1, 10_000)]
+    late: Late = 0.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        low, high = self.travel
+        if not high - low >= 0.01:
+            raise ValueError(f"travel {low * 1e3:g} to {high * 1e3:g} mm: the first must be smaller, by 10 mm or more")
+        return self
+
+
+MOST_PAYLOAD = {
+    "UR3": 3.0, "UR5": 5.0, "UR10": 10.0, "UR3e": 3.0, "UR5e": 5.0, "UR7e": 7.5, "UR10e": 12.5, "UR12e": 12.5,
+    "UR16e": 16.0, "UR20": 20.0, "UR30": 30.0,
+}  # fmt: skip
+"""What each model carries, kg, by the maker's data sheets."""
+Centre = Annotated[float, quantity("mm", -500, 500)]
+
+
+class ArmConfig(DeviceConfig):
+    """The arm and where it stands on the vehicle.
+
+    The cell plans with the table that the arm's controller tells; it has to be that of an arm of `model`.
+    """
+
+    model: Literal["UR3", "UR5", "UR10", "UR3e", "UR5e", "UR7e", "UR10e", "UR12e", "UR16e", "UR20", "UR30"] = "UR10e"
+    max_joint_speed: Annotated[float, quantity("deg/s", 1, 120)]
+    max_joint_acceleration: Annotated[float, quantity("deg/s^2", 1, 800)]
+    max_joint_jerk: Annotated[float, quantity("deg/s^3", 10, 40_000)]
+    max_tool_speed: Annotated[float, quantity("mm/s", 1, 1500)]
+    payload: Annotated[float, quantity("kg", 0, 30)]
+    payload_centre: tuple[Centre, Centre, Centre]
+    vehicle_from_base: Pose
+    settle_time: Annotated[float, quantity("s", 0, 5)]
+    repeatability: Scatter
+    repeatability_angle: AngleScatter
+    kinematic_sigma: Annotated[float, quantity("mm", 0, 10)]
+    kinematic_sigma_angle: Annotated[float, quantity("mrad", 0, 10)]
+
+    @field_validator("payload")
+    @classmethod
+    def _carries(cls, payload: float, others: ValidationInfo) -> float:
+        model = others.data.get("model")
+        if model is not None and payload > (most := MOST_PAYLOAD[model]):
+            raise ValueError(f"{payload:g} kg is outside of 0 to {most:g} kg, what a {model} carries")
+        return payload
+
+    @model_validator(mode="after")
+    def _on_the_vehicle(self) -> Self:
+        stand = self.vehicle_from_base.se3()
+        x, y, z = stand.translation
+        if max(abs(x), abs(y)) > 2.0 or not 0.0 <= z <= 2.0:
+            raise ValueError(
+                f"vehicle_from_base.translation ({1e3 * x:g}, {1e3 * y:g}, {1e3 * z:g}) mm puts the arm off the "
+                "vehicle (allowed: -2000 to 2000 mm ahead and aside, 0 to 2000 mm above the floor)"
+            )
+        if stand.rotation[2, 2] < math.cos(math.radians(5.0)):
+            raise ValueError("vehicle_from_base.rotation tilts the arm; it has to stand upright to within 5 deg")
+        return self
+
+
+class VehicleConfig(DeviceConfig):
+    """The carrier. One that does not drive (`DRIVES`) stands at the target of every job."""
+
+    DRIVES: ClassVar[bool] = True
+
+    track: Annotated[float, quantity("mm", 100, 3000)]
+    max_speed: Annotated[float, quantity("m/s", 0.01, 1.5)]
+    max_yaw_rate: Annotated[float, quantity("deg/s", 25, 90)]
+    lean_sigma: Annotated[float, quantity("mrad/m", 0, 20)] = 0.0004
+
+
+class CameraConfig(DeviceConfig):
+    """A camera with its nominal optics and mounting.
+
+    `late`: by how much its time stamps may come after the exposures really began; nobody can see that from outside.
+    """
+
+    width: Pixels
+    height: Pixels
+    pixel: Annotated[float, quantity("um", 0.5, 30)]
+    focal_length: Annotated[float, quantity("mm", 1, 200)]
+    flange_from_camera: Mounting
+    photo_exposure: PhotoExposure
+    late: Late = 0.002
+
+    @model_validator(mode="after")
+    def _sees(self) -> Self:
+        sides = self.width, self.height
+        if max(sides) > 4 * min(sides):
+            raise ValueError(
+                f"{self.width} x {self.height} pixels is no shape of a sensor: one side is over 4 times the other"
+            )
+        field = 2 * math.degrees(math.atan(0.5 * max(sides) * self.pixel / self.focal_length))
+        if not 1.0 <= field <= 120.0:
+            raise ValueError(
+                f"width, height, pixel and focal_length make a field of view of {field:.2g} deg (allowed: 1 to 120 "
+                "deg); correct the one that is wrong"
+            )
+        return self
+
+
+class LaserConfig(DeviceConfig):
+    """The line laser with its nominal place in the scan camera's frame.
+
+    `witness`: where the rail shows the scan camera the line on a plate that is fixed to the claw; None without one.
+    """
+
+    baseline: Annotated[float, quantity("mm", 5, 500)]
+    tan_theta: Annotated[float, number(0.2, 20)]
+    witness: Annotated[float, quantity("mm", -2000, 2000)] | None = None
+
+    @property
+    def exit_point(self) -> NDArray[np.float64]:
+        """The laser's exit point (3,) in the scan camera's frame as drawn, m."""
+        return np.array([-self.baseline, 0.0, 0.0])
+
+
+class ClawConfig(DeviceConfig):
+    """The claw."""
+
+
+class PlateConfig(Table):
+    """A calibration board fixed on the vehicle's deck."""
+
+    board: Annotated[str, AfterValidator(lambda text: checked_board(text))]
+    base_from_board: Pose
+
+
+class CalibrationConfig(Table):
+    """How the cell calibrates itself."""
+
+    fine: PlateConfig
+    large: PlateConfig
+    max_age: Annotated[float, quantity("day", 0.01, 3650)]
+    stripe_exposure: PhotoExposure
+    rail_sigma: Scatter
+
+
+def checked_board(text: str) -> str:
+    """A board's name, once it is known to be well formed."""
+    from cell.measure.vision.board.view import parse_board
+
+    try:
+        parse_board(text)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    return text
+
 
 KINDS: dict[str, type[DeviceConfig]] = {
     "rail": RailConfig,

@@ -10,12 +10,11 @@ from pydantic import StringConstraints, model_validator
 from cell.base.addresses import Port
 from cell.base.toml_file import Table
 from cell.base.units import whole
-from cell.makes.make import AnyMake, Make, Surroundings
-from cell.makes.records import Late, RailConfig
+from cell.makes.make import AnyMake, Late, Make, RailConfig, Surroundings
 
 if TYPE_CHECKING:
+    from drivers.rail.modbus.link import Action, Flag, Number, Rate, RegisterMap
     from drivers.rail.modbus.rail import ModbusRail
-    from drivers.rail.modbus.registers import Action, Flag, Number, Rate, RegisterMap
 
 BAUDS = (4800, 9600, 19200, 38400, 57600, 115200, 230400)
 COUNTS = 2**31 - 1
@@ -71,7 +70,7 @@ class SetupConfig(Table):
 
 
 class RegistersConfig(Table):
-    """What stands where in the drive; names as in `drivers.rail.modbus.registers`."""
+    """What stands where in the drive; names as in `drivers.rail.modbus.link`."""
 
     word_order: Literal["high first", "low first"] = "high first"
     position: NumberConfig
@@ -143,13 +142,13 @@ class ModbusRailConfig(RailConfig):
 
 def register_map(config: RegistersConfig) -> RegisterMap:
     """The record as the driver takes it."""
-    from drivers.rail.modbus.registers import RegisterMap
+    from drivers.rail.modbus.link import RegisterMap
 
     return RegisterMap(**dict(_parts(config)))
 
 
 def _parts(config: RegistersConfig) -> Iterator[tuple[str, Any]]:
-    from drivers.rail.modbus.registers import Action, Flag, Number, Rate
+    from drivers.rail.modbus.link import Action, Flag, Number, Rate
 
     high_first = config.word_order == "high first"
 

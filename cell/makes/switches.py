@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from cell.base.addresses import Endpoint, Port
 from cell.base.units import whole
-from cell.makes.make import AnyMake, Make, Surroundings
-from cell.makes.records import ClawConfig, DeviceConfig, LaserConfig, real_path
+from cell.makes.make import AnyMake, ClawConfig, DeviceConfig, LaserConfig, Make, Surroundings, real_path
 
 if TYPE_CHECKING:
     from drivers.claw.robotiq import RobotiqClaw

@@ -15,8 +15,7 @@ from pydantic import ValidationError, ValidationInfo
 from pydantic_core import InitErrorDetails
 
 from cell.makes.built_in import BUILT_IN, OnArm
-from cell.makes.make import KINDS, AnyMake, Make
-from cell.makes.records import DeviceConfig
+from cell.makes.make import KINDS, AnyMake, DeviceConfig, Make
 from drivers.errors import ConfigError
 
 GROUP = "assembly_cell.devices"

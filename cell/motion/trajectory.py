@@ -2,22 +2,84 @@
 
 Ruckig computes them without waypoints (those would call a cloud service); several moves are joined at rest. What is in
 the way is the planner's business, not known here.
-"""
+
+How fast the flange and what it carries may be: the arm's tool speed as a bound on every point of them.
+
+Of a rigid body the fastest point is always one of its corners, since a point's speed is a convex function of where the
+point is: the flange's origin and the corners of all boxes that hang on the flange are enough.
+
+Where the flange was at a given time: between the states that the arm reported while it moved.
+
+A packet's arrival tells its time only roughly, always late, and all of them may be late alike. The arm's own clock
+runs evenly; round trips tie it to the host's, and then every state has its time."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import pinocchio as pin
 import ruckig
 from numpy.typing import NDArray
 
+from cell.measure.geometry.poses import from_ur
+from cell.motion.collision import FLANGE, Body
 from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
-from cell.motion.point_speed import PointSpeed
-from drivers.errors import RefusedError
+from drivers.clock import ClockMap
+from drivers.errors import DeviceFault, RefusedError
+from drivers.interfaces import ArmState, Vector
+
+STEP = 0.02
+"""Largest joint step in rad between two looks at a path."""
+MARGIN = 1.001
+"""What the speed between two looks may exceed that at them by; 5e-5 is the most seen over 600 random moves."""
+
+
+class PointSpeed:
+    """A bound `limit` in m/s on the speed of `points` (n, 3), m in the flange frame."""
+
+    def __init__(self, kinematics: ArmKinematics, points: NDArray[np.float64], limit: float) -> None:
+        self._kinematics = kinematics
+        self._points = points
+        self._limit = limit
+
+    def fraction_speed(self, start: Joints, end: Joints) -> float:
+        """How fast the straight joint way from `start` to `end` (6,) may be driven at most, in ways per second."""
+        way = end - start
+        count = int(np.ceil(np.abs(way).max() / STEP)) + 1
+        fastest = max(self._fastest(start + part * way, way) for part in np.linspace(0.0, 1.0, count + 1))
+        return self._limit / max(MARGIN * fastest, 1e-12)
+
+    def excess(self, times: NDArray[np.float64], joints: NDArray[np.float64]) -> float:
+        """Speed of the fastest point along the samples (n,) s and (n, 6) rad of a motion, over the limit."""
+        placed = np.array([self._placed(row) for row in joints])
+        ways = np.linalg.norm(np.diff(placed, axis=0), axis=2).max(axis=1)
+        return float((ways / np.diff(times)).max() / self._limit)
+
+    def _fastest(self, joints: Joints, rates: Joints) -> float:
+        """Speed of the fastest point, m/s, when the joints turn at `rates` (6,) rad/s."""
+        twist = self._kinematics.jacobian(joints) @ rates
+        speeds = twist[:3] + np.cross(twist[3:], self._points)
+        return float(np.sqrt(np.max(np.sum(speeds**2, axis=1))))
+
+    def _placed(self, joints: Joints) -> NDArray[np.float64]:
+        flange = self._kinematics.fk(joints)
+        placed: NDArray[np.float64] = self._points @ flange.rotation.T + flange.translation
+        return placed
+
+
+def carried_points(bodies: Sequence[Body]) -> NDArray[np.float64]:
+    """The flange's origin and the corners of every body on the flange, (n, 3) m in the flange frame."""
+    points = [np.zeros(3)]
+    for body in bodies:
+        if body.parent == FLANGE:
+            half = 0.5 * np.array(body.size) + (body.radius or 0.0)
+            points += [body.placement.act(np.array(signs) * half) for signs in product((-1.0, 1.0), repeat=3)]
+    return np.array(points)
+
 
 PERIOD = 0.008
 """Time between samples in s; drivers interpolate."""
@@ -199,3 +261,74 @@ def _profile(
         )
     times = np.linspace(0.0, profile.duration, max(1, int(np.ceil(profile.duration / period - 1e-9))) + 1)
     return times, np.array([profile.at_time(t)[0][0] for t in times])
+
+
+LEAST_STATES = 10
+LONGEST_GAP_S = 0.2
+"""Between two states further apart than this the arm may have done anything."""
+MOST_BEND_M = 2e-5
+"""What a straight and even way between two states may be off by, by how the speed before and after differs from it."""
+
+
+class FlangeTrack:
+    """The poses base_from_flange of a motion by host time in s."""
+
+    def __init__(
+        self, name: str, states: Sequence[ArmState], clocks: ClockMap, longest_gap: float = LONGEST_GAP_S
+    ) -> None:
+        """`name` is the arm's, for errors: `DeviceFault` when there are too few states. `clocks` maps its clock to the
+        host's; `longest_gap` is in s."""
+        device = np.array([state.device_time for state in states])
+        kept = np.flatnonzero(np.diff(device, prepend=-np.inf) > 0)
+        self._name, self._longest_gap = name, longest_gap
+        if len(kept) < LEAST_STATES:
+            raise self._fault(f"only {len(kept)} states of the arm came during the motion, at least {LEAST_STATES}")
+        self.times: Vector = np.array([clocks.host_time(time) for time in device[kept]])
+        poses = [from_ur(states[int(k)].flange) for k in kept]
+        self.translations: Vector = np.array([pose.translation for pose in poses])
+        self._rotations = [pose.rotation for pose in poses]
+        gaps = np.diff(self.times)
+        speeds = np.diff(self.translations, axis=0) / gaps[:, None]
+        change = np.linalg.norm(np.diff(speeds, axis=0), axis=1)
+        self._bends = 0.25 * gaps * np.maximum(np.append(0.0, change), np.append(change, 0.0))
+
+    def inside(self, times: Vector) -> NDArray[np.bool_]:
+        """Which of the times (n,) lie between the first and the last state."""
+        return np.asarray((times >= self.times[0]) & (times <= self.times[-1]))
+
+    def even(self, times: Vector) -> NDArray[np.bool_]:
+        """At which of the times (n,), which must be `inside`, the arm is known to have moved evenly.
+
+        An arm that paused where no state came from it was not on the straight way between the two states around.
+        """
+        after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
+        return np.asarray(self._bends[after - 1] <= MOST_BEND_M)
+
+    def at(self, times: Vector) -> Vector:
+        """base_from_flange (n, 4, 4) at the times (n,), which must be `inside`.
+
+        Straight and at an even turn between two states. Raises `DeviceFault` when those are too far apart.
+        """
+        after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
+        gaps = self.times[after] - self.times[after - 1]
+        if len(gaps) and gaps.max() > self._longest_gap:
+            raise self._fault(
+                f"no state of the arm came for {gaps.max():.3f} s of the motion, allowed {self._longest_gap:g} s"
+            )
+        shares = (times - self.times[after - 1]) / gaps
+        poses = np.tile(np.eye(4), (len(times), 1, 1))
+        for n, (k, share) in enumerate(zip(after, shares, strict=True)):
+            before = self._rotations[k - 1]
+            turn = pin.log3(before.T @ self._rotations[k])
+            poses[n, :3, :3] = before @ pin.exp3(share * turn)
+            poses[n, :3, 3] = (1 - share) * self.translations[k - 1] + share * self.translations[k]
+        return poses
+
+    def _fault(self, text: str) -> DeviceFault:
+        return DeviceFault(
+            self._name,
+            "arm.states_lost",
+            text,
+            recoverable=True,
+            hint="Look at the arm's link and at what else this machine is busy with.",
+        )

@@ -1,42 +1,48 @@
-"""The cell's work on its own calibration: find it, make one over the boards on the deck, see how good it is today."""
+"""The cell's work on its own calibration: find it, make one over the boards on the deck, see how good it is today.
+
+A time in which a person has lifted interlocks, as a recorded run: which, for what reason, and how it ended."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import os
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from cell.base.storage import sealed, write_json
+from cell.base.version import release
 from cell.config.calibrations.finding import find_calibration
 from cell.config.calibrations.store import (
     CellCalibration,
     gathered,
     read_calibration,
+    require_as_configured,
     save_calibration,
     save_with_observations,
     solve_observations,
 )
-from cell.config.calibrations.validation import require_as_configured
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, load_job
 from cell.devices.devices import Devices
 from cell.measure.calibration.archive import Observations
 from cell.measure.calibration.drift.timing_fit import TimesRefused
-from cell.motion.arm_models import kinematics_name
+from cell.motion.kinematics import kinematics_name
 from cell.procedures.calibrate.boards import collect_scan, collect_target
-from cell.procedures.calibrate.edge import with_edge
-from cell.procedures.calibrate.reference_plate import look_at_witness
+from cell.procedures.calibrate.reference_plate import look_at_witness, with_edge
 from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
-from cell.procedures.verify.confirm import keep_confirmed
-from cell.procedures.verify.verdict import Verification
+from cell.procedures.verify.verdict import Verification, keep_confirmed
 from cell.procedures.verify.views import collect_verification
+from cell.run.folder import REPORT, new_run, run_log, when
 from cell.run.recorded_work import Hands
-from cell.run.run import Run
+from cell.run.runs import Run
 from cell.run.session import warm_up as ahead
 from cell.run.session.session import Opened
-from drivers.errors import CalibrationStale
+from drivers.errors import CalibrationStale, CellError
 from drivers.interfaces import Device, why_untold
+from statemachine.journal import Journal, JournalError
 from statemachine.step import Event
 
 
@@ -181,3 +187,28 @@ def time_stamps(cell: Opened, run: Run[Any], calibration: CellCalibration, job: 
     save_calibration(made, cell.calibrations_folder / f"{made.name}.json")
     tell(1.0, "stored")
     return made
+
+
+@contextmanager
+def recorded_maintenance(root: Path, facts: Mapping[str, Any], reason: str, lift: Sequence[str]) -> Iterator[None]:
+    """A run of kind "maintenance" below `root` for as long as the context is open. `CellError` if it cannot be kept."""
+    started = time.time()
+    facts = {"kind": "maintenance", "pid": os.getpid(), **facts, "maintenance": reason, "lifted": list(lift)}
+    try:
+        folder = new_run(root)
+        journal = Journal(folder, folder.name, facts)
+    except (OSError, JournalError) as error:
+        raise CellError(f"no maintenance can be recorded in {root}, so nothing is lifted: {error}") from error
+    outcome, said = "done", f"maintenance done: {reason}"
+    try:
+        with run_log(folder):
+            yield
+    except BaseException as error:
+        outcome, said = "faulted", f"maintenance ({reason}) ended by {type(error).__name__}: {error}"
+        raise
+    finally:
+        journal.run_ended(outcome, said)
+        journal.close()
+        ended = {"started": when(started), "ended": when(time.time()), "wall_s": round(time.time() - started, 2)}
+        report = {"run": folder.name, "version": release(), "outcome": outcome, "reason": said, **ended, **facts}
+        write_json(folder / REPORT, sealed(report))

@@ -1,4 +1,8 @@
-"""One job as a recorded run: its folder and journal, what watches the cell meanwhile, what an error means for it."""
+"""One job as a recorded run: its folder and journal, what watches the cell meanwhile, what an error means for it.
+
+A job that was read and fits the cell; nothing of it has begun.
+
+What a job's run does around the steps: a calibration first where there is none, and the sweep of a run before."""
 
 from __future__ import annotations
 
@@ -13,38 +17,76 @@ from typing import Any
 
 import pinocchio as pin
 
-from cell.base.notebook import table
-from cell.base.storage import write_json
+from cell.base.storage import table, write_json
+from cell.check.fit import require_fit
 from cell.config.calibrations.store import CellCalibration, save_calibration
-from cell.config.cell_config import CellConfig
-from cell.config.job import Job
-from cell.devices.devices import Devices
+from cell.config.cell_config import DEVICES, CellConfig
+from cell.config.job import Job, load_job
+from cell.devices.devices import Devices, require_healthy, stop_cell
 from cell.devices.simulated.following import DeviceFollowing
 from cell.devices.simulated.injection import Injector
-from cell.devices.stopping import require_healthy, stop_cell
+from cell.devices.simulated.mixed import beware
+from cell.devices.simulated.process import is_whole
 from cell.measure.inversion import NominalSurface
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.arm.moves import Pace
+from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
-from cell.procedures.pace import Pace
-from cell.procedures.steps.kinds import Kind
+from cell.procedures.steps.kinds import Kind, find_kind
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep
 from cell.procedures.sweep.swath import SweepCollector, Sweeping
-from cell.run.faults import classify, clear
-from cell.run.files.folder import new_run
-from cell.run.files.logs import run_log
-from cell.run.record.perception import save as save_perception
+from cell.run import calibration as sessions
+from cell.run.folder import new_run, read_report, run_log
 from cell.run.record.recorder import Recorder, recorded
-from cell.run.report.figures import told
+from cell.run.record.replay import save as save_perception
+from cell.run.recorded_work import classify, clear, outcome_of
+from cell.run.report.figures import following_words, told
 from cell.run.report.report import make_report
 from cell.run.report.truth import TruthRecorder
-from cell.run.run import Run
+from cell.run.resumption import UnfinishedRun, job_source
+from cell.run.runs import Run
+from cell.run.session.session import Opened
 from drivers.errors import CellError
 from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
-from statemachine.policy import Outcome
-from statemachine.runner import Event, Runner
-from statemachine.script import NO_SCRIPT, Script
+from statemachine.runner import NO_SCRIPT, Event, Runner, Script
+from statemachine.step import Outcome
+
+
+@dataclass(frozen=True, eq=False)
+class ReadyJob:
+    """A job with its kind, up to the step after which it is to end, its surface, and the script that looks at it.
+
+    `info` is for the journal: what a resumed run has to know.
+    """
+
+    job: Job
+    kind: Kind
+    nominal: NominalSurface
+    script: Script
+    info: dict[str, Any]
+
+    @classmethod
+    def read(
+        cls, file: str | Path, config: CellConfig, until: str | None, script: Script, *, calibrates: bool = False
+    ) -> ReadyJob:
+        """From its file or by its name; `ConfigError` when it does not fit the cell or has no such step.
+
+        With `calibrates` the cell may be calibrated first, with this job's part in the claw.
+        """
+        job, mesh = load_job(file)
+        require_fit(job, config, mesh, calibrates=calibrates)
+        kind = find_kind(job.job.kind).until(until)
+        kind.require_steps(script.after)
+        nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+        info: dict[str, Any] = dict(job_source(file))
+        # A resumed run must end where this one was to end, and be looked at as this one was.
+        if until is not None:
+            info["until"] = until
+        if not script.idle:
+            info["scripted"] = True
+        return cls(job, kind, nominal, script, info)
+
 
 Observer = Callable[[Event], None]
 
@@ -265,3 +307,78 @@ def each_of(observers: tuple[Observer, ...]) -> Observer:
                 log.warning("an observer of the run failed and is told nothing more: %s", error)
 
     return tell
+
+
+@dataclass(frozen=True, eq=False)
+class JobWork:
+    """A job, read as `ready` from `file`, for a run of this cell; `info` goes into the journal and the report.
+
+    `stored` is its calibration; without one it is calibrated first. `before` is the run that this one resumes,
+    `at_start` somebody's word that the vehicle stands at the job's start pose, for this run alone.
+    """
+
+    cell: Opened
+    file: str | Path
+    ready: ReadyJob
+    info: Mapping[str, Any]
+    stored: CellCalibration | None
+    before: UnfinishedRun | None
+    inline: tuple[Observer, ...]
+    at_start: bool
+
+    def perform(self, run: Run[RunOutcome]) -> RunOutcome:
+        """Do it; raises what `JobRun.perform` raises. Ended as any run where the calibration before it ends it."""
+        cell, ready = self.cell, self.ready
+
+        def note(text: str) -> None:
+            run.tell(Event("note", None, {"text": text}))
+
+        if (simulated := cell.simulated) is not None and not is_whole(simulated):
+            for sentence in beware(simulated.simulated, DEVICES):
+                note(sentence)
+            if (following := cell.devices.following) is not None:
+                note(f"readings reach the simulated world after: {following_words(following.figures())}")
+        if self.at_start:
+            cell.whereabouts.say_at_start()
+        calibration = self.stored
+        if calibration is None:
+            note("this simulated cell has no calibration yet: calibrating first")
+            begun = time.time()
+            try:
+                calibration = sessions.calibrate(cell, run, self.file)
+            except Exception as error:
+                return self._uncalibrated(run, error, time.time() - begun)
+        earlier = None
+        if self.before is not None:
+            earlier, why = self.before.sweep(ready.job, cell.config, calibration)
+            note(why if earlier is not None else f"{why}: sweeping again")
+        job_run = JobRun(
+            run,
+            cell.config,
+            cell.devices,
+            job=ready.job,
+            nominal=ready.nominal,
+            calibration=calibration,
+            info=self.info,
+            kind=ready.kind,
+            script=ready.script,
+            inline=self.inline,
+            earlier=earlier,
+            truth=cell.truth,
+            pace=cell.pace,
+        )
+        try:
+            return job_run.perform(cell.runs_folder, cell.whereabouts)
+        finally:
+            if self.at_start:
+                cell.whereabouts.forget_word()
+
+    def _uncalibrated(self, run: Run[RunOutcome], error: Exception, wall_s: float) -> RunOutcome:
+        """How a job ended whose first calibration ended with this error; its report is the calibration's."""
+        if run.folder is None:
+            raise error
+        run.control.over = True
+        outcome, reason = outcome_of(error), f"in the calibration before the job: {error}"
+        run.tell(Event("run_ended", None, {"outcome": outcome, "reason": reason}))
+        report = {**read_report(run.folder), "outcome": outcome, "reason": reason}
+        return RunOutcome(outcome, reason, run.folder, report, control=run.control, wall_s=wall_s)

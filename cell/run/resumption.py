@@ -11,7 +11,7 @@ from typing import Any
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, job_path, load_job
-from cell.procedures.arm.part import PartState
+from cell.procedures.arm.moves import PartState
 from cell.procedures.steps import laser_sweep
 from cell.procedures.sweep.stored_sweep import FILE, StoredSweep
 from drivers.errors import ConfigError, RefusedError

@@ -44,7 +44,7 @@ class Watched:
 
 
 def examine(name: str, address: str, clock: Clock, seconds: float) -> list[Reading]:
-    """Watch the arm at `address`; errors as of `drivers.arm.clock_latch.latch_clock`."""
+    """Watch the arm at `address`; errors as of `drivers.arm.rtde_link.latch_clock`."""
     try:
         with RtdeLink(address, clock, clock.wall(seconds) + _TIMEOUT_S) as link:
             watched = _watch(name, link, clock, seconds)

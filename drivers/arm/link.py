@@ -19,7 +19,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any
 
-from drivers.arm.messages import UNANSWERED, ChildReply, ChildRequest, ChildSetup, Ended, Lost, Snapshot
+from drivers.arm.feed import UNANSWERED, ChildReply, ChildRequest, ChildSetup, Ended, Lost, Snapshot
 from drivers.errors import Aborted, DeviceFault, NotConnectedError
 from drivers.packages import lacking
 from drivers.pulse import Pulse

@@ -18,21 +18,17 @@ from typing import Any
 import numpy as np
 
 from drivers.arm import health
-from drivers.arm.clock_latch import latch_clock
 from drivers.arm.dashboard import unknown
-from drivers.arm.factory import read_factory_kinematics
+from drivers.arm.factory import Forward, read_factory_kinematics
 from drivers.arm.faults import late_words
-from drivers.arm.limits import ArmLimits
-from drivers.arm.messages import MODE_RUNNING, ChildSetup, Ended, Snapshot, safety_code
-from drivers.arm.motion import UrMotion
+from drivers.arm.feed import MODE_RUNNING, ChildSetup, Ended, Snapshot, safety_code
+from drivers.arm.motion import ArmLimits, UrMotion
+from drivers.arm.rtde_link import latch_clock
 from drivers.arm.session import ArmSession
-from drivers.arm.wrong_arm import Forward
-from drivers.clock import Clock
-from drivers.clock_map import Latch
-from drivers.errors import Aborted, DeviceError, InterlockError, LimitError
+from drivers.clock import Clock, Latch
+from drivers.errors import UNTOLD, Aborted, DeviceError, InterlockError, LimitError, check_positive, shown
 from drivers.interfaces import ATTENDED_S, ArmSafety, ArmState, Identity, Reading, Vector
 from drivers.link_table import LinkTable
-from drivers.quantities import UNTOLD, check_positive, shown
 
 _FIRST_POINT = 0.02
 _WATCHDOG_S, _WATCHDOG_FAST_S = 0.15, 0.45

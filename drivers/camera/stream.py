@@ -13,15 +13,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.camera.frame_link import FrameLink
-from drivers.camera.frame_protocol import Header
+from drivers.camera.frame_link import FrameLink, Header
 from drivers.camera.frame_queue import FrameQueue
-from drivers.clock import Clock
-from drivers.clock_map import ClockMap, Latch
-from drivers.endings import in_the_end
-from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, LimitError
+from drivers.clock import Clock, ClockMap, Latch
+from drivers.errors import (
+    CellError,
+    ConfigError,
+    DeviceFault,
+    InterlockError,
+    LimitError,
+    check_positive,
+    check_range,
+    in_the_end,
+    shown,
+)
 from drivers.interfaces import Frame, Identity, LinkStatistics
-from drivers.quantities import check_positive, check_range, shown
 
 _LATCHES = 8
 _MAX_LATCHES = 32

@@ -9,22 +9,24 @@ time, overtakes every queued or running command, returns when the device has tak
 leaves the device safe and is idempotent.
 """
 
-from drivers.clock_map import Latch
+from drivers.clock import Latch
 from drivers.interfaces.arm import Arm, ArmMotion, ArmSafety, ArmState, SaysWhyUntold, TriesOutputs, why_untold
 from drivers.interfaces.camera import Camera, Frame, FrameStream, Image
 from drivers.interfaces.device import (
     ATTENDED_S,
     Attended,
+    Claw,
     Device,
     Examined,
     Identity,
+    Laser,
     LinkStatistics,
     Motion,
     Reading,
+    SaysHowKnown,
     Vector,
 )
 from drivers.interfaces.rail import LONGEST_NUDGE_M, ChecksZero, Nudged, Rail, RailState, Sweep
-from drivers.interfaces.switches import Claw, Laser, SaysHowKnown
 from drivers.interfaces.vehicle import Vehicle, VehicleState
 from drivers.link_table import LinkTable
 

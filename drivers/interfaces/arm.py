@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol, runtime_checkable
 
-from drivers.clock_map import Latch
+from drivers.clock import Latch
 from drivers.interfaces.device import Device, Motion, Vector
 from drivers.link_table import LinkTable
 

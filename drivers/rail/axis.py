@@ -13,11 +13,9 @@ from contextlib import AbstractContextManager
 from typing import Protocol
 
 from drivers.clock import Clock
-from drivers.errors import CellError, ConfigError, InterlockError
+from drivers.errors import CellError, ConfigError, InterlockError, check_positive, check_range, shown
 from drivers.interfaces import LONGEST_NUDGE_M, LinkStatistics
-from drivers.quantities import check_positive, check_range, shown
-from drivers.rail.following import CarriageWatch
-from drivers.rail.motion import SWEEP_MARGIN_M, RailMotion, move_duration, run_up_distance
+from drivers.rail.motion import SWEEP_MARGIN_M, CarriageWatch, RailMotion, move_duration, run_up_distance
 from drivers.rail.sweep import RailSweep
 from drivers.rail.zero_check import LONGEST_S, ZeroCheck
 

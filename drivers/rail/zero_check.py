@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from drivers.errors import DeviceFault
-from drivers.quantities import shown
+from drivers.errors import DeviceFault, shown
 
 LOST_M = 0.05e-3
 """By so much the switch's edge may lie beside 0: more is steps that were lost."""

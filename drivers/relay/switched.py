@@ -12,8 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from drivers.clock import Clock
-from drivers.endings import in_the_end
-from drivers.errors import InterlockError, NotConnectedError
+from drivers.errors import InterlockError, NotConnectedError, in_the_end
 from drivers.interfaces import Identity
 from drivers.last_words import LastWords
 from drivers.relay.boards import NumatoBoard, RelayWiring

@@ -16,15 +16,21 @@ from functools import partial
 from typing import Any
 
 from drivers.clock import Clock
-from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, NotConnectedError
+from drivers.errors import (
+    Aborted,
+    CellError,
+    DeadlineError,
+    DeviceFault,
+    InterlockError,
+    NotConnectedError,
+    check_range,
+)
 from drivers.interfaces import Identity, LinkStatistics, Reading, VehicleState
-from drivers.quantities import check_range
 from drivers.vehicle import health
-from drivers.vehicle.agilex_link import AgilexLink, load_database
-from drivers.vehicle.can_interface import can_interface
+from drivers.vehicle.agilex_link import TEXT_REQUEST, UNKNOWN, AgilexLink, load_database
 from drivers.vehicle.faults import OUT_OF_COMMAND
 from drivers.vehicle.feedback import CAN_MODE, CYCLIC, WANTED, MessageFeedback, patience
-from drivers.vehicle.version import TEXT_REQUEST, UNKNOWN
+from drivers.vehicle.health import can_interface
 
 KEEP_ALIVE_S = 0.020
 DEAD_MAN_S = 0.5
@@ -108,7 +114,7 @@ class AgilexVehicle:
         self._keeper.start()
 
     def identity(self) -> Identity:
-        """The protocol has no serial number; a version that is not told is "unknown" (`drivers.vehicle.version`)."""
+        """The protocol has no serial number; a version that is not told is "unknown"."""
         for ask in (self._ask_text, self._ask_numbers):
             answer = self._feedback.ask_version()
             ask()

@@ -23,7 +23,7 @@ def board(
 
     Exit code 1 when a board, or the order of its points, was taken for another.
     """
-    from cell.measure.vision.board.spec import KINDS
+    from cell.measure.vision.board.view import KINDS
     from drivers.errors import ConfigError
     from lab.bench.board.campaign import campaign
     from lab.bench.board.conditions import CONDITIONS

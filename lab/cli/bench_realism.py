@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from cell.apps.cli import completion as completing
+from cell.apps.cli import options as completing
 from cell.apps.cli.options import JobOption, JsonOption
 from lab.cli.shown import bar, counted, show, table
 
@@ -36,7 +36,7 @@ def realism(
     """
     from drivers.errors import ConfigError
     from lab.bench.job.realism import ALONE, TOGETHER, campaign, is_well
-    from sim_backends.world.effects import Effects
+    from sim_backends.world.levels import Effects
 
     known = (ALONE, *Effects.names(), TOGETHER)
     # No parts of the workshop: a scan camera needs a global shutter, a carriage that droops is a broken one.

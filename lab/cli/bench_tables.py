@@ -8,7 +8,7 @@ from typing import Any
 from rich.console import Console
 
 from cell.run.report.figures import noise_rows
-from cell.run.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
+from cell.run.report.report import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
 from lab.cli.paper_tables import print_acceptance
 from lab.cli.shown import empty, table
 

@@ -62,7 +62,7 @@ def _show(result: dict[str, Any], json: bool, out: Path | None, name: str, table
     """Print as JSON or as a table, and keep the numbers in the folder."""
     show(result, json, table)
     if out is not None:
-        from cell.run.files.folder import write_json
+        from cell.run.folder import write_json
 
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / f"{name}.json", result)

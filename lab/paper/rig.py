@@ -20,8 +20,8 @@ from cell.measure.reconstruction import ScanGeometry
 from cell.measure.vision import BoardView, parse_board
 from cell.measure.vision.stripe.extract import StripeProfile
 from sim_backends.optics import Board, BoardInstance, CameraOptics, LaserOptics, Mesh, MeshInstance
+from sim_backends.optics.laser.sheet import lit
 from sim_backends.optics.laser.stripe import crossings
-from sim_backends.optics.laser.visibility import lit
 from sim_backends.world.levels import deviations
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import from_axes, perturbed, transform
 from cell.measure.reconstruction import ScanGeometry
-from cell.run.report.paper import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
+from cell.run.report.report import TABLE_1_HANDSCAN, TABLE_1_OPTIMISED
 from lab.bench.over_cores import Progress, run_all
 from lab.paper.rig import RigSpec, Sweep, arm_error, draw_head, observe, sweep
 from lab.paper.solved import Solved, aligned, expected_length, in_scan_frame, point_covariances, solve

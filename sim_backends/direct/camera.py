@@ -19,8 +19,8 @@ from drivers.interfaces import Frame, Identity, LinkStatistics
 from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import CameraSetup
 from sim_backends.models.camera import CameraState
+from sim_backends.world.drawing import inverse
 from sim_backends.world.hardware import camera_spec
-from sim_backends.world.nominal import inverse
 from sim_backends.world.world import World
 
 ROUND_TRIP_S = 0.0005

@@ -18,10 +18,17 @@ from typing import Any
 import numpy as np
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.arm_joints import GRAVITY, JointErrors
-from sim_backends.models.arm_kinematics import TABLES, UR10E_DH, Kinematics, Matrix, Vector
+from sim_backends.models.arm_kinematics import (
+    GRAVITY,
+    TABLES,
+    UR10E_DH,
+    JointErrors,
+    Kinematics,
+    Matrix,
+    TruePose,
+    Vector,
+)
 from sim_backends.models.arm_motion import JointDrives, MotionError, SimulatedMotion, StopMotion
-from sim_backends.models.arm_truth import TruePose
 
 Contact = Callable[[Matrix], Vector]
 """Wrench (6,) on the arm at the flange, base axes, N and N·m, for a true base_from_flange (4, 4)."""

@@ -3,15 +3,30 @@
 Angles are in rad, lengths in m. A pose is a (4, 4) matrix `base_from_flange` or the controller's 6-vector
 (x, y, z, rx, ry, rz) with a rotation vector. Sources: the maker's DH table (docs/reference/protocols.md, section 1);
 damped least squares after Nakamura and Hanafusa 1986.
+
+What an arm's joints are off: angles that its encoders do not see, from uneven gears and from the weight it carries.
+
+A strain wave gear repeats its error once and twice a turn of the motor, which turns some hundred times as often as the
+joint: over the whole workspace it looks like noise, and yet is the same wherever a joint comes back. Under a weight
+each joint gives way by its compliance times the torque about its axis; gravity is along the base's -z.
+
+Where the flange truly is: the true kinematics at the encoders' joint angles, and an error of repeatability.
+
+The error is drawn anew for every rest. While the arm moves, it passes smoothly from the last rest's error to the next
+one's, and its variance stays the same on the way. Or, with a memory, it is another one only after some way of the
+joints: a place approached again in the same manner has the same error. What the joints are off is in `arm_joints`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sim_backends.clock import History
 
 Vector = NDArray[np.float64]
 Matrix = NDArray[np.float64]
@@ -204,3 +219,105 @@ def invert(matrix: Matrix) -> Matrix:
     inverse[:3, :3] = matrix[:3, :3].T
     inverse[:3, 3] = -matrix[:3, :3].T.dot(matrix[:3, 3])
     return inverse
+
+
+GRAVITY = 9.81
+GEAR_RATIO = 101.0
+
+
+@dataclass(frozen=True, eq=False)
+class JointErrors:
+    """`harmonics` (6, 4): sine and cosine of one turn of the motor, then of two, rad; `compliance` in rad/(N m).
+
+    The flange carries `mass` kg at its origin.
+    """
+
+    kinematics: Kinematics
+    harmonics: Matrix
+    compliance: float = 0.0
+    mass: float = 0.0
+
+    def true(self, q: Vector) -> Vector:
+        """The angles (6,), rad, at which the joints truly stand when their encoders read `q` (6,)."""
+        h, motor = self.harmonics, GEAR_RATIO * q
+        off = h[:, 0] * np.sin(motor) + h[:, 1] * np.cos(motor)
+        off = off + h[:, 2] * np.sin(2.0 * motor) + h[:, 3] * np.cos(2.0 * motor)
+        if self.compliance > 0.0:
+            _, jacobian = self.kinematics.forward_with_jacobian(q)
+            off = off - (self.compliance * self.mass * GRAVITY) * jacobian[2]
+        return np.asarray(q + off)
+
+
+class TruePose:
+    """True base_from_flange over time of an arm with `kinematics`; errors per axis `sigma` in m and rad."""
+
+    def __init__(
+        self,
+        kinematics: Kinematics,
+        sigma: tuple[float, float],
+        blend_time: float,
+        rng: np.random.Generator,
+        joints: JointErrors | None = None,
+        memory: float = 0.0,
+    ) -> None:
+        """`blend_time` is how many seconds of motion the error takes to become the next one; with a `memory`, rad, it
+        changes with the joints' way instead, and is another one after about that way."""
+        self.pose: Matrix = np.eye(4)
+        self._kinematics = kinematics
+        self._sigma = np.repeat(sigma, 3)
+        self._blend_time = blend_time
+        self._rng = rng
+        self._from = self._to = self._error = self._draw()
+        self._turn = rotation_matrix(self._error[3:])
+        self._blend = 1.0
+        self._resting = True
+        self._joints = joints
+        self._memory = memory
+        self._q: Vector | None = None
+        self._history = History()
+
+    def update(self, t: float, dt: float, q: Vector, moving: bool) -> None:
+        """Follow the joints `q` (6,) to world time `t`, `dt` after the last call, and remember the pose."""
+        if moving and self._memory > 0.0:
+            self._drift(q)
+        elif moving:
+            self._wander(dt)
+        self._resting = not moving
+        self.look(q)
+        self._history.append(t, self.pose)
+
+    def look(self, q: Vector) -> Matrix:
+        """The true pose (4, 4) at joint angles `q` with the error of this moment; not remembered."""
+        if self._q is not q:
+            pose = self._kinematics.forward(q if self._joints is None else self._joints.true(q))
+            pose[:3, 3] += self._error[:3]
+            pose[:3, :3] = self._turn.dot(pose[:3, :3])
+            self.pose, self._q = pose, q
+        return self.pose
+
+    def at(self, t: float) -> Matrix:
+        """The true pose (4, 4) at world time `t`."""
+        return self._history.at(t)
+
+    def _draw(self) -> Vector:
+        error: Vector = self._rng.normal(size=6) * self._sigma
+        return error
+
+    def _drift(self, q: Vector) -> None:
+        """A first-order process over the joints' way, with the same variance everywhere."""
+        way = 0.0 if self._q is None else float(np.linalg.norm(q - self._q))
+        if way > 0.0:
+            kept = math.exp(-way / self._memory)
+            self._error = kept * self._error + math.sqrt(1.0 - kept * kept) * self._draw()
+            self._turn = rotation_matrix(self._error[3:])
+            self._q = None
+
+    def _wander(self, dt: float) -> None:
+        if self._resting:
+            self._from, self._to, self._blend = self._error, self._draw(), 0.0
+        if self._blend < 1.0:
+            self._blend = min(1.0, self._blend + dt / self._blend_time)
+            angle = 0.5 * math.pi * self._blend
+            self._error = math.cos(angle) * self._from + math.sin(angle) * self._to
+            self._turn = rotation_matrix(self._error[3:])
+            self._q = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 
-FAULTS = ("camera.frame_loss", "camera.silent")
+from sim_backends.faults import CAMERA_FAULTS as FAULTS
 
 
 @dataclass(frozen=True)

@@ -2,23 +2,73 @@
 
 Motion is kept as a time line of constant-acceleration pieces in motor turns, so nothing has to be ticked and cameras
 may ask for the recent past. The controller counts microsteps; only `carriage` knows where the carriage really is.
-"""
+
+What a rail is made of, and what its controller can be told: the data of the rail's model."""
 
 from __future__ import annotations
 
 import threading
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from sim_backends.faults import EXCHANGED_SWITCHES, LOST_STEPS
+from sim_backends.faults import RAIL_MODEL_FAULTS as FAULTS
 from sim_backends.models import ramp
-from sim_backends.models.rail_settings import RailParams, RailSettings
+from sim_backends.models.ramp import Screw
+
+
+@dataclass(frozen=True)
+class RailParams:
+    """Hardware of one rail. Lengths in m from where the home switch's edge is; the left and right switches and the
+    mechanical ends lie beyond the usable travel. `repeatability` is the scatter (1 σ) of a switch edge per search."""
+
+    screw: Screw = field(default_factory=Screw)
+    steps_per_turn: int = 200
+    travel: tuple[float, float] = (0.0, 0.100)
+    switches: tuple[float, float] = (-0.002, 0.102)
+    ends: tuple[float, float] = (-0.004, 0.104)
+    repeatability: float = 0.0
+    start: float = 0.037
+    reversed: bool = False
+    """A coil of the motor is connected the other way round: it turns backwards."""
+    serial: int = 1
+    firmware: tuple[int, int] = (1, 12)
+
+    def around(self, travel: tuple[float, float]) -> RailParams:
+        """The same for a usable `travel`, m: the home switch at 0, the others 2 mm and the ends 4 mm beyond both."""
+        low, high = min(0.0, travel[0]), max(0.0, travel[1])
+        return replace(self, travel=travel, switches=(low - 0.002, high + 0.002), ends=(low - 0.004, high + 0.004))
+
+
+@dataclass(frozen=True)
+class RailSettings:
+    """What the controller's axis parameters set: pps and pps² (microsteps), switches, reference search."""
+
+    max_velocity: int = 512_000
+    max_acceleration: int = 2_000_000
+    max_deceleration: int | None = None
+    """Of positioning; None: the acceleration."""
+    first_acceleration: int = 2_000_000
+    last_deceleration: int = 2_000_000
+    first_speed: int = 0
+    """Below this speed (pps) positioning uses the two above instead; 0 switches that off."""
+    microsteps: int = 8
+    """Microsteps per full step as a power of two."""
+    search_mode: int = 1
+    """1 left switch; 2 right, then left switch; 3, 4 the same; 5 or 7 home switch in negative direction; 6 the same
+    from the right switch."""
+    search_speed: int = 256_000
+    switch_speed: int = 51_200
+    left_stop: bool = True
+    right_stop: bool = True
+    soft_stop: bool = False
+    reverse_shaft: bool = False
+
 
 __all__ = ["RailModel", "RailParams", "RailSettings"]
 
-EXCHANGED, LOST_STEPS = "rail.exchanged_switches", "rail.lost_steps"
-FAULTS = (EXCHANGED, LOST_STEPS)
 _LOST = 0.10
 """Share of the steps that a motor with `LOST_STEPS` loses on its way to the right, as the counter goes on."""
 _KEEP = 30.0
@@ -97,11 +147,11 @@ class RailModel:
 
     def left_switch(self, t: float) -> bool:
         """State of the input of the left limit switch."""
-        return self._at_switch(t, 1 if EXCHANGED in self._faults else 0)
+        return self._at_switch(t, 1 if EXCHANGED_SWITCHES in self._faults else 0)
 
     def right_switch(self, t: float) -> bool:
         """State of the input of the right limit switch."""
-        return self._at_switch(t, 0 if EXCHANGED in self._faults else 1)
+        return self._at_switch(t, 0 if EXCHANGED_SWITCHES in self._faults else 1)
 
     def home_switch(self, t: float) -> bool:
         """State of the home switch: active from its edge at 0 to the left end."""
@@ -204,7 +254,7 @@ class RailModel:
                 self._search_in_vain(legs, +1)
                 return
             mode = self.settings.search_mode
-            if EXCHANGED in self._faults and mode not in (5, 7):
+            if EXCHANGED_SWITCHES in self._faults and mode not in (5, 7):
                 self._search_in_vain(legs, -1 if mode == 1 else +1)
                 return
             right = self._motor(self.params.switches[1], +1)
@@ -314,7 +364,7 @@ class RailModel:
         for direction, enabled in ((-1, self.settings.left_stop), (+1, self.settings.right_stop)):
             side = (direction + 1) // 2
             # A limit switch stops the direction that the controller believes to lead to it.
-            if enabled and not self.backwards and EXCHANGED not in self._faults:
+            if enabled and not self.backwards and EXCHANGED_SWITCHES not in self._faults:
                 pieces = self._stop_at(pieces, self._motor(self.params.switches[side], direction), direction)
             end = self.params.screw.motor(self.params.ends[side], direction)
             pieces, stalled = ramp.clip(pieces, end, direction)

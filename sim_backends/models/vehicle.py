@@ -15,10 +15,10 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.history import History
+from sim_backends.clock import History
+from sim_backends.faults import VEHICLE_MODEL_FAULTS as FAULTS
 
 _STEP = 0.005
-FAULTS = ("vehicle.emergency_stop", "vehicle.motor_fault")
 MOTOR_FAULT = 0x0100
 """Error bit of the system state: a motor driver fails (ugv_sdk, SYSTEM_ERROR_MOTOR_DRIVER_MASK)."""
 DRIVER_FAULT, DRIVER_OVERLOAD = 0x20, 0x04

@@ -3,7 +3,7 @@
 Knows nothing of devices or of the controller; shares no projection, plane or noise code with the estimator.
 """
 
-from sim_backends.optics.camera import CameraOptics
+from sim_backends.optics.camera import CameraOptics, sensor
 from sim_backends.optics.mesh import Mesh
 from sim_backends.optics.render import expected_image, render
 from sim_backends.optics.scene import (
@@ -15,7 +15,6 @@ from sim_backends.optics.scene import (
     PlaneInstance,
     SceneObject,
 )
-from sim_backends.optics.sensor import sensor
 
 __all__ = [
     "Board",

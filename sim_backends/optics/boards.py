@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.optics.blur import blur_window
-from sim_backends.optics.camera import CameraOptics
+from sim_backends.optics.camera import CameraOptics, blur_window
 from sim_backends.optics.compiled import compiled, compiled_fast
 from sim_backends.optics.lighting import ambient_dn, fill_background, gain_line, gain_parameters, lambert
 from sim_backends.optics.pattern import (

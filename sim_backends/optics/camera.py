@@ -1,7 +1,10 @@
 """Pin-hole camera with Brown distortion, thin-lens defocus and mild vignetting, as the simulated cameras see the world.
 
 Camera frame: z along the optical axis, x to the right, y down the image; metres. Pixel centres lie at whole numbers.
-"""
+
+Gaussian blur of a window of an image, in place: point spread and defocus.
+
+From light to the picture: shot noise, read noise, saturation and quantisation of an 8-bit sensor."""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.optics.compiled import compiled
+from sim_backends.optics.compiled import compiled, compiled_fast
 
 Vector = NDArray[np.float64]
 Plane = NDArray[np.float32]
@@ -159,3 +162,122 @@ def undistort_pixels(pixels: Vector, k: Vector) -> Vector:
         normalised[i, 0] = x
         normalised[i, 1] = y
     return normalised
+
+
+Image = NDArray[np.float32]
+
+
+def blur_window(image: Image, window: tuple[int, int, int, int], sigma: float) -> None:
+    """Blur `image` inside the window (u0, v0, u1, v1, ends excluded) by `sigma` pixels; edges are repeated."""
+    u0, v0, u1, v1 = window
+    radius = 3 * max(1, int(np.ceil(3.5 * sigma / 3)))
+    if u1 <= u0 or v1 <= v0 or sigma < 0.05:
+        return
+    kernel = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
+    # The compiler makes fast code for contiguous arrays only.
+    part = np.ascontiguousarray(image[v0:v1, u0:u1])
+    separable_blur(part, (kernel / kernel.sum()).astype(np.float32))
+    image[v0:v1, u0:u1] = part
+
+
+@compiled_fast
+def separable_blur(image: Image, kernel: Image) -> None:
+    """Convolve with the symmetric `kernel` along both axes, repeating edge pixels; its radius is a multiple of 3."""
+    rows, cols = image.shape
+    radius = kernel.shape[0] // 2
+    across = np.empty((rows, cols), dtype=np.float32)
+    line = np.empty(cols + 2 * radius, dtype=np.float32)
+    for v in range(rows):
+        for u in range(line.shape[0]):
+            line[u] = image[v, min(max(u - radius, 0), cols - 1)]
+        out = across[v]
+        scale(out, line[radius : radius + cols], kernel[radius])
+        for k in range(0, radius, 3):
+            far = 2 * radius - k
+            add_pairs(
+                out,
+                kernel[k : k + 3],
+                line[k : k + cols],
+                b=line[far : far + cols],
+                c=line[k + 1 : k + 1 + cols],
+                d=line[far - 1 : far - 1 + cols],
+                e=line[k + 2 : k + 2 + cols],
+                f=line[far - 2 : far - 2 + cols],
+            )
+    for v in range(rows):
+        out = image[v]
+        scale(out, across[v], kernel[radius])
+        for k in range(0, radius, 3):
+            reach = radius - k
+            add_pairs(
+                out,
+                kernel[k : k + 3],
+                across[max(0, v - reach)],
+                b=across[min(rows - 1, v + reach)],
+                c=across[max(0, v - reach + 1)],
+                d=across[min(rows - 1, v + reach - 1)],
+                e=across[max(0, v - reach + 2)],
+                f=across[min(rows - 1, v + reach - 2)],
+            )
+
+
+@compiled_fast
+def scale(out: Image, line: Image, weight: np.float32) -> None:
+    """Set `out` to `weight` times `line`."""
+    for u in range(out.shape[0]):
+        out[u] = weight * line[u]
+
+
+@compiled_fast
+def add_pairs(out: Image, weights: Image, a: Image, b: Image, c: Image, d: Image, e: Image, f: Image) -> None:
+    """Add the weighted pairs (a, b), (c, d), (e, f) to `out`."""
+    p, q, r = weights[0], weights[1], weights[2]
+    for u in range(out.shape[0]):
+        out[u] += p * (a[u] + b[u]) + q * (c[u] + d[u]) + r * (e[u] + f[u])
+
+
+def sensor(image_dn: Image, optics: CameraOptics, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Expose: `image_dn` (height, width) expected DN → uint8 picture.
+
+    Variance in DN² = DN / (electrons per DN) + read noise², drawn as a Gaussian (docs/explanation/theory.md, section
+    4); the same state of `rng` gives the same picture.
+    """
+    picture = np.empty(image_dn.shape, dtype=np.uint8)
+    seed = rng.integers(0, 2**63, dtype=np.uint64)
+    quantise(
+        np.ascontiguousarray(image_dn, dtype=np.float32).ravel(),
+        np.float32(1.0 / optics.electrons_per_dn),
+        np.float32(optics.read_noise_dn**2),
+        seed,
+        picture.ravel(),
+    )
+    return picture
+
+
+@compiled_fast
+def scramble(counter: np.uint64) -> np.uint64:
+    """Splitmix64's finaliser: 64 random bits of a counter."""
+    z = counter * np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+@compiled_fast
+def gaussian(bits: np.uint64) -> np.float32:
+    """Standard normal number as the sum of the eight bytes of `bits` (within ±4.8, kurtosis −0.15)."""
+    mask = np.uint64(0x00FF00FF00FF00FF)
+    pairs = (bits & mask) + ((bits >> np.uint64(8)) & mask)
+    total = (pairs * np.uint64(0x0001000100010001)) >> np.uint64(48)
+    return (np.float32(np.int64(total)) - np.float32(1020.0)) * np.float32(0.0047841)
+
+
+@compiled_fast
+def quantise(
+    light: Image, gain: np.float32, read_variance: np.float32, seed: np.uint64, picture: NDArray[np.uint8]
+) -> None:
+    """Compiled core of `sensor` on flat arrays."""
+    for i in range(light.shape[0]):
+        level = max(light[i], np.float32(0.0))
+        noise = np.sqrt(level * gain + read_variance) * gaussian(scramble(seed + np.uint64(i)))
+        picture[i] = np.uint8(min(max(level + noise + np.float32(0.5), np.float32(0.0)), np.float32(255.0)))

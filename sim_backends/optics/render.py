@@ -8,14 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.boards import render_rectangle
-from sim_backends.optics.camera import CameraOptics
-from sim_backends.optics.laser.speckle import add_speckled
+from sim_backends.optics.camera import CameraOptics, sensor
+from sim_backends.optics.laser.profile import add_speckled
 from sim_backends.optics.laser.stripe import render_stripe
-from sim_backends.optics.lighting import ambient_dn, fill_background, gain_parameters
+from sim_backends.optics.lighting import add_sun, ambient_dn, fill_background, gain_parameters, render_mesh
 from sim_backends.optics.scene import BoardInstance, LaserOptics, Light, MeshInstance, PlaneInstance, SceneObject
-from sim_backends.optics.sensor import sensor
-from sim_backends.optics.shading import render_mesh
-from sim_backends.optics.sunlight import add_sun
 
 Image = NDArray[np.float32]
 

@@ -2,18 +2,27 @@
 
 One JSON object per line each way: {"op": "truth"} → {"ok": true, "truth": {…}}, {"op": "fault", "name": …} and
 {"op": "reset"} → {"ok": true}; anything else → {"ok": false, "error": …}.
-"""
+
+The endpoint at which a world is told of real devices; no part of any device.
+
+One JSON object per line each way. {"op": "time"} → {"ok": true, "time": world s}. {"op": "begin", "table": [[…]],
+"outputs": bits} before the arm's first reading. {"op": "tell", "device": …, "rows": [[…]]} → {"ok": true, "wrenches":
+[[…]]}. {"op": "board", "base_from_board": [[…]]}. {"op": "switch", "output": n, "on": …} and {"op": "connector"} →
+inputs and outputs as bits, for a laser or claw that is simulated beside a real arm. {"op": "figures"}. Anything else,
+and what is wrong, → {"ok": false, "error": …}."""
 
 from __future__ import annotations
 
 import json
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from sim_backends.peers.server import TcpServer
+from sim_backends.world.following import WorldFollowing
+from sim_backends.world.world import World
 
 _LONGEST = 64 * 1024
 
@@ -84,3 +93,66 @@ def _plain(value: object) -> object:
     if isinstance(value, np.generic):
         return value.item()
     raise TypeError(f"{type(value).__name__} is not fit for JSON")
+
+
+_LONGEST_READINGS = 4 * 1024 * 1024
+
+
+class FollowingPeer:
+    """Serves at `address` (`127.0.0.1:port`)."""
+
+    def __init__(self, world: World, following: WorldFollowing) -> None:
+        self._world, self._following = world, following
+        self._server = TcpServer("following", self._serve)
+        self.address = self._server.address
+        self._operations: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
+            "time": lambda request: {"time": world.clock.now()},
+            "begin": self._begin,
+            "tell": self._tell,
+            "board": self._board,
+            "switch": self._switch,
+            "connector": lambda request: {"inputs": world.arm.digital_inputs, "outputs": world.arm.digital_outputs},
+            "figures": lambda request: {"figures": following.figures()},
+        }
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._server.start()
+
+    def stop(self) -> None:
+        """End all connections and threads; idempotent."""
+        self._server.stop()
+
+    def _serve(self, connection: socket.socket) -> None:
+        with connection.makefile("rb") as lines:
+            while line := lines.readline(_LONGEST_READINGS):
+                connection.sendall(json.dumps(self._answer(line)).encode() + b"\n")
+
+    def _answer(self, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+            operation = self._operations[request["op"]]
+        except (ValueError, TypeError, KeyError):
+            return {"ok": False, "error": f'a request has "op", one of {", ".join(self._operations)}'}
+        try:
+            return {"ok": True, **operation(request)}
+        except (ValueError, TypeError, KeyError, IndexError) as error:
+            return {"ok": False, "error": f"{type(error).__name__}: {error}"}
+
+    def _begin(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        self._following.begin_arm(request["table"], request["outputs"])
+        return {}
+
+    def _tell(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        return {"wrenches": self._following.tell(request["device"], request["rows"])}
+
+    def _board(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        pose = np.array(request["base_from_board"], dtype=np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError("base_from_board is a pose, 4 by 4")
+        self._following.board_seen(pose)
+        return {}
+
+    def _switch(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        self._following.switch(int(request["output"]), bool(request["on"]), self._world.clock.now())
+        return {}

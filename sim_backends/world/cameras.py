@@ -24,10 +24,9 @@ from sim_backends.optics.scene import (
     SceneObject,
     Sun,
 )
-from sim_backends.world import nominal
+from sim_backends.world import drawing
 from sim_backends.world.bodies.station import Station
-from sim_backends.world.drawing import CameraDrawing
-from sim_backends.world.nominal import inverse
+from sim_backends.world.drawing import CameraDrawing, inverse
 from sim_backends.world.scene import Lens, Scene, rotation, stream
 
 Pose = NDArray[np.float64]
@@ -112,7 +111,7 @@ class Cameras:
         pose = camera_from_flange @ self._witness_pose
         corners, optics = _witness_corners(pose), self._cold["scan"]
         left = (-0.55 * optics.width / optics.fx) * corners[:, 2]
-        return [PlaneInstance(pose, nominal.WITNESS_SIZE, WITNESS_ALBEDO)] if (corners[:, 0] > left).any() else []
+        return [PlaneInstance(pose, drawing.WITNESS_SIZE, WITNESS_ALBEDO)] if (corners[:, 0] > left).any() else []
 
     def lens(self, camera: str, warm: float) -> Lens:
         """The lens with the shift and zoom of what is `warm`, 0 to 1."""
@@ -151,9 +150,9 @@ class Cameras:
         camera_from_base = camera_from_world @ world_from_base
         camera_from_surface = camera_from_world @ scene.world_from_surface
         camera_from_table = camera_from_world @ scene.world_from_table
-        table = (2 * nominal.TABLE_HALF, 2 * nominal.TABLE_HALF)
+        table = (2 * drawing.TABLE_HALF, 2 * drawing.TABLE_HALF)
         placed: list[tuple[SceneObject, Pose, float]] = [
-            (PlaneInstance(camera_from_table, table, TABLE_ALBEDO), camera_from_table, nominal.TABLE_HALF * 1.5),
+            (PlaneInstance(camera_from_table, table, TABLE_ALBEDO), camera_from_table, drawing.TABLE_HALF * 1.5),
         ]
         boards = [
             (camera_from_world @ scene.world_from_board, board_there),
@@ -173,7 +172,7 @@ class Cameras:
 
 
 def _witness_corners(pose: Pose) -> Pose:
-    half = np.array(nominal.WITNESS_SIZE) / 2.0
+    half = np.array(drawing.WITNESS_SIZE) / 2.0
     corners = np.array([[x, y, 0.0] for x in (-half[0], half[0]) for y in (-half[1], half[1])])
     return corners @ pose[:3, :3].T + pose[:3, 3]
 
@@ -198,7 +197,7 @@ def _optics(scene: Scene, lens: Lens, drawn: CameraDrawing, transmission: float)
         cy=lens.cy,
         distortion=lens.dist,
         pixel=drawn.pixel,
-        f_number=nominal.F_NUMBER,
+        f_number=drawing.F_NUMBER,
         focal=drawn.focal_length,
         focus_distance=drawn.focus,
         read_noise_dn=scene.deviations.read_noise,

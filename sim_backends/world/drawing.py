@@ -2,20 +2,95 @@
 
 A world is drawn around a `Drawing`: its true values are those described here and the level's tolerances. `STOCK` is the
 cell of `nominal`. Poses are (4, 4), m, named `a_from_b`; frames as in `nominal`.
-"""
+
+The nominal geometry of the simulated cell: where everything would be if nothing deviated.
+
+Frames: world W (z up, floor z = 0), vehicle V, arm base B, flange F (z out of the flange), scan camera C, target
+camera T (z along the optical axis), part, surface S, place frame P, boards D (x right, y down, z into the board)."""
 
 from __future__ import annotations
 
 import json
+import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.world import nominal
-
 Pose = NDArray[np.float64]
+
+
+def pose(translation: Sequence[float], x_axis: Sequence[float], z_axis: Sequence[float]) -> Pose:
+    """The (4, 4) transformation with this translation, m, and these (exact, orthonormal) x and z axes."""
+    x, z = np.array(x_axis, dtype=float), np.array(z_axis, dtype=float)
+    made = np.eye(4)
+    made[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    made[:3, 3] = translation
+    return made
+
+
+def inverse(a_from_b: Pose) -> Pose:
+    """`b_from_a` (4, 4) of a rigid transformation."""
+    made = np.eye(4)
+    made[:3, :3] = a_from_b[:3, :3].T
+    made[:3, 3] = -made[:3, :3] @ a_from_b[:3, 3]
+    return made
+
+
+def board_pose(
+    centre: Sequence[float], x_axis: Sequence[float], z_axis: Sequence[float], size: Sequence[float]
+) -> Pose:
+    """The pose of a board whose lattice of `size` (m) is centred at `centre`; its origin is the lattice's corner."""
+    made = pose(centre, x_axis, z_axis)
+    made[:3, 3] -= made[:3, 0] * size[0] / 2.0 + made[:3, 1] * size[1] / 2.0
+    return made
+
+
+LARGE_BOARD_SIZE = (0.160, 0.120)
+"""From the first dot to the last of the station's board and of the deck's large board, m."""
+_FINE_SIZE = (0.030, 0.024)
+_C45 = math.sqrt(0.5)
+
+TABLE_HEIGHT = 0.60
+"""The table's top above the floor, m."""
+TABLE_HALF = 0.25
+"""The table reaches this far, m, along x and y around the surface's origin."""
+WORLD_FROM_PLACE = pose((0.0, 0.0, TABLE_HEIGHT), (1, 0, 0), (0, 0, 1))
+PLACE_FROM_BOARD = board_pose((0.10, 0.32, 0.12), (0, -1, 0), (_C45, 0, -_C45), LARGE_BOARD_SIZE)
+WORLD_FROM_VEHICLE_START = pose((-3.05, 0.0, 0.0), (1, 0, 0), (0, 0, 1))
+VEHICLE_FROM_BASE = pose((0.30, 0.0, 0.55), (1, 0, 0), (0, 0, 1))
+BASE_FROM_FINE_BOARD = board_pose((-0.55, 0.25, 0.02), (1, 0, 0), (0, 0, -1), _FINE_SIZE)
+BASE_FROM_DECK_BOARD = board_pose((-0.60, -0.25, 0.02), (1, 0, 0), (0, 0, -1), LARGE_BOARD_SIZE)
+
+FLANGE_FROM_SCAN_CAMERA = pose((0.09, -0.05, 0.08), (0, 1, 0), (0, 0, 1))
+"""The scan camera with the carriage at home."""
+FLANGE_FROM_TARGET_CAMERA = pose((-0.10, 0.0, 0.03), (0, 1, 0), (0, 0, 1))
+FLANGE_FROM_WITNESS = pose((0.09, -0.0625, 0.165), (0, 1, 0), (0, 0, 1))
+"""A plate of `WITNESS_SIZE` on the claw: with the carriage at home the laser's line lies on it, beside the sweeps."""
+WITNESS_SIZE = (0.013, 0.012)
+FLANGE_FROM_PART = pose((0.0, 0.0, 0.17), (0, 1, 0), (0, 0, -1))
+RAIL_DIRECTION = np.array([1.0, 0.0, 0.0])
+"""The way the carriage moves, in C."""
+
+FOCAL_LENGTH = 0.008
+F_NUMBER = 4.0
+PIXEL = 4.8e-6
+SCAN_SIZE = (640, 480)
+SCAN_FOCUS = 0.130
+TARGET_SIZE = (1280, 1024)
+TARGET_FOCUS = 1.0
+LASER_BASELINE = 0.035
+"""From the scan camera to the laser's exit point, against C's x axis, m."""
+LASER_TAN_THETA = 3.5
+"""Tangent of the angle at the laser between baseline and light plane."""
+
+LASER_OUTPUT = 0
+CLAW_OUTPUT = 1
+GRIP_INPUT = 0
+"""Standard digital outputs and input of the arm that switch the laser, close the claw and report its grip."""
+
 
 TEXT_M, TEXT_RAD = 5e-6, 1e-9
 """A pose written in hundredths of a millimetre and in degrees is this near to the one that was meant, m and rad."""
@@ -138,37 +213,37 @@ STOCK = Drawing(
         arm="UR10e",
         payload=2.1,
         payload_centre=(0.0, 0.0, 0.06),
-        vehicle_from_base=nominal.VEHICLE_FROM_BASE,
+        vehicle_from_base=VEHICLE_FROM_BASE,
         track=0.583,
         rail=RailDrawing(0.002, 200, (0.0, 0.100), (0.01, 0.09)),
         scan=CameraDrawing(
-            nominal.SCAN_SIZE, nominal.PIXEL, nominal.FOCAL_LENGTH, nominal.SCAN_FOCUS, nominal.FLANGE_FROM_SCAN_CAMERA
+            SCAN_SIZE, PIXEL, FOCAL_LENGTH, SCAN_FOCUS, FLANGE_FROM_SCAN_CAMERA
         ),
         target=CameraDrawing(
-            nominal.TARGET_SIZE, nominal.PIXEL, nominal.FOCAL_LENGTH, nominal.TARGET_FOCUS,
-            nominal.FLANGE_FROM_TARGET_CAMERA,
+            TARGET_SIZE, PIXEL, FOCAL_LENGTH, TARGET_FOCUS,
+            FLANGE_FROM_TARGET_CAMERA,
         ),
-        baseline=nominal.LASER_BASELINE,
-        tan_theta=nominal.LASER_TAN_THETA,
-        witness=nominal.FLANGE_FROM_WITNESS,
-        laser_output=nominal.LASER_OUTPUT,
-        claw_output=nominal.CLAW_OUTPUT,
-        grip_input=nominal.GRIP_INPUT,
+        baseline=LASER_BASELINE,
+        tan_theta=LASER_TAN_THETA,
+        witness=FLANGE_FROM_WITNESS,
+        laser_output=LASER_OUTPUT,
+        claw_output=CLAW_OUTPUT,
+        grip_input=GRIP_INPUT,
         fine_board="marked_dots:11x9:3mm",
-        base_from_fine_board=nominal.BASE_FROM_FINE_BOARD,
+        base_from_fine_board=BASE_FROM_FINE_BOARD,
         deck_board="marked_dots:9x7:20mm",
-        base_from_deck_board=nominal.BASE_FROM_DECK_BOARD,
+        base_from_deck_board=BASE_FROM_DECK_BOARD,
     ),
     StationDrawing(
-        height=nominal.TABLE_HEIGHT,
-        place_from_start=nominal.inverse(nominal.WORLD_FROM_PLACE) @ nominal.WORLD_FROM_VEHICLE_START,
+        height=TABLE_HEIGHT,
+        place_from_start=inverse(WORLD_FROM_PLACE) @ WORLD_FROM_VEHICLE_START,
         board="marked_dots:9x7:20mm",
-        place_from_board=nominal.PLACE_FROM_BOARD,
+        place_from_board=PLACE_FROM_BOARD,
         place_from_surface=np.eye(4),
         surface="pot",
         mesh="",
         mesh_unit="m",
-        flange_from_part=nominal.FLANGE_FROM_PART,
+        flange_from_part=FLANGE_FROM_PART,
         surface_from_part=np.eye(4),
         part_size=(0.070, 0.036, 0.020),
     ),

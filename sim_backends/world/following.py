@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.models.followed import FollowedArm, FollowedRail, FollowedVehicle, Track
-from sim_backends.world.nominal import inverse
+from sim_backends.world.drawing import inverse
 from sim_backends.world.world import World
 
 FOLLOWED = ("arm", "rail", "vehicle", "laser", "claw")

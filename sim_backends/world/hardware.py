@@ -11,7 +11,7 @@ from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.models.camera import CameraSpec
 from sim_backends.models.rail import RailModel, RailParams
-from sim_backends.models.screw import Screw
+from sim_backends.models.ramp import Screw
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.world.scene import Scene, stream
 

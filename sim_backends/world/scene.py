@@ -12,10 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.world.drawing import STOCK, CameraDrawing, CellDrawing, Drawing
-from sim_backends.world.effects import WARMING_K, Effects
-from sim_backends.world.levels import CUT, Deviations, deviations, effects_of, number_of
-from sim_backends.world.nominal import RAIL_DIRECTION, inverse, pose
+from sim_backends.world.drawing import RAIL_DIRECTION, STOCK, CameraDrawing, CellDrawing, Drawing, inverse, pose
+from sim_backends.world.levels import CUT, WARMING_K, Deviations, Effects, deviations, effects_of, number_of
 
 Pose = NDArray[np.float64]
 Vector = NDArray[np.float64]

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from cell import Cell, NotConnectedError
 from cell.apps.cli.app import app
 from cell.apps.cli.commands import run
-from cell.apps.doctor.packages import asked_for
+from cell.apps.doctor import asked_for
 from drivers.arm.link import ArmLink
 from drivers.packages import lacking
 from lab.bench import platforms
@@ -65,7 +65,7 @@ def test_over_the_wires_it_is_refused_before_anything_is_started(
 
 
 def test_the_doctor_asks_for_nothing_that_has_no_wheel_here(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("cell.apps.doctor.packages.tomllib.loads", lambda text: {"project": {"dependencies": [NEVER]}})
+    monkeypatch.setattr("cell.apps.doctor.tomllib.loads", lambda text: {"project": {"dependencies": [NEVER]}})
     assert asked_for(()) == {"": []}
 
 

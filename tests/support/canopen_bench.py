@@ -13,7 +13,7 @@ import can
 import numpy as np
 
 from drivers.clock import Clock
-from drivers.vehicle.cia402.geometry import WheelDrives
+from drivers.vehicle.cia402.feedback import WheelDrives
 from drivers.vehicle.cia402.setup import Watchdog
 from drivers.vehicle.cia402.vehicle import CanopenVehicle
 from sim_backends.clock import WorldClock

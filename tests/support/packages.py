@@ -10,7 +10,7 @@ RAIL = '''
 
 from typing import Annotated, ClassVar, Literal
 
-from cell.makes.records import RailConfig
+from cell.makes.make import RailConfig
 from cell.makes.make import Make
 from cell.base.units import quantity
 from drivers.errors import InterlockError, LimitError

@@ -11,8 +11,7 @@ import pinocchio as pin
 import pytest
 
 from cell.apps.recordings.frames import RecordedFrame
-from cell.measure.vision.board.spec import parse_board
-from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.board.view import BoardView, parse_board
 from cell.measure.vision.stripe.extract import StripeProfile
 from tests.support import ROOT
 

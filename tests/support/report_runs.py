@@ -18,22 +18,22 @@ from typing import Any
 from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import Job, load_job
 from cell.devices.simulated.direct import VirtualCell
-from cell.devices.simulated.truth_link import ask_truth
+from cell.devices.simulated.process import ask_truth
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.workplace import Workplace
-from cell.run.faults import classify
-from cell.run.files.folder import new_run
+from cell.run.folder import new_run
+from cell.run.recorded_work import classify
 from cell.run.report.report import make_report
 from cell.run.report.truth import TruthRecorder, pose_of
 from cell.run.resumption import job_source
 from drivers.errors import CellError
 from lab.bench.job.whole_job import JobRecord
-from statemachine.policy import Failure, Outcome
 from statemachine.runner import FaultRecord, RunResult, StepContext, StepRecord
+from statemachine.step import Failure, Outcome
 
 CONFIG = load_config(None)
 NAMES = list(PLACE.names)

@@ -9,8 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from cell.apps.commission.check import CommissionCheck, bounds
-from cell.apps.commission.progress import Progress
+from cell.apps.commission.check import CommissionCheck, Progress, bounds
 from cell.base.version import release
 from cell.config.cell_config import CellConfig
 from drivers.interfaces import Reading

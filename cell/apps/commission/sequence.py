@@ -1,16 +1,30 @@
 """The order of the checks, and going through them: what is good already is passed over, what was found is mended.
 
 First what does not move, then each axis by itself and slowly, then what a wrong axis would make dangerous.
-"""
+
+Changing values in a TOML file without touching the rest of it: comments, order and spaces stay as they are.
+
+The new text is parsed again and has to say what was meant; else nothing is written. The old file is always kept.
+
+Everything that a commissioning begins with: which cell, which person, where its record is."""
 
 from __future__ import annotations
 
+import hashlib
+import os
+import shutil
 import time
-from collections.abc import Callable, Sequence
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
-from cell.apps.commission.check import CheckVerdict, CommissionCheck, Result
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+
+from cell.apps.commission.check import CheckVerdict, CommissionCheck, Progress, Result, done_well
 from cell.apps.commission.checks import arm as arm_checks
 from cell.apps.commission.checks import cameras as camera_checks
 from cell.apps.commission.checks import closing as closing_checks
@@ -19,13 +33,64 @@ from cell.apps.commission.checks import outputs as output_checks
 from cell.apps.commission.checks import rail as rail_checks
 from cell.apps.commission.checks import stops as stop_checks
 from cell.apps.commission.checks import vehicle as vehicle_checks
-from cell.apps.commission.progress import Progress, done_well
-from cell.apps.commission.toml_edit import write_changes
+from cell.apps.commission.person import Person
 from cell.apps.commission.workplace import CommissionWorkplace, Declined, told
+from cell.config.cell_config import CONFIGURATION, load_config, require_confirm
 from cell.config.job import job_path
 from cell.run.recorded_work import Hands
+from cell.run.session.supervisor import Cell
 from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, RefusedError
 from drivers.interfaces import Frame
+
+
+def edited(text: str, changes: Mapping[str, str]) -> str:
+    """`text` with each dotted key of `changes` set to its value, given as TOML. `ConfigError` when that fails."""
+    wanted = tomllib.loads(text)
+    try:
+        document = tomlkit.parse(text)
+        for key, value in changes.items():
+            table, _, name = key.rpartition(".")
+            _table(document, table)[name] = tomlkit.value(value)
+            _table(wanted, table)[name] = tomllib.loads(f"x = {value}")["x"]
+        new = document.as_string()
+        good = tomllib.loads(new) == wanted
+    except (TOMLKitError, tomllib.TOMLDecodeError, TypeError):
+        good = False
+    if not good:
+        raise ConfigError(
+            "the configuration is written in a way that this program does not change without risk; write yourself: "
+            + "; ".join(f"{key} = {value}" for key, value in changes.items())
+        )
+    return new
+
+
+def write_changes(path: Path, changes: Mapping[str, str]) -> Path:
+    """Change the file, and keep the old one beside it; returns where that is. `ConfigError` when it cannot be done."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        new = edited(text, changes)
+        backup = _free(path)
+        shutil.copy2(path, backup)
+        beside = path.with_name(f".{path.name}.{os.getpid()}")
+        beside.write_text(new, encoding="utf-8")
+        shutil.copymode(path, beside)
+        beside.replace(path)
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be changed: {error.strerror or error}; see its permissions") from error
+    return backup
+
+
+def _free(path: Path) -> Path:
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    names = [f"{path.name}.before-{stamp}", *(f"{path.name}.before-{stamp}-{k}" for k in range(2, 100))]
+    return next(path.with_name(name) for name in names if not path.with_name(name).exists())
+
+
+def _table(tables: Any, dotted: str) -> Any:
+    for part in dotted.split("."):
+        tables = tables.setdefault(part, {})
+    return tables
+
 
 CHECKS: tuple[CommissionCheck, ...] = (
     *link_checks.CHECKS,
@@ -195,3 +260,53 @@ def table() -> str:
 
 if __name__ == "__main__":
     print(table())
+
+
+FOLDER = "commissioning"
+
+
+def begin(
+    config: Path | None,
+    person: Person,
+    show: Callable[[CommissionCheck, str, Result | None], None],
+    *,
+    job: str,
+    sim: str | None = None,
+    seed: int = 1,
+    level: str = "nominal",
+    clock: str = "wall",
+    truth: Path | None = None,
+) -> Commissioning:
+    """A commissioning of the cell of this configuration, whose record is in `commissioning/` beside it.
+
+    With `sim="all"` the cell is simulated, as `truth` describes it. `ConfigError` for what is wrong before anything is
+    connected. The caller closes `desk`.
+    """
+    path = Path(CONFIGURATION) if config is None else config
+    if not path.is_file():
+        raise ConfigError(
+            f"there is no {path} to commission: `cell init` writes one; put in what you know, addresses first. Or try "
+            "it with a simulated cell: `cell init`, then `cell commission --sim all`"
+        )
+    loaded = load_config(path)
+    if sim is None:
+        require_confirm(loaded)
+    if truth is not None:
+        load_config(truth)
+    job_path(job)
+    options: dict[str, Any] = {"sim": sim, "job": job}
+    simulated = sim == "all" or (sim is None and bool(loaded.cell.truth))
+    which: dict[str, Any] = {"name": loaded.cell.name, "simulated": simulated, "sim": sim, "job": job}
+    if sim is not None:
+        options |= {"seed": seed, "level": level, "clock": clock, "truth": truth}
+        world = "" if truth is None else hashlib.sha256(truth.read_bytes()).hexdigest()[:12]
+        which |= {"seed": seed, "level": level, "clock": clock, "world": world}
+    folder = path.resolve().parent / FOLDER
+    desk = CommissionWorkplace(path, partial(Cell.open, path, **options), person, folder, job, simulated=simulated)
+    return Commissioning(desk, Progress(folder, which, desk.job), path, show)
+
+
+def confirms_itself(config: Path | None) -> bool:
+    """Whether the configuration names a simulated cell that confirms by itself what a person has to."""
+    path = Path(CONFIGURATION) if config is None else config
+    return path.is_file() and load_config(path).cell.confirm == "simulated"

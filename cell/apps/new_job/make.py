@@ -12,16 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from cell.apps.new_job.alternative_poses import FITS, rivals
 from cell.apps.new_job.answers import as_pose, job_name, laid_mesh, station, template
 from cell.apps.new_job.mesh_file import Drawn, read_drawing
-from cell.apps.new_job.observability import known, place_from, told_by_few
+from cell.apps.new_job.observability import known, place_from, sight_problems, told_by_few
 from cell.apps.new_job.picture import draw_proposal
 from cell.apps.new_job.proposal import Proposal, propose
 from cell.apps.new_job.questions import Asker, choice
-from cell.apps.new_job.rays import Array
-from cell.apps.new_job.sight import sight_problems
 from cell.apps.new_job.surface import about, written
+from cell.apps.new_job.sweeps import FITS, Array, rivals
 from cell.apps.new_job.text import job_text, pose_text
 from cell.base.units import parse_quantity
 from cell.check.fit import require_fit

@@ -17,18 +17,15 @@ from matplotlib.patches import Rectangle
 from scipy.spatial import ConvexHull, cKDTree
 
 from cell.apps.new_job.proposal import SEEN_WITHIN, Proposal
-from cell.apps.new_job.rays import Array
-from cell.apps.new_job.sweeps import SeenSurface
+from cell.apps.new_job.sweeps import Array, SeenSurface
 from cell.check.reach import nominal_scan, station_planner
 from cell.config.cell_config import CellConfig
 from cell.config.job import SwathSection
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion import NominalSurface
-from cell.motion.arm_models import HOME
-from cell.motion.bodies import Body
-from cell.motion.collision import CollisionError
-from cell.motion.kinematics import Unreachable
-from cell.procedures.arm.camera_poses import base_from_place_at_target, scan_plans
+from cell.motion.collision import Body, CollisionError
+from cell.motion.kinematics import HOME, Unreachable
+from cell.procedures.arm.photograph import base_from_place_at_target, scan_plans
 
 COLOURS = ("tab:blue", "tab:orange", "tab:green", "tab:purple", "tab:brown", "tab:olive", "tab:cyan", "tab:pink")
 PLACES = 6000

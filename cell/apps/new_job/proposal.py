@@ -14,9 +14,8 @@ import numpy as np
 import pinocchio as pin
 
 from cell.apps.new_job.observability import verdict
-from cell.apps.new_job.rays import ABOVE, Array, Rays
 from cell.apps.new_job.surface import Laid, open_side
-from cell.apps.new_job.sweeps import FARTHEST, NEAREST, SeenSurface, look
+from cell.apps.new_job.sweeps import ABOVE, FARTHEST, NEAREST, Array, Rays, SeenSurface, look
 from cell.check.fit import RAMP_MARGIN
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
 from cell.config.job import Job, ScanSection, SwathSection

@@ -16,7 +16,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from cell.base.toml_file import wording
 from cell.base.units import shown
-from cell.makes.records import Mounting, Pose
+from cell.makes.make import Mounting, Pose
 from drivers.errors import ConfigError
 
 PROGRESS_S = 3.0

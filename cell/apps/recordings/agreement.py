@@ -16,7 +16,7 @@ import pinocchio as pin
 from cell.apps.recordings.consistency import odd_turns, orders, turn_votes, weighted_median
 from cell.apps.recordings.conventions import FORM, TRIED, PoseReading, readings_of, why_not
 from cell.apps.recordings.series import Series
-from cell.measure.calibration.solve.hand_eye import park_martin
+from cell.measure.calibration.solve.starts import park_martin
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.poses import from_parts
 from drivers.errors import RefusedError

@@ -25,7 +25,7 @@ from cell.apps.recordings.solution import (
     rough_camera,
     solve_frames,
 )
-from cell.measure.vision.board.spec import BoardSpec
+from cell.measure.vision.board.view import BoardSpec
 from drivers.errors import ConfigError, RefusedError
 
 

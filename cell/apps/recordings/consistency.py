@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.apps.recordings.frames import RecordedFrame, by_stop, merged
-from cell.measure.calibration.solve.hand_eye import park_martin
+from cell.measure.calibration.solve.starts import park_martin
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.vision.board.board import board_pose
 from cell.measure.vision.pictures import Reason

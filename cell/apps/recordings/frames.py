@@ -24,8 +24,7 @@ from cell.apps.recordings.stripes import ChosenChannel, ReadStripe, Source, calm
 from cell.apps.recordings.texts import PICTURES
 from cell.measure.geometry.poses import difference, mean
 from cell.measure.vision.board.board import find_board
-from cell.measure.vision.board.spec import BoardSpec
-from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.board.view import BoardSpec, BoardView
 from cell.measure.vision.pictures import PictureRefused, Reason, read_picture
 from cell.measure.vision.stripe.extract import LaserChannel, StripeProfile
 from cell.measure.vision.stripe.planes import read_colours

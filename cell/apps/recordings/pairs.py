@@ -17,7 +17,7 @@ from cell.apps.recordings.result import closed_form_dict, empty_result, hand_eye
 from cell.apps.recordings.solution import apply_checks
 from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.judge.scale import metric_scale
-from cell.measure.calibration.solve.hand_eye import HandEye, refine_hand_eye, solve_hand_eye
+from cell.measure.calibration.solve.starts import HandEye, refine_hand_eye, solve_hand_eye
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.poses import difference, from_matrix, mean
 from cell.measure.vision.pictures import Reason

@@ -12,11 +12,11 @@ import pinocchio as pin
 from cell.apps.recordings.frames import RecordedFrame
 from cell.measure.calibration.judge.flatness import Flatness
 from cell.measure.calibration.judge.plane_checks import PlaneKnown
-from cell.measure.calibration.solve.hand_eye import HandEye
 from cell.measure.calibration.solve.intrinsics import Intrinsics
+from cell.measure.calibration.solve.starts import HandEye
 from cell.measure.geometry.camera import PARAMETER_NAMES, Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.vision.board.spec import BoardSpec
+from cell.measure.vision.board.view import BoardSpec
 
 FAR_CAMERA_M = 0.8
 CAMERAS = ("intrinsics", "intrinsics_without_distortion", "intrinsics_from_pictures")

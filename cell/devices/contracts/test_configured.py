@@ -15,12 +15,11 @@ from cell.config.cell_config import CellConfig, load_config, require_real_addres
 from cell.devices.assembly import connect_one
 from cell.devices.contracts import Bench
 from cell.devices.contracts.arm import ArmContract
-from cell.devices.contracts.camera import CameraContract
+from cell.devices.contracts.device import CameraContract, ClawContract, LaserContract
 from cell.devices.contracts.rail import RailContract
-from cell.devices.contracts.switches import ClawContract, LaserContract
 from cell.devices.contracts.vehicle import VehicleContract
 from cell.devices.lock import CellLock
-from cell.devices.simulated.truth_link import cause_fault, clear_faults
+from cell.devices.simulated.process import cause_fault, clear_faults
 from drivers.clock import Clock
 from drivers.interfaces import Arm
 

@@ -19,9 +19,8 @@ from cell.config.cell_config import DEVICES, CellConfig, find_config, load_confi
 from cell.devices.diagnosis.local_devices import ROOT, Found, barred, cameras, can_interfaces, opened_by, serial_ports
 from cell.devices.lock import who_holds
 from cell.makes.built_in import TmclRailConfig
-from cell.makes.make import Surroundings
+from cell.makes.make import DeviceConfig, Surroundings
 from cell.makes.rails import ModbusRailConfig
-from cell.makes.records import DeviceConfig
 from cell.makes.switches import OnBoard
 from cell.makes.table import make_of
 from cell.makes.vehicles import CanopenVehicleConfig
@@ -162,7 +161,7 @@ def _look(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
 
 
 def _look_at_nodes(record: CanopenVehicleConfig) -> tuple[str, bool]:
-    from cell.makes.canopen_nodes import look_at_nodes
+    from cell.makes.vehicles import look_at_nodes
 
     return look_at_nodes(record)
 

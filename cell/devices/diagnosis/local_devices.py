@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from drivers.vehicle.can_interface import can_interface
+from drivers.vehicle.health import can_interface
 
 ROOT = Path("/")
 _CAN_TYPE = "280"

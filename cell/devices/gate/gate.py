@@ -17,7 +17,7 @@ from typing import Generic, Protocol, TypeVar
 from cell.devices.gate.interlocks import DeviceCommand, Interlocks
 from drivers.errors import Aborted, InterlockError
 from drivers.interfaces import Device, Identity
-from statemachine.cancel import CancelToken
+from statemachine.control import CancelToken
 
 log = logging.getLogger(__name__)
 

@@ -1,20 +1,30 @@
 """The devices behind the gate: each holds a device of any make and lets begin only what the gate lets begin.
 
 Reading, stopping and closing always pass. What a make offers beyond its interface is asked of the bare device (`bare`).
+
+What the arm is asked for, checked before the interlocks reckon with it: shape, finite numbers, widest ranges.
+
+The make's own limits, which may be tighter, are its driver's.
+
+A guarded motion of the arm that remembers where the arm stood when it had ended at contact.
+
+What is let go of there is let go of at contact only as long as the arm has not been moved since, by hand for example.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, TypeVar
 
-from cell.devices.contact import GuardedMotion
-from cell.devices.gate.arguments import checked_joints, checked_pose, checked_way
+import numpy as np
+from numpy.typing import ArrayLike
+
 from cell.devices.gate.gate import Gate, Gated
 from cell.devices.gate.interlocks import DeviceCommand
-from drivers.clock_map import Latch
-from drivers.errors import CellError, InterlockError
+from drivers.clock import Latch
+from drivers.errors import CellError, InterlockError, LimitError, check_range
 from drivers.interfaces import (
     Arm,
     ArmMotion,
@@ -34,7 +44,83 @@ from drivers.interfaces import (
 from drivers.link_table import LinkTable
 
 if TYPE_CHECKING:
-    from cell.devices.simulated.touch import SimulatedTouch
+    from cell.devices.simulated.mixed import SimulatedTouch
+
+
+TURN_RAD = 2 * math.pi
+"""No joint turns further than a full turn from zero."""
+FAR_M = 3.0
+"""No arm of this kind reaches further from its base."""
+
+
+def checked_joints(device: str, joints: ArrayLike) -> Vector:
+    """Joint angles (6,) in rad, else `LimitError`."""
+    array = _numbers(device, "joint angles", joints)
+    if array.shape != (6,):
+        raise LimitError(device, f"joint angles must be 6 numbers, got shape {array.shape}; nothing was sent")
+    return _turns(device, array)
+
+
+def checked_way(device: str, joints: ArrayLike) -> Vector:
+    """Joint angles (n, 6) in rad of at least one point, else `LimitError`."""
+    array = _numbers(device, "a trajectory's joint angles", joints)
+    if array.ndim != 2 or array.shape[1] != 6 or not len(array):
+        raise LimitError(
+            device, f"a trajectory needs joint angles (n, 6), n at least 1, got shape {array.shape}; nothing was sent"
+        )
+    return _turns(device, array)
+
+
+def checked_pose(device: str, flange: ArrayLike) -> Vector:
+    """The flange's pose (6,) in the base, m and rotation vector in rad, else `LimitError`."""
+    array = _numbers(device, "flange pose", flange)
+    if array.shape != (6,):
+        raise LimitError(device, f"flange pose must be 6 numbers, got shape {array.shape}; nothing was sent")
+    check_range(device, "distance of the flange from the base", float(np.linalg.norm(array[:3])), 0.0, FAR_M, unit="m")
+    return array
+
+
+def _numbers(device: str, what: str, values: ArrayLike) -> Vector:
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise LimitError(device, f"{what} must be numbers; nothing was sent: {error}") from error
+    if not np.isfinite(array).all():
+        raise LimitError(device, f"{what} hold values that are not finite; nothing was sent")
+    return array
+
+
+def _turns(device: str, joints: Vector) -> Vector:
+    for value in (joints.min(), joints.max()):
+        check_range(device, "joint angle", float(value), low=-TURN_RAD, high=TURN_RAD, unit="rad")
+    return joints
+
+
+class GuardedMotion:
+    """`motion` of `arm`; see `drivers.interfaces.ArmMotion`."""
+
+    def __init__(self, motion: ArmMotion, arm: Arm) -> None:
+        self.rest: Vector | None = None
+        """Joint angles (6,) in rad after it had ended at contact, when that was first seen."""
+        self._motion = motion
+        self._arm = arm
+
+    @property
+    def done(self) -> bool:
+        """True once the motion has ended, however it ended."""
+        return self._motion.done
+
+    @property
+    def contact(self) -> bool:
+        """Whether it ended at its force limit."""
+        return self._motion.contact
+
+    def wait(self, timeout: float) -> None:
+        """See `drivers.interfaces.Motion`."""
+        self._motion.wait(timeout)
+        if self.contact and self.rest is None:
+            self.rest = self._arm.state().joints
+
 
 Begun = TypeVar("Begun", bound=Motion)
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import pinocchio as pin
 
-from cell.motion.bodies import Body
+from cell.motion.collision import Body
 from drivers.clock import Clock
 from drivers.errors import ConfigError, InterlockError
 from drivers.interfaces import Arm, ArmMotion, Claw, Laser, TriesOutputs, Vector, Vehicle

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from cell.config.cell_config import CALIBRATION_DEPTHS, DEVICES, CellConfig
 from cell.config.job import Job, load_job, shipped_mesh
 from cell.makes.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
+from cell.makes.make import CameraConfig, DeviceConfig, Pose, RailConfig, VehicleConfig
 from cell.makes.rails import ModbusRailConfig
-from cell.makes.records import CameraConfig, DeviceConfig, Pose, RailConfig, VehicleConfig
 from cell.makes.switches import NumatoClawConfig, OnBoard, RobotiqClawConfig
 from cell.makes.vehicles import CanopenVehicleConfig
 from cell.measure.geometry.poses import from_parts, transform
@@ -27,9 +27,8 @@ from drivers.errors import ConfigError
 from sim_backends.optics.scene import KINDS, Board
 from sim_backends.world import drawing as drawn
 from sim_backends.world.bodies.surfaces import surface
-from sim_backends.world.drawing import STOCK, Drawing
+from sim_backends.world.drawing import SCAN_FOCUS, STOCK, TABLE_HALF, TARGET_FOCUS, Drawing
 from sim_backends.world.hardware import CAMERA_RATE
-from sim_backends.world.nominal import SCAN_FOCUS, TABLE_HALF, TARGET_FOCUS
 
 MOST_BLUR, MOST_STRIPE_BLUR_PX = 0.5, 16.0
 """Diameter of the blur disc at which a board's dots are still found, in diameters of a dot, and a stripe, in px."""

@@ -15,21 +15,20 @@ from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.devices import Devices
 from cell.devices.simulated.described import Described, reverses
 from cell.makes.built_in import TmclRailConfig
+from cell.makes.make import MOST_PAYLOAD, RailConfig, of_make
 from cell.makes.rails import ModbusRailConfig
-from cell.makes.records import MOST_PAYLOAD, RailConfig, of_make
 from cell.makes.vehicles import CanopenVehicleConfig
-from cell.motion.arm_models import MODELS
+from cell.motion.kinematics import MODELS
 from drivers.arm.faults import fault
-from drivers.arm.limits import ArmLimits
-from drivers.clock_map import ClockMap, Latch
-from drivers.errors import ConfigError
-from drivers.quantities import UNTOLD
-from drivers.rail.following import CarriageWatch
-from drivers.rail.timing import EvenMotion
+from drivers.arm.motion import ArmLimits
+from drivers.clock import ClockMap, Latch
+from drivers.errors import UNTOLD, ConfigError
+from drivers.rail.motion import CarriageWatch
+from drivers.rail.sweep import EvenMotion
 from drivers.rail.zero_check import ZeroCheck
 from drivers.vehicle.faults import system_trouble, vehicle_error
-from drivers.vehicle.odometry import PlanarOdometry
-from sim_backends.direct import faults
+from drivers.vehicle.feedback import PlanarOdometry
+from sim_backends.direct import cell
 from sim_backends.direct.cell import DirectCell
 from sim_backends.direct.product import ArmSetup, CameraSetup, DirectSetup, RailSetup, VehicleSetup
 from sim_backends.direct.switches import DirectClaw, DirectLaser
@@ -93,7 +92,7 @@ class VirtualCell(DirectCell):
         if name.startswith("vehicle.") and not self._config.vehicle.DRIVES:
             raise ConfigError(f"{name}: the arm stands on a fixed frame, there is no vehicle that could have it")
         try:
-            faults.require(name)
+            cell.require(name)
         except ValueError as error:
             raise ConfigError(str(error)) from error
 

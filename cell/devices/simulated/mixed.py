@@ -1,30 +1,199 @@
-"""A cell of real devices and simulated ones: the world that has the latter, and follows the former."""
+"""A cell of real devices and simulated ones: the world that has the latter, and follows the former.
+
+Which devices of one cell are simulated beside real ones, and whether that makes sense.
+
+A simulated camera sees a simulated world, which follows the real devices. A real camera sees the real one, in which
+nothing follows a simulated device: what it would need of those is refused, not made up.
+
+What a real arm feels of a simulated station: the force of the simulated part on the simulated surface.
+
+The arm's own force counts as ever: whatever really is in the way ends a guarded motion as well."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
+import threading
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from cell.config.cell_config import DEVICES, CellConfig
+import numpy as np
+
+from cell.config.cell_config import DEVICES, CellConfig, find_config, load_config
 from cell.devices.assembly import connect, connect_one
 from cell.devices.gate.gated import GatedArm
 from cell.devices.lock import CellLock
 from cell.devices.simulated.described import Described
-from cell.devices.simulated.followed_camera import FollowedCamera
-from cell.devices.simulated.following import DeviceFollowing
-from cell.devices.simulated.mix import beware, followed, require_possible
-from cell.devices.simulated.process import SimulatedCell, on_gige, with_endpoints
-from cell.devices.simulated.touch import SimulatedTouch
-from cell.devices.simulated.world_link import WorldConnector, WorldLink
+from cell.devices.simulated.following import DeviceFollowing, FollowedCamera
+from cell.devices.simulated.process import SimulatedCell, WorldConnector, WorldLink, on_gige, with_endpoints
 from cell.makes.built_in import ArmOutputClawConfig, ArmOutputLaserConfig
 from drivers.clock import Clock
-from drivers.errors import ConfigError
+from drivers.errors import Aborted, CellError, ConfigError
+from drivers.interfaces import ArmMotion, ArmState, Vector
 from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
 
+Sim = str | Sequence[str] | None
+"""What may be asked for: "all", "none", names of devices in one text or in a list, or None for what `cell.sim` has."""
+
+NEEDS = {
+    "scan_camera": ("arm", "rail", "vehicle", "laser", "target_camera"),
+    "target_camera": ("arm", "vehicle"),
+}
+"""What has to be real where a camera is real: it carries the camera, lights its picture or finds its station."""
+
+
+def named(sim: Sim) -> tuple[str, ...] | None:
+    """The devices that `sim` asks to simulate, in the cell's order; None where it leaves that to the configuration.
+
+    Raises `ConfigError` for a name that is none.
+    """
+    if sim is None:
+        return None
+    names = [word.strip() for word in sim.split(",") if word.strip()] if isinstance(sim, str) else list(sim)
+    if names == ["all"]:
+        return tuple(DEVICES)
+    if names == ["none"]:
+        return ()
+    if unknown := [name for name in names if name not in DEVICES]:
+        raise ConfigError(
+            f'sim: there is no device {", ".join(map(repr, unknown))}; write "all", "none", or some of '
+            f"{', '.join(DEVICES)}"
+        )
+    return tuple(name for name in DEVICES if name in names)
+
+
+def simulated_of(sim: Sim, config: Path | None) -> tuple[str, ...]:
+    """As `named`, else what `cell.sim` of this configuration's file names. Raises `ConfigError`."""
+    if (names := named(sim)) is not None:
+        return names
+    return named(load_config(find_config(config)).cell.sim) or ()
+
+
+def require_possible(config: CellConfig, simulated: Collection[str], needed: Collection[str]) -> None:
+    """Raise `ConfigError`, a line each, for what physics does not allow: these devices simulated, the others that
+    are `needed` real."""
+    problems = []
+    for name in needed:
+        if name in simulated:
+            continue
+        if config.make(name).on_arm and "arm" in simulated:
+            problems.append(f"{name} is real and hangs on the arm's output, and the arm is simulated")
+        if missing := [other for other in NEEDS.get(name, ()) if other in simulated]:
+            problems.append(
+                f"{name} is real: its pictures show nothing of what {_and(missing)} only simulated would do"
+            )
+    if problems:
+        raise ConfigError(
+            f"these devices cannot be simulated beside the others: {_and(simulated)}\n  "
+            + "\n  ".join(problems)
+            + "\nSimulate the first named of each line as well, or have the others real"
+        )
+
+
+def followed(config: CellConfig, simulated: Collection[str], needed: Collection[str]) -> tuple[str, ...]:
+    """The real devices that the simulated world follows: those that move or light its pictures."""
+    kinds = ("arm", "rail", "vehicle", "laser", "claw")
+    return tuple(name for name in needed if name in kinds and name not in simulated and not config.make(name).on_arm)
+
+
+def beware(simulated: Collection[str], needed: Collection[str]) -> list[str]:
+    """What a person has to know before real devices move beside simulated ones; one sentence each."""
+    real = [name for name in needed if name not in simulated]
+    told = [f"simulated: {', '.join(simulated)}; real: {', '.join(real)}"]
+    if "arm" in real and "scan_camera" in simulated:
+        told.append(
+            "the real arm moves by simulated pictures and puts down where the simulated surface is: keep the place "
+            "clear. Touch is what it feels and what the simulated part would"
+        )
+    if "arm" in real and "vehicle" in simulated:
+        told.append("the vehicle's brake is simulated: see that what the real arm stands on cannot roll")
+    if "vehicle" in real and "arm" in simulated:
+        told.append("the arm's posture is simulated: see that a real one on the vehicle is folded, or not there")
+    if "claw" in simulated and "arm" in real:
+        told.append("the claw is simulated: what a real one holds, it keeps")
+    if "target_camera" in simulated and "vehicle" in real:
+        told.append(
+            "the real vehicle drives by a simulated board: it was taken to stand at the job's start when the cell was "
+            "opened"
+        )
+    return told
+
+
+def _and(names: Collection[str]) -> str:
+    return ", ".join(names)
+
+
 log = logging.getLogger(__name__)
+
+
+class SimulatedTouch:
+    """Adds the simulated wrench to a real arm's, and ends its guarded motions at it."""
+
+    def __init__(self, following: DeviceFollowing) -> None:
+        self._following = following
+        self._zero: Vector = np.zeros(6)
+
+    def zero(self) -> None:
+        """Take the present simulated wrench as zero, too."""
+        self._zero = self._following.wrench()
+
+    def felt(self, state: ArmState) -> ArmState:
+        """The state with the newest simulated wrench in it."""
+        return replace(state, wrench=state.wrench + self._following.wrench() - self._zero)
+
+    def recorded(self, states: list[ArmState]) -> None:
+        """Put into each of these states the simulated wrench that held at its time."""
+        found = self._following.wrenches_at(states)
+        states[:] = [
+            replace(state, wrench=state.wrench + wrench - self._zero)
+            for state, wrench in zip(states, found, strict=True)
+        ]
+
+    def guard(self, motion: ArmMotion, limit: float, stop: Callable[[], None]) -> ArmMotion:
+        """The same motion, ended by `stop` as soon as the simulated force has changed by `limit` N."""
+        return _Guarded(motion, limit, stop, self._following)
+
+
+class _Guarded:
+    """A motion that ends at its own contact or at a simulated one; see `drivers.interfaces.ArmMotion`."""
+
+    def __init__(self, motion: ArmMotion, limit: float, stop: Callable[[], None], following: DeviceFollowing) -> None:
+        self._motion, self._limit, self._stop, self._following = motion, limit, stop, following
+        self._touched = False
+        self._start = following.wrench()[:3]
+        self._watch = threading.Thread(target=self._look, name="simulated touch", daemon=True)
+        self._watch.start()
+
+    @property
+    def done(self) -> bool:
+        """True once the motion has ended, however it ended."""
+        return self._motion.done
+
+    @property
+    def contact(self) -> bool:
+        """Whether it ended at its force limit, real or simulated."""
+        return self._touched or self._motion.contact
+
+    def wait(self, timeout: float) -> None:
+        """See `drivers.interfaces.Motion`."""
+        try:
+            self._motion.wait(timeout)
+        except Aborted:
+            if not self._touched:
+                raise
+        self._watch.join(timeout)
+
+    def _look(self) -> None:
+        while not self._motion.done:
+            if np.linalg.norm(self._following.next_wrench()[:3] - self._start) >= self._limit:
+                self._touched = True
+                try:
+                    self._stop()
+                except CellError as error:
+                    log.error("the arm was to stop at a simulated contact: %s", error)
+                return
 
 
 class MixedCell:

@@ -2,30 +2,155 @@
 
 The process serves the devices' real protocols on free loopback endpoints; the rest of the cell only gets their
 addresses, as if they were hardware. It ends when its standard input closes, so it cannot outlive its owner.
-"""
+
+The truth endpoint of a served simulated cell, from this side: ask for the truth, cause a fault.
+
+A line to a simulated world that follows real devices: one request at a time, answered at once."""
 
 from __future__ import annotations
 
 import json
 import os
 import select
+import socket
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
 from cell.config.cell_config import DEVICES, CellConfig
-from cell.devices.simulated.truth_link import ask_truth, cause_fault, make_ready
-from cell.devices.simulated.world_link import WorldLink
-from drivers.errors import ConfigError, DeviceFault
+from drivers.errors import CellError, ConfigError, DeviceFault
+from drivers.interfaces import Identity
 
 if TYPE_CHECKING:
-    # It knows the world's drawing, which takes long to load: only who simulates a cell needs it.
     from cell.devices.simulated.described import Described
+
+
+TIMEOUT_S = 5.0
+
+
+def ask_truth(address: str) -> dict[str, Any]:
+    """The whole truth of a simulated cell; raises `CellError` when its endpoint does not answer."""
+    truth: dict[str, Any] = _asked(address, {"op": "truth"}, "does not tell its truth")["truth"]
+    return truth
+
+
+def cause_fault(address: str, name: str) -> None:
+    """Cause a fault by its name; raises `CellError` when that was not taken."""
+    _asked(address, {"op": "fault", "name": name}, f"did not take the fault {name}")
+
+
+def make_ready(address: str, drawing: str) -> None:
+    """Have the station of a drawing set up and its part put into the claw; raises `CellError` when that was not
+    taken."""
+    _asked(address, {"op": "make_ready", "drawing": drawing}, "was not made ready for the job")
+
+
+def clear_faults(address: str) -> None:
+    """Take away all causes of faults; raises `CellError` when that was not taken."""
+    _asked(address, {"op": "reset"}, "did not take its faults away")
+
+
+def _asked(address: str, request: dict[str, str], failed: str) -> dict[str, Any]:
+    host, port = address.rsplit(":", 1)
+    try:
+        with socket.create_connection((host, int(port)), timeout=TIMEOUT_S) as link, link.makefile("rwb") as file:
+            file.write(json.dumps(request).encode() + b"\n")
+            file.flush()
+            answer: dict[str, Any] = json.loads(file.readline())
+    except (OSError, ValueError) as error:
+        raise CellError(f"the simulated cell at {address} {failed}: {error}") from error
+    if not answer.get("ok"):
+        raise CellError(f"the simulated cell at {address} {failed}: {answer.get('error')}")
+    return answer
+
+
+class WorldLink:
+    """A connection to the endpoint at `address`; safe between threads."""
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self._asking = threading.Lock()
+        host, port = address.rsplit(":", 1)
+        try:
+            self._socket = socket.create_connection((host, int(port)), timeout=TIMEOUT_S)
+        except OSError as error:
+            raise self._lost(error) from error
+        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self._file = self._socket.makefile("rwb")
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """The answer to a request; `DeviceFault` (sim.lost) when none comes, or when it was refused."""
+        with self._asking:
+            try:
+                self._file.write(json.dumps(request).encode() + b"\n")
+                self._file.flush()
+                answer: dict[str, Any] = json.loads(self._file.readline())
+            except (OSError, ValueError) as error:
+                # An answer that comes after all would be taken for the next request's.
+                self.close()
+                raise self._lost(error) from error
+        if not answer.get("ok"):
+            raise self._lost(answer.get("error"))
+        return answer
+
+    def close(self) -> None:
+        """End the connection; idempotent."""
+        with suppress(OSError):
+            self._file.close()
+        self._socket.close()
+
+    def _lost(self, why: object) -> DeviceFault:
+        return DeviceFault(
+            "simulated world",
+            "sim.lost",
+            f"it does not take what the real devices do: {why}",
+            recoverable=False,
+            hint="Its process has ended or hangs; open the cell again.",
+        )
+
+
+@dataclass(frozen=True)
+class _Outputs:
+    """What a connector shows; see `drivers.switches.Shown`."""
+
+    digital_outputs: int
+
+
+class WorldConnector:
+    """Where a simulated laser or claw hangs while the arm is real; see `drivers.switches.Connector`."""
+
+    def __init__(self, link: WorldLink) -> None:
+        self._link = link
+
+    def identity(self) -> Identity:
+        """That it is simulated."""
+        return Identity("simulated world", "", "", self._link.address)
+
+    def ping(self) -> float:
+        """One round trip, wall seconds."""
+        begun = time.monotonic()
+        self._link.ask(op="time")
+        return time.monotonic() - begun
+
+    def state(self) -> _Outputs:
+        """The outputs as they are in the simulated world."""
+        return _Outputs(int(self._link.ask(op="connector")["outputs"]))
+
+    def set_digital_output(self, index: int, value: bool) -> None:
+        """Set an output of the simulated world."""
+        self._link.ask(op="switch", output=index, on=value)
+
+    def digital_input(self, index: int) -> bool:
+        """Read an input of the simulated world."""
+        return bool(int(self._link.ask(op="connector")["inputs"]) >> index & 1)
+
 
 START_TIMEOUT_S = 120.0  # the optics are compiled at the first start
 

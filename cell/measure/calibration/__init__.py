@@ -1,9 +1,8 @@
 """Calibration of cameras, light plane, rail and hand-eye, from closed form to the joint adjustment."""
 
-from cell.measure.calibration.observations import ScanObservation, TargetObservation
+from cell.measure.calibration.archive import ScanObservation, TargetObservation
 from cell.measure.calibration.solve.adjustment import Priors
-from cell.measure.calibration.solve.cameras import calibrate_scan, calibrate_target
-from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
+from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration, calibrate_scan, calibrate_target
 
 __all__ = [
     "Priors",

@@ -2,7 +2,8 @@
 
 A NumPy archive of plain arrays (nothing in it is executed when it is read) and one JSON text with everything else that
 the solution depends on. What is read is checked as if a stranger had written it.
-"""
+
+What a calibration is made of: a picture of a board, a stripe on it, where the flange was and where the rail."""
 
 from __future__ import annotations
 
@@ -20,13 +21,38 @@ import pinocchio as pin
 
 from cell.base.storage import DIGEST, replacing, require_date, require_unchanged, sealed_arrays
 from cell.measure.calibration.drift.reference_plate import PlateLine, read_edge
-from cell.measure.calibration.observations import ScanObservation, TargetObservation
 from cell.measure.calibration.solve.adjustment import Priors
 from cell.measure.geometry.camera import Array, CameraModel
-from cell.measure.vision.board.spec import parse_board
-from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.board.view import BoardView, parse_board
 from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import ConfigError
+
+
+@dataclass(frozen=True, eq=False)
+class ScanObservation:
+    """One arm pose of a scan camera's calibration.
+
+    `view` is the board in a picture, `profile` the laser stripe on the same board at the same pose, in the same picture
+    or another; either may be None, not both. `base_from_flange` as the arm reports it, `rail_position` in m.
+    `same_rest` says that only the rail has moved since the observation before: the arm's repeatability is the same.
+    """
+
+    view: BoardView | None
+    profile: StripeProfile | None
+    base_from_flange: pin.SE3
+    rail_position: float = 0.0
+    name: str = ""
+    same_rest: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class TargetObservation:
+    """One arm pose of a camera that sees a board at rest; `base_from_flange` as the arm reports it."""
+
+    view: BoardView
+    base_from_flange: pin.SE3
+    name: str = ""
+
 
 FORMAT, UNSEALED = 2, 1
 """Of the archives written now, and of those that had no digest."""

@@ -176,7 +176,7 @@ def dots_terms(
 
     `board`, `flange` and `hand` are the rotations (3, 3) of base_from_board, base_from_flange and flange_from_camera,
     `places` (3, 3) has their translations as rows; `travel` (3,) is the camera's way per metre of `rail`. The columns
-    are those of `cell.measure.calibration.solve.blocks`. A circle of `radius` is seen at its ellipse's centre.
+    are those of `cell.measure.calibration.solve.normal`. A circle of `radius` is seen at its ellipse's centre.
     """
     to_camera = np.zeros((3, 3))
     for i in range(3):

@@ -11,12 +11,10 @@ import pinocchio as pin
 
 from cell.measure.geometry.poses import difference, perturbed
 from cell.measure.inversion.closest import Array
-from cell.measure.inversion.correspondences import Scan, sigmas_along
-from cell.measure.inversion.correspondences import correspondences as matched
-from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.inversion.nominal import NominalSurface, Scan, sigmas_along
+from cell.measure.inversion.nominal import correspondences as matched
 from cell.measure.inversion.observability import FREE
-from cell.measure.inversion.registration import Prior
-from cell.measure.inversion.start_poses import MOST_SHIFT, candidates
+from cell.measure.inversion.registration import MOST_SHIFT, Prior, candidates
 from drivers.errors import Measured, RefusedError
 
 POINTS = 400

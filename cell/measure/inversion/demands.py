@@ -11,12 +11,10 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.inversion.closest import Array
-from cell.measure.inversion.correspondences import Scan
 from cell.measure.inversion.disagreement import Dissent
-from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.inversion.nominal import NominalSurface, Scan
 from cell.measure.inversion.observability import Tolerance
-from cell.measure.inversion.registration import Prior, Registration
-from cell.measure.inversion.start_poses import across
+from cell.measure.inversion.registration import Prior, Registration, across
 from drivers.errors import Measured, RefusedError
 
 BOARD_DISAGREES = 40.0

@@ -1,10 +1,22 @@
-"""From the cloud to the place pose: registration and its whole uncertainty. Reasons to refuse it are in `demands`."""
+"""From the cloud to the place pose: registration and its whole uncertainty. Reasons to refuse it are in `demands`.
+
+What neighbouring points of a scan are off by together: the drawing's facets, the part's form, a stripe on a slope.
+
+A point's own noise averages out over thousands of them. What a patch of the surface shares does not, and a motion that
+one patch tells is known no better than that patch. How much it is, the patches' own mean distances show.
+
+Several sweeps in one scan: the pose of each is off by an error of its own, which is found along with the surface's.
+
+Fitted as if they lay right, two strips side by side turn what their heights differ by into a tilt. But every sweep sees
+the same surface, and how much its pose may be off is known: both together tell the errors apart. Least squares with
+one more unknown for each of them, known beforehand to its standard deviation (docs/explanation/theory.md, section 8).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -13,8 +25,6 @@ from numpy.typing import NDArray
 from cell.measure.geometry.poses import difference, perturbed
 from cell.measure.inversion.alternative_poses import require_alone
 from cell.measure.inversion.closest import Array
-from cell.measure.inversion.correlated_errors import shared_by_patches
-from cell.measure.inversion.correspondences import Scan
 from cell.measure.inversion.demands import (
     Demands,
     fit_figures,
@@ -24,12 +34,80 @@ from cell.measure.inversion.demands import (
     require_whole,
 )
 from cell.measure.inversion.disagreement import dissent
-from cell.measure.inversion.nominal import NominalSurface
+from cell.measure.inversion.nominal import SIGMA_FLOOR, NominalSurface, Scan
 from cell.measure.inversion.observability import PoseVerdict, Tolerance, determined, judge
-from cell.measure.inversion.registration import Prior, register
-from cell.measure.inversion.sweeps import balance
+from cell.measure.inversion.registration import Prior, Registration, by_lines, register
 from cell.measure.reconstruction.cloud import Cloud
 from drivers.errors import Measured, RefusedError
+
+PATCH_M = 0.004
+LEAST_POINTS = 8
+"""Of a patch whose mean distance counts."""
+FAR = 3.5
+"""Robust deviations beyond which a patch is a foreign body, not one of many."""
+
+
+def shared_by_patches(found: Registration) -> tuple[float, Array]:
+    """One standard deviation, m, of what a patch's points share, and the pose's covariance (6, 6) because of it."""
+    patch, count = _patches(found)
+    weights = 1.0 / found.sigmas**2
+    total = np.bincount(patch, weights)
+    means, by_noise = np.bincount(patch, weights * found.heights) / total, 1.0 / total
+    many = count >= LEAST_POINTS
+    sigma = _beyond_noise(means[many], by_noise[many])
+    follow = np.stack([np.bincount(patch, along) for along in found.follow])
+    return sigma, np.asarray(sigma**2 * follow @ follow.T)
+
+
+def _beyond_noise(means: Array, by_noise: Array) -> float:
+    """What patches with these mean distances, m, deviate by beyond the variances, m², of their points' noise."""
+    if not len(means):
+        return SIGMA_FLOOR
+    near = np.abs(means) <= FAR * 1.4826 * np.median(np.abs(means))
+    return float(np.sqrt(max(SIGMA_FLOOR**2, np.mean(means[near] ** 2 - by_noise[near]))))
+
+
+def _patches(found: Registration) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The patch of each accepted point, and how many points each has: a square across the way that the surface faces.
+
+    Not by how high the points lie: a border along the surface would part them by the sign of their noise.
+    """
+    turn = found.base_from_surface.rotation
+    square = np.floor(found.arms @ turn / PATCH_M).astype(np.intp)
+    normals = found.normals @ turn
+    axis = np.argmax(np.abs(normals), axis=1)[:, None]
+    np.put_along_axis(square, axis, 0, axis=1)
+    faces = 2 * axis + (np.take_along_axis(normals, axis, axis=1) > 0)
+    _, patch, count = np.unique(np.hstack([square, faces]), axis=0, return_inverse=True, return_counts=True)
+    return patch.reshape(-1), count
+
+
+def balance(found: Registration, scan: Scan, moved: Array, prior: Prior) -> Registration:
+    """The registration `found` in `scan`, with the sweeps' own errors told apart from the pose.
+
+    `moved` (n, 3, m): how one standard deviation of each of m independent errors displaces the n used points, m, base
+    axes. One step from where the registration has converged. What the errors leave behind in the pose is not part of
+    the covariance: as for any displacement of the points, `follow` says it.
+    """
+    by_pose = np.concatenate([found.normals, np.cross(found.arms, found.normals)], axis=1)
+    columns = np.concatenate([by_pose, np.einsum("ni,nim->nm", found.normals, moved)], axis=1)
+    weighted = columns / found.sigmas[:, None] ** 2
+    known = np.eye(columns.shape[1])
+    known[:6, :6] = prior.information()
+    towards = np.zeros(len(known))
+    towards[:6] = prior.information() @ difference(prior.base_from_surface, found.base_from_surface)
+    total = np.linalg.inv(weighted.T @ columns + known)[:6]
+    follow = total @ weighted.T
+    by_prior = total[:, :6]
+    lines = by_lines(follow, scan, found)
+    return replace(
+        found,
+        base_from_surface=perturbed(found.base_from_surface, follow @ found.heights + total @ towards),
+        covariance=np.asarray(
+            (follow * found.sigmas**2) @ follow.T + by_prior @ known[:6, :6] @ by_prior.T + lines @ lines.T
+        ),
+        follow=follow,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,11 +1,16 @@
 """From stripe profiles to an organised cloud in the arm base."""
 
-from cell.measure.reconstruction.build import ProfileBuilder, ScanGeometry
+from cell.measure.reconstruction.build import (
+    ProfileBuilder,
+    ScanGeometry,
+    calibration_motions,
+    flange_motions,
+    lean_motions,
+)
 from cell.measure.reconstruction.cloud import Cloud, Filled, merge
 from cell.measure.reconstruction.holes import fill_holes
 from cell.measure.reconstruction.ply import deviation_colours, write_cloud, write_ply
 from cell.measure.reconstruction.seams import Seam, find_seams
-from cell.measure.reconstruction.sensitivity import calibration_motions, flange_motions, lean_motions
 
 __all__ = [
     "Cloud",

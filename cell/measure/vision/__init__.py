@@ -11,13 +11,18 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from cell.measure.vision.board.board import BoardPose, board_pose, find_board
-    from cell.measure.vision.board.spec import BoardSpec, parse_board
-    from cell.measure.vision.board.view import BoardView
+    from cell.measure.vision.board.view import BoardSpec, BoardView, parse_board
     from cell.measure.vision.pictures import PictureRefused, Reason, check_picture, read_picture
-    from cell.measure.vision.stripe.extract import LaserChannel, Mark, StripeProfile, StripeSettings, extract
+    from cell.measure.vision.stripe.extract import (
+        LaserChannel,
+        Mark,
+        StripeProfile,
+        StripeSettings,
+        StripeStream,
+        extract,
+        read_stripe,
+    )
     from cell.measure.vision.stripe.planes import read_colours
-    from cell.measure.vision.stripe.read import read_stripe
-    from cell.measure.vision.stripe.stream import StripeStream
 
 __all__ = [
     "BoardPose",
@@ -42,13 +47,18 @@ __all__ = [
 
 _ROOMS = {
     "board.board": ("BoardPose", "board_pose", "find_board"),
-    "board.spec": ("BoardSpec", "parse_board"),
-    "board.view": ("BoardView",),
+    "board.view": ("BoardSpec", "BoardView", "parse_board"),
     "pictures": ("PictureRefused", "Reason", "check_picture", "read_picture"),
-    "stripe.extract": ("LaserChannel", "Mark", "StripeProfile", "StripeSettings", "extract"),
+    "stripe.extract": (
+        "LaserChannel",
+        "Mark",
+        "StripeProfile",
+        "StripeSettings",
+        "StripeStream",
+        "extract",
+        "read_stripe",
+    ),
     "stripe.planes": ("read_colours",),
-    "stripe.read": ("read_stripe",),
-    "stripe.stream": ("StripeStream",),
 }
 
 

@@ -11,7 +11,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array, CameraModel
-from cell.measure.vision.board.spec import DOTS, BoardSpec
+from cell.measure.vision.board.view import DOTS, BoardSpec
 from cell.measure.vision.stripe.extract import StripeProfile
 
 # How far beyond the outermost points there is board for certain, in pitches.

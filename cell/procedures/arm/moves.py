@@ -1,38 +1,73 @@
-"""Moves of the arm as the steps ask for them: planned free of collisions, jerk-limited, followed and settled."""
+"""Moves of the arm as the steps ask for them: planned free of collisions, jerk-limited, followed and settled.
+
+How fast work moves arm and vehicle, of what is planned: a person who wants to look closely slows them down.
+
+What has become of the part in the claw: held, released, or not known."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 import pinocchio as pin
 
-from cell.config.cell_config import ArmConfig, CellConfig
+from cell.config.cell_config import ArmConfig, CellConfig, deck_plates, mounted, station_obstacles, vehicle_obstacles
 from cell.config.job import Job
-from cell.config.mounting import deck_plates, mounted
-from cell.config.obstacles import station_obstacles, vehicle_obstacles
 from cell.devices.gate.interlocks import Interlocks
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision import BoardSpec
-from cell.measure.vision.board.spec import centre_of
-from cell.motion.arm_models import arm_kinematics
-from cell.motion.bodies import (
+from cell.measure.vision.board.view import centre_of
+from cell.motion.collision import (
     BASE,
     PLACED,
     Body,
+    CollisionModel,
+    Pair,
     arm_bodies,
     box,
     station_bodies,
     tool_bodies,
     vehicle_bodies,
 )
-from cell.motion.collision import CollisionModel, Pair
-from cell.motion.kinematics import JointLimits, Joints
+from cell.motion.kinematics import JointLimits, Joints, arm_kinematics
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
-from cell.procedures.pace import Pace
 from drivers.clock import Clock
+from drivers.errors import ConfigError
 from drivers.interfaces import Arm, ArmMotion, Vector
+
+LEAST = 0.25
+"""Slower than this, steps of a usual length would not end within their deadlines."""
+
+
+class Pace:
+    """The `share` holds from the next motion on, until it is set again; any thread may set it.
+
+    Slowed are the arm's motions and the vehicle's ways. Sweeps keep their speed: the lines on the surface would lie
+    closer than the job has them.
+    """
+
+    def __init__(self) -> None:
+        self._share = 1.0
+
+    @property
+    def share(self) -> float:
+        """Of the planned speed, `LEAST` to 1; raises `ConfigError` when it is set to anything else."""
+        return self._share
+
+    @share.setter
+    def share(self, share: object) -> None:
+        self._share = require_share(share)
+
+
+def require_share(share: object) -> float:
+    """`share` if it is one; raises `ConfigError` that says what is allowed."""
+    if not isinstance(share, int | float) or isinstance(share, bool) or not LEAST <= share <= 1.0:
+        raise ConfigError(f"pace {share!r}: allowed are {LEAST:g} to 1, of the planned speed")
+    return float(share)
+
 
 ROOM_ABOVE = 0.005
 """How much higher than drawn the surface is taken to be, m: where it stands is known roughly before it was scanned."""
@@ -179,3 +214,34 @@ def _joint_limits(config: ArmConfig) -> JointLimits:
         acceleration=(config.max_joint_acceleration,) * 6,
         jerk=(config.max_joint_jerk,) * 6,
     )
+
+
+class PartState(Enum):
+    """Where the part is, as far as the claw's commands and its feedback tell."""
+
+    HELD = "held"
+    UNKNOWN = "unknown"
+    RELEASED = "released"
+
+
+@dataclass(eq=False)
+class PartProgress:
+    """What has become of the part, kept beside the step: a run may be ended by others while the part is on its way.
+
+    `where` is base_from_part at the release; `left` tells whether the arm has gone from there and folded.
+    """
+
+    state: PartState = PartState.HELD
+    where: pin.SE3 | None = None
+    left: bool = False
+
+    def told(self, reason: str) -> str:
+        """A run's reason, not to be read without what has become of the part."""
+        if self.state is PartState.HELD or self.where is None:
+            return reason
+        x, y, z = 1e3 * self.where.translation
+        at = f"at ({x:.1f}, {y:.1f}, {z:.1f}) mm in the arm base"
+        if self.state is PartState.RELEASED:
+            failed = "" if self.left else ", only the retreat failed"
+            return f"the part is already down {at} and is not to be placed again{failed}: {reason}"
+        return f"the claw was told to release the part {at}, look whether it did: {reason}"

@@ -1,20 +1,27 @@
-"""A photograph of the station's board, as its pose in the arm's base with its covariance."""
+"""A photograph of the station's board, as its pose in the arm's base with its covariance.
+
+Where the cameras have to be: poses for looking, photographing, scanning and calibrating.
+
+Pure geometry: nominal poses and the present calibration come in, poses of the flange in the arm's base go out. Whether
+the arm can reach them without a collision is `cell.motion`'s business."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
 
-from cell.config.job import PhotoSection
-from cell.measure.calibration import TargetCalibration
-from cell.measure.geometry.poses import compose_covariance, from_ur, mean, transform
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job, PhotoSection
+from cell.measure.calibration import ScanCalibration, TargetCalibration
+from cell.measure.geometry.poses import compose_covariance, from_parts, from_ur, mean, transform
 from cell.measure.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board
+from cell.measure.vision.board.view import centre_of
 from cell.procedures.drive.settled import swing
-from drivers.errors import Measured, RefusedError
+from drivers.errors import CalibrationStale, Measured, RefusedError
 from drivers.interfaces import Arm, Camera, Frame, Vector
 
 
@@ -123,3 +130,228 @@ def _require(pose: BoardPose, limits: PhotoSection) -> None:
             "px; is the target camera still in focus and calibrated, and the board flat?",
             Measured("board's dots off their places, RMS", pose.rms_px, "px", most=limits.max_residual),
         )
+
+
+@dataclass(frozen=True)
+class ScanPlan:
+    """A planned sweep: where the flange begins and ends, in the base, and the rail positions at these two places.
+
+    Between them the velocity is constant. Either the flange stands still, or the rail.
+    """
+
+    base_from_flange: pin.SE3
+    base_from_flange_end: pin.SE3
+    rail_start: float
+    rail_stop: float
+
+
+@dataclass(frozen=True)
+class CalibrationView:
+    """A calibration view: the flange's pose in the base and, for the camera on the rail, the rail's position."""
+
+    base_from_flange: pin.SE3
+    rail_position: float
+
+
+def base_from_place_at_target(config: CellConfig, job: Job) -> pin.SE3:
+    """Nominal pose of the place frame in the arm's base once the vehicle stands at its target."""
+    place_from_base = job.approach.target.se3() * config.arm.vehicle_from_base.se3()
+    return place_from_base.inverse()
+
+
+def facing(board: BoardSpec, base_from_board: pin.SE3, stand_off: float) -> pin.SE3:
+    """base_from_camera that looks square at the board's centre from `stand_off` m, image x along the board's x."""
+    return base_from_board * from_parts(centre_of(board)) * from_parts((0.0, 0.0, -stand_off))
+
+
+def look_pose(config: CellConfig, job: Job, board: BoardSpec, flange_from_camera: pin.SE3) -> pin.SE3:
+    """base_from_flange for driving: the target camera looks ahead and down and sees the board all along."""
+    base_from_board = base_from_place_at_target(config, job) * job.place_from_board
+    place = transform(facing(board, base_from_board, job.photo.stand_off), np.zeros(3))
+    down = job.photo.look_down
+    forward = np.array([np.cos(down), 0.0, -np.sin(down)])
+    right = np.array([0.0, -1.0, 0.0])
+    base_from_camera = from_parts(place, np.column_stack([right, np.cross(forward, right), forward]))
+    return base_from_camera * flange_from_camera.inverse()
+
+
+def photo_pose(job: Job, board: BoardSpec, base_from_board: pin.SE3, flange_from_camera: pin.SE3) -> pin.SE3:
+    """base_from_flange that puts the target camera square in front of the board."""
+    return facing(board, base_from_board, job.photo.stand_off) * flange_from_camera.inverse()
+
+
+def scan_plans(
+    config: CellConfig, job: Job, base_from_surface: pin.SE3, calibration: ScanCalibration
+) -> list[ScanPlan]:
+    """The job's sweeps, each along the surface's x axis over its own part of the surface.
+
+    The scan camera looks along the surface's −z from the stand-off, image x along the surface's x, then turned about
+    the middle of what it scans; the stripe crosses the optical axis's height where the calibrated light plane does, so
+    the camera runs behind by that much. The rail is in the middle of its travel at half-way, or all along when the arm
+    moves the head.
+    """
+    low, high = config.rail.travel
+    middle, half = 0.5 * (low + high), 0.5 * job.scan.length
+    by_arm = job.scan.mode == "arm"
+    if not by_arm and job.scan.length > high - low:
+        raise ValueError(
+            f"scan.length {job.scan.length * 1e3:g} mm exceeds the rail's travel {1e3 * (high - low):g} mm"
+        )
+    normal, distance = np.array(calibration.light_plane.normal), calibration.light_plane.distance
+    stripe_x = (distance - normal[2] * job.scan.stand_off) / normal[0]
+    looking_down = np.diag([1.0, -1.0, -1.0])
+    head = from_parts((-stripe_x, 0.0, job.scan.stand_off), looking_down)
+    plans = []
+    for swath in job.scan.swath:
+        turn = pin.rpy.rpyToMatrix(swath.roll, swath.pitch, 0.0)
+        centre = base_from_surface * from_parts((0.0, swath.across, 0.0), turn)
+        camera_from_flange = calibration.flange_from_camera_at(middle).inverse()
+        if by_arm:
+            ends = [centre * from_parts((x, 0.0, 0.0)) * head * camera_from_flange for x in (-half, half)]
+            plans.append(ScanPlan(ends[0], ends[1], middle, middle))
+        else:
+            stand = centre * head * camera_from_flange
+            plans.append(ScanPlan(stand, stand, middle - half, middle + half))
+    return plans
+
+
+def scan_calibration_views(config: CellConfig, board: BoardSpec) -> list[CalibrationView]:
+    """Views of the fine deck board for the scan camera: depths, tilts, turns, all of the field and of the rail."""
+    base_from_board = config.calibration.fine.base_from_board.se3()
+    views = []
+    for k in range(len(_SCAN_VIEWS)):
+        rail = _scan_rail(config, k)
+        flange_from_camera = config.scan_camera.flange_from_camera.se3() * from_parts((rail, 0.0, 0.0))
+        views.append(
+            CalibrationView(_looking(base_from_board, board, _SCAN_VIEWS[k]) * flange_from_camera.inverse(), rail)
+        )
+    return views
+
+
+def target_calibration_views(config: CellConfig, board: BoardSpec) -> list[CalibrationView]:
+    """Views of the large deck board for the target camera: several distances and tilts, and all of the field."""
+    base_from_board = config.calibration.large.base_from_board.se3()
+    camera_from_flange = config.target_camera.flange_from_camera.se3().inverse()
+    return [
+        CalibrationView(_looking(base_from_board, board, drawn) * camera_from_flange, 0.0) for drawn in _TARGET_VIEWS
+    ]
+
+
+def verification_views(
+    config: CellConfig, fine: BoardSpec, large: BoardSpec, scan: ScanCalibration, target: TargetCalibration
+) -> tuple[CalibrationView, CalibrationView]:
+    """One of the scan camera's calibration views and one of the target camera's, aimed with what the calibration found.
+
+    Mounts and boards stand some millimetres from where they are drawn. From the drawn poses a board may lie half out
+    of the picture, which leaves the rail no way to go; from the calibrated ones the pictures are as drawn. The rail
+    stands near its middle, so that it can move both ways, and the boards are tilted. Raises `CalibrationStale` for a
+    calibration that was stored without its reference.
+    """
+    if scan.reference is None or target.reference is None:
+        raise CalibrationStale(
+            "the stored calibration holds no reference to verify against, it was made by an older program; run "
+            "`cell calibrate` once"
+        )
+    rail = _scan_rail(config, SCAN_VERIFICATION)
+    base_from_scan = _looking(scan.reference.base_from_board, fine, _SCAN_VIEWS[SCAN_VERIFICATION])
+    base_from_target = _looking(target.reference.base_from_board, large, _TARGET_VIEWS[TARGET_VERIFICATION])
+    return (
+        CalibrationView(base_from_scan * scan.flange_from_camera_at(rail).inverse(), rail),
+        CalibrationView(base_from_target * target.flange_from_camera.inverse(), 0.0),
+    )
+
+
+def rail_ends(
+    scan: ScanCalibration,
+    base_from_board: pin.SE3,
+    view: CalibrationView,
+    board: BoardSpec,
+    travel: tuple[float, float],
+) -> tuple[float, float]:
+    """The rail positions farthest either way of a view at which the picture shows the rings and half of the dots.
+
+    Raises `RefusedError` when they are less than `LEAST_WAY` apart.
+    """
+    points, radius = board.points(), board.dot_radius
+    rings = [row * board.cols + column for column, row in board.rings]
+    size = np.array([scan.camera.width, scan.camera.height])
+
+    def shown(rail: float) -> bool:
+        if not travel[0] <= rail <= travel[1]:
+            return False
+        base_from_camera = view.base_from_flange * scan.flange_from_camera_at(rail)
+        seen = transform(base_from_camera.inverse() * base_from_board, points)
+        room = EDGE_PX + scan.camera.fx * radius / seen[:, 2:]
+        pixels = scan.camera.project(seen)
+        inside = np.logical_and(pixels > room, pixels < size - 1 - room).all(axis=1)
+        return bool(np.take(inside, rings).all() and np.mean(inside) >= LEAST_DOTS)
+
+    ends = []
+    for way in (-RAIL_STEP, RAIL_STEP):
+        rail = view.rail_position
+        while shown(rail + way):
+            rail += way
+        ends.append(rail)
+    if ends[1] - ends[0] < LEAST_WAY:
+        raise RefusedError(
+            f"the fine board stays in the scan camera's picture for {1e3 * (ends[1] - ends[0]):.0f} mm of the rail's "
+            f"way, a verification needs at least {1e3 * LEAST_WAY:.0f} mm: run `cell calibrate`, or see that "
+            "calibration.fine.base_from_board and scan_camera.flange_from_camera are as built"
+        )
+    return ends[0], ends[1]
+
+
+def _scan_rail(config: CellConfig, k: int) -> float:
+    """Where the rail stands in the scan camera's view `k`, m: each view elsewhere, all of the travel but its ends."""
+    low, high = config.rail.travel
+    return low + (high - low) * (0.1 + 0.8 * ((k * 5) % len(_SCAN_VIEWS)) / (len(_SCAN_VIEWS) - 1))
+
+
+def _looking(base_from_board: pin.SE3, board: BoardSpec, drawn: Sequence[float]) -> pin.SE3:
+    """base_from_camera for a line of the tables of views."""
+    along, across, depth, *turns = drawn
+    rotation = pin.rpy.rpyToMatrix(*np.deg2rad(turns))
+    centre = base_from_board * from_parts(centre_of(board))
+    return centre * from_parts(np.zeros(3), rotation) * from_parts(1e-3 * np.array([along, across, -depth]))
+
+
+SCAN_VERIFICATION, TARGET_VERIFICATION = 6, 5
+EDGE_PX, LEAST_DOTS, RAIL_STEP, LEAST_WAY = 12.0, 0.5, 1e-3, 0.02
+
+# Offset of the optical axis along and across the board in mm, depth in mm, tilts about x and y and turn about z in deg.
+_SCAN_VIEWS: tuple[tuple[float, float, float, float, float, float], ...] = (
+    (0, 0, 130, 0, 0, 0),
+    (4, 2, 124, 20, 0, 0),
+    (-4, -2, 142, -28, 0, 0),
+    (4, -2, 135, 0, 28, 10),
+    (-4, 2, 125, 0, -28, -10),
+    (0, 3, 120, 15, 20, 25),
+    (0, -3, 142, -20, 20, -25),
+    (5, 0, 138, 15, -20, 40),
+    (-5, 0, 124, -20, -20, -40),
+    (2, 2, 130, 20, 0, 90),
+    (-2, -2, 130, -28, 0, 90),
+    (2, -2, 128, 0, 28, 70),
+    (-2, 2, 138, 0, -28, 70),
+    (5, 3, 132, 12, 22, -20),
+    (-5, -3, 128, -12, -22, 20),
+    (5, -3, 140, 20, -10, 0),
+    (-5, 3, 124, -25, 10, 0),
+    (0, 0, 120, 0, 0, 45),
+    (3, 0, 142, 0, 25, -60),
+    (-3, 0, 136, -28, 0, 60),
+)
+_TARGET_VIEWS: tuple[tuple[float, float, float, float, float, float], ...] = (
+    (0, 0, 650, 0, 0, 0),
+    (90, 60, 620, 15, 0, 0),
+    (-90, -60, 600, -15, 0, 0),
+    (90, -60, 640, 0, 18, 0),
+    (-90, 60, 600, 0, -18, 0),
+    (0, 0, 560, 12, 12, 30),
+    (0, 0, 700, -12, 12, -30),
+    (60, 0, 680, 15, -12, 20),
+    (-60, 0, 580, -15, -12, -20),
+    (0, 50, 640, 20, 0, 45),
+    (0, -50, 640, -20, 0, -45),
+    (100, 0, 600, 0, 15, 15),
+)

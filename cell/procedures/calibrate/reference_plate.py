@@ -1,17 +1,23 @@
-"""A look at the witness of the laser's pointing: the rail to its end, the laser on, a few pictures of the plate."""
+"""A look at the witness of the laser's pointing: the rail to its end, the laser on, a few pictures of the plate.
+
+A look at the edge of the plate on the claw: the rail takes the laser's line over it, to and fro."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
+from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
-from cell.measure.calibration.drift.reference_plate import LEAST_ROWS, PlateLine
+from cell.measure.calibration.drift.reference_plate import LEAST_ROWS, Edge, PlateLine
+from cell.measure.geometry.camera import Array
 from cell.measure.vision import extract
-from drivers.errors import DeviceFault, LimitError, RefusedError
+from drivers.errors import DeviceFault, LimitError, Measured, RefusedError
 from drivers.interfaces import Frame
 
 PICTURES = 12
@@ -88,3 +94,191 @@ def _on_the_plate(seen: PlateLine) -> PlateLine | None:
     kept = longest[5:-5]
     columns[kept] = seen.columns[kept]
     return replace(seen, columns=columns)
+
+
+SPEED = 2e-3
+SEARCH_SPEED = 5e-3
+"""With the fastest camera; a slower one is taken over the edge as much slower, for the pictures to lie as close."""
+ROOM_M = 1e-3
+"""To an end of the rail's travel, beyond what it takes to gain speed."""
+REACH_M = 10e-3
+"""So far from the witness an edge is searched."""
+BESIDE_M = 0.6e-3
+"""To either side of where the edge is expected."""
+INNER_PX, OUTER_PX = 8, 14
+"""Half widths of the line as it shows on the plate, and of its surroundings."""
+LEAST_FRAMES = 8
+BRIGHTEST, LEAST_LIGHT_DN = 3, 2.0
+"""So many pictures say about how bright a row of the line is; with less than that over its surroundings it is none."""
+UNSEEN = (
+    "whether the scan head slips on its mount will not be seen: the plate on the claw has no edge that the laser's "
+    "line passes within 10 mm of laser.witness"
+)
+ALL, NONE = 0.85, 0.15
+"""Share of the line's light on the plate, and beside it."""
+GAP = 1.5
+"""Pictures so many times further apart than usual have lost one between them."""
+OPEN_M = 4e-6
+"""What lost pictures may leave open of where the line leaves the plate: 2 ms."""
+BRIGHTENS = 1.25
+"""Surroundings that become so many times as bright as the line leaves the plate follow it: gain is not fixed."""
+PASSES = 3
+"""So often the rail takes the line over the edge when pictures are lost there."""
+
+
+def with_edge(
+    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], calibration: CellCalibration
+) -> CellCalibration:
+    """A new `calibration` whose witness has the plate's edge, where there is one to find."""
+    scan = calibration.scan
+    if scan.witness is None:
+        return calibration
+    devices.interlocks.work_with(calibration.configuration)
+    edge = look_at_edge(config, devices, keep, scan.witness, None)
+    notes = scan.notes if edge is not None else (*scan.notes, UNSEEN)
+    return replace(calibration, scan=replace(scan, witness=replace(scan.witness, edge=edge), notes=notes))
+
+
+def require_edge(
+    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], before: PlateLine, now: PlateLine
+) -> PlateLine:
+    """`now` with the edge that the calibration saw `before`; `RefusedError` where it is not about there."""
+    assert before.edge is not None
+    edge = look_at_edge(config, devices, keep, now, before.edge.place)
+    if edge is None:
+        raise RefusedError(
+            f"the edge of the plate on the claw is not within {1e3 * BESIDE_M:g} mm of where the calibration saw it, "
+            f"with the rail at {1e3 * before.edge.place:.2f} mm: the scan head or the plate has slipped, the rail "
+            "loses steps, or the plate is covered. Look at the screws of both, at the rail's motor, clean the plate, "
+            "then run `cell calibrate`"
+        )
+    return replace(now, edge=edge)
+
+
+def look_at_edge(
+    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], witness: PlateLine, near: float | None
+) -> Edge | None:
+    """The plate's edge by the rail, m, as both ways over it show it; it is searched where no place `near` is given.
+
+    None where the plate shows no edge there: it may be larger than the camera sees, or covered.
+    """
+    low, high = config.rail.travel
+    room = SEARCH_SPEED**2 / (2 * config.rail.acceleration) + ROOM_M
+    low, high = low + room, high - room
+    rate = configure_fast(devices, config.calibration.stripe_exposure)
+    speed, search = (share * rate / RATES_HZ[0] for share in (SPEED, SEARCH_SPEED))
+    passed = partial(_passed, devices, keep, witness)
+    # Away from the nearer end of the travel.
+    way = 1.0 if high - witness.rail > witness.rail - low else -1.0
+    if near is None:
+        begin, end = (float(np.clip(witness.rail + way * far, low, high)) for far in (0.0, REACH_M))
+        near = _crossing(*passed((begin, end), search), way)
+        if near is None:
+            return None
+    begin, end = (float(np.clip(near + way * beside, low, high)) for beside in (-BESIDE_M, BESIDE_M))
+    fro = _crossing(*_whole(lambda: passed((begin, end), speed)), way)
+    to = _crossing(*_whole(lambda: passed((end, begin), speed)), way)
+    if fro is None or to is None:
+        return None
+    return Edge(0.5 * (fro + to), way * (fro - to) / (2.0 * speed))
+
+
+def _whole(passed: Callable[[], tuple[Array, Array]]) -> tuple[Array, Array]:
+    """What `passed` gives, again where pictures were lost at the edge; `RefusedError` when they always are."""
+    left_open = 0.0
+    for _ in range(PASSES):
+        places, shares = passed()
+        left_open = _left_open(places, shares)
+        if left_open <= OPEN_M:
+            return places, shares
+    raise RefusedError(
+        f"pictures were lost each of the {PASSES} times that the rail took the laser's line over the edge of the plate "
+        f"on the claw: where the edge is stays open by {1e3 * left_open:.3f} mm, allowed are {1e3 * OPEN_M:g} mm. See "
+        "why pictures of the scan camera or readings of the rail are lost (cable, packets, a busy computer), then try "
+        "again",
+        Measured("edge of the plate open by", 1e3 * left_open, "mm", most=1e3 * OPEN_M),
+    )
+
+
+def _passed(
+    devices: Devices, keep: Callable[[str, Frame], None], witness: PlateLine, ends: tuple[float, float], speed: float
+) -> tuple[Array, Array]:
+    """Places (n,) of the rail, m, rising, and the share (n,) of the line's light on the plate."""
+    rail, camera, laser = devices.rail, devices.scan_camera, devices.laser
+    rail.move_to(rail.sweep_start(*ends, speed)).wait(30.0)
+    times, light, dark = [], [], []
+    with devices.interlocks.purpose("calibration"), camera.stream() as frames, laser.lit():
+        sweep, over = rail.sweep(*ends, speed), np.inf
+        for frame in frames:
+            laser.renew()
+            if sweep.done and over == np.inf:
+                sweep.wait(1.0)
+                over = sweep.window[1]
+            if frame.mid_exposure > over:
+                break
+            keep("witness-edge", frame)
+            times.append(frame.mid_exposure)
+            light.append(_light(frame.image, witness))
+            dark.append(_surroundings(frame.image))
+    begin, end = sweep.window
+    inside = np.flatnonzero((np.array(times) >= begin) & (np.array(times) <= end))
+    if len(inside) < LEAST_FRAMES:
+        return np.zeros(0), np.zeros(0)
+    _require_fixed_gain(np.array(dark)[inside])
+    places = np.array([sweep.position_at(times[k]) for k in inside])
+    lit = np.array(light)[inside]
+    # Each row against its own light on the plate: the plate's colour and the laser's profile fall out.
+    bright = np.sort(lit, axis=0)[-BRIGHTEST:].mean(axis=0)
+    whole = np.ma.masked_less(lit, 0.75 * bright).mean(axis=0).filled(0.0)
+    lit = lit / np.maximum(whole, LEAST_LIGHT_DN)
+    order = np.argsort(places)
+    return places[order], np.asarray(lit.mean(axis=1))[order]
+
+
+def _surroundings(image: NDArray[np.generic]) -> float:
+    """How bright a picture is beside the line and what it lights, DN."""
+    some = np.sort(image[::8, ::8].astype(np.float64), axis=None)
+    return float(some[: len(some) * 3 // 4].mean())
+
+
+def _require_fixed_gain(dark: Array) -> None:
+    """Raise `RefusedError` where the surroundings (n,), DN, of a rail's passage follow the line's light."""
+    low, high = max(1.0, float(dark.min())), float(dark.max())
+    if high > BRIGHTENS * low:
+        raise RefusedError(
+            f"the scan camera's pictures become {high / low:.1f} times as bright beside the laser's line as that "
+            f"leaves the plate on the claw, allowed are {BRIGHTENS:g} times: gain or exposure follow the picture, or "
+            "the room's light changes. Switch the camera's auto gain and auto exposure off; only then look whether the "
+            "scan head has slipped",
+            Measured("pictures brighter beside the line", high / low, "times", most=BRIGHTENS),
+        )
+
+
+def _light(image: NDArray[np.generic], witness: PlateLine) -> Array:
+    """The line's light (rows,) where the witness has it, over what is beside it."""
+    rows = witness.rows
+    offsets = np.arange(-OUTER_PX, OUTER_PX + 1)
+    columns = np.round(witness.columns[rows]).astype(np.intp)[:, None] + offsets
+    window = image[rows[:, None], np.clip(columns, 0, image.shape[1] - 1)].astype(np.float64)
+    inner = np.abs(offsets) <= INNER_PX
+    return np.asarray(window[:, inner].mean(axis=1) - window[:, ~inner].mean(axis=1))
+
+
+def _left_open(places: Array, shares: Array) -> float:
+    """How far, m, the area under `shares` at `places` may be off by what was lost in between; too few tell nothing."""
+    if len(places) < LEAST_FRAMES:
+        return 2.0 * BESIDE_M
+    apart = np.diff(places)
+    lost = apart > GAP * np.median(apart)
+    return float(np.sum((0.5 * apart * np.abs(np.diff(shares)))[lost]))
+
+
+def _crossing(places: Array, shares: Array, way: float) -> float | None:
+    """Where by `places` the line leaves the plate, in direction `way`, by the area under its `shares`."""
+    if len(places) < LEAST_FRAMES:
+        return None
+    on, off = (shares[:2], shares[-2:]) if way > 0 else (shares[-2:], shares[:2])
+    if on.min() < ALL or off.max() > NONE:
+        return None
+    shown = float(np.sum(0.5 * (shares[1:] + shares[:-1]) * np.diff(places)))
+    return float(places[0] + shown) if way > 0 else float(places[-1] - shown)

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 
-from cell.config.calibrations.store import CellCalibration
-from cell.config.calibrations.timing_link import link_of, most_late
+from cell.config.calibrations.store import CellCalibration, link_of, most_late
 from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
 from cell.measure.calibration.drift.timing_fit import (
@@ -24,9 +23,9 @@ from cell.measure.calibration.drift.timing_fit import (
 from cell.measure.calibration.timing import StampTiming
 from cell.measure.geometry.poses import from_ur
 from cell.measure.vision import BoardSpec, find_board, parse_board
-from cell.motion.arm_models import HOME
-from cell.procedures.arm.camera_poses import rail_ends, verification_views
+from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.photograph import rail_ends, verification_views
 from cell.procedures.calibrate.boards import Check, Keep, Progress, move_to_view
 from drivers.errors import DeviceFault, LimitError, RefusedError
 

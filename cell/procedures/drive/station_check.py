@@ -11,8 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from cell.measure.geometry.poses import difference
-from cell.procedures.arm.camera_poses import photo_pose
-from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.arm.photograph import BoardFix, photo_pose
 from cell.procedures.drive.settled import swing_covariance
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, Workplace
 from drivers.errors import Measured, RefusedError

@@ -2,28 +2,324 @@
 
 Everything is seen from above, in the place frame. The way is the one that the line law would drive without errors; the
 room that it needs grows with how far the vehicle has gone, and turned on the spot, since it was last seen.
-"""
+
+The vehicle's way over the floor: planar poses, the law that keeps it on a line, and driving on odometry.
+
+Frame: the place frame seen from above, with the line of approach along its x axis. Angles are about z.
+
+What is known about where the vehicle stands: nothing, or its pose by odometry since it was seen or said.
+
+Odometry counts from wherever the driver was opened. It tells a place only from an anchor on: a sighting of the board,
+or a person's word that the vehicle stands at its start. The anchor is lost with the driver, with its link, and when
+somebody else moved or commanded the vehicle meanwhile."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import pinocchio as pin
 
-from cell.config.job import Job
-from cell.config.obstacles import station_obstacles
+from cell.config.cell_config import station_obstacles
+from cell.config.job import BoardSection, Job
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision import parse_board
-from cell.measure.vision.board.spec import centre_of
-from cell.motion.bodies import Body, station_bodies, vehicle_bodies
-from cell.procedures.drive.approach import Planar, line_command, wrap
-from cell.procedures.drive.whereabouts import Whereabouts
-from drivers.errors import RefusedError
-from drivers.interfaces import Vector
+from cell.measure.vision.board.view import centre_of
+from cell.motion.collision import Body, station_bodies, vehicle_bodies
+from drivers.clock import Clock
+from drivers.errors import DeviceFault, RefusedError
+from drivers.interfaces import Vector, Vehicle, VehicleState
+
+CONTROL_PERIOD_S = 0.04
+DECELERATION = 0.25  # m/s², below what the vehicle can do, so that it stops where it was told to
+CREEP = 0.015  # m/s, the slowest speed that is commanded while a distance remains
+LINE_GAIN = 2.2  # rad of heading per m beside the line
+HEADING_GAIN = 2.0  # 1/s
+TURN_GAIN = 1.5  # 1/s
+MAX_HEADING = math.radians(25)
+MAX_TURN_RATE = math.radians(25)
+ARRIVED = 0.0005  # m
+FRESH_S = 0.1  # s on the wall; feedback up to this old says whether the vehicle is there, it comes every 0.02 s
+
+
+@dataclass(frozen=True)
+class Planar:
+    """A pose in the plane: m, m, rad."""
+
+    x: float
+    y: float
+    yaw: float
+
+    @classmethod
+    def of(cls, pose: pin.SE3) -> Planar:
+        """The planar part of a spatial pose."""
+        return cls(pose.translation[0], pose.translation[1], math.atan2(pose.rotation[1, 0], pose.rotation[0, 0]))
+
+    def __mul__(self, other: Planar) -> Planar:
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return Planar(
+            self.x + c * other.x - s * other.y, self.y + s * other.x + c * other.y, wrap(self.yaw + other.yaw)
+        )
+
+    def inverse(self) -> Planar:
+        """The pose that undoes this one."""
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return Planar(-c * self.x - s * self.y, s * self.x - c * self.y, wrap(-self.yaw))
+
+
+def wrap(angle: float) -> float:
+    """The angle in (−π, π]."""
+    return math.remainder(angle, 2 * math.pi)
+
+
+def line_command(pose: Planar, goal: Planar, speed: float) -> tuple[float, float]:
+    """Speed in m/s and yaw rate in rad/s that bring a vehicle at `pose` along the goal's line to the goal.
+
+    The line runs through `goal` along its heading. Forwards or backwards, whichever leads there; the speed falls so
+    that the vehicle can stop at the goal. (0, 0) once it is there or past it within 0.5 mm.
+    """
+    error = goal.inverse() * pose
+    remaining = -error.x
+    if abs(remaining) < ARRIVED:
+        return 0.0, 0.0
+    magnitude = max(CREEP, min(speed, math.sqrt(2 * DECELERATION * abs(remaining))))
+    v = math.copysign(magnitude, remaining)
+    wanted = np.clip(-LINE_GAIN * error.y, -MAX_HEADING, MAX_HEADING) * math.copysign(1.0, v)
+    # The correction fades at low speed: a vehicle that creeps cannot move sideways, it can only spoil its heading.
+    fade = min(1.0, magnitude / 0.1)
+    turn = np.clip(HEADING_GAIN * wrap(fade * wanted - error.yaw), -MAX_TURN_RATE, MAX_TURN_RATE)
+    return v, float(turn)
+
+
+class Located(Protocol):
+    """Knows where the vehicle is, by odometry."""
+
+    def pose(self) -> Planar:
+        """The pose now."""
+
+
+class RelativeOdometry:
+    """The vehicle's pose relative to where it stood when this was made."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+        self._start_from_odometry = _reading(vehicle.state()).inverse()
+
+    def pose(self) -> Planar:
+        """The pose now."""
+        return self._start_from_odometry * _reading(self._vehicle.state())
+
+
+class _SinceNews:
+    """How far a vehicle has gone, by its commands, since the feedback that odometry tells of."""
+
+    def __init__(self, vehicle: Vehicle, clock: Clock) -> None:
+        self._vehicle, self._clock = vehicle, clock
+        self._stamp, self._looked, self._gone = -math.inf, 0.0, Planar(0.0, 0.0, 0.0)
+
+    def look(self, speed: float, yaw_rate: float) -> tuple[Planar, bool]:
+        """The way gone since then, of it at `speed` and `yaw_rate` since the last look, and whether the news are so
+        fresh that they say whether it is there."""
+        now, stamp = self._clock.now(), self._vehicle.state().stamp
+        if stamp != self._stamp:
+            self._stamp, self._gone = stamp, Planar(0.0, 0.0, 0.0)
+        else:
+            self._gone *= Planar(speed * (now - self._looked), 0.0, yaw_rate * (now - self._looked))
+        self._looked = now
+        return self._gone, now - stamp <= FRESH_S * max(1.0, self._clock.rate)
+
+
+def _reading(state: VehicleState) -> Planar:
+    return Planar(state.x, state.y, state.yaw)
+
+
+def drive_line(
+    vehicle: Vehicle, odometry: Located, goal: Planar, speed: float, clock: Clock, check: Callable[[], None]
+) -> None:
+    """Drive along the goal's line and stop at the goal, on odometry. `check` raises when the run is to end.
+
+    Feedback that comes late finds the vehicle further on: it slows down for that, and stands where it may have arrived
+    until newer feedback tells.
+    """
+    distance = abs((goal.inverse() * odometry.pose()).x)
+    deadline = clock.now() + 10.0 + 3.0 * (distance / speed + speed / DECELERATION + 0.1 / CREEP)
+    since_news = _SinceNews(vehicle, clock)
+    direction = v = w = 0.0
+    while True:
+        check()
+        gone, fresh = since_news.look(v, w)
+        v, w = line_command(odometry.pose() * gone, goal, speed)
+        if v == 0.0 or direction * v < 0:  # there, or just past it
+            if fresh:
+                break
+            v = w = 0.0
+        direction = v or direction
+        if clock.now() > deadline:
+            vehicle.stop()
+            raise _blocked(f"did not arrive at x = {goal.x:.3f} m in time")
+        vehicle.drive(v, w)
+        clock.sleep(CONTROL_PERIOD_S)
+    vehicle.stop()
+
+
+def _blocked(what: str) -> DeviceFault:
+    """A vehicle that does not come along: driving against what blocks it once more is not for a program to decide."""
+    return DeviceFault(
+        "vehicle",
+        "vehicle.blocked",
+        f"it {what}",
+        recoverable=False,
+        hint="Look what blocks it or where its wheels slip, and jog it away from there. Then run the job again.",
+    )
+
+
+def turn_to(vehicle: Vehicle, odometry: Located, yaw: float, clock: Clock, check: Callable[[], None]) -> None:
+    """Turn on the spot to `yaw` in the place frame, on odometry, to 0.1°."""
+    deadline = clock.now() + 20.0
+    since_news, rate = _SinceNews(vehicle, clock), 0.0
+    while True:
+        check()
+        gone, fresh = since_news.look(0.0, rate)
+        error = wrap(yaw - odometry.pose().yaw - gone.yaw)
+        there = abs(error) <= math.radians(0.1)
+        if there and fresh:
+            break
+        if clock.now() > deadline:
+            vehicle.stop()
+            raise _blocked(f"did not turn by {math.degrees(error):.2f} deg in time")
+        rate = (
+            0.0 if there else math.copysign(max(math.radians(0.6), min(MAX_TURN_RATE, TURN_GAIN * abs(error))), error)
+        )
+        vehicle.drive(0.0, rate)
+        clock.sleep(CONTROL_PERIOD_S)
+    vehicle.stop()
+
+
+PLAUSIBLE = 0.10
+"""A sighting this far, m, from what odometry says is worth a note."""
+PLAUSIBLE_ANGLE = math.radians(5)
+TIGHT = 0.3
+"""Turns about a point nearer than this, m, count as on the spot: about half the track, the wheels go against each
+other and scrub. Wider ones are part of the way."""
+
+
+@dataclass(frozen=True)
+class _Anchor:
+    """`pose` in the place frame, or None for the start pose of the job to come, at the odometry's `reading`."""
+
+    pose: Planar | None
+    reading: Planar
+    interruptions: int
+
+
+class Whereabouts:
+    """The vehicle's pose in the place frame as far as it is known. One for each connected vehicle, used by one thread.
+
+    `way` is how far it has gone, m, and `turned` how far it has turned on the spot, rad, either way, since it was seen
+    or said: what odometry may be off by grows with both.
+    """
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+        self._anchor: _Anchor | None = None
+        self._board: BoardSection | None = None
+        self._unknown = "this program has just connected to it"
+        self._last = Planar(0.0, 0.0, 0.0)
+        self.way = self.turned = 0.0
+
+    @property
+    def anchored(self) -> bool:
+        """Whether a run of this program has worked from a known place already."""
+        return self._anchor is not None and self._anchor.pose is not None
+
+    def say_at_start(self) -> None:
+        """Take somebody's word that the vehicle stands at the start pose of the job that is run next."""
+        self._hold(None)
+
+    def forget_word(self) -> None:
+        """The word that was given for one job does not hold for the next, if that job never came to use it."""
+        if self._anchor is not None and self._anchor.pose is None:
+            self._lose("it was said to stand at the start of another job, which did not begin to drive")
+
+    def enter(self, job: Job) -> None:
+        """From now on poses are in the place frame of `job`."""
+        if self._anchor is not None and self._anchor.pose is None:
+            self._anchor = _Anchor(
+                Planar.of(job.approach.start.se3()), self._anchor.reading, self._anchor.interruptions
+            )
+        elif self._anchor is not None and self._board != job.board:
+            self._lose("it was last seen by the board of another job")
+        self._board = job.board
+
+    def see(self, seen: Planar) -> str | None:
+        """The board shows the vehicle at `seen`, standing: odometry counts from there.
+
+        The sighting wins: the job is done by the board, odometry only bridges the way to it, and slips. What
+        contradicts odometry by more than `PLAUSIBLE` is returned as a note.
+        """
+        try:
+            before = self.pose()
+        except RefusedError:
+            before = None
+        self._hold(seen)
+        if before is None:
+            return None
+        apart, turned = math.hypot(seen.x - before.x, seen.y - before.y), abs(wrap(seen.yaw - before.yaw))
+        if apart <= PLAUSIBLE and turned <= PLAUSIBLE_ANGLE:
+            return None
+        return (
+            f"the board shows the vehicle {1e3 * apart:.0f} mm and {math.degrees(turned):.1f} deg from where odometry "
+            f"had it (expected within {1e3 * PLAUSIBLE:.0f} mm and {math.degrees(PLAUSIBLE_ANGLE):.0f} deg); "
+            "the board is believed. Look whether its wheels slip, it was pushed, or it did not stand at its start"
+        )
+
+    def pose(self) -> Planar:
+        """The pose now, by odometry; `RefusedError` that says why when it is not known."""
+        state = self._vehicle.state()
+        if self._anchor is not None and state.interruptions != self._anchor.interruptions:
+            self._lose(state.interruption)
+        if self._anchor is None or self._anchor.pose is None:
+            raise RefusedError(f"where the vehicle stands is not known: {self._unknown}")
+        return self._anchor.pose * self._anchor.reading.inverse() * self._count(state)
+
+    def count(self) -> None:
+        """Count what it has gone since the last look; for those who drive it by other means than `pose`, all the time.
+
+        A way there and back is none between two looks.
+        """
+        self._count(self._vehicle.state())
+
+    def _count(self, state: VehicleState) -> Planar:
+        now = _reading(state)
+        way, turn = math.hypot(now.x - self._last.x, now.y - self._last.y), abs(wrap(now.yaw - self._last.yaw))
+        self.way += way
+        if way < TIGHT * turn:
+            self.turned += turn
+        self._last = now
+        return now
+
+    def _hold(self, pose: Planar | None) -> None:
+        state = self._vehicle.state()
+        self._anchor = _Anchor(pose, _reading(state), state.interruptions)
+        self._last, self.way, self.turned = self._anchor.reading, 0.0, 0.0
+
+    def _lose(self, why: str) -> None:
+        self._anchor, self._unknown = None, why
+
+
+def next_step(job: Job) -> str:
+    """What a person can do about a vehicle that does not know where it stands."""
+    start = Planar.of(job.approach.start.se3())
+    return (
+        "Nothing was driven. Bring the vehicle where it sees the board, with `cell jog vehicle`; or put it at the "
+        f"job's start (x {start.x:.2f} m, y {start.y:.2f} m, {math.degrees(start.yaw):.0f} deg in the place frame) and "
+        "say so with --at-start"
+    )
+
 
 MARGIN = 0.05
 """What stays between vehicle and station, m, when the vehicle has just been seen."""

@@ -10,15 +10,13 @@ from dataclasses import replace
 
 import pinocchio as pin
 
-from cell.procedures.arm.camera_poses import photo_pose
 from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.arm.photograph import BoardFix, photo_pose
 from cell.procedures.drive.settled import swing_covariance, words
 from cell.procedures.steps.drive_to_target import VehicleArrival
-from cell.procedures.steps.step import JobStep
-from cell.procedures.steps.workplace import PHOTO_RATE_HZ, Workplace
-from statemachine.policy import Step
+from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
 from statemachine.runner import StepContext
+from statemachine.step import Step
 
 WAIT_S, WAITS = 1.0, 4
 """How long a vehicle that rocks is waited for, and how often. One that has stopped is quiet by then."""

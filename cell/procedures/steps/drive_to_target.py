@@ -9,21 +9,17 @@ from dataclasses import dataclass
 import pinocchio as pin
 
 from cell.config.job import Job
-from cell.motion.arm_models import HOME
-from cell.motion.bodies import Body
-from cell.procedures.arm.camera_poses import look_pose
-from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.drive.approach import Planar, drive_line, turn_to, wrap
-from cell.procedures.drive.way import BACK_UP, Way
-from cell.procedures.drive.whereabouts import Whereabouts, next_step
-from cell.procedures.pace import Pace
-from cell.procedures.steps.step import JobStep
-from cell.procedures.steps.workplace import PHOTO_RATE_HZ, Workplace
+from cell.motion.collision import Body
+from cell.motion.kinematics import HOME
+from cell.procedures.arm.moves import Pace
+from cell.procedures.arm.photograph import BoardFix, look_pose
+from cell.procedures.drive.way import BACK_UP, Planar, Way, Whereabouts, drive_line, next_step, turn_to, wrap
+from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
 from drivers.clock import Clock
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vehicle
-from statemachine.policy import Step
 from statemachine.runner import StepContext
+from statemachine.step import Step
 
 MAX_TRIES = 5
 SETTLE_S = 0.3

@@ -12,19 +12,24 @@ from cell.measure.geometry.poses import compose_covariance
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion import invert_pose as register
 from cell.measure.inversion.effects.causes import find_causes, likeliest
-from cell.measure.inversion.effects.droop import Head, find_droop
-from cell.measure.inversion.effects.rocking import find_rocking, rocking_covariance, rocking_motions, words
+from cell.measure.inversion.effects.rocking import (
+    Head,
+    find_droop,
+    find_rocking,
+    rocking_covariance,
+    rocking_motions,
+    words,
+)
 from cell.measure.reconstruction.cloud import Indices
 from cell.measure.reconstruction.seams import Motions
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.steps.reconstruct import Reconstruction
-from cell.procedures.steps.step import JobStep
-from cell.procedures.steps.workplace import Workplace
-from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.procedures.steps.workplace import JobStep, Workplace
+from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import NotObservable, RefusedError
 from drivers.interfaces import Vector
-from statemachine.policy import Step
 from statemachine.runner import StepContext
+from statemachine.step import Step
 
 
 @dataclass(frozen=True, eq=False)

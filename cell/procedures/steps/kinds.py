@@ -12,12 +12,11 @@ from functools import partial
 from importlib.metadata import entry_points
 
 from cell.procedures.steps import board_photo, drive_to_target, invert_pose, laser_sweep, place, reconstruct
-from cell.procedures.steps.step import JobStep
-from cell.procedures.steps.workplace import Workplace
+from cell.procedures.steps.workplace import JobStep, Workplace
 from drivers.errors import ConfigError
-from statemachine.policy import Policy
 from statemachine.runner import StepContext
 from statemachine.sequence import JobState, Sequence
+from statemachine.step import Policy
 
 GROUP = "assembly_cell.kinds"
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pinocchio as pin
 
-from cell.config.calibrations.timing_link import changed, doubt_of, link_of
+from cell.config.calibrations.store import changed, doubt_of, link_of
 from cell.config.cell_config import CellConfig
 from cell.config.job import ScanSection
 from cell.devices.devices import Devices
@@ -18,23 +18,18 @@ from cell.measure.calibration.drift.reference_plate import pointing as pointing_
 from cell.measure.calibration.drift.slip import Slip, slip_since
 from cell.measure.calibration.timing import StampTiming
 from cell.measure.reconstruction import ScanGeometry
-from cell.procedures.arm.camera_poses import ScanPlan, scan_plans
 from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.calibrate.edge import require_edge
-from cell.procedures.calibrate.reference_plate import require_witness
+from cell.procedures.arm.photograph import BoardFix, ScanPlan, scan_plans
+from cell.procedures.calibrate.reference_plate import require_edge, require_witness
 from cell.procedures.drive.station_check import require_unmoved
-from cell.procedures.steps.step import JobStep
-from cell.procedures.steps.workplace import Workplace
-from cell.procedures.sweep.arm_sweep import arm_sweep
-from cell.procedures.sweep.rail_sweep import rail_sweep
-from cell.procedures.sweep.stored_sweep import FILE, save_sweep
+from cell.procedures.steps.workplace import JobStep, Workplace
+from cell.procedures.sweep.stored_sweep import FILE, SweepRecord, save_sweep
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION, SweepCollector, SweepErrors, rehearse
-from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.procedures.sweep.sweeping import arm_sweep, rail_sweep
 from drivers.errors import CalibrationStale
 from drivers.interfaces import Frame
-from statemachine.policy import Step
 from statemachine.runner import StepContext
+from statemachine.step import Step
 
 SHIFT_SHARE = 0.25
 """Share of the place's tolerance by which the unknown of its times may shift a sweep. Replies that are all late shift

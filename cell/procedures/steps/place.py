@@ -11,26 +11,24 @@ import pinocchio as pin
 from cell.config.job import Job
 from cell.measure.geometry.poses import from_parts, from_ur, to_ur
 from cell.measure.inversion import PlacePose
-from cell.measure.inversion.effects.creep import Creep
-from cell.measure.inversion.obstruction import highest_standing, require_bare
+from cell.measure.inversion.disagreement import highest_standing, require_bare
+from cell.measure.inversion.effects.moved import Creep
 from cell.measure.reconstruction.cloud import Indices
-from cell.motion.arm_models import HOME
-from cell.motion.bodies import TOUCHES
-from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.part import PartProgress, PartState
+from cell.motion.collision import TOUCHES
+from cell.motion.kinematics import HOME
+from cell.procedures.arm.moves import Mover, PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.arm.touch import TouchCheck, TouchHeight, expected_touch, felt_touch
 from cell.procedures.drive.station_check import require_unmoved
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction
-from cell.procedures.steps.step import JobStep
-from cell.procedures.steps.workplace import Workplace
+from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.second_look import SecondLook, require_in_place
-from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Arm, Claw, Vector
-from statemachine.policy import OnFailure, Step
 from statemachine.runner import StepContext
+from statemachine.step import OnFailure, Step
 
 APPROACH_S = 3.0
 """About what the arm takes from the scan pose to the approach pose."""

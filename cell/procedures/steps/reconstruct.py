@@ -24,12 +24,11 @@ from cell.measure.reconstruction import (
 from cell.measure.reconstruction.cloud import Array, Indices
 from cell.measure.reconstruction.seams import Motions
 from cell.procedures.observed import TimedCloud
-from cell.procedures.steps.step import JobStep
-from cell.procedures.steps.workplace import Workplace
-from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.procedures.steps.workplace import JobStep, Workplace
+from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import RefusedError
-from statemachine.policy import Step
 from statemachine.runner import StepContext
+from statemachine.step import Step
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,6 @@
-"""Where a job is done: one cell's configuration, calibration and devices, the job's surface, and the run's folder."""
+"""Where a job is done: one cell's configuration, calibration and devices, the job's surface, and the run's folder.
+
+What one step of a job is: how it is watched, what it needs of earlier steps, what it makes, and what it does."""
 
 from __future__ import annotations
 
@@ -17,18 +19,19 @@ from cell.config.job import Job
 from cell.devices.devices import Devices
 from cell.measure.inversion import NominalSurface
 from cell.measure.vision import BoardSpec, parse_board
-from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.part import PartProgress
+from cell.procedures.arm.moves import Mover, Pace, PartProgress
 from cell.procedures.arm.photograph import BoardFix, photograph
 from cell.procedures.drive.settled import APART_S
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
-from cell.procedures.pace import Pace
 from cell.procedures.sweep.swath import SweepCollector
 from drivers.interfaces import Vector
+from statemachine.runner import StepContext
+from statemachine.step import Step
 
 if TYPE_CHECKING:
     from cell.procedures.sweep.stored_sweep import StoredSweep
+
 
 CHANCE_SCATTER = 1.3
 """Found over configured scatter of the arm that the few views of a calibration show by chance."""
@@ -148,3 +151,18 @@ class Workplace:
         if self.devices.following is not None:
             self.devices.following.board_seen(fix.base_from_board)
         return replace(fix, number=self._photographs)
+
+
+@dataclass(frozen=True)
+class JobStep:
+    """`work(workplace, context)` returns a `makes`; it takes what it `needs`, by type, with `context.made(type)`."""
+
+    policy: Step
+    work: Callable[[Workplace, StepContext], object]
+    makes: type
+    needs: tuple[type, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The step's name, in reports and on the command line."""
+        return self.policy.name

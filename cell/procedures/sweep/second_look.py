@@ -13,8 +13,7 @@ import numpy as np
 
 from cell.config.job import ScanSection
 from cell.measure.inversion import PlacePose
-from cell.measure.inversion.effects.creep import Creep
-from cell.measure.inversion.effects.moved import LEAST_MATCHED, SurfaceMotion, surface_motion
+from cell.measure.inversion.effects.moved import LEAST_MATCHED, Creep, SurfaceMotion, surface_motion
 from cell.measure.inversion.observability import Tolerance
 from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix
@@ -23,8 +22,8 @@ from cell.procedures.drive.station_check import require_unmoved as require_board
 from cell.procedures.steps.laser_sweep import swept
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
 from cell.procedures.steps.workplace import Workplace
+from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.procedures.sweep.swath import Swath
-from cell.procedures.sweep.sweep_record import SweepRecord
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext

@@ -2,28 +2,35 @@
 
 The decision itself is `cell.measure.calibration.drift.decision`'s, the pictures are taken by
 `cell.procedures.verify.views`.
-"""
+
+What a verification found out about the laser, kept with the calibration for the jobs that come after it.
+
+A job has only the plate on the claw, which may have been knocked, and so has to state a turn of the laser as an
+uncertainty. A verification has seen the stripe on a board. What it confirms is written into the stored calibration with
+its date, what it contradicts is taken out of it. The calibration itself is not changed."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from cell.base.notebook import table
-from cell.config.calibrations.store import CellCalibration
+from cell.base.storage import table
+from cell.config.calibrations.store import CellCalibration, save_calibration
 from cell.config.job import Job
 from cell.measure.calibration.drift.decision import WORST_FIT, DriftVerdict, Suspect
-from cell.measure.calibration.drift.detectability import DETECTED
-from cell.measure.calibration.drift.place_effect import scan_effect, target_effect
-from cell.measure.calibration.drift.pointing import WitnessCheck
+from cell.measure.calibration.drift.detectability import DETECTED, scan_effect, target_effect
+from cell.measure.calibration.drift.reference_plate import ConfirmedTurn
+from cell.measure.calibration.drift.slip import WitnessCheck
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision import parse_board
-from cell.measure.vision.board.spec import centre_of
-from cell.procedures.verify.looks import CheckObservations, check_witness, verify
+from cell.measure.vision.board.view import centre_of
+from cell.procedures.verify.views import CheckObservations, check_witness, verify
 
 SHARE = 0.3
 """Of the place's tolerance: what moves the place by less is told and not called bad. A third, with room for an estimate
@@ -232,3 +239,21 @@ _DECK = {
 
 def _way(effect: float) -> str:
     return f"{1e3 * effect:.2f} mm" if np.isfinite(effect) else "any amount"
+
+
+def keep_confirmed(folder: Path, calibration: CellCalibration, verification: Verification) -> ConfirmedTurn | None:
+    """Keep what `verification` says of the laser with the `calibration` stored in `folder`; what is newly kept.
+
+    A verification that finds anything wrong confirms nothing, and what an earlier one had confirmed goes: the plate by
+    which jobs would carry it on may have been knocked since, and so may the laser.
+    """
+    witness, known = verification.witness, calibration.scan.confirmed
+    if witness is None:
+        return None
+    found = witness.confirmation(time.time()) if verification.good else None
+    # Good, and the laser as at the calibration: an earlier turn is as true as it was.
+    kept = found if found is not None or not verification.good else known
+    if kept is not known:
+        changed = replace(calibration, scan=replace(calibration.scan, confirmed=kept))
+        save_calibration(changed, folder / f"{calibration.name}.json")
+    return found

@@ -21,7 +21,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import CameraModel
-from cell.motion.bodies import Body
+from cell.motion.collision import Body
 from cell.motion.kinematics import ArmKinematics
 from cell.run.record.small import stamp
 from drivers.interfaces import Vector

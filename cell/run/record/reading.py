@@ -1,11 +1,16 @@
-"""Reading a record: whole ones by the library's reader, one that was cut off as far as it goes."""
+"""Reading a record: whole ones by the library's reader, one that was cut off as far as it goes.
+
+What a record holds, in figures.
+
+The raw traffic of a record for other programs: CAN as candump writes it, all wires as text."""
 
 from __future__ import annotations
 
 import json
 import struct
 import zlib
-from collections.abc import Generator, Iterator
+from collections import Counter
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -209,3 +214,119 @@ def messages(path: Path, topics: tuple[str, ...]) -> Iterator[tuple[str, int, An
     """As `said`, decoded: topic, time in ns, the message."""
     for message in said(path, Parts(), topics):
         yield message.topic, message.at, message.decoded()
+
+
+def information(path: Path) -> dict[str, Any]:
+    """Its channels with their messages and bytes, its span in s, whether it is whole, what was let go, by topic.
+
+    It is `whole` when it was closed, its CRCs fit (`damaged` names what does not) and it holds a message.
+
+    `dropped` is None where the record was cut off before it could tell. `cpu_s` of a core were taken to write it: None
+    then, and on the virtual clock. Raises as `said` does.
+    """
+    counts: Counter[str] = Counter()
+    sizes: Counter[str] = Counter()
+    schemas: dict[str, str] = {}
+    times: list[int] = []
+    end: dict[str, Any] = {}
+    told = Parts()
+    try:
+        for message in said(path, told):
+            counts[message.topic] += 1
+            sizes[message.topic] += len(message.data)
+            schemas[message.topic] = message.schema
+            times = [min([message.at, *times]), max([message.at, *times])]
+            if message.topic == "/record/end":
+                with decoding(told):
+                    end = dict(json.loads(message.data))
+    except CellError as error:
+        raise CellError(f"{path}: {error}") from error
+    return {
+        "file": str(path),
+        "bytes": path.stat().st_size,
+        "whole": told.whole and counts.total() > 0,
+        "closed": told.closed,
+        "damaged": told.damaged,
+        "lost_bytes": told.lost,
+        "messages": counts.total(),
+        "begun_ns": times[0] if times else None,
+        "span_s": round(1e-9 * (times[1] - times[0]), 3) if times else None,
+        "dropped": end.get("dropped"),
+        "cpu_s": end.get("cpu_s"),
+        "channels": [
+            {"topic": topic, "schema": schemas[topic], "messages": counts[topic], "bytes": sizes[topic]}
+            for topic in sorted(counts)
+        ],
+    }
+
+
+ERROR_FLAG = 0x20000000
+CAN, WIRES = "/vehicle/can", ("/vehicle/can", "/arm/rtde", "/rail/serial", "/laser/serial", "/claw/serial")
+
+
+def as_candump(record: Path, out: Path, bus: str = "can0") -> int:
+    """Write the CAN frames in candump's log format, with R for those that came and T for those sent; their number."""
+    count = 0
+    with out.open("w", encoding="ascii") as file:
+        for _, at, told in messages(record, (CAN,)):
+            way = "T" if told["sent"] else "R"
+            file.write(f"({at // 10**9}.{at % 10**9 // 1000:06d}) {bus} {candump_frame(told)} {way}\n")
+            count += 1
+    return count
+
+
+def candump_frame(told: dict[str, Any]) -> str:
+    """A frame as candump's log has it. Source: `sprint_canframe` of can-utils and the headers of SocketCAN."""
+    if told["error"]:
+        return f"{ERROR_FLAG | told['id']:08X}#{told['data'].upper()}"
+    number = f"{told['id']:08X}" if told["extended"] else f"{told['id']:03X}"
+    if told["remote"]:
+        # The length that is asked for; none stands for 0.
+        return f"{number}#R{told['dlc'] or ''}"
+    return f"{number}#{'#0' if told['fd'] else ''}{told['data'].upper()}"
+
+
+def as_text(record: Path, out: Path) -> int:
+    """Write all raw traffic as lines: time in s, wire, > for what was sent and < for what came, data; their number."""
+    count = 0
+    with out.open("w", encoding="utf-8") as file:
+        for line in lines(record):
+            file.write(f"{line}\n")
+            count += 1
+    return count
+
+
+def lines(record: Path) -> Iterator[str]:
+    """The lines of `as_text`."""
+    for topic, at, told in messages(record, WIRES):
+        say = _can if topic == CAN else _other
+        yield f"{at // 10**9}.{at % 10**9:09d} {topic} {'>' if told['sent'] else '<'} {say(told)}"
+
+
+def _can(told: dict[str, Any]) -> str:
+    number = f"{told['id']:08X}" if told["extended"] else f"{told['id']:03X}"
+    kind = " error" if told["error"] else " remote" if told["remote"] else ""
+    return f"{number}{kind} [{told['dlc']}] {_spaced(told['data'])}".rstrip()
+
+
+def _other(told: dict[str, Any]) -> str:
+    if "data" in told:
+        data = bytes.fromhex(told["data"])
+        shown = "".join(chr(byte) if 32 <= byte < 127 else "." for byte in data)
+        return f"{_spaced(told['data'])}  |{shown}|"
+    if "text" in told:
+        return f"dashboard {told['text']!r}"
+    if "request" in told:
+        return f"{told['request']} {told['arguments']}"
+    return f"state {told['state']}"
+
+
+def _spaced(data: str) -> str:
+    return " ".join(data[k : k + 2] for k in range(0, len(data), 2))
+
+
+FORMATS: dict[str, tuple[str, Callable[[Path, Path], int]]] = {
+    "candump": (".candump.log", as_candump),
+    "text": (".wires.txt", as_text),
+}
+"""By name: how the file's name ends, and what writes it."""

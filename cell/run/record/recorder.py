@@ -2,36 +2,136 @@
 
 Whoever is listened to only puts what it has into a queue. On the wall's clock times are nanoseconds since the epoch; on
 the virtual clock they are the cell's own, so that the same seed gives the same record.
-"""
+
+Readings, commands and what passed on a wire as JSON: numbers keep every digit, what is no number becomes null.
+
+The times of a record: nanoseconds since the epoch on the wall's clock, the cell's own on the virtual one."""
 
 from __future__ import annotations
 
+import json
 import logging
+import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from enum import Enum
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import can
 import numpy as np
+import pinocchio as pin
 
 from cell.config.calibrations.store import CellCalibration
-from cell.config.cell_config import DEVICES, CellConfig
-from cell.config.mounting import deck_plates, mounted
+from cell.config.cell_config import DEVICES, CellConfig, deck_plates, mounted
 from cell.devices.devices import Devices
 from cell.devices.gate.interlocks import DeviceCommand
-from cell.motion.bodies import Body, arm_bodies, tool_bodies, vehicle_bodies
+from cell.motion.collision import Body, arm_bodies, tool_bodies, vehicle_bodies
 from cell.procedures.frame_store import FrameFile
 from cell.procedures.observed import RailPath, TimedCloud
-from cell.run.record.channels import CAMERAS, COMMANDED
-from cell.run.record.file import FILE, RecordFile, missing
+from cell.run.record.file import CAMERAS, COMMANDED, FILE, RecordFile, missing
 from cell.run.record.sketch import Sketch
-from cell.run.record.times import Times
-from cell.run.record.words import as_json, rtde, wire
-from cell.run.run import Run
+from cell.run.runs import Run
+from drivers.clock import Clock
 from drivers.interfaces import ArmState, Frame, RailState
 from statemachine.step import Event
+from statemachine.waiting import WaitableClock
+
+MOST_NUMBERS = 2000
+"""Of an array that goes into a message; of a larger one its shape is told."""
+
+
+def as_json(data: object) -> bytes:
+    """Strict JSON."""
+    try:
+        return _ENCODER.encode(data).encode()
+    except (ValueError, TypeError):
+        # A number that is none, or a key that is no text.
+        return _ENCODER.encode(plain(data)).encode()
+
+
+def plain(value: object) -> Any:
+    """What JSON has words for."""
+    if isinstance(value, bool | str | int) or value is None:
+        return value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist()) if value.size <= MOST_NUMBERS else f"{'×'.join(map(str, value.shape))} numbers"
+    if isinstance(value, Enum):
+        return plain(value.value)
+    if isinstance(value, pin.SE3):
+        return plain(value.homogeneous)
+    if isinstance(value, bytes | bytearray):
+        return value.hex()
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple | set | frozenset):
+        return [plain(each) for each in value]
+    return str(value)
+
+
+_ENCODER = json.JSONEncoder(allow_nan=False, separators=(",", ":"), default=plain)
+_WORDS = (b"false", b"true")
+
+
+def wire(sent: bool, what: object) -> bytes:
+    """A CAN frame, or bytes, as JSON. Written out, because hundreds come in a second."""
+    if isinstance(what, can.Message):
+        flags = (what.is_extended_id, what.is_remote_frame, what.is_error_frame, what.is_fd)
+        extended, remote, error, fd = (_WORDS[flag] for flag in flags)
+        return (
+            b'{"sent":%s,"id":%d,"extended":%s,"remote":%s,"error":%s,"fd":%s,"dlc":%d,"data":"%s"}'
+            % (_WORDS[sent], what.arbitration_id, extended, remote, error, fd, what.dlc, what.data.hex().encode())
+        )  # fmt: skip
+    data = what.hex() if isinstance(what, bytes | bytearray) else str(what)
+    return as_json({"sent": sent, "data": data})
+
+
+def rtde(sent: bool, what: object) -> bytes:
+    """What passes between arm and driver, as JSON: packets as bytes, lines of the dashboard, values, requests."""
+    match what:
+        case bytes() | bytearray():
+            return as_json({"sent": sent, "data": what.hex()})
+        case str():
+            return as_json({"sent": sent, "text": what})
+        case (str() as name, tuple() as arguments):
+            return as_json({"sent": sent, "request": name, "arguments": arguments})
+    return as_json({"sent": sent, "state": vars(what)})
+
+
+class Times:
+    """Turns the times that others tell into those of a record; all in ns."""
+
+    def __init__(self, clock: Clock) -> None:
+        self.virtual = isinstance(clock, WaitableClock)
+        self.name = "virtual" if self.virtual else "wall"
+        self._clock = clock
+        self._begun, self._epoch = clock.now(), time.time_ns()
+
+    def now(self) -> int:
+        """Now."""
+        return self.of(self._clock.now())
+
+    def of(self, host_time: float) -> int:
+        """A time of the cell's clock, in s; one that nobody knows is now."""
+        if not math.isfinite(host_time):
+            host_time = self._clock.now()
+        if self.virtual:
+            return max(0, round(1e9 * host_time))
+        return self._epoch + round(1e9 * self._clock.wall(host_time - self._begun))
+
+    def of_wall(self, seconds: float) -> int:
+        """A time since the epoch, in s, that was taken just now."""
+        return self.now() if self.virtual else round(1e9 * seconds)
+
 
 LOGGERS = ("cell", "drivers", "statemachine")
 READINGS_S, PROGRESS_S, GROWN_S = 1 / 30, 0.2, 1.0

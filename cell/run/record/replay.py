@@ -3,10 +3,17 @@
 The run's folder is the truth: its PNG files, `sweep.npz` (where the scan head was at each line, from the rail's or the
 arm's readings), the flange at the photograph, job, configuration and calibration. The pictures in `record.mcap` have to
 be the same bytes. Everything is compared bit for bit: a difference means other code, other libraries, or changed files.
+
+What a run's perception was given and what it made of it, to the last digit: `perception.json` in the run's folder.
+
+With the frames, `sweep.npz`, job, configuration and calibration beside it, `cell.run.record.replay` does it all again.
 """
 
 from __future__ import annotations
 
+import hashlib
+import json
+import logging
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,25 +29,94 @@ from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.devices.assembly import behind_gate
 from cell.measure.geometry.poses import difference, from_matrix
-from cell.measure.inversion import NominalSurface
+from cell.measure.inversion import NominalSurface, PlacePose
 from cell.measure.reconstruction.ply import read_cloud
 from cell.procedures.arm.photograph import BoardFix, photograph
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.board_photo import settled
 from cell.procedures.steps.invert_pose import inverted
-from cell.procedures.steps.reconstruct import reconstructed
+from cell.procedures.steps.reconstruct import Reconstruction, reconstructed
 from cell.procedures.steps.workplace import Workplace
-from cell.procedures.sweep.stored_sweep import StoredSweep
-from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.procedures.sweep.stored_sweep import StoredSweep, SweepRecord
+from cell.run.folder import write_json
 from cell.run.record.file import FILE as RECORD
-from cell.run.record.perception import CLOUD, REPLAYED, load, of_points, sha256
 from cell.run.record.reading import messages
 from drivers.camera.folder import read_image
 from drivers.clock import Clock
-from drivers.errors import ConfigError, RefusedError
+from drivers.errors import CellError, ConfigError, RefusedError
 from drivers.interfaces import Arm, ArmSafety, ArmState, Camera, Frame, Vehicle
 from statemachine.journal import JournalError, read
+from statemachine.runner import RunResult
+
+FILE, CLOUD = "perception.json", "cloud.ply"
+FORMAT = 1
+REPLAYED = ("reconstruct", "invert_pose")
+"""Steps that are done again, so that their refusal is, too."""
+
+log = logging.getLogger(__name__)
+
+
+def save(folder: Path, result: RunResult) -> None:
+    """Keep it for a run that came as far as its cloud, or was refused there; a disk that takes none is only told."""
+    made = {type(value): value for value in result.results.values()}
+    fix = made.get(BoardFix)
+    failed = next((step.name for step in result.steps if step.state == "failed"), None)
+    refused = failed in REPLAYED and isinstance(result.error, RefusedError)
+    sweep, scan = made.get(SweepRecord), made.get(Reconstruction)
+    if not isinstance(fix, BoardFix) or not isinstance(sweep, SweepRecord) or not (scan or refused):
+        return
+    data: dict[str, Any] = {
+        "format": FORMAT,
+        "photograph": {
+            "files": [f"board-{fix.number:02d}-{frame.frame_id:06d}.png" for frame in fix.frames],
+            "flange": fix.flange.tolist(),
+            "base_from_board": fix.base_from_board.homogeneous.tolist(),
+            "covariance": fix.covariance.tolist(),
+        },
+        "earlier_sweep": sweep.earlier,
+        "cloud_sha256": sha256(folder / CLOUD),
+        "points_sha256": None if not isinstance(scan, Reconstruction) else of_points(scan),
+        "pose": None,
+        "refused": {"step": failed, "reason": str(result.error)} if refused else None,
+    }
+    if isinstance(pose := made.get(PlacePose), PlacePose):
+        data["pose"] = {
+            "base_from_surface": pose.base_from_surface.homogeneous.tolist(),
+            "covariance": pose.covariance.tolist(),
+        }
+    try:
+        write_json(folder / FILE, data)
+    except (CellError, OSError) as error:
+        log.warning("%s is not kept, this run cannot be replayed: %s", FILE, error)
+
+
+def load(folder: Path) -> dict[str, Any]:
+    """What was kept; `ConfigError` when there is nothing to do again, `CellError` for a file that is none of ours."""
+    path = folder / FILE
+    if not path.exists():
+        raise ConfigError(
+            f"{folder.name} cannot be replayed: it holds no {FILE}. It did not come as far as a cloud, was no job, or "
+            "was made by an older version; `cell report` says how it ended"
+        )
+    try:
+        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        if data["format"] != FORMAT:
+            raise ValueError(f"format {data['format']}, this program reads {FORMAT}")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CellError(f"{path} cannot be read: {error}") from error
+    return data
+
+
+def of_points(scan: Reconstruction) -> str:
+    """SHA-256 of a cloud's points with all their digits, of which the file keeps seven."""
+    return hashlib.sha256(scan.cloud.points.tobytes()).hexdigest()
+
+
+def sha256(path: Path) -> str | None:
+    """Of a file's bytes; None where there is no file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.exists() else None
+
 
 Progress = Callable[[float, str], None]
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
-from cell.motion.arm_models import arm_kinematics
-from cell.motion.bodies import Body
+from cell.motion.collision import Body
+from cell.motion.kinematics import arm_kinematics
 from cell.procedures.frame_store import FrameFile
-from cell.run.record.channels import CAMERAS
+from cell.run.record.file import CAMERAS
 from drivers.errors import CellError
 from drivers.interfaces import ArmState
 

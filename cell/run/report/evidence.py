@@ -13,8 +13,8 @@ from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.place import PlaceResult
 from drivers.errors import Measured, RefusedError
-from statemachine.policy import Outcome
 from statemachine.runner import RunResult
+from statemachine.step import Outcome
 
 CLOUD = "cloud.ply"
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from cell.config.job import load_job
 from cell.measure.geometry.poses import from_ur, transform
 from cell.measure.inversion import NominalSurface
-from cell.measure.reconstruction.e57 import write_e57
-from cell.measure.reconstruction.mesh import triangles, write_mesh
-from cell.measure.reconstruction.ply import StoredCloud, deviation_colours, read_cloud, write_ply
-from cell.run.files.reading import read_report
+from cell.measure.reconstruction.cloud import triangles, write_mesh
+from cell.measure.reconstruction.ply import StoredCloud, deviation_colours, read_cloud, write_e57, write_ply
+from cell.run.folder import read_report
 from cell.run.report.figures import simulated_words
 from drivers.errors import ConfigError
 

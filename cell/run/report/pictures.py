@@ -2,16 +2,21 @@
 
 Each panel shows what the run has of it. Where a run ended early the panels show what was looked at, and why that did
 not do. The panels themselves are drawn in `panels.py`.
-"""
+
+The panels of a run's picture. Lengths in mm, pictures in px; every scale says its unit."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
 from cell.config.job import Job
@@ -23,22 +28,204 @@ from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.reconstruct import Reconstruction
-from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.report.evidence import RefusalEvidence, ended_in
-from cell.run.report.figures import simulated_words
-from cell.run.report.panels import (
-    BoardPanel,
-    StripePanel,
-    SurfacePanel,
-    draw_board,
-    draw_error,
-    draw_reason,
-    draw_stripe,
-    draw_surface,
-    empty,
-)
-from drivers.interfaces import Frame
+from cell.run.report.figures import simulated_words, told
+from drivers.interfaces import Frame, Image, Vector
 from statemachine.runner import RunResult
+
+LEAST_SQUARE_MM, MOST_SQUARES = 1.2, 60
+"""Edge of the map's squares: a line of the sweep or more falls into each; and how many make its longer side at most."""
+LEAST_MAP_MM = 25.0
+NO_DATA, BESIDE = "0.8", "0.45"
+GREY: dict[str, Any] = {"cmap": "gray", "vmin": 0, "vmax": 255, "interpolation_stage": "data"}
+"""A picture's colours, given to what is shown of it and not to all of its pixels before."""
+MARGIN = 0.35
+"""Room around the board in the photograph, in its own size."""
+REASON_COLUMNS, REASON_LINES = 54, 9
+LINE = 0.036
+"""Height of a line of text in a panel."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPanel:
+    """A photograph (h, w), 8 bit, the points found in it, and their residual in px if a pose was taken from them."""
+
+    image: Image
+    view: BoardView | None
+    residual_px: float | None = None
+    refused: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePanel:
+    """Points (n, 3) in m in the surface's frame and their deviations (n,) in m, NaN beside the surface.
+
+    `deviation` is None when no pose of the surface was found; `believed` is False for a pose that was refused.
+    """
+
+    points: Vector
+    deviation: Vector | None
+    believed: bool
+
+
+@dataclass(frozen=True, eq=False)
+class StripePanel:
+    """A frame of the sweep (h, w), 8 bit, and the stripe found in it, (n, 2) px of column and row."""
+
+    image: Image
+    stripe: Vector | None
+
+
+def draw_board(axes: Axes, board: BoardPanel) -> None:
+    """The photograph, cut to the board's surroundings, with every point found drawn over it."""
+    axes.imshow(board.image, **GREY)
+    axes.set_xlabel("column in px")
+    axes.set_ylabel("row in px")
+    if board.view is None:
+        _title(axes, ["the refused photograph: no board found" if board.refused else "the last photograph"])
+        return
+    pixels = board.view.pixels
+    axes.plot(
+        pixels[:, 0], pixels[:, 1], "o", color="tab:red", markerfacecolor="none", markersize=5, markeredgewidth=0.9
+    )
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    room = MARGIN * (high - low).max()
+    height, width = board.image.shape
+    axes.set_xlim(max(0, low[0] - room), min(width, high[0] + room))
+    axes.set_ylim(min(height, high[1] + room), max(0, low[1] - room))
+    said = "refused" if board.residual_px is None else f"off by {board.residual_px:.3f} px RMS"
+    _title(axes, [f"the board: {len(pixels)} of {len(board.view.spec.lattice())} points found, {said}"])
+
+
+def draw_surface(
+    figure: Figure, axes: Axes, surface: SurfacePanel, span_mm: float, seams: Sequence[Mapping[str, Any]]
+) -> None:
+    """A map of the scanned points from above, means over squares: their deviation from the drawn surface within
+    ±`span_mm`, or their height where no place of the surface was found."""
+    points = 1e3 * surface.points
+    frame_map(axes, points)
+    if surface.deviation is None:
+        _title(axes, [f"{len(points)} points of the sweep; the surface was not found in them"])
+        if len(points):
+            shown = _map(axes, points, points[:, 2], cmap="viridis")
+            figure.colorbar(shown, ax=axes, label="height in mm", shrink=0.8, pad=0.07)
+        return
+    deviation = 1e3 * surface.deviation
+    on = np.isfinite(deviation)
+    _map(axes, points[~on], np.zeros(int((~on).sum())), cmap=ListedColormap([BESIDE]), vmin=0.0, vmax=1.0)
+    shown = _map(axes, points[on], deviation[on], cmap="RdBu_r", vmin=-span_mm, vmax=span_mm)
+    figure.colorbar(shown, ax=axes, label="deviation from the drawn surface in mm", shrink=0.8, pad=0.07, extend="both")
+    said = "deviation from the drawn surface" if surface.believed else "deviation at the place that was refused"
+    rms = float(np.sqrt(np.mean(deviation[on] ** 2))) if on.any() else float("nan")
+    _title(axes, [f"{said}: {rms:.3f} mm RMS" + ("" if on.all() else "; dark: beside it"), *map(seam_words, seams)])
+
+
+def frame_map(axes: Axes, points: Vector) -> None:
+    """Axes in mm around points (n, 3) in mm, seen from above; what carries no data is grey."""
+    low, high = (points[:, :2].min(axis=0), points[:, :2].max(axis=0)) if len(points) else (np.zeros(2), np.zeros(2))
+    room = np.maximum(1.0, 0.5 * (LEAST_MAP_MM - (high - low)))
+    axes.set_xlim(low[0] - room[0], high[0] + room[0])
+    axes.set_ylim(low[1] - room[1], high[1] + room[1])
+    axes.set_aspect("equal")
+    axes.set_facecolor(NO_DATA)
+    axes.set_xlabel("x of the surface in mm")
+    axes.set_ylabel("y in mm")
+
+
+def _map(axes: Axes, points: Vector, values: Vector, **look: Any) -> Any:
+    """Means of `values` (n,) over squares of the plane, drawn; squares without a point stay clear."""
+    edges, mean = square_means(axes, points, values)
+    return axes.pcolormesh(*edges, np.ma.masked_invalid(mean.T), **look)
+
+
+def square_means(axes: Axes, points: Vector, values: Vector) -> tuple[list[Vector], Vector]:
+    """Edges of the map's squares along x and y, in mm, and means of `values` (n,) in them, NaN where no point is."""
+    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+    square = max(LEAST_SQUARE_MM, max(x1 - x0, y1 - y0) / MOST_SQUARES)
+    edges = [np.arange(low, high + square, square) for low, high in ((x0, x1), (y0, y1))]
+    count, _, _ = np.histogram2d(points[:, 0], points[:, 1], edges)
+    total, _, _ = np.histogram2d(points[:, 0], points[:, 1], edges, weights=values)
+    return edges, np.divide(total, count, out=np.full_like(total, np.nan), where=count > 0)
+
+
+def _title(axes: Axes, lines: Sequence[str]) -> None:
+    axes.set_title("\n".join(lines), fontsize="medium")
+
+
+def seam_words(seam: Mapping[str, Any]) -> str:
+    """One of the report's seams in a line."""
+    first, second = (number + 1 for number in seam["sweeps"])
+    return (
+        f"sweep {second} on sweep {first}: mean {seam['mean_mm']:+.3f} mm (expected ± {seam['expected_mean_mm']:.3f}), "
+        f"rms {seam['rms_mm']:.3f} mm (expected {seam['expected_rms_mm']:.3f})"
+    )
+
+
+def draw_stripe(axes: Axes, stripe: StripePanel) -> None:
+    """A frame of the sweep with its stripe."""
+    axes.imshow(stripe.image, **GREY)
+    axes.set_xlabel("column in px")
+    axes.set_ylabel("row in px")
+    if stripe.stripe is None:
+        _title(axes, ["the last frame of the sweep"])
+        return
+    axes.plot(stripe.stripe[:, 0], stripe.stripe[:, 1], ",", color="tab:red")
+    _title(axes, [f"the middle of the sweep: the stripe found in {len(stripe.stripe)} rows"])
+
+
+def draw_error(
+    axes: Axes, truth: Mapping[str, Any] | None, bound: Mapping[str, Any] | None, tolerance_mm: float
+) -> None:
+    """Bars by axis and for D: the true error where it is known, and what the run itself states, up to the tolerance."""
+    _title(axes, ["place error beside its tolerance" if truth else "stated place error beside its tolerance"])
+    names = ["x", "y", "z", "d"]
+    rows: list[tuple[str, str, list[float]]] = []
+    if truth is not None:
+        rows.append(("true, largest of 45 points", "tab:blue", [truth["error_mm"][name]["max"] for name in names]))
+        rows.append(("true, mean", "lightsteelblue", [truth["error_mm"][name]["mean"] for name in names]))
+    if bound is not None:
+        rows.append(("stated: 95 % lie below", "tab:orange", [bound[name] for name in names]))
+    thick = 0.8 / max(1, len(rows))
+    for k, (label, colour, values) in enumerate(rows):
+        places = np.arange(4) + thick * (k - 0.5 * (len(rows) - 1))
+        axes.barh(places, values, 0.92 * thick, color=colour, label=label)
+        for place, value in zip(places, values, strict=True):
+            axes.text(value + 0.012 * tolerance_mm, place, f"{value:.3f}", va="center", fontsize=8)
+    axes.axvline(tolerance_mm, color="tab:red", linestyle="--", label=f"tolerance of the job, {tolerance_mm:g} mm")
+    axes.set_yticks(np.arange(4), ["x", "y", "z", "D"])
+    axes.invert_yaxis()
+    axes.set_xlim(0, 1.15 * max([tolerance_mm, *(value for _, _, values in rows for value in values)]))
+    axes.set_xlabel("mm, axes of the surface; D: length of all three")
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=2)
+
+
+def draw_reason(axes: Axes, report: Mapping[str, Any], step: str | None) -> None:
+    """Why a run ended, and the figures that it was judged by; one that leaves its limit is red."""
+    empty(axes, f"{report['outcome']}" + ("" if step is None else f" in {step}"), "")
+    lines = textwrap.wrap(str(report["reason"]), REASON_COLUMNS)
+    if len(lines) > REASON_LINES:
+        lines = [*lines[: REASON_LINES - 1], "… (the whole of it is in report.json)"]
+    _write(axes, 0.0, 1.0, "\n".join(lines), "black")
+    top = 1.0 - LINE * (len(lines) + 1)
+    fitting = int(top / (2.2 * LINE))
+    for k, row in enumerate(report["measured"][:fitting]):
+        colour = "black" if row["kept"] else "tab:red"
+        name = textwrap.shorten(str(row["name"]), REASON_COLUMNS, placeholder=" …")
+        _write(axes, 0.0, top - 2.2 * LINE * k, f"{name}\n      {told(row)}", colour)
+
+
+def _write(axes: Axes, x: float, y: float, text: str, colour: str) -> None:
+    # Not part of the layout, which would make room for a long line by squeezing the panels beside it.
+    axes.text(x, y, text, va="top", fontsize=10, color=colour, transform=axes.transAxes, in_layout=False)
+
+
+def empty(axes: Axes, title: str, text: str) -> None:
+    """A panel with nothing but words."""
+    _title(axes, [title])
+    axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes)
+    axes.set_axis_off()
+
 
 SCALE_SHARE = 1 / 3
 """End of the colours' scale in tolerances: what lies farther off the surface counts against it."""

@@ -23,7 +23,7 @@ class TruthRecorder:
     """Listens to a run and notes the truth right after the sweep, when the scanned surface was where it was scanned."""
 
     def __init__(self, ask: Callable[[], dict[str, Any]]) -> None:
-        """`ask()` gives the whole truth; see `sim_backends.world.truth`."""
+        """`ask()` gives the whole truth; see `sim_backends.world.world`."""
         self.ask = ask
         self.at_sweep: dict[str, Any] | None = None
 

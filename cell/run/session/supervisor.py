@@ -22,32 +22,26 @@ from cell.base.lateness import LATENESS
 from cell.config.calibrations.store import CalibrationEdited, CellCalibration
 from cell.config.cell_config import DEVICES, CellConfig, Confirm
 from cell.config.job import Job, load_job
-from cell.devices.devices import Devices
+from cell.devices.devices import Devices, stop_cell
 from cell.devices.simulated.injection import Injector
-from cell.devices.simulated.mix import Sim
+from cell.devices.simulated.mixed import Sim
 from cell.devices.simulated.process import Simulation, is_whole
-from cell.devices.stopping import stop_cell
-from cell.motion.arm_models import HOME
+from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.drive.way import Whereabouts
 from cell.procedures.steps.kinds import find_kind
 from cell.procedures.verify.verdict import Verification
 from cell.run import calibration as sessions
-from cell.run.files.folder import find_run
-from cell.run.job_run import Observer, RunOutcome
-from cell.run.job_work import JobWork
+from cell.run.calibration import recorded_maintenance
+from cell.run.folder import find_run
+from cell.run.job_run import JobWork, Observer, ReadyJob, RunOutcome
 from cell.run.jogging import arm_is_ready, begin_program
-from cell.run.maintenance import recorded_maintenance
-from cell.run.ready_job import ReadyJob
 from cell.run.recorded_work import Hands
 from cell.run.resumption import UnfinishedRun
-from cell.run.run import Run
-from cell.run.runs import Runs
-from cell.run.session.opening import open_devices
-from cell.run.session.session import Opened
+from cell.run.runs import Run, Runs
+from cell.run.session.session import Opened, open_devices
 from drivers.errors import CalibrationStale, ConfigError
-from statemachine.runner import Event
-from statemachine.script import NO_SCRIPT, Script
+from statemachine.runner import NO_SCRIPT, Event, Script
 from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
 
 HOMED = {"rail": ("rail",), "arm": ("arm", "vehicle")}

@@ -18,10 +18,10 @@ import pinocchio as pin
 from cell.base.compiled import is_kept
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.closest import closest
-from cell.measure.inversion.start_poses import candidates
+from cell.measure.inversion.registration import candidates
 from cell.measure.reconstruction import Cloud, fill_holes
 from cell.measure.reconstruction.outliers import find_outliers
-from cell.measure.vision.stripe.warm_up import read_drawn
+from cell.measure.vision.stripe.extract import read_drawn
 
 LINES = 40
 """Lines and rows of the drawn cloud."""

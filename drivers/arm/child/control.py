@@ -17,7 +17,7 @@ from typing import Any
 
 from drivers.arm.child.program import KICK_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
 from drivers.arm.child.streaming import Streaming
-from drivers.arm.messages import (
+from drivers.arm.feed import (
     UNANSWERED,
     ChildReply,
     ChildRequest,

@@ -3,12 +3,18 @@
 It ends by itself, with the motion stopped and the safe outputs off, as soon as its owner is gone (the pipe ends, or
 another parent has taken over), and at once when the arm is gone. Run by the driver; with `--safe ADDRESS 0,3` it only
 switches outputs off and sees that the arm stands.
+
+Child side: what goes to the owner, sent by a thread of its own.
+
+An owner that computes may not read for a second, and its pipe fills: neither the thread that reads the arm nor the one
+that commands it may wait for that, or the controller's watchdog ends the program of an arm that is perfectly well.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import queue
 import resource
 import signal
 import socket
@@ -27,12 +33,10 @@ from rtde_control import RTDEControlInterface
 from rtde_io import RTDEIOInterface
 
 from drivers.arm.child.control import ControlThread
-from drivers.arm.child.outbox import ChildOutbox, Message
-from drivers.arm.child.outputs import OFF_S, keep_low, make_safe, switch_output
-from drivers.arm.child.packets import Packets
+from drivers.arm.child.outputs import OFF_S, Packets, keep_low, make_safe, switch_output
 from drivers.arm.child.program import PERIOD
 from drivers.arm.dashboard import Dashboard
-from drivers.arm.messages import (
+from drivers.arm.feed import (
     MODE_RUNNING,
     UNANSWERED,
     ChildReply,
@@ -46,6 +50,43 @@ from drivers.arm.messages import (
 from drivers.clock import Clock
 from drivers.errors import DeviceError
 from drivers.last_words_child import FROZEN_S, LOOK_S, Owner, raise_priority
+
+Message = ChildReply | Ended | Snapshot | Lost
+
+
+class ChildOutbox:
+    """Sends messages in the order in which they were put; `on_gone` is called once when nobody takes them any more."""
+
+    def __init__(self, pipe: Connection, on_gone: Callable[[], None]) -> None:
+        self._pipe = pipe
+        self._on_gone = on_gone
+        self._messages: queue.SimpleQueue[Message | threading.Event] = queue.SimpleQueue()
+        threading.Thread(target=self._run, name="outbox", daemon=True).start()
+
+    def put(self, *messages: Message) -> None:
+        """Have messages sent; never waits."""
+        for message in messages:
+            self._messages.put(message)
+
+    def drain(self, seconds: float) -> None:
+        """Wait until what was put so far is sent, at most `seconds` on the wall."""
+        sent = threading.Event()
+        self._messages.put(sent)
+        sent.wait(seconds)
+
+    def _run(self) -> None:
+        gone = False
+        while True:
+            message = self._messages.get()
+            if isinstance(message, threading.Event):
+                message.set()
+            elif not gone:
+                try:
+                    self._pipe.send(message)
+                except OSError:
+                    gone = True
+                    self._on_gone()
+
 
 SILENCE_S = 1.5
 """The arm counts as lost after this time without a packet; it sends one every 2 ms."""

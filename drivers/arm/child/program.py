@@ -11,7 +11,7 @@ from typing import Any
 
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.faults import LATE_S, late_words
-from drivers.arm.messages import MODE_RUNNING, PLAYING, STOPPED, ChildSetup, Six, Snapshot, safety_code
+from drivers.arm.feed import MODE_RUNNING, PLAYING, STOPPED, ChildSetup, Six, Snapshot, safety_code
 from drivers.arm.motion import largest_difference
 from drivers.clock import Clock
 from drivers.errors import DeviceError

@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Any
 
 from drivers.arm.child.program import BRAKING_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
-from drivers.arm.messages import ChildSetup, Six, Snapshot, StreamTiming
+from drivers.arm.feed import ChildSetup, Six, Snapshot, StreamTiming
 from drivers.arm.motion import JointTrajectory
 from drivers.clock import Clock
 

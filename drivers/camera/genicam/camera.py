@@ -14,13 +14,10 @@ from contextlib import contextmanager
 
 from drivers.camera.frame_queue import FrameQueue
 from drivers.camera.genicam.acquisition import AcquiredPicture, Acquisition
-from drivers.camera.genicam.connection import GenicamSetup, connect
-from drivers.camera.genicam.device import GenicamDevice, Place
-from drivers.camera.genicam.settings import Wish, set_timing, set_trigger
-from drivers.camera.genicam.stamps import StampClock
+from drivers.camera.genicam.connection import GenicamSetup, Wish, connect, set_timing, set_trigger
+from drivers.camera.genicam.device import GenicamDevice, Place, StampClock
 from drivers.clock import Clock
-from drivers.endings import in_the_end
-from drivers.errors import CellError, DeviceFault, InterlockError, NotConnectedError
+from drivers.errors import CellError, DeviceFault, InterlockError, NotConnectedError, in_the_end
 from drivers.interfaces import Frame, Identity, LinkStatistics
 
 _QUEUE_BYTES = 64 * 1024 * 1024

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from drivers.errors import DeviceFault, LimitError
-from drivers.rail.modbus.link import ModbusLink
-from drivers.rail.modbus.registers import Flag, Number, Rate, RegisterMap
+from drivers.rail.modbus.link import Flag, ModbusLink, Number, Rate, RegisterMap
 
 
 class ModbusDrive:

@@ -8,15 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drivers.clock import Clock
-from drivers.errors import Aborted, ConfigError, LimitError
+from drivers.errors import UNTOLD, Aborted, ConfigError, LimitError, shown
 from drivers.interfaces import Identity, RailState, Reading
-from drivers.quantities import UNTOLD, shown
 from drivers.rail.axis import RailAxis, Samples
-from drivers.rail.modbus.arrival import DriveArrival
+from drivers.rail.modbus.arrival import DriveArrival, DriveZero
 from drivers.rail.modbus.drive import ModbusDrive
-from drivers.rail.modbus.link import ModbusLink
-from drivers.rail.modbus.registers import Number, Rate, RegisterMap
-from drivers.rail.modbus.zero import DriveZero
+from drivers.rail.modbus.link import ModbusLink, Number, Rate, RegisterMap
 
 ROUNDING = 0.01
 """By what share a speed may be rounded to the drive's unit; an acceleration by five times that."""

@@ -3,7 +3,10 @@
 The vendor's modules with a six-point ramp name their parameters 15, 16 and 19 in two orders (first acceleration, its
 end speed, start speed; or start speed, first acceleration, its end speed). All three are set to 0, which switches the
 first phase off in either order; then only 5 and 17, acceleration and deceleration, are left. Every value is read back.
-"""
+
+What a rail's module tells of its motor driver's health; it tells no voltage.
+
+Source: docs/reference/protocols.md, section 2."""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ import re
 from dataclasses import dataclass
 
 from drivers.errors import ConfigError, DeviceFault
+from drivers.interfaces import Reading
 from drivers.rail.tmcl.codec import Axis
 from drivers.rail.tmcl.link import NO_SUCH_TYPE, WRONG_VALUE, CommandRefused, TmclLink
 
@@ -128,3 +132,18 @@ def _in_pulses(link: TmclLink) -> None:
         raise
     if mode != PULSES_MODE:
         set_checked(link, Axis.UNIT_MODE, PULSES_MODE, EXACT)
+
+
+TOO_HOT, SHORT_A, SHORT_B = 1 << 1, 1 << 3, 1 << 4
+_ALARMS = (
+    ("driver too hot", TOO_HOT, "Let it cool down; lower the motor's current, or give the module air."),
+    ("short circuit of the motor", SHORT_A | SHORT_B, "Switch off, then measure the motor's cable and windings."),
+)
+
+
+def readings(driver_bits: int) -> list[Reading]:
+    """One figure for each alarm in axis parameter 208, 1 where it is set.
+
+    Open load is left out: a motor that stands shows it without cause.
+    """
+    return [Reading(what, float(bool(driver_bits & bits)), "", most=0.0, remedy=why) for what, bits, why in _ALARMS]

@@ -13,12 +13,11 @@ from drivers.errors import Aborted, ConfigError
 from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.motion import RailMotion
-from drivers.rail.tmcl import health
-from drivers.rail.tmcl.arrival import ArrivalWatch
+from drivers.rail.tmcl import module
+from drivers.rail.tmcl.arrival import STALL_FLAG, ArrivalWatch, ZeroMark
 from drivers.rail.tmcl.codec import Axis, ReferenceSearch
 from drivers.rail.tmcl.link import NO_SUCH_TYPE, CommandRefused, TmclLink
 from drivers.rail.tmcl.module import EXACT, SPEED, require_supported, set_checked, set_direction, set_ramp
-from drivers.rail.tmcl.zero import STALL_FLAG, ZeroMark
 
 _HOME_SWITCH_ON_BELOW = (5, 7)
 """Reference modes whose zero is the edge below which the home switch is on."""
@@ -101,9 +100,9 @@ class TmclRail(RailAxis):
         return self._clock.wall(self._link.get_stamped(Axis.POSITION)[2])
 
     def examine(self, seconds: float) -> list[Reading]:
-        """What the module tells of its motor driver, at once; see `drivers.rail.tmcl.health`."""
+        """What the module tells of its motor driver, at once; see `drivers.rail.tmcl.module`."""
         try:
-            return health.readings(self._link.get(Axis.DRIVER_ERRORS))
+            return module.readings(self._link.get(Axis.DRIVER_ERRORS))
         except CommandRefused as refused:
             if refused.status == NO_SUCH_TYPE:
                 return []

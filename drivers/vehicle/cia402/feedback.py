@@ -1,22 +1,141 @@
-"""What both drives tell together: the vehicle's state, and the faults that it shows."""
+"""What both drives tell together: the vehicle's state, and the faults that it shows.
+
+How a vehicle of two wheel drives is built: from its metres a second to its drives' numbers, and back.
+
+Whether a wheel's speed and its counts tell of the same way: a unit may be wrong, in cell.toml or in the drive."""
 
 from __future__ import annotations
 
 import math
 import threading
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
 
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics, VehicleState
-from drivers.vehicle.cia402.drive import SideDrive
-from drivers.vehicle.cia402.faults import command_lost, drive_error, wrong_units
-from drivers.vehicle.cia402.geometry import SIDES, WheelDrives
-from drivers.vehicle.cia402.objects import OPERATIONAL, STATUS
-from drivers.vehicle.cia402.states import DriveState, may_turn
-from drivers.vehicle.cia402.units import UnitCheck
+from drivers.vehicle.cia402.bus import command_lost, drive_error, wrong_units
+from drivers.vehicle.cia402.drive import OPERATIONAL, STATUS, DriveState, SideDrive, may_turn
 from drivers.vehicle.faults import disturbed, emergency_stop, no_feedback, two_vehicles
-from drivers.vehicle.travel import Travel
+from drivers.vehicle.feedback import Travel
+
+VelocityUnit = Literal["counts/s", "rpm", "0.1 rpm", "0.01 rpm", "0.001 rpm"]
+SIDES = ("left", "right")
+SI_UNITS = {
+    "counts/s": 0x00B50300, "rpm": 0x00B44700, "0.1 rpm": 0xFFB44700, "0.01 rpm": 0xFEB44700, "0.001 rpm": 0xFDB44700,
+}  # fmt: skip
+"""How object 60A9h writes these units (CiA 303-2: decimal prefix, numerator, denominator)."""
+_RPM = {"rpm": 1.0, "0.1 rpm": 0.1, "0.01 rpm": 0.01, "0.001 rpm": 0.001}
+
+
+@dataclass(frozen=True)
+class WheelDrives:
+    """Two wheel drives, left and right, SI units.
+
+    `nodes` are their numbers on the bus. `gear` is turns of the motor per turn of the wheel, `counts` increments per
+    turn of the motor, `reversed` whether the motor turns backwards when the vehicle drives ahead. `acceleration` and
+    `deceleration` in m/s² are the ramps that the drives keep, `deceleration` also that of halt and quick stop.
+    `brake_output` and `stop_input` are bits of a drive's digital outputs and inputs, or None: then the drive switches
+    its brake by itself, or nobody tells of the emergency stop. `brake_locks` and `stop_active` are the levels at which
+    the brake is locked and the emergency stop is pressed.
+    """
+
+    nodes: tuple[int, int]
+    wheel_radius: float
+    gear: float
+    counts: int
+    velocity_unit: VelocityUnit
+    reversed: tuple[bool, bool]
+    track: float
+    acceleration: float
+    deceleration: float
+    brake_output: int | None = None
+    brake_locks: bool = False
+    stop_input: int | None = None
+    stop_active: bool = True
+
+    @property
+    def count_length(self) -> float:
+        """Way of a wheel's rim per increment, m."""
+        return 2.0 * math.pi * self.wheel_radius / (self.gear * self.counts)
+
+    @property
+    def velocity_step(self) -> float:
+        """Speed of a wheel's rim per unit of velocity, m/s."""
+        turn = 2.0 * math.pi * self.wheel_radius / self.gear
+        return turn / self.counts if self.velocity_unit == "counts/s" else _RPM[self.velocity_unit] * turn / 60.0
+
+    def targets(self, speed: float, yaw_rate: float) -> tuple[int, int]:
+        """Target velocities of both drives for m/s and rad/s of the vehicle."""
+        rims = speed - 0.5 * self.track * yaw_rate, speed + 0.5 * self.track * yaw_rate
+        left, right = (
+            round(rim / self.velocity_step) * (-1 if back else 1) for rim, back in zip(rims, self.reversed, strict=True)
+        )
+        return left, right
+
+    def motion(self, velocities: tuple[int, int]) -> tuple[float, float]:
+        """Speed in m/s and yaw rate in rad/s of the vehicle from what both drives report."""
+        left, right = (
+            velocity * self.velocity_step * (-1 if back else 1)
+            for velocity, back in zip(velocities, self.reversed, strict=True)
+        )
+        return 0.5 * (left + right), (right - left) / self.track
+
+    def ramp(self, acceleration: float) -> int:
+        """m/s² of the rim as the drives have it: units of velocity per second."""
+        return max(1, round(acceleration / self.velocity_step))
+
+
+WAY_M, WALL_S = 0.05, 0.3
+"""Over which both are compared, at least: m, and seconds on the wall."""
+GAP_WALL_S = 0.1
+"""A reading that comes later than this after the last, on the wall, does not say how it went between."""
+RATIO = 1.6
+"""By which both may differ. Readings that bunch up make a third."""
+IN_A_ROW = 2
+CREEPS = 0.02
+"""Below this, m/s, nothing is compared: an offset of a drive's speed must not add up."""
+
+
+class UnitCheck:
+    """One wheel."""
+
+    def __init__(self, clock: Clock, wheels: WheelDrives) -> None:
+        self._clock = clock
+        self._count, self._step = wheels.count_length, wheels.velocity_step
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._last: tuple[float, int, int] | None = None
+        self._wrong = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._counted = self._told = self._took = 0.0
+
+    def contradiction(self, now: float, position: int, velocity: int) -> float:
+        """Take a reading; the ratio of both ways, speed's to counts', where it is wrong in every comparison, else 0."""
+        last, self._last = self._last, (now, position, velocity)
+        if last is None:
+            return 0.0
+        took = now - last[0]
+        turned = ((position - last[1] + 2**31) % 2**32 - 2**31) * self._count
+        stands = abs(velocity) * self._step < CREEPS and abs(turned) < CREEPS * took
+        if stands or self._clock.wall(took) > GAP_WALL_S:
+            self._begin()
+            return 0.0
+        self._counted += turned
+        self._told += 0.5 * (velocity + last[2]) * self._step * took
+        self._took += took
+        if self._clock.wall(self._took) < WALL_S or max(abs(self._counted), abs(self._told)) < WAY_M:
+            return 0.0
+        ratio = self._told / self._counted if self._counted else math.inf
+        self._begin()
+        self._wrong = 0 if 1.0 / RATIO < ratio < RATIO else self._wrong + 1
+        return ratio if self._wrong >= IN_A_ROW else 0.0
+
 
 SILENCE_S = 0.5
 """Feedback that stays away for this long is a fault."""

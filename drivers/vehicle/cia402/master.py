@@ -2,12 +2,16 @@
 
 A thread sends SYNC and signs of life and, while the vehicle may be driven, both target velocities. One wheel alone
 never drives: when one drive gives up, both are stopped with the quick stop.
-"""
+
+Asking both drives by SDO for what they otherwise tell in PDOs: nothing on them has to be set for that.
+
+What is sent to the drives when this process is killed: both quick stops, then the brakes' outputs."""
 
 from __future__ import annotations
 
 import logging
 import math
+import struct
 import threading
 from collections.abc import Callable
 from functools import partial
@@ -15,16 +19,58 @@ from functools import partial
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
-from drivers.vehicle.cia402 import objects as od
-from drivers.vehicle.cia402 import polling, states
-from drivers.vehicle.cia402.bus import CanopenBus
-from drivers.vehicle.cia402.faults import unguarded
-from drivers.vehicle.cia402.feedback import DriveFeedback
-from drivers.vehicle.cia402.geometry import WheelDrives
-from drivers.vehicle.cia402.last_words import last_words
+from drivers.vehicle.cia402 import drive as od
+from drivers.vehicle.cia402 import drive as states
+from drivers.vehicle.cia402.bus import Absent, CanopenBus, unguarded
+from drivers.vehicle.cia402.drive import QUICK_STOP, DriveState, SideDrive
+from drivers.vehicle.cia402.feedback import DriveFeedback, WheelDrives
 from drivers.vehicle.cia402.setup import Watchdog, lock, set_up
-from drivers.vehicle.cia402.states import DriveState
 from drivers.vehicle.faults import disturbed
+
+
+def ask(bus: CanopenBus, feedback: DriveFeedback, wheels: WheelDrives) -> None:
+    """Bring `feedback` up to date. Raises what `CanopenBus.read` does; a value that a drive lacks is left out."""
+    for drive in feedback.drives:
+        motion = struct.pack("<i", bus.read(drive.node, od.VELOCITY))
+        if wheels.stop_input is not None:
+            motion += struct.pack("<I", bus.read(drive.node, od.INPUTS))
+        feedback.take(drive.node, od.MOTION, motion, in_pdo=False)
+        code = _optional(bus, drive, od.ERROR_CODE)
+        health = struct.pack("<H", code or 0)
+        if (millivolts := _optional(bus, drive, od.DC_LINK)) is not None:
+            health += struct.pack("<I", millivolts)
+        feedback.take(drive.node, od.HEALTH, health, in_pdo=False)
+        told = [bus.read(drive.node, entry) for entry in (od.STATUSWORD, od.POSITION, od.MODE_DISPLAY)]
+        feedback.take(drive.node, od.STATUS, struct.pack("<Hib", *told), in_pdo=False)
+
+
+def number(bus: CanopenBus, drive: SideDrive, entry: od.Entry) -> str:
+    """A number of the drive as text, "" where it has none."""
+    told = _optional(bus, drive, entry)
+    return "" if told is None else str(told)
+
+
+def _optional(bus: CanopenBus, drive: SideDrive, entry: od.Entry) -> int | None:
+    try:
+        return bus.read(drive.node, entry)
+    except Absent:
+        return None
+
+
+_EXPEDITED_4 = 0x23
+"""SDO: set four bytes."""
+
+
+def last_words(wheels: WheelDrives) -> list[tuple[int, bytes]]:
+    """Identifiers and data. With a brake on an output, all outputs of the drives are set to where it is locked."""
+    stop = od.CONTROLWORD.pack(QUICK_STOP) + od.TARGET_VELOCITY.pack(0)
+    words = [(od.COMMAND + node, stop) for _ in range(3) for node in wheels.nodes]
+    if wheels.brake_output is not None:
+        level = 1 << wheels.brake_output if wheels.brake_locks else 0
+        request = struct.pack("<BHBI", _EXPEDITED_4, od.OUTPUTS.index, od.OUTPUTS.sub, level)
+        words += [(od.SDO_REQUEST + node, request) for node in wheels.nodes]
+    return words
+
 
 SYNC_S, SYNC_AT_REST_S = 0.020, 0.050
 _SYNC_WALL_S = 0.010
@@ -197,7 +243,7 @@ class Master:
             while self._feedback.may_turn() and self._clock.now() - begun < longest:
                 self._clock.wait(self._closed, _STEP_WALL_S * self._clock.rate)
                 # By SDO: a drive that left the operational state tells nothing in PDOs.
-                polling.ask(self.bus, self._feedback, self._wheels)
+                ask(self.bus, self._feedback, self._wheels)
         finally:
             self._mute = False
         took = self._clock.wall(self._clock.now() - begun)

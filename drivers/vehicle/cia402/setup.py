@@ -10,13 +10,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from drivers.errors import ConfigError, DeviceFault
-from drivers.vehicle.cia402 import objects as od
-from drivers.vehicle.cia402.bus import Absent, CanopenBus
-from drivers.vehicle.cia402.drive import SideDrive
-from drivers.vehicle.cia402.faults import SETUP, unfit
-from drivers.vehicle.cia402.geometry import SI_UNITS, WheelDrives
-from drivers.vehicle.cia402.objects import Entry
-from drivers.vehicle.cia402.states import DISABLE_VOLTAGE, may_turn, state_of
+from drivers.vehicle.cia402 import drive as od
+from drivers.vehicle.cia402.bus import SETUP, Absent, CanopenBus, unfit
+from drivers.vehicle.cia402.drive import DISABLE_VOLTAGE, Entry, SideDrive, may_turn, state_of
+from drivers.vehicle.cia402.feedback import SI_UNITS, WheelDrives
 
 HEARTBEATS_IN_TIME = 5
 """So many of our heartbeats go into the time after which a drive stops without one."""

@@ -2,27 +2,65 @@
 hardware.
 
 When this program is gone, the drives stop by their own watchdog. That they do is tried at speed 0, once per connection.
-"""
+
+How the drives' CAN bus is used, who else commands there, and what the drives tell of their supply."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
+import can
+
 from drivers.clock import Clock
-from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, NotConnectedError
+from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, NotConnectedError, check_range
 from drivers.interfaces import Identity, LinkStatistics, Reading, VehicleState
-from drivers.quantities import check_range
-from drivers.vehicle.cia402 import health, polling
-from drivers.vehicle.cia402 import objects as od
-from drivers.vehicle.cia402.bus import CanopenBus
-from drivers.vehicle.cia402.faults import TOLD_ONCE
-from drivers.vehicle.cia402.feedback import DriveFeedback
-from drivers.vehicle.cia402.geometry import WheelDrives
+from drivers.vehicle.cia402 import drive as od
+from drivers.vehicle.cia402 import master
+from drivers.vehicle.cia402.bus import TOLD_ONCE, CanopenBus
+from drivers.vehicle.cia402.drive import SideDrive
+from drivers.vehicle.cia402.feedback import DriveFeedback, WheelDrives
 from drivers.vehicle.cia402.master import Master
 from drivers.vehicle.cia402.setup import Watchdog, compare_units
+from drivers.vehicle.health import MOST_LOAD, bus_readings, can_interface, most_bits
+
+
+def readings(
+    heard: Sequence[can.Message],
+    seconds: float,
+    bitrate: int,
+    others: int,
+    drives: Sequence[SideDrive],
+    system_name: str | None,
+    judged: bool,
+) -> list[Reading]:
+    """Figures of what was heard in `seconds` of the clock; `others` frames by which somebody else commanded.
+
+    Without `judged`, on a clock that is not the wall's, the load has no limit. `system_name` is the computer's CAN
+    interface, where it has one.
+    """
+    bits = sum(most_bits(frame) for frame in heard)
+    found = [
+        Reading(
+            "bus load, at most", 100.0 * bits / (bitrate * seconds), "%",
+            most=MOST_LOAD if judged else None, remedy="Take others off the CAN bus, or raise its bit rate.",
+        ),
+        Reading(
+            "frames of another master", float(others), "", most=0.0,
+            remedy="Find out who else sends SYNC, NMT, or commands to the drives, and end it.",
+        ),
+        *bus_readings(heard, None if system_name is None else can_interface(system_name)),
+    ]  # fmt: skip
+    # What is too low for the cells of its battery, the drive knows, and says by its error code.
+    found += [
+        Reading(f"supply, {drive.side} drive", 1e-3 * drive.millivolts, "V")
+        for drive in drives
+        if drive.millivolts is not None
+    ]
+    return found
+
 
 STOP_TIMEOUT_S = 4.0
 RAMP_SLACK_S = 0.7
@@ -109,7 +147,7 @@ class CanopenVehicle:
         told = [
             (
                 self._bus.text(drive.node, *od.DEVICE_NAME) or f"vendor {self._bus.read(drive.node, od.VENDOR):X}h",
-                polling.number(self._bus, drive, od.SERIAL),
+                master.number(self._bus, drive, od.SERIAL),
                 self._bus.text(drive.node, *od.SOFTWARE) or "unknown",
             )
             for drive in self._feedback.drives
@@ -128,7 +166,7 @@ class CanopenVehicle:
         return taken
 
     def examine(self, seconds: float) -> list[Reading]:
-        """How the bus is used in `seconds`, and what the drives tell; see `drivers.vehicle.cia402.health`."""
+        """How the bus is used in `seconds`, and what the drives tell; see `drivers.vehicle.cia402.vehicle`."""
         before = self.statistics.errors.get("other_master", 0)
         with self._bus.listening() as frames:
             self._clock.wait(self._closed, seconds)
@@ -137,7 +175,7 @@ class CanopenVehicle:
         judged = self._clock.rate <= 1.0
         heard = [frame for _, frame in frames]
         drives = self._feedback.drives
-        return health.readings(
+        return readings(
             heard, seconds, self._bitrate, others=others, drives=drives, system_name=self._system_name, judged=judged
         )
 
@@ -145,7 +183,7 @@ class CanopenVehicle:
         """The newest feedback, at most `max_age` s old, else `DeadlineError`."""
         self._bus.check()
         if self._look:
-            polling.ask(self._bus, self._feedback, self._wheels)
+            master.ask(self._bus, self._feedback, self._wheels)
         with self._master.command:
             braked, in_command = self._braked, self._in_command
         if braked and (self._feedback.may_turn() or self._feedback.interruptions != self._interruptions):

@@ -19,7 +19,7 @@ from scipy.stats import chi2
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.poses import difference
 from cell.measure.vision.board.board import board_pose, find_board
-from cell.measure.vision.board.spec import KINDS, Kind
+from cell.measure.vision.board.view import KINDS, Kind
 from cell.measure.vision.pictures import PictureRefused
 from lab.bench.board.conditions import CONDITIONS, Condition, View, draw_view
 from lab.bench.board.render import Lens

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
-from cell.measure.vision.board.spec import DEFAULT_DICTIONARY, MARKER_SHARE, BoardSpec, Kind
+from cell.measure.vision.board.view import DEFAULT_DICTIONARY, MARKER_SHARE, BoardSpec, Kind
 from lab.bench.board.render import Lens, Placed, paint, true_pixels
 
 LENSES = (

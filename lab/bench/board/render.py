@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cell.base.compiled import compiled
 from cell.measure.geometry.camera import Array
-from cell.measure.vision.board.spec import MARKED, BoardSpec
+from cell.measure.vision.board.view import MARKED, BoardSpec
 
 KIND = {"marked_dots": 0, "asymmetric_dots": 1, "dots": 2, "chessboard": 3, "charuco": 4, "aprilgrid": 5}
 SUB = 8

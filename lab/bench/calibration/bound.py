@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.archive import ScanObservation
 from lab.bench.calibration.world import OWN, SHARED, Array, HeadWorld, Noise, seen_dots, seen_rows
 
 STEPS = np.array(

@@ -165,7 +165,7 @@ def _names() -> tuple[str, ...]:
 
 def _parameter_errors(state: Any, world: HeadWorld) -> Array:
     """Errors (21,) of the estimate in the order and the terms of the calibration's covariance."""
-    from cell.measure.calibration.solve.blocks import tangents
+    from cell.measure.calibration.solve.normal import tangents
     from cell.measure.geometry.poses import difference, from_matrix
 
     length = np.linalg.norm(world.plane)

@@ -18,15 +18,14 @@ from cell.measure.calibration import ScanObservation, TargetObservation
 from cell.measure.geometry.poses import from_matrix
 from cell.measure.vision import BoardSpec, BoardView, parse_board
 from cell.measure.vision.stripe.extract import StripeProfile
-from cell.motion.arm_models import HOME, arm_kinematics
-from cell.motion.kinematics import Joints
-from cell.procedures.arm.camera_poses import CalibrationView, scan_calibration_views, target_calibration_views
+from cell.motion.kinematics import HOME, Joints, arm_kinematics
+from cell.procedures.arm.photograph import CalibrationView, scan_calibration_views, target_calibration_views
 from cell.procedures.calibrate.boards import RAIL_MOVE, RAIL_MOVE_VIEWS
 from drivers.link_table import LinkTable
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from sim_backends.optics.camera import CameraOptics
-from sim_backends.world import nominal
-from sim_backends.world.nominal import inverse
+from sim_backends.world import drawing
+from sim_backends.world.drawing import inverse
 from sim_backends.world.scene import Scene, rotation
 
 Array = NDArray[np.float64]
@@ -134,20 +133,20 @@ class ObservedCell:
     def scan_view(self, rest: Rest, carriage: float) -> BoardView:
         """The fine board in a photograph of the scan camera."""
         return self._photo(
-            self._camera_from(rest, self.truth.base_from_fine, carriage), self.truth.scan_lens, nominal.SCAN_SIZE,
+            self._camera_from(rest, self.truth.base_from_fine, carriage), self.truth.scan_lens, drawing.SCAN_SIZE,
             self.fine, self.bend,
         )  # fmt: skip
 
     def target_view(self, rest: Rest) -> BoardView:
         """The large board in a photograph of the target camera."""
         seen = inverse(rest.true @ self.truth.flange_from_target) @ self.truth.base_from_large
-        return self._photo(seen, self.truth.target_lens, nominal.TARGET_SIZE, self.large, 0.0)
+        return self._photo(seen, self.truth.target_lens, drawing.TARGET_SIZE, self.large, 0.0)
 
     def stripe(self, rest: Rest, carriage: float) -> StripeProfile:
         """The laser's stripe on the fine board's plate, one centre per image row."""
         truth = self.truth
         seen = self._camera_from(rest, truth.base_from_fine, carriage)
-        width, height = nominal.SCAN_SIZE
+        width, height = drawing.SCAN_SIZE
         size = np.ptp(self.fine.points()[:, :2], axis=0) + 2 * self.fine.pitch
         normal, at = seen[:3, 2], seen[:3, 3]
         along = np.cross(truth.plane_normal, normal)
@@ -168,7 +167,7 @@ class ObservedCell:
         on = (np.abs(local[:, :2] - centre) < size / 2).all(axis=1)
         columns = np.full(height, np.nan)
         if np.count_nonzero(on) > 10:
-            pixels = _optics(truth.scan_lens, nominal.SCAN_SIZE).project(line[on])
+            pixels = _optics(truth.scan_lens, drawing.SCAN_SIZE).project(line[on])
             pixels = pixels[np.argsort(pixels[:, 1])]
             columns = np.interp(np.arange(height), pixels[:, 1], pixels[:, 0], left=np.nan, right=np.nan)
             columns[(columns < 5) | (columns > width - 6)] = np.nan

@@ -19,13 +19,12 @@ from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.measure.calibration import ScanObservation, TargetObservation
 from cell.measure.calibration.drift.detectability import Change, Detectable
-from cell.measure.calibration.drift.hypotheses import SCAN_DEPTH, SHIFT, TARGET_DEPTH, TURN
-from cell.measure.calibration.solve.blocks import CAMERA, HAND, PLANE, RAIL, tangents
+from cell.measure.calibration.drift.evidence import SCAN_DEPTH, SHIFT, TARGET_DEPTH, TURN
+from cell.measure.calibration.solve.normal import CAMERA, HAND, PLANE, RAIL, tangents
 from cell.measure.geometry.poses import from_matrix
-from cell.procedures.arm.camera_poses import rail_ends, verification_views
-from cell.procedures.verify.looks import CheckObservations, verify
+from cell.procedures.arm.photograph import rail_ends, verification_views
 from cell.procedures.verify.verdict import Verification, at_place
-from cell.procedures.verify.views import SCAN_APPROACHES, TARGET_APPROACHES
+from cell.procedures.verify.views import SCAN_APPROACHES, TARGET_APPROACHES, CheckObservations, verify
 from lab.bench.calibration.observed_cell import ObservedCell, Truth
 from sim_backends.world.scene import draw, rotation
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cell.config.cell_config import load_config
-from cell.measure.vision.board.spec import BoardSpec, parse_board
-from cell.procedures.arm.camera_poses import scan_calibration_views
+from cell.measure.vision.board.view import BoardSpec, parse_board
+from cell.procedures.arm.photograph import scan_calibration_views
 from sim_backends.optics.camera import project_points, undistort_pixels
 from sim_backends.world.levels import NOMINAL
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cell.measure.inversion import Prior
-from cell.measure.inversion.correspondences import Scan
+from cell.measure.inversion.nominal import Scan
 from cell.measure.inversion.registration import register
 from drivers.errors import RefusedError
 from lab.bench.inversion.parts import PARTS, nominal

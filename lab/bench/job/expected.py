@@ -18,15 +18,14 @@ from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
-from cell.measure.calibration.solve.blocks import SHARED, AdjustmentState
 from cell.measure.calibration.solve.joint import solve_joint, solve_staged
-from cell.measure.geometry.covariance import covariance_root
-from cell.measure.geometry.poses import composition_jacobians, transform
+from cell.measure.calibration.solve.normal import SHARED, AdjustmentState
+from cell.measure.geometry.poses import composition_jacobians, covariance_root, transform
 from cell.measure.inversion import NominalSurface
 from cell.measure.reconstruction import Cloud, calibration_motions, flange_motions
 from cell.measure.reconstruction.build import ScanGeometry
 from cell.procedures.part_error import part_points
-from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.interfaces import Vector
 from lab.bench.job.contact import mean_after_contact
 from lab.bench.job.scan_errors import by_pose

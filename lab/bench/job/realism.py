@@ -24,8 +24,7 @@ from lab.bench.job.accuracy import figures
 from lab.bench.job.scan_errors import COVERED
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from lab.bench.over_cores import over_cores
-from sim_backends.world.effects import Effects
-from sim_backends.world.levels import assumed_noise
+from sim_backends.world.levels import Effects, assumed_noise
 
 STOOD_S = 3600.0
 """Between calibration and job."""

@@ -29,9 +29,8 @@ from cell.run.report.truth import SENSOR_POINTS, pose_of
 from drivers.interfaces import Vector
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.models.arm import ArmParams
-from sim_backends.models.arm_joints import JointErrors
-from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
-from sim_backends.world.nominal import inverse
+from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics
+from sim_backends.world.drawing import inverse
 from sim_backends.world.scene import draw
 
 Indices = NDArray[np.intp]

@@ -21,20 +21,18 @@ from cell.measure.calibration import ScanObservation, TargetObservation
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.boards import collect_scan, collect_target
-from cell.procedures.calibrate.edge import with_edge
-from cell.procedures.calibrate.reference_plate import look_at_witness
+from cell.procedures.calibrate.reference_plate import look_at_witness, with_edge
 from cell.procedures.calibrate.timing import look_at_shutter
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.workplace import Workplace
-from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.calibration import arm_table
-from cell.run.faults import classify
 from cell.run.job_run import JobRun
-from cell.run.recorded_work import Hands, RecordedWork
+from cell.run.recorded_work import Hands, RecordedWork, classify
 from cell.run.resumption import mesh_source
-from cell.run.run import Run
+from cell.run.runs import Run
 from drivers.errors import CellError
 from drivers.interfaces import Frame, Vector
 from sim_backends.direct.camera import Shot

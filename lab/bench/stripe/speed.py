@@ -10,8 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.vision.stripe.extract import StripeSettings, extract
-from cell.measure.vision.stripe.stream import StripeStream
+from cell.measure.vision.stripe.extract import StripeSettings, StripeStream, extract
 from lab.bench.stripe.truth import Cell, draw
 
 SHAPE = (1024, 1280)

@@ -23,9 +23,9 @@ from typing import Any
 
 import numpy as np
 
-from cell.devices.simulated.truth_link import TIMEOUT_S
+from cell.devices.simulated.process import TIMEOUT_S
 from cell.procedures.steps.kinds import PLACE
-from cell.run.files.folder import is_going, list_runs
+from cell.run.folder import is_going, list_runs
 from drivers.clock import Clock
 from drivers.errors import CellError
 from statemachine.journal import JournalError, read, request

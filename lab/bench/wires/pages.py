@@ -21,7 +21,7 @@ from typing import Any
 
 from cell.apps.console.host.console import Console
 from cell.procedures.frame_store import FrameStore
-from cell.run.run import Run
+from cell.run.runs import Run
 from cell.run.session.supervisor import Cell
 from drivers.errors import CellError, DeadlineError
 from lab.bench.wires.servo import streamed

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.vision.stripe.stream import StripeStream
+from cell.measure.vision.stripe.extract import StripeStream
 from cell.run.session.supervisor import Cell
 from drivers.arm.child.streaming import pace_of
 from drivers.arm.motion import UrMotion

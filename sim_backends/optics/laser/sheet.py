@@ -1,20 +1,107 @@
 """A light sheet that is not perfect: bowed, fading at its ends, with shadows of dust; and surfaces that mirror it.
 
 The fan's middle is the sheet's direction that is nearest to the camera's axis; y is across it, in the sheet.
-"""
+
+Which points of a light plane's cut the laser reaches and the camera, at the origin of its frame, sees."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_backends.optics.boards import appearance
 from sim_backends.optics.camera import step_on_plane
 from sim_backends.optics.compiled import compiled
 from sim_backends.optics.laser.profile import NARROWEST
-from sim_backends.optics.laser.visibility import laser_frame
-from sim_backends.optics.scene import Grain, LaserOptics
+from sim_backends.optics.scene import Grain, LaserOptics, MeshInstance, SceneObject
 
 Vector = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+TOUCH = 5e-6
+"""Surfaces nearer than this (m) to the lit point do not shade it: it is the surface itself."""
+
+
+@lru_cache(maxsize=64)
+def laser_frame(laser: LaserOptics) -> tuple[Vector, float, Vector]:
+    """Unit normal, distance and origin (moved onto the plane) of the light plane in the camera frame."""
+    normal = np.asarray(laser.normal, dtype=np.float64)
+    length = float(np.linalg.norm(normal))
+    if not 0.5 < length < 2.0:
+        raise ValueError(f"light plane normal {laser.normal}: needs about unit length")
+    normal, distance = normal / length, laser.distance / length
+    origin = np.asarray(laser.origin, dtype=np.float64)
+    return normal, distance, origin - (origin @ normal - distance) * normal
+
+
+def lit(
+    points: Vector, normals: Vector, instance: SceneObject, scene: Sequence[SceneObject], laser: LaserOptics
+) -> Mask:
+    """Which `points` (n, 3) with surface `normals` (n, 3) of `instance` are lit and seen past every object of `scene`.
+
+    A surface is lit and seen when laser and camera are on the same side of it.
+    """
+    normal, _, origin = laser_frame(laser)
+    axis = np.array([0.0, 0.0, 1.0]) - normal[2] * normal
+    points = np.ascontiguousarray(points)
+    seen = facing(points, np.ascontiguousarray(normals), origin, axis / np.linalg.norm(axis), np.cos(laser.fan))
+    for other in scene:
+        if isinstance(other, MeshInstance):
+            pose = np.asarray(other.camera_from_mesh, dtype=np.float64)
+            # A plane that a mesh touches is covered by it; a mesh must not shade itself.
+            start = TOUCH if isinstance(instance, MeshInstance) else -2 * TOUCH
+            local = (points - pose[:3, 3]) @ pose[:3, :3]
+            for eye in (np.zeros(3), origin):
+                other.mesh.hide(local, (eye - pose[:3, 3]) @ pose[:3, :3], start, seen)
+        elif other is not instance:
+            pose, pattern = appearance(other)
+            bounds = np.ascontiguousarray(pattern[4:8])
+            for eye in (np.zeros(3), origin):
+                hide_behind_rectangle(points, eye, np.ascontiguousarray(pose), bounds=bounds, start=TOUCH, seen=seen)
+    return seen
+
+
+@compiled
+def facing(points: Vector, normals: Vector, origin: Vector, axis: Vector, cos_fan: float) -> Mask:
+    """Points in the laser's fan about `axis` whose surface has laser and camera on the same side."""
+    seen = np.zeros(points.shape[0], dtype=np.bool_)
+    for i in range(points.shape[0]):
+        camera, laser, along, span = 0.0, 0.0, 0.0, 0.0
+        for k in range(3):
+            ray = points[i, k] - origin[k]
+            camera += normals[i, k] * points[i, k]
+            laser += normals[i, k] * ray
+            along += axis[k] * ray
+            span += ray * ray
+        seen[i] = camera * laser > 0.0 and along > cos_fan * np.sqrt(span)
+    return seen
+
+
+@compiled
+def hide_behind_rectangle(points: Vector, eye: Vector, pose: Vector, bounds: Vector, start: float, seen: Mask) -> None:
+    """Clear `seen` where the rectangle crosses the way from a point to `eye` more than `start` m from the point."""
+    ends = np.empty((2, 3))
+    for i in range(points.shape[0]):
+        if not seen[i]:
+            continue
+        length = 0.0
+        for k in range(3):
+            ends[0, k], ends[1, k] = 0.0, 0.0
+            for m in range(3):
+                ends[0, k] += pose[m, k] * (points[i, m] - pose[m, 3])
+                ends[1, k] += pose[m, k] * (eye[m] - pose[m, 3])
+            length += (ends[1, k] - ends[0, k]) ** 2
+        if (ends[0, 2] > 0.0) == (ends[1, 2] > 0.0):
+            continue
+        share = ends[0, 2] / (ends[0, 2] - ends[1, 2])
+        x = ends[0, 0] + share * (ends[1, 0] - ends[0, 0])
+        y = ends[0, 1] + share * (ends[1, 1] - ends[0, 1])
+        if bounds[0] < x < bounds[1] and bounds[2] < y < bounds[3] and share * np.sqrt(length) > start:
+            seen[i] = False
+
 
 FADE = 0.1
 """Over this share of its angle the fan fades out."""

@@ -18,8 +18,7 @@ from sim_backends.optics.boards import appearance
 from sim_backends.optics.camera import CameraOptics, distort, distort_jacobian
 from sim_backends.optics.compiled import compiled
 from sim_backends.optics.laser.profile import expose
-from sim_backends.optics.laser.sheet import bend, light_at
-from sim_backends.optics.laser.visibility import laser_frame, lit
+from sim_backends.optics.laser.sheet import bend, laser_frame, light_at, lit
 from sim_backends.optics.pattern import grain_parameters
 from sim_backends.optics.scene import LaserOptics, MeshInstance, PlaneInstance, SceneObject
 

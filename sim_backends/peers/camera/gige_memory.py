@@ -2,6 +2,19 @@
 
 Source: GigE Vision 1.2, "bootstrap registers". All numbers are big-endian; the description (GenICam XML) tells a client
 where each feature is.
+
+Where a simulated GigE Vision camera keeps what: the standard's registers first, its own from 0x10000 on.
+
+Source: GigE Vision 1.2, "bootstrap registers".
+
+Grey pictures in the pixel formats of a GigE Vision camera, as its sensor would send them.
+
+Source: Pixel Format Naming Convention 2.1 and GigE Vision 1.2, "pixel formats". 10 and 12 bits are the grey's 8 with
+noughts below; a colour sensor sees grey as equal parts of its colours.
+
+How a simulated GigE Vision camera describes itself to a client: GenICam XML, written from tables.
+
+Source: GenICam Standard 2.1 (schema 1.1); Standard Features Naming Convention 2.4 for the features' names and units.
 """
 
 from __future__ import annotations
@@ -9,41 +22,184 @@ from __future__ import annotations
 import math
 import socket
 import struct
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sim_backends.models.camera import CameraSpec
-from sim_backends.peers.camera.gige_description import describe
-from sim_backends.peers.camera.gige_pixels import ENCODERS
-from sim_backends.peers.camera.gige_registers import (
-    ACQUISITION,
-    ACQUISITION_MODE,
-    CONTROL,
-    EXPOSURE,
-    FRAME_RATE,
-    GAIN,
-    GAINS_DB,
-    HEARTBEAT,
-    HEIGHT,
-    LEFT,
-    LINE,
-    PACKET_DELAY,
-    PACKET_SIZE,
-    PACKET_SIZES,
-    PAYLOAD,
-    PIXEL_FORMAT,
-    SLOWEST_HZ,
-    SOFTWARE,
-    STREAM_ADDRESS,
-    STREAM_PORT,
-    TIMESTAMP,
-    TIMESTAMP_CONTROL,
-    TOP,
-    TRIGGER_ACTIVATION,
-    TRIGGER_MODE,
-    TRIGGER_SOFTWARE,
-    TRIGGER_SOURCE,
-    WIDTH,
-)
 from sim_backends.peers.camera.gvcp import GvcpRefused, GvcpStatus
+
+CONTROL = 0x0A00
+CONTROLLER_PORT, CONTROLLER_ADDRESS = 0x0A10, 0x0A14
+HEARTBEAT = 0x0938
+TIMESTAMP_CONTROL, TIMESTAMP = 0x0944, 0x0948
+STREAM_PORT, PACKET_SIZE, PACKET_DELAY, STREAM_ADDRESS = 0x0D00, 0x0D04, 0x0D08, 0x0D18
+
+WIDTH, HEIGHT, LEFT, TOP, PIXEL_FORMAT = 0x10000, 0x10004, 0x10008, 0x1000C, 0x10010
+ACQUISITION, ACQUISITION_MODE = 0x10020, 0x10024
+TRIGGER_MODE, TRIGGER_SOURCE, TRIGGER_ACTIVATION, TRIGGER_SOFTWARE = 0x10030, 0x10034, 0x10038, 0x1003C
+EXPOSURE, FRAME_RATE, GAIN, PAYLOAD = 0x10040, 0x10048, 0x10050, 0x10060
+
+SOFTWARE, LINE = 0, 1
+"""Sources of triggers."""
+PACKET_SIZES = (576, 9000)
+GAINS_DB = (0.0, 24.0)
+SLOWEST_HZ = 0.01
+
+
+Grey = NDArray[np.uint8]
+
+
+def _plain(image: Grey) -> bytes:
+    return image.tobytes()
+
+
+def _words(bits: int) -> Callable[[Grey], bytes]:
+    return lambda image: (image.astype("<u2") << (bits - 8)).tobytes()
+
+
+def _packed(bits: int) -> Callable[[Grey], bytes]:
+    """Two pixels in three bytes: high bits of the first, low ones of both, high bits of the second."""
+
+    def encode(image: Grey) -> bytes:
+        values = _pairs(image, 2).astype(np.uint16) << (bits - 8)
+        low = (1 << (bits - 8)) - 1
+        middle = ((values[:, 1] & low) << 4) | (values[:, 0] & low)
+        return np.stack([values[:, 0] >> (bits - 8), middle, values[:, 1] >> (bits - 8)], 1).astype(np.uint8).tobytes()
+
+    return encode
+
+
+def _stream_of_bits(bits: int) -> Callable[[Grey], bytes]:
+    """Pixels one after the other, the lowest bit first."""
+
+    def encode(image: Grey) -> bytes:
+        values = _pairs(image, 4).reshape(-1).astype(np.uint16) << (bits - 8)
+        each = (values[:, None] >> np.arange(bits)) & 1
+        return np.packbits(each.astype(np.uint8).reshape(-1), bitorder="little").tobytes()
+
+    return encode
+
+
+def _triple(image: Grey) -> bytes:
+    return np.repeat(image.reshape(-1), 3).tobytes()
+
+
+def _pairs(image: Grey, group: int) -> Grey:
+    flat = image.reshape(-1)
+    return np.concatenate([flat, np.zeros(-len(flat) % group, np.uint8)]).reshape(-1, group)
+
+
+ENCODERS: dict[int, tuple[str, int, Callable[[Grey], bytes]]] = {
+    0x01080001: ("Mono8", 8, _plain),
+    0x01100003: ("Mono10", 16, _words(10)),
+    0x010C0004: ("Mono10Packed", 12, _packed(10)),
+    0x010A0046: ("Mono10p", 10, _stream_of_bits(10)),
+    0x01100005: ("Mono12", 16, _words(12)),
+    0x010C0006: ("Mono12Packed", 12, _packed(12)),
+    0x010C0047: ("Mono12p", 12, _stream_of_bits(12)),
+    0x01080009: ("BayerRG8", 8, _plain),
+    0x02180014: ("RGB8", 24, _triple),
+}
+"""Format's number → name, bits a pixel, and its bytes from a grey picture."""
+
+
+_TEXTS = (
+    ("DeviceVendorName", 0x48, 32), ("DeviceModelName", 0x68, 32), ("DeviceVersion", 0x88, 32),
+    ("DeviceSerialNumber", 0xD8, 16),
+)  # fmt: skip
+_CHOICES: tuple[tuple[str, int, dict[str, int]], ...] = (
+    ("PixelFormat", PIXEL_FORMAT, {name: code for code, (name, _, _) in ENCODERS.items()}),
+    ("AcquisitionMode", ACQUISITION_MODE, {"Continuous": 0}),
+    ("TriggerMode", TRIGGER_MODE, {"Off": 0, "On": 1}),
+    ("TriggerSource", TRIGGER_SOURCE, {"Software": SOFTWARE, "Line1": LINE}),
+    ("TriggerActivation", TRIGGER_ACTIVATION, {"RisingEdge": 0, "FallingEdge": 1}),
+)
+_COMMANDS = (
+    ("AcquisitionStart", ACQUISITION, 1), ("AcquisitionStop", ACQUISITION, 0),
+    ("TriggerSoftware", TRIGGER_SOFTWARE, 1), ("GevSCPSFireTestPacket", PACKET_SIZE, None),
+)  # fmt: skip
+_UNITS = {EXPOSURE: ("ExposureTime", "us"), FRAME_RATE: ("AcquisitionFrameRate", "Hz"), GAIN: ("Gain", "dB")}
+_FIXED = (
+    '<Enumeration Name="TriggerSelector"><EnumEntry Name="FrameStart"><Value>0</Value></EnumEntry><Value>0</Value>'
+    '</Enumeration><Integer Name="TLParamsLocked"><Value>0</Value><Min>0</Min><Max>1</Max></Integer>'
+)
+_HEAD = (
+    '<?xml version="1.0" encoding="utf-8"?><RegisterDescription ModelName="SimulatedCamera" '
+    'VendorName="simulated" StandardNameSpace="GEV" SchemaMajorVersion="1" SchemaMinorVersion="1" '
+    'SchemaSubMinorVersion="0" MajorVersion="1" '
+    'MinorVersion="0" SubMinorVersion="0" ProductGuid="0" VersionGuid="0" '
+    'xmlns="http://www.genicam.org/GenApi/Version_1_1">'
+)
+
+
+def describe(spec: CameraSpec, reals: dict[int, tuple[float, float]]) -> str:
+    """The camera's description, a GenICam XML of schema 1.1; `reals` are least and most of its real registers."""
+    words = (
+        ("Width", WIDTH, 16, spec.width, 1), ("Height", HEIGHT, 16, spec.height, 1),
+        ("OffsetX", LEFT, 0, spec.width, 1), ("OffsetY", TOP, 0, spec.height, 1),
+        ("PayloadSize", PAYLOAD, 0, 2**31, 1),
+        ("GevSCPSPacketSize", PACKET_SIZE, *PACKET_SIZES, 4), ("GevSCPD", PACKET_DELAY, 0, 2**31, 1),
+    )  # fmt: skip
+    nodes = [_integer(name, address, (low, high, step)) for name, address, low, high, step in words]
+    nodes += [_register("StringReg", name, address, size) for name, address, size in _TEXTS]
+    nodes += [_choice(name, address, entries) for name, address, entries in _CHOICES]
+    nodes.append(_FIXED)
+    nodes += [_command(name, address, value) for name, address, value in _COMMANDS]
+    nodes += [_real(name, unit, address, reals[address]) for address, (name, unit) in _UNITS.items()]
+    names = "".join(f"<pFeature>{name}</pFeature>" for name in (w[0] for w in (*words, *_TEXTS, *_CHOICES)))
+    return f'{_HEAD}<Category Name="Root">{names}</Category>{"".join(nodes)}<Port Name="Device"/></RegisterDescription>'
+
+
+def _integer(name: str, address: int, limits: tuple[int, int, int]) -> str:
+    low, high, step = limits
+    mask = "<LSB>31</LSB><MSB>16</MSB>" if name == "GevSCPSPacketSize" else ""
+    kind = "MaskedIntReg" if mask else "IntReg"
+    return (
+        f'<Integer Name="{name}"><pValue>{name}Reg</pValue><Min>{low}</Min><Max>{high}</Max><Inc>{step}</Inc>'
+        "</Integer>"
+        f"{_register(kind, f'{name}Reg', address, 4, mask)}"
+    )
+
+
+def _choice(name: str, address: int, entries: dict[str, int]) -> str:
+    listed = "".join(
+        f'<EnumEntry Name="{entry}"><Value>{value}</Value></EnumEntry>' for entry, value in entries.items()
+    )
+    return (
+        f'<Enumeration Name="{name}">{listed}<pValue>{name}Reg</pValue></Enumeration>'
+        f"{_register('IntReg', f'{name}Reg', address, 4)}"
+    )
+
+
+def _command(name: str, address: int, value: int | None) -> str:
+    """What writes `value`; None for one bit of a register that is for something else."""
+    if value is None:
+        register = _register("MaskedIntReg", f"{name}Reg", address, 4, "<LSB>0</LSB><MSB>0</MSB>")
+    else:
+        register = _register("IntReg", f"{name}Reg", address, 4)
+    shown = 1 if value is None else value
+    return f'<Command Name="{name}"><pValue>{name}Reg</pValue><CommandValue>{shown}</CommandValue></Command>{register}'
+
+
+def _real(name: str, unit: str, address: int, limits: tuple[float, float]) -> str:
+    least, most = limits
+    return (
+        f'<Float Name="{name}"><pValue>{name}Reg</pValue><Min>{least!r}</Min><Max>{most!r}</Max>'
+        f"<Unit>{unit}</Unit></Float>"
+        f"{_register('FloatReg', f'{name}Reg', address, 8)}"
+    )
+
+
+def _register(kind: str, name: str, address: int, length: int, more: str = "") -> str:
+    sign = "<Sign>Unsigned</Sign>" if kind in ("IntReg", "MaskedIntReg") else ""
+    endian = "" if kind == "StringReg" else "<Endianess>BigEndian</Endianess>"
+    return (
+        f'<{kind} Name="{name}"><Address>0x{address:X}</Address><Length>{length}</Length><AccessMode>RW</AccessMode>'
+        f"<pPort>Device</pPort><Cachable>NoCache</Cachable>{more}{sign}{endian}</{kind}>"
+    )
+
 
 _DESCRIPTION = 0x20000
 _TICKS_PER_SECOND = 10**9

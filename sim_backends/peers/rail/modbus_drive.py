@@ -21,11 +21,11 @@ from pymodbus.pdu.register_message import (
 )
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.rail import FAULTS as RAIL_FAULTS
+from sim_backends.faults import RAIL_FAULTS as FAULTS
+from sim_backends.faults import RAIL_MODEL_FAULTS
 from sim_backends.models.rail import RailModel
-from sim_backends.peers.serial_port import SerialServer
+from sim_backends.peers.server import SerialServer
 
-FAULTS = ("rail.drop_reply", "rail.late_reply", "rail.reset", *RAIL_FAULTS)
 LATE_S = 0.2
 """Wall seconds by which `rail.late_reply` delays every reply."""
 SEARCH_RPM, CREEP_RPM = 600.0, 120.0
@@ -212,7 +212,7 @@ class ModbusPeer(SerialServer):
                 self._late = True
             case "rail.reset":
                 self.drive.reset()
-            case _ if name in RAIL_FAULTS:
+            case _ if name in RAIL_MODEL_FAULTS:
                 self.drive.fault(name)
             case _:
                 raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")

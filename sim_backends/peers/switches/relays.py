@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from sim_backends.peers.serial_port import SerialServer
+from sim_backends.peers.server import SerialServer
 
 COUNT = 8
 """Relays, and inputs, of a board."""

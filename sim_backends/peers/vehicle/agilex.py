@@ -3,7 +3,8 @@
 Encoded here from the protocol's description (docs/reference/protocols.md, section 3), independently of any DBC.
 Feedback keeps its cycles in world time; in a fast world a frame is sent at most once per `_FAST` or `_SLOW` of wall
 time, with the newest values.
-"""
+
+The peer of the vehicle that a drawing has: AgileX v2 unless its wires name another make, or none at all."""
 
 from __future__ import annotations
 
@@ -15,12 +16,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.vehicle import FAULTS as VEHICLE_FAULTS
+from sim_backends.faults import FOREIGN_COMMANDS, SECOND_VEHICLE, VEHICLE_MODEL_FAULTS
+from sim_backends.faults import VEHICLE_FAULTS as FAULTS
 from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams, VehicleReadings
+from sim_backends.peers.vehicle.canopen import CanopenPeer, CanopenSettings
 from sim_backends.peers.vehicle.slcan import CanFrame, SlcanBus
-
-FOREIGN, SECOND = "can.foreign_commands", "can.second_vehicle"
-FAULTS = ("can.bus_off", "can.refused_frames", FOREIGN, SECOND, *VEHICLE_FAULTS)
+from sim_backends.world.world import World
 
 MOTION_COMMAND, BRAKE, MOTION_MODE, VERSION_REQUEST, MODE, CLEAR = 0x111, 0x131, 0x141, 0x411, 0x421, 0x441
 SYSTEM_STATE, MOTION_STATE, MOTION_MODE_STATE, ODOMETRY, BATTERY = 0x211, 0x221, 0x291, 0x311, 0x361
@@ -57,7 +58,7 @@ class AgilexPeer:
         self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
         self._count = 0
         self._others: set[str] = set()
-        """`FOREIGN` and `SECOND`, while they are on the bus."""
+        """`FOREIGN_COMMANDS` and `SECOND_VEHICLE`, while they are on the bus."""
         self._schedule = [_Cyclic(identifier, *entry) for identifier, entry in _CYCLES.items()]
 
     @property
@@ -89,9 +90,9 @@ class AgilexPeer:
             self._bus.drop()
         elif name == "can.refused_frames":
             self._bus.refusing = True
-        elif name in (FOREIGN, SECOND):
+        elif name in (FOREIGN_COMMANDS, SECOND_VEHICLE):
             self._others.add(name)
-        elif name in VEHICLE_FAULTS:
+        elif name in VEHICLE_MODEL_FAULTS:
             self.model.fault(name, self._clock.now())
         else:
             raise ValueError(f"unknown vehicle fault {name!r}; known: {', '.join(FAULTS)}")
@@ -121,11 +122,11 @@ class AgilexPeer:
     def _of_others(self, cyclic: _Cyclic, feedback: VehicleReadings) -> list[CanFrame]:
         """What others put on the bus beside this frame of the vehicle's."""
         frames = []
-        if SECOND in self._others and cyclic.id in (SYSTEM_STATE, MOTION_STATE, ODOMETRY):
+        if SECOND_VEHICLE in self._others and cyclic.id in (SYSTEM_STATE, MOTION_STATE, ODOMETRY):
             left, right = _SECOND_AT_M
             second = replace(feedback, speed=0.0, yaw_rate=0.0, left=left, right=right)
             frames.append(CanFrame(cyclic.id, cyclic.encode(second, self.model.params, self._count)))
-        if FOREIGN in self._others and cyclic.id == MOTION_STATE:
+        if FOREIGN_COMMANDS in self._others and cyclic.id == MOTION_STATE:
             frames.append(CanFrame(MOTION_COMMAND, _FOREIGN_FRAME))
             self._receive(frames[-1])
         return frames
@@ -245,3 +246,41 @@ _CYCLES: dict[int, tuple[float, float, _Encoder]] = {
     BATTERY: (0.500, _SLOW, _battery),
 }
 """Feedback frames: id → (cycle in world s, shortest interval in wall s, encoder)."""
+
+
+class FixedFrame:
+    """No vehicle: nothing to connect to. Its model stands braked where it was set down."""
+
+    endpoint: dict[str, str] = {}  # noqa: RUF012
+
+    def __init__(self, model: VehicleModel) -> None:
+        self._model = model
+
+    def start(self) -> None:
+        """Nothing moves it."""
+
+    def stop(self) -> None:
+        """Nothing to end."""
+
+    def fault(self, name: str) -> None:
+        """It has none: ValueError."""
+        raise ValueError(f"{name}: the arm stands on a fixed frame, there is no vehicle that could have it")
+
+    def clear(self) -> None:
+        """Nothing to clear."""
+
+
+VehiclePeer = AgilexPeer | CanopenPeer | FixedFrame
+
+
+def vehicle_peer(world: World) -> VehiclePeer:
+    """The peer; ValueError for a make that none simulates."""
+    wire = dict(world.scene.drawing.cell.wires.get("vehicle", {"make": "agilex"}))
+    make = wire.pop("make")
+    if make == "agilex":
+        return AgilexPeer(world.vehicle, world.clock)
+    if make == "canopen":
+        return CanopenPeer(world.vehicle, world.clock, CanopenSettings(**wire))
+    if make == "fixed":
+        return FixedFrame(world.vehicle)
+    raise ValueError(f"nothing simulates a vehicle of the make {make!r}")

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from functools import partial
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.vehicle import DRIVER_OVERLOAD, FAULTS, ChassisState, Mode, VehicleModel
+from sim_backends.faults import VEHICLE_MODEL_FAULTS
+from sim_backends.models.vehicle import DRIVER_OVERLOAD, ChassisState, Mode, VehicleModel
 from sim_backends.models.wheel_drive import WheelDrive
 from sim_backends.peers.vehicle.canopen_node import WRONG_VALUE, Abort, CanopenNode, Value
 from sim_backends.peers.vehicle.slcan import CanFrame, SlcanBus
@@ -54,7 +55,7 @@ class CanopenPeer:
     """Serves the bus as slcan adapters at `channel` and lets the vehicle's time pass; see `AgilexPeer`."""
 
     interface = "slcan"
-    FAULTS = ("can.bus_off", "can.node_lost", *FAULTS)
+    FAULTS = ("can.bus_off", "can.node_lost", *VEHICLE_MODEL_FAULTS)
 
     def __init__(self, model: VehicleModel, clock: WorldClock, settings: CanopenSettings) -> None:
         self.model = model
@@ -96,7 +97,7 @@ class CanopenPeer:
             self._bus.drop()
         elif name == "can.node_lost":
             self.drives[0].node.silent = True
-        elif name in FAULTS:
+        elif name in VEHICLE_MODEL_FAULTS:
             self.model.fault(name, self._clock.now())
         else:
             raise ValueError(f"unknown vehicle fault {name!r}; known: {', '.join(self.FAULTS)}")

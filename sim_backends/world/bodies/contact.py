@@ -11,9 +11,9 @@ import threading
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.world import nominal
+from sim_backends.world import drawing
 from sim_backends.world.bodies.surfaces import Surface
-from sim_backends.world.nominal import inverse
+from sim_backends.world.drawing import inverse
 
 Pose = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -46,7 +46,7 @@ class PartContact:
         *,
         world_from_table: Pose | None = None,
         surface_from_part: Pose | None = None,
-        table_height: float = nominal.TABLE_HEIGHT,
+        table_height: float = drawing.TABLE_HEIGHT,
     ) -> None:
         """The table lies at the surface's origin, and the part's frame is the surface's when it is placed, unless
         `world_from_table` and `surface_from_part` say so. Raises ValueError when there is no surface for the part."""
@@ -146,7 +146,7 @@ class PartContact:
 
     def _on_table(self, points: Vector) -> NDArray[np.bool_]:
         made: NDArray[np.bool_] = (
-            np.abs(_moved(points, self._table_from_world)[:, :2]).max(axis=1) <= nominal.TABLE_HALF
+            np.abs(_moved(points, self._table_from_world)[:, :2]).max(axis=1) <= drawing.TABLE_HALF
         )
         return made
 

@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.mesh import Mesh
-from sim_backends.world.bodies.own_surface import OwnSurface, own_surface
-from sim_backends.world.bodies.surfaces import Surface
+from sim_backends.world.bodies.surfaces import OwnSurface, Surface, own_surface
 from sim_backends.world.bodies.surfaces import mesh as drawn_mesh
 from sim_backends.world.bodies.surfaces import surface as named_surface
-from sim_backends.world.drawing import StationDrawing
-from sim_backends.world.nominal import inverse
+from sim_backends.world.drawing import StationDrawing, inverse
 
 _KEPT = 4
 """Meshes with their box trees, which take longer to make than all the rest of a world."""

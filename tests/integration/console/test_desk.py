@@ -16,16 +16,15 @@ import pytest
 from cell.apps.console.host.controller import SOON_S, ConsoleController
 from cell.apps.console.host.observer import _figure
 from cell.apps.console.host.questions import Questions
-from cell.apps.console.server.mailbox import MOST_CLOUDS, Mailbox
-from cell.apps.console.view.facts import cell_facts, jobs
+from cell.apps.console.server.commands import MOST_CLOUDS, Mailbox
+from cell.apps.console.view.readings import cell_facts, jobs
 from cell.apps.console.view.run_view import RunView
 from cell.config.job import job_path, load_job, shipped_jobs
-from cell.run.run import Run
+from cell.run.runs import Run
 from cell.run.session.supervisor import Cell
 from drivers.errors import CellError, ConfigError, InterlockError, LimitError, Measured, RefusedError
-from statemachine.policy import Failure, Outcome
-from statemachine.script import Again
-from statemachine.step import Event
+from statemachine.runner import Again
+from statemachine.step import Event, Failure, Outcome
 from tests.support.console.server import until
 
 STEPS = ("board_photo", "laser_sweep", "reconstruct")
@@ -130,7 +129,7 @@ def test_what_ends_a_held_button_stops_the_motion(
     told: list[str] = []
     moved: Any = getattr(cell.devices, device)
     monkeypatch.setattr(moved.bare, "attended", lambda: nullcontext(lambda: None), raising=False)
-    monkeypatch.setattr("cell.apps.console.host.holding.ATTENDED_S", 60.0)
+    monkeypatch.setattr("cell.apps.console.host.manual.ATTENDED_S", 60.0)
     monkeypatch.setattr(desk, "_say", lambda client, words: told.append(words["state"]))
     desk.do("c1", {"do": "hold", "name": "Ann"})
     desk.do("c1", {"do": "manual", "on": True})
@@ -149,7 +148,7 @@ def test_what_ends_a_held_button_stops_the_motion(
     ends: dict[str, Any] = {
         "release": lambda: desk.jog_end("c1"), "page gone": lambda: desk.left("c1"), "another button": lambda: beat(2),
         "manual off": lambda: desk.do("c1", {"do": "manual", "on": False}),
-        "silence": lambda: monkeypatch.setattr("cell.apps.console.host.holding.ATTENDED_S", 0.0),
+        "silence": lambda: monkeypatch.setattr("cell.apps.console.host.manual.ATTENDED_S", 0.0),
     }  # fmt: skip
     ends[end]()
     assert until(lambda: told == ["moving", "ended"])

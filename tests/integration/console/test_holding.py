@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
-from cell.apps.console.host.holding import LATE_S, Presses
+from cell.apps.console.host.manual import LATE_S, Presses
 from drivers.errors import InterlockError
 from drivers.interfaces import ATTENDED_S
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cell.apps.console.view.archive import Archive
-from cell.run.files.folder import list_runs
+from cell.run.folder import list_runs
 from cell.run.session.supervisor import Cell
 
 

@@ -17,10 +17,10 @@ from cell.apps.cli import main
 from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.view.run_view import RunView
 from cell.devices.simulated.direct import VirtualCell
-from cell.motion.arm_models import HOME
+from cell.motion.kinematics import HOME
 from cell.run import calibration as sessions
 from cell.run.jogging import Jog, jog
-from cell.run.run import Run
+from cell.run.runs import Run
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, RefusedError
 from sim_backends.models.arm import Safety
 from tests.support.console.server import until

@@ -9,9 +9,8 @@ import pytest
 from cell.config.cell_config import load_config
 from cell.devices.contracts import Bench
 from cell.devices.contracts.arm import ArmContract
-from cell.devices.contracts.camera import CameraContract
+from cell.devices.contracts.device import CameraContract, ClawContract, LaserContract
 from cell.devices.contracts.rail import RailContract
-from cell.devices.contracts.switches import ClawContract, LaserContract
 from cell.devices.contracts.vehicle import VehicleContract
 from cell.devices.simulated.direct import VirtualCell
 

@@ -23,11 +23,11 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.run.events import ConfirmNeeded, Held, RunEnded, RunEvent, StepStarted
 from cell.run.job_run import RunOutcome
 from cell.run.record.reading import Parts, said
-from cell.run.run import Run
+from cell.run.runs import Run
 from drivers.errors import Aborted, ConfigError, InterlockError
 from lab.bench.job.whole_job import JobRecord
 from statemachine.journal import request
-from statemachine.script import Script
+from statemachine.runner import Script
 from statemachine.step import Event
 from tests.golden.golden import plain_journal, plain_report
 

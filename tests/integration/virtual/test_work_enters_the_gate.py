@@ -11,13 +11,12 @@ from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.inversion import NominalSurface
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.drive.way import Whereabouts
 from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.workplace import Workplace
 from drivers.errors import Aborted
 from lab.bench.job.whole_job import NoFrames
-from statemachine.cancel import CancelToken
-from statemachine.control import RunControl
+from statemachine.control import CancelToken, RunControl
 from statemachine.step import StepContext
 
 

@@ -11,8 +11,7 @@ import pytest
 
 from cell import Cell
 from cell.apps.cli import main
-from cell.run.files.folder import list_runs
-from cell.run.files.reading import read_report
+from cell.run.folder import list_runs, read_report
 from tests.project.test_readme import block
 from tests.support.wire.cells import Supervised
 

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from drivers.camera.genicam.aravis import AravisMissing, load
 from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import GenicamSetup
+from drivers.camera.genicam.connection import GenicamSetup, Region
 from drivers.camera.genicam.device import GigePlace
-from drivers.camera.genicam.settings import Region
 from drivers.clock import Clock
 from drivers.interfaces import Frame
 from sim_backends.clock import WorldClock

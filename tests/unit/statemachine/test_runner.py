@@ -13,13 +13,11 @@ from dataclasses import replace
 import pytest
 
 from drivers.clock import Clock
-from statemachine.cancel import Cancelled, CancelToken
-from statemachine.control import RunControl
+from statemachine.control import Cancelled, CancelToken, RunControl
 from statemachine.journal import FILE_NAME, Journal, read, request
-from statemachine.policy import Failure, OnFailure, Outcome, Policy, Step
-from statemachine.runner import Runner, StepContext
-from statemachine.script import Again, Script
+from statemachine.runner import Again, Runner, Script, StepContext
 from statemachine.sequence import Sequence
+from statemachine.step import Failure, OnFailure, Outcome, Policy, Step
 from statemachine.watch import SignalWatch
 
 NAMES = ["drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose", "place"]

@@ -6,8 +6,8 @@ import re
 
 import pytest
 
-from statemachine.policy import Policy, Step
 from statemachine.sequence import JobState, JobTrigger, Sequence, SequenceError, mermaid
+from statemachine.step import Policy, Step
 
 STEPS = ("drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose", "place")
 ENDS = (JobState.PLACED, JobState.REFUSED, JobState.FAULTED, JobState.ABORTED)

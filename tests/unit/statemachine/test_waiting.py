@@ -12,19 +12,17 @@ import numpy as np
 import pytest
 
 from cell.config.cell_config import load_config
+from cell.devices.devices import stop_cell
 from cell.devices.simulated.direct import VirtualCell
-from cell.devices.stopping import stop_cell
-from cell.motion.arm_models import HOME
-from cell.run.faults import classify
+from cell.motion.kinematics import HOME
+from cell.run.recorded_work import classify
 from drivers.clock import Clock
 from drivers.errors import Aborted
-from statemachine.cancel import Cancelled
-from statemachine.control import RunControl
+from statemachine.control import Cancelled, RunControl
 from statemachine.journal import Journal, request
-from statemachine.policy import OnFailure, Policy, Step
 from statemachine.runner import Runner, RunResult, StepContext
 from statemachine.sequence import JobState, Sequence
-from statemachine.step import StepCall
+from statemachine.step import OnFailure, Policy, Step, StepCall
 from statemachine.waiting import InLine, Threads, waiting_on
 
 FAR = HOME + np.array([3.0, 0, 0, 0, 0, 0])

@@ -63,9 +63,8 @@ def commission(
     from rich.console import Console
 
     from cell.apps.cli.progress import tell_question
-    from cell.apps.commission.begin import begin, confirms_itself
     from cell.apps.commission.protocol import write_protocol
-    from cell.apps.commission.sequence import CHECKS, chosen
+    from cell.apps.commission.sequence import CHECKS, begin, chosen, confirms_itself
     from drivers.errors import ConfigError
 
     if sim != "all" and (truth is not None or confirm is Confirm.simulated):

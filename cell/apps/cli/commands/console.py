@@ -53,7 +53,7 @@ def console(
     """
     from cell.apps.console.host.console import Address
     from cell.config.cell_config import DEVICES
-    from cell.devices.simulated.mix import simulated_of
+    from cell.devices.simulated.mixed import simulated_of
     from cell.run.session.supervisor import Cell
 
     require_installed()

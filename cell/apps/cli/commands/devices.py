@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cell.apps.cli import completion as completing
+from cell.apps.cli import options as completing
 from cell.apps.cli.options import (
     ConfigOption,
     JobOption,

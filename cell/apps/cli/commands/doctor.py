@@ -17,7 +17,7 @@ def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
 
     Touches no device. Exit code 1 when something is wrong that the configured cell needs; what mends it is beside it.
     """
-    from cell.apps.doctor.examine import examine_computer
+    from cell.apps.doctor import examine_computer
 
     rows = examine_computer(config)
     if json:

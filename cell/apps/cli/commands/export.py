@@ -42,7 +42,7 @@ def export(
     """Write a run's cloud as PLY, E57 or mesh, coloured by its deviation from the nominal surface, in metres."""
     from cell.base.units import parse_quantity
     from cell.config.cell_config import beside, find_config, load_config
-    from cell.run.files.folder import find_run
+    from cell.run.folder import find_run
     from cell.run.report.export import SUFFIXES, export_run
     from drivers.errors import ConfigError
 

@@ -35,7 +35,7 @@ def _group() -> None:
 @app.command()
 def repair(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
     """Close the record of a run that was cut off, so that every reader opens it; a whole one stays as it is."""
-    from cell.run.files.folder import is_going
+    from cell.run.folder import is_going
     from cell.run.record import repair as work
     from drivers.errors import ConfigError
 
@@ -67,7 +67,7 @@ def info(name: RunArgument = None, config: ConfigOption = None, json: JsonOption
     from rich.console import Console
     from rich.table import Table
 
-    from cell.run.record.information import information
+    from cell.run.record.reading import information
 
     path, _ = _record(name, config)
     data = information(path)
@@ -107,7 +107,7 @@ def export(
     json: JsonOption = False,
 ) -> None:
     """Write the raw traffic of a run: CAN in candump's log format, or CAN, serial lines and RTDE as text."""
-    from cell.run.record.export import FORMATS
+    from cell.run.record.reading import FORMATS
     from drivers.errors import ConfigError
 
     path, _ = _record(name, config)
@@ -127,7 +127,7 @@ def export(
 def replay(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
     """Feed a run's frames and readings through perception again: exits 1 unless cloud and pose come out bit for bit."""
     from cell.apps.cli import EXIT_FAILED
-    from cell.run.files.folder import find_run
+    from cell.run.folder import find_run
     from cell.run.record import replay as work
 
     folder = find_run(folder_of_runs(config), name, "job")
@@ -151,7 +151,7 @@ def replay(name: RunArgument = None, config: ConfigOption = None, json: JsonOpti
 
 def _record(name: str | None, config: Path | None) -> tuple[Path, Path | None]:
     """The record of a run, and the run's folder; or a file by its path."""
-    from cell.run.files.folder import find_run
+    from cell.run.folder import find_run
     from cell.run.record.file import FILE
 
     if name is not None and Path(name).suffix == ".mcap":

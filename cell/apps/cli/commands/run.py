@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from cell.apps.cli import completion as completing
+from cell.apps.cli import options as completing
 from cell.apps.cli.commands.runs import NoiseOption, RunArgument, folder_of_runs
 from cell.apps.cli.options import (  # fmt: skip
     CellClock,
@@ -64,7 +64,7 @@ def run(
 
     The vehicle drives only when it is known where it stands: it sees the board, or somebody says --at-start.
     """
-    from cell.procedures.pace import require_share
+    from cell.procedures.arm.moves import require_share
     from cell.run.session.supervisor import Cell
 
     def perform(cell: Cell, display: Observer) -> RunOutcome:
@@ -171,7 +171,7 @@ def resume(
 
     A dry run's world has ended with it: its job is done again in the same simulated world from the start.
     """
-    from cell.run.files.folder import find_run
+    from cell.run.folder import find_run
     from cell.run.resumption import UnfinishedRun
     from cell.run.session.supervisor import Cell
 

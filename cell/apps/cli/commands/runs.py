@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from cell.apps.cli import completion as completing
+from cell.apps.cli import options as completing
 from cell.apps.cli.options import ConfigOption, JsonOption, print_json
 
 RunArgument = Annotated[
@@ -36,7 +36,7 @@ def abort(
     reason: Annotated[str, typer.Option(help="Goes into the report.")] = "asked for with `cell abort`",
 ) -> None:
     """End what is going on in another process (run, calibration, verification, homing, jog): the cell is stopped."""
-    from cell.run.files.folder import list_runs, listens
+    from cell.run.folder import list_runs, listens
     from drivers.errors import ConfigError
 
     going = [run for run in list_runs(_going_folder(config)) if listens(run)] if name is None else []
@@ -83,7 +83,7 @@ def confirm(
     import sys
 
     from cell.apps.cli import EXIT_FAILED
-    from cell.run.files.reading import awaited_word
+    from cell.run.folder import awaited_word
     from drivers.errors import ConfigError
 
     folder = _going(name, config)
@@ -111,7 +111,7 @@ def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: 
 
 
 def _going(name: str | None, config: Path | None) -> Path:
-    from cell.run.files.folder import find_going
+    from cell.run.folder import find_going
 
     return find_going(_going_folder(config), name)
 
@@ -119,8 +119,7 @@ def _going(name: str | None, config: Path | None) -> Path:
 def runs(config: ConfigOption = None, json: JsonOption = False) -> None:
     """List what was run, newest last, a line each: when, what, how it ended, how long it took, and why."""
     from cell.apps.cli.display import print_runs
-    from cell.run.files.folder import list_runs
-    from cell.run.files.reading import run_row
+    from cell.run.folder import list_runs, run_row
 
     rows = [run_row(folder) for folder in list_runs(folder_of_runs(config))]
     if json:
@@ -143,8 +142,7 @@ def report(
 ) -> None:
     """Show the report of a run."""
     from cell.apps.cli.display import print_report
-    from cell.run.files.folder import find_run
-    from cell.run.files.reading import read_report
+    from cell.run.folder import find_run, read_report
     from drivers.errors import ConfigError
 
     if out is not None and not html:

@@ -50,12 +50,12 @@ def init(
 
 def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption = False) -> None:
     """Read the configuration and the job and say what is wrong with them; touches no device."""
-    from cell.apps.console.view.meshes import link_meshes
-    from cell.check.contact import contact_notes
+    from cell.apps.console.view.scene import link_meshes
     from cell.check.fit import require_fit
+    from cell.check.place import contact_notes
     from cell.config.cell_config import DEVICES, beside, example_addresses, find_config, load_config, require_confirm
     from cell.config.job import job_path, load_job
-    from cell.devices.simulated.mix import require_possible
+    from cell.devices.simulated.mixed import require_possible
     from cell.run.report.figures import simulated_words
     from drivers.errors import ConfigError
 

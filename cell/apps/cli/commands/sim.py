@@ -69,7 +69,7 @@ def fill(config: ConfigOption = None, job: JobOption = "pot") -> None:
     """
     from cell.config.cell_config import find_config, load_config
     from cell.devices.simulated.described import Described
-    from cell.devices.simulated.truth_link import make_ready
+    from cell.devices.simulated.process import make_ready
     from drivers.errors import ConfigError
 
     loaded, described = load_config(find_config(config)), Described.of(job)

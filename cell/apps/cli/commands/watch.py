@@ -39,7 +39,7 @@ def watch(
     from rich.live import Live
     from rich.text import Text
 
-    from cell.apps.watch.watch import watching
+    from cell.apps.watch import watching
     from cell.config.cell_config import beside, find_config, load_config
 
     source = find_config(config, simulated=True)

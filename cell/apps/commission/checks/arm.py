@@ -10,7 +10,7 @@ import pinocchio as pin
 from cell.apps.commission.check import CommissionCheck, Finding, Result
 from cell.apps.commission.workplace import CommissionWorkplace
 from cell.measure.geometry.poses import from_ur
-from cell.motion.arm_models import HOME
+from cell.motion.kinematics import HOME
 from drivers.errors import LimitError
 from drivers.interfaces import Vector
 

@@ -10,10 +10,8 @@ import numpy as np
 import pinocchio as pin
 
 from cell.apps.commission.check import CommissionCheck, Finding, Result
-from cell.apps.commission.measuring import measure
-from cell.apps.commission.mounting import RoughMounting, against_drawing
-from cell.apps.commission.seeing import Eye, eye_of, find_view
-from cell.apps.commission.workplace import CommissionWorkplace
+from cell.apps.commission.measuring import RoughMounting, against_drawing, measure
+from cell.apps.commission.workplace import CommissionWorkplace, Eye, eye_of, find_view
 from cell.measure.vision import BoardSpec
 from drivers.interfaces import Image
 

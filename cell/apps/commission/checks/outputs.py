@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cell.apps.commission.check import CommissionCheck, Finding, Result
-from cell.apps.commission.seeing import camera_of, centred_view, eye_of
-from cell.apps.commission.workplace import CommissionWorkplace
+from cell.apps.commission.workplace import CommissionWorkplace, camera_of, centred_view, eye_of
 from cell.makes.built_in import OnArm
 from cell.measure.vision import extract
 from drivers.errors import RefusedError

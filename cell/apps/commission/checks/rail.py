@@ -7,9 +7,8 @@ import math
 import numpy as np
 
 from cell.apps.commission.check import CommissionCheck, Finding, Result
-from cell.apps.commission.seeing import centred_view, eye_of, see
-from cell.apps.commission.workplace import CommissionWorkplace
-from cell.makes.records import RailConfig
+from cell.apps.commission.workplace import CommissionWorkplace, centred_view, eye_of, see
+from cell.makes.make import RailConfig
 from drivers.errors import DeviceFault, LimitError, RefusedError
 from drivers.interfaces import Nudged, Vector
 

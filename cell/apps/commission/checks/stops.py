@@ -11,7 +11,7 @@ import numpy as np
 
 from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.workplace import CommissionWorkplace
-from cell.procedures.drive.approach import Planar, RelativeOdometry, drive_line
+from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line
 from cell.run.recorded_work import Hands
 from drivers.errors import Aborted, CellError, InterlockError
 from drivers.interfaces import ArmSafety, Motion

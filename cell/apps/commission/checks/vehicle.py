@@ -10,14 +10,14 @@ import pinocchio as pin
 
 from cell.apps.commission.check import CommissionCheck, Finding, Result
 from cell.apps.commission.checks.cameras import PITCH_OFF, renamed
-from cell.apps.commission.mounting import axes_from_shifts
+from cell.apps.commission.measuring import axes_from_shifts
 from cell.apps.commission.workplace import CommissionWorkplace
 from cell.config.calibrations.store import nominal_camera
 from cell.config.job import job_path, ships
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import BoardSpec, board_pose, find_board, parse_board
-from cell.procedures.arm.camera_poses import look_pose
-from cell.procedures.drive.approach import Planar, RelativeOdometry, drive_line
+from cell.procedures.arm.photograph import look_pose
+from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line
 from drivers.errors import CellError, DeviceFault, RefusedError
 
 WAY, SPEED = 0.050, 0.050

@@ -21,13 +21,13 @@ from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.host.link import ServerProcess
 from cell.apps.console.host.observer import CellObserver
 from cell.apps.console.messages import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, ServerSetup
-from cell.apps.console.view.facts import cell_facts
+from cell.apps.console.view.readings import cell_facts
 from cell.config.job import load_job
 from cell.procedures.steps.kinds import find_kind
 from cell.run.job_run import RunOutcome
-from cell.run.run import Run
+from cell.run.runs import Run
 from drivers.errors import CellError, ConfigError, InterlockError
-from statemachine.script import Script
+from statemachine.runner import Script
 
 if TYPE_CHECKING:
     from cell.run.session.supervisor import Cell

@@ -12,19 +12,18 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from cell.apps.console.host.holding import Press, Presses
-from cell.apps.console.host.manual import Manual
+from cell.apps.console.host.manual import Manual, Press, Presses
 from cell.apps.console.host.questions import Questions
 from cell.apps.console.host.rehearsal import Rehearsals
+from cell.apps.console.server.access import Holders
 from cell.apps.console.server.commands import checked_command, checked_message
-from cell.apps.console.server.holders import Holders
 from cell.config.job import load_job, require_job_name
 from cell.devices.diagnosis.diagnosis import ask
 from cell.devices.gate.gate import Gated
 from cell.procedures.steps.kinds import find_kind
 from cell.procedures.verify.verdict import Verification
 from cell.run.jogging import Jog
-from cell.run.run import Run
+from cell.run.runs import Run
 from drivers.errors import CellError, InterlockError
 
 if TYPE_CHECKING:

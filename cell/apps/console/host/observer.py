@@ -13,17 +13,15 @@ from typing import TYPE_CHECKING, Any
 from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.messages import CloudPart, Happened, Show, ShownPicture
 from cell.apps.console.view.archive import true_error_mm
-from cell.apps.console.view.pictures import GrowingCloud, Pictures
 from cell.apps.console.view.readings import Readings
-from cell.apps.console.view.run_view import RunView
-from cell.apps.console.view.scene_now import SceneNow
+from cell.apps.console.view.run_view import GrowingCloud, Pictures, RunView
+from cell.apps.console.view.scene import SceneNow
 from cell.base.lateness import busy_words
 from cell.config.job import load_job
 from cell.measure.geometry.poses import from_ur
 from cell.procedures.steps.kinds import find_kind
-from cell.run.files.folder import list_runs
-from cell.run.files.reading import read_report
-from cell.run.run import Run
+from cell.run.folder import list_runs, read_report
+from cell.run.runs import Run
 from drivers.errors import CellError
 
 if TYPE_CHECKING:

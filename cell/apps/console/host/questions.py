@@ -7,10 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 from cell.apps.console.view.run_view import RunView
-from cell.run.run import Run
+from cell.run.runs import Run
 from drivers.errors import ConfigError, Measured, RefusedError
-from statemachine.policy import Failure
-from statemachine.script import Again, Script
+from statemachine.runner import Again, Script
+from statemachine.step import Failure
 
 LOOK_S = 0.05
 CONFIRM, AGAIN, ABORT = "confirm", "again", "abort"

@@ -14,8 +14,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from cell.apps.console.messages import Beat, Joined, Left
 from cell.apps.console.server.access import Bucket
-from cell.apps.console.server.commands import checked_message
-from cell.apps.console.server.mailbox import Mailbox
+from cell.apps.console.server.commands import Mailbox, checked_message
 from drivers.errors import ConfigError
 
 VERSION = 1

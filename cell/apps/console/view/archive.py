@@ -1,4 +1,8 @@
-"""The runs of a cell as the page lists them; read from their folders, for whoever asks."""
+"""The runs of a cell as the page lists them; read from their folders, for whoever asks.
+
+How the cell moved in a run, by its `record.mcap`: for the replay with a slider.
+
+Run as a module by the server, in a process of its own: `python -m cell.apps.console.view.archive FILE`."""
 
 from __future__ import annotations
 
@@ -13,12 +17,65 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from cell.apps.console.view.recorded import moves
+from cell.apps.console.host.rehearsal import end_with_parent
 from cell.base.toml_file import below
-from cell.run.files.folder import list_runs
-from cell.run.files.reading import read_report, run_row
+from cell.run.folder import list_runs, read_report, run_row
 from cell.run.record.file import FILE
+from cell.run.record.reading import Parts, messages, said
 from drivers.errors import CellError
+
+JOINTS, VEHICLE, EVENT = "/joints", "/vehicle/state", "/sequence/event"
+RAIL = "rail"
+PERIOD_S, MOST = 0.1, 40_000
+"""Seconds between two moments that are kept, and how many are at most: more than an hour."""
+
+
+def moves(record: Path) -> bool:
+    """Whether a record tells where the arm was, so that it can be replayed."""
+    try:
+        return next(said(record, Parts(), (JOINTS,)), None) is not None
+    except (CellError, OSError):
+        return False
+
+
+def motion(record: Path) -> dict[str, Any]:
+    """Ten times a second from the record's beginning, as docs/reference/console.md has it: joints in rad, rail in m,
+    vehicle in m and rad; None where not told yet. Raises `CellError` for a file that is no record."""
+    told = sorted(messages(record, (JOINTS, VEHICLE, EVENT)), key=lambda message: message[1])
+    begun = told[0][1] if told else 0
+    rows: list[tuple[float, Any, Any, Any]] = []
+    steps: list[dict[str, Any]] = []
+    joints: list[float] | None = None
+    rail: float | None = None
+    vehicle: list[float] | None = None
+    for topic, at, message in told:
+        now = round(1e-9 * (at - begun), 3)
+        if topic == EVENT:
+            if message["kind"] == "step_started":
+                steps.append({"name": message["step"], "begin": now, "end": None})
+            elif message["kind"] in ("step_done", "step_failed") and steps:
+                steps[-1]["end"] = now
+            continue
+        if topic == VEHICLE:
+            vehicle = [round(float(message[key]), 5) for key in ("x", "y", "yaw")]
+        elif [joint.name for joint in message.joints] == [RAIL]:
+            rail = round(message.joints[0].position, 6)
+        else:
+            joints = [round(joint.position, 5) for joint in message.joints if joint.name != RAIL]
+        row = now, joints, rail, vehicle
+        # The newest of each tenth of a second.
+        if rows and int(rows[-1][0] / PERIOD_S) == int(now / PERIOD_S):
+            rows[-1] = row
+        elif len(rows) < MOST:
+            rows.append(row)
+    columns = [list(column) for column in zip(*rows, strict=True)] or [[], [], [], []]
+    return {**dict(zip(("times", "joints", "rail", "vehicle"), columns, strict=True)), "steps": steps}
+
+
+if __name__ == "__main__":
+    end_with_parent()
+    print(json.dumps(motion(Path(sys.argv[1]))))
+
 
 RUN = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
 PICTURE = re.compile(r"[\w][\w.+-]*\.png")
@@ -117,7 +174,7 @@ class Archive:
         kept = Path(self._pages.name) / f"{name}.json"
         with self._drawing:
             if not kept.exists():
-                read = self._printed("-m", "cell.apps.console.view.recorded", str(folder / FILE))
+                read = self._printed("-m", "cell.apps.console.view.archive", str(folder / FILE))
                 if read is None:
                     return None
                 # A run that goes on is read anew each time.

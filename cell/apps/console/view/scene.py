@@ -2,7 +2,12 @@
 
 Made once for a configuration and a job. Whoever draws it turns the joints, shifts the carriage and places the station
 as the readings say; nothing here moves. Lengths are in m, poses 16 numbers of a 4×4 matrix, row after row.
-"""
+
+Pictures of the links: a folder of meshes that the 3-D scene shows in place of the planner's capsules.
+
+They are for the eye only; the planner keeps apart what it kept apart before.
+
+What a run has told of the place, the part and the arm's way, in the arm's base: for drawing, beside `scene`."""
 
 from __future__ import annotations
 
@@ -15,19 +20,100 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.apps.console.view.meshes import LINKS, coarser, link_meshes
-from cell.config.cell_config import CellConfig
+from cell.base.toml_file import below
+from cell.config.cell_config import CellConfig, deck_plates, mounted, station_obstacles, vehicle_obstacles
 from cell.config.job import Job, load_job
-from cell.config.mounting import deck_plates, mounted
-from cell.config.obstacles import station_obstacles, vehicle_obstacles
-from cell.makes.records import CameraConfig
+from cell.devices.gate.interlocks import Situation
+from cell.makes.make import CameraConfig
 from cell.measure.inversion.nominal import read_mesh
 from cell.measure.vision import parse_board
-from cell.measure.vision.board.spec import centre_of
-from cell.motion.arm_models import HOME, arm_kinematics
-from cell.motion.bodies import Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
-from cell.procedures.arm.camera_poses import base_from_place_at_target
+from cell.measure.vision.board.view import centre_of
+from cell.motion.collision import PLACED, Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
+from cell.motion.kinematics import HOME, arm_kinematics
+from cell.procedures.arm.photograph import base_from_place_at_target
+from drivers.errors import ConfigError
+from drivers.interfaces import Vector
 from drivers.link_table import LinkTable
+
+LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+"""Fixed to the base, then to what each joint turns."""
+NAMES = (*LINKS, "flange", "vehicle")
+KINDS = (".stl", ".ply", ".obj")
+MOST_TRIANGLES = 8_000
+"""A finer mesh is drawn coarser."""
+SMALLEST_M, LARGEST_M = 0.005, 5.0
+
+
+def link_meshes(folder: Path) -> list[dict[str, Any]]:
+    """The files of `folder` as JSON objects: `on`, one of `NAMES`, flat `vertices` in m and `triangles`.
+
+    Raises `ConfigError` for a folder that is not there, a file of another name, two of one name, and one that is no
+    mesh in metres.
+    """
+    try:
+        files = sorted(path for path in folder.iterdir() if below(folder, path.name) and not path.name.startswith("."))
+    except OSError as error:
+        raise ConfigError(
+            f"cell.meshes: the folder {folder} cannot be read ({error.strerror}); create it or remove the line"
+        ) from error
+    found: dict[str, Path] = {}
+    for path in files:
+        if path.suffix.lower() not in KINDS:
+            continue
+        if path.stem not in NAMES:
+            raise ConfigError(
+                f"cell.meshes: {path} belongs to no link; the names are {', '.join(NAMES)} with {', '.join(KINDS)}"
+            )
+        if path.stem in found:
+            raise ConfigError(
+                f"cell.meshes: {path.name} and {found[path.stem].name} in {folder} are the same link; keep one"
+            )
+        found[path.stem] = path
+    if not found:
+        raise ConfigError(
+            f"cell.meshes: {folder} holds no mesh; the names are {', '.join(NAMES)} with {', '.join(KINDS)}"
+        )
+    return [_drawn(name, path) for name, path in found.items()]
+
+
+def _drawn(name: str, path: Path) -> dict[str, Any]:
+    import trimesh
+
+    try:
+        mesh = trimesh.load_mesh(path, process=True)
+        vertices, triangles = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+    except Exception as error:  # every reader of trimesh raises its own
+        raise ConfigError(f"cell.meshes: {path} cannot be read as a mesh; export it as STL, PLY or OBJ") from error
+    if vertices.ndim != 2 or not len(triangles) or not np.isfinite(vertices).all():
+        raise ConfigError(
+            f"cell.meshes: {path} holds {len(triangles)} triangles, or corners that are not numbers; export it again"
+        )
+    size = float(np.ptp(vertices, axis=0).max())
+    if not SMALLEST_M <= size <= LARGEST_M:
+        raise ConfigError(
+            f"cell.meshes: {path} measures {size:.3g} m (allowed: {SMALLEST_M:g} to {LARGEST_M:g} m); export it in "
+            "metres"
+        )
+    points, faces = coarser(vertices, triangles)
+    return {"on": name, "vertices": points.round(5).ravel().tolist(), "triangles": faces.ravel().tolist()}
+
+
+def coarser(
+    vertices: NDArray[np.float64], triangles: NDArray[np.int64], most: int = MOST_TRIANGLES
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The mesh of vertices (n, 3) m and triangles (m, 3), or one of at most `most`: one vertex for all in a cube."""
+    edge = float(np.ptp(vertices, axis=0).max()) / 512
+    points, faces = vertices, triangles
+    while len(faces) > most:
+        cubes = np.floor((vertices - vertices.min(axis=0)) / edge).astype(np.int64)
+        _, owner = np.unique(cubes @ np.array([1, 1 << 20, 1 << 40]), return_inverse=True)
+        count = np.bincount(owner)
+        points = np.column_stack([np.bincount(owner, weights=vertices[:, axis]) / count for axis in range(3)])
+        faces = owner[triangles]
+        apart = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+        faces, edge = faces[apart], 1.5 * edge
+    return points, faces
+
 
 ON_RAIL = "scan head"
 """The body that the rail moves; the planner keeps free all that it sweeps over."""
@@ -143,3 +229,49 @@ def numbers(pose: pin.SE3) -> list[float]:
 
 def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
     return [float(v) for v in np.asarray(values).round(9)]
+
+
+MOST_POINTS = 80
+"""Points of a way that are drawn."""
+
+
+class SceneNow:
+    """Reads a cell's interlocks, which planner and steps tell; called by one thread, keeps nobody waiting."""
+
+    def __init__(self) -> None:
+        self._way: Vector | None = None
+        self._path: dict[str, Any] | None = None
+        self._count = 0
+        # The same table that the planner is given, at the place's own frame.
+        self._table = station_bodies(pin.SE3.Identity(), pin.SE3.Identity())[0]
+
+    def as_dict(self, situation: Situation) -> dict[str, Any]:
+        """`place` (base_from_place) once the board was measured, `part` (base_from_part) once it was let go, each 16
+        numbers or None, and `path`, the flange's points (m) on the way that the arm follows now, or None."""
+        told = {body.name: body for body in situation.station}
+        return {
+            "place": self._place(told.get(self._table.name)),
+            "part": _part(told.get(PLACED)),
+            "path": self._followed(situation),
+        }
+
+    def _place(self, table: Body | None) -> list[float] | None:
+        return None if table is None else numbers(table.placement * self._table.placement.inverse())
+
+    def _followed(self, situation: Situation) -> dict[str, Any] | None:
+        way, motion = situation.way, situation.last
+        if way is None or motion is None or motion.done:
+            return None
+        if way is not self._way:
+            self._way, self._count = way, self._count + 1
+            chosen = np.linspace(0, len(way) - 1, min(len(way), MOST_POINTS)).round().astype(int)
+            points = [situation.forward(joints).translation.round(4).tolist() for joints in way[chosen]]
+            self._path = {"n": self._count, "points": points}
+        return self._path
+
+
+def _part(placed: Body | None) -> list[float] | None:
+    """The part's frame lies in its mating face, half its height below the body's middle."""
+    if placed is None:
+        return None
+    return numbers(placed.placement * pin.SE3(np.eye(3), np.array([0.0, 0.0, -0.5 * placed.size[2]])))

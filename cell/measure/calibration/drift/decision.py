@@ -1,7 +1,7 @@
 """How good is a stored calibration today? One decision from a view of each deck board and a sweep over the fine one.
 
 Every part of the chain that may have changed is a hypothesis against none
-(`cell.measure.calibration.drift.hypotheses`). Their mean Bayes factor is the statistic; what it exceeds by chance is
+(`cell.measure.calibration.drift.evidence`). Their mean Bayes factor is the statistic; what it exceeds by chance is
 found by drawing scores from their own covariance, so that a good calibration is called disturbed in `FALSE_ALARMS` of
 all checks. The most probable part is named. What a good verdict is worth is said by
 `cell.measure.calibration.drift.detectability`.
@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 
 from cell.measure.calibration.drift.detectability import Detectable, detectable
-from cell.measure.calibration.drift.evidence import DriftEvidence
-from cell.measure.calibration.drift.hypotheses import Hypothesis, hypotheses, log_factor, log_mean
-from cell.measure.calibration.solve.blocks import BOARD, PLANE, RAIL, SHARED, AdjustmentState
+from cell.measure.calibration.drift.evidence import DriftEvidence, Hypothesis, hypotheses, log_factor, log_mean
+from cell.measure.calibration.solve.normal import BOARD, PLANE, RAIL, SHARED, AdjustmentState
 from cell.measure.calibration.solve.results import PARAMETERS
 from cell.measure.geometry.camera import Array
-from cell.measure.geometry.covariance import covariance_root
+from cell.measure.geometry.poses import covariance_root
 
 FALSE_ALARMS = 0.03
 WORST_FIT = 1.6

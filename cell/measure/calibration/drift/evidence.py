@@ -2,25 +2,36 @@
 
 The observations are predicted from the calibration. What the arm's repeatability, the rail's reading, the noise and the
 calibration's own covariance explain of the misfit is taken out; what is left speaks for a change since.
-"""
+
+What a calibration leaves behind so that it can be verified later: where its board was, and how sure all of it is.
+
+What may have changed in a calibrated chain, and how strongly a score speaks for each of these changes.
+
+A hypothesis is a Gaussian change of about `SHIFT` or `TURN` of some parameters of one camera's chain; against it stands
+that nothing changed. Scores and information are those of `cell.measure.calibration.drift.evidence`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
+import pinocchio as pin
 import scipy
 from numpy.typing import NDArray
 
-from cell.measure.calibration.drift.reference import Reference
-from cell.measure.calibration.observations import ScanObservation
-from cell.measure.calibration.solve.blocks import (
+from cell.measure.calibration.archive import ScanObservation
+from cell.measure.calibration.solve.adjustment import Adjusted
+from cell.measure.calibration.solve.normal import (
     BOARD,
     CAMERA,
     COLUMNS,
     FLANGE,
+    HAND,
+    PLANE,
     POSITION,
+    RAIL,
     SHARED,
     AdjustmentState,
     ViewData,
@@ -28,6 +39,68 @@ from cell.measure.calibration.solve.blocks import (
     stripe_block,
 )
 from cell.measure.geometry.camera import Array
+from cell.measure.geometry.poses import from_matrix
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The board in the arm's base, and the covariance (27, 27) of everything that the calibration estimated.
+
+    The covariance is in the order of `cell.measure.calibration.solve.normal` (camera, light plane, rail, hand-eye,
+    board), zero where nothing was estimated, and allows for the scatter that was found. `arm_translation` (m),
+    `arm_rotation` (rad) and `rail` (m) are the standard deviations per axis of a flange pose and of a rail reading: as
+    configured, or as found where that was more. `dots_scale` and `stripe_scale` multiply the stated σ of dots and
+    stripe.
+    """
+
+    base_from_board: pin.SE3
+    covariance: Array
+    arm_translation: float
+    arm_rotation: float
+    rail: float
+    dots_scale: float
+    stripe_scale: float
+
+    @classmethod
+    def of(cls, adjusted: Adjusted) -> Self:
+        """Of a joint adjustment."""
+        excess = {name: max(1.0, adjusted.excess.get(name, 1.0)) for name in ("shift", "turn", "rail")}
+        priors = adjusted.priors
+        return cls(
+            adjusted.state.base_from_board,
+            adjusted.reliable_covariance,
+            priors.arm_translation * excess["shift"],
+            arm_rotation=priors.arm_rotation * excess["turn"],
+            rail=priors.rail * excess["rail"],
+            dots_scale=priors.dots_scale,
+            stripe_scale=priors.stripe_scale,
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """For storage."""
+        return {
+            "base_from_board": self.base_from_board.homogeneous.tolist(),
+            "covariance": self.covariance.tolist(),
+            "sigma": {"arm_translation": self.arm_translation, "arm_rotation": self.arm_rotation, "rail": self.rail},
+            "scale": {"dots": self.dots_scale, "stripe": self.stripe_scale},
+        }
+
+    @classmethod
+    def read(cls, data: dict[str, Any] | None) -> Self | None:
+        """From storage, None for None; KeyError, TypeError or ValueError when it is not one."""
+        if data is None:
+            return None
+        sigma, scale = data["sigma"], data["scale"]
+        return cls(
+            from_matrix(data["base_from_board"]),
+            np.array(data["covariance"], dtype=np.float64).reshape(SHARED, SHARED),
+            float(sigma["arm_translation"]),
+            arm_rotation=float(sigma["arm_rotation"]),
+            rail=float(sigma["rail"]),
+            dots_scale=float(scale["dots"]),
+            stripe_scale=float(scale["stripe"]),
+        )
+
 
 # The lens model itself is no better than this; it keeps few-thousandths noise from making a test of the model.
 LEAST_DOTS_PX = 0.02
@@ -155,3 +228,63 @@ def _white(residual: Array, jacobian: Array, sigma: Array, index: NDArray[np.int
     wide[:, index[SHARED:-1]] = jacobian[:, FLANGE]
     wide[:, index[-1:]] = jacobian[:, POSITION]
     return residual / sigma, wide / sigma[:, None]
+
+
+SHIFT, TURN = 0.2e-3, float(np.deg2rad(0.05))
+"""The disturbance that has to be found, m and rad."""
+SCAN_DEPTH, TARGET_DEPTH = 0.13, 0.65
+"""Where a shift of a focal length counts, m in front of the camera."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A change of parameters `index` of one camera's chain, of about `size` each; `part` is what a person would fix."""
+
+    part: str
+    index: tuple[int, ...]
+    size: tuple[float, ...]
+
+
+def hypotheses(chain: str, focal: float) -> list[Hypothesis]:
+    """What may change in the chain of the "scan" or the "target" camera of `focal` length in px."""
+    hand = range(HAND.start, HAND.stop)
+    mount, lens = f"{chain} camera's mount on the flange", f"{chain} camera's lens"
+    depth = SCAN_DEPTH if chain == "scan" else TARGET_DEPTH
+    made = [
+        Hypothesis(mount, tuple(hand[:3]), (SHIFT,) * 3),
+        Hypothesis(mount, tuple(hand[3:]), (TURN,) * 3),
+        Hypothesis(lens, (2, 3), (TURN * focal,) * 2),
+        Hypothesis(lens, (0, 1), (SHIFT / depth * focal,) * 2),
+    ]
+    if chain == "scan":
+        plane, rail = range(PLANE.start, PLANE.stop), range(RAIL.start, RAIL.stop)
+        made += [
+            Hypothesis("laser's light plane", tuple(plane), (TURN, TURN, SHIFT)),
+            Hypothesis("rail", tuple(rail), (TURN,) * 3),
+        ]
+    return made
+
+
+def log_factor(weighed: DriftEvidence, h: Hypothesis, scores: Array) -> Array:
+    """Logarithms (n,) of the Bayes factor for a Gaussian change of size `h.size` against none, for scores (n, 27)."""
+    gain, offset = quadratic(weighed, h)
+    s = scores[:, list(h.index)]
+    return np.asarray(0.5 * np.einsum("ni,ij,nj->n", s, gain, s, optimize=True) + offset, dtype=np.float64)
+
+
+def quadratic(weighed: DriftEvidence, h: Hypothesis) -> tuple[Array, float]:
+    """The matrix A (k, k) and the number c for which ½ sᵀA s + c is that logarithm for the score s of `h.index`.
+
+    With the change's covariance P and its information F these are (P⁻¹ + F)⁻¹ and −½ log det(1 + F P).
+    """
+    index, size = list(h.index), np.array(h.size)
+    information = weighed.information[np.ix_(index, index)] * size[:, None] * size
+    posterior = np.eye(len(index)) + information
+    gain = np.linalg.inv(posterior) * size[:, None] * size
+    return np.asarray(0.5 * (gain + gain.T)), -0.5 * float(np.linalg.slogdet(posterior)[1])
+
+
+def log_mean(factors: Array) -> Array:
+    """Logarithm (n,) of the mean of exp over the last axis of (n, k)."""
+    most = factors.max(axis=1)
+    return np.asarray(most + np.log(np.mean(np.exp(factors - most[:, None]), axis=1)), dtype=np.float64)

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
+from cell.measure.calibration.archive import ScanObservation
 from cell.measure.calibration.drift.evidence import dots_of
-from cell.measure.calibration.observations import ScanObservation
-from cell.measure.calibration.solve.blocks import BOARD, POSITION, AdjustmentState, dots_block
+from cell.measure.calibration.solve.normal import BOARD, POSITION, AdjustmentState, dots_block
 from cell.measure.calibration.solve.results import ScanCalibration
 from cell.measure.calibration.timing import Shutter, StampTiming
 from cell.measure.geometry.camera import Array

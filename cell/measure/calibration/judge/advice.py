@@ -15,12 +15,11 @@ import pinocchio as pin
 
 from cell.measure.calibration.judge.coverage import Coverage
 from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
-from cell.measure.calibration.solve.blocks import AdjustmentState, ViewData
 from cell.measure.calibration.solve.joint import Joint
-from cell.measure.geometry.camera import Array
-from cell.measure.geometry.circles import seen_centres
+from cell.measure.calibration.solve.normal import AdjustmentState, ViewData
+from cell.measure.geometry.camera import Array, seen_centres
 from cell.measure.geometry.poses import from_parts, transform
-from cell.measure.vision.board.spec import BoardSpec
+from cell.measure.vision.board.view import BoardSpec
 
 STEEP = np.deg2rad(28.0)
 SLIGHT = np.deg2rad(12.0)

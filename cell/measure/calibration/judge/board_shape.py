@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.measure.calibration.solve.adjustment import Adjustment
-from cell.measure.calibration.solve.blocks import CAMERA, FLANGE, AdjustmentState
+from cell.measure.calibration.solve.normal import CAMERA, FLANGE, AdjustmentState
 from cell.measure.geometry.camera import Array
 
 SHAPES = 3

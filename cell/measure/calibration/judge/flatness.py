@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.archive import ScanObservation
 from cell.measure.calibration.solve.adjustment import Adjustment
-from cell.measure.calibration.solve.blocks import AdjustmentState
 from cell.measure.calibration.solve.choice import Solution
 from cell.measure.calibration.solve.joint import Staged
+from cell.measure.calibration.solve.normal import AdjustmentState
 from cell.measure.calibration.solve.starts import stripe_pixels
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.light_plane import LightPlane

@@ -13,8 +13,8 @@ from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.solve.intrinsics import Intrinsics
 from cell.measure.calibration.solve.starts import robust_plane, stripe_pixels
 from cell.measure.geometry.camera import Array, CameraModel
-from cell.measure.geometry.covariance import covariance_root
 from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import covariance_root
 from cell.measure.vision.board.board import board_pose
 from cell.measure.vision.board.view import BoardView
 from cell.measure.vision.stripe.extract import StripeProfile

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.calibration.solve.blocks import (
+from cell.measure.calibration.solve.normal import (
     CAMERA,
     COLUMNS,
     FLANGE,
@@ -25,12 +25,14 @@ from cell.measure.calibration.solve.blocks import (
     RAIL,
     SHARED,
     AdjustmentState,
+    Block,
+    Inverse,
+    Normal,
     ViewData,
     dots_block,
     rests_of,
     stripe_block,
 )
-from cell.measure.calibration.solve.normal import Block, Inverse, Normal
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.poses import difference
 

@@ -12,13 +12,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.archive import ScanObservation
 from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
-from cell.measure.calibration.solve.blocks import CAMERA, PLANE, SHARED, ViewData
-from cell.measure.calibration.solve.closed_form import closed_form
 from cell.measure.calibration.solve.intrinsics import Intrinsics
 from cell.measure.calibration.solve.joint import Staged, start_state, view_data
-from cell.measure.calibration.solve.left_out import LeftOut, Mask, leave_out
+from cell.measure.calibration.solve.left_out import LeftOut, Mask, closed_form, leave_out
+from cell.measure.calibration.solve.normal import CAMERA, PLANE, SHARED, ViewData
 from cell.measure.geometry.camera import Array
 
 TRUSTS = (1.0, 0.3, 0.1)

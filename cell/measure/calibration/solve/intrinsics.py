@@ -14,8 +14,8 @@ import pinocchio as pin
 
 from cell.measure.calibration.judge.board_shape import Bend, bend_of, untold_by_bend
 from cell.measure.calibration.solve.adjustment import DISTORTION_PRIOR, Adjustment, Priors
-from cell.measure.calibration.solve.blocks import CAMERA, SHARED, AdjustmentState, ViewData
 from cell.measure.calibration.solve.left_out import LeftOut, leave_out
+from cell.measure.calibration.solve.normal import CAMERA, SHARED, AdjustmentState, ViewData
 from cell.measure.calibration.solve.starts import zhang
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.vision.board.board import board_pose

@@ -9,10 +9,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.measure.calibration.judge.board_size import BoardSize
-from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.archive import ScanObservation
+from cell.measure.calibration.judge.scale import BoardSize
 from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
-from cell.measure.calibration.solve.blocks import (
+from cell.measure.calibration.solve.bow import with_bow
+from cell.measure.calibration.solve.normal import (
     CAMERA,
     COLUMNS,
     HAND,
@@ -22,10 +23,15 @@ from cell.measure.calibration.solve.blocks import (
     rests_of,
     stripe_block,
 )
-from cell.measure.calibration.solve.bow import with_bow
-from cell.measure.calibration.solve.hand_eye import HandEye, solve_hand_eye
 from cell.measure.calibration.solve.paper_steps import PaperPlane, paper_plane, step_2_one_coordinate_system
-from cell.measure.calibration.solve.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels
+from cell.measure.calibration.solve.starts import (
+    HandEye,
+    PlaneStart,
+    plane_from_board,
+    solve_hand_eye,
+    stripe_means,
+    stripe_pixels,
+)
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision.board.board import board_pose

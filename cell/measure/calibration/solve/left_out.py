@@ -2,29 +2,40 @@
 
 Says how well the others predict a view, and by how much each parameter scatters between the calibrations that lack one
 view (jackknife): a deviation that needs no model of the noise. For views that are rests of their own.
-"""
+
+The closed form with each frame left out in turn: what the joint adjustment has to beat."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment
-from cell.measure.calibration.solve.blocks import (
+from cell.measure.calibration.archive import ScanObservation
+from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment, Priors
+from cell.measure.calibration.solve.joint import Staged, start_state
+from cell.measure.calibration.solve.normal import (
+    BOARD,
     CAMERA,
     FLANGE,
+    HAND,
     OWN,
+    PLANE,
     SHARED,
     AdjustmentState,
     ViewData,
     dots_block,
     stripe_block,
+    tangents,
 )
+from cell.measure.calibration.solve.starts import robust_plane, solve_hand_eye, stripe_pixels
 from cell.measure.geometry.camera import Array
-from cell.measure.geometry.poses import perturbed, transform
+from cell.measure.geometry.poses import difference, perturbed, transform
+from cell.measure.vision.stripe_on_board import on_plane
+from drivers.errors import RefusedError
 
 Mask = NDArray[np.bool_]
 BEST_POSE_STEPS = 3
@@ -142,3 +153,87 @@ def predicted(view: ViewData, flange: pin.SE3, other: AdjustmentState) -> list[f
 def _rms(values: Array) -> float:
     known = np.asarray(values)[~np.isnan(values)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedForm:
+    """The closed form as an adjustment would return it, and how the others predict each frame."""
+
+    adjusted: Adjusted
+    left: LeftOut
+
+
+def closed_form(
+    observations: Sequence[ScanObservation], staged: Staged, views: list[ViewData], free: Mask
+) -> ClosedForm:
+    """Hand-eye and light plane of all frames, and of all but one, with the same camera."""
+    flanges, boards = [o.base_from_flange for o in observations], staged.camera_from_board
+    clouds = points_on_boards(staged, observations)
+    state = replace(start_state(staged), flanges=flanges, rails=np.zeros(len(views)))
+    states = [_without(state, k, flanges, boards, clouds) for k in range(len(views))]
+    figures = np.array(
+        [
+            [np.inf] * 4 if other is None else predicted(view, flange_seen(state, board), other)
+            for view, other, board in zip(views, states, boards, strict=True)
+        ]
+    )
+    steps = np.array([np.zeros(SHARED) if other is None else _step(state, other) for other in states])
+    apart = steps - steps.mean(axis=0)
+    covariance = (len(views) - 1) / len(views) * apart.T @ apart
+    if any(other is None for other in states):
+        covariance = np.diag(np.full(SHARED, np.inf))
+    dots_px, stripe_m, board_m, squares = figures.T
+    known = [other or state for other in states]
+    left = LeftOut(
+        known, dots_px, stripe_m, board_m, squares=squares, covariance=covariance, by_held=np.zeros((SHARED, SHARED))
+    )
+    seen = replace(state, flanges=[flange_seen(state, board) for board in boards])
+    dots, stripe = Adjustment(views, free, Priors()).residual_rms(seen)
+    nothing = np.zeros((SHARED, SHARED))
+    return ClosedForm(Adjusted(state, nothing, float("nan"), dots, stripe, priors=Priors(), iterations=0), left)
+
+
+def flange_seen(state: AdjustmentState, camera_from_board: pin.SE3) -> pin.SE3:
+    """The flange pose at which the board would be seen where it is seen."""
+    return state.base_from_board * (state.flange_from_camera * camera_from_board).inverse()
+
+
+def points_on_boards(staged: Staged, observations: Sequence[ScanObservation]) -> list[Array]:
+    """The stripe's points (n, 3) on the boards in the camera frame in m, of each observation."""
+    made = []
+    for k, o in enumerate(observations):
+        rows = None if staged.plane is None else staged.plane.rows[k]
+        if rows is None or o.profile is None or not len(rows):
+            made.append(np.zeros((0, 3)))
+        else:
+            made.append(on_plane(staged.camera, staged.camera_from_board[k], stripe_pixels(o.profile, rows)))
+    return made
+
+
+def _without(
+    state: AdjustmentState, k: int, flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], clouds: Sequence[Array]
+) -> AdjustmentState | None:
+    """The closed form of all frames but one; None where the others give none."""
+    rest = [j for j in range(len(flanges)) if j != k]
+    try:
+        hand_eye = solve_hand_eye([flanges[j] for j in rest], [boards[j] for j in rest])
+    except RefusedError:
+        return None
+    lit = [clouds[j] for j in rest if len(clouds[j])]
+    plane = state.plane
+    if plane is not None and lit:
+        plane = robust_plane(np.concatenate(lit))[0]
+    return replace(
+        state, plane=plane, flange_from_camera=hand_eye.flange_from_camera, base_from_board=hand_eye.base_from_board
+    )
+
+
+def _step(whole: AdjustmentState, other: AdjustmentState) -> Array:
+    """The step (27,) from one state to another: hand-eye, board and plane."""
+    step = np.zeros(SHARED)
+    step[HAND] = difference(other.flange_from_camera, whole.flange_from_camera)
+    step[BOARD] = difference(other.base_from_board, whole.base_from_board)
+    if whole.plane is not None and other.plane is not None:
+        a, b = tangents(whole.plane.n)
+        step[PLANE] = other.plane.n @ a, other.plane.n @ b, other.plane.distance - whole.plane.distance
+    return step

@@ -1,26 +1,33 @@
-"""What a calibration gives: the scan head's and the target camera's, with their covariance and residuals."""
+"""What a calibration gives: the scan head's and the target camera's, with their covariance and residuals.
+
+A camera's calibration from its observations: closed form, joint adjustment, and what refuses the result."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
 import pinocchio as pin
 
-from cell.measure.calibration.drift.reference import Reference
-from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, PlateLine, Pointing, turned
-from cell.measure.calibration.drift.roll import rolled
-from cell.measure.calibration.solve.blocks import HAND, SHARED, AdjustmentState
+from cell.measure.calibration.archive import ScanObservation, TargetObservation
+from cell.measure.calibration.drift.evidence import Reference
+from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, PlateLine, Pointing, rolled, turned
+from cell.measure.calibration.judge.faults import refuse_bent, refuse_exchanged, refuse_slipped
+from cell.measure.calibration.judge.hand_eye_checks import joint_checks
+from cell.measure.calibration.judge.scale import board_size
+from cell.measure.calibration.solve.adjustment import Adjustment, Priors
 from cell.measure.calibration.solve.bow import FLAT
-from cell.measure.calibration.solve.joint import Joint, effective_hand_eye_covariance
+from cell.measure.calibration.solve.joint import Joint, Staged, effective_hand_eye_covariance, solve_joint, solve_staged
+from cell.measure.calibration.solve.normal import HAND, SHARED, AdjustmentState
 from cell.measure.calibration.timing import Shutter, StampTiming
 from cell.measure.geometry.camera import Array, CameraModel
-from cell.measure.geometry.covariance import covariance_root
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.geometry.poses import from_matrix, from_parts
+from cell.measure.geometry.poses import covariance_root, from_matrix, from_parts
 from cell.measure.reconstruction.build import ScanGeometry
+from cell.measure.vision.board.board import board_pose
+from drivers.errors import RefusedError
 
 PARAMETERS = (
     "fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "plane tilt a", "plane tilt b", "plane distance",
@@ -59,7 +66,7 @@ class ScanCalibration:
 
     `rail_direction` (3,): metres that the camera moves, in its own axes, per metre of rail reading (direction times
     scale). `flange_from_camera` holds at rail position 0. `covariance` (21, 21) in the order of `PARAMETERS`; the light
-    plane's tilts are about the tangents of `cell.measure.calibration.solve.blocks.tangents`, the hand-eye's are
+    plane's tilts are about the tangents of `cell.measure.calibration.solve.normal.tangents`, the hand-eye's are
     (translation, rotation) in flange axes. `reference` is what a verification compares with; files of older programs
     have none. `bow_sigma` is one standard deviation of the sheet's bow, 0 where it is taken as flat, and `bow_gain`
     (21,) how the other parameters follow the bow; `covariance` has that in it. `notes` are for people: what is not as
@@ -271,3 +278,61 @@ def _camera_dict(camera: CameraModel) -> dict[str, Any]:
 def _camera(data: dict[str, Any]) -> CameraModel:
     model = CameraModel(int(data["width"]), int(data["height"]), 1.0, fy=1.0, cx=0.0, cy=0.0)
     return model.with_parameters(data["parameters"])
+
+
+def calibrate_scan(
+    observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
+) -> ScanCalibration:
+    """Closed form and joint adjustment; raises `RefusedError` when the observations do not determine it."""
+    return ScanCalibration.of(adjust_scan(observations, nominal, rail_direction, priors))
+
+
+def adjust_scan(
+    observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
+) -> Joint:
+    """The joint adjustment of the scan head; observations of one rest share what the arm's repeatability made there."""
+    staged = solve_staged(observations, nominal, rail_direction)
+    return _solve(observations, staged, priors, camera="scan", board="fine", nominal=nominal)
+
+
+def calibrate_target(
+    observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors
+) -> TargetCalibration:
+    """The same for a camera without laser and rail."""
+    return TargetCalibration.of(adjust_target(observations, nominal, priors))
+
+
+def adjust_target(observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors) -> Joint:
+    """The joint adjustment of a camera without laser and rail."""
+    same = [ScanObservation(o.view, None, o.base_from_flange, 0.0, o.name) for o in observations]
+    return _solve(same, solve_staged(same, nominal, stripe=False), priors, "target", board="large", nominal=nominal)
+
+
+def _solve(
+    observations: Sequence[ScanObservation],
+    staged: Staged,
+    priors: Priors,
+    camera: str,
+    board: str,
+    nominal: CameraModel,
+) -> Joint:
+    """The joint adjustment, after and before the checks for faults that have a name, and the absolute ones."""
+    rests = [o for o in observations if not o.same_rest]
+    names = [o.name for o in rests]
+    if all(o.view is not None for o in rests):
+        refuse_exchanged(names, [o.base_from_flange for o in rests], staged.camera_from_board)
+    joint = solve_joint(observations, staged, priors)
+    refuse_bent(board, joint.adjusted, joint.views)
+    seen = [o.view for o in rests if o.view is not None]
+    if len(seen) == len(rests):
+        poses = [board_pose(view, joint.adjusted.state.camera).camera_from_board for view in seen]
+        alone = [view for view in joint.views if not view.same_rest]
+        refuse_slipped(camera, names, joint.adjusted, alone, poses)
+    pitch = next(o.view.spec.pitch for o in observations if o.view is not None)
+    problem = Adjustment(joint.views, joint.free, joint.adjusted.priors)
+    size = board_size(board, pitch, problem, joint.adjusted)
+    size.require()
+    wrong = [check.text for check in joint_checks(joint, nominal) if check.verdict == "refused"]
+    if wrong:
+        raise RefusedError(f"the {camera} camera's calibration: {'; '.join(wrong)}")
+    return replace(joint, adjusted=size.allowed_for(joint.adjusted), size=size)

@@ -2,12 +2,17 @@
 
 The stripe points that are chosen here are those that the joint adjustment uses. The paper's own way to the plane is in
 `paper_steps`.
-"""
+
+Hand-eye in closed form: where a camera sits on the flange, or where it stands when the board is on the flange.
+
+Park and Martin's rotation, then one linear system for everything that is a translation, the rail's included. A start
+for the joint adjustment, and an answer by itself when only poses are given."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -16,6 +21,7 @@ from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import difference, from_parts, mean, perturbed
 from cell.measure.vision.board.view import BoardView
 from cell.measure.vision.stripe.extract import StripeProfile
 from cell.measure.vision.stripe_on_board import on_plane, points_on_board
@@ -145,3 +151,144 @@ def stripe_means(profile: StripeProfile, rows: NDArray[np.intp], count: int) -> 
     pixels = stripe_pixels(profile, rows)
     means = [np.bincount(member, weight * pixels[:, axis]) / total for axis in (0, 1)]
     return np.column_stack(means), 1 / np.sqrt(total)
+
+
+LEAST_TURN = np.deg2rad(2.0)
+LEAST_AXES_SINE = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class HandEye:
+    """flange_from_camera (at rail position 0), the rail's travel per metre of reading (3,) in camera axes, the board.
+
+    `scatter_m` and `scatter_rad`: RMS, over the views, of how far the board of one view lies from `base_from_board`.
+    """
+
+    flange_from_camera: pin.SE3
+    rail_direction: Array
+    base_from_board: pin.SE3
+    scatter_m: float
+    scatter_rad: float
+
+
+def park_martin(base_from_flange: Sequence[pin.SE3], camera_from_board: Sequence[pin.SE3]) -> Array:
+    """Rotation (3, 3) flange_from_camera from pairs of poses, from the rotation vectors of all relative motions.
+
+    Raises RefusedError when the flange was not turned about two different axes.
+    """
+    moment = np.zeros((3, 3))
+    axes = []
+    for i, j in combinations(range(len(base_from_flange)), 2):
+        hand = pin.log3(base_from_flange[j].rotation.T @ base_from_flange[i].rotation)
+        eye = pin.log3(camera_from_board[j].rotation @ camera_from_board[i].rotation.T)
+        if LEAST_TURN < np.linalg.norm(hand) < 0.95 * np.pi and np.linalg.norm(eye) < 0.98 * np.pi:
+            moment += np.outer(eye, hand)
+            axes.append(hand)
+    spread = np.linalg.svd(np.array(axes), compute_uv=False) if len(axes) > 1 else np.zeros(2)
+    if spread[1] < LEAST_AXES_SINE * max(spread[0], 1e-9) or spread[0] == 0:
+        raise RefusedError(
+            f"{len(base_from_flange)} views turn the flange about one axis at most; hand-eye needs turns of more than "
+            f"{np.degrees(LEAST_TURN):.0f}° about two different axes"
+        )
+    u, _, vt = np.linalg.svd(moment)
+    return np.asarray(vt.T @ np.diag([1.0, 1.0, float(np.linalg.det(vt.T @ u.T))]) @ u.T, dtype=np.float64)
+
+
+def solve_hand_eye(
+    base_from_flange: Sequence[pin.SE3],
+    camera_from_board: Sequence[pin.SE3],
+    rail: Sequence[float] | None = None,
+    nominal_direction: Array | None = None,
+) -> HandEye:
+    """Hand-eye of a camera on the flange that sees a board at rest, from pairs of poses.
+
+    With rail readings in m that differ, the rail's direction and scale are solved too; else `nominal_direction` holds.
+    """
+    rotation = park_martin(base_from_flange, camera_from_board)
+    readings = np.zeros(len(base_from_flange)) if rail is None else np.asarray(rail, dtype=np.float64)
+    with_rail = np.ptp(readings) > 1e-3
+    nominal = np.zeros(3) if nominal_direction is None else np.asarray(nominal_direction, dtype=np.float64)
+    rows, right = [], []
+    for flange, board, s in zip(base_from_flange, camera_from_board, readings, strict=True):
+        # base position of the board's origin: R_F (R_X c + s m + t) + t_F = b, linear in m, t and b.
+        known = board.translation if with_rail else board.translation + s * nominal
+        m_part = s * flange.rotation if with_rail else np.zeros((3, 3))
+        rows.append(np.hstack([flange.rotation, -np.eye(3), m_part]))
+        right.append(-flange.rotation @ rotation @ known - flange.translation)
+    solution = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
+    direction = rotation.T @ solution[6:] if with_rail else nominal
+    flange_from_camera = from_parts(solution[:3], rotation)
+    return _scatter(base_from_flange, camera_from_board, readings, flange_from_camera, direction)
+
+
+def refine_hand_eye(
+    base_from_flange: Sequence[pin.SE3], camera_from_board: Sequence[pin.SE3], start: HandEye, balance: float = 0.3
+) -> tuple[HandEye, Array, Array]:
+    """Hand-eye and board together by robust least squares on the poses; 1 rad counts like `balance` m.
+
+    Also the deviations (6,) of the hand-eye, m and rad, by leaving each pair out in turn, and how far (n,) in m each
+    left-out pair puts the board from where the others do. For pairs of poses without pictures; where there are
+    pictures the joint adjustment does better. The rail rests.
+    """
+    hand_eye, board = start.flange_from_camera, start.base_from_board
+    weight = np.array([1.0, 1.0, 1.0, balance, balance, balance])
+
+    def residuals(x: pin.SE3, b: pin.SE3) -> Array:
+        return np.array(
+            [difference(f * x * c, b) * weight for f, c in zip(base_from_flange, camera_from_board, strict=True)]
+        )
+
+    for _ in range(30):
+        here = residuals(hand_eye, board)
+        columns = []
+        for k in range(12):
+            d = np.zeros(12)
+            d[k] = 1e-6
+            moved = residuals(perturbed(hand_eye, d[:6]), perturbed(board, d[6:]))
+            columns.append(((moved - here) / 1e-6).ravel())
+        size = np.linalg.norm(here, axis=1)
+        robust = 1 / (1 + (size / (2 * np.median(size) + 1e-12)) ** 2)
+        root = np.repeat(np.sqrt(robust), 6)
+        design, right = np.column_stack(columns) * root[:, None], -here.ravel() * root
+        step = np.linalg.lstsq(design, right, rcond=None)[0]
+        hand_eye, board = perturbed(hand_eye, step[:6]), perturbed(board, step[6:])
+        if np.abs(step).max() < 1e-12:
+            break
+    count = len(base_from_flange)
+    found = _scatter(base_from_flange, camera_from_board, np.zeros(count), hand_eye, start.rail_direction)
+    blocks, rights = design.reshape(count, 6, 12), right.reshape(count, 6)
+    whole, pull = design.T @ design, design.T @ right
+    steps = np.array(
+        [np.linalg.lstsq(whole - j.T @ j, pull - j.T @ r, rcond=None)[0] for j, r in zip(blocks, rights, strict=True)]
+    )
+    off = np.array(
+        [
+            np.linalg.norm(difference(f * perturbed(hand_eye, d[:6]) * c, perturbed(board, d[6:]))[:3])
+            for f, c, d in zip(base_from_flange, camera_from_board, steps, strict=True)
+        ]
+    )
+    spread = steps[:, :6] - steps[:, :6].mean(axis=0)
+    return found, np.sqrt((count - 1) / count * np.sum(spread**2, axis=0)), off
+
+
+def _scatter(
+    base_from_flange: Sequence[pin.SE3],
+    camera_from_board: Sequence[pin.SE3],
+    rail: Array,
+    flange_from_camera: pin.SE3,
+    direction: Array,
+) -> HandEye:
+    boards = [
+        f * flange_from_camera * from_parts(s * direction) * c
+        for f, c, s in zip(base_from_flange, camera_from_board, rail, strict=True)
+    ]
+    middle = mean(boards)
+    apart = np.array([difference(b, middle) for b in boards])
+    squares = np.mean(apart**2, axis=0)
+    return HandEye(
+        flange_from_camera,
+        direction,
+        middle,
+        float(np.sqrt(squares[:3].sum())),
+        float(np.sqrt(squares[3:].sum())),
+    )

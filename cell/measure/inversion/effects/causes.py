@@ -16,11 +16,10 @@ import pinocchio as pin
 
 from cell.measure.geometry.poses import perturbed
 from cell.measure.inversion.closest import Array
-from cell.measure.inversion.correlated_errors import PATCH_M
-from cell.measure.inversion.correspondences import Scan, correspondences
 from cell.measure.inversion.effects.rocking import LARGEST_OVERTONES
-from cell.measure.inversion.nominal import NominalSurface
-from cell.measure.inversion.start_poses import across
+from cell.measure.inversion.nominal import NominalSurface, Scan, correspondences
+from cell.measure.inversion.place_pose import PATCH_M
+from cell.measure.inversion.registration import across
 from cell.measure.reconstruction.cloud import Cloud
 
 GATE_M, MOST_POINTS = 1.5e-3, 30_000

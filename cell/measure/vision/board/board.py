@@ -19,9 +19,8 @@ from cell.measure.vision.board.charuco import find_charuco
 from cell.measure.vision.board.chess import find_chessboard
 from cell.measure.vision.board.dot_board import find_dots
 from cell.measure.vision.board.outliers import without_outliers
-from cell.measure.vision.board.spec import DOTS, BoardSpec
 from cell.measure.vision.board.tags import find_tags
-from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.board.view import DOTS, BoardSpec, BoardView
 from cell.measure.vision.pictures import Image, PictureRefused, Reason, check_picture
 
 STEPS = 30

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
 from cell.measure.vision.board.chess import LEAST_CORNERS, LEAST_SIGMA_PX
-from cell.measure.vision.board.corner_fit import fit_corners
+from cell.measure.vision.board.corners import fit_corners
 from cell.measure.vision.board.ends import check_hidden_sides, smoothed
-from cell.measure.vision.board.plane_map import PlaneMap
-from cell.measure.vision.board.spec import BoardSpec, propose_counts
-from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.board.lattice import PlaneMap
+from cell.measure.vision.board.view import BoardSpec, BoardView, propose_counts
 from cell.measure.vision.pictures import Image, PictureRefused, Reason
 
 LEAST_MARKERS = 3

@@ -11,13 +11,11 @@ import scipy
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
-from cell.measure.vision.board.corner_fit import WINDOW_SHARE, fit_corners
-from cell.measure.vision.board.corners import Corners, corner_lattices, find_corners
+from cell.measure.vision.board.corners import WINDOW_SHARE, Corners, corner_lattices, find_corners, fit_corners
 from cell.measure.vision.board.ends import check_chess_ends, grey
 from cell.measure.vision.board.identify import Places, by_outline
-from cell.measure.vision.board.plane_map import PlaneMap
-from cell.measure.vision.board.spec import BoardSpec
-from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.board.lattice import PlaneMap
+from cell.measure.vision.board.view import BoardSpec, BoardView
 from cell.measure.vision.pictures import Image, PictureRefused, Reason, only_one
 
 LEAST_CORNERS = 6

@@ -12,10 +12,8 @@ from cell.measure.geometry.camera import Array
 from cell.measure.vision.board.dots import find_blobs, measure_dots, tell_dots
 from cell.measure.vision.board.ends import check_dot_ends
 from cell.measure.vision.board.identify import LEAST_SHARE, identify
-from cell.measure.vision.board.lattice import Blobs, Places, dot_lattices
-from cell.measure.vision.board.plane_map import PlaneMap
-from cell.measure.vision.board.spec import BoardSpec
-from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.board.lattice import Blobs, Places, PlaneMap, dot_lattices
+from cell.measure.vision.board.view import BoardSpec, BoardView
 from cell.measure.vision.pictures import Image, PictureRefused, Reason, counts_of, only_one, percentile
 
 LEAST_SIGMA_PX = 0.004

@@ -11,8 +11,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
-from cell.measure.vision.board.plane_map import PlaneMap
-from cell.measure.vision.board.spec import BoardSpec
+from cell.measure.vision.board.lattice import PlaneMap
+from cell.measure.vision.board.view import BoardSpec
 from cell.measure.vision.pictures import Image, PictureRefused, Reason
 
 # Share of the places along a side that have to show its end, and how many further points contradict it.

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
-from cell.measure.vision.board.spec import BoardSpec
+from cell.measure.vision.board.view import BoardSpec
 from cell.measure.vision.pictures import PictureRefused, Reason
 
 Places = NDArray[np.intp]

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
 from cell.measure.vision.board.charuco import best_dictionary
-from cell.measure.vision.board.spec import BoardSpec, propose_counts
-from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.board.view import BoardSpec, BoardView, propose_counts
 from cell.measure.vision.pictures import Image, PictureRefused, Reason
 
 LEAST_TAGS = 4

@@ -10,7 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from cell.run.files.reading import read_report
+from cell.run.folder import read_report
 from cell.run.report.figures import noise_rows, simulated_words
 from cell.run.report.page import facts
 from cell.run.report.page.maps import map_picture, view_data

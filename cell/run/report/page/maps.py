@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from cell.run.report.page.scanned import Scanned
-from cell.run.report.panels import frame_map, square_means
+from cell.run.report.pictures import frame_map, square_means
 from drivers.interfaces import Vector
 
 MOST_POINTS = 20_000

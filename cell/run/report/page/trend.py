@@ -8,8 +8,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from cell.run.files.folder import list_runs
-from cell.run.files.reading import read_report
+from cell.run.folder import list_runs, read_report
 from drivers.errors import CellError
 
 MOST = 30

@@ -2,15 +2,112 @@
 
 Names and types follow the maker's RTDE guide. What the simulated arm has nothing of, currents, temperatures, the tool's
 connector, is zero or a usual value.
-"""
+
+The controller's general purpose registers, and the arm's state as RTDE shows it.
+
+Recipes of RTDE: which variables a data packet carries, and how they are packed and unpacked."""
 
 from __future__ import annotations
 
 import math
+import re
+import struct
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 
-from sim_backends.models.arm import Power
-from sim_backends.peers.arm.rtde.registers import BITS, REGISTERS, RegisterView
+import numpy as np
+
+from sim_backends.models.arm import ArmModel, Power, Safety
+from sim_backends.models.arm_kinematics import Matrix, Vector, pose_from_matrix
+
+REGISTERS = 48
+BITS = 128
+
+
+class Registers:
+    """General purpose registers; a program reads the inputs and writes the outputs."""
+
+    def __init__(self) -> None:
+        self.int_in = [0] * REGISTERS
+        self.double_in = [0.0] * REGISTERS
+        self.int_out = [0] * REGISTERS
+        self.double_out = [0.0] * REGISTERS
+        self.bits_in = [False] * BITS
+        self.bits_out = [False] * BITS
+        self.commands = 0
+        """How many packets have carried the command so far."""
+        self.command_fields: frozenset[str] = frozenset()
+        self.external_force = [0.0] * 6
+        self.analog_out = [0.0, 0.0]
+        self.written: dict[str, int] = {}
+        """How often clients have written to the inputs that a program watches."""
+
+
+_SAFETY_BITS = {
+    1: 1 << 0,
+    2: 1 << 1,
+    Safety.PROTECTIVE_STOP.value: 1 << 2 | 1 << 10,
+    Safety.SAFEGUARD_STOP.value: 1 << 4 | 1 << 10,
+    Safety.EMERGENCY_STOP.value: 1 << 6 | 1 << 7 | 1 << 10,
+}
+"""By the number of the safety system's state."""
+
+
+class RegisterView:
+    """The arm's and the program's state as RTDE shows it, computed at most once per tick."""
+
+    def __init__(self, model: ArmModel, registers: Registers) -> None:
+        self.model = model
+        self.registers = registers
+        self.runtime_state = 1
+        self._q: Vector | None = None
+        self._qd: Vector | None = None
+        self._tool: Matrix | None = None
+        self._turn = np.eye(3)
+        self._jacobian: Matrix = np.eye(6)
+        self._pose: list[float] = []
+        self._speed: list[float] = []
+
+    def tcp_pose(self) -> list[float]:
+        """Tool pose as a 6-vector."""
+        self._update()
+        return self._pose
+
+    def tcp_speed(self) -> list[float]:
+        """Tool velocity and rotation rate (6,) in base axes."""
+        self._update()
+        if self._qd is not self.model.drive.qd:
+            self._qd = self.model.drive.qd
+            self._speed = self._jacobian.dot(self._qd).tolist()
+        return self._speed
+
+    def raw_wrench(self) -> list[float]:
+        """What the force sensor in the flange feels, in flange axes, without any zero."""
+        self._update()
+        wrench = self.model.wrench
+        return [*wrench[:3].dot(self._turn).tolist(), *wrench[3:].dot(self._turn).tolist()]
+
+    def _update(self) -> None:
+        drive = self.model.drive
+        if self._q is drive.q and self._tool is drive.flange_from_tcp:
+            return
+        self._q, self._tool, self._qd = drive.q, drive.flange_from_tcp, None
+        flange, self._jacobian = drive.tcp_state()
+        self._turn = flange[:3, :3]
+        self._pose = pose_from_matrix(flange.dot(self._tool)).tolist()
+
+    def safety_bits(self) -> int:
+        """RTDE `safety_status_bits`."""
+        return _SAFETY_BITS[self.model.safety_mode]
+
+    def tcp_offset(self) -> list[float]:
+        """The tool in the flange as a 6-vector."""
+        return list(pose_from_matrix(self.model.drive.flange_from_tcp).tolist())
+
+    def robot_bits(self) -> int:
+        """RTDE `robot_status_bits`: power on, program running."""
+        return int(self.model.power is not Power.OFF) | int(self.runtime_state == 2) << 1
+
 
 FORMATS = {
     "BOOL": "?",
@@ -173,3 +270,87 @@ def _add_registers() -> None:
 
 
 _add_registers()
+
+
+_COMMANDS = frozenset({"input_int_register_0", "input_int_register_24"})
+_REGISTER = re.compile(r"input_(int|double|bit)_register_(\d+)")
+
+
+class InputRecipe:
+    """The variables that one kind of data packet carries, in order."""
+
+    def __init__(self, names: list[str], model: ArmModel, registers: Registers) -> None:
+        """`names` are keys of `INPUTS`."""
+        self._model = model
+        self._registers = registers
+        self._names = frozenset(names)
+        self._unpacker = struct.Struct(">" + "".join(FORMATS[INPUTS[name]] for name in names))
+        self._slots: list[tuple[list[int] | list[float] | list[bool], int]] = []
+        self._others: list[tuple[str, int]] = []
+        self._force = place = 0
+        for name in names:
+            match = _REGISTER.fullmatch(name)
+            if match is None:
+                self._others.append((name, place))
+                if name == "external_force_torque":
+                    self._force = place
+                self._slots += [([0.0], 0)] * (6 if INPUTS[name] == "VECTOR6D" else 1)
+            elif match[1] == "int":
+                self._slots.append((registers.int_in, int(match[2])))
+            elif match[1] == "bit":
+                self._slots.append((registers.bits_in, int(match[2])))
+            else:
+                self._slots.append((registers.double_in, int(match[2])))
+            place = len(self._slots)
+
+    def apply(self, payload: bytes) -> None:
+        """Write one packet's values; real clients send packets too long or too short, which are cut or padded."""
+        size = self._unpacker.size
+        numbers = self._unpacker.unpack(payload if len(payload) == size else payload[:size].ljust(size, b"\0"))
+        for (bank, index), number in zip(self._slots, numbers, strict=True):
+            bank[index] = number
+        if self._names & _COMMANDS:
+            self._registers.commands += 1
+            self._registers.command_fields = self._names
+        for name in self._registers.written.keys() & self._names:
+            self._registers.written[name] += 1
+        if "external_force_torque" in self._names:
+            self._registers.external_force = list(numbers[self._force : self._force + 6])
+        if self._others:
+            self._write_outputs({name: numbers[place] for name, place in self._others})
+
+    def _write_outputs(self, values: dict[str, float]) -> None:
+        """Masked outputs change only where their mask says so."""
+        for kind, first, bits in (("standard", 0, 255), ("configurable", 8, 255), ("tool", 16, 3)):
+            mask = int(values.get(f"{kind}_digital_output_mask", 0)) & bits
+            levels = int(values.get(f"{kind}_digital_output", 0))
+            if mask:
+                self._model.write_digital_outputs(mask << first, levels << first)
+        if int(values.get("speed_slider_mask", 0)) & 1:
+            self._model.drive.speed_fraction = min(1.0, max(0.0, values.get("speed_slider_fraction", 1.0)))
+        for first in (0, 32):
+            if (name := f"input_bit_registers{first}_to_{first + 31}") in values:
+                bits = int(values[name])
+                self._registers.bits_in[first : first + 32] = [bool(bits >> bit & 1) for bit in range(32)]
+        mask = int(values.get("standard_analog_output_mask", 0))
+        for i in (0, 1):
+            if mask >> i & 1:
+                self._registers.analog_out[i] = values.get(f"standard_analog_output_{i}", 0.0)
+
+
+@dataclass(frozen=True)
+class OutputRecipe:
+    """The variables that are sent in every `every`-th tick under recipe `number`, 0 for protocol 1, which has none."""
+
+    number: int
+    every: int
+    packer: struct.Struct
+    getters: tuple[Getter, ...]
+
+    def packet(self, view: RegisterView) -> bytes:
+        """One data packet."""
+        values: list[float] = []
+        for getter in self.getters:
+            values += getter(view)
+        head = (self.number,) if self.number else ()
+        return self.packer.pack(self.packer.size, ord("U"), *head, *values)

@@ -14,14 +14,12 @@ from enum import IntEnum
 from typing import NamedTuple
 
 from sim_backends.models.arm import ArmModel, Safety
-from sim_backends.peers.arm.rtde.registers import Registers
-from sim_backends.peers.arm.script.context import CYCLE, Context, Job, ProgramError, done
-from sim_backends.peers.arm.script.motion import MOTION_COMMANDS, tool_contact
-from sim_backends.peers.arm.script.outputs import HeldOutputs
-from sim_backends.peers.arm.script.queries import QUERY_COMMANDS
+from sim_backends.peers.arm.rtde.variables import Registers
+from sim_backends.peers.arm.script.context import CYCLE, Context, HeldOutputs, Job, ProgramError, done
+from sim_backends.peers.arm.script.motion import MOTION_COMMANDS, QUERY_COMMANDS, tool_contact
 from sim_backends.peers.arm.urscript.environment import Environment
 from sim_backends.peers.arm.urscript.machine import Machine
-from sim_backends.peers.arm.urscript.words import ScriptError
+from sim_backends.peers.arm.urscript.translate import ScriptError
 
 COMMANDS: dict[int, Callable[[Context], Job | None]] = {**MOTION_COMMANDS, **QUERY_COMMANDS}
 """Every command that does something; other numbers are answered as done."""

@@ -1,15 +1,167 @@
-"""What the commands of a URScript program share: the arm, who moves it, its messages and its connections."""
+"""What the commands of a URScript program share: the arm, who moves it, its messages and its connections.
+
+URScript's values beside numbers, texts and truth values: lists, poses and structs, with their arithmetic.
+
+Lists are added and scaled element by element; a pose is a list of six that prints with a `p`. Members that scripts
+can reach begin with `u_`, so that a script reaches nothing else of an object.
+
+URScript's commands that only compute: numbers, texts, lists, poses. Source: the maker's script manual."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+import math
+import operator
+import random
+import struct
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
-from sim_backends.models.arm_motion import SimulatedMotion, StopMotion
-from sim_backends.models.arm_streams import ForceMode
-from sim_backends.peers.arm.script.context import CYCLE, Context, Job, ProgramError
-from sim_backends.peers.arm.script.outputs import HeldOutputs
+import numpy as np
+
+from sim_backends.models.arm_kinematics import (
+    Matrix,
+    invert,
+    matrix_from_pose,
+    pose_from_matrix,
+    rotation_matrix,
+    rotation_vector,
+)
+from sim_backends.models.arm_motion import ForceMode, SimulatedMotion, StopMotion
+from sim_backends.peers.arm.script.context import CYCLE, Context, HeldOutputs, Job, ProgramError
+
+MOST_ELEMENTS, MOST_CHARACTERS, MOST_INTEGER = 100_000, 1_000_000, 2**63
+"""What a variable may hold; a controller's own limits are lower, and a program that exceeds them ends."""
+
+
+class List(list[Any]):
+    """A list or, as a list of lists, a matrix."""
+
+    def __getitem__(self, index: Any) -> Any:
+        """The element at a whole number, counted from 0; negative ones do not exist."""
+        return list.__getitem__(self, index if isinstance(index, slice) else _whole(index))
+
+    def __setitem__(self, index: Any, value: Any) -> None:
+        """Change the element at a whole number."""
+        list.__setitem__(self, _whole(index), value)
+
+    def _each(self, other: Any, act: Callable[[Any, Any], Any]) -> List:
+        if isinstance(other, list):
+            if len(other) != len(self):
+                raise TypeError(f"lists of {len(self)} and {len(other)} elements")
+            return type(self)(map(act, self, other))
+        return type(self)(act(mine, other) for mine in self)
+
+    def __add__(self, other: Any) -> List:
+        """Element by element."""
+        return self._each(other, operator.add)
+
+    def __sub__(self, other: Any) -> List:
+        """Element by element."""
+        return self._each(other, operator.sub)
+
+    def __mul__(self, other: Any) -> List:
+        """By a number, or element by element."""
+        return self._each(other, operator.mul)
+
+    __rmul__ = __mul__
+    __radd__ = __add__
+
+    def __truediv__(self, other: Any) -> List:
+        """By a number, or element by element."""
+        return self._each(other, operator.truediv)
+
+    def __neg__(self) -> List:
+        """Each element's opposite."""
+        return type(self)(-value for value in self)
+
+    def u_length(self) -> int:
+        """How many elements."""
+        return len(self)
+
+    def u_append(self, value: Any) -> None:
+        """Add `value` at the end."""
+        self.append(value)
+
+    def u_pop(self) -> Any:
+        """Take the last element away."""
+        return self.pop()
+
+    def u_clear(self) -> None:
+        """Take all elements away."""
+        self.clear()
+
+
+class ScriptPose(List):
+    """Place in m and rotation vector in rad: p[x, y, z, rx, ry, rz]."""
+
+    def __init__(self, values: Iterable[Any]) -> None:
+        super().__init__(values)
+        if len(self) != 6:
+            raise TypeError(f"a pose of {len(self)} numbers")
+
+
+class Struct:
+    """Named members, made by struct(name = value, …)."""
+
+    def __init__(self, **members: Any) -> None:
+        for name, value in members.items():
+            setattr(self, f"u_{name}", value)
+
+    def members(self) -> dict[str, Any]:
+        """The members by name."""
+        return {name[2:]: value for name, value in vars(self).items()}
+
+
+def own(value: Any) -> tuple[Any, int]:
+    """A copy of a list or struct, anything else as it is, and how many values that are: an assignment or a call gives
+    a variable a value of its own. `ValueError` for one that is too large.
+    """
+    return _copied(value, 0)
+
+
+def _copied(value: Any, count: int) -> tuple[Any, int]:
+    count += 1
+    if count > MOST_ELEMENTS:
+        raise ValueError(f"a list or struct of more than {MOST_ELEMENTS} values")
+    if isinstance(value, str) and len(value) > MOST_CHARACTERS:
+        raise ValueError(f"a text of {len(value)} characters, at most {MOST_CHARACTERS}")
+    if isinstance(value, int) and abs(value) > MOST_INTEGER:
+        raise ValueError(f"a whole number of {value.bit_length()} bits")
+    if isinstance(value, Struct):
+        members = {}
+        for name, member in value.members().items():
+            members[name], count = _copied(member, count)
+        return Struct(**members), count
+    if not isinstance(value, List):
+        return value, count
+    elements = []
+    for element in value:
+        one, count = _copied(element, count)
+        elements.append(one)
+    return type(value)(elements), count
+
+
+def shown(value: Any) -> str:
+    """`value` as textmsg and to_str write it."""
+    if isinstance(value, bool) or value is None:
+        return str(value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list):
+        return ("p" if isinstance(value, ScriptPose) else "") + "[" + ", ".join(map(shown, value)) + "]"
+    if isinstance(value, Struct):
+        return "struct(" + ", ".join(f"{name}={shown(one)}" for name, one in value.members().items()) + ")"
+    return str(value)
+
+
+def _whole(index: Any) -> int:
+    whole = int(index)
+    if whole != index or whole < 0:
+        raise IndexError(f"element {index}")
+    return whole
+
 
 Announce = Callable[[str, str], None]
 """Tells the clients of the primary port: the kind of message (text, popup) and its words."""
@@ -129,3 +281,131 @@ class InputWatchdog:
         elif cycle - self._at > self._limit:
             self._at = cycle
             self._act()
+
+
+def matrix(pose: Any) -> Matrix:
+    """A script's pose as (4, 4)."""
+    return matrix_from_pose(np.array(pose, float))
+
+
+def as_pose(base_from_tool: Matrix) -> ScriptPose:
+    """(4, 4) as a script's pose."""
+    return ScriptPose(pose_from_matrix(base_from_tool).tolist())
+
+
+def numbers(values: Any) -> List:
+    """An array as a script's list."""
+    return List(np.asarray(values, float).tolist())
+
+
+def _norm(value: Any) -> float:
+    return math.hypot(*value) if isinstance(value, list) else abs(value)
+
+
+def _distance(a: Any, b: Any, first: int) -> float:
+    return math.dist(a[first : first + 3], b[first : first + 3])
+
+
+def _turn_between(a: Any, b: Any) -> float:
+    return math.hypot(*rotation_vector(matrix(a)[:3, :3].T.dot(matrix(b)[:3, :3])))
+
+
+def _interpolate(a: Any, b: Any, share: float) -> ScriptPose:
+    start, end = matrix(a), matrix(b)
+    turn = rotation_vector(start[:3, :3].T.dot(end[:3, :3]))
+    between = np.eye(4)
+    between[:3, :3] = start[:3, :3].dot(rotation_matrix(turn * share))
+    between[:3, 3] = (1 - share) * start[:3, 3] + share * end[:3, 3]
+    return as_pose(between)
+
+
+def _pose_add(a: Any, b: Any) -> ScriptPose:
+    sum_ = np.eye(4)
+    sum_[:3, :3] = matrix(a)[:3, :3].dot(matrix(b)[:3, :3])
+    sum_[:3, 3] = matrix(a)[:3, 3] + matrix(b)[:3, 3]
+    return as_pose(sum_)
+
+
+def _rpy2rotvec(rpy: Any) -> List:
+    roll, pitch, yaw = (rotation_matrix(angle * axis) for angle, axis in zip(rpy, np.eye(3), strict=True))
+    return numbers(rotation_vector(yaw.dot(pitch).dot(roll)))
+
+
+def _rotvec2rpy(vector: Any) -> List:
+    r = rotation_matrix(np.array(vector, float))
+    pitch = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
+    return List([math.atan2(r[2, 1], r[2, 2]), pitch, math.atan2(r[1, 0], r[0, 0])])
+
+
+def _twist(frame: Any, twist: Any) -> List:
+    """A wrench, given in `frame`, in the frame that `frame` is given in."""
+    place, force, torque = matrix(frame), np.array(twist[:3], float), np.array(twist[3:], float)
+    turned = place[:3, :3].dot(force)
+    return numbers([*turned, *(place[:3, :3].dot(torque) + np.cross(place[:3, 3], turned))])
+
+
+def _to_number(text: str) -> float:
+    return float(text) if any(mark in text for mark in ".eE") else int(text)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _integer_to_bits(value: int) -> List:
+    return List(bool(value >> bit & 1) for bit in range(32))
+
+
+def _bits_to_integer(bits: Any) -> int:
+    word = sum(bool(bit) << place for place, bit in enumerate(bits[:32]))
+    return int(struct.unpack("i", struct.pack("I", word))[0])
+
+
+def _make_list(length: int, value: Any, capacity: int = 0) -> List:
+    if length > MOST_ELEMENTS:
+        raise ValueError(f"a list of {length} elements, at most {MOST_ELEMENTS}")
+    return List([value] * length)
+
+
+def _size(values: Any) -> Any:
+    """Rows and columns of a matrix, the length of a list."""
+    return List([len(values), len(values[0])]) if values and isinstance(values[0], list) else len(values)
+
+
+def _str_sub(text: str, index: int, length: int = -1) -> str:
+    return text[index:] if length < 0 else text[index : index + length]
+
+
+def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
+    """By name; they need nothing of `environment`."""
+    return {
+        "sin": math.sin, "cos": math.cos, "tan": math.tan, "asin": math.asin, "acos": math.acos, "atan": math.atan,
+        "atan2": math.atan2, "sqrt": math.sqrt, "pow": math.pow, "exp": math.exp,
+        "log": lambda base, x: math.log(x, base),
+        "floor": math.floor, "ceil": math.ceil, "round": round, "norm": _norm, "random": random.random,
+        "d2r": math.radians, "r2d": math.degrees, "inv": lambda pose: as_pose(invert(matrix(pose))),
+        "pose_inv": lambda pose: as_pose(invert(matrix(pose))),
+        "pose_trans": lambda a, b: as_pose(matrix(a).dot(matrix(b))),
+        "pose_add": _pose_add,
+        "pose_sub": lambda a, b: _pose_add(a, as_pose(invert(matrix(b)))),
+        "pose_dist": lambda a, b: _distance(a, b, 0),
+        "point_dist": lambda a, b: _distance(a, b, 0),
+        "rotation_dist": _turn_between,
+        "interpolate_pose": _interpolate,
+        "wrench_trans": _twist,
+        "rpy2rotvec": _rpy2rotvec, "rotvec2rpy": _rotvec2rpy,
+        "str_cat": lambda a, b: shown(a) + shown(b),
+        "str_len": len, "str_at": lambda text, index: text[index], "str_empty": lambda text: not text,
+        "str_find": lambda text, part, start=0: text.find(part, start),
+        "str_sub": _str_sub,
+        "to_str": shown, "to_num": _to_number, "is_number": _is_number,
+        "get_list_length": len, "length": len, "size": _size,
+        "make_list": _make_list,
+        "transpose": lambda m: List(List(row) for row in zip(*m, strict=True)),
+        "struct": Struct,
+        "binary_list_to_integer": _bits_to_integer, "integer_to_binary_list": _integer_to_bits,
+    }  # fmt: skip

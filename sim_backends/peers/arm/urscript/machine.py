@@ -11,11 +11,10 @@ from traceback import walk_tb
 from typing import Any
 
 from sim_backends.peers.arm.script.context import Context, Job, ProgramError
-from sim_backends.peers.arm.urscript import arithmetic, motions, sensing, settings, sockets
-from sim_backends.peers.arm.urscript.environment import Environment
-from sim_backends.peers.arm.urscript.translate import translate
-from sim_backends.peers.arm.urscript.values import List, ScriptPose, own
-from sim_backends.peers.arm.urscript.words import ScriptError
+from sim_backends.peers.arm.urscript import environment as arithmetic
+from sim_backends.peers.arm.urscript import motions, sensing, settings, sockets
+from sim_backends.peers.arm.urscript.environment import Environment, List, ScriptPose, own
+from sim_backends.peers.arm.urscript.translate import ScriptError, translate
 
 Thread = Generator[None, None, Any]
 _MOST_TURNS = 20000

@@ -12,15 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from sim_backends.models.arm_circle import ArcMove
 from sim_backends.models.arm_kinematics import Matrix, Vector
-from sim_backends.models.arm_motion import JointMove, LinearMove, StopMotion
-from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
+from sim_backends.models.arm_motion import (
+    ArcMove,
+    ForceMode,
+    JointMove,
+    JointSpeed,
+    LinearMove,
+    LinearSpeed,
+    Servo,
+    StopMotion,
+)
 from sim_backends.peers.arm.script.context import CYCLE, Job, ProgramError
 from sim_backends.peers.arm.script.motion import tool_contact
-from sim_backends.peers.arm.urscript.arithmetic import matrix
-from sim_backends.peers.arm.urscript.environment import Environment
-from sim_backends.peers.arm.urscript.values import ScriptPose
+from sim_backends.peers.arm.urscript.environment import Environment, ScriptPose, matrix
 
 _MOST_ACCELERATION = 8.0
 """rad/s², of which the moves that plan for themselves take a share."""

@@ -11,9 +11,7 @@ import numpy as np
 from sim_backends.models.arm import Safety
 from sim_backends.models.arm_kinematics import Matrix, Vector, invert
 from sim_backends.peers.arm.script.context import CYCLE, ProgramError
-from sim_backends.peers.arm.urscript.arithmetic import as_pose, matrix, numbers
-from sim_backends.peers.arm.urscript.environment import Environment
-from sim_backends.peers.arm.urscript.values import List
+from sim_backends.peers.arm.urscript.environment import Environment, List, as_pose, matrix, numbers
 
 _ZEROS = [0.0] * 6
 

@@ -10,11 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from sim_backends.peers.arm.rtde.registers import REGISTERS
+from sim_backends.peers.arm.rtde.variables import REGISTERS
 from sim_backends.peers.arm.script.context import Job, ProgramError
-from sim_backends.peers.arm.urscript.arithmetic import matrix
-from sim_backends.peers.arm.urscript.environment import Environment, InputWatchdog
-from sim_backends.peers.arm.urscript.values import shown
+from sim_backends.peers.arm.urscript.environment import Environment, InputWatchdog, matrix, shown
 
 _KINDS = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}
 """First bit and number of the digital inputs and outputs of each kind."""

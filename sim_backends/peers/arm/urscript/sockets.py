@@ -14,8 +14,7 @@ from contextlib import suppress
 from typing import Any
 
 from sim_backends.peers.arm.script.context import CYCLE
-from sim_backends.peers.arm.urscript.environment import Environment
-from sim_backends.peers.arm.urscript.values import List, shown
+from sim_backends.peers.arm.urscript.environment import Environment, List, shown
 
 _NAME = "socket_0"
 _CONNECTING_S = 2.0

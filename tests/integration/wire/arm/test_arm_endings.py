@@ -16,10 +16,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.devices.devices import Devices
+from cell.devices.devices import Devices, require_healthy
 from cell.devices.gate.gate import Gate
 from cell.devices.gate.interlocks import Interlocks
-from cell.devices.stopping import require_healthy
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, NotConnectedError

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cell.measure.geometry.poses import to_ur
-from cell.motion.arm_models import arm_kinematics
+from cell.motion.kinematics import arm_kinematics
 from drivers.arm.faults import fault, require_named
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock

@@ -12,7 +12,7 @@ import pytest
 
 from cell.devices.diagnosis.diagnosis import _arm_state
 from cell.measure.geometry.poses import to_ur
-from cell.motion.arm_models import arm_kinematics
+from cell.motion.kinematics import arm_kinematics
 from drivers.arm.factory import parse_kinematics_info, read_factory_kinematics
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock

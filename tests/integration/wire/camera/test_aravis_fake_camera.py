@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cell.devices.contracts import Bench
-from cell.devices.contracts.camera import EXPOSURE_S, PATIENCE_S, RATE_HZ, CameraContract
+from cell.devices.contracts.device import EXPOSURE_S, PATIENCE_S, RATE_HZ, CameraContract
 from drivers.clock import Clock
 from drivers.interfaces import Camera
 from tests.support.wire.aravis_fake import fake_camera, opened

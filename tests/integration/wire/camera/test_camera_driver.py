@@ -16,11 +16,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cell.devices.diagnosis.examination import examine
+from cell.devices.diagnosis.diagnosis import examine
 from drivers.camera.folder import FolderCamera, image_files, read_image
 from drivers.camera.stream import StreamCamera
-from drivers.clock import Clock
-from drivers.clock_map import ClockMap, Latch
+from drivers.clock import Clock, ClockMap, Latch
 from drivers.errors import (
     Aborted,
     ConfigError,
@@ -33,8 +32,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import Camera, Frame, FrameStream
 from sim_backends.clock import WorldClock
-from sim_backends.peers.camera.frame_wire import message
-from sim_backends.peers.camera.frames import CameraSpec, FramePeer
+from sim_backends.peers.camera.frames import CameraSpec, FramePeer, message
 from tests.support.wire.clocks import ahead
 
 SPEED = 4.0

@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 
 from cell.devices.contracts import Bench as ContractBench
-from cell.devices.contracts.camera import CameraContract
-from drivers.camera.genicam.acquisition import BlockCount, Network
+from cell.devices.contracts.device import CameraContract
+from drivers.camera.genicam.acquisition import FORMATS, BlockCount, Network
 from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import GenicamSetup
+from drivers.camera.genicam.connection import ExposureTrigger, GenicamSetup, Region
 from drivers.camera.genicam.device import GigePlace
-from drivers.camera.genicam.pixels import FORMATS
-from drivers.camera.genicam.settings import ExposureTrigger, Region
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
 from drivers.interfaces import Camera

@@ -13,11 +13,10 @@ from typing import Any
 import pytest
 
 from cell.devices.contracts import Bench
-from cell.devices.contracts.camera import CameraContract
+from cell.devices.contracts.device import CameraContract
 from drivers.camera.genicam.aravis import LIBRARIES, Aravis
 from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import GenicamSetup
-from drivers.camera.genicam.settings import Region
+from drivers.camera.genicam.connection import GenicamSetup, Region
 from drivers.clock import Clock
 from drivers.interfaces import Camera
 from tests.support.wire.gige_bench import require_aravis

@@ -14,7 +14,7 @@ import pytest
 
 from cell import Cell
 from cell.config.job import job_path
-from cell.devices.simulated.followed_camera import FollowedCamera
+from cell.devices.simulated.following import FollowedCamera
 from drivers.errors import CalibrationStale, DeadlineError
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams

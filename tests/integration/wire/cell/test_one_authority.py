@@ -13,11 +13,10 @@ from typing import Any
 import pytest
 
 from cell import Cell, RunOutcome
-from cell.devices.simulated.truth_link import ask_truth
+from cell.devices.simulated.process import ask_truth
 from cell.run.events import ConfirmNeeded, FaultMet, Held, RunEvent, StepProgress, StepStarted
-from cell.run.files.folder import is_going, list_runs
-from cell.run.files.reading import read_report
-from cell.run.run import Run
+from cell.run.folder import is_going, list_runs, read_report
+from cell.run.runs import Run
 from drivers.clock import Clock
 from drivers.errors import InterlockError
 from statemachine.journal import request

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from cell import Cell
-from cell.run.files.reading import awaited_word
+from cell.run.folder import awaited_word
 from drivers.clock import Clock
 from drivers.errors import DeviceFault
 from statemachine.journal import request

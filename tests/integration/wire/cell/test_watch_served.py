@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.apps.watch.watch import watching
+from cell.apps.watch import watching
 from cell.config.cell_config import load_config
 from drivers.clock import Clock
 from tests.support.wire.cells import served, started

@@ -15,10 +15,8 @@ from typing import Any
 import pytest
 from can.io.canutils import CanutilsLogReader
 
-from cell.run.files.folder import list_runs
-from cell.run.files.reading import read_report
-from cell.run.record.export import as_candump
-from cell.run.record.information import information
+from cell.run.folder import list_runs, read_report
+from cell.run.record.reading import as_candump, information
 from drivers.vehicle.agilex_link import load_database
 from tests.integration.wire.conftest import supervise
 from tests.support.wire.cells import Supervised, assert_safe, served, started, wait_for_step

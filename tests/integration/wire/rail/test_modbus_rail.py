@@ -27,9 +27,8 @@ from cell.makes.rails import ModbusRailConfig, register_map
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import LinkStatistics, Rail
-from drivers.rail.modbus.link import ModbusLink, ModbusRefused
+from drivers.rail.modbus.link import Action, ModbusLink, ModbusRefused
 from drivers.rail.modbus.rail import ModbusRail
-from drivers.rail.modbus.registers import Action
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.rail.modbus_drive import ModbusDriveServer, ModbusPeer
@@ -394,7 +393,7 @@ OWNER = """
 import sys
 from drivers.clock import Clock
 from drivers.rail.modbus.rail import ModbusRail
-from drivers.rail.modbus.registers import *
+from drivers.rail.modbus.link import *
 rail = ModbusRail("rail", sys.argv[1], eval(sys.argv[2]), lead=0.002, counts_per_turn=10_000, travel=(0.0, 0.1),
     max_speed=0.04, acceleration=0.2, clock=Clock(5.0), unit=7)
 rail.home().wait(60)

@@ -28,7 +28,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import LinkStatistics, Rail
 from drivers.rail.motion import move_duration, run_up_distance
-from drivers.rail.timing import fit_line
+from drivers.rail.sweep import fit_line
 from drivers.rail.tmcl.codec import Axis
 from drivers.rail.tmcl.link import TmclLink
 from drivers.rail.tmcl.rail import TmclRail

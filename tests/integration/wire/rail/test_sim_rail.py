@@ -18,7 +18,7 @@ from pytrinamic.tmcl import TMCLReplyStatusError
 from sim_backends.clock import WorldClock
 from sim_backends.models import ramp
 from sim_backends.models.rail import RailModel, RailParams, RailSettings
-from sim_backends.models.screw import Screw
+from sim_backends.models.ramp import Screw
 from sim_backends.peers.rail.tmcl import TmclPeer
 from tests.support.wire.clocks import until
 

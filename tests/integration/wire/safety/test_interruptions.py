@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from cell.procedures.sweep.stored_sweep import FILE
-from cell.run.files.folder import list_runs
-from cell.run.files.reading import read_report, run_row
+from cell.run.folder import list_runs, read_report, run_row
 from cell.run.resumption import UnfinishedRun
 from drivers.clock import Clock
 from drivers.errors import ConfigError

@@ -10,7 +10,7 @@ import pytest
 from cell.config.cell_config import load_config
 from cell.devices.assembly import connect
 from drivers.errors import Aborted
-from statemachine.cancel import CancelToken
+from statemachine.control import CancelToken
 from tests.support.wire.cells import ask, assert_safe, served
 
 pytestmark = pytest.mark.wire

@@ -15,8 +15,7 @@ from numato_usb_relay.relay import Relay as VendorsClient
 
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
-from drivers.relay.boards import LcusBoard, open_board, open_numato
-from drivers.relay.port import RelayPort
+from drivers.relay.boards import LcusBoard, RelayPort, open_board, open_numato
 from drivers.relay.switched import BoardClaw, BoardLaser
 from sim_backends.peers.switches.relays import LcusPeer, NumatoPeer, RelayBoard
 

@@ -16,7 +16,7 @@ import pytest
 import serial
 
 from cell.config.job import load_job
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.drive.way import Whereabouts
 from drivers.clock import Clock
 from drivers.errors import (
     ConfigError,

@@ -1,4 +1,6 @@
-"""Configuration and jobs: every quantity has its unit, every value its range, every mistake its own clear line."""
+"""Configuration and jobs: every quantity has its unit, every value its range, every mistake its own clear line.
+
+Boxes that a configuration or a job names are kept away from: by planned ways, by raw commands, by the vehicle."""
 
 from __future__ import annotations
 
@@ -9,14 +11,182 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cell.base import units
 from cell.base.units import parse_quantity
 from cell.check.fit import require_fit
-from cell.config.cell_config import CellConfig, default_toml, load_config, validate
-from cell.config.job import job_path, load_job, shipped_jobs
-from drivers.errors import ConfigError
+from cell.config.cell_config import CellConfig, StationObstacle, default_toml, load_config, validate
+from cell.config.job import Job, job_path, load_job, shipped_jobs
+from cell.devices.simulated.direct import VirtualCell
+from cell.makes.make import Pose
+from cell.measure.geometry.poses import from_parts, from_ur
+from cell.measure.inversion import NominalSurface
+from cell.measure.vision import parse_board
+from cell.motion.collision import CollisionError
+from cell.motion.kinematics import HOME
+from cell.motion.trajectory import Trajectory
+from cell.procedures.arm.moves import Mover
+from cell.procedures.drive.way import Planar, Upright, Way, Whereabouts
+from drivers.errors import ConfigError, InterlockError, RefusedError
+from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
+
+JOB, MESH = load_job("pot")
+forward = Kinematics(UR10E_DH).forward
+"""The simulated arm's own kinematics, which is not the planner's."""
+POST = """
+[[obstacle]]
+name = "post"
+base_from_centre = { translation = ["%d mm", "%d mm", "300 mm"], rotation = ["0 deg", "0 deg", "0 deg"] }
+size = ["60 mm", "60 mm", "700 mm"]
+"""
+CORNERS = np.array([[x, y, z] for x in (-0.125, 0.115) for y in (-0.11, 0.08) for z in (-0.03, 0.145)])
+"""Around claw, scan head and target camera, in the flange frame, m."""
+TIPS = np.array([
+    [x, y, z]
+    for xs, ys, zs in (
+        ((-0.03, 0.03), (-0.03, 0.03), (0.0, 0.145)),
+        ((0.065, 0.115), (-0.11, 0.08), (0.02, 0.09)),
+        ((-0.125, -0.075), (-0.025, 0.025), (-0.03, 0.05)),
+    )
+    for x in xs
+    for y in ys
+    for z in zs
+])  # fmt: skip
+"""Corners of claw, scan head and target camera one by one, in the flange frame, m."""
+
+
+def configured(folder: Path, text: str) -> CellConfig:
+    path = folder / "cell.toml"
+    path.write_text(default_toml() + text)
+    return load_config(path)
+
+
+def swept(motion: Trajectory) -> np.ndarray:
+    """Where the flange's origin was on the way, (n, 3) m in the base, by the simulated arm's own kinematics."""
+    times = np.linspace(0.0, motion.duration, 400)
+    return np.array([forward(motion.at(time))[:3, 3] for time in times])
+
+
+def mover_of(config: CellConfig, job: Job | None = JOB) -> tuple[VirtualCell, Mover]:
+    cell = VirtualCell(config, seed=1, level="ideal")
+    cell.devices.vehicle.brake()
+    return cell, Mover(cell.devices.arm, cell.clock, config, job, interlocks=cell.devices.interlocks)
+
+
+def test_the_arm_goes_round_a_post_on_the_vehicle_and_a_raw_move_into_it_is_refused(tmp_path: Path) -> None:
+    cell, free = mover_of(load_config(None), None)
+    free.to_joints(HOME)
+    here = from_ur(cell.devices.arm.state().flange)
+    turned = HOME + np.array([1.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    straight = free.plan_to(pin.SE3(forward(turned)), "beside")
+    middle = swept(straight)[200]
+    config = configured(tmp_path, POST % tuple(1e3 * middle[:2]))
+    cell, mover = mover_of(config, None)
+    mover.to_joints(HOME)
+    assert np.allclose(from_ur(cell.devices.arm.state().flange).translation, here.translation, atol=1e-3)
+    around = mover.plan_to(pin.SE3(forward(turned)), "beside")
+    low, high = middle[:2] - 0.03, middle[:2] + 0.03
+    inside = [
+        bool(((p[:, :2] > low) & (p[:, :2] < high)).all(axis=1).any() and p[:, 2].min() < 0.65)
+        for p in (
+            CORNERS @ forward(around.at(t))[:3, :3].T + forward(around.at(t))[:3, 3]
+            for t in np.linspace(0.0, around.duration, 400)
+        )
+    ]
+    assert not any(inside)
+    assert around.duration > straight.duration
+    with pytest.raises(InterlockError, match="obstacle post would collide on the way"):
+        cell.devices.arm.move_joints(turned, 0.3, 1.0)
+
+
+def test_an_obstacle_is_read_with_units_and_one_name_each(tmp_path: Path) -> None:
+    assert configured(tmp_path, POST % (0, 600)).obstacle[0].size == pytest.approx((0.06, 0.06, 0.7))
+    assert configured(tmp_path, POST % (0, 600)).calibration_hash() == load_config(None).calibration_hash()
+    with pytest.raises(ConfigError, match="obstacle post is there twice"):
+        configured(tmp_path, POST % (0, 600) + POST % (0, 700))
+    with pytest.raises(ConfigError, match="size"):
+        configured(tmp_path, (POST % (0, 600)).replace('"700 mm"', "700"))
+
+
+def beside_the_target(solid: Upright, gap: float) -> Job:
+    """The job with a beam `gap` m ahead of where `solid` (in the vehicle's frame) is at the target, at its height."""
+    target = JOB.approach.target.se3()
+    ahead = Planar.of(target).x + solid.corners[:, 0].max() + gap
+    middle = (ahead + 0.05, Planar.of(target).y + solid.corners[:, 1].mean(), 0.5 * (solid.low + solid.high))
+    beam = StationObstacle.model_validate(
+        {
+            "name": "beam",
+            "size": ["100 mm", "50 mm", "20 mm"],
+            "place_from_centre": {"translation": [f"{1e3 * v:.3f} mm" for v in middle], "rotation": ["0 deg"] * 3},
+        }
+    )
+    return JOB.model_copy(update={"obstacle": (beam,)})
+
+
+def test_the_vehicle_keeps_the_arm_that_it_carries_off_the_station(tmp_path: Path) -> None:
+    config = load_config(None)
+    cell, mover = mover_of(config)
+    mover.to_joints(HOME)
+    stand = config.arm.vehicle_from_base.se3()
+    lifted = from_parts((0.0, 0.0, JOB.approach.target.se3().translation[2]))
+    solids = [Upright.of(body, lifted * stand) for body in mover.solids()]
+    front = max((s for s in solids if s.name not in ("deck", "part")), key=lambda solid: solid.corners[:, 0].max())
+    whereabouts = Whereabouts(cell.vehicle)
+    whereabouts.enter(JOB)
+    whereabouts.see(Planar.of(JOB.approach.staging.se3()))
+    target = Planar.of(JOB.approach.target.se3())
+    for gap, met in ((0.02, True), (0.3, False)):
+        way = Way(beside_the_target(front, gap), stand, whereabouts, mover.solids())
+        if not met:
+            way.require_line(target)
+            continue
+        with pytest.raises(RefusedError, match=r"with the arm's [\w ]+ within \d+ mm of the station obstacle beam"):
+            way.require_line(target)
+
+
+def _shifted(beam: StationObstacle, to: np.ndarray) -> Pose:
+    return beam.place_from_centre.model_copy(update={"translation": tuple(to.tolist())})
+
+
+def test_a_jobs_obstacle_is_met_by_no_planned_way(tmp_path: Path) -> None:
+    config = load_config(None)
+    cell, mover = mover_of(config)
+    mover.to_joints(HOME)
+    flange = from_ur(cell.devices.arm.state().flange)
+    beam = beside_the_target(Upright("x", np.zeros((4, 2)), 0.0, 0.0), 0.0).obstacle[0]
+    goal = from_parts((0.0, 0.0, -0.1)) * flange
+    at = goal.translation + np.array([0.0, 0.0, -0.16])
+    extent = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit).extent
+    far = from_parts((0.0, 3.0, -1.0))
+    here = beam.model_copy(update={"place_from_centre": _shifted(beam, far.inverse().act(at))})
+    mover.meet_station(far, JOB.model_copy(update={"obstacle": (here,)}), parse_board(JOB.board.spec), extent)
+    with pytest.raises(CollisionError, match="station obstacle beam"):
+        mover.plan_to(goal, "down")
+
+
+def test_a_raw_joint_move_takes_no_corner_of_the_tool_faster_than_allowed() -> None:
+    config = load_config(None)
+    cell, mover = mover_of(config, None)
+    mover.to_joints(HOME)
+    goal = HOME + np.array([0.9, 0.0, 0.0, 0.0, 0.0, 0.0])
+    began = cell.clock.now()
+    motion = cell.devices.arm.move_joints(goal, config.arm.max_joint_speed, 3.0)
+    places = []
+    while not motion.done:
+        flange = forward(cell.devices.arm.state().joints)
+        places.append((cell.clock.now(), TIPS @ flange[:3, :3].T + flange[:3, 3]))
+        cell.clock.sleep(0.01)
+    motion.wait(1.0)
+    assert cell.clock.now() - began > 1.0
+    fastest = max(
+        np.linalg.norm(b - a, axis=1).max() / (later - now)
+        for (now, a), (later, b) in zip(places[:-4], places[4:], strict=True)
+        if later > now
+    )
+    assert 0.4 < fastest <= 1.01 * config.arm.max_tool_speed
+    assert np.allclose(cell.devices.arm.state().joints, goal, atol=1e-3)
 
 
 def edited(**changes: Any) -> dict[str, Any]:

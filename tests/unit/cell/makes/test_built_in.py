@@ -13,15 +13,15 @@ from pymodbus.framer import FramerRTU
 from cell.config.cell_config import CellConfig, load_config, tables_of, validate
 from cell.devices.assembly import safe_off_outputs
 from cell.devices.contracts import Bench
+from cell.devices.contracts.device import ClawContract, LaserContract
 from cell.devices.contracts.rail import RailContract
-from cell.devices.contracts.switches import ClawContract, LaserContract
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.makes.built_in import BUILT_IN
 from cell.makes.rails import register_map
 from drivers.errors import ConfigError
 from drivers.rail.modbus import link as modbus_link
-from drivers.rail.modbus.registers import Number, Rate
+from drivers.rail.modbus.link import Number, Rate
 from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.world.drawing import read
 from sim_backends.world.world import World

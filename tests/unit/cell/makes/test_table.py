@@ -204,7 +204,7 @@ def test_the_command_lists_what_is_installed_with_its_source(site: Path, tmp_pat
 
 ARM = """
 from typing import Annotated, Literal
-from cell.makes.records import ArmConfig
+from cell.makes.make import ArmConfig
 from cell.makes.built_in import UrArmConfig
 from cell.makes.make import Make
 from drivers.interfaces import LinkStatistics

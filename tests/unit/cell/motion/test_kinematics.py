@@ -1,21 +1,43 @@
-"""The arm reaches what it should, touches nothing it must not, and moves within its limits."""
+"""The arm reaches what it should, touches nothing it must not, and moves within its limits.
+
+Arms of every model, as drawn and as calibrated in the factory: against the vendor's description and real tables."""
 
 from __future__ import annotations
 
+import struct
 import sys
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.motion import bodies
-from cell.motion.clearance import first_touch
-from cell.motion.collision import CollisionError, CollisionModel
-from cell.motion.kinematics import ArmKinematics, DenavitHartenberg, JointLimits, Joints, Unreachable
+from cell.motion import collision
+from cell.motion.collision import CollisionError, CollisionModel, arm_bodies, first_touch
+from cell.motion.kinematics import (
+    MODELS,
+    ArmKinematics,
+    DenavitHartenberg,
+    JointLimits,
+    Joints,
+    Unreachable,
+    arm_kinematics,
+    kinematics_name,
+)
 from cell.motion.planning import EFFORTS, Planner
-from cell.motion.point_speed import PointSpeed, carried_points
-from cell.motion.trajectory import LineLimits, SingularLine, Trajectory, join, plan_joint, plan_line
-from drivers.errors import RefusedError
+from cell.motion.trajectory import (
+    LineLimits,
+    PointSpeed,
+    SingularLine,
+    Trajectory,
+    carried_points,
+    join,
+    plan_joint,
+    plan_line,
+)
+from drivers.arm.factory import parse_kinematics_info
+from drivers.errors import ConfigError, RefusedError
+from drivers.link_table import LinkTable
+from sim_backends.models.arm_kinematics import TABLES, Kinematics
 
 WORKING = np.array([2.8, -1.25, 2.0, -2.3, -1.57, 2.8])
 """Posture over the placement area: tool down, elbow up."""
@@ -52,13 +74,13 @@ def arm() -> ArmKinematics:
 
 @pytest.fixture(scope="module")
 def planner(arm: ArmKinematics) -> Planner:
-    solids = bodies.arm_bodies() + bodies.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART)
+    solids = collision.arm_bodies() + collision.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART)
     face_up = np.diag([1.0, -1.0, -1.0])
     plates = [
         ("fine plate", pin.SE3(face_up, np.array([-0.55, 0.25, 0.01])), (0.042, 0.036, 0.02)),
         ("large plate", pin.SE3(face_up, np.array([-0.60, -0.25, 0.01])), (0.21, 0.17, 0.02)),
     ]
-    solids += bodies.vehicle_bodies(plates) + bodies.station_bodies(BASE_FROM_PLACE, PLACE_FROM_BOARD_CENTRE)
+    solids += collision.vehicle_bodies(plates) + collision.station_bodies(BASE_FROM_PLACE, PLACE_FROM_BOARD_CENTRE)
     return Planner(arm, CollisionModel(arm, solids))
 
 
@@ -241,8 +263,8 @@ def test_the_job_is_planned_without_touching_anything(planner: Planner) -> None:
 
 
 def test_an_obstacle_in_the_direct_way_is_avoided(arm: ArmKinematics) -> None:
-    wall = bodies.block("wall", bodies.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45))
-    model = CollisionModel(arm, [*bodies.arm_bodies(), *bodies.tool_bodies(), wall])
+    wall = collision.block("wall", collision.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45))
+    model = CollisionModel(arm, [*collision.arm_bodies(), *collision.tool_bodies(), wall])
     planner = Planner(arm, model)
     left, right = (planner.reach(down(0.7, y, 0.25), WORKING, "beside") for y in (0.35, -0.35))
     assert not all(model.free(q) for q in plan_joint(left, right, arm.limits).joints)
@@ -255,10 +277,10 @@ def test_an_obstacle_in_the_direct_way_is_avoided(arm: ArmKinematics) -> None:
 
 def test_a_slot_that_no_simple_detour_passes_is_searched(arm: ArmKinematics) -> None:
     solids = [
-        bodies.block("wall", bodies.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45)),
-        bodies.block("roof", bodies.BASE, (0.45, -0.6, 0.75), (1.2, 0.6, 0.80)),
+        collision.block("wall", collision.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45)),
+        collision.block("roof", collision.BASE, (0.45, -0.6, 0.75), (1.2, 0.6, 0.80)),
     ]
-    model = CollisionModel(arm, [*bodies.arm_bodies(), *bodies.tool_bodies(), *solids])
+    model = CollisionModel(arm, [*collision.arm_bodies(), *collision.tool_bodies(), *solids])
     planner = Planner(arm, model)
     left, right = (planner.reach(down(0.6, y, 0.25), WORKING, "beside") for y in (0.30, -0.30))
     motion = planner.free(left, right)
@@ -269,8 +291,8 @@ def test_without_ompl_ways_over_one_corner_are_tried_and_what_lacks_is_told(
     arm: ArmKinematics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "ompl", None)
-    wall = bodies.block("wall", bodies.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45))
-    model = CollisionModel(arm, [*bodies.arm_bodies(), *bodies.tool_bodies(), wall])
+    wall = collision.block("wall", collision.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45))
+    model = CollisionModel(arm, [*collision.arm_bodies(), *collision.tool_bodies(), wall])
     planner = Planner(arm, model)
     left, right = (planner.reach(down(0.7, y, 0.25), WORKING, "beside") for y in (0.35, -0.35))
     assert first_touch(model, np.stack([left, right])) is not None
@@ -291,8 +313,8 @@ def test_an_end_that_touches_is_refused_by_name(planner: Planner) -> None:
 
 def test_bodies_need_names_and_sizes() -> None:
     with pytest.raises(ValueError, match="three lengths"):
-        bodies.box("flat", bodies.BASE, pin.SE3.Identity(), (1.0, 0.0, 1.0))
-    solid = bodies.block("twin", bodies.BASE, (0, 0, 0), (1, 1, 1))
+        collision.box("flat", collision.BASE, pin.SE3.Identity(), (1.0, 0.0, 1.0))
+    solid = collision.block("twin", collision.BASE, (0, 0, 0), (1, 1, 1))
     with pytest.raises(ValueError, match="names of their own"):
         CollisionModel(ArmKinematics(), [solid, solid])
 
@@ -300,7 +322,7 @@ def test_bodies_need_names_and_sizes() -> None:
 def corners_on_the_flange() -> np.ndarray:
     """Corners of claw, scan head, target camera and part, homogeneous (n, 4), from their sizes as the cell has them."""
     found = [np.zeros(3)]
-    for body in bodies.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART):
+    for body in collision.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART):
         signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
         found += list(signs * np.array(body.size) / 2 @ body.placement.rotation.T + body.placement.translation)
     return np.column_stack([found, np.ones(len(found))])
@@ -321,7 +343,7 @@ def fastest_point(motion: Trajectory, count: int) -> float:
 
 def test_no_point_of_flange_tool_or_part_is_faster_than_allowed_in_free_moves(arm: ArmKinematics) -> None:
     generator = np.random.default_rng(9)
-    solids = bodies.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART)
+    solids = collision.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART)
     limits = JointLimits(speed=(1.6,) * 6, acceleration=(3.0,) * 6, jerk=(20.0,) * 6)
     bound = PointSpeed(arm, carried_points(solids), 0.5)
     unbound, speeds = [], []
@@ -338,7 +360,7 @@ def test_no_point_of_flange_tool_or_part_is_faster_than_allowed_in_free_moves(ar
 
 
 def test_the_planners_moves_and_lines_keep_to_the_tool_speed(arm: ArmKinematics) -> None:
-    model = CollisionModel(arm, bodies.arm_bodies() + bodies.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART))
+    model = CollisionModel(arm, collision.arm_bodies() + collision.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART))
     planner = Planner(arm, model, tool_speed=0.25)
     free = planner.free(WORKING, WORKING + np.array([1.2, 0.1, -0.1, 0, 0, 0.5]))
     assert 0.2 < fastest_point(free, 800) <= 0.25
@@ -353,7 +375,7 @@ def test_the_planners_moves_and_lines_keep_to_the_tool_speed(arm: ArmKinematics)
 # --- between the samples ---
 
 
-def spheres(body: bodies.Body, flange_frames: list[np.ndarray], step: float = 0.01) -> tuple[np.ndarray, float]:
+def spheres(body: collision.Body, flange_frames: list[np.ndarray], step: float = 0.01) -> tuple[np.ndarray, float]:
     """Points (n, 3) in the base, no farther apart than `step`, that with the radius lie on the body's skin or core."""
     x, y, z = body.size
     if body.radius is not None:
@@ -376,10 +398,10 @@ def link_frames(joints: Joints) -> list[np.ndarray]:
     return [*frames, pose]
 
 
-def nearest_station_body(solids: list[bodies.Body], joints: Joints) -> float:
+def nearest_station_body(solids: list[collision.Body], joints: Joints) -> float:
     """Distance in m from what the arm moves to what stands, by points and boxes: never less than the true one."""
     frames, least = link_frames(joints), np.inf
-    for obstacle in (b for b in solids if b.parent == bodies.BASE and b.radius is None):
+    for obstacle in (b for b in solids if b.parent == collision.BASE and b.radius is None):
         inverse = np.linalg.inv(obstacle.placement.homogeneous)
         for body in (b for b in solids if b.parent > 2):
             points, radius = spheres(body, frames)
@@ -403,8 +425,8 @@ def test_searched_ways_keep_five_millimetres_between_their_samples(planner: Plan
 
 
 def test_a_fin_thinner_than_a_step_is_found_where_it_stands(arm: ArmKinematics) -> None:
-    fin = bodies.block("fin", bodies.BASE, (0.3, -0.0005, 0.0), (1.2, 0.0005, 0.9))
-    pole = bodies.capsule("pole", bodies.FLANGE, (0, 0, 0.01), (0, 0, 0.2), 0.01)
+    fin = collision.block("fin", collision.BASE, (0.3, -0.0005, 0.0), (1.2, 0.0005, 0.9))
+    pole = collision.capsule("pole", collision.FLANGE, (0, 0, 0.01), (0, 0, 0.2), 0.01)
     model = CollisionModel(arm, [fin, pole])
     end = arm.ik(down(0.7, 0.15, 0.4), WORKING)
     start = end.copy()
@@ -418,8 +440,8 @@ def test_a_fin_thinner_than_a_step_is_found_where_it_stands(arm: ArmKinematics) 
 
 
 def test_what_touches_at_the_beginning_may_open_but_not_close(arm: ArmKinematics) -> None:
-    floor = bodies.block("floor", bodies.BASE, (0.3, -0.5, -0.1), (1.2, 0.5, 0.0))
-    pole = bodies.capsule("pole", bodies.FLANGE, (0, 0, 0.0), (0, 0, 0.2), 0.01)
+    floor = collision.block("floor", collision.BASE, (0.3, -0.5, -0.1), (1.2, 0.5, 0.0))
+    pole = collision.capsule("pole", collision.FLANGE, (0, 0, 0.0), (0, 0, 0.2), 0.01)
     model = CollisionModel(arm, [floor, pole])
     low, lower, high, away = (
         arm.ik(down(0.7, y, 0.21 + h), WORKING) for y, h in ((0, 1e-3), (0, 0), (0, 0.03), (0.1, 1e-3))
@@ -429,3 +451,170 @@ def test_what_touches_at_the_beginning_may_open_but_not_close(arm: ArmKinematics
         touch = first_touch(model, np.array(way), opening=True)
         assert (touch is None) is free, way
     assert first_touch(model, plan_line(arm, low, arm.fk(away)).joints, opening=True) is None
+
+
+HALF = np.pi / 2
+URDF = {
+    "UR3": (0.1519, -0.24365, -0.21325, 0.11235, -0.08535, 0.0819),
+    "UR5": (0.089159, -0.425, -0.39225, 0.10915, -0.09465, 0.0823),
+    "UR10": (0.1273, -0.612, -0.5723, 0.163941, -0.1157, 0.0922),
+    "UR3e": (0.15185, -0.24355, -0.2132, 0.13105, -0.08535, 0.0921),
+    "UR5e": (0.1625, -0.425, -0.3922, 0.1333, -0.0997, 0.0996),
+    "UR10e": (0.1807, -0.6127, -0.57155, 0.17415, -0.11985, 0.11655),
+    "UR16e": (0.1807, -0.4784, -0.36, 0.17415, -0.11985, 0.11655),
+    "UR20": (0.2363, -0.862, -0.7287, 0.201, -0.1593, 0.1543),
+    "UR30": (0.2363, -0.637, -0.5037, 0.201, -0.1593, 0.1543),
+}
+"""Of the vendor's `ur_description`, config/*/default_kinematics.yaml: shoulder z, forearm x, wrist 1 x and z, wrist 2
+y, wrist 3 y, m. Its joints turn about frames of their own, not those of Denavit and Hartenberg."""
+
+PUBLISHED = {
+    "first": (
+        "UR10e",
+        [-0.000144894975118076141, 303.469135666158195, -309.88394307789747, 6.41459904397394975,
+         -4.48232900190081995e-05, -0.00087071402790364627],
+        [0.000108651068627930392, 0.240324175250532346, 0.00180628180213493472, 2.63076149165684402e-05,
+         3.96638632500012715e-06, 0],
+        [1.59613525316931737e-07, -0.917209621528830232, 7.12936131346499469, 0.0710299029424392298,
+         -1.64258976526054923e-06, 9.17286101034808787e-08],
+        [-0.000444781952841921679, -0.00160215112531214153, 0.00631917793331091861, -0.00165055247340828437,
+         0.000763682515545038854, 0],
+    ),
+    "second": (
+        "UR10e",
+        [-0.000160188285741325043, 439.140974079900957, -446.027059806332147, 6.88618689642360149,
+         -3.86588496858186748e-05, -0.00087908274257374186],
+        [2.12234865571205891e-05, 0.632017132627700651, 0.00229833638891230319, -4.61409023720933908e-05,
+         -6.39280053471801522e-05, 0],
+        [-2.41478068943590252e-07, 1.60233952386694556, -1.68607190752171299, 0.0837331147700118711,
+         -1.01260355871157781e-07, 3.91986209186123702e-08],
+        [-0.000650246557584166496, 0.00139416666825590402, 0.00693818880325995126, -0.000811641562390219562,
+         0.000411120504570705592, 0],
+    ),
+    "third": (
+        "UR10",
+        [0.00065609212979853, 1.4442162376284788, 0.854147723854608, -2.2989425877563705, -1.573498686836816e-05,
+         1.9072435590711256e-05],
+        [4.6311376834935676e-05, -0.00012568315331862312, 0.00186216581161458, 9.918593870679266e-05,
+         4.215462720453189e-06, 0],
+        [-7.290070070824746e-05, -0.01713897289704999, -0.03707159413492756, 0.054279462160583214,
+         1.488984257025741e-07, 1.551499479707493e-05],
+        [0.000211987863869334, -0.0072553625957652995, -0.013483226769541364, 0.0013495820227329425,
+         -0.001263136163679901, 0],
+    ),
+}  # fmt: skip
+"""Factory deltas of d, a, theta, alpha of three real arms, published in the tests of the maker's `ur_calibration`."""
+
+
+def told(name: str) -> LinkTable:
+    model, *deltas = PUBLISHED[name]
+    drawn = MODELS[model].table
+    d, a, theta, alpha = (
+        tuple(np.add(base, delta).tolist())
+        for base, delta in zip((drawn.d, drawn.a, (0.0,) * 6, drawn.alpha), deltas, strict=True)
+    )
+    return LinkTable(theta, a, d, alpha)
+
+
+def by_hand(table: LinkTable, joints: np.ndarray) -> np.ndarray:
+    """The product of the four elementary transformations of each joint, nothing else."""
+    pose = np.eye(4)
+    for q, theta, a, d, alpha in zip(joints, table.theta, table.a, table.d, table.alpha, strict=True):
+        c, s, ca, sa = np.cos(q + theta), np.sin(q + theta), np.cos(alpha), np.sin(alpha)
+        pose = pose @ np.array([[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]])
+    return pose
+
+
+def of_urdf(name: str, joints: np.ndarray) -> pin.SE3:
+    """base_link_inertia to flange (wrist 3) of the vendor's description."""
+    z, forearm, x, across, down, out = URDF[name]
+    offsets = (
+        ((0, 0, z), (0, 0, 0)), ((0, 0, 0), (HALF, 0, 0)), ((forearm, 0, 0), (0, 0, 0)),
+        ((x, 0, across), (0, 0, 0)), ((0, down, 0), (HALF, 0, 0)), ((0, out, 0), (HALF, np.pi, np.pi)),
+    )  # fmt: skip
+    pose = pin.SE3.Identity()
+    for (shift, turn), angle in zip(offsets, joints, strict=True):
+        pose = pose * pin.SE3(pin.rpy.rpyToMatrix(*turn), np.array(shift, dtype=float))
+        pose = pose * pin.SE3(pin.utils.rotate("z", angle), np.zeros(3))
+    return pose
+
+
+@pytest.mark.parametrize("name", list(URDF))
+def test_each_model_as_drawn_is_that_of_the_vendors_description(name: str) -> None:
+    arm, simulated = arm_kinematics(name, None), Kinematics(TABLES[name])
+    for joints in np.random.default_rng(3).uniform(-3.0, 3.0, (20, 6)):
+        expected = of_urdf(name, joints).homogeneous
+        np.testing.assert_allclose(arm.fk(joints).homogeneous, expected, atol=1e-9)
+        np.testing.assert_allclose(simulated.forward(joints), expected, atol=1e-9)
+
+
+def test_the_cell_and_the_world_know_the_same_models() -> None:
+    assert set(MODELS) == set(TABLES) == set(URDF) | {"UR7e", "UR12e"}
+
+
+@pytest.mark.parametrize("name", list(PUBLISHED))
+def test_a_factory_table_is_kept_exactly_and_its_poses_are_reached(name: str) -> None:
+    table = told(name)
+    arm = arm_kinematics(PUBLISHED[name][0], table)
+    rng = np.random.default_rng(5)
+    for joints in rng.uniform(-2.5, 2.5, (25, 6)):
+        expected = by_hand(table, joints)
+        np.testing.assert_allclose(arm.fk(joints).homogeneous, expected, atol=2e-9)
+        found = arm.solutions(pin.SE3(expected), joints + rng.uniform(-0.2, 0.2, 6))
+        assert any(np.allclose(answer, joints, atol=1e-6) for answer in found)
+        for answer in found:
+            np.testing.assert_allclose(by_hand(table, answer), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", list(PUBLISHED))
+def test_the_bodies_of_a_calibrated_arm_are_where_the_drawing_has_them_to_a_centimetre(name: str) -> None:
+    model = PUBLISHED[name][0]
+    drawn, calibrated = arm_kinematics(model, None), arm_kinematics(model, told(name))
+    bodies = arm_bodies(model)
+    for joints in np.random.default_rng(6).uniform(-2.5, 2.5, (20, 6)):
+        places = []
+        for arm in (drawn, calibrated):
+            data = arm.model.createData()
+            pin.forwardKinematics(arm.model, data, joints)
+            places.append([data.oMi[body.parent] * body.placement for body in bodies])
+        for first, second in zip(*places, strict=True):
+            assert np.linalg.norm(first.translation - second.translation) < 0.01
+    assert CollisionModel(calibrated, bodies).touching(np.radians([0, -90, 90, -90, -90, 0])) == []
+
+
+@pytest.mark.parametrize("name", ["UR3e", "UR5e", "UR20"])
+def test_an_arm_of_another_model_is_named(name: str) -> None:
+    drawn = MODELS[name].table
+    with pytest.raises(ConfigError, match=rf"The nearest model is {name} \(0.0 mm\): correct arm.model"):
+        arm_kinematics("UR10e", LinkTable(drawn.theta, drawn.a, drawn.d, drawn.alpha))
+
+
+def test_a_calibration_is_named_after_the_table_to_the_last_bit() -> None:
+    table = told("first")
+    other = LinkTable(table.theta, table.a, table.d, (*table.alpha[:5], 1e-15))
+    names = {kinematics_name("UR10e", t) for t in (None, table, other, told("second"))}
+    assert len(names) == 4
+    assert kinematics_name("UR10e", told("first")) == kinematics_name("UR10e", table)
+
+
+def test_kinematics_info_is_read_byte_by_byte() -> None:
+    numbers = [float(k) / 8 for k in range(24)]
+    data = struct.pack(">6I", *range(1, 7)) + struct.pack(">24d", *numbers) + struct.pack(">I", 2)
+    assert parse_kinematics_info(data + b"more") == LinkTable(*(tuple(numbers[k : k + 6]) for k in (0, 6, 12, 18)))
+
+
+@pytest.mark.parametrize(("change", "reason"), [("short", "219 bytes, 220"), ("nan", "theta of a link table"),
+                                                ("far", "d of a link table"),
+                                                ("status", "not initialised; switch the arm on"),
+                                                ("zeros", "not initialised; switch the arm on")])  # fmt: skip
+def test_kinematics_info_that_is_none_is_refused(change: str, reason: str) -> None:
+    numbers = [0.1] * 24
+    if change == "nan":
+        numbers[2] = float("nan")
+    if change == "far":
+        numbers[14] = 2e4
+    if change == "zeros":
+        numbers[6:18] = [0.0] * 12
+    data = struct.pack(">6I24dI", *range(6), *numbers, 0 if change == "status" else 2)
+    with pytest.raises(ValueError, match=reason):
+        parse_kinematics_info(data[:219] if change == "short" else data)

@@ -10,7 +10,7 @@ import time
 import pytest
 
 from cell.run.events import MOST_WAITING, Detached, RunEnded, StepProgress, StepStarted, Subscription
-from cell.run.run import Run
+from cell.run.runs import Run
 from statemachine.step import Event
 from statemachine.watch import EndSignals, SignalInterrupt
 

@@ -15,11 +15,11 @@ from cell.config.job import load_job
 from cell.devices.devices import Devices
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.vision import parse_board
-from cell.motion.arm_models import HOME
+from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.boards import collect_scan, look_for
 from cell.run.recorded_work import Hands, RecordedWork
-from cell.run.run import Run
+from cell.run.runs import Run
 from drivers.camera.folder import read_image
 from drivers.errors import RefusedError
 

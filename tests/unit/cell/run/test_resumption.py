@@ -21,14 +21,13 @@ from cell.measure.calibration.drift.reference_plate import Pointing
 from cell.measure.calibration.drift.slip import Slip
 from cell.measure.geometry.poses import from_parts
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.laser_sweep import STEP, SweepRecord
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep import stored_sweep
 from cell.procedures.sweep.stored_sweep import FILE, UNSEALED, StoredSweep, save_sweep
-from cell.run.files.folder import is_going
-from cell.run.files.reading import run_row
+from cell.run.folder import is_going, run_row
 from cell.run.resumption import UnfinishedRun, job_hash
 from drivers.errors import CalibrationStale, ConfigError, InterlockError, RefusedError
 from drivers.interfaces import Frame
@@ -36,7 +35,7 @@ from lab.bench.job.whole_job import NoFrames
 from statemachine.journal import FILE_NAME, Journal
 from statemachine.step import Event, StepContext
 from tests.unit.cell.config.calibrations.test_store import made
-from tests.unit.cell.procedures.sweep.test_rail_sweep import CONFIG, sweep
+from tests.unit.cell.procedures.sweep.test_sweeping import CONFIG, sweep
 
 CALIBRATION = made()
 SIGMA_M, SIGMA_RAD = 1e-4, 2e-4

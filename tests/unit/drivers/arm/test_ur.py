@@ -13,12 +13,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from drivers.arm.dashboard import Dashboard
+from drivers.arm.factory import flange_agrees, require_same_flange, same_payload
 from drivers.arm.faults import fault, unlock
-from drivers.arm.feed import StateFeed
-from drivers.arm.limits import ArmLimits
-from drivers.arm.messages import Snapshot, safety_code
-from drivers.arm.motion import JointTrajectory, UrMotion, pose_difference
-from drivers.arm.wrong_arm import flange_agrees, require_same_flange, same_payload
+from drivers.arm.feed import Snapshot, StateFeed, safety_code
+from drivers.arm.motion import ArmLimits, JointTrajectory, UrMotion, pose_difference
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, LimitError, NotConnectedError
 from drivers.interfaces import LinkStatistics

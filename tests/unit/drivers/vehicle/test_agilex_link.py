@@ -9,7 +9,7 @@ import pytest
 from cantools.database.can import Database
 
 from drivers.vehicle.agilex_link import load_database
-from drivers.vehicle.odometry import PlanarOdometry
+from drivers.vehicle.feedback import PlanarOdometry
 
 TRACK = 0.583
 

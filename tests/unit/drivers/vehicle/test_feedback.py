@@ -6,9 +6,9 @@ import pytest
 
 from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
+from drivers.vehicle.agilex_link import VersionAnswer
 from drivers.vehicle.faults import driver_trouble, system_trouble
 from drivers.vehicle.feedback import CAN_MODE, STILL_FRAMES, MessageFeedback
-from drivers.vehicle.version import VersionAnswer
 from tests.support.inner_bus import Hand
 
 

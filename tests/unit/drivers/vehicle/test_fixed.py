@@ -23,7 +23,7 @@ from cell.devices.diagnosis.diagnosis import _vehicle_state
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.drive.way import Whereabouts
 from cell.procedures.steps.drive_to_target import stand_at_target
 from drivers.clock import Clock
 from drivers.errors import ConfigError, InterlockError, NotConnectedError, RefusedError

@@ -17,8 +17,7 @@ from sim_backends.models.arm_kinematics import (
     pose_from_matrix,
     rotation_vector,
 )
-from sim_backends.models.arm_motion import JointMove, LinearMove, StopMotion
-from sim_backends.models.arm_streams import ForceMode, JointSpeed, LinearSpeed, Servo
+from sim_backends.models.arm_motion import ForceMode, JointMove, JointSpeed, LinearMove, LinearSpeed, Servo, StopMotion
 
 TICK = 0.002
 Array = NDArray[np.float64]

@@ -10,16 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sim_backends.optics import (
-    Board,
-    BoardInstance,
-    CameraOptics,
-    Light,
-    PlaneInstance,
-    expected_image,
-    render,
-    sensor,
-)
+from sim_backends.optics import Board, BoardInstance, CameraOptics, Light, PlaneInstance, expected_image, render, sensor
 
 FOCAL_PX = 8e-3 / 4.8e-6
 LENS = (-0.08, 0.03, 4e-4, -3e-4, 0.01)

@@ -9,8 +9,8 @@ from sim_backends.clock import SteppedClock
 from sim_backends.models.arm_motion import JointMove
 from sim_backends.models.followed import Track
 from sim_backends.models.vehicle import Mode
+from sim_backends.world.drawing import inverse
 from sim_backends.world.following import NotFollowed, WorldFollowing
-from sim_backends.world.nominal import inverse
 from sim_backends.world.world import World
 from tests.support import ROOT
 

@@ -9,16 +9,14 @@ import numpy as np
 import pytest
 
 from sim_backends import serve
-from sim_backends.clock import SteppedClock, WorldClock
-from sim_backends.history import History, interpolate
-from sim_backends.world import nominal
+from sim_backends.clock import History, SteppedClock, WorldClock, interpolate
+from sim_backends.world import drawing
 from sim_backends.world.bodies.contact import STIFFNESS, PartContact
 from sim_backends.world.bodies.surfaces import HALF_X, HALF_Y, surface
 from sim_backends.world.drawing import STOCK
 from sim_backends.world.levels import CUT, HARSH, IDEAL, NOMINAL, deviations
 from sim_backends.world.scene import draw, rotation, stream
-from sim_backends.world.truth import truth
-from sim_backends.world.world import World
+from sim_backends.world.world import World, truth
 
 
 def turned(vector: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
@@ -131,9 +129,9 @@ def test_each_quantity_has_a_stream_of_its_own() -> None:
 
 def test_the_ideal_world_is_the_nominal_geometry() -> None:
     scene = draw(11, "ideal")
-    assert scene.world_from_surface == pytest.approx(nominal.WORLD_FROM_PLACE)
-    assert scene.flange_from_scan_camera == pytest.approx(nominal.FLANGE_FROM_SCAN_CAMERA)
-    assert scene.flange_from_part == pytest.approx(nominal.FLANGE_FROM_PART)
+    assert scene.world_from_surface == pytest.approx(drawing.WORLD_FROM_PLACE)
+    assert scene.flange_from_scan_camera == pytest.approx(drawing.FLANGE_FROM_SCAN_CAMERA)
+    assert scene.flange_from_part == pytest.approx(drawing.FLANGE_FROM_PART)
     # Where the light plane meets the optical axis: l tan θ = 122.5 mm (paper, equation 6; docs/explanation/theory.md,
     # section 2).
     assert scene.light_plane_distance / scene.light_plane_normal[2] == pytest.approx(0.1225)
@@ -145,7 +143,7 @@ def test_nominal_deviations_scatter_as_the_table_says_and_are_cut() -> None:
     shifts, turns = [], []
     for seed in range(200):
         scene = draw(seed, "nominal")
-        moved = nominal.inverse(nominal.WORLD_FROM_PLACE) @ scene.world_from_surface
+        moved = drawing.inverse(drawing.WORLD_FROM_PLACE) @ scene.world_from_surface
         shifts.append(moved[:3, 3])
         turns.append(angle(moved, np.eye(4)))
     assert np.std(shifts) == pytest.approx(NOMINAL.station_translation, rel=0.1)
@@ -154,7 +152,7 @@ def test_nominal_deviations_scatter_as_the_table_says_and_are_cut() -> None:
 
 
 def test_the_board_faces_the_vehicle_and_up_with_its_centre_where_the_drawing_says() -> None:
-    place_from_board = nominal.PLACE_FROM_BOARD
+    place_from_board = drawing.PLACE_FROM_BOARD
     centre = place_from_board @ [0.08, 0.06, 0.0, 1.0]
     assert centre[:3] == pytest.approx([0.10, 0.32, 0.12])
     assert -place_from_board[:3, 2] == pytest.approx([-np.sqrt(0.5), 0.0, np.sqrt(0.5)])
@@ -168,11 +166,11 @@ def contact(
     name: str = "pot", lean: tuple[float, float, float] = (0.004, -0.006, 0.01)
 ) -> tuple[PartContact, np.ndarray]:
     world_from_surface = turned(lean, (0.01, -0.02, 0.6))
-    return PartContact(surface(name), world_from_surface, nominal.FLANGE_FROM_PART), world_from_surface
+    return PartContact(surface(name), world_from_surface, drawing.FLANGE_FROM_PART), world_from_surface
 
 
 def flange_for(world_from_part: np.ndarray) -> np.ndarray:
-    return world_from_part @ nominal.inverse(nominal.FLANGE_FROM_PART)
+    return world_from_part @ drawing.inverse(drawing.FLANGE_FROM_PART)
 
 
 def raised(pose: np.ndarray, dx: float = 0.0, dz: float = 0.0) -> np.ndarray:
@@ -229,7 +227,7 @@ def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact() ->
         a.ravel() for a in np.meshgrid(np.linspace(-HALF_X, HALF_X, 21) * 0.9, np.linspace(-HALF_Y, HALF_Y, 11) * 0.9)
     )
     underside = np.column_stack([x, y, surface("pot").height(x, y), np.ones_like(x)])
-    seen = (nominal.inverse(target) @ rest @ underside.T).T
+    seen = (drawing.inverse(target) @ rest @ underside.T).T
     gap = seen[:, 2] - surface("pot").height(seen[:, 0], seen[:, 1])
     assert 0 < rest[2, 3] - target[2, 3] < 0.002
     assert gap.min() > -2e-5
@@ -272,7 +270,7 @@ class StandingWorld(World):
 
     def __init__(self, level: str = "ideal", seed: int = 5, surface: str = "pot") -> None:
         super().__init__(seed=seed, level=level, drawing=STOCK.with_surface(surface))
-        self.base = nominal.pose((-0.75, 0.0, 0.55), (1, 0, 0), (0, 0, 1))
+        self.base = drawing.pose((-0.75, 0.0, 0.55), (1, 0, 0), (0, 0, 1))
 
     def world_from_base(self, t: float) -> np.ndarray:
         return self.base
@@ -290,7 +288,7 @@ def ideal() -> StandingWorld:
 
 def above(point: tuple[float, float, float]) -> np.ndarray:
     """A camera that looks straight down from `point`, its x axis along world x."""
-    return nominal.pose(point, (1, 0, 0), (0, 0, -1))
+    return drawing.pose(point, (1, 0, 0), (0, 0, -1))
 
 
 def test_the_stripe_on_the_table_is_where_the_closed_form_puts_it(ideal: StandingWorld) -> None:
@@ -323,8 +321,8 @@ def test_the_stripe_follows_the_relief(ideal: StandingWorld) -> None:
 
 
 def test_the_target_camera_sees_the_boards_dots_where_a_pinhole_puts_them(ideal: StandingWorld) -> None:
-    world_from_board = nominal.WORLD_FROM_PLACE @ nominal.PLACE_FROM_BOARD
-    world_from_camera = world_from_board @ nominal.pose((0.08, 0.06, -0.9), (1, 0, 0), (0, 0, 1))
+    world_from_board = drawing.WORLD_FROM_PLACE @ drawing.PLACE_FROM_BOARD
+    world_from_camera = world_from_board @ drawing.pose((0.08, 0.06, -0.9), (1, 0, 0), (0, 0, 1))
     picture = ideal.look("target", world_from_camera, exposure=0.008).astype(float)
     for i, j in [(0, 0), (8, 0), (0, 6), (8, 6)]:
         u, v = (
@@ -338,7 +336,7 @@ def test_the_target_camera_sees_the_boards_dots_where_a_pinhole_puts_them(ideal:
 
 
 def test_a_camera_that_looks_away_sees_only_the_room(ideal: StandingWorld) -> None:
-    picture = ideal.look("target", nominal.pose((-0.75, 0.0, 1.5), (1, 0, 0), (0, 0, 1)), exposure=0.008)
+    picture = ideal.look("target", drawing.pose((-0.75, 0.0, 1.5), (1, 0, 0), (0, 0, 1)), exposure=0.008)
     assert np.ptp(picture) < 30
 
 
@@ -367,9 +365,9 @@ def test_the_arm_carries_laser_claw_and_grip_feedback_at_its_next_tick() -> None
 
 def test_pressing_the_part_down_is_felt_upward_in_base_axes() -> None:
     world = StandingWorld()
-    on_the_surface = nominal.inverse(world.base) @ world.scene.world_from_surface
+    on_the_surface = drawing.inverse(world.base) @ world.scene.world_from_surface
     on_the_surface[2, 3] -= 0.0005
-    wrench = world.arm.contact(on_the_surface @ nominal.inverse(nominal.FLANGE_FROM_PART))
+    wrench = world.arm.contact(on_the_surface @ drawing.inverse(drawing.FLANGE_FROM_PART))
     assert 5.0 < wrench[2] < 10.0
 
 

@@ -2,31 +2,147 @@
 
 Slower than the search and fit of ordinary pictures: the plane is chosen in which the laser stands out, the stripe is
 followed as a line, its profile learned, and the deviation told from what surrounds it. `extract` comes here by itself.
+
+Which fitted lines are believable stripes, and how far the stated deviation has to grow where the model misfits.
+
+Pieces of a line that are much wider or narrower than the rest of it: out of focus, or on what shines.
+
+A picture teaches one width, and what differs from it by more than twice is not believed. Rows that stay without a
+stripe so are read once more by themselves, and what they show is taken where it goes on from the rest of the line.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.base.compiled import compiled
 from cell.measure.vision.stripe.careful.follow import CANDIDATES, SCALES, Candidates, StripeChain, candidates, follow
 from cell.measure.vision.stripe.careful.learning import FREE_SCALE, learn_profile
-from cell.measure.vision.stripe.careful.segments import fill_gaps
-from cell.measure.vision.stripe.careful.shape import Shape
-from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, binned, fit_shape
+from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, Shape, binned, fit_shape
 from cell.measure.vision.stripe.careful.surroundings import around, carried, surrounded, wander
-from cell.measure.vision.stripe.careful.validation import MISFIT_SIGMAS
+from cell.measure.vision.stripe.ordinary.find import CENTRE, CORE
+from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, CHI2, FISHER, FIT_CENTRE, SIGMA, WIDTH
 from cell.measure.vision.stripe.overview import ALONG, BINNED_WIDTH, LEAST_SCORE, SURE, choose_mix, coarse, difference
 from cell.measure.vision.stripe.planes import MIXES, LaserChannel, Picture
 
 if TYPE_CHECKING:
     from cell.measure.vision.stripe.profile import StripeSettings
 
+
+# A misfit that noise makes once in some hundred lines; beyond it, the deviation grows with the misfit.
+MISFIT_SIGMAS = 3.0
+
+
+@compiled
+def believe(
+    fitted: Any, start: Any, length: int, narrowest: float, widest: float, least: float, excess: float, double: Any,
+    saturated: Any,
+) -> None:  # fmt: skip
+    """Put NaN into the lines of `fitted` (FITTED, lines) that are no stripe of a picture of `length` px a line.
+
+    A stripe has a width in px within the range, an amplitude above `least` DN, its whole peak in the picture, and its
+    centre near the start's. The variance of the others grows by `excess` and with their misfit. `double` and
+    `saturated` (lines,) are True of no line that is none; the latter is told here.
+    """
+    for r in range(fitted.shape[1]):
+        centre, width, fisher = fitted[FIT_CENTRE, r], fitted[WIDTH, r], fitted[FISHER, r]
+        keep = width > narrowest and width < widest and fitted[AMPLITUDE, r] > least
+        keep = keep and centre > 1.5 * width and centre < length - 1 - 1.5 * width
+        keep = keep and abs(centre - start[r, 0, CENTRE]) < max(3.0, 2 * width)
+        if keep and fisher < max(1.0, 0.5 * width):
+            pixels = 8 * width + 2
+            allowed = 1 + MISFIT_SIGMAS * np.sqrt(2 / pixels)
+            fitted[SIGMA, r] *= np.sqrt(excess * max(1.0, fitted[CHI2, r] / allowed))
+            saturated[r] = start[r, 0, CORE] > 0
+        else:
+            fitted[FIT_CENTRE, r] = fitted[SIGMA, r] = fitted[AMPLITUDE, r] = fitted[WIDTH, r] = np.nan
+            double[r] = saturated[r] = False
+
+
 Array = NDArray[np.float64]
+
+LEAST_ROWS = 32
+END_ROWS = 12
+"""So many rows on either side of a seam tell whether the line goes on there."""
+SEAM_ROWS = 3 * END_ROWS
+LEAST_LINE, LEAST_SHARE = 0.3, 0.8
+"""Shares of the picture's rows, and of a piece's, that have to show the line."""
+MOST_LIGHT = 4.0
+"""Times more or less light than the rest of the line: a laser has the same everywhere, a surface takes its share."""
+
+
+def fill_gaps(line: Careful, read: Callable[[slice], Careful]) -> None:
+    """Fill into `line` what `read` finds in its longer gaps, where that is the same line in another width."""
+    seen = np.isfinite(line.centres)
+    if seen.mean() < LEAST_LINE:
+        return
+    for gap in _gaps(seen):
+        piece = read(gap)
+        there = np.isfinite(piece.centres)
+        if there.sum() < LEAST_ROWS or there.mean() < LEAST_SHARE or not _goes_on(line, gap, piece):
+            continue
+        for name in ("centres", "sigma", "amplitude", "width", "saturated", "rival", "misfit"):
+            getattr(line, name)[gap] = getattr(piece, name)
+
+
+def _gaps(seen: NDArray[np.bool_]) -> list[slice]:
+    """Runs of rows that show little of the line, which lies right beside them."""
+    share = np.convolve(
+        np.pad(seen.astype(np.float64), END_ROWS // 2, "edge"), np.full(END_ROWS + 1, 1 / (END_ROWS + 1))
+    )
+    sparse = share[END_ROWS : END_ROWS + len(seen)] < LEAST_SHARE
+    edges = np.flatnonzero(np.diff(np.r_[False, sparse, False]))
+    beside = [
+        (a, b, seen[max(0, a - SEAM_ROWS) : a].sum(), seen[b : b + SEAM_ROWS].sum()) for a, b in edges.reshape(-1, 2)
+    ]
+    return [slice(int(a), int(b)) for a, b, *ends in beside if b - a >= LEAST_ROWS and max(ends) >= END_ROWS]
+
+
+def _goes_on(line: Careful, gap: slice, piece: Careful) -> bool:
+    """Whether the piece meets the line at one of its ends, at least."""
+    rows = np.flatnonzero(np.isfinite(line.centres))
+    own = gap.start + np.flatnonzero(np.isfinite(piece.centres))
+    before, after = rows[rows < gap.start][-END_ROWS:], rows[rows >= gap.stop][:END_ROWS]
+    return any(
+        _meet(_end(line, beside, 0), _end(piece, inner, gap.start))
+        for beside, inner in ((before, own[:END_ROWS]), (after, own[-END_ROWS:]))
+        if min(len(beside), len(inner)) == END_ROWS
+    )
+
+
+@dataclass(frozen=True)
+class _End:
+    """An end of a line: its middle `row`, `place` in px and `slope` there, its width in px and light in DN px."""
+
+    row: float
+    place: float
+    slope: float
+    width: float
+    light: float
+
+
+def _end(line: Careful, rows: NDArray[np.intp], first: int) -> _End:
+    """Of `rows` of the picture, of which `first` is the line's first."""
+    at = rows - first
+    slope, place = np.polyfit(rows - rows.mean(), line.centres[at], 1)
+    width, light = (float(np.median(values[at])) for values in (line.width, line.amplitude * line.width))
+    return _End(float(rows.mean()), float(place), float(slope), width, light)
+
+
+def _meet(one: _End, other: _End) -> bool:
+    """Whether they lie on one straight line and have about as much light."""
+    if abs(other.row - one.row) > SEAM_ROWS or not 1 / MOST_LIGHT < one.light / other.light < MOST_LIGHT:
+        return False
+    half = 0.5 * (other.row - one.row)
+    apart = one.place + one.slope * half - (other.place - other.slope * half)
+    return abs(apart) < max(1.0, 0.5 * max(one.width, other.width))
+
 
 MOST_WANDER = 8.0
 WIDEST = 48.0

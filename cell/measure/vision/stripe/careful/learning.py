@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.vision.stripe.careful.shape import Shape, gaussian, learn
-from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, fit_shape
-from cell.measure.vision.stripe.careful.shaped_speckle import speckled
+from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, Shape, fit_shape, gaussian, learn
+from cell.measure.vision.stripe.careful.speckle import speckled
 
 Array = NDArray[np.float64]
 

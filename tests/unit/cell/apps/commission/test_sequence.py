@@ -11,12 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from cell.apps.commission.begin import begin
 from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.checks.vehicle import judge_board
 from cell.apps.commission.person import PersonAtTheConsole, SimulatedPerson
 from cell.apps.commission.protocol import write_protocol
-from cell.apps.commission.sequence import CHECKS, Commissioning, by_name, chosen
+from cell.apps.commission.sequence import CHECKS, Commissioning, begin, by_name, chosen
 from cell.config.cell_config import default_toml, load_config
 from cell.config.job import load_job
 from cell.devices.simulated.described import Described

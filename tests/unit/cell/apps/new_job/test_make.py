@@ -14,7 +14,7 @@ from cell.apps.new_job.make import Made, make_job
 from cell.apps.new_job.mesh_file import read_drawing
 from cell.apps.new_job.questions import Asker, checked
 from cell.apps.new_job.surface import lay, open_side
-from cell.apps.new_job.units import told_by_size
+from cell.apps.new_job.text import told_by_size
 from cell.check.fit import require_fit
 from cell.config.cell_config import load_config
 from cell.config.job import SurfaceSection, load_job

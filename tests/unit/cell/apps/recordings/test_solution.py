@@ -16,15 +16,15 @@ import pytest
 from cell.apps.recordings.frames import RecordedFrame
 from cell.apps.recordings.result import empty_result
 from cell.apps.recordings.solution import agreeing, camera_of, solve_frames
+from cell.measure.calibration.archive import ScanObservation
 from cell.measure.calibration.judge.board_shape import moved_by_bend
 from cell.measure.calibration.judge.camera_checks import camera_checks
-from cell.measure.calibration.judge.foreign_pictures import foreign_view, own_cameras
-from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.judge.faults import foreign_view, own_cameras
 from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
-from cell.measure.calibration.solve.blocks import HAND
 from cell.measure.calibration.solve.choice import choose_solution, with_doubt_of_camera
 from cell.measure.calibration.solve.intrinsics import choose_lens
 from cell.measure.calibration.solve.joint import solve_staged, start_state, view_data
+from cell.measure.calibration.solve.normal import HAND
 from cell.measure.geometry.camera import CameraModel
 from drivers.errors import RefusedError
 from tests.support.recorded_scenes import DISTANCE, FLANGE_FROM_CAMERA, LENS, MATRIX, NORMAL, SIZE, scene

@@ -18,9 +18,9 @@ from cell.config.calibrations.store import (
     accept_calibration,
     nominal_camera,
     read_calibration,
+    require_as_configured,
     save_calibration,
 )
-from cell.config.calibrations.validation import require_as_configured
 from cell.config.cell_config import load_config
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration import ScanCalibration, TargetCalibration

@@ -11,7 +11,7 @@ import pytest
 from cell.devices.gate.gate import Gate
 from cell.devices.gate.interlocks import DeviceCommand, Interlocks, Rule, Situation
 from drivers.errors import Aborted, InterlockError
-from statemachine.cancel import CancelToken
+from statemachine.control import CancelToken
 
 MOVE = DeviceCommand("rail", "move_to", {"position": 0.0})
 

@@ -12,9 +12,9 @@ from cell.config.cell_config import load_config
 from cell.devices.devices import Devices
 from cell.devices.gate.interlocks import DeviceCommand, Rule, Situation
 from cell.devices.simulated.direct import VirtualCell
-from cell.motion.arm_models import HOME
+from cell.motion.kinematics import HOME
 from drivers.errors import Aborted, InterlockError
-from statemachine.cancel import CancelToken
+from statemachine.control import CancelToken
 
 CONFIG = load_config(None)
 

@@ -19,13 +19,12 @@ from cell.config.job import job_path
 from cell.devices.devices import Devices
 from cell.devices.gate.interlocks import DeviceCommand
 from cell.devices.gate.laser import UNATTENDED_S
-from cell.devices.gate.rules import RULES, markdown
-from cell.devices.gate.ways import LINE_STEP_M, LINE_STEP_RAD, Ways
+from cell.devices.gate.rules import LINE_STEP_M, LINE_STEP_RAD, RULES, Ways, markdown
 from cell.devices.lock import CellLock
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur, to_ur
-from cell.motion.arm_models import HOME
-from cell.motion.bodies import BASE, FLANGE, block, tool_bodies
+from cell.motion.collision import BASE, FLANGE, block, tool_bodies
+from cell.motion.kinematics import HOME
 from cell.run.jogging import jog, parse_jog
 from cell.run.session.supervisor import Cell
 from drivers.clock import Clock

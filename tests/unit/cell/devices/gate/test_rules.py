@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.devices.contact import GuardedMotion
+from cell.devices.gate.gated import GuardedMotion
 from cell.devices.gate.interlocks import DeviceCommand, Interlocks, Situation
 from cell.devices.gate.rules import LATE_S, LOOK_M, LOOK_RAD, RULES
 from cell.measure.geometry.poses import to_ur

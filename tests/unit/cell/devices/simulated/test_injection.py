@@ -7,7 +7,7 @@ import pytest
 from cell.devices.simulated.injection import Injection, Injector
 from cell.procedures.steps.kinds import PLACE
 from drivers.errors import ConfigError, DeviceFault
-from sim_backends.direct import faults as direct
+from sim_backends.direct import cell as direct
 from sim_backends.faults import FAULT_NAMES
 from statemachine.step import Event
 

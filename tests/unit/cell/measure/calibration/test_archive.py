@@ -14,8 +14,7 @@ from cell.config.cell_config import load_config
 from cell.measure.calibration import Priors, TargetObservation, calibrate_scan
 from cell.measure.calibration.archive import Observations, read_archive, write_archive
 from cell.measure.calibration.judge.advice import advice
-from cell.measure.calibration.judge.coverage import Coverage
-from cell.measure.calibration.judge.influence import Places, derivatives, influences, place_rms
+from cell.measure.calibration.judge.coverage import Coverage, Places, derivatives, influences, place_rms
 from cell.measure.calibration.solve.paper_steps import Crossing, paper_plane, step_3_keep_the_cross_ratio
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.poses import from_matrix, from_parts

@@ -16,12 +16,11 @@ from scipy.spatial import cKDTree
 
 from cell.measure.geometry.poses import difference, perturbed
 from cell.measure.inversion import Demands, NominalSurface, PlacePose, Prior, Tolerance, invert_pose
-from cell.measure.inversion.correspondences import Scan
-from cell.measure.inversion.motions import name as motion_name
-from cell.measure.inversion.motions import sorted_out
-from cell.measure.inversion.observability import judge
+from cell.measure.inversion.nominal import Scan
+from cell.measure.inversion.observability import judge, sorted_out
+from cell.measure.inversion.observability import name as motion_name
+from cell.measure.inversion.place_pose import balance
 from cell.measure.inversion.registration import register
-from cell.measure.inversion.sweeps import balance
 from cell.measure.reconstruction import Cloud, merge
 from drivers.errors import ConfigError, NotObservable, RefusedError
 from lab.bench.inversion.parts import PARTS

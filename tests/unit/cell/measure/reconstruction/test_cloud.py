@@ -20,8 +20,8 @@ from cell.measure.reconstruction import (
     merge,
 )
 from cell.measure.vision.stripe.extract import StripeProfile
-from cell.motion.track import FlangeTrack
-from drivers.clock_map import ClockMap, Latch
+from cell.motion.trajectory import FlangeTrack
+from drivers.clock import ClockMap, Latch
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmSafety, ArmState
 from tests.unit.cell.measure.reconstruction.test_build import BASE_FROM_FLANGE, GEOMETRY, MOUNT, RAIL, TABLE

@@ -10,10 +10,9 @@ import pytest
 import trimesh
 
 from cell.measure.reconstruction import Cloud, Filled, fill_holes, merge, write_cloud
-from cell.measure.reconstruction.e57 import write_e57
-from cell.measure.reconstruction.mesh import triangles, write_mesh
+from cell.measure.reconstruction.cloud import triangles, write_mesh
 from cell.measure.reconstruction.outliers import find_outliers
-from cell.measure.reconstruction.ply import deviation_colours, read_cloud
+from cell.measure.reconstruction.ply import deviation_colours, read_cloud, write_e57
 from drivers.errors import ConfigError
 from lab.bench.reconstruction.scenes import KINDS, Scene, cut_holes, scene
 

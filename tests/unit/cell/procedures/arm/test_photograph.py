@@ -14,13 +14,12 @@ from cell.config.job import PhotoSection, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix, from_parts
 from cell.measure.vision import parse_board
-from cell.motion.arm_models import HOME
-from cell.procedures.arm.camera_poses import look_pose
+from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.photograph import BoardFix, photograph
+from cell.procedures.arm.photograph import BoardFix, look_pose, photograph
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ
 from drivers.errors import RefusedError
-from sim_backends.world.nominal import inverse
+from sim_backends.world.drawing import inverse
 from tests.unit.cell.config.calibrations.test_store import made
 
 CONFIG = load_config(None)

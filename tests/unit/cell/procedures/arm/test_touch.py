@@ -16,7 +16,7 @@ from cell.procedures.arm.touch import FELT_M, TouchCheck, TouchHeight, expected_
 from drivers.errors import RefusedError
 from drivers.interfaces import ArmSafety, ArmState
 from lab.bench.job.whole_job import JobRecord, run_whole_job
-from sim_backends.world import effects
+from sim_backends.world import levels
 
 JOB, MESH = load_job("pot")
 NOMINAL = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
@@ -104,7 +104,7 @@ def test_a_laser_that_turned_unseen_is_caught_when_the_part_touches(
     """One milliradian, no plate to see it on, and a job that knows its grasp as this level's claw holds it."""
     assert placed_pot.calibration is not None
     blind = replace(placed_pot.calibration, scan=replace(placed_pot.calibration.scan, witness=None))
-    monkeypatch.setattr(effects, "ALONE", replace(effects.ALONE, laser_pointing=150e-6))
+    monkeypatch.setattr(levels, "ALONE", replace(levels.ALONE, laser_pointing=150e-6))
     job, quick = replaced_grasp(0.02e-3, 0.1e-3), {"speed": 2 * JOB.scan.speed}
     job = job.model_copy(update={"scan": JOB.scan.model_copy(update=quick)})
     before = replace(placed_pot, calibration=blind)

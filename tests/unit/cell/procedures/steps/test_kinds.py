@@ -15,15 +15,13 @@ from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.steps import kinds
 from cell.procedures.steps.kinds import PLACE, Kind, find_kind
 from cell.procedures.steps.place import PlaceResult
-from cell.procedures.steps.step import JobStep
-from cell.procedures.steps.workplace import Workplace
+from cell.procedures.steps.workplace import JobStep, Workplace
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from statemachine.journal import Journal, read
-from statemachine.policy import Failure, Outcome, Policy, Step
-from statemachine.runner import Runner, RunResult, StepContext
-from statemachine.script import NO_SCRIPT, Again, Script
+from statemachine.runner import NO_SCRIPT, Again, Runner, RunResult, Script, StepContext
 from statemachine.sequence import Sequence
+from statemachine.step import Failure, Outcome, Policy, Step
 
 
 @dataclass(frozen=True)

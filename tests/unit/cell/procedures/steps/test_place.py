@@ -16,13 +16,12 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix, from_parts, from_ur
 from cell.measure.inversion import NominalSurface
 from cell.measure.vision import parse_board
-from cell.motion.arm_models import HOME
 from cell.motion.collision import CollisionError
+from cell.motion.kinematics import HOME
 from cell.motion.trajectory import Trajectory
-from cell.procedures.arm.moves import PLACED, Mover
-from cell.procedures.arm.part import PartProgress, PartState
+from cell.procedures.arm.moves import PLACED, Mover, PartProgress, PartState
 from cell.procedures.arm.touch import TouchHeight
-from cell.procedures.drive.whereabouts import Whereabouts
+from cell.procedures.drive.way import Whereabouts
 from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.place import PlaceResult, place
@@ -32,10 +31,10 @@ from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
 from lab.bench.job.whole_job import NoFrames
-from sim_backends.world.nominal import inverse
+from sim_backends.world.drawing import inverse
 from statemachine.journal import Journal
-from statemachine.policy import OnFailure
 from statemachine.runner import StepContext
+from statemachine.step import OnFailure
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")

@@ -20,8 +20,7 @@ from cell.procedures.steps import reconstruct
 from cell.procedures.steps.board_photo import photographed
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.workplace import CHANCE_SCATTER, PHOTO_RATE_HZ, Workplace
-from cell.procedures.sweep.stored_sweep import FILE
-from cell.procedures.sweep.sweep_record import SweepRecord
+from cell.procedures.sweep.stored_sweep import FILE, SweepRecord
 from drivers.errors import NotObservable, RefusedError
 from lab.bench.job.whole_job import JobRecord, NoFrames
 from tests.support.report_runs import changed, pot, with_few_lines, work_of

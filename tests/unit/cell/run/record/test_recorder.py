@@ -29,16 +29,13 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.reconstruction.ply import read_cloud
 from cell.run.record import file as record_file
 from cell.run.record import recorder
-from cell.run.record.channels import BY_TOPIC, CHANNELS
-from cell.run.record.export import as_candump, as_text
-from cell.run.record.file import RecordFile
-from cell.run.record.information import information
-from cell.run.record.perception import FILE as PERCEPTION
-from cell.run.record.reading import messages
+from cell.run.record.file import BY_TOPIC, CHANNELS, RecordFile
+from cell.run.record.reading import as_candump, as_text, information, messages
+from cell.run.record.recorder import as_json, rtde, wire
 from cell.run.record.repair import repair
+from cell.run.record.replay import FILE as PERCEPTION
 from cell.run.record.replay import replay
-from cell.run.record.words import as_json, rtde, wire
-from cell.run.run import Run
+from cell.run.runs import Run
 from drivers.errors import CellError, ConfigError
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.can_link import CanLink
@@ -558,7 +555,7 @@ def test_rerun_sees_frames_lenses_pictures_and_cloud(folder: Path, tmp_path: Pat
 
 
 def test_the_documentation_lists_the_channels() -> None:
-    from cell.run.record.channels import table
+    from cell.run.record.file import table
 
     text = (ROOT / "docs" / "reference" / "record.md").read_text(encoding="utf-8")
     assert table() in text

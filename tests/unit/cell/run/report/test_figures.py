@@ -14,9 +14,8 @@ import pinocchio as pin
 import pytest
 
 from cell.measure.calibration.drift.decision import Figure, Suspect
-from cell.measure.calibration.drift.pointing import WitnessCheck
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing
-from cell.measure.calibration.drift.slip import Slip
+from cell.measure.calibration.drift.slip import Slip, WitnessCheck
 from cell.measure.calibration.timing import Shutter, StampTiming
 from cell.measure.reconstruction.seams import Seam
 from cell.procedures.arm.touch import TouchCheck, TouchHeight

@@ -20,9 +20,9 @@ from cell.measure.reconstruction.ply import read_cloud
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.part_error import stated_bound
 from cell.procedures.steps.reconstruct import Reconstruction
-from cell.run.files.folder import write_json
+from cell.run.folder import write_json
 from cell.run.job_run import RunOutcome
-from cell.run.report.panels import SurfacePanel, draw_surface
+from cell.run.report.pictures import SurfacePanel, draw_surface
 from cell.run.report.report import strict
 from drivers.errors import CellError, Measured, RefusedError
 from drivers.interfaces import Frame

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from cell.run.faults import classify
+from cell.run.recorded_work import classify
 from drivers.arm.child import program
 from drivers.arm.child.program import ControlProgram, joints_off
-from drivers.arm.messages import ChildSetup, Snapshot
+from drivers.arm.feed import ChildSetup, Snapshot
 from drivers.errors import (
     Aborted,
     CalibrationStale,
@@ -23,7 +23,7 @@ from drivers.errors import (
     LimitError,
     RefusedError,
 )
-from statemachine.policy import Outcome
+from statemachine.step import Outcome
 
 SETUP = ChildSetup("127.255.0.9", 1.0, (), (0.0, (0.0, 0.0, 0.0)), 0.15, 4.0)
 STILL = (0.0,) * 6

@@ -15,12 +15,18 @@ from cell.makes.table import make_of
 from cell.makes.vehicles import CanopenVehicleConfig
 from drivers.errors import ConfigError, DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
-from drivers.vehicle.cia402.emergencies import meaning
-from drivers.vehicle.cia402.feedback import DriveFeedback
-from drivers.vehicle.cia402.geometry import WheelDrives
-from drivers.vehicle.cia402.objects import HEARTBEAT, MOTION, STATUS
-from drivers.vehicle.cia402.states import DriveState, leads_to_enabled, leads_to_switched_on, may_turn, state_of
-from drivers.vehicle.cia402.units import UnitCheck
+from drivers.vehicle.cia402.drive import (
+    HEARTBEAT,
+    MOTION,
+    STATUS,
+    DriveState,
+    leads_to_enabled,
+    leads_to_switched_on,
+    may_turn,
+    meaning,
+    state_of,
+)
+from drivers.vehicle.cia402.feedback import DriveFeedback, UnitCheck, WheelDrives
 from tests.support import ROOT
 from tests.support.inner_bus import Hand
 

@@ -13,8 +13,7 @@ import pytest
 
 from cell.measure.geometry.poses import difference
 from cell.measure.vision import PictureRefused, Reason, board_pose, find_board
-from cell.measure.vision.board.spec import KINDS
-from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.board.view import KINDS, BoardView
 from lab.bench.board.campaign import Tally as BoardTally
 from lab.bench.board.campaign import camera_of, judge
 from lab.bench.board.conditions import CONDITIONS, LENSES, draw_pose, draw_spec, draw_view

@@ -12,18 +12,16 @@ import pytest
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.devices.simulated.described import Described
-from cell.motion.bodies import BASE, FLANGE, Body, arm_bodies, tool_bodies
+from cell.motion.collision import BASE, FLANGE, Body, arm_bodies, tool_bodies
 from cell.motion.kinematics import ArmKinematics
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm import Safety
 from sim_backends.models.arm_motion import JointMove, LinearMove
 from sim_backends.models.vehicle import MOTOR_FAULT, ChassisState, Mode
-from sim_backends.world import nominal
-from sim_backends.world.bodies.arm_points import BODIES
-from sim_backends.world.bodies.collisions import DECK, Collisions
+from sim_backends.world import drawing as nominal
+from sim_backends.world.bodies.collisions import BODIES, DECK, Collisions
 from sim_backends.world.drawing import read
-from sim_backends.world.truth import truth
-from sim_backends.world.world import World
+from sim_backends.world.world import World, truth
 from tests.support.described_cells import described, pose
 
 OVER_DECK = np.deg2rad([0.0, -100.0, 100.0, -90.0, -90.0, 0.0])

@@ -10,7 +10,7 @@ import pytest
 
 from cell.apps.cli import main
 from cell.apps.cli.progress import ProgressDisplay
-from cell.run.files.folder import new_run
+from cell.run.folder import new_run
 from statemachine.journal import Journal, RunRequest
 from statemachine.step import Event
 

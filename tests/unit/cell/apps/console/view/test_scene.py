@@ -13,13 +13,11 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from cell.apps.console.view.meshes import LINKS, MOST_TRIANGLES, coarser, link_meshes
-from cell.apps.console.view.scene import scene
-from cell.apps.console.view.scene_now import MOST_POINTS, SceneNow
+from cell.apps.console.view.scene import LINKS, MOST_POINTS, MOST_TRIANGLES, SceneNow, coarser, link_meshes, scene
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.devices.gate.interlocks import Situation
-from cell.motion.bodies import BASE, PLACED, box, station_bodies
+from cell.motion.collision import BASE, PLACED, box, station_bodies
 from drivers.errors import ConfigError
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from tests.support import ROOT

@@ -12,7 +12,7 @@ from cell.config.calibrations.store import CellCalibration, nominal_camera, read
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.measure.calibration import Priors
-from cell.measure.calibration.drift.reference import Reference
+from cell.measure.calibration.drift.evidence import Reference
 from cell.measure.calibration.drift.reference_plate import Pointing, turned
 from cell.measure.calibration.judge.faults import (
     SCALE_RANGE,
@@ -26,9 +26,9 @@ from cell.measure.calibration.solve.results import Quality, ScanCalibration, Tar
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_matrix
 from cell.measure.vision.board.board import board_pose
-from cell.procedures.arm.camera_poses import rail_ends, verification_views
-from cell.procedures.verify.looks import verify
+from cell.procedures.arm.photograph import rail_ends, verification_views
 from cell.procedures.verify.verdict import Verification
+from cell.procedures.verify.views import verify
 from drivers.errors import CalibrationStale, RefusedError
 from lab.bench.calibration.observed_cell import ObservedCell, shifted
 from lab.bench.calibration.verification import disturbances, look_again

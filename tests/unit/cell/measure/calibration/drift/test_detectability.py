@@ -18,17 +18,14 @@ from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.measure.calibration.drift.decision import verdict
 from cell.measure.calibration.drift.detectability import detectable
-from cell.measure.calibration.drift.evidence import DriftEvidence, evidence
-from cell.measure.calibration.drift.hypotheses import SHIFT, hypotheses, log_factor
-from cell.measure.calibration.drift.reference import Reference
-from cell.measure.calibration.solve.blocks import BOARD, HAND, SHARED, AdjustmentState
+from cell.measure.calibration.drift.evidence import SHIFT, DriftEvidence, Reference, evidence, hypotheses, log_factor
+from cell.measure.calibration.solve.normal import BOARD, HAND, SHARED, AdjustmentState
 from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
 from cell.measure.geometry.camera import CameraModel
-from cell.measure.geometry.covariance import covariance_root
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.geometry.poses import from_matrix
-from cell.procedures.verify.looks import scan_looks, target_looks, verify
+from cell.measure.geometry.poses import covariance_root, from_matrix
 from cell.procedures.verify.verdict import Verification
+from cell.procedures.verify.views import scan_looks, target_looks, verify
 from lab.bench.calibration.observed_cell import ObservedCell
 from lab.bench.calibration.verification import KINDS_OF_CHANGE, changed, look_again
 from sim_backends.world.scene import draw

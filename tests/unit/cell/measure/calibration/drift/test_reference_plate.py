@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cell.measure.calibration.drift.reference_plate import LARGEST_RAD, PlateLine, Pointing, pointing, turned
-from cell.measure.calibration.drift.roll import rolled
+from cell.measure.calibration.drift.reference_plate import LARGEST_RAD, PlateLine, Pointing, pointing, rolled, turned
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane, triangulate
 from drivers.errors import RefusedError

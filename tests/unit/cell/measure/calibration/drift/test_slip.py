@@ -14,8 +14,7 @@ from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.calibration.drift.slip import LARGEST_LAG_S, LARGEST_M, NOTED_M, Slip, slip_since
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.procedures.calibrate.edge import SPEED, look_at_edge, require_edge
-from cell.procedures.calibrate.reference_plate import require_witness
+from cell.procedures.calibrate.reference_plate import SPEED, look_at_edge, require_edge, require_witness
 from cell.procedures.steps.laser_sweep import unwatched
 from drivers.errors import RefusedError
 from drivers.interfaces import Frame

@@ -13,13 +13,12 @@ import pinocchio as pin
 import pytest
 
 from cell.config.calibrations.finding import find_calibration
-from cell.config.calibrations.store import CellCalibration, save_calibration
-from cell.config.calibrations.timing_link import changed, link_of
+from cell.config.calibrations.store import CellCalibration, changed, link_of, save_calibration
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration import ScanCalibration
-from cell.measure.calibration.drift.reference import Reference
+from cell.measure.calibration.drift.evidence import Reference
 from cell.measure.calibration.drift.timing_fit import (
     TimedFrame,
     TimedSweep,
@@ -41,11 +40,11 @@ from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
 from cell.procedures.steps.laser_sweep import times_known
 from cell.run.calibration import kept_if_refused
 from cell.run.recorded_work import Hands, RecordedWork
-from cell.run.run import Run
+from cell.run.runs import Run
 from drivers.errors import CalibrationStale, RefusedError
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world import scene
-from tests.unit.cell.procedures.sweep.test_rail_sweep import ERRORS, sweep
+from tests.unit.cell.procedures.sweep.test_sweeping import ERRORS, sweep
 
 CONFIG = load_config(None)
 CAMERA = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)

@@ -9,11 +9,10 @@ import pytest
 
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import load_config
-from cell.measure.calibration.observations import ScanObservation
+from cell.measure.calibration.archive import ScanObservation
 from cell.measure.calibration.solve.adjustment import Priors, shared_mask
-from cell.measure.calibration.solve.blocks import OWN, SHARED, rests_of
 from cell.measure.calibration.solve.joint import Joint, solve_joint, solve_staged
-from cell.measure.calibration.solve.normal import Normal
+from cell.measure.calibration.solve.normal import OWN, SHARED, Normal, rests_of
 from cell.measure.geometry.poses import from_matrix
 from lab.bench.calibration.campaign import observe
 from lab.bench.calibration.world import HeadWorld, Noise, draw_head, turned

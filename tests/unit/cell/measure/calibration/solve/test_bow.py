@@ -1,8 +1,7 @@
 """A bowed light sheet: found beside the rest of the calibration where it is, and not where it is not.
 
 The observations come from a generator that shares nothing with the estimator; it tells the bow by the distance from the
-laser, the product by that along the camera's axis.
-"""
+laser, the product by that along the camera's axis."""
 
 from __future__ import annotations
 
@@ -15,9 +14,9 @@ import pytest
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import load_config
 from cell.measure.calibration.solve.adjustment import Adjustment, Priors
-from cell.measure.calibration.solve.blocks import PLANE
-from cell.measure.calibration.solve.extra_parameter import one_more
+from cell.measure.calibration.solve.bow import one_more
 from cell.measure.calibration.solve.joint import Joint, solve_joint, solve_staged
+from cell.measure.calibration.solve.normal import PLANE
 from cell.measure.calibration.solve.results import ScanCalibration
 from cell.measure.geometry.light_plane import LightPlane
 from lab.bench.calibration.campaign import observe

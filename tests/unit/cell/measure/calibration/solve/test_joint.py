@@ -12,10 +12,10 @@ import pytest
 
 from cell.measure.calibration import Priors, ScanObservation, TargetObservation, calibrate_scan, calibrate_target
 from cell.measure.calibration.solve.adjustment import Adjustment, shared_mask
-from cell.measure.calibration.solve.blocks import COLUMNS, OWN, SHARED, AdjustmentState, dots_block, stripe_block
-from cell.measure.calibration.solve.hand_eye import refine_hand_eye, solve_hand_eye
 from cell.measure.calibration.solve.joint import solve_joint, solve_staged, start_state, view_data
+from cell.measure.calibration.solve.normal import COLUMNS, OWN, SHARED, AdjustmentState, dots_block, stripe_block
 from cell.measure.calibration.solve.results import PARAMETERS, ScanCalibration
+from cell.measure.calibration.solve.starts import refine_hand_eye, solve_hand_eye
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import difference, from_axes, from_parts, perturbed

@@ -7,8 +7,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.measure.geometry.camera import CameraModel
-from cell.measure.geometry.circles import seen_centres
+from cell.measure.geometry.camera import CameraModel, seen_centres
 from cell.measure.geometry.poses import difference, transform
 from cell.measure.vision import PictureRefused, Reason, board_pose, find_board, parse_board, read_picture
 from drivers.errors import ConfigError

@@ -13,7 +13,7 @@ from scipy.special import erf, ndtr
 
 from cell.measure.geometry.poses import difference
 from cell.measure.vision import board_pose
-from cell.measure.vision.board.corner_fit import fit_corners
+from cell.measure.vision.board.corners import fit_corners
 from cell.measure.vision.board.dots import measure_dots
 from cell.measure.vision.board.lattice import Blobs
 from cell.measure.vision.board.outliers import without_outliers

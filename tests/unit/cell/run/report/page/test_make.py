@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from cell.apps.cli.app import app
 from cell.measure.reconstruction.ply import write_cloud
 from cell.procedures.steps.reconstruct import Reconstruction
-from cell.run.files.folder import write_json
+from cell.run.folder import write_json
 from cell.run.report.page.make import MOST_BYTES, make_page, write_page
 from cell.run.report.page.maps import MOST_POINTS
 from cell.run.report.page.timeline import timeline, timeline_svg

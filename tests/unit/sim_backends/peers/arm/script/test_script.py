@@ -10,7 +10,7 @@ import pytest
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
-from sim_backends.peers.arm.rtde.registers import Registers
+from sim_backends.peers.arm.rtde.variables import Registers
 from sim_backends.peers.arm.script.port import robot_mode, robot_state, version_message
 from sim_backends.peers.arm.script.script import ProgramMemory, RuntimeState
 

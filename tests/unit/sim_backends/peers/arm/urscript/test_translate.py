@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
-from sim_backends.peers.arm.rtde.registers import Registers
+from sim_backends.peers.arm.rtde.variables import Registers
 from sim_backends.peers.arm.script.script import ProgramMemory, RuntimeState
-from sim_backends.peers.arm.urscript.words import ScriptCollector
+from sim_backends.peers.arm.urscript.translate import ScriptCollector
 
 TICK = 0.002
 

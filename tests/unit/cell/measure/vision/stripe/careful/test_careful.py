@@ -8,11 +8,9 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from cell.measure.vision import LaserChannel, Mark, PictureRefused, read_colours, read_picture, read_stripe
-from cell.measure.vision.stripe.careful.careful import Careful
-from cell.measure.vision.stripe.careful.segments import fill_gaps
-from cell.measure.vision.stripe.extract import extract
+from cell.measure.vision.stripe.careful.careful import Careful, fill_gaps
+from cell.measure.vision.stripe.extract import StripeStream, extract
 from cell.measure.vision.stripe.planes import as_picture, range_of
-from cell.measure.vision.stripe.stream import StripeStream
 from lab.bench.stripe.profiles import measure, within_limits
 from lab.bench.stripe.workshop import Scene, draw
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from cell.measure.vision.pictures import PictureRefused
-from cell.measure.vision.stripe.careful.neighbours import widen_what_departs
-from cell.measure.vision.stripe.extract import StripeSettings, extract
-from cell.measure.vision.stripe.stream import BLOCK, StripeStream
+from cell.measure.vision.stripe.careful.surroundings import widen_what_departs
+from cell.measure.vision.stripe.extract import BLOCK, StripeSettings, StripeStream, extract
 from lab.bench.stripe.accuracy import measure
 from lab.bench.stripe.truth import Cell, bound, draw
 

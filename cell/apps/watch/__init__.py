@@ -1,1 +1,0 @@
-"""What `cell watch` shows at a text terminal."""

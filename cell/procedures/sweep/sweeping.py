@@ -1,0 +1,218 @@
+"""A sweep by the arm alone: the rail stands still, the flange runs along a straight line under the lit laser.
+
+Every line has a flange pose of its own, between the states that the arm reported. What is not known of the two clocks
+shifts the whole sweep along its way: it is bounded by round trips before and after the sweep, and stated in the
+covariance. How long the arm held a state back before it put its time on it cannot be known.
+
+A sweep by the rail: the arm stands still, the carriage runs at constant velocity under the lit laser."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import numpy as np
+
+from cell.devices.devices import Devices
+from cell.devices.simulated.following import MOST_SCATTER
+from cell.measure.geometry.poses import from_parts, from_ur
+from cell.motion.trajectory import LONGEST_GAP_S, FlangeTrack
+from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.photograph import ScanPlan
+from cell.procedures.observed import RailPath
+from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors, TimeBound, shift_by_times
+from drivers.clock import ClockMap
+from drivers.errors import CellError, DeviceFault
+
+RUN_UP_S = 0.7
+"""Seconds at full speed by which the line is longer at both ends: the arm gains its speed and its wobble dies out."""
+LATENCY_S = 0.002
+"""What the time of a state may be off, 1 sigma, wall seconds, beside what round trips leave open: a controller's cycle,
+since nothing tells where in it the joints were read."""
+JITTER_S = 0.0003
+"""The same from one line to the next."""
+
+
+def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: SweepCollector) -> Swath:
+    """Move the scan head over the placement area and pair every profile with the flange's pose.
+
+    Raises `DeviceFault` when more than `errors.lost` of the frames were lost, none came from the planned stretch, the
+    arm's states have gaps or it moved unevenly between them, or the times of arm or camera are not known well enough;
+    whatever happens, the arm is stopped before the error goes on.
+    """
+    scan, arm, camera = collector.scan, devices.arm, devices.scan_camera
+    shift = plan.base_from_flange_end.translation - plan.base_from_flange.translation
+    length = float(np.linalg.norm(shift))
+    along = shift / length
+    run_up = RUN_UP_S * scan.speed * along
+    start, stop = from_parts(-run_up) * plan.base_from_flange, from_parts(run_up) * plan.base_from_flange_end
+    devices.rail.move_to(plan.rail_start).wait(30.0)
+    way, line = mover.plan_line(start, stop, scan.speed)
+    mover.follow(way)
+    rail = devices.rail.state().position
+    camera.configure(scan.exposure, scan.frame_rate)
+    clocks = ClockMap()
+    clocks.add([arm.latch_clock()])
+    # Before anything is lit and moved in vain.
+    shift_by_times([TimeBound(arm.name, "arm", clocks.uncertainty)], scan.speed, errors)
+    laser, purpose = devices.laser, devices.interlocks.purpose("sweep")
+    # The laser within all else: it goes off first, however long arm and camera take to end what they send.
+    with purpose, arm.record() as states, camera.stream() as frames, laser.lit():
+        motion, patience = mover.begin(line)
+        over: list[float] = []
+        deadline = devices.clock.now() + patience
+
+        def ended() -> float | None:
+            laser.renew()
+            if motion.done or devices.clock.now() > deadline:
+                motion.wait(0.0)  # raises what ended it early, and the deadline
+                over.append(devices.clock.now())
+            return over[0] if over else None
+
+        try:
+            collector.take(frames, ended)
+        except BaseException:
+            with suppress(CellError):
+                arm.stop()
+            raise
+    clocks.add([arm.latch_clock()])
+    track = FlangeTrack(arm.name, states, clocks, LONGEST_GAP_S * max(1.0, errors.rate))
+    times = np.array(collector.times)
+    seen = np.flatnonzero(track.inside(times))
+    flanges = track.at(times[seen])
+    done = (flanges[:, :3, 3] - plan.base_from_flange.translation) @ along
+    within = (done >= 0) & (done <= length)
+    even = track.even(times[seen])
+    uneven = int(np.count_nonzero(within & ~even))
+    if uneven > errors.lost * np.count_nonzero(within):
+        raise DeviceFault(
+            arm.name,
+            "arm.uneven_sweep",
+            f"where the arm was is not known at {uneven} of {np.count_nonzero(within)} profiles, allowed are "
+            f"{100 * errors.lost:.0f} %: it did not move evenly between the states that came from it",
+            recoverable=True,
+            hint="Look at the arm's link and at what else this machine is busy with.",
+        )
+    within &= even
+    lines, flanges, done = seen[within], flanges[within], done[within]
+    middle = collector.require_frames(camera.name, lines, errors.lost)
+    collector.require_one_clock(camera.name, errors)
+    if len(lines) < 3:
+        raise DeviceFault(
+            arm.name,
+            "arm.sweep_too_short",
+            f"only {len(lines)} profiles were taken on the planned {1e3 * length:.1f} mm",
+            recoverable=True,
+            hint="Lower scan.speed or raise scan.frame_rate.",
+        )
+    steady = np.polynomial.Polynomial.fit(times[lines], done, 1)
+    residual = float(np.std(done - steady(times[lines])))
+    known = TimeBound(arm.name, "arm", max(clocks.bound_at(float(times[k])) for k in (lines[0], lines[-1])))
+    shift, variance = shift_by_times([known, TimeBound.of(camera)], scan.speed, errors)
+    shared = np.zeros((6, 6))
+    shared[:3, :3] = np.outer(along, along) * ((scan.speed * LATENCY_S * errors.rate) ** 2 + variance)
+    own = scan.speed * JITTER_S * errors.rate * along
+    return Swath(
+        builder=collector.builder,
+        lines=lines,
+        frame_ids=np.array(collector.frame_ids)[lines],
+        times=times[lines],
+        flanges=flanges,
+        rail=np.full(len(lines), rail),
+        line_spread=np.tile(own, (len(lines), 1)),
+        covariance=errors.repeatability + shared,
+        lost=collector.lost + uneven,
+        residual=residual,
+        shift=shift,
+        points=sum(collector.counts[k] for k in lines),
+        middle=middle[0],
+        middle_profile=middle[1],
+        seen=np.array(collector.frame_ids),
+    )
+
+
+MAX_FLANGE_MOTION = 1e-4
+MAX_RESIDUAL = 5.0
+"""Median distance of the rail's readings from an even motion that a sweep may have, in σ of a rail position."""
+
+
+def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: SweepCollector) -> Swath:
+    """Sweep the scan head over the placement area and pair every profile with the rail's position.
+
+    Raises `DeviceFault` when more than `errors.lost` of the frames were lost, none came from the constant-velocity
+    part, the flange moved by more than 0.1 mm meanwhile, the replies of rail or camera came so late that the sweep may
+    lie off by more than `errors.shift`, or the rail did not run evenly.
+    """
+    scan, rail, arm = collector.scan, devices.rail, devices.arm
+    mover.to(plan.base_from_flange, "the scan pose")
+    rail.move_to(rail.sweep_start(plan.rail_start, plan.rail_stop, scan.speed)).wait(30.0)
+    devices.scan_camera.configure(scan.exposure, scan.frame_rate)
+    base_from_flange = from_ur(arm.state().flange)
+    laser = devices.laser
+    # The laser within the stream: it goes off first, however long the camera takes to end its frames.
+    with devices.interlocks.purpose("sweep"), devices.scan_camera.stream() as frames, laser.lit():
+        sweep = rail.sweep(plan.rail_start, plan.rail_stop, scan.speed)
+
+        def ended() -> float | None:
+            laser.renew()
+            if not sweep.done:
+                return None
+            sweep.wait(1.0)
+            return sweep.window[1]
+
+        collector.take(frames, ended)
+    begin, end = sweep.window
+    # Stamps that come late are put back to when the exposures were.
+    late = 0.0 if errors.timing is None else errors.timing.late
+    times = np.array(collector.times) - late
+    lines = np.flatnonzero((times >= begin) & (times <= end))
+    middle = collector.require_frames(devices.scan_camera.name, lines, errors.lost)
+    collector.require_one_clock(devices.scan_camera.name, errors)
+    moved = np.linalg.norm(from_ur(arm.state().flange).translation - base_from_flange.translation)
+    if not moved <= MAX_FLANGE_MOTION:
+        raise DeviceFault(
+            arm.name,
+            "arm.moved_in_sweep",
+            f"the flange moved by {1e3 * moved:.2f} mm during the sweep, allowed {1e3 * MAX_FLANGE_MOTION:.1f} mm",
+            recoverable=True,
+            hint="See what pushed the arm; the sweep is of no use.",
+        )
+    allowed = MAX_RESIDUAL * errors.rail * max(1.0, errors.rate)
+    if not sweep.unevenness <= allowed:
+        raise DeviceFault(
+            rail.name,
+            "rail.uneven_sweep",
+            f"the rail's readings lie {1e3 * sweep.unevenness:.3f} mm (median) off an even motion, more than their "
+            f"round trips explain; allowed {1e3 * allowed:.3f} mm",
+            recoverable=True,
+            hint="See whether the carriage jams and what else commands this module.",
+        )
+    times_known = [TimeBound(rail.name, "rail", sweep.time_bound), TimeBound.of(devices.scan_camera)]
+    shift, variance = shift_by_times(times_known, scan.speed, errors.by_rail)
+    samples = sweep.samples
+    devices.gate.seen("rail", RailPath(samples))
+    moving = samples[(samples[:, 0] >= begin) & (samples[:, 0] <= end)]
+    deviations = [abs(position - sweep.position_at(time)) for time, position in moving]
+    residual = float(np.median(deviations)) if deviations else 0.0
+    if devices.following is not None and deviations:
+        devices.following.require_paired(float(np.percentile(deviations, 95)), MOST_SCATTER * errors.rail)
+    along = collector.builder.sweep_direction(base_from_flange)
+    spread = errors.rail * along
+    shared = np.zeros((6, 6))
+    shared[:3, :3] = np.outer(along, along) * variance
+    return Swath(
+        builder=collector.builder,
+        lines=lines,
+        frame_ids=np.array(collector.frame_ids)[lines],
+        times=times[lines],
+        flanges=np.tile(base_from_flange.homogeneous, (len(lines), 1, 1)),
+        rail=np.array([sweep.position_at(time) for time in times[lines]]),
+        line_spread=np.tile(spread, (len(lines), 1)),
+        covariance=errors.repeatability + shared,
+        lost=collector.lost,
+        residual=residual,
+        shift=shift,
+        points=sum(collector.counts[k] for k in lines),
+        middle=middle[0],
+        middle_profile=middle[1],
+        seen=np.array(collector.frame_ids),
+    )

@@ -1,0 +1,283 @@
+"""Run folders `runs/<time>-<id>/`: make one, write into it, find one by name or the one that is going on.
+
+What a run's folder tells afterwards, or while it is going on: its report, or what the journal knows so far.
+
+Where the modules' loggers write: `run.log` in a run's folder, and the console.
+
+Every module has a logger of its own, `logging.getLogger(__name__)`; nothing but the command line prints."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import secrets
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from cell.base.storage import EditedError, read_json
+from cell.base.storage import write_json as write_json
+from drivers.errors import CellError, ConfigError
+from statemachine.journal import JournalError, JournalRecord, read
+
+REPORT = "report.json"
+_NAME = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
+
+
+def new_run(root: Path) -> Path:
+    """Create the folder of a new run below `root`."""
+    root.mkdir(parents=True, exist_ok=True)
+    while True:
+        folder = root / f"{time.strftime('%Y%m%dT%H%M%S')}-{secrets.token_hex(2)}"
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            continue
+        return folder
+
+
+def list_runs(root: Path) -> list[Path]:
+    """All run folders below `root`, oldest first."""
+    if not root.is_dir():
+        return []
+    return sorted(entry for entry in root.iterdir() if entry.is_dir() and _NAME.fullmatch(entry.name))
+
+
+def find_run(root: Path, name: str | None, kind: str | None = None) -> Path:
+    """A run by its folder, name or id; without a name the newest, of one kind if given. Raises `ConfigError`."""
+    if name is not None and (Path(name) / "journal.sqlite").exists():
+        return Path(name)
+    runs = list_runs(root)
+    if name is None:
+        matching = [run for run in runs if kind is None or _info(run).get("kind", "job") == kind][-1:]
+    else:
+        matching = [run for run in runs if run.name == name or run.name.endswith(f"-{name}")]
+    if not matching:
+        wanted = f"no {kind or 'run'} at all" if name is None else f"no run {name}"
+        raise ConfigError(f"{wanted} in {root}; `cell runs` lists them")
+    return matching[-1]
+
+
+def find_going(root: Path, name: str | None) -> Path:
+    """The run that is going on below `root`, by name or the only one; `ConfigError` that says what there is instead."""
+    if name is not None:
+        folder = find_run(root, name)
+        if not listens(folder):
+            raise ConfigError(f"run {folder.name} has ended already, or its process died; nothing is going on there")
+        return folder
+    going = [folder for folder in list_runs(root) if listens(folder)]
+    if len(going) == 1:
+        return going[0]
+    if going:
+        listed = ", ".join(f"{folder.name} ({_info(folder).get('kind', 'job')})" for folder in going)
+        raise ConfigError(f"more than one is going on in {root}: {listed}; name the one that you mean")
+    raise ConfigError(
+        f"nothing is going on in {root}: no run, calibration, verification, homing or jog. Run this in the folder of "
+        "the cell that moves, or name its configuration with -c; `cell runs` lists what was run"
+    )
+
+
+def is_going(folder: Path) -> bool:
+    """Whether a run has not ended and its process lives."""
+    try:
+        run = read(folder).run
+    except (JournalError, ValueError, TypeError):
+        return False
+    return run.ended is None and _lives(run.pid, run.started)
+
+
+def listens(folder: Path) -> bool:
+    """Whether a run is going on that takes requests: nobody works in a time of maintenance, it is only recorded."""
+    return is_going(folder) and _info(folder).get("kind", "job") != "maintenance"
+
+
+def _lives(pid: object, since: float) -> bool:
+    """Whether the process `pid` lives and is the one that did at `since`, seconds since the epoch."""
+    if not isinstance(pid, int):
+        return False
+    try:
+        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        ticks = float(words[19]) / os.sysconf("SC_CLK_TCK")
+        begun = time.time() - float(Path("/proc/uptime").read_text().split()[0]) + ticks
+    except (OSError, ValueError, IndexError):
+        return False
+    return words[0] != "Z" and begun < since + 1.0
+
+
+def _info(folder: Path) -> dict[str, Any]:
+    try:
+        return read(folder).run.info
+    except (JournalError, ValueError, TypeError):
+        return {}
+
+
+def when(seconds: float) -> str:
+    """A time since the epoch as ISO 8601, local, with its offset."""
+    return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(seconds))
+
+
+def timeless(report: dict[str, Any]) -> dict[str, Any]:
+    """A report as it is written: on the virtual clock without what differs each time, durations on the wall and the
+    process. The same seed then gives the same report, but for the run's name and its dates."""
+    if report.get("clock") != "virtual":
+        return report
+    steps = [{**step, "wall_s": None} for step in report["steps"]] if "steps" in report else None
+    return {**report, "wall_s": None, "pid": None, **({} if steps is None else {"steps": steps})}
+
+
+def read_report(folder: Path) -> dict[str, Any]:
+    """The report of a run; for a run that has none yet, what the journal tells.
+
+    Raises `CellError` for a report or a journal that cannot be read, `ConfigError` where there is neither.
+    """
+    path = folder / REPORT
+    if not path.exists():
+        return _from_journal(folder)
+    try:
+        report = read_json(path).require()
+    except EditedError as error:
+        raise CellError(f"{path}: {error}; it is not what the run reported. The journal is beside it") from error
+    except (OSError, ValueError) as error:
+        raise CellError(
+            f"{path} cannot be read ({error}): it was cut off or is none of ours; what else is left of the run lies "
+            "beside it"
+        ) from error
+    if not isinstance(report.get("outcome"), str) or not all(
+        _rows(report.get(key)) for key in ("steps", "measured", "faults")
+    ):  # fmt: skip
+        raise CellError(f"{path} is not the report of a run: it does not tell an outcome, or not as a report does")
+    return report
+
+
+def _rows(value: object) -> bool:
+    return value is None or (isinstance(value, list) and all(isinstance(row, dict) for row in value))
+
+
+def _from_journal(folder: Path) -> dict[str, Any]:
+    try:
+        record = read(folder)
+    except JournalError as error:
+        raise ConfigError(f"{folder} holds neither a report nor a journal that can be read: {error}") from error
+    except (ValueError, TypeError) as error:
+        raise CellError(f"{folder} holds a journal that is none of ours: {error}") from error
+    run = record.run
+    waits = _awaited(record)
+    going = "the run is still going on, or its process died" if waits is None else f"waits for a person, {waits}"
+    part = [event.data["part"] for event in record.events if event.kind == "note" and "part" in event.data]
+    steps: dict[str, dict[str, Any]] = {}
+    for row in record.steps:
+        before = steps.get(row.name, {"duration_s": 0.0, "wall_s": 0.0, "retries": -1})
+        steps[row.name] = {
+            "name": row.name,
+            "state": row.state,
+            "duration_s": before["duration_s"] + (row.duration_s or 0.0),
+            "wall_s": before["wall_s"] + max(0.0, (row.ended or row.started) - row.started),
+            "retries": before["retries"] + 1,
+        }
+    return {
+        "run": folder.name,
+        "kind": "job",
+        "outcome": run.outcome or "not ended",
+        "reason": run.reason or going,
+        "started": when(run.started),
+        "ended": None if run.ended is None else when(run.ended),
+        "wall_s": None if run.ended is None else round(run.ended - run.started, 2),
+        "pid": run.pid,
+        "steps": list(steps.values()),
+        **({"part": part[-1]} if part else {}),
+        **run.info,
+    }
+
+
+def run_row(folder: Path) -> dict[str, Any]:
+    """A run in a few facts, for a list; one that cannot be read has the outcome "unreadable" and says why."""
+    try:
+        report = read_report(folder)
+    except (CellError, OSError) as error:
+        report = {"outcome": "unreadable", "reason": str(error)}
+    keys = ("outcome", "job", "simulated", "seed", "level", "reason", "started")
+    kind = report.get("kind", "job") if report["outcome"] != "unreadable" else None
+    return {
+        "run": folder.name,
+        **{key: report.get(key) for key in keys},
+        "kind": kind,
+        "duration_s": wall_seconds(report),
+    }
+
+
+def wall_seconds(report: Mapping[str, Any]) -> float | None:
+    """How long a run took on the wall, by its dates where the report does not say; None while it is not known."""
+    if report.get("wall_s") is not None:
+        return float(report["wall_s"])
+    try:
+        begun, ended = (datetime.fromisoformat(str(report[key])) for key in ("started", "ended"))
+    except (KeyError, ValueError):
+        return None
+    return (ended - begun).total_seconds()
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a person has to confirm before a run goes on; each question of a run has a number of its own."""
+
+    number: int
+    reason: str
+
+    def __str__(self) -> str:
+        return f"question {self.number}: {self.reason}"
+
+
+def awaited_word(folder: Path) -> Question | None:
+    """What a person has to confirm now before the run in `folder` goes on; None when it waits for nobody."""
+    try:
+        return _awaited(read(folder))
+    except JournalError as error:
+        raise ConfigError(str(error)) from error
+
+
+def _awaited(record: JournalRecord) -> Question | None:
+    kinds = ("confirm_needed", "confirmed", "state")
+    last = next((event for event in reversed(record.events) if event.kind in kinds), None)
+    if last is None or last.kind != "confirm_needed":
+        return None
+    return Question(int(last.data.get("number", 0)), str(last.data["reason"]))
+
+
+FILE_NAME = "run.log"
+PACKAGES = ("cell", "drivers", "statemachine")
+_FORMAT = "%(asctime)s.%(msecs)03d %(levelname)-7s %(name)s: %(message)s"
+_DATE = "%Y-%m-%dT%H:%M:%S"
+
+
+@contextmanager
+def run_log(folder: Path) -> Iterator[None]:
+    """While the context is open, what the modules log goes to `run.log` in `folder` as well."""
+    handler = logging.FileHandler(folder / FILE_NAME, encoding="utf-8", delay=True)
+    handler.setFormatter(logging.Formatter(_FORMAT, _DATE))
+    loggers = [logging.getLogger(name) for name in PACKAGES]
+    for logger in loggers:
+        if logger.level == logging.NOTSET:
+            logger.setLevel(logging.INFO)
+        logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        for logger in loggers:
+            logger.removeHandler(handler)
+        handler.close()
+
+
+def console_log(verbosity: int) -> None:
+    """Show warnings on standard error; what happens with `verbosity` 1, everything with 2."""
+    handler = logging.StreamHandler()
+    handler.setLevel({0: logging.WARNING, 1: logging.INFO}.get(verbosity, logging.DEBUG))
+    handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    for name in PACKAGES:
+        logger = logging.getLogger(name)
+        logger.addHandler(handler)
+        logger.setLevel(logging.DEBUG if verbosity > 1 else logging.INFO)

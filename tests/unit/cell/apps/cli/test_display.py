@@ -1,0 +1,240 @@
+"""What a person sees: a run's end on one screen of 80 by 24, and a list of the runs that nothing spoils."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cell.apps.cli import main
+from cell.apps.cli.display import HEIGHT, duration, end_screen, print_report
+from cell.run.folder import new_run, read_report, run_row, write_json
+from drivers.errors import CellError
+from statemachine.journal import Journal
+from tests.support import report_runs
+from tests.support.report_runs import NAMES, Ended, Ends, Make
+
+MAKES: list[tuple[Make, str]] = [
+    (report_runs.placed, "placed"),
+    (report_runs.real, "placed"),
+    (report_runs.no_board, "refused"),
+    (report_runs.too_strict, "refused"),
+    (report_runs.faulted, "faulted"),
+    (report_runs.aborted, "aborted"),
+]
+CALIBRATION = {
+    "kind": "calibration", "outcome": "done", "reason": "stored", "started": "2026-03-01T10:00:00+0100",
+    "ended": "2026-03-01T10:02:05+0100", "wall_s": 125.0,
+}  # fmt: skip
+
+
+def shown(run: Ended, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, **asked: bool) -> str:
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("LINES", "24")
+    print_report(run.report, str(run.folder), **asked)
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("make", "outcome"), MAKES)
+def test_the_end_of_a_run_is_one_screen(
+    ends: Ends, make: Make, outcome: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = ends(make)
+    monkeypatch.chdir(run.folder.parent.parent)
+    lines = shown(run, capsys, monkeypatch).splitlines()
+    assert len(lines) < 24
+    assert max(map(len, lines)) <= 80
+    assert lines[0].startswith(f"{outcome}  ")
+    text = "\n".join(lines)
+    assert "cell time" in text
+    assert "wall time" in text
+    assert [line[:18].strip() for line in lines if line[:18].strip() in NAMES] == NAMES
+    assert f"runs/{run.folder.name}/report.json" in text
+    assert any(line.startswith("next ") and "cell " in line for line in lines)
+    assert any(line.startswith("faults ") for line in lines)
+
+
+def test_a_placed_run_shows_what_was_measured_beside_its_limit(
+    ends: Ends, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = shown(ends(report_runs.placed), capsys, monkeypatch)
+    for name in ("place error, largest of 45 points", "place error, stated 95 % bound", "contact depth", "fit, χ²/dof",
+                 "surface covered"):  # fmt: skip
+        (line,) = (line for line in text.splitlines() if name in line)
+        assert any(bound in line for bound in ("at most", "at least", "about"))
+    assert "at most 0.6 mm" in text
+    assert "faults    1: camera.frames_lost in laser_sweep, tried again" in text
+    assert "retries   laser_sweep 1" in text
+    assert "Handscan" not in text
+
+
+def test_the_noise_is_shown_where_it_is_asked_for(
+    ends: Ends, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "assumed noise" not in shown(ends(report_runs.placed), capsys, monkeypatch)
+    assert "assumed noise" in shown(ends(report_runs.placed), capsys, monkeypatch, noise=True)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (report_runs.placed, "cell export"),
+        (report_runs.no_board, "picture.png shows why; put that right, then cell dry-run -j pot"),
+        (report_runs.faulted, "cell resume"),
+        (report_runs.aborted, "cell resume"),
+    ],
+)
+def test_what_to_type_next_depends_on_the_end(ends: Ends, make: Make, words: str) -> None:
+    run = ends(make)
+    assert words in next(line for line in end_screen(run.report, run.folder) if line.startswith("next"))
+
+
+@pytest.mark.parametrize(
+    ("part", "words"), [("released", "look at the part, it is down"), ("unknown", "what has become")]
+)
+@pytest.mark.parametrize("outcome", ["refused", "faulted", "aborted", "not ended"])
+def test_whoever_has_lost_a_part_is_not_told_to_resume(tmp_path: Path, outcome: str, part: str, words: str) -> None:
+    report = {"outcome": outcome, "reason": "a link broke", "job": "pot", "part": part, "simulated": False}
+    text = "\n".join(end_screen(report, tmp_path))
+    assert words in text
+    assert "resume" not in text
+
+
+def test_what_became_of_the_part_of_a_killed_run_is_in_its_journal(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, "run", {"job": "pot"})
+    journal.event("note", "place", {"part": "unknown"})
+    journal.close()
+    assert read_report(tmp_path)["part"] == "unknown"
+
+
+def test_a_stale_calibration_asks_for_a_new_one(tmp_path: Path) -> None:
+    report = {"outcome": "refused", "code": "CalibrationStale", "reason": "too old", "job": "pot", "simulated": False}
+    assert "cell calibrate, then cell run -j pot" in "\n".join(end_screen(report, tmp_path))
+
+
+def test_a_reason_however_long_leaves_room_for_the_rest(ends: Ends) -> None:
+    run = ends(report_runs.faulted)
+    many = [{**run.report["faults"][0]}] * 30
+    lines = end_screen({**run.report, "reason": "word " * 400, "faults": many}, run.folder)
+    assert len(lines) <= HEIGHT
+    assert lines[2].endswith("…")
+    assert any(line.startswith("faults    30: ") for line in lines)
+
+
+def test_a_run_without_steps_has_its_screen_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    print_report(CALIBRATION, str(tmp_path / "20260301T100000-0001"), noise=True)
+    text = capsys.readouterr().out
+    assert text.startswith("done  stored\ncalibration · 2 min on the wall")
+    assert "next      cell calibrate verify" in text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(None, ""), (3.21, "3.2 s"), (31.4, "31 s"), (125.0, "2 min"), (7300.0, "2 h 2 min")]
+)
+def test_durations_are_told_as_people_do(seconds: float | None, words: str) -> None:
+    assert duration(seconds) == words
+
+
+# --- cell runs, cell report ---
+
+
+def spoiled(root: Path) -> dict[str, Path]:
+    """Run folders in which something is wrong."""
+    folders = {name: new_run(root) for name in ("torn", "empty", "foreign", "list", "nothing", "journal", "no journal")}
+    (folders["torn"] / "report.json").write_text('{"outcome": "placed", "steps": [{"na', encoding="utf-8")
+    (folders["empty"] / "report.json").write_bytes(b"")
+    (folders["foreign"] / "report.json").write_text('{"tests": 12}', encoding="utf-8")
+    (folders["list"] / "report.json").write_bytes(b"[1, 2]\xff")
+    (folders["journal"] / "journal.sqlite").write_bytes(b"SQLite format 3\0" + 400 * b"\x13")
+    sqlite3.connect(folders["no journal"] / "journal.sqlite").close()
+    return folders
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+    return tmp_path / "runs"
+
+
+def run_cell(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
+    monkeypatch.setattr("sys.argv", ["cell", *words])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    return int(ended.value.code or 0)
+
+
+def test_one_bad_report_does_not_spoil_the_list(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good = new_run(root)
+    write_json(good / "report.json", {"run": good.name, "outcome": "placed", "job": "pot", "wall_s": 31.2})
+    folders = spoiled(root)
+    assert run_cell(monkeypatch, "runs", "--json") == 0
+    rows: dict[str, dict[str, Any]] = {row["run"]: row for row in json.loads(capsys.readouterr().out)}
+    assert len(rows) == 1 + len(folders)
+    assert (rows[good.name]["outcome"], rows[good.name]["duration_s"]) == ("placed", 31.2)
+    for folder in folders.values():
+        assert rows[folder.name]["outcome"] == "unreadable"
+        assert folder.name in rows[folder.name]["reason"]
+    assert run_cell(monkeypatch, "runs") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 1 + len(folders)
+    assert max(map(len, lines)) <= 80
+
+
+@pytest.mark.parametrize("name", ["torn", "empty", "foreign", "list", "nothing", "journal", "no journal"])
+def test_a_report_that_cannot_be_read_is_an_error_in_our_words(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    folder = spoiled(root)[name]
+    assert run_cell(monkeypatch, "report", folder.name) in (1, 2)
+    said = capsys.readouterr().err
+    assert said.startswith("error: ")
+    assert folder.name in said
+    assert "Traceback" not in said
+
+
+def test_the_list_tells_when_what_how_and_how_long(
+    root: Path, ends: Ends, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for data in (CALIBRATION, ends(report_runs.too_strict).report):
+        write_json(new_run(root) / "report.json", data)
+    going_on = new_run(root)
+    journal = Journal(going_on, going_on.name, {"job": "pot", "seed": 3})
+    journal.step_ended(journal.step_started("drive_to_target", 1), 1.5, error="lost")
+    journal.step_ended(journal.step_started("drive_to_target", 2), 2.0, {})
+    journal.close()
+    assert run_cell(monkeypatch, "runs", "--json") == 0
+    rows = json.loads(capsys.readouterr().out)
+    keys = {"run", "outcome", "job", "simulated", "seed", "level", "reason", "kind", "started", "duration_s"}
+    assert all(set(row) == keys for row in rows)
+    kinds = {row["kind"]: row for row in rows}
+    assert kinds["calibration"]["duration_s"] == 125.0
+    assert run_row(going_on)["outcome"] == "not ended"
+    (step,) = read_report(going_on)["steps"]
+    assert (step["state"], step["retries"], step["duration_s"]) == ("done", 1, 3.5)
+    assert run_cell(monkeypatch, "runs") == 0
+    text = capsys.readouterr().out
+    assert "2026-03-01 10:00" in text
+    assert "2 min  stored" in text
+    assert "job pot (sim)" in text
+    assert "31 s  translation" in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_a_report_with_rows_that_are_none_is_refused(tmp_path: Path) -> None:
+    write_json(tmp_path / "report.json", {"outcome": "placed", "steps": ["drive"]})
+    with pytest.raises(CellError, match="not the report of a run"):
+        read_report(tmp_path)
+
+
+def test_a_long_reason_keeps_what_to_do_about_it(tmp_path: Path) -> None:
+    remedy = "Scan more of the surface, or photograph the board more often"
+    reason = f"{'; '.join(f'translation {k} is not determined: 0.181 mm > 0.1 mm' for k in range(9))}. {remedy}"
+    lines = end_screen({"outcome": "refused", "reason": reason}, tmp_path)
+    assert lines[2] == remedy
+    assert lines[1].endswith(" …")

@@ -1,0 +1,107 @@
+"""`cell doctor`: what is wrong with a computer is found, with what mends it, and only what the cell needs counts."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from cell.apps import doctor
+from cell.apps.cli.app import app
+from cell.apps.doctor import OWN, can_check, link_checks, package_checks, shadow_check
+from cell.config.cell_config import DEVICES, default_toml, load_config
+from drivers.vehicle.health import CanInterface
+
+
+def test_packages_are_held_against_the_pins() -> None:
+    def installed(name: str) -> str:
+        if name in ("canopen", "pye57"):
+            raise PackageNotFoundError(name)
+        return "1.7.0" if name == "ur-rtde" else version(name)
+
+    rows = package_checks(["canopen"], ["e57"], installed)
+    assert rows[0].state == "wrong"
+    assert rows[0].found.startswith("ur-rtde is 1.7.0, asked for is ")
+    assert rows[0].mend == "pip install 'ur-rtde<1.7,>=1.6.3'"
+    assert (rows[1].state, rows[1].found) == ("wrong", "canopen is not installed")
+    # What this cell does without is told, and is not wrong.
+    assert (rows[2].state, rows[2].mend) == ("not needed", "pip install 'pye57>=0.4.13'")
+
+
+def test_a_package_of_the_same_name_is_told(tmp_path: Path) -> None:
+    ours = {name: ["assembly-cell", "assembly-cell"] for name in OWN}
+    assert shadow_check(lambda: ours).state == "ok"
+    row = shadow_check(lambda: {**ours, "statemachine": ["assembly-cell", "python-statemachine"]})
+    assert (row.state, row.mend) == ("wrong", "pip uninstall python-statemachine; pip install -e .")
+    assert row.found.startswith("python-statemachine installs a package statemachine as well")
+    assert shadow_check(lambda: ours, tmp_path).found.startswith("cell is imported from ")
+
+
+def test_a_port_and_its_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load_config(None)
+    others = [name for name in DEVICES if name != "rail"]
+    (row,) = (row for row in link_checks(config, others, tmp_path) if row.state != "not needed")
+    assert (row.what, row.state, row.found) == (f"rail, port {config.rail.place}", "wrong", "not there")
+    master, port = pty.openpty()
+    rail = config.rail.model_copy(update={config.rail.ADDRESS: os.ttyname(port)})
+    monkeypatch.setattr("os.access", lambda *arguments: False)
+    there = config.model_copy(update={"rail": rail})
+    (row,) = (row for row in link_checks(there, others, tmp_path) if row.state != "not needed")
+    assert row.found == "no permission"
+    assert row.mend.startswith("sudo usermod -aG ")
+    os.close(master)
+    os.close(port)
+
+
+@pytest.mark.parametrize(
+    ("about", "verdict", "mend"),
+    [
+        (None, "wrong", "plug the adapter in; sudo ip link set can0 up type can bitrate 500000"),
+        (CanInterface("can0", False), "wrong", "sudo ip link set can0 up type can bitrate 500000"),
+        (CanInterface("can0", True, 250_000), "wrong", "sudo ip link set can0 down; sudo ip link set can0 up type"),
+        (CanInterface("can0", True, 500_000), "ok", ""),
+        # A virtual bus has no bit rate.
+        (CanInterface("can0", True), "ok", ""),
+    ],
+)
+def test_a_can_interface_against_the_configuration(about: CanInterface | None, verdict: str, mend: str) -> None:
+    vehicle = load_config(None).vehicle.model_copy(update={"interface": "socketcan", "channel": "can0"})
+    row = can_check("vehicle", vehicle, about)
+    assert row.state == verdict
+    assert row.mend.startswith(mend)
+
+
+def test_room_clock_and_date(tmp_path: Path) -> None:
+    (tmp_path / "runs" / "20260101T000000-0001").mkdir(parents=True)
+    assert doctor.disk_check(tmp_path / "runs" / "not" / "yet", wanted=0).state == "ok"
+    row = doctor.disk_check(tmp_path / "runs", wanted=10**18)
+    assert row.state == "wrong"
+    assert row.mend.startswith(f"rm -r {tmp_path}/runs/20260101T000000-0001 ")
+    source = tmp_path / "sys/devices/system/clocksource/clocksource0/current_clocksource"
+    source.parent.mkdir(parents=True)
+    for name, needed, verdict in (("tsc", True, "ok"), ("hpet", True, "wrong"), ("hpet", False, "not needed")):
+        source.write_text(f"{name}\n")
+        assert doctor.clock_check(tmp_path, needed).state == verdict
+    for told, verdict in ((True, "ok"), (False, "wrong"), (None, "wrong")):
+        assert doctor.date_check(told, needed=True).state == verdict
+    for needed, verdict in ((True, "wrong"), (False, "not needed")):
+        assert doctor.scheduling_check(tmp_path, needed, most=-1.0).state == verdict
+
+
+def test_only_what_the_configured_cell_needs_ends_with_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    without = json.loads(CliRunner().invoke(app, ["doctor", "--json"]).stdout)
+    assert {row["what"] for row in without if row["state"] == "wrong"} <= {"packages", "disk"}
+    (tmp_path / "cell.toml").write_text(default_toml())
+    real = CliRunner().invoke(app, ["doctor"])
+    assert real.exit_code == 1
+    assert "rail, port" in real.stdout
+    (tmp_path / "cell.toml").write_text("[cell]\n")
+    broken = CliRunner().invoke(app, ["doctor", "--json"])
+    assert broken.exit_code == 1
+    assert json.loads(broken.stdout)[0]["mend"] == "cell check -c cell.toml"

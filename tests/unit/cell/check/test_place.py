@@ -1,0 +1,113 @@
+"""Jobs whose put-down makes no sense are refused with the value and what is allowed, before anything moves."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.base.toml_file import read_toml, validate
+from cell.check.place import contact_notes, contact_problems, under_part
+from cell.check.reach import _sweeps, _unreached, nominal_scan
+from cell.config.cell_config import CellConfig, load_config
+from cell.config.job import Job, load_job, shipped_jobs
+from cell.motion.kinematics import Unreachable
+from cell.procedures.arm.photograph import scan_plans
+from cell.procedures.sweep.sweeping import RUN_UP_S
+
+POT = load_job("pot")[1].with_suffix(".toml")
+
+
+@pytest.fixture(scope="module")
+def config() -> CellConfig:
+    return load_config(None)
+
+
+def changed(key: str, value: Any) -> Job:
+    raw = read_toml(POT, "job", "")
+    section = raw
+    *parents, last = key.split(".")
+    for parent in parents:
+        section = section[parent]
+    section[last] = value
+    return validate(Job, raw, "job")
+
+
+@pytest.mark.parametrize("name", shipped_jobs())
+def test_the_jobs_that_ship_make_sense(name: str, config: CellConfig) -> None:
+    job, mesh = load_job(name)
+    assert list(contact_problems(job, config, mesh)) == []
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("place.contact_force", "119 N", r"119 N .*\(allowed: 2 to 102 N"),
+        ("place.contact_speed", "40 mm/s", "goes on by 2 mm.* at most 12 mm/s"),
+        ("place.contact_travel", "0.1 mm", "at least 0.3 mm"),
+        ("place.tolerance", "0.01 mm", "cannot be kept: grasp.sigma .* leave 0.*mm open"),
+        ("place.tolerance_angle", "0.1 mrad", "cannot be kept: grasp.sigma_angle"),
+        ("grasp.sigma", "5 mm", "leave 5 mm open"),
+        ("grasp.sigma_angle", "50 mrad", "leave 50 mrad open"),
+        ("grasp.size", ["400 mm", "400 mm", "20 mm"], "1 % of the part's footprint"),
+        ("grasp.size", ["70 mm", "36 mm", "1 mm"], "goes through the whole part, 8.39 mm"),
+        ("scan.exposure", "30 ms", "smears a line by 0.45 mm"),
+        ("place.surface_from_part.translation", ["0 mm", "0 mm", "10 mm"], "1.61 mm below .* in the air"),
+        ("place.surface_from_part.translation", ["40 mm", "0 mm", "0 mm"], "43 % of the part's footprint"),
+        ("place.surface_from_part.translation", ["300 mm", "0 mm", "0 mm"], "0 % of the part's footprint"),
+    ],
+)
+def test_a_senseless_put_down_is_refused_with_its_number(key: str, value: Any, told: str, config: CellConfig) -> None:
+    problems = list(contact_problems(changed(key, value), config, POT.with_suffix(".stl")))
+    assert any(re.search(told, problem) for problem in problems), problems
+
+
+def test_a_part_whose_lowest_plane_ends_over_the_surface_comes_down_onto_it(config: CellConfig) -> None:
+    """The surface lies 0.1 mm below that plane, within `place.contact_travel`."""
+    higher = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "8.49 mm"])
+    assert under_part(higher, POT.with_suffix(".stl"))[1] == pytest.approx(-0.1e-3, abs=0.02e-3)
+    assert list(contact_problems(higher, config, POT.with_suffix(".stl"))) == []
+
+
+def test_how_deep_the_surface_reaches_into_the_part_is_noted() -> None:
+    mesh: Path = POT.with_suffix(".stl")
+    deeper = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "-5 mm"])
+    assert "13.4 mm into the part's box of 20 mm" in next(contact_notes(deeper, mesh))
+
+
+# --- what the arm has to reach ---
+
+
+def test_sweeps_are_planned_with_the_scan_head_as_drawn(config: CellConfig) -> None:
+    head = nominal_scan(config)
+    np.testing.assert_array_equal(head.rail_direction, [1.0, 0.0, 0.0])
+    assert not head.covariance.any()
+
+
+@pytest.mark.parametrize(("mode", "run_up"), [("rail", 0.0), ("arm", RUN_UP_S * 0.015)])
+def test_a_sweep_by_the_arm_reaches_from_its_run_up_to_its_run_out(
+    mode: str, run_up: float, config: CellConfig
+) -> None:
+    job = changed("scan.mode", mode)
+    surface = pin.SE3(np.eye(3), np.array([0.7, 0.3, 0.1]))
+    (plan,) = scan_plans(config, job, surface, nominal_scan(config))
+    (_, begin, _), (_, end, _) = _sweeps(job, config, surface)
+    ahead = [surface.actInv(pose).translation[0] for pose in (begin, plan.base_from_flange, plan.base_from_flange_end)]
+    ahead.append(surface.actInv(end).translation[0])
+    assert np.diff(ahead) == pytest.approx([run_up, job.scan.length * (mode == "arm"), run_up], abs=1e-9)
+
+
+def test_of_many_poses_out_of_reach_three_are_told() -> None:
+    class Short:
+        def reach(self, goal: pin.SE3, joints: object, what: str, allowed: object) -> object:
+            if what == "near":
+                return joints
+            raise Unreachable("out of reach")
+
+    goals = [(what, pin.SE3.Identity(), ()) for what in ("near", "a", "b", "near", "c", "d")]
+    told = list(_unreached(Short(), iter(goals)))  # type: ignore[arg-type]
+    assert told == [f"{what}: out of reach" for what in "abc"]

@@ -1,0 +1,59 @@
+"""What neighbouring points are off by together is found from the scan, and stated where few patches tell a motion."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cell.measure.geometry.poses import difference
+from cell.measure.inversion import Prior, invert_pose
+from cell.measure.inversion.nominal import SIGMA_FLOOR, Scan
+from cell.measure.inversion.place_pose import PATCH_M, shared_by_patches
+from cell.measure.inversion.registration import register
+from cell.measure.reconstruction import Cloud
+from tests.unit.cell.measure.inversion.test_registration import BOARD, JOB, TRUE, ledges, nominal, scanned
+
+Array = NDArray[np.float64]
+FORM = np.random.default_rng(5).standard_normal((40, 40))
+
+
+def uneven(size: float) -> Cloud:
+    """Two ledges on a plane of which each patch of 4 mm is off along its normal, 1 σ of `size` m, as a stripe or a
+    casting is: the ledges, with 2 % of the points, tell the shifts along x and y, and the turn."""
+
+    def height(x: Array, y: Array) -> Array:
+        i, j = (np.clip(np.floor(v / PATCH_M).astype(int) + 20, 0, 39) for v in (x, y))
+        step = 1e-6
+        slope_x = (ledges(x + step, y) - ledges(x - step, y)) / (2 * step)
+        slope_y = (ledges(x, y + step) - ledges(x, y - step)) / (2 * step)
+        return ledges(x, y) + size * FORM[i, j] * np.sqrt(1 + slope_x**2 + slope_y**2)
+
+    return scanned(height, 4)
+
+
+@pytest.mark.parametrize("size", [0.0, 15e-6])
+def test_what_a_patch_shares_is_found_and_counts_for_what_few_patches_tell(size: float) -> None:
+    found = register(Scan.of(uneven(size)), nominal(ledges), Prior(TRUE, BOARD))
+    sigma, by_patches = shared_by_patches(found)
+    assert sigma == pytest.approx(size, rel=0.25, abs=2 * SIGMA_FLOOR)
+    shared, random = (np.sqrt(np.diag(matrix)) for matrix in (by_patches, found.covariance))
+    if not size:
+        # Nothing to speak of where there is nothing: 3 µm of facets.
+        assert (shared < 1.2 * random).all()
+        return
+    # The nine patches along a ledge tell the way across it no better than their mean.
+    assert shared[0] == pytest.approx(size / np.sqrt(9), rel=0.5)
+    assert shared[5] > 2.0 * random[5]
+    # What the whole plane tells averages out.
+    assert shared[2] < 3e-6
+
+
+def test_the_stated_deviation_holds_where_neighbours_err_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Believed to the last point: the rule that leaves what few points tell to the board is another one.
+    monkeypatch.setattr("cell.measure.inversion.observability.FEW", 0.0)
+    found = invert_pose(uneven(15e-6), nominal(ledges), Prior(TRUE, BOARD), JOB)
+    off = difference(found.base_from_surface, TRUE)
+    assert (np.abs(off) < 3.0 * found.sigma).all()
+    # The turn that the ledges tell: three times as much as the points' own noise leaves of it.
+    assert found.sigma[5] > 2.0 * np.sqrt(found.random[5, 5])

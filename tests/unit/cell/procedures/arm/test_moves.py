@@ -1,0 +1,80 @@
+"""A person slows the cell down: arm and vehicle go the same ways more slowly, from the next motion on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cell import Cell
+from cell.config.cell_config import load_config
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_parts, from_ur
+from cell.motion.kinematics import HOME
+from cell.procedures.arm.moves import LEAST, Mover, Pace
+from cell.procedures.steps.drive_to_target import drive_to_target
+from drivers.errors import ConfigError
+from tests.unit.cell.procedures.drive.test_way import JOB, VEHICLE_FROM_BASE, Site
+
+CONFIG = load_config(None)
+
+
+def test_the_arm_goes_the_same_way_at_a_share_of_its_speed_from_the_next_motion_on() -> None:
+    cell, pace = VirtualCell(CONFIG, 2, "nominal"), Pace()
+    cell.devices.vehicle.brake()
+    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None, interlocks=cell.devices.interlocks, pace=pace)
+    mover.to_joints(HOME)
+    there = HOME + np.array([0.3, 0.1, 0.0, 0.0, 0.0, 0.0])
+
+    def speeds(move) -> tuple[float, float]:
+        """Of the leading joint, largest, and of the flange, largest."""
+        with cell.devices.arm.record() as states:
+            move()
+        places = np.array([state.flange[:3] for state in states])
+        times = np.array([state.device_time for state in states])
+        flange = np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times)
+        return max(float(np.abs(state.joint_speeds).max()) for state in states), float(flange.max())
+
+    def line() -> None:
+        below = from_parts((0.0, 0.0, 0.05)) * from_ur(cell.devices.arm.state().flange)
+        mover.line(below, 0.1)
+
+    whole, straight = speeds(lambda: mover.to_joints(there))[0], speeds(line)[1]
+    pace.share = 0.5
+    assert speeds(lambda: mover.to_joints(HOME))[0] == pytest.approx(0.5 * whole, rel=0.08)
+    assert np.abs(cell.devices.arm.state().joints - HOME).max() < 1e-3
+    assert speeds(line)[1] == pytest.approx(0.5 * straight, rel=0.05)
+
+
+def test_the_vehicle_drives_at_a_share_of_the_jobs_speed() -> None:
+    def fastest(share: float) -> float:
+        site, pace, speeds = Site(), Pace(), [0.0]
+        pace.share = share
+        site.whereabouts.say_at_start()
+        site.vehicle.enable()
+        site.whereabouts.enter(JOB)
+        drive_to_target(
+            JOB, VEHICLE_FROM_BASE, site.vehicle, site.whereabouts, site.photograph, site.cell.clock,
+            lambda: speeds.append(abs(site.vehicle.state().speed)),
+            lambda share, text: None, site.notes.append, pace=pace,
+        )  # fmt: skip
+        return max(speeds)
+
+    for share in (1.0, 0.5):
+        assert fastest(share) == pytest.approx(share * JOB.approach.speed, rel=0.1)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.9 * LEAST, 1.01, float("nan"), True, "fast", None])
+def test_what_is_no_pace_is_refused_with_what_is_allowed(share: object) -> None:
+    pace = Pace()
+    with pytest.raises(ConfigError, match=r"allowed are 0\.25 to 1"):
+        pace.share = share
+    assert pace.share == 1.0
+
+
+def test_a_cell_is_slowed_from_outside_while_it_works() -> None:
+    with Cell.open(sim="all", clock="virtual", seed=4) as cell:
+        assert cell.pace == 1.0
+        cell.pace = 0.3
+        assert cell.mover(None).pace.share == 0.3
+        with pytest.raises(ConfigError):
+            cell.pace = 2.0

@@ -1,0 +1,262 @@
+"""Run folders and the lock: one holder at a time, none left behind, and a held cell says who holds it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sqlite3
+import time
+from pathlib import Path
+
+import pytest
+
+from cell import Cell
+from cell.apps.cli.commands.runs import abort
+from cell.base.storage import sealed
+from cell.config.cell_config import CellConfig, default_toml, load_config
+from cell.devices.lock import CellLock, _name
+from cell.run.folder import (
+    Question,
+    awaited_word,
+    find_going,
+    find_run,
+    is_going,
+    list_runs,
+    new_run,
+    read_report,
+    run_row,
+    write_json,
+)
+from drivers.errors import CellError, ConfigError, InterlockError
+from statemachine.journal import Journal
+
+
+@pytest.fixture
+def config() -> CellConfig:
+    """A configuration whose addresses nobody else uses while the test runs."""
+    shipped = load_config(None)
+    own = f"127.1.{os.getpid() // 250 % 250}.{os.getpid() % 250}"
+    return shipped.model_copy(
+        update={
+            "arm": shipped.arm.model_copy(update={"address": own}),
+            "rail": shipped.rail.model_copy(update={"url": f"socket://{own}:1"}),
+            "vehicle": shipped.vehicle.model_copy(update={"channel": f"socket://{own}:2"}),
+            "scan_camera": shipped.scan_camera.model_copy(update={"address": f"{own}:3"}),
+            "target_camera": shipped.target_camera.model_copy(update={"address": f"{own}:4"}),
+        }
+    )
+
+
+def test_a_cell_is_held_once_and_free_again_afterwards(config: CellConfig) -> None:
+    with CellLock(config), pytest.raises(InterlockError, match=f"held by process {os.getpid()}"):
+        CellLock(config).__enter__()
+    with CellLock(config):
+        pass
+
+
+def test_two_configurations_that_share_one_device_are_not_open_at_once(config: CellConfig) -> None:
+    other = config.model_copy(update={"arm": config.arm.model_copy(update={"address": "127.2.0.1"})})
+    with CellLock(config):
+        with pytest.raises(InterlockError, match="the rail at"):
+            CellLock(other).__enter__()
+        # What it had taken before it met the rail is free again.
+        with pytest.raises(InterlockError, match="the rail at"):
+            CellLock(other).__enter__()
+
+
+def test_a_cell_that_another_holds_is_not_opened(config: CellConfig, tmp_path: Path) -> None:
+    own = config.arm.address
+    text = default_toml()
+    for wanted, given in (
+        ('address = "192.0.2.10"', f'address = "{own}"'),
+        ('url = "/dev/ttyACM0"', f'url = "{config.rail.url}"'),
+    ):
+        assert wanted in text
+        text = text.replace(wanted, given)
+    (tmp_path / "cell.toml").write_text(text.replace("192.0.2.", "127.3.0."))
+    held = load_config(tmp_path / "cell.toml")
+    with CellLock(held), pytest.raises(InterlockError, match="is held by process"):
+        Cell.open(tmp_path / "cell.toml")
+
+
+def test_another_user_finds_the_cell_held(config: CellConfig) -> None:
+    if os.getuid() != 0:
+        pytest.skip("only root can become another user")
+    reader, writer = os.pipe()
+    with CellLock(config):
+        child = os.fork()
+        if child == 0:
+            os.setgid(65534)
+            os.setuid(65534)
+            try:
+                CellLock(config).__enter__()
+                os.write(writer, b"free")
+            except InterlockError:
+                os.write(writer, b"held")
+            os._exit(0)
+        os.waitpid(child, 0)
+    assert os.read(reader, 4) == b"held"
+
+
+@pytest.mark.parametrize("listens", [True, False])
+def test_a_name_that_is_taken_denies_nothing(
+    config: CellConfig, listens: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """No cell has it: who does, and how to go on, is told. Two of this user's cells still exclude each other."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as taken:
+        taken.bind(_name("arm", config.device("arm").held))
+        if listens:
+            taken.listen()
+        with pytest.raises(InterlockError, match=f"process {os.getpid()}" if listens else "CELL_LOCKS=own goes on"):
+            CellLock(config).__enter__()
+        monkeypatch.setenv("CELL_LOCKS", "own")
+        with CellLock(config), pytest.raises(InterlockError, match="is held by"):
+            CellLock(config).__enter__()
+    # A folder that others may enter, or that is another's, is not used.
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / f"assembly-cell-{os.getuid()}").mkdir(0o755)
+    with pytest.raises(InterlockError, match="mode 0755"):
+        CellLock(config).__enter__()
+
+
+def test_the_lock_of_a_killed_process_is_free(config: CellConfig) -> None:
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        CellLock(config).__enter__()
+        os.write(writer, b"held")
+        os.kill(os.getpid(), signal.SIGKILL)
+    assert os.read(reader, 4) == b"held"
+    os.waitpid(child, 0)
+    with CellLock(config):
+        pass
+
+
+def test_runs_are_found_by_name_id_or_as_the_newest(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    with pytest.raises(ConfigError, match="no run at all"):
+        find_run(root, None)
+    first = new_run(root)
+    second = new_run(root)
+    assert set(list_runs(root)) == {first, second}
+    assert find_run(root, None) == sorted((first, second))[-1]
+    assert find_run(root, first.name.split("-")[1]) == first
+    with pytest.raises(ConfigError, match="no run nothing"):
+        find_run(root, "nothing")
+
+
+def test_a_run_without_a_report_tells_what_its_journal_does(tmp_path: Path) -> None:
+    folder = new_run(tmp_path / "runs")
+    journal = Journal(folder, folder.name, {"job": "pot"})
+    journal.step_started("drive_to_target", 1)
+    journal.close()
+    report = read_report(folder)
+    assert report["outcome"] == "not ended"
+    assert report["job"] == "pot"
+    assert report["steps"][0]["name"] == "drive_to_target"
+    write_json(folder / "report.json", {"outcome": "placed"})
+    assert read_report(folder) == {"outcome": "placed"}
+    write_json(folder / "report.json", sealed({"outcome": "refused", "reason": "too rough"}))
+    assert read_report(folder) == {"outcome": "refused", "reason": "too rough"}
+    (folder / "report.json").write_text((folder / "report.json").read_text().replace("refused", "placed"))
+    with pytest.raises(CellError, match=r"report\.json: it was changed after it was written"):
+        read_report(folder)
+    assert "it was changed" in run_row(folder)["reason"]
+
+
+def test_what_is_going_on_is_found_and_what_has_ended_or_died_is_not(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    with pytest.raises(ConfigError, match="nothing is going on"):
+        find_going(root, None)
+    dead = new_run(root)
+    Journal(dead, dead.name, {"kind": "job", "pid": 2**22 + 1}).close()
+    ended = new_run(root)
+    journal = Journal(ended, ended.name, {"kind": "calibration", "pid": os.getpid()})
+    with pytest.raises(ConfigError, match="process died"):
+        find_going(root, dead.name)
+    assert find_going(root, None) == ended
+    journal.run_ended("done", "calibration done")
+    with pytest.raises(ConfigError, match="nothing is going on"):
+        find_going(root, None)
+    assert find_run(root, None, "job") == dead
+    assert find_run(root, None, "calibration") == ended
+
+
+def test_what_a_run_waits_for_is_read_from_its_journal(tmp_path: Path) -> None:
+    folder = new_run(tmp_path / "runs")
+    journal = Journal(folder, folder.name)
+    assert awaited_word(folder) is None
+    journal.event("confirm_needed", "laser_sweep", {"reason": "the arm has stopped", "code": "x", "number": 2})
+    assert awaited_word(folder) == Question(2, "the arm has stopped")
+    assert read_report(folder)["reason"] == "waits for a person, question 2: the arm has stopped"
+    journal.event("confirmed", "laser_sweep", {"by": "Ann", "reason": "the arm has stopped"})
+    assert awaited_word(folder) is None
+
+
+def test_of_two_that_go_on_one_has_to_be_named(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    two = [new_run(root), new_run(root)]
+    for folder in two:
+        Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()})
+    with pytest.raises(ConfigError, match="more than one is going on"):
+        find_going(root, None)
+    assert find_going(root, two[0].name) == two[0]
+
+
+def test_a_time_of_maintenance_takes_no_requests_and_keeps_no_run_from_being_asked(tmp_path: Path) -> None:
+    root = tmp_path / "runs"
+    job = new_run(root)
+    Journal(job, job.name, {"kind": "job", "pid": os.getpid()})
+    maintenance = new_run(root)
+    Journal(maintenance, maintenance.name, {"kind": "maintenance", "pid": os.getpid()})
+    assert is_going(maintenance)
+    assert find_going(root, None) == job
+    with pytest.raises(ConfigError, match="nothing is going on there"):
+        find_going(root, maintenance.name)
+
+
+def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = tmp_path / "runs"
+    going = [new_run(root), new_run(root)]
+    journals = [Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()}) for folder in going]
+    first = min(going)
+    base = sqlite3.connect(first / "journal.sqlite")
+    base.execute("DROP TABLE requests")
+    base.commit()
+    base.close()
+    with pytest.raises(ConfigError, match=f"not asked to end: .*{first.name}"):
+        abort()
+    other = journals[going.index(max(going))]
+    assert [request.kind for request in other.take_requests()] == ["abort"]
+
+
+def test_a_run_that_ended_as_the_others_were_asked_to_end_is_no_failure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    root = tmp_path / "runs"
+    going = sorted([new_run(root), new_run(root)])
+    journals = [Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()}) for folder in going]
+    said = []
+
+    def echo(line: str) -> None:
+        said.append(line)
+        journals[1].run_ended("placed", "all steps done")
+
+    monkeypatch.setattr("typer.echo", echo)
+    abort()
+    assert said == [f"asked {going[0].name} to end", f"{going[1].name} has ended meanwhile"]
+
+
+def test_a_process_that_took_over_the_number_of_a_dead_one_is_not_the_run(tmp_path: Path) -> None:
+    folder = new_run(tmp_path / "runs")
+    Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()})
+    assert is_going(folder)
+    base = sqlite3.connect(folder / "journal.sqlite")
+    base.execute("UPDATE runs SET started = ?", (time.time() - 30 * 86400.0,))
+    base.commit()
+    assert not is_going(folder)

@@ -1,0 +1,202 @@
+"""A folder of recorded pictures with their times, as a camera; and what V4L2 pictures become."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cell.config.cell_config import default_toml, load_config
+from cell.devices.assembly import connect, connect_one
+from cell.devices.contracts import Bench
+from cell.devices.contracts.device import CameraContract
+from cell.makes.make import Surroundings
+from cell.makes.table import installed, make_of
+from drivers.camera.folder import RecordedCamera
+from drivers.camera.genicam import aravis
+from drivers.camera.v4l2 import ExposureTiming, to_grey
+from drivers.clock import Clock
+from drivers.errors import ConfigError, DeviceFault, LimitError, NotConnectedError, RefusedError
+from drivers.interfaces import Camera
+
+RATE_HZ, EXPOSURE_S = 10.0, 0.005
+
+
+def record(folder: Path, numbers: list[int]) -> Path:
+    """Pictures at 10 Hz whose grey is their number; those numbers that are left out were lost."""
+    folder.mkdir(exist_ok=True)
+    lines = ["file,time_s,exposure_s,frame"]
+    for number in numbers:
+        cv2.imwrite(str(folder / f"{number}.png"), np.full((48, 64), number, np.uint8))
+        lines.append(f"{number}.png,{100.0 + number / RATE_HZ},{EXPOSURE_S},{number}")
+    (folder / "times.csv").write_text("\n".join(lines), encoding="utf-8")
+    return folder
+
+
+def opened(folder: Path, clock: Clock | None = None) -> RecordedCamera:
+    return RecordedCamera("recording", folder, clock=clock or Clock(10.0), shape=(48, 64))
+
+
+class TestContract(CameraContract):
+    """What the cell relies on in any camera, of a recording that was taken as the suite takes it."""
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def bench(cls, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench[Camera]]:
+        folder = record(tmp_path_factory.mktemp("recording") / "frames", [n for n in range(1, 40) if n % 6])
+        clock = Clock(10.0)
+        made: Bench[Camera] = Bench(lambda: opened(folder, clock), clock)
+        yield made
+        made.over()
+
+
+def test_pictures_are_played_at_the_pace_at_which_they_were_taken(tmp_path: Path) -> None:
+    clock = Clock(5.0)
+    camera = opened(record(tmp_path / "r", [1, 2, 3, 5, 6]), clock)
+    with camera.stream() as frames:
+        begun = clock.now()
+        made = [frames.next(5.0) for _ in range(5)]
+        took = clock.now() - begun
+    assert [int(frame.image[0, 0]) for frame in made] == [1, 2, 3, 5, 6]
+    assert [frame.lost_before for frame in made] == [0, 0, 0, 1, 0]
+    assert np.diff([frame.host_time for frame in made]) == pytest.approx([0.1, 0.1, 0.2, 0.1])
+    assert 0.5 <= took < 1.5
+    assert camera.time_bound == float("inf")
+    with pytest.raises(DeviceFault, match="all 5 pictures"):
+        camera.grab()
+
+
+def test_what_is_wrong_with_a_recording_is_named(tmp_path: Path) -> None:
+    folder = record(tmp_path / "r", [1, 2, 3])
+    good = (folder / "times.csv").read_text()
+    for text, words in (
+        (good.replace("time_s", "when"), r"times\.csv, line 2: KeyError"),
+        (good.replace("100.2", "soon"), "line 3: ValueError"),
+        (good.replace("100.2", "99"), "line 3: time and frame must grow"),
+        (good.replace(str(EXPOSURE_S), "0"), "line 2: .*exposure 0 s"),
+        ("file,time_s,exposure_s\n", "has 0 pictures"),
+    ):
+        (folder / "times.csv").write_text(text)
+        with pytest.raises(ConfigError, match=words):
+            opened(folder)
+    (folder / "times.csv").write_text(good, encoding="utf-8-sig")  # as spreadsheets write it
+    opened(folder)
+    (folder / "times.csv").write_text(good, encoding="utf-16")
+    with pytest.raises(ConfigError, match="is no table of text"):
+        opened(folder)
+    (folder / "times.csv").unlink()
+    with pytest.raises(ConfigError, match="cannot be read"):
+        opened(folder)
+    with pytest.raises(NotConnectedError, match="is not a folder"):
+        opened(tmp_path / "nowhere")
+
+
+def test_another_exposure_or_rate_than_the_recorded_is_refused(tmp_path: Path) -> None:
+    camera = opened(record(tmp_path / "r", [1, 2, 3]))
+    camera.configure(EXPOSURE_S, RATE_HZ)
+    with pytest.raises(LimitError, match=r"exposure 20 ms is not that of the recording .*allowed: 5 ms"):
+        camera.configure(0.02, RATE_HZ)
+    with pytest.raises(LimitError, match=r"frame rate 30 Hz .*allowed: 10 Hz"):
+        camera.configure(EXPOSURE_S, 30.0)
+
+
+def test_a_cut_picture_is_refused_by_name_and_the_next_one_comes(tmp_path: Path) -> None:
+    folder = record(tmp_path / "r", [1, 2, 3])
+    (folder / "2.png").write_bytes((folder / "2.png").read_bytes()[:40])
+    camera = opened(folder)
+    camera.grab()
+    with pytest.raises(RefusedError, match=r"2\.png: is cut off"):
+        camera.grab()
+    assert camera.grab().frame_id == 3
+
+
+# --- makes ---
+
+
+def named(tmp_path: Path, driver: str, address: str) -> Path:
+    """The shipped configuration with another scan camera."""
+    before, camera, after = default_toml().partition("[scan_camera]")
+    after = after.replace('driver = "stream"', f'driver = "{driver}"', 1)
+    after = after.replace('address = "192.0.2.20:5000"', address, 1)
+    path = tmp_path / "cell.toml"
+    path.write_text(before + camera + after, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("driver", "address", "words"),
+    [
+        ("gige", 'address = "camera.local"', "no IPv4 address"),
+        ("gige", 'address = "255.255.255.255"', "not the address of one camera"),
+        ("gige", 'address = "192.0.2.20"\npacket_size = 100', "576 to 16000"),
+        ("gige", 'address = "192.0.2.20"\npixel_format = "YUV422"', "pixel_format"),
+        ("gige", 'address = "192.0.2.20"\npacket_delay = 5', "no unit"),
+        ("usb3", 'guid = "12"', "guid"),
+        ("v4l2", 'device = "video0"', "device"),
+    ],
+)
+def test_the_makes_values_are_checked(tmp_path: Path, driver: str, address: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load_config(named(tmp_path, driver, address))
+
+
+def test_a_region_changes_what_a_calibration_fits_and_an_address_does_not(tmp_path: Path) -> None:
+    def hash_of(address: str) -> str:
+        return load_config(named(tmp_path, "gige", address)).calibration_hash()
+
+    own = hash_of('address = "192.0.2.20"')
+    assert own != load_config(None).calibration_hash()
+    assert hash_of('address = "192.0.2.21"\nresend = false') == own
+    assert hash_of('address = "192.0.2.20"\noffset = [16, 0]') != own
+
+
+def test_without_aravis_its_makes_are_listed_as_not_installed_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(aravis, "LIBRARIES", ("libaravis-none.so",))
+    aravis.load.cache_clear()
+    try:
+        rows = {row.make: row for row in installed() if row.kind == "camera"}
+        assert rows["gige"].state == rows["usb3"].state
+        assert rows["gige"].state.startswith("not installed: install the library Aravis: apt-get install libaravis")
+        assert rows["stream"].ok and rows["v4l2"].ok and rows["folder"].ok
+        config = load_config(named(tmp_path, "gige", 'address = "127.0.0.1"'))
+        with pytest.raises(NotConnectedError, match="scan_camera: install the library Aravis"):
+            connect_one(config, "scan_camera", Clock())
+    finally:
+        aravis.load.cache_clear()
+
+
+def test_nothing_moves_by_a_recording(tmp_path: Path) -> None:
+    record(tmp_path / "frames", [1, 2])
+    config = load_config(named(tmp_path, "folder", f'folder = "{tmp_path / "frames"}"'))
+    with pytest.raises(ConfigError, match=r'scan_camera\.driver = "folder" plays recorded pictures, .*rail'):
+        connect(config, ("rail", "scan_camera"))
+
+
+# --- V4L2, of which no camera was at hand ---
+
+
+def test_a_device_file_without_a_camera_is_named_with_remedies() -> None:
+    make = make_of("camera", "v4l2")
+    record = make.record.model_construct(device="/dev/video77", width=640, height=480, pixel_format="YUYV", gain=None)
+    with pytest.raises(NotConnectedError, match=r"/dev/video77 is no camera .*v4l2-ctl .*fuser"):
+        make.connect("scan_camera", record, Surroundings(Clock()))
+
+
+def test_what_a_driver_hands_over_becomes_grey() -> None:
+    grey = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
+    yuyv = np.stack([grey, np.full_like(grey, 128)], axis=2)
+    bgr = np.repeat(grey[:, :, None], 3, axis=2)
+    for raw in (grey, grey.reshape(1, -1), yuyv, bgr):
+        assert (to_grey(raw, (48, 64)) == grey).all()
+    for wrong in (None, grey.astype(np.uint16), grey[:40]):
+        with pytest.raises(ValueError):
+            to_grey(wrong, (48, 64))
+
+
+def test_a_uvc_stamp_leaves_a_frame_and_the_exposure_open() -> None:
+    assert ExposureTiming(0.02, 10.0).open_s == pytest.approx(0.12)

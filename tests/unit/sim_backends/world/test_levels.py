@@ -1,0 +1,203 @@
+"""The workshop's effects in the simulated world: each is off unless asked for, and as large as told."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cell.measure.inversion.effects.causes import Cause, likeliest
+from lab.bench.job.realism import verdict
+from sim_backends.clock import SteppedClock
+from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics, TruePose
+from sim_backends.optics.camera import CameraOptics
+from sim_backends.optics.laser.stripe import crossings
+from sim_backends.optics.pattern import grain_at, grain_parameters
+from sim_backends.optics.scene import Grain, LaserOptics, PlaneInstance
+from sim_backends.world import drawing
+from sim_backends.world.levels import ALONE, LEVELS, Effects, assumed_noise, deviations, effects_of, number_of, only
+from sim_backends.world.scene import draw
+from sim_backends.world.world import World
+
+OPTICS = CameraOptics(640, 480, 1667.0, 1667.0, 319.5, 239.5)
+RNG = np.random.default_rng(0)
+
+
+def test_every_effect_can_be_had_alone_and_workshop_has_all_but_the_options() -> None:
+    for name in Effects.names():
+        alone = effects_of(f"nominal+{name}")
+        assert getattr(alone, name) == getattr(ALONE, name) > 0
+        assert sum(bool(getattr(alone, other)) for other in Effects.names()) == 1
+    off = [name for name in Effects.names() if not getattr(effects_of("workshop"), name)]
+    assert off == ["rolling_shutter", "droop"]
+    for level in ("ideal", "nominal", "harsh"):
+        assert effects_of(level) == Effects()
+
+
+def test_each_row_says_its_unit_meaning_and_source() -> None:
+    for row in dataclasses.fields(Effects):
+        assert all(row.metadata[key] for key in ("unit", "meaning", "source")), row.name
+    assert set(assumed_noise("nominal+rocking")) - set(assumed_noise("nominal")) == {"rocking"}
+
+
+@pytest.mark.parametrize("level", ["noisy", "nominal+thunder", "workshop+grasp"])
+def test_a_level_that_is_none_is_refused_with_those_that_are(level: str) -> None:
+    with pytest.raises(ValueError, match="choose"):
+        effects_of(level)
+
+
+def test_no_two_levels_share_a_serial_number() -> None:
+    levels = [*LEVELS, *(f"nominal+{name}" for name in Effects.names()), "nominal+grasp+sag", "harsh+grasp"]
+    assert len({number_of(level) for level in levels}) == len(levels)
+
+
+def test_an_effect_leaves_everything_else_as_it_was() -> None:
+    plain, one = draw(5, "nominal"), draw(5, "nominal+sheet_bow")
+    assert one.workshop.sheet_bow != 0.0 == plain.workshop.sheet_bow
+    assert (one.light_plane_normal == plain.light_plane_normal).all()
+    assert (one.flange_from_part == plain.flange_from_part).all()
+    assert deviations("nominal+sheet_bow") == deviations("nominal")
+
+
+def test_joints_are_off_by_seven_hundredths_of_a_milliradian() -> None:
+    off = []
+    for seed in range(40):
+        errors = JointErrors(Kinematics(UR10E_DH), draw(seed, "nominal+joint_harmonics").workshop.harmonics)
+        for _ in range(20):
+            q = RNG.uniform(-3, 3, 6)
+            off.append(errors.true(q) - q)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(0.07e-3, rel=0.1)
+
+
+def test_a_stretched_arm_sags_about_its_shoulder() -> None:
+    errors = JointErrors(Kinematics(UR10E_DH), np.zeros((6, 4)), compliance=3e-6, mass=2.0)
+    flat = np.zeros(6)
+    reach = np.linalg.norm(Kinematics(UR10E_DH).forward(flat)[:2, 3])
+    turned = errors.true(flat) - flat
+    assert abs(turned[1]) == pytest.approx(3e-6 * 2.0 * 9.81 * reach, rel=0.05)
+    lowered = Kinematics(UR10E_DH).forward(errors.true(flat))[2, 3] - Kinematics(UR10E_DH).forward(flat)[2, 3]
+    assert lowered < 0.0
+
+
+def test_with_a_memory_the_error_changes_with_the_way_and_keeps_its_size() -> None:
+    def run(step: float, rng: np.random.Generator) -> tuple[float, float]:
+        made = TruePose(Kinematics(UR10E_DH), (1e-4, 0.0), 0.3, rng, memory=0.5)
+        q = np.zeros(6)
+        made.update(0.0, 0.1, q, moving=False)
+        before = made.pose[:3, 3] - Kinematics(UR10E_DH).forward(q)[:3, 3]
+        q = q + np.array([step, 0, 0, 0, 0, 0])
+        made.update(0.1, 0.1, q, moving=True)
+        after = made.pose[:3, 3] - Kinematics(UR10E_DH).forward(q)[:3, 3]
+        return float(before @ after), float(after @ after)
+
+    near = np.mean([run(0.01, np.random.default_rng(k)) for k in range(200)], axis=0)
+    far = np.mean([run(3.0, np.random.default_rng(k)) for k in range(200)], axis=0)
+    assert near[0] > 0.9 * 3e-8 * 0.9
+    assert abs(far[0]) < 0.2 * 3e-8
+    assert near[1] == pytest.approx(3e-8, rel=0.2)
+    assert far[1] == pytest.approx(3e-8, rel=0.2)
+
+
+def test_a_bowed_sheet_is_seen_where_geometry_says() -> None:
+    wall = np.eye(4)
+    wall[2, 3] = 0.130
+    bow = 1e-4 * 0.13 / 0.018**2
+    flat = crossings(OPTICS, LaserOptics(), PlaneInstance(wall, (0.2, 0.2)))
+    bent = crossings(OPTICS, LaserOptics(bow=bow), PlaneInstance(wall, (0.2, 0.2)))
+    # Across the optical axis, a sheet that is off by s along its normal meets the wall s / n_x to the side.
+    laser = LaserOptics()
+    along = np.hypot(0.130, 0.130 / 3.5)
+    sag = bow * flat.points[:, 1] ** 2 / along
+    assert bent.columns - flat.columns == pytest.approx(1667.0 / 0.130 * sag / laser.normal[0], abs=2e-3)
+    assert sag.max() > 0.9e-4
+
+
+def test_the_vehicle_rocks_by_a_tenth_of_a_milliradian_about_four_times_a_second() -> None:
+    world = World(3, "nominal+rocking", clock=SteppedClock())
+    # Leaning as it stands from the first tick on.
+    times = np.arange(1.0, 11.0, 0.01)
+    world.vehicle.tick(1.0)
+    world.vehicle.tick(11.0)
+    up = np.array([world.world_from_base(t)[:3, :3] @ (0.0, 0.0, 1.0) for t in times])
+    lean = np.hypot(*(up[:, :2] - up[:, :2].mean(axis=0)).T)
+    assert lean.max() == pytest.approx(0.1e-3, rel=0.35)
+    power = np.abs(np.fft.rfft(up[:, 0] - up[:, 0].mean())) + np.abs(np.fft.rfft(up[:, 1] - up[:, 1].mean()))
+    assert np.fft.rfftfreq(len(times), 0.01)[int(np.argmax(power))] == pytest.approx(4.0, abs=0.6)
+
+
+def test_laser_and_cameras_drift_while_the_cell_stands_and_not_without_the_effects() -> None:
+    for level, moves in (("nominal", False), ("nominal+laser_pointing+camera_warm_up", True)):
+        world = World(4, level, clock=SteppedClock())
+        before, lens = world.light_plane(0.0), world.lens("scan", 0.0)
+        world.stand(7200.0)
+        after = world.light_plane(0.0)
+        turned = float(np.arccos(min(1.0, np.dot(before["normal"], after["normal"]))))
+        assert (turned > 1e-5) == moves
+        assert (world.lens("scan", 0.0) != lens) == moves
+        if moves:
+            assert turned == pytest.approx(abs(world.scene.workshop.pointing), rel=0.01)
+            # About the exit point, which stays on the plane.
+            assert np.dot(after["normal"], world.scene.laser_origin) == pytest.approx(after["distance"], abs=1e-12)
+
+
+def test_texture_has_the_size_told_and_stays_on_the_surface() -> None:
+    pattern = grain_parameters(0.6, Grain(texture=0.1))
+    places = RNG.uniform(-0.05, 0.05, (4000, 2))
+    albedo = np.array([grain_at(x, y, pattern) for x, y in places])
+    assert albedo.mean() == pytest.approx(0.6, rel=0.02)
+    assert albedo.std() / 0.6 == pytest.approx(0.1, rel=0.25)
+    assert grain_at(*places[0], pattern) == albedo[0]
+
+
+def test_dust_shades_a_few_places() -> None:
+    pattern = grain_parameters(0.6, Grain(spots=1.0))
+    x, y = np.meshgrid(np.arange(-0.03, 0.03, 1e-4), np.arange(-0.03, 0.03, 1e-4))
+    albedo = np.array([grain_at(a, b, pattern) for a, b in zip(x.ravel(), y.ravel(), strict=True)])
+    dark = float(np.mean(albedo < 0.3))
+    # 36 spots of 0.4 to 1 mm across on 36 cm², give or take.
+    assert 0.001 < dark < 0.008
+
+
+def test_a_rolling_shutter_shears_what_moves_and_nothing_else() -> None:
+    still = World(2, "nominal+rolling_shutter", clock=SteppedClock())
+    plain = World(2, "nominal", clock=SteppedClock())
+    for world in (still, plain):
+        world.arm.tick(0.1)
+        world.vehicle.tick(0.1)
+    assert still.render("scan", 0.1, 0.002).shape == plain.render("scan", 0.1, 0.002).shape
+
+
+def test_a_carriage_that_droops_sinks_and_rolls_by_its_way_and_nothing_else_changes() -> None:
+    plain, worn = (World(2, level, clock=SteppedClock()) for level in ("nominal", "nominal+droop"))
+    for world in (plain, worn):
+        world.rail.carriage = lambda t: t  # type: ignore[method-assign]
+    assert np.array_equal(plain.scene.flange_from_scan_camera, worn.scene.flange_from_scan_camera)
+    for way, sunk in ((0.0, 0.0), (0.05, 25e-6), (0.1, 100e-6)):
+        moved = np.linalg.inv(plain.flange_from_camera("scan", way)) @ worn.flange_from_camera("scan", way)
+        assert moved[:3, 3] == pytest.approx([0.0, 0.0, sunk], abs=1e-12)
+        angle = np.arccos(np.clip((np.trace(moved[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))
+        assert angle == pytest.approx(10.0 * sunk, abs=1e-7)
+    assert np.array_equal(plain.flange_from_camera("target", 0.1), worn.flange_from_camera("target", 0.1))
+
+
+def test_the_fan_ends_and_the_sun_moves() -> None:
+    assert only("sheet_ends").sheet_ends < np.deg2rad(30.0)
+    world = World(1, "nominal+sunlight", clock=SteppedClock())
+    facing = world.scene.world_from_surface @ drawing.pose((0.0, 0.0, 0.9), (1, 0, 0), (0, 0, -1))
+    base = world.world_from_base(0.0)
+    early = world._cameras.picture("target", facing, base, False, 0.004, t=0.0).astype(float)
+    late = world._cameras.picture("target", facing, base, False, 0.004, t=100.0).astype(float)
+    moved = np.abs(late - early)
+    assert np.percentile(moved, 99.5) > 8.0 > 3.0 * np.median(moved)
+
+
+@pytest.mark.parametrize("effect", [*Effects.names(), "workshop"])
+def test_only_a_refusal_that_names_the_effect_is_excused(effect: str) -> None:
+    elsewhere = "the arm, the camera and the laser's light: 3 points of the stripe cover the joint; held at the elbow"
+    assert verdict({"outcome": "refused", "effect": effect, "reason": elsewhere}) == "refused"
+
+
+def test_a_refusal_that_names_rocking_is_one_by_its_name() -> None:
+    reason = f"the parts do not agree {likeliest([Cause('sway', 'the vehicle rocks at 4 Hz', 'line', 0.0, 0.9)])}"
+    assert verdict({"outcome": "refused", "effect": "rocking", "reason": reason}) == "named"
