@@ -9,8 +9,10 @@ from __future__ import annotations
 import platform
 from importlib.metadata import PackageNotFoundError, requires
 from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
-from packaging.requirements import Requirement
+if TYPE_CHECKING:
+    from packaging.requirements import Requirement
 
 _DISTRIBUTION = "assembly-cell"
 
@@ -31,6 +33,8 @@ def lacking(module: str, package: str) -> str:
 
 def _asked_for(package: str) -> Requirement:
     """What this program's distribution asks for, with its marker; the bare package where it is not installed."""
+    from packaging.requirements import Requirement
+
     try:
         lines = requires(_DISTRIBUTION) or []
     except PackageNotFoundError:

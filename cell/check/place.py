@@ -12,7 +12,6 @@ from pathlib import Path
 import coal
 import numpy as np
 import pinocchio as pin
-import trimesh
 
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
@@ -108,6 +107,8 @@ def contact_notes(job: Job, mesh: Path) -> Iterator[str]:
 def under_part(job: Job, mesh: Path) -> tuple[float, float]:
     """Share of the part's footprint over the nominal surface, and how far the surface rises there above the part's
     lowest plane, m; (0, -inf) where nothing is under it. The part is its box `grasp.size`, upwards from its origin."""
+    import trimesh  # takes long to load, which only this check needs
+
     vertices, triangles = read_mesh(mesh, job.surface.mesh_unit)
     pose = job.place.surface_from_part.se3()
     body = trimesh.Trimesh((vertices - pose.translation) @ pose.rotation, triangles, process=False)

@@ -14,7 +14,6 @@ import threading
 import time
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
-import can
 from pydantic import model_validator
 
 from cell.base.addresses import checked_can
@@ -22,7 +21,6 @@ from cell.base.units import number, quantity, whole
 from cell.makes.make import Make, Surroundings, VehicleConfig, real_path
 from drivers.errors import CellError
 from drivers.interfaces import LinkStatistics
-from drivers.vehicle.can_link import CanLink
 from drivers.vehicle.cia402.drive import (
     DEVICE_TYPE,
     DRIVE_PROFILE,
@@ -35,6 +33,9 @@ from drivers.vehicle.cia402.drive import (
 )
 
 if TYPE_CHECKING:
+    import can
+
+    from drivers.vehicle.can_link import CanLink
     from drivers.vehicle.cia402.feedback import WheelDrives
     from drivers.vehicle.cia402.vehicle import CanopenVehicle
 
@@ -196,6 +197,8 @@ _UPLOAD, _ABORT = 0x40, 0x80
 
 def look_at_nodes(record: CanopenVehicleConfig) -> tuple[str, bool]:
     """What is on the vehicle's bus, in words, and whether both configured nodes are drives of CiA 402."""
+    from drivers.vehicle.can_link import CanLink
+
     heard: dict[int, dict[int, bytes]] = {}
     news = threading.Condition()
 
@@ -254,6 +257,8 @@ def _ask(
     link: CanLink, node: int, entry: Entry, heard: dict[int, dict[int, bytes]], news: threading.Condition
 ) -> int | None:
     """A value of four bytes or less; None when the node is silent or has no such object."""
+    import can
+
     with news:
         heard.get(node, {}).pop(SDO_REPLY, None)
     where = struct.pack("<HB", entry.index, entry.sub)

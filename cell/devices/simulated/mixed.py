@@ -25,7 +25,6 @@ from cell.config.cell_config import DEVICES, CellConfig, find_config, load_confi
 from cell.devices.assembly import connect, connect_one
 from cell.devices.gate.gated import GatedArm
 from cell.devices.lock import CellLock
-from cell.devices.simulated.described import Described
 from cell.devices.simulated.following import DeviceFollowing, FollowedCamera
 from cell.devices.simulated.process import SimulatedCell, WorldConnector, WorldLink, on_gige, with_endpoints
 from cell.makes.built_in import ArmOutputClawConfig, ArmOutputLaserConfig
@@ -213,6 +212,8 @@ class MixedCell:
 
         Raises `ConfigError` for a mix that physics does not allow, else as `connect` and `DeviceFollowing`.
         """
+        from cell.devices.simulated.described import Described
+
         require_possible(config, simulated, needed)
         real = followed(config, simulated, needed)
         self.world = SimulatedCell(

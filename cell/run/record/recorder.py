@@ -21,7 +21,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import can
 import numpy as np
 import pinocchio as pin
 
@@ -84,6 +83,8 @@ _WORDS = (b"false", b"true")
 
 def wire(sent: bool, what: object) -> bytes:
     """A CAN frame, or bytes, as JSON. Written out, because hundreds come in a second."""
+    import can  # takes long to load, which only cells with a bus need
+
     if isinstance(what, can.Message):
         flags = (what.is_extended_id, what.is_remote_frame, what.is_error_frame, what.is_fd)
         extended, remote, error, fd = (_WORDS[flag] for flag in flags)
