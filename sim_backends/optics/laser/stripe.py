@@ -11,8 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from sim_backends.optics.boards import appearance
 from sim_backends.optics.camera import CameraOptics, distort, distort_jacobian
@@ -146,7 +146,7 @@ def share_on(instance: PlaneInstance, laser: LaserOptics, points: Vector) -> Vec
     pose, spread = np.asarray(instance.camera_from_plane, dtype=np.float64), _spread(instance, laser)
     local = (points - pose[:3, 3]) @ pose[:3, :2]
     beyond = np.abs(local) - np.array(instance.size) / 2
-    return np.asarray(ndtr(-beyond / np.maximum(spread, 1e-9)).prod(axis=1))
+    return np.asarray(scipy.special.ndtr(-beyond / np.maximum(spread, 1e-9)).prod(axis=1))
 
 
 def _spread(instance: PlaneInstance, laser: LaserOptics) -> Vector:

@@ -17,8 +17,8 @@ from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull
 
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.optics.scene import Board
@@ -181,7 +181,7 @@ class Collisions:
             corners = _moved(size * _CORNERS, pose)
             if corners[:, 2].min() < top:
                 # As seen from above: the corners of its top and bottom together.
-                outline = ConvexHull(corners[:, :2])
+                outline = scipy.spatial.ConvexHull(corners[:, :2])
                 self._standing[f"station obstacle {name}"] = corners[outline.vertices, :2]
                 self._far = max(
                     self._far, float(np.hypot(*self._footprint.T).max() + np.hypot(*corners[:, :2].T).max())

@@ -18,7 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cell.config.cell_config import CONFIGURATION
+from cell.config.files import CONFIGURATION
 from drivers.errors import CellError, InterlockError
 from statemachine.step import Event
 
