@@ -18,6 +18,7 @@ from cell.measure.geometry.poses import difference, from_parts, perturbed, trans
 from cell.measure.vision.board.charuco import find_charuco
 from cell.measure.vision.board.chess import find_chessboard
 from cell.measure.vision.board.dot_board import find_dots
+from cell.measure.vision.board.ends import OtherBoard
 from cell.measure.vision.board.outliers import without_outliers
 from cell.measure.vision.board.tags import find_tags
 from cell.measure.vision.board.view import DOTS, BoardSpec, BoardView
@@ -72,7 +73,7 @@ def _find_dots(image: Image, spec: BoardSpec) -> BoardView:
     try:
         return find_dots(image, spec)
     except PictureRefused as refused:
-        if refused.reason is not Reason.NO_BOARD:
+        if refused.reason is not Reason.NO_BOARD or isinstance(refused, OtherBoard):
             raise
         try:
             return find_dots(np.asarray(255 - image, dtype=np.uint8), spec)

@@ -10,7 +10,7 @@ import numpy as np
 
 from cell.measure.geometry.camera import Array
 from cell.measure.vision.board.dots import find_blobs, measure_dots, tell_dots
-from cell.measure.vision.board.ends import check_dot_ends
+from cell.measure.vision.board.ends import OtherBoard, check_dot_ends
 from cell.measure.vision.board.identify import LEAST_SHARE, identify
 from cell.measure.vision.board.lattice import Blobs, Places, PlaneMap, dot_lattices
 from cell.measure.vision.board.view import BoardSpec, BoardView
@@ -22,11 +22,14 @@ SMALL_PX = 400_000
 AROUND = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
 # Window of the local threshold as a share of the picture's larger side, most common first.
 WINDOWS = (0.06, 0.12, 0.03, 0.25)
+SURE = 2
+"""Thresholds at which the only lattice is another board: further ones would find the same, sixteen times as slowly."""
 
 
 def find_dots(image: Image, spec: BoardSpec) -> BoardView:
     """The dots of `spec` in an 8-bit image (h, w). Raises PictureRefused with the most telling of its reasons."""
     refusals: list[PictureRefused] = []
+    others = 0
     few = counts_of(image[::4, ::4])
     contrast = percentile(few, 97) - percentile(few, 3)
     # Enlarging helps small pictures of small dots, and only those.
@@ -41,6 +44,9 @@ def find_dots(image: Image, spec: BoardSpec) -> BoardView:
                 if views:
                     return only_one(views, spec.name)
                 refusals += reasons
+                others += len(reasons) == 1 and isinstance(reasons[0], OtherBoard)
+                if others == SURE:
+                    raise reasons[0]
     rank = (Reason.MIRRORED, Reason.AMBIGUOUS, Reason.NO_BOARD)
     raise min(refusals, key=lambda r: rank.index(r.reason))
 

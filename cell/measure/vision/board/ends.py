@@ -15,6 +15,11 @@ from cell.measure.vision.board.lattice import PlaneMap
 from cell.measure.vision.board.view import BoardSpec
 from cell.measure.vision.pictures import Image, PictureRefused, Reason
 
+
+class OtherBoard(PictureRefused):
+    """A board that was identified, and does not end where the named one does."""
+
+
 # Share of the places along a side that have to show its end, and how many further points contradict it.
 LEAST_ENDS = 0.3
 MOST_BEYOND = 2
@@ -58,7 +63,7 @@ def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArra
             elif near_side - dark > 0.6 * step or (np.isfinite(rim).all() and darker.sum() < 6):
                 ends += 1
         if further >= MOST_BEYOND:
-            raise PictureRefused(
+            raise OtherBoard(
                 Reason.NO_BOARD,
                 f"the board in the picture goes on beyond the {name} of {spec.name}: {further} more dots there; "
                 "is it the board that the set-up names?",
@@ -131,7 +136,7 @@ def check_hidden_sides(smooth: Image, spec: BoardSpec, plane: PlaneMap, found: N
         seen = np.isfinite(margin) & np.isfinite(next_line)
         bright = (margin > black[at_line] + AS_WHITE * (white - black)[at_line])[seen]
         if seen.sum() >= 2 and bright.mean() > 0.6:
-            raise PictureRefused(
+            raise OtherBoard(
                 Reason.NO_BOARD,
                 f"the board in the picture ends before the {name} of {spec.name}, which is not hidden; is it the board "
                 "that the set-up names?",
