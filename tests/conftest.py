@@ -71,7 +71,7 @@ GROUPS = (
         "unit/cell/procedures/drive/test_settled.py",
         "unit/cell/procedures/drive/test_station_check.py",
         "unit/cell/procedures/sweep/test_second_look.py",
-        "unit/cell/measure/inversion/effects/test_rocking.py",
+        "unit/cell/measure/inversion/effects/test_during_sweep.py",
         "unit/cell/measure/inversion/effects/test_causes.py",
         "unit/cell/measure/inversion/test_disagreement.py",
         "unit/cell/procedures/steps/test_workplace.py",

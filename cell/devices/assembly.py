@@ -11,8 +11,8 @@ from cell.devices.devices import Devices
 from cell.devices.gate.gate import Gate
 from cell.devices.gate.gated import GatedArm, GatedClaw, GatedRail, GatedVehicle
 from cell.devices.gate.interlocks import Interlocks, Situation
-from cell.devices.gate.laser import GatedCamera, GatedLaser
 from cell.devices.gate.rules import RULES, Ways
+from cell.devices.gate.scan_head import GatedCamera, GatedLaser
 from cell.makes.built_in import OnArm
 from cell.makes.make import Surroundings
 from cell.measure.geometry.poses import to_ur

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 from cell.devices.gate.gate import Gate
 from cell.devices.gate.gated import GatedRail
 from cell.devices.gate.interlocks import Interlocks
-from cell.devices.gate.laser import GatedLaser
+from cell.devices.gate.scan_head import GatedLaser
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceError, DeviceFault, NotConnectedError
 from drivers.interfaces import Arm, ArmSafety, Camera, Claw, Device, Vehicle

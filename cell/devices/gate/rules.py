@@ -20,7 +20,7 @@ import pinocchio as pin
 from cell.config.cell_config import CellConfig, deck_plates, mounted, vehicle_obstacles
 from cell.devices.gate.gated import GuardedMotion
 from cell.devices.gate.interlocks import PURPOSES, DeviceCommand, Rule, Situation
-from cell.devices.gate.laser import UNATTENDED_S
+from cell.devices.gate.scan_head import UNATTENDED_S
 from cell.measure.geometry.poses import from_ur
 from cell.motion.collision import (
     TOUCHES,

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 import scipy
 
-from cell.measure.inversion.effects.rocking import require_firm
+from cell.measure.inversion.effects.during_sweep import require_firm
 from cell.measure.vision import BoardView
 from drivers.interfaces import Vector
 

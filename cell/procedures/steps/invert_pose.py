@@ -12,7 +12,7 @@ from cell.measure.geometry.poses import compose_covariance
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion import invert_pose as register
 from cell.measure.inversion.effects.causes import find_causes, likeliest
-from cell.measure.inversion.effects.rocking import (
+from cell.measure.inversion.effects.during_sweep import (
     Head,
     find_droop,
     find_rocking,

@@ -12,7 +12,7 @@ from cell.config.job import Job
 from cell.measure.geometry.poses import from_parts, from_ur, to_ur
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.disagreement import highest_standing, require_bare
-from cell.measure.inversion.effects.moved import Creep
+from cell.measure.inversion.effects.between_sweeps import Creep
 from cell.measure.reconstruction.cloud import Indices
 from cell.motion.collision import TOUCHES
 from cell.motion.kinematics import HOME

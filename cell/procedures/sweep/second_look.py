@@ -13,7 +13,7 @@ import numpy as np
 
 from cell.config.job import ScanSection
 from cell.measure.inversion import PlacePose
-from cell.measure.inversion.effects.moved import LEAST_MATCHED, Creep, SurfaceMotion, surface_motion
+from cell.measure.inversion.effects.between_sweeps import LEAST_MATCHED, Creep, SurfaceMotion, surface_motion
 from cell.measure.inversion.observability import Tolerance
 from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix

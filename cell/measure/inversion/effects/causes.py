@@ -16,7 +16,7 @@ import pinocchio as pin
 
 from cell.measure.geometry.poses import perturbed
 from cell.measure.inversion.closest import Array
-from cell.measure.inversion.effects.rocking import LARGEST_OVERTONES
+from cell.measure.inversion.effects.during_sweep import LARGEST_OVERTONES
 from cell.measure.inversion.nominal import NominalSurface, Scan, correspondences
 from cell.measure.inversion.place_pose import PATCH_M
 from cell.measure.inversion.registration import across

@@ -18,8 +18,8 @@ from cell.config.cell_config import load_config
 from cell.config.job import job_path
 from cell.devices.devices import Devices
 from cell.devices.gate.interlocks import DeviceCommand
-from cell.devices.gate.laser import UNATTENDED_S
 from cell.devices.gate.rules import LINE_STEP_M, LINE_STEP_RAD, RULES, Ways, markdown
+from cell.devices.gate.scan_head import UNATTENDED_S
 from cell.devices.lock import CellLock
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur, to_ur

@@ -12,8 +12,8 @@ import pytest
 from cell.config.job import load_job
 from cell.measure.inversion import Demands, Tolerance
 from cell.measure.inversion.demands import require_agreement, require_board, require_fit
-from cell.measure.inversion.effects.moved import SurfaceMotion
-from cell.measure.inversion.effects.rocking import require_firm
+from cell.measure.inversion.effects.between_sweeps import SurfaceMotion
+from cell.measure.inversion.effects.during_sweep import require_firm
 from cell.procedures.arm.photograph import _require
 from cell.procedures.sweep.second_look import require_unmoved
 from cell.procedures.sweep.swath import SweepErrors, TimeBound, shift_by_times

@@ -18,7 +18,7 @@ from cell.config.job import Job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import NominalSurface, PlacePose
-from cell.measure.inversion.effects.moved import Creep, SurfaceMotion, surface_motion
+from cell.measure.inversion.effects.between_sweeps import Creep, SurfaceMotion, surface_motion
 from cell.measure.reconstruction import Cloud, flange_motions, merge
 from cell.measure.reconstruction.cloud import Filled
 from cell.procedures.arm.touch import felt_touch

@@ -18,7 +18,7 @@ import pytest
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import load_config
 from cell.config.job import ScanSection, load_job
-from cell.devices.gate.laser import UNATTENDED_S
+from cell.devices.gate.scan_head import UNATTENDED_S
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts, from_ur

@@ -16,8 +16,8 @@ from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
-from cell.measure.inversion.effects.moved import Creep
-from cell.measure.inversion.effects.rocking import (
+from cell.measure.inversion.effects.between_sweeps import Creep
+from cell.measure.inversion.effects.during_sweep import (
     LARGEST_RAD,
     LEAST_SAG,
     Droop,

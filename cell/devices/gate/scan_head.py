@@ -1,4 +1,6 @@
-"""The laser behind the gate, with a watchdog: it goes off by itself when whoever lit it falls asleep.
+"""The scan head behind the gate: its laser and its camera.
+
+The laser behind the gate, with a watchdog: it goes off by itself when whoever lit it falls asleep.
 
 A camera beside the gate: it moves nothing, and nothing holds its commands back; who listens there is told them."""
 

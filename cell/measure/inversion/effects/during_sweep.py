@@ -1,4 +1,6 @@
-"""A vehicle that rocks on its tyres while the laser sweeps: seen in the scan's lines, and told apart from the pose.
+"""What moves while the laser sweeps: the vehicle on its tyres, and the carriage on its guide.
+
+A vehicle that rocks on its tyres while the laser sweeps: seen in the scan's lines, and told apart from the pose.
 
 The arm's base rocks with it, so that every line is displaced, up and down with a frequency of a few hertz. Its lines'
 mean distances from the surface show the frequency; two angles, each with a sine and a cosine, are then found along with

@@ -1,4 +1,6 @@
-"""Has a surface moved between two scans of it? The second one need have a few lines only.
+"""What moved between two sweeps: the surface at once, or vehicle and floor slowly.
+
+Has a surface moved between two scans of it? The second one need have a few lines only.
 
 What the surface is shaped like beside its model is in both scans: their heights over the model are compared where they
 lie beside each other. A motion shows in all of them, noise and a vehicle that rocks in one line or another.
