@@ -48,3 +48,13 @@ def test_sections_are_numbered_without_gaps(document: str) -> None:
 def test_nothing_cites_a_document_that_a_reader_does_not_have() -> None:
     outside = re.compile(r"\b(?:theory|protocol)s?[\s_]" + "sheets?", re.IGNORECASE)
     assert [path for path, text in texts() if outside.search(text)] == []
+
+
+def test_every_place_of_the_walks_exists() -> None:
+    walks = (ROOT / "docs/explanation/walks.md").read_text(encoding="utf-8")
+    places = re.findall(r"^\d+\. `([^`]+)`(?:, `(\w+)`)?:", walks, re.MULTILINE)
+    assert len(places) > 20
+    for file, name in places:
+        assert re.search(rf"^(?:def|class) {name}\b" if name else "", (ROOT / file).read_text("utf-8"), re.MULTILINE), (
+            file
+        )
