@@ -13,12 +13,11 @@ from dataclasses import replace
 import pytest
 
 from drivers.clock import Clock
-from statemachine.control import Cancelled, CancelToken, RunControl
+from statemachine.control import RunControl
 from statemachine.journal import FILE_NAME, Journal, read, request
 from statemachine.runner import Again, Runner, Script, StepContext
 from statemachine.sequence import Sequence
 from statemachine.step import Failure, OnFailure, Outcome, Policy, Step
-from statemachine.watch import SignalWatch
 
 NAMES = ["drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose", "place"]
 POLICY = Policy(
@@ -462,21 +461,6 @@ def test_who_asks_for_the_end_as_a_run_comes_to_a_good_one_is_not_lost(tmp_path)
     assert bench.runner.control.late
 
 
-def test_who_asks_for_the_end_just_as_the_run_has_it_is_late():
-    """The run comes to its end while it is being asked to: between the two nothing is lost."""
-
-    class EndsMeanwhile(CancelToken):
-        def cancel(self, reason):
-            control.over = True
-            assert super().cancel("the run has ended")
-            return super().cancel(reason)
-
-    control = RunControl()
-    control.token = EndsMeanwhile()
-    control.abort("Cell.stop()")
-    assert control.late
-
-
 def test_who_asks_for_the_end_after_the_last_step_and_before_the_end_is_late(tmp_path):
     def observe(event):
         if event.data.get("to") == "placed":
@@ -488,33 +472,10 @@ def test_who_asks_for_the_end_after_the_last_step_and_before_the_end_is_late(tmp
     assert bench.runner.control.late
 
 
-def test_the_signal_that_ended_a_run_is_told_whoever_asks_afterwards():
-    control = RunControl()
-    control.abort("terminated", signal.SIGTERM)
-    control.abort("interrupted from the keyboard", signal.SIGINT)
-    assert control.signal == signal.SIGTERM
-    control = RunControl()
-    control.abort("Cell.stop()")
-    control.abort("interrupted from the keyboard", signal.SIGINT)
-    assert control.signal is None
-
-
 def test_who_ended_a_run_did_not_come_late(tmp_path):
     bench = Bench(tmp_path, board_photo=lambda context: bench.runner.control.abort("enough"))
     assert bench.run().outcome is Outcome.ABORTED
     assert not bench.runner.control.late
-
-
-def test_outside_the_main_thread_signals_are_left_alone():
-    def work():
-        with SignalWatch() as watch:
-            seen.append(watch.reason)
-
-    seen = []
-    thread = threading.Thread(target=work)
-    thread.start()
-    thread.join(5)
-    assert seen == [None]
 
 
 def test_ctrl_c_aborts_and_a_second_one_does_not_cut_the_safe_stop_short(tmp_path):
@@ -743,40 +704,9 @@ def test_a_recovery_that_does_not_end_is_cut_short(tmp_path):
     assert time.monotonic() - begun < 2.0
 
 
-def test_a_retry_is_for_the_named_errors_and_those_that_derive_from_them():
-    step = Step("any", 1.0, 1, ("OSError",))
-    assert step.retries(OSError())
-    assert step.retries(ConnectionResetError())
-    assert not step.retries(ValueError())
-    assert not step.retries(Exception())
-
-
-def test_held_work_ends_with_its_own_token_though_the_run_stays_paused():
-    """Its deadline, or another fault, ends it where it is held."""
-    control, token = RunControl(), CancelToken()
-    control.pause()
-    threading.Timer(0.05, lambda: token.cancel("overrun")).start()
-    threading.Timer(2.0, control.go_on).start()
-    begun = time.monotonic()
-    with pytest.raises(Cancelled, match="overrun"):
-        control.safe_point(token, lambda held: None)
-    assert time.monotonic() - begun < 1.0
-    assert 0.0 < control.held_s < 1.0
-
-
 def test_past_its_deadline_a_step_has_no_time_left():
     context = StepContext(POLICY.of("place"), 1, 0.0, {}, Clock(), lambda event: None)
     assert context.remaining() == 0.0
-
-
-def test_what_begins_after_its_run_was_ended_is_ended_as_it_begins():
-    run, told = CancelToken(), []
-    run.cancel("enough")
-    late = CancelToken(run)
-    late.on_cancel(told.append)
-    assert (late.reason, told, late.event.is_set()) == ("enough", ["enough"], True)
-    assert not late.cancel("later")
-    assert late.reason == "enough"
 
 
 def test_a_fault_that_needs_a_person_waits_for_the_word_and_only_then_recovers(tmp_path):
@@ -833,15 +763,6 @@ def test_nobody_confirms_and_the_run_ends_without_a_recovery(tmp_path):
     assert result.outcome is Outcome.FAULTED
     assert "nobody confirmed within 0.1 s" in result.reason
     assert "recover" not in bench.log
-
-
-def test_a_word_that_was_given_before_it_was_asked_for_does_not_count():
-    control = RunControl()
-    assert not control.confirm("too early")
-    control.ask("protective stop")
-    assert control.answer() is None
-    assert control.confirm("Ann")
-    assert control.answer() == "Ann"
 
 
 def test_a_pause_holds_the_step_at_its_next_safe_point_and_its_deadline_waits_too(tmp_path):
@@ -958,19 +879,6 @@ def test_after_a_recovery_the_cell_has_to_be_known_to_stand_before_the_step_is_t
     assert result.outcome is Outcome.FAULTED
     assert "arm stopped: not confirmed" in result.reason
     assert bench.log.count("laser_sweep") == 1
-
-
-def test_a_word_about_an_earlier_fault_does_not_count_for_the_next():
-    control = RunControl()
-    first = control.ask("protective stop in the sweep")
-    assert control.question == (first, "protective stop in the sweep")
-    assert control.confirm("Ann", first)
-    control.asked_no_more()
-    assert control.question is None
-    second = control.ask("protective stop while placing")
-    assert not control.confirm("a listener that is late", first)
-    assert control.answer() is None
-    assert control.confirm("Ann", second)
 
 
 def test_a_signal_after_the_end_of_the_run_is_kept(tmp_path):

@@ -7,7 +7,6 @@ import re
 import pytest
 
 from statemachine.sequence import JobState, JobTrigger, Sequence, SequenceError, mermaid
-from statemachine.step import Policy, Step
 
 STEPS = ("drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert_pose", "place")
 ENDS = (JobState.PLACED, JobState.REFUSED, JobState.FAULTED, JobState.ABORTED)
@@ -128,27 +127,6 @@ def test_the_diagram_shows_every_state_and_trigger():
     assert ("any_state", "aborted", "abort") in edges
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"name": "place", "deadline_s": 0.0}, "must be greater than 0 s"),
-        ({"name": "place", "deadline_s": 1.0, "max_retries": -1}, "must be 0 or more"),
-    ],
-)
-def test_a_wrong_step_policy_is_refused(values, message):
-    with pytest.raises(ValueError, match=message):
-        Step(**values)
-
-
-def test_a_policy_names_every_step_once():
-    photo, place = Step("board_photo", 1.0), Step("place", 1.0)
-    with pytest.raises(ValueError, match="each step once"):
-        Policy((photo, photo))
-    changed = Policy((photo, place)).with_step(Step("place", 7.0))
-    assert changed.of("place").deadline_s == 7.0
-    assert changed.of("board_photo") == photo
-
-
 @pytest.mark.parametrize("steps", [(), ("photo", "photo"), ("photo", "paused")])
 def test_steps_have_names_of_their_own(steps):
     with pytest.raises(ValueError, match="names of their own"):
@@ -166,12 +144,3 @@ def test_a_chosen_step_is_done_again_with_all_that_follow_it():
     assert sequence.fire(JobTrigger.AGAIN) == "board_photo"
     assert sequence.facts.done == {"drive_to_target"}
     assert sequence.facts.chosen is None
-
-
-def test_retries_go_by_the_name_of_the_exception_or_of_a_base_of_it():
-    class Silent(TimeoutError):
-        pass
-
-    step = Step("board_photo", 1.0, 1, retry_on=("TimeoutError",))
-    assert step.retries(Silent())
-    assert not step.retries(ValueError())

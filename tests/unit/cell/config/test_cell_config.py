@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import re
 import tomllib
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +13,9 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.base import units
-from cell.base.units import parse_quantity
 from cell.check.fit import require_fit
 from cell.config.cell_config import CellConfig, StationObstacle, default_toml, load_config, validate
-from cell.config.job import Job, job_path, load_job, shipped_jobs
+from cell.config.job import Job, job_path, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.makes.make import Pose
 from cell.measure.geometry.poses import from_parts, from_ur
@@ -204,43 +201,6 @@ def edited(**changes: Any) -> dict[str, Any]:
     return data
 
 
-@pytest.mark.parametrize(
-    ("text", "unit", "expected"),
-    [
-        ("35 mm", "mm", 0.035),
-        ("5deg", "deg", np.deg2rad(5)),
-        ("500 kbit/s", "kbit/s", 500_000.0),
-        ("+0.1m", "mm", 0.1),
-        ("-10 mm", "mm", -0.01),
-        ("2 ms", "ms", 0.002),
-        ("1e-3 m", "mm", 0.001),
-        ("200 mm/s^2", "mm/s^2", 0.2),
-    ],
-)
-def test_a_quantity_is_read_into_si(text: str, unit: str, expected: float) -> None:
-    assert parse_quantity(text, unit) == pytest.approx(expected, rel=1e-12)
-
-
-def test_the_usual_units_are_those_of_the_library_to_the_last_bit() -> None:
-    for unit, number in product(units._USUAL, ("35", "0.1", "-7.3e-3", "+123456.789", ".6", "1e3")):
-        text = f"{number} {unit}"
-        assert parse_quantity(text, unit) == units._converted(text, unit)[1], text
-
-
-@pytest.mark.parametrize(
-    "text", [35, 35.0, True, "35", "35 kg", "mm", "", "5 mm; 3", "nan mm", "-1e999 mm", "inf mm", "5 furlongs/", None]
-)
-def test_anything_but_a_number_with_a_fitting_unit_is_refused(text: object) -> None:
-    for limits in ((0, 100), ()):
-        with pytest.raises(ValueError, match=r"unit|quantity|range"):
-            parse_quantity(text, "mm", *limits)
-
-
-def test_a_value_out_of_range_is_named_with_its_range() -> None:
-    with pytest.raises(ValueError, match=r'"120 mm" is outside the allowed range \(allowed: 0 to 100 mm\)'):
-        parse_quantity("120 mm", "mm", 0, 100)
-
-
 def test_the_shipped_configuration_is_valid() -> None:
     config = load_config(None)
     assert config.rail.lead == pytest.approx(0.002)
@@ -285,13 +245,6 @@ def test_addresses_do_not_make_a_calibration_foreign_but_optics_do() -> None:
     assert other.calibration_hash() != own
 
 
-@pytest.mark.parametrize("name", shipped_jobs())
-def test_every_shipped_job_is_valid(name: str) -> None:
-    job, mesh = load_job(name)
-    assert job.job.name == name
-    assert mesh.is_file()
-
-
 def test_a_job_that_does_not_exist_lists_those_that_do() -> None:
     with pytest.raises(ConfigError, match="pot"):
         load_job("teapot")
@@ -312,10 +265,3 @@ def test_a_job_that_asks_too_much_of_the_cell_is_refused(tmp_path: Path, edit: t
     job, mesh = load_job(path)
     with pytest.raises(ConfigError, match=re.escape(words)):
         require_fit(job, load_config(None), mesh)
-
-
-def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(job_path("pot").read_text().replace("pot.stl", "gone.stl"))
-    with pytest.raises(ConfigError, match=r"gone\.stl"):
-        load_job(path)

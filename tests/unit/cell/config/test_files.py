@@ -20,7 +20,6 @@ from cell.config.cell_config import (
     require_real_addresses,
     runs_folder,
 )
-from cell.config.job import job_path
 from cell.devices.simulated.process import with_endpoints
 
 MOVING = (["run"], ["home"], ["jog", "rail", "+5mm"], ["calibrate"], ["calibrate", "verify"], ["diag"])
@@ -121,19 +120,6 @@ def test_check_reads_the_local_files_and_says_which(cell: Callable[..., tuple[in
     assert any("192.0.2.10" in note for note in told["notes"])
     Path("cell.toml").write_text(default_toml().replace('lead = "2 mm"', 'lead = "2"'))
     assert cell("check")[0] == 2
-
-
-def test_the_job_of_the_present_folder_wins_over_the_one_that_ships(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    shipped = job_path("pot")
-    assert shipped.is_absolute()
-    Path("pot").mkdir()
-    assert job_path("pot") == shipped
-    Path("pot.toml").write_text(shipped.read_text())
-    assert job_path("pot") == Path("pot.toml")
-    assert job_path(shipped) == shipped
 
 
 def test_runs_are_looked_for_where_the_local_file_says(cell: Callable[..., tuple[int, str]]) -> None:

@@ -601,20 +601,3 @@ def test_kinematics_info_is_read_byte_by_byte() -> None:
     numbers = [float(k) / 8 for k in range(24)]
     data = struct.pack(">6I", *range(1, 7)) + struct.pack(">24d", *numbers) + struct.pack(">I", 2)
     assert parse_kinematics_info(data + b"more") == LinkTable(*(tuple(numbers[k : k + 6]) for k in (0, 6, 12, 18)))
-
-
-@pytest.mark.parametrize(("change", "reason"), [("short", "219 bytes, 220"), ("nan", "theta of a link table"),
-                                                ("far", "d of a link table"),
-                                                ("status", "not initialised; switch the arm on"),
-                                                ("zeros", "not initialised; switch the arm on")])  # fmt: skip
-def test_kinematics_info_that_is_none_is_refused(change: str, reason: str) -> None:
-    numbers = [0.1] * 24
-    if change == "nan":
-        numbers[2] = float("nan")
-    if change == "far":
-        numbers[14] = 2e4
-    if change == "zeros":
-        numbers[6:18] = [0.0] * 12
-    data = struct.pack(">6I24dI", *range(6), *numbers, 0 if change == "status" else 2)
-    with pytest.raises(ValueError, match=reason):
-        parse_kinematics_info(data[:219] if change == "short" else data)

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import threading
 import time
-
-import pytest
 
 from cell.run.events import MOST_WAITING, Detached, RunEnded, StepProgress, StepStarted, Subscription
 from cell.run.runs import Run
 from statemachine.step import Event
-from statemachine.watch import EndSignals, SignalInterrupt
 
 
 def progress(step: str, fraction: float) -> Event:
@@ -86,65 +81,3 @@ def test_every_event_has_its_time() -> None:
     events.close()
     (event,) = events
     assert before <= event.at <= time.time()
-
-
-def test_nested_contexts_leave_the_programs_own_handlers_as_they_were() -> None:
-    before = [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)]
-    outer, inner = EndSignals(), EndSignals()
-    with outer:
-        pass
-    inner.__enter__()
-    assert signal.getsignal(signal.SIGTERM) == inner._raise
-    with pytest.raises(SignalInterrupt, match="asked to end"):
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(1.0)
-    os.kill(os.getpid(), signal.SIGTERM)  # what is cleaned up after the first is not cut short by a second
-    inner.__exit__(None, None, None)
-    assert [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)] == before
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
-def test_each_signal_to_end_is_raised_outside_of_a_run(number: int) -> None:
-    usual = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
-    before = signal.signal(number, usual)
-    try:
-        with EndSignals(keyboard=True):
-            assert signal.getsignal(number) is not usual
-            with pytest.raises(SignalInterrupt) as caught:
-                signal.raise_signal(number)
-            assert caught.value.number == number
-    finally:
-        signal.signal(number, before)
-
-
-def ask_to_end() -> None:
-    """A SIGTERM as soon as somebody waits for it."""
-    until = time.monotonic() + 5.0
-    while signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        assert time.monotonic() < until
-        time.sleep(0.001)
-    os.kill(os.getpid(), signal.SIGTERM)
-
-
-@pytest.mark.parametrize("late", [0.0, 0.2])
-def test_a_signal_at_the_very_end_of_a_job_leaves_its_result_and_is_kept(late: float) -> None:
-    def work(run: Run[int]) -> int:
-        run.control.over = True
-        ask_to_end()
-        time.sleep(late)  # within the waiting's last look, or after it
-        return 7
-
-    run = Run("job", work)
-    assert run.result(5.0) == 7
-    assert run.control.signal == signal.SIGTERM
-
-
-@pytest.mark.parametrize("late", [0.0, 0.2])
-def test_a_signal_as_other_work_ends_ends_the_program_too(late: float) -> None:
-    def work(run: Run[int]) -> int:
-        ask_to_end()
-        time.sleep(late)
-        return 7
-
-    with pytest.raises(SignalInterrupt, match="asked to end"):
-        Run("jog", work).result(5.0)

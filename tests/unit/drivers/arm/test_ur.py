@@ -10,13 +10,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.factory import flange_agrees, require_same_flange, same_payload
-from drivers.arm.faults import fault, unlock
-from drivers.arm.feed import Snapshot, StateFeed, safety_code
-from drivers.arm.motion import ArmLimits, JointTrajectory, UrMotion, pose_difference
+from drivers.arm.faults import unlock
+from drivers.arm.feed import Snapshot, StateFeed
+from drivers.arm.motion import ArmLimits, UrMotion
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, LimitError, NotConnectedError
 from drivers.interfaces import LinkStatistics
@@ -109,54 +108,6 @@ def test_a_centre_of_gravity_in_millimetres_is_refused(axis):
 def test_a_trajectory_that_cannot_be_driven_is_refused(times, joints, message):
     with pytest.raises(LimitError, match=message):
         LIMITS.check_trajectory("arm", np.array(times), np.array(joints))
-
-
-def test_a_trajectory_is_straight_between_its_points_and_ends_at_its_last():
-    trajectory = JointTrajectory([0.0, 1.0, 3.0], [(0.0,) * 6, (1.0,) * 6, (5.0,) * 6])
-    assert trajectory.at(-1.0) == (0.0,) * 6
-    assert trajectory.at(0.25) == pytest.approx((0.25,) * 6)
-    assert trajectory.at(2.0) == pytest.approx((3.0,) * 6)
-    assert trajectory.at(99.0) == (5.0,) * 6
-
-
-def test_pose_difference_agrees_with_an_independent_one():
-    generator = np.random.default_rng(1)
-    for _ in range(50):
-        a, b = generator.normal(size=(2, 6))
-        way, turn = pose_difference(tuple(a), tuple(b))
-        assert way == pytest.approx(np.linalg.norm(a[:3] - b[:3]))
-        between = Rotation.from_rotvec(a[3:]).inv() * Rotation.from_rotvec(b[3:])
-        assert turn == pytest.approx(between.magnitude(), abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("bit", "code"),
-    [
-        (2, "arm.protective_stop"),
-        (3, "arm.recovery_mode"),
-        (4, "arm.safeguard_stop"),
-        (5, "arm.emergency_stop"),
-        (6, "arm.emergency_stop"),
-        (7, "arm.emergency_stop"),
-        (8, "arm.safety_fault"),
-        (9, "arm.safety_fault"),
-        (10, "arm.safeguard_stop"),
-    ],
-)
-def test_safety_bits_have_the_makers_meaning(bit, code):
-    # docs/reference/protocols.md, section 1
-    assert safety_code(1 << bit) == code
-    assert safety_code(1) == ""
-
-
-def test_an_emergency_stop_outranks_a_protective_stop():
-    assert safety_code(1 << 2 | 1 << 6) == "arm.emergency_stop"
-
-
-def test_only_some_faults_can_be_cleared_by_the_driver():
-    assert fault("arm", "arm.protective_stop").recoverable
-    assert not fault("arm", "arm.emergency_stop").recoverable
-    assert "release the button" in str(fault("arm", "arm.emergency_stop"))
 
 
 def motion(stops):
@@ -334,11 +285,6 @@ def test_another_payload_is_told_by_its_mass_and_by_its_centre(mass, centre, sam
     seen = replace(snapshot(0.0), payload=(mass, centre))
     assert same_payload(seen, (2.0, (0.0, 0.0, 0.05))) is same
     assert same_payload(seen, (mass, (0.0, 0.0, 0.0)))  # a centre of zeros is none
-
-
-def test_a_trajectory_knows_its_speed_for_a_stop_on_the_way():
-    trajectory = JointTrajectory([0.0, 1.0, 3.0], [(0.0,) * 6, (1.0,) * 6, (5.0, *(1.0,) * 5)])
-    assert [trajectory.speed_at(time) for time in (-1.0, 0.5, 2.0, 3.0)] == [0.0, 1.0, 2.0, 0.0]
 
 
 def dashboard_of(server, status):

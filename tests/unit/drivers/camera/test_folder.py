@@ -17,7 +17,6 @@ from cell.makes.make import Surroundings
 from cell.makes.table import installed, make_of
 from drivers.camera.folder import RecordedCamera
 from drivers.camera.genicam import aravis
-from drivers.camera.v4l2 import ExposureTiming, to_grey
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault, LimitError, NotConnectedError, RefusedError
 from drivers.interfaces import Camera
@@ -185,18 +184,3 @@ def test_a_device_file_without_a_camera_is_named_with_remedies() -> None:
     record = make.record.model_construct(device="/dev/video77", width=640, height=480, pixel_format="YUYV", gain=None)
     with pytest.raises(NotConnectedError, match=r"/dev/video77 is no camera .*v4l2-ctl .*fuser"):
         make.connect("scan_camera", record, Surroundings(Clock()))
-
-
-def test_what_a_driver_hands_over_becomes_grey() -> None:
-    grey = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
-    yuyv = np.stack([grey, np.full_like(grey, 128)], axis=2)
-    bgr = np.repeat(grey[:, :, None], 3, axis=2)
-    for raw in (grey, grey.reshape(1, -1), yuyv, bgr):
-        assert (to_grey(raw, (48, 64)) == grey).all()
-    for wrong in (None, grey.astype(np.uint16), grey[:40]):
-        with pytest.raises(ValueError):
-            to_grey(wrong, (48, 64))
-
-
-def test_a_uvc_stamp_leaves_a_frame_and_the_exposure_open() -> None:
-    assert ExposureTiming(0.02, 10.0).open_s == pytest.approx(0.12)

@@ -81,13 +81,6 @@ def test_a_motor_drivers_overload_is_a_fault_and_being_enabled_is_none() -> None
         bench.feedback.check(in_command=False, driving=False)
 
 
-def test_each_bit_of_a_motors_driver_is_a_fault_but_the_two_that_say_it_works() -> None:
-    told = {bit: driver_trouble(1, 1 << bit) for bit in range(8)}
-    assert [bit for bit, words in told.items() if not words] == [6, 7]
-    assert len({words for words in told.values() if words}) == 6
-    assert told[5] == ("motor 1: driver fails",)
-
-
 def test_whoever_took_command_away_is_for_a_person_to_find_out() -> None:
     bench = Bench()
     bench.tell(0, 0, mode=0)
@@ -292,12 +285,6 @@ def test_what_moves_by_our_own_command_is_no_push() -> None:
     for _ in range(200):
         bench.tell(8 * 149, 8 * 149)
     assert bench.interruption() == (0, "")
-
-
-def test_that_commands_stayed_away_is_no_fault_of_a_vehicle_that_nobody_commands() -> None:
-    assert system_trouble(0x0200, commanded=False) == ()
-    assert system_trouble(0x0200, commanded=True) == ("commands stayed away",)
-    assert system_trouble(0x0100, commanded=False) == ("a motor driver fails",)
 
 
 def test_a_version_text_shorter_than_its_frames_is_that_text_and_no_row_of_zeros() -> None:

@@ -196,12 +196,6 @@ def test_the_same_seed_gives_the_same_picture_and_another_seed_another():
     assert (first != other).mean() > 0.3
 
 
-@pytest.mark.parametrize("spec", ["marked_dots:9x7", "stars:9x7:20mm", "dots:1x7:20mm", "dots:9x7:20", "dots:9x7:0mm"])
-def test_wrong_board_names_are_refused(spec):
-    with pytest.raises(ValueError, match="board"):
-        Board.parse(spec)
-
-
 def test_undistortion_undoes_the_lens_to_a_nanopixel():
     pixels = np.array([[0.0, 0.0], [639.0, 479.0], [319.5, 239.5], [17.3, 440.2]])
     rays = np.column_stack([SCAN.undistort(pixels), np.ones(4)])

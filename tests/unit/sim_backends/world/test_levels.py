@@ -10,17 +10,14 @@ import pytest
 from cell.measure.inversion.effects.causes import Cause, likeliest
 from lab.bench.job.realism import verdict
 from sim_backends.clock import SteppedClock
-from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics, TruePose
-from sim_backends.optics.camera import CameraOptics
-from sim_backends.optics.laser.stripe import crossings
+from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics
 from sim_backends.optics.pattern import grain_at, grain_parameters
-from sim_backends.optics.scene import Grain, LaserOptics, PlaneInstance
+from sim_backends.optics.scene import Grain
 from sim_backends.world import drawing
 from sim_backends.world.levels import ALONE, LEVELS, Effects, assumed_noise, deviations, effects_of, number_of, only
 from sim_backends.world.scene import draw
 from sim_backends.world.world import World
 
-OPTICS = CameraOptics(640, 480, 1667.0, 1667.0, 319.5, 239.5)
 RNG = np.random.default_rng(0)
 
 
@@ -70,49 +67,6 @@ def test_joints_are_off_by_seven_hundredths_of_a_milliradian() -> None:
     assert np.sqrt(np.mean(np.square(off))) == pytest.approx(0.07e-3, rel=0.1)
 
 
-def test_a_stretched_arm_sags_about_its_shoulder() -> None:
-    errors = JointErrors(Kinematics(UR10E_DH), np.zeros((6, 4)), compliance=3e-6, mass=2.0)
-    flat = np.zeros(6)
-    reach = np.linalg.norm(Kinematics(UR10E_DH).forward(flat)[:2, 3])
-    turned = errors.true(flat) - flat
-    assert abs(turned[1]) == pytest.approx(3e-6 * 2.0 * 9.81 * reach, rel=0.05)
-    lowered = Kinematics(UR10E_DH).forward(errors.true(flat))[2, 3] - Kinematics(UR10E_DH).forward(flat)[2, 3]
-    assert lowered < 0.0
-
-
-def test_with_a_memory_the_error_changes_with_the_way_and_keeps_its_size() -> None:
-    def run(step: float, rng: np.random.Generator) -> tuple[float, float]:
-        made = TruePose(Kinematics(UR10E_DH), (1e-4, 0.0), 0.3, rng, memory=0.5)
-        q = np.zeros(6)
-        made.update(0.0, 0.1, q, moving=False)
-        before = made.pose[:3, 3] - Kinematics(UR10E_DH).forward(q)[:3, 3]
-        q = q + np.array([step, 0, 0, 0, 0, 0])
-        made.update(0.1, 0.1, q, moving=True)
-        after = made.pose[:3, 3] - Kinematics(UR10E_DH).forward(q)[:3, 3]
-        return float(before @ after), float(after @ after)
-
-    near = np.mean([run(0.01, np.random.default_rng(k)) for k in range(200)], axis=0)
-    far = np.mean([run(3.0, np.random.default_rng(k)) for k in range(200)], axis=0)
-    assert near[0] > 0.9 * 3e-8 * 0.9
-    assert abs(far[0]) < 0.2 * 3e-8
-    assert near[1] == pytest.approx(3e-8, rel=0.2)
-    assert far[1] == pytest.approx(3e-8, rel=0.2)
-
-
-def test_a_bowed_sheet_is_seen_where_geometry_says() -> None:
-    wall = np.eye(4)
-    wall[2, 3] = 0.130
-    bow = 1e-4 * 0.13 / 0.018**2
-    flat = crossings(OPTICS, LaserOptics(), PlaneInstance(wall, (0.2, 0.2)))
-    bent = crossings(OPTICS, LaserOptics(bow=bow), PlaneInstance(wall, (0.2, 0.2)))
-    # Across the optical axis, a sheet that is off by s along its normal meets the wall s / n_x to the side.
-    laser = LaserOptics()
-    along = np.hypot(0.130, 0.130 / 3.5)
-    sag = bow * flat.points[:, 1] ** 2 / along
-    assert bent.columns - flat.columns == pytest.approx(1667.0 / 0.130 * sag / laser.normal[0], abs=2e-3)
-    assert sag.max() > 0.9e-4
-
-
 def test_the_vehicle_rocks_by_a_tenth_of_a_milliradian_about_four_times_a_second() -> None:
     world = World(3, "nominal+rocking", clock=SteppedClock())
     # Leaning as it stands from the first tick on.
@@ -148,15 +102,6 @@ def test_texture_has_the_size_told_and_stays_on_the_surface() -> None:
     assert albedo.mean() == pytest.approx(0.6, rel=0.02)
     assert albedo.std() / 0.6 == pytest.approx(0.1, rel=0.25)
     assert grain_at(*places[0], pattern) == albedo[0]
-
-
-def test_dust_shades_a_few_places() -> None:
-    pattern = grain_parameters(0.6, Grain(spots=1.0))
-    x, y = np.meshgrid(np.arange(-0.03, 0.03, 1e-4), np.arange(-0.03, 0.03, 1e-4))
-    albedo = np.array([grain_at(a, b, pattern) for a, b in zip(x.ravel(), y.ravel(), strict=True)])
-    dark = float(np.mean(albedo < 0.3))
-    # 36 spots of 0.4 to 1 mm across on 36 cm², give or take.
-    assert 0.001 < dark < 0.008
 
 
 def test_a_rolling_shutter_shears_what_moves_and_nothing_else() -> None:

@@ -15,7 +15,7 @@ from sim_backends.world.bodies.contact import STIFFNESS, PartContact
 from sim_backends.world.bodies.surfaces import HALF_X, HALF_Y, surface
 from sim_backends.world.drawing import STOCK
 from sim_backends.world.levels import CUT, HARSH, IDEAL, NOMINAL, deviations
-from sim_backends.world.scene import draw, rotation, stream
+from sim_backends.world.scene import draw, rotation
 from sim_backends.world.world import World, truth
 
 
@@ -107,38 +107,6 @@ def test_unknown_levels_and_seeds_are_refused_with_the_choices() -> None:
         draw(-1, "nominal")
 
 
-def flat(value: object) -> np.ndarray:
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return np.concatenate([flat(getattr(value, f.name)) for f in dataclasses.fields(value)])
-    if isinstance(value, str | dict):
-        return np.zeros(0)
-    return np.asarray(value, dtype=float).ravel()
-
-
-def test_a_seed_fixes_the_whole_world_and_another_changes_it() -> None:
-    assert (flat(draw(7, "nominal")) == flat(draw(7, "nominal"))).all()
-    a, b = draw(7, "nominal"), draw(8, "nominal")
-    for name in ("world_from_surface", "flange_from_scan_camera", "light_plane_normal", "dh_error", "rail_direction"):
-        assert np.abs(getattr(a, name) - getattr(b, name)).max() > 0, name
-
-
-def test_each_quantity_has_a_stream_of_its_own() -> None:
-    a, b = stream(3, "light_plane.tilt"), stream(3, "light_plane.offset")
-    assert abs(np.corrcoef(a.standard_normal(2000), b.standard_normal(2000))[0, 1]) < 0.1
-
-
-def test_the_ideal_world_is_the_nominal_geometry() -> None:
-    scene = draw(11, "ideal")
-    assert scene.world_from_surface == pytest.approx(drawing.WORLD_FROM_PLACE)
-    assert scene.flange_from_scan_camera == pytest.approx(drawing.FLANGE_FROM_SCAN_CAMERA)
-    assert scene.flange_from_part == pytest.approx(drawing.FLANGE_FROM_PART)
-    # Where the light plane meets the optical axis: l tan θ = 122.5 mm (paper, equation 6; docs/explanation/theory.md,
-    # section 2).
-    assert scene.light_plane_distance / scene.light_plane_normal[2] == pytest.approx(0.1225)
-    assert scene.scan_lens.fx == pytest.approx(0.008 / 4.8e-6)
-    assert scene.scan_lens.dist == (0, 0, 0, 0, 0)
-
-
 def test_nominal_deviations_scatter_as_the_table_says_and_are_cut() -> None:
     shifts, turns = [], []
     for seed in range(200):
@@ -149,14 +117,6 @@ def test_nominal_deviations_scatter_as_the_table_says_and_are_cut() -> None:
     assert np.std(shifts) == pytest.approx(NOMINAL.station_translation, rel=0.1)
     assert np.abs(shifts).max() <= CUT * NOMINAL.station_translation + 1e-12
     assert np.sqrt(np.mean(np.square(turns)) / 3) == pytest.approx(NOMINAL.station_rotation, rel=0.1)
-
-
-def test_the_board_faces_the_vehicle_and_up_with_its_centre_where_the_drawing_says() -> None:
-    place_from_board = drawing.PLACE_FROM_BOARD
-    centre = place_from_board @ [0.08, 0.06, 0.0, 1.0]
-    assert centre[:3] == pytest.approx([0.10, 0.32, 0.12])
-    assert -place_from_board[:3, 2] == pytest.approx([-np.sqrt(0.5), 0.0, np.sqrt(0.5)])
-    assert np.linalg.det(place_from_board[:3, :3]) == pytest.approx(1.0)
 
 
 # --- the part and the surface ---

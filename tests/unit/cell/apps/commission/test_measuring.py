@@ -13,8 +13,6 @@ import pinocchio as pin
 import pytest
 
 from cell.apps.commission.check import CommissionCheck, Progress, Result
-from cell.apps.commission.checks.arm import GRAVITY, weigh
-from cell.apps.commission.checks.outputs import bright_rows
 from cell.apps.commission.checks.rail import judge
 from cell.apps.commission.measuring import against_drawing, axes_from_shifts, solve_mounting
 from cell.apps.commission.sequence import CHECKS, edited, table, write_changes
@@ -135,22 +133,6 @@ def test_a_rail_is_judged_by_the_way_that_its_camera_went() -> None:
 # --- weight and light ---
 
 
-def test_what_is_carried_is_weighed_apart_from_the_sensors_zero() -> None:
-    zero, mass, moment = np.array([3.0, -2.0, 5.0, 0.1, 0.2, -0.3]), 1.7, np.array([0.02, -0.01, 0.15])
-    turns, wrenches = [], []
-    for axis in ((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.6, 0.0)):
-        turn = np.asarray(pin.exp3(np.array(axis))) @ np.diag([1.0, -1.0, -1.0])
-        down = np.array([0.0, 0.0, -GRAVITY])
-        force, torque = mass * down, np.cross(turn @ moment, down)
-        turns.append(turn)
-        wrenches.append(np.concatenate([force + turn @ zero[:3], torque + turn @ zero[3:]]))
-    found, arm, sigma = weigh(np.array(turns), np.array(wrenches))
-    assert found == pytest.approx(mass)
-    # Along the weight a centre of gravity cannot be felt in one posture; these postures differ.
-    assert arm == pytest.approx(moment, abs=1e-9)
-    assert sigma == pytest.approx(0.0, abs=1e-6)
-
-
 def test_a_simulated_arm_feels_the_weight_that_it_was_not_told_of_and_takes_it_as_zero_when_asked() -> None:
     arm = ArmModel(ArmParams(carried=3.0, carried_centre=(0.0, 0.0, 0.1)), np.random.default_rng(1), SteppedClock())
     assert arm.felt == pytest.approx(np.zeros(6))
@@ -160,16 +142,6 @@ def test_a_simulated_arm_feels_the_weight_that_it_was_not_told_of_and_takes_it_a
     assert arm.felt == pytest.approx([*weight, *np.cross(flange @ [0.0, 0.0, 0.1], weight)], abs=1e-9)
     arm.zero_force()
     assert arm.felt == pytest.approx(np.zeros(6))
-
-
-def test_a_stripe_is_seen_as_one_and_light_that_goes_on_everywhere_is_not() -> None:
-    rng = np.random.default_rng(2)
-    off = rng.normal(40.0, 3.0, (120, 200))
-    line = off + 120.0 * np.exp(-0.5 * ((np.arange(200) - 90.0) / 2.0) ** 2)
-    pictures = [np.clip(p, 0, 255).astype(np.uint8) for p in (off, line, off + 60.0, rng.normal(40.0, 3.0, (120, 200)))]
-    assert bright_rows(pictures[0], pictures[1]) == 120
-    assert bright_rows(pictures[0], pictures[2]) == 0
-    assert bright_rows(pictures[0], pictures[3]) == 0
 
 
 # --- files ---

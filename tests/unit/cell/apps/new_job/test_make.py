@@ -9,15 +9,13 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from cell.apps.new_job.answers import laid_mesh
 from cell.apps.new_job.make import Made, make_job
 from cell.apps.new_job.mesh_file import read_drawing
-from cell.apps.new_job.questions import Asker, checked
-from cell.apps.new_job.surface import lay, open_side
+from cell.apps.new_job.questions import Asker
 from cell.apps.new_job.text import told_by_size
 from cell.check.fit import require_fit
 from cell.config.cell_config import load_config
-from cell.config.job import SurfaceSection, load_job
+from cell.config.job import load_job
 from drivers.errors import ConfigError, NotObservable, RefusedError
 
 Array = NDArray[np.float64]
@@ -80,51 +78,6 @@ def test_what_is_wrong_with_a_mesh_is_named_and_put_right(tmp_path: Path) -> Non
             assert made.volume == pytest.approx(1000.0)
 
 
-def test_only_what_lies_open_from_above_is_kept(tmp_path: Path) -> None:
-    """A mushroom: its hat hides foot and stem. Seen from above is the square of its foot, no more and no less."""
-    parts = [((60.0, 60.0, 4.0), 2.0), ((10.0, 10.0, 16.0), 12.0), ((30.0, 30.0, 4.0), 22.0)]
-    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix((0, 0, z))) for size, z in parts]
-    path = tmp_path / "mushroom.stl"
-    trimesh.util.concatenate(boxes).export(path)
-    seen = open_side(lay(read_drawing(path).bodies, "mm", "z", 0.0))
-    corners = seen.vertices[seen.faces]
-    areas = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
-    heights = corners[:, :, 2].mean(axis=1)
-    assert (areas > 0).all()
-    assert areas[heights > 0.020].sum() == pytest.approx(30e-3**2, rel=1e-6)
-    assert areas[heights < 0.020].sum() == pytest.approx(60e-3**2 - 30e-3**2, rel=0.03)
-
-
-OVER = {
-    "side by side": (((40, 30, 10), (0, 0, 5)), ((10, 10, 10), (40, 0, 5)), False, 1300.0),
-    "one on the other": (((40, 40, 10), (0, 0, 5)), ((20, 20, 10), (0, 0, 15)), False, 1600.0),
-    "one in the other": (((40, 40, 20), (0, 0, 10)), ((20, 20, 10), (0, 0, 10)), True, 1600.0),
-    "crossing": (((40, 30, 10), (0, 0, 5)), ((20, 20, 10), (15, 3, 9)), True, 1300.0),
-    "tops in one plane": (((40, 30, 10), (0, 0, 5)), ((40, 20, 10), (25, 0, 5)), True, 1700.0),
-}
-
-
-@pytest.mark.parametrize("case", OVER)
-def test_bodies_that_overlap_are_told_and_what_lies_double_counts_once(tmp_path: Path, case: str) -> None:
-    *boxes, overlap, area = OVER[case]
-    made = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in boxes]
-    path = tmp_path / "two.stl"
-    trimesh.util.concatenate(made).export(path)
-    told: list[str] = []
-    laid, _ = laid_mesh(Asker({"unit": "mm"}, None, told.append), read_drawing(path))
-    assert any("2 bodies that share no corner" in text for text in told)
-    assert any("1 and 2 overlap" in text for text in told) is overlap
-    corners = open_side(laid).vertices[open_side(laid).faces]
-    seen = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2].sum()
-    assert 1e6 * seen == pytest.approx(area, rel=0.005)
-
-
-@pytest.mark.parametrize(("longest", "unit"), [(60.0, "mm"), (0.14, "m"), (5.0, "inch")])
-def test_a_unit_is_told_by_the_size_where_one_alone_makes_sense(longest: float, unit: str) -> None:
-    found, words = told_by_size(longest)
-    assert found == unit and f"taken as {unit}" in words
-
-
 @pytest.mark.parametrize("longest", [16.0, 600.0, 0.001])
 def test_a_unit_that_the_size_does_not_tell_is_asked_for(longest: float) -> None:
     with pytest.raises(ConfigError, match="--unit"):
@@ -171,13 +124,3 @@ def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path: Path) -
     with pytest.raises(ConfigError, match=r"there already.*--overwrite"):
         from_options(tmp_path, mesh=str(mesh), name="lid", part_size="20 mm, 20 mm, 20 mm")
     assert made.job.read_text(encoding="utf-8") == written
-
-
-def test_a_wrong_answer_is_told_and_asked_again() -> None:
-    answers = iter(["3", "200 mm", "0.5 mm"])
-    told: list[str] = []
-    asker = Asker({}, lambda question, default: next(answers), told.append)
-    assert asker.get("prior", "How exactly", "3 mm", checked(SurfaceSection, "prior_sigma")) == 0.0005
-    assert "no unit" in told[0] and "0.01 to 100 mm" in told[0] and "0.01 to 100 mm" in told[1]
-    with pytest.raises(ConfigError, match=r"--prior: .*0\.01 to 100 mm"):
-        Asker({"prior": "200 mm"}, None, told.append).get("prior", "", "3 mm", checked(SurfaceSection, "prior_sigma"))

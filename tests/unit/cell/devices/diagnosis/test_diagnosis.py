@@ -15,7 +15,7 @@ from drivers.arm.health import readings as arm_readings
 from drivers.interfaces import Reading
 from drivers.rail.tmcl.module import readings as rail_readings
 from drivers.vehicle.agilex_link import load_database
-from drivers.vehicle.health import CanInterface, most_bits, parse_interface
+from drivers.vehicle.health import CanInterface
 from drivers.vehicle.health import readings as vehicle_readings
 
 
@@ -90,13 +90,6 @@ def test_a_vehicles_voltages_temperatures_and_bus_load_are_read() -> None:
     assert named(found, "bus load, at most") == pytest.approx(100 * 53 * (108 + 24 + 3) / 500_000)
 
 
-def test_the_longest_can_frames_are_as_long_as_known() -> None:
-    """Worst cases of the literature on response times (Davis et al. 2007): 55 + 10 n and 80 + 10 n bits."""
-    for n in range(9):
-        assert most_bits(can.Message(data=bytes(n), is_extended_id=False)) == 55 + 10 * n
-        assert most_bits(can.Message(data=bytes(n), is_extended_id=True)) == 80 + 10 * n
-
-
 def test_each_trouble_of_a_vehicle_and_its_bus_is_told() -> None:
     error = [(0.1, can.Message(is_error_frame=True))]
     crowd = [(0.1, can.Message(arbitration_id=0x7, data=bytes(8), is_extended_id=False))] * 3000
@@ -108,22 +101,6 @@ def test_each_trouble_of_a_vehicle_and_its_bus_is_told() -> None:
     assert outside(vehicle([])) == ["feedback period, p99"]
     passive = CanInterface("can0", True, 500_000, "ERROR-PASSIVE", 128, 3)
     assert outside(vehicle(heard(), passive)) == ["error counter, sending"]
-
-
-LINK = (
-    '[{"ifindex":4,"ifname":"can0","flags":["NOARP","UP","LOWER_UP","ECHO"],"link_type":"can","linkinfo":{"info_kind":'
-    '"can","info_data":{"state":"ERROR-WARNING","berr_counter":{"tx":0,"rx":97},"restart_ms":0,"bittiming":{"bitrate":'
-    '500000,"sample_point":"0.875"},"clock":24000000}}}]'
-)
-
-
-def test_what_linux_tells_of_a_can_interface_is_read_and_what_is_odd_is_not_made_up() -> None:
-    assert parse_interface("can0", LINK) == CanInterface("can0", True, 500_000, "ERROR-WARNING", 0, 97)
-    assert parse_interface("can1", LINK) is None
-    virtual = '[{"ifname":"vcan0","flags":["NOARP"],"linkinfo":{"info_kind":"vcan"}}]'
-    assert parse_interface("vcan0", virtual) == CanInterface("vcan0", False)
-    for odd in ("", "{}", "[null]", '[{"ifname":"can0","linkinfo":null}', "no such device"):
-        assert parse_interface("can0", odd) is None
 
 
 def test_alarms_of_a_rails_module_are_told_and_its_open_load_and_standstill_are_none() -> None:

@@ -23,7 +23,7 @@ from cell.devices.simulated.direct import VirtualCell
 from drivers.errors import ConfigError
 from sim_backends.world import drawing as nominal
 from sim_backends.world.bodies.surfaces import own_surface
-from sim_backends.world.drawing import STOCK, Drawing, inverse, read
+from sim_backends.world.drawing import STOCK, Drawing, inverse
 from sim_backends.world.world import World, truth
 from tests.support.described_cells import Changes, Numbers, described, pose, saddle, write_saddle
 
@@ -63,12 +63,6 @@ def test_what_ships_describes_the_stock_cell_to_the_last_bit(job: str) -> None:
     stock = STOCK.with_surface(job)
     assert drawn.cell.scan.mounting is STOCK.cell.scan.mounting
     assert drawn.as_json() == stock.as_json().replace("[0.07, 0.036, 0.02]", str(list(size)))
-
-
-def test_a_drawing_survives_its_text() -> None:
-    assert read(STOCK.as_json()).as_json() == STOCK.as_json()
-    with pytest.raises(ValueError, match="no drawing of a cell"):
-        read('{"cell": 3}')
 
 
 def test_a_copy_of_a_shipped_mesh_is_known_by_what_is_in_it_not_by_its_name(tmp_path: Path) -> None:

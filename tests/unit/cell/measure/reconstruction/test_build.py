@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +18,6 @@ from cell.measure.reconstruction import (
     ScanGeometry,
     calibration_motions,
     deviation_colours,
-    outliers,
     write_ply,
 )
 from cell.measure.reconstruction.outliers import find_outliers
@@ -164,24 +162,6 @@ def test_a_subsample_is_spread_over_all_lines_and_rows() -> None:
 # --- outliers ---
 
 
-@pytest.mark.parametrize("half", [0, 1])
-def test_a_half_that_could_not_be_judged_is_an_error_and_never_left_unfiltered(
-    monkeypatch: pytest.MonkeyPatch, half: int
-) -> None:
-    whole = outliers._judge
-    middle = 20
-
-    def judge(*arguments: Any, first: int, **others: Any) -> None:
-        if (first >= middle) == bool(half):
-            raise MemoryError("no room")
-        whole(*arguments, first=first, **others)
-
-    monkeypatch.setattr(outliers, "_judge", judge)
-    depth = np.zeros((2 * middle, 30))
-    with pytest.raises(MemoryError, match="no room"):
-        find_outliers(depth, np.full_like(depth, 1e-5))
-
-
 def relief(name: str, rng: np.random.Generator) -> tuple[Array, Array]:
     """Depth (256, 480) of a curved surface with noise, m, as a sweep samples it, and the noise's σ."""
     x, y = np.meshgrid((np.arange(256) - 128) * 0.25e-3, (np.arange(480) - 240) * 0.078e-3, indexing="ij")
@@ -223,13 +203,6 @@ def test_outliers_are_found_and_little_else(name: str, kind: str, share: float) 
     assert np.count_nonzero(found & bad) / np.count_nonzero(found) >= 0.90
 
 
-def test_a_lone_point_is_an_outlier_and_an_empty_cloud_has_none() -> None:
-    depth = np.full((20, 20), np.nan)
-    assert not find_outliers(depth, np.ones_like(depth)).any()
-    depth[10, 10] = 0.1
-    assert find_outliers(depth, np.full_like(depth, 1e-5))[10, 10]
-
-
 # --- PLY ---
 
 
@@ -253,15 +226,3 @@ def test_a_ply_is_read_back_by_another_library(tmp_path: Path) -> None:
     for line in ("format binary_little_endian 1.0", "comment coordinates in metres", "comment frame: arm base"):
         assert line in header.splitlines()
     assert path.stat().st_size == len(header) + len("end_header\n") + count * (7 * 4 + 3)
-
-
-def test_a_ply_with_columns_of_different_length_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="quality has 3 values for 2 points"):
-        write_ply(tmp_path / "x.ply", np.zeros((2, 3)), quality=np.zeros(3))
-
-
-def test_deviation_colours_run_from_blue_over_green_to_red() -> None:
-    colours = deviation_colours([-1.0, -0.001, 0.0, 0.001, np.nan], 0.001)
-    assert colours.tolist() == [[0, 0, 255], [0, 0, 255], [0, 255, 0], [255, 0, 0], [128, 128, 128]]
-    with pytest.raises(ValueError, match="greater than 0"):
-        deviation_colours([0.0], 0.0)

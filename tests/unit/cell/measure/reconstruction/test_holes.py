@@ -11,10 +11,9 @@ import trimesh
 
 from cell.measure.reconstruction import Cloud, Filled, fill_holes, merge, write_cloud
 from cell.measure.reconstruction.cloud import triangles, write_mesh
-from cell.measure.reconstruction.outliers import find_outliers
 from cell.measure.reconstruction.ply import deviation_colours, read_cloud, write_e57
 from drivers.errors import ConfigError
-from lab.bench.reconstruction.scenes import KINDS, Scene, cut_holes, scene
+from lab.bench.reconstruction.scenes import Scene, cut_holes, scene
 
 
 def z_of(made: Scene, filled: Filled) -> np.ndarray:
@@ -76,14 +75,6 @@ def test_interpolated_points_are_never_measurements() -> None:
 
 
 # --- outliers ---
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_whole_runs_and_near_outliers_are_found_too(kind: str) -> None:
-    made = scene("steps", kind, 0.03, 8)
-    found = find_outliers(made.depth, made.sigma)
-    assert np.count_nonzero(found & made.bad) >= 0.99 * np.count_nonzero(made.bad)
-    assert np.count_nonzero(found & made.bad) >= 0.90 * np.count_nonzero(found)
 
 
 # --- files ---

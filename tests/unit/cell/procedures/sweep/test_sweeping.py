@@ -30,7 +30,7 @@ from cell.procedures.drive.way import Whereabouts
 from cell.procedures.steps.laser_sweep import UNCHECKED, _home, laser_sweep
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
-from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors, TimeBound, shift_by_times, step_of_clock
+from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors
 from cell.procedures.sweep.sweeping import JITTER_S, LATENCY_S, arm_sweep, rail_sweep
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame, Motion, Rail, RailState
@@ -224,27 +224,6 @@ def test_a_camera_whose_clock_is_set_meanwhile_is_a_fault() -> None:
     assert len(sweep(lambda cell: set_the_clock(cell, 0.001)).lines) == pytest.approx(20, abs=2)
 
 
-def test_only_what_pace_and_arrival_both_tell_is_a_step_of_the_clock() -> None:
-    rng, numbers = np.random.default_rng(0), np.arange(100)
-    true, late = 1e5 + numbers / 30.0, rng.exponential(0.004, 100)
-    stepped = true + 0.012 * (numbers >= 60)
-    assert step_of_clock(numbers, stepped, true + late) == pytest.approx(0.012, abs=0.004)
-    assert step_of_clock(numbers, 2 * true - stepped, true + late) == pytest.approx(-0.012, abs=0.004)
-    # A machine that was busy for a while, a camera that paused, lost pictures, stamps that scatter.
-    busy = late + 0.05 * (numbers >= 60)
-    paused = true + 0.05 * (numbers >= 60)
-    some = np.delete(numbers, slice(40, 46))
-    noisy = true + 0.002 * rng.standard_normal(100)
-    for times, arrived, kept in (
-        (true, true + busy, numbers),
-        (paused, paused + late, numbers),
-        (true, true + late, some),
-        (noisy, true + late, numbers),
-    ):
-        assert abs(step_of_clock(kept, times[kept], arrived[kept])) < 0.003
-    assert step_of_clock(numbers[:9], stepped[55:64], true[55:64]) == 0.0
-
-
 def test_an_arm_that_is_pushed_meanwhile_is_a_fault() -> None:
     assert "the flange moved by" in refused("arm.moved_in_sweep", push_the_arm)
 
@@ -271,12 +250,6 @@ def test_lateness_that_is_allowed_is_in_the_budget() -> None:
     assert swath.residual < 10e-6
     assert swath.shift == pytest.approx(0.5 * late * SCAN.speed, abs=15e-6)
     assert np.sqrt(np.trace(swath.covariance[:3, :3])) == pytest.approx(swath.shift / np.sqrt(3), rel=0.1)
-
-
-def test_what_times_leave_open_adds_up_for_the_shift_and_by_squares_for_its_variance() -> None:
-    errors = SweepErrors(np.eye(6), 1e-5, 1e-4, late=2e-3)
-    known = [TimeBound("rail", "rail", 1e-3), TimeBound("scan_camera", "camera", 2e-3)]
-    assert shift_by_times(known, 0.01, errors) == pytest.approx((3e-5, 0.01**2 * (1e-6 + 4e-6 + 4e-6) / 3))
 
 
 def test_a_camera_whose_clock_cannot_be_compared_well_is_refused_as_well() -> None:

@@ -24,12 +24,11 @@ from mcap_protobuf.decoder import DecoderFactory
 from scipy.spatial.transform import Rotation
 
 from cell.apps.cli import main
-from cell.apps.cli.commands import record as record_command
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.reconstruction.ply import read_cloud
 from cell.run.record import file as record_file
 from cell.run.record import recorder
-from cell.run.record.file import BY_TOPIC, CHANNELS, RecordFile
+from cell.run.record.file import BY_TOPIC, RecordFile
 from cell.run.record.reading import as_candump, as_text, information, messages
 from cell.run.record.recorder import as_json, rtde, wire
 from cell.run.record.repair import repair
@@ -40,7 +39,6 @@ from drivers.errors import CellError, ConfigError
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.can_link import CanLink
 from lab.bench.job.whole_job import JobRecord
-from tests.support import ROOT
 from tests.support.report_runs import CONFIG
 
 Messages = dict[str, list[tuple[int, Any]]]
@@ -296,18 +294,6 @@ def test_a_flipped_bit_anywhere_is_named_and_left_out(tmp_path: Path, monkeypatc
         (tmp_path / "record.mcap.damaged").unlink(missing_ok=True)
 
 
-def test_a_record_without_a_message_is_not_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "record.mcap"
-    path.write_bytes(b"")
-    assert not information(path)["whole"]
-    assert not repair(path).whole
-    told = information(path)
-    assert (told["whole"], told["closed"], told["messages"]) == (False, True, 0)
-    for command, says in (("info", "empty, it holds no message"), ("repair", "is closed and empty")):
-        record_command.app([command, str(path)], standalone_mode=False)
-        assert says in " ".join(capsys.readouterr().out.split())
-
-
 def test_what_is_no_record_is_left_as_it_is(tmp_path: Path) -> None:
     path = tmp_path / "record.mcap"
     path.write_bytes(b"SQLite format 3\0" * 10)
@@ -345,27 +331,6 @@ def test_a_process_that_is_killed_leaves_all_but_its_last_seconds(tmp_path: Path
     done = repair(path)
     assert not done.whole
     assert done.messages == len(raw(path)) > 10
-
-
-def test_what_comes_too_fast_is_counted_and_never_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(record_file, "MOST_WAITING", 50)
-    out = RecordFile(tmp_path / "record.mcap", {}, lossless=False)
-    begun = time.monotonic()
-    for k in range(5000):
-        out.put("/vehicle/can", k, lambda: b"{}")
-    assert time.monotonic() - begun < 2.0
-    out.close()
-    told = information(out.path)
-    assert told["dropped"] == dict(out.dropped)
-    assert out.dropped["/vehicle/can"] + told["messages"] == 5001
-    assert out.dropped["/vehicle/can"] > 0
-
-
-def test_a_disk_that_takes_nothing_costs_the_record_and_not_the_run(tmp_path: Path) -> None:
-    out = RecordFile(tmp_path / "nowhere" / "record.mcap", {}, lossless=True)
-    out.put("/vehicle/can", 0, lambda: b"{}")
-    out.close()
-    assert out.failure is not None and "nowhere" in out.failure
 
 
 def test_a_configuration_can_do_without_records(tmp_path: Path) -> None:
@@ -552,11 +517,3 @@ def test_rerun_sees_frames_lenses_pictures_and_cloud(folder: Path, tmp_path: Pat
         assert "EncodedImage:blob" in found[f"/{camera}/image"]
         assert "Pinhole:image_from_camera" in found[f"/{camera}/calibration"]
     assert "TextLog:text" in found["/log"]
-
-
-def test_the_documentation_lists_the_channels() -> None:
-    from cell.run.record.file import table
-
-    text = (ROOT / "docs" / "reference" / "record.md").read_text(encoding="utf-8")
-    assert table() in text
-    assert len({topic for channel in CHANNELS for topic in channel.topics}) == len(BY_TOPIC)

@@ -10,36 +10,9 @@ from scipy.ndimage import gaussian_filter
 from cell.measure.vision import LaserChannel, Mark, PictureRefused, read_colours, read_picture, read_stripe
 from cell.measure.vision.stripe.careful.careful import Careful, fill_gaps
 from cell.measure.vision.stripe.extract import StripeStream, extract
-from cell.measure.vision.stripe.planes import as_picture, range_of
-from lab.bench.stripe.profiles import measure, within_limits
 from lab.bench.stripe.workshop import Scene, draw
 
 SHAPE = (384, 480)
-
-
-@pytest.mark.parametrize(
-    "scene",
-    [
-        Scene("flat top", 2.0),
-        Scene("halo", 2.0),
-        Scene("one-sided", 3.0),
-        Scene("flat top", 12.0),
-        Scene("Gaussian", 30.0),
-        Scene("flat top", 30.0),
-        Scene("halo", 30.0),
-        Scene("one-sided", 30.0),
-        Scene("Gaussian", 0.6),
-        Scene("Gaussian", 2.0, camera="12 bit low"),
-        Scene("Gaussian", 2.0, camera="12 bit high"),
-        Scene("Gaussian", 2.0, camera="red"),
-        Scene("Gaussian", 2.0, camera="green"),
-        Scene("Gaussian", 2.0, texture=8.0),
-    ],
-    ids=lambda scene: f"{scene.name} {scene.width}",
-)
-def test_every_stripe_comes_near_its_own_bound_with_a_true_deviation(scene):
-    row = measure(scene, seed=5)
-    assert within_limits(row), row
 
 
 def board(laser: float, seed: int, extra: float | np.ndarray = 0.0, ambient: float = 70.0):
@@ -115,16 +88,6 @@ def test_alpha_is_left_out_and_equal_channels_are_grey():
     rgba = np.dstack([image] * 3 + [np.full_like(image, 255)])
     np.testing.assert_array_equal(extract(rgba).centres, extract(image).centres)
     assert np.nanmax(np.abs(extract(rgba).centres - centres)) < 0.2
-
-
-@pytest.mark.parametrize(
-    ("bits", "shift", "full"), [(10, 0, 1023), (12, 0, 4095), (12, 4, 65520), (14, 2, 65532), (16, 0, 65535)]
-)
-def test_the_range_is_taken_from_the_values(bits, shift, full):
-    values = np.random.default_rng(0).integers(0, 1 << bits, (64, 64)).astype(np.uint16)
-    values[0, :2] = (1 << bits) - 1, 1
-    assert range_of(values << shift) == full
-    assert as_picture(values << shift).saturated[0, 0]
 
 
 def test_a_jpeg_is_read_with_a_true_deviation(tmp_path):

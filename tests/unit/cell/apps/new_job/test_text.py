@@ -1,0 +1,13 @@
+"""Promises of `cell.apps.new_job.text`."""
+
+from __future__ import annotations
+
+import pytest
+
+from cell.apps.new_job.text import told_by_size
+
+
+@pytest.mark.parametrize(("longest", "unit"), [(60.0, "mm"), (0.14, "m"), (5.0, "inch")])
+def test_a_unit_is_told_by_the_size_where_one_alone_makes_sense(longest: float, unit: str) -> None:
+    found, words = told_by_size(longest)
+    assert found == unit and f"taken as {unit}" in words

@@ -1,0 +1,38 @@
+"""Promises of `cell.config.job`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cell import ConfigError
+from cell.config.job import job_path, load_job, shipped_jobs
+from drivers.errors import ConfigError
+
+
+@pytest.mark.parametrize("name", shipped_jobs())
+def test_every_shipped_job_is_valid(name: str) -> None:
+    job, mesh = load_job(name)
+    assert job.job.name == name
+    assert mesh.is_file()
+
+
+def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(job_path("pot").read_text().replace("pot.stl", "gone.stl"))
+    with pytest.raises(ConfigError, match=r"gone\.stl"):
+        load_job(path)
+
+
+def test_the_job_of_the_present_folder_wins_over_the_one_that_ships(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = job_path("pot")
+    assert shipped.is_absolute()
+    Path("pot").mkdir()
+    assert job_path("pot") == shipped
+    Path("pot.toml").write_text(shipped.read_text())
+    assert job_path("pot") == Path("pot.toml")
+    assert job_path(shipped) == shipped

@@ -1,0 +1,45 @@
+"""Promises of `cell.run.runs`."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pytest
+
+from cell.run.runs import Run
+from statemachine.watch import SignalInterrupt
+
+
+def ask_to_end() -> None:
+    """A SIGTERM as soon as somebody waits for it."""
+    until = time.monotonic() + 5.0
+    while signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
+        assert time.monotonic() < until
+        time.sleep(0.001)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.2])
+def test_a_signal_at_the_very_end_of_a_job_leaves_its_result_and_is_kept(late: float) -> None:
+    def work(run: Run[int]) -> int:
+        run.control.over = True
+        ask_to_end()
+        time.sleep(late)  # within the waiting's last look, or after it
+        return 7
+
+    run = Run("job", work)
+    assert run.result(5.0) == 7
+    assert run.control.signal == signal.SIGTERM
+
+
+@pytest.mark.parametrize("late", [0.0, 0.2])
+def test_a_signal_as_other_work_ends_ends_the_program_too(late: float) -> None:
+    def work(run: Run[int]) -> int:
+        ask_to_end()
+        time.sleep(late)
+        return 7
+
+    with pytest.raises(SignalInterrupt, match="asked to end"):
+        Run("jog", work).result(5.0)
