@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from cell import ConfigError
 from cell.config.job import job_path, load_job, shipped_jobs
 from drivers.errors import ConfigError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sim_backends.optics import Board, CameraOptics, PlaneInstance
+from sim_backends.optics import Board
 from sim_backends.optics.camera import CameraOptics
 from sim_backends.optics.laser.stripe import crossings
 from sim_backends.optics.scene import LaserOptics, PlaneInstance
