@@ -149,7 +149,7 @@ def test_a_surface_that_is_another_by_now_is_not_compared_with(folder: Path, tmp
     report["mesh"]["sha256"] = 64 * "0"
     write_json(run / "report.json", report)
     text = Page(make_page(run)).text
-    assert "pot.stl was changed since the run" in text
+    assert "pot.ply was changed since the run" in text
     assert "mm (height)" in text
     (run / "cloud.ply").write_bytes(b"ply\n")
     assert "is no cloud of this program" in Page(make_page(run)).text
