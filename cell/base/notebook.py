@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from html import escape
 
-LONGEST = 240
-"""Characters of a cell; a reason can be long, and the report has all of it."""
+# A reason can be long, and the report has all of it.
+_TABLE = """<table><caption>{{ title | truncate(240, true, " …", 0) }}</caption>
+{%- for name, value in rows %}<tr><th style='text-align:left'>{{ name | truncate(240, true, " …", 0) }}</th>
+<td>{{ value | truncate(240, true, " …", 0) }}</td></tr>{% endfor %}</table>"""
 
 
 def table(title: str, rows: Iterable[tuple[str, str]]) -> str:
-    """An HTML table of names and values under a title."""
-    lines = "".join(f"<tr><th style='text-align:left'>{_safe(n)}</th><td>{_safe(v)}</td></tr>" for n, v in rows)
-    return f"<table><caption>{_safe(title)}</caption>{lines}</table>"
+    """An HTML table of names and values under a title; of each no more than 240 characters."""
+    from jinja2 import Environment  # only who shows a table waits for it
 
-
-def _safe(text: str) -> str:
-    return escape(text if len(text) <= LONGEST else text[: LONGEST - 2] + " …")
+    return Environment(autoescape=True).from_string(_TABLE).render(title=title, rows=rows)

@@ -1,21 +1,34 @@
-"""The drawings of a page that come from the cloud: the map with its histogram, and the points for the 3-D view."""
+"""The scanned surface on a run's page: points in mm, how far they lie off the drawn surface, and drawings of both."""
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
-from collections.abc import Mapping
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import matplotlib
 import numpy as np
+import pinocchio as pin
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from cell.run.report.page.scanned import Scanned
+from cell.measure.geometry.poses import from_ur, transform
+from cell.measure.inversion import NominalSurface
+from cell.measure.reconstruction.ply import read_cloud
+from cell.run.report.evidence import CLOUD
 from cell.run.report.panels import frame_map, square_means
+from cell.run.report.pictures import SCALE_SHARE
+from drivers.errors import CellError
 from drivers.interfaces import Vector
 
+SPAN_MM = 0.2
+"""End of the scale of deviations where a report names no tolerance."""
 MOST_POINTS = 20_000
 """Points of the 3-D view; a cloud with more is thinned to so many, spread evenly over it."""
 COLOURS, HEIGHTS = "RdBu_r", "viridis"
@@ -24,6 +37,91 @@ SHADES = 255
 BINS = 61
 LEAST_IN_SQUARE = 5
 """Points in a square of the map that may be called an extreme: single ones are noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scanned:
+    """Measured points (n, 3) in mm and their deviations (n,) in mm, NaN beside the surface.
+
+    With deviations the points are in the surface's frame; without (None) they are about their middle, axes of the arm
+    base, and `why` says what the deviations lack.
+    """
+
+    points: Vector
+    deviation: Vector | None
+    why: str
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceView:
+    """What a page shows of a cloud: the `map` as PNG, and `cloud`, the points of the 3-D view for `cloud.js`.
+
+    `compared` tells whether it is coloured by deviations, ± `span_mm`; else it is by height, and `why` says why.
+    `stops` are the scale's colours for CSS.
+    """
+
+    map: bytes
+    cloud: Mapping[str, Any]
+    compared: bool
+    why: str
+    span_mm: float
+    stops: Sequence[str]
+
+
+def surface_view(folder: Path, report: Mapping[str, Any]) -> SurfaceView | None:
+    """What is shown of the run's cloud, None where it has none; `CellError` for one that cannot be read."""
+    scan = scanned(folder, report)
+    if scan is None or not len(scan.points):
+        return None
+    tolerance = (report.get("tolerance") or {}).get("translation_mm")
+    span = SPAN_MM if tolerance is None else SCALE_SHARE * float(tolerance)
+    compared = scan.deviation is not None
+    stops = [f"rgb({r},{g},{b})" for r, g, b in _palette(compared)[:SHADES:15]]
+    return SurfaceView(
+        map=map_picture(scan, span),
+        cloud=view_data(scan, span),
+        compared=compared,
+        why=scan.why,
+        span_mm=span,
+        stops=stops,
+    )
+
+
+def scanned(folder: Path, report: Mapping[str, Any]) -> Scanned | None:
+    """The cloud of a run, None where it has none; `CellError` for one that cannot be read."""
+    if not (folder / CLOUD).exists():
+        return None
+    cloud = read_cloud(folder / CLOUD)
+    points = cloud.points[~cloud.interpolated]
+    try:
+        base_from_surface, nominal = _surface(folder, report)
+    except _NotKnown as error:
+        middle = points.mean(axis=0) if len(points) else np.zeros(3)
+        return Scanned(1e3 * (points - middle), None, str(error))
+    local = transform(base_from_surface.inverse(), points)
+    return Scanned(1e3 * local, 1e3 * nominal.deviations(local), "")
+
+
+class _NotKnown(Exception):
+    """Why a cloud cannot be compared with the drawn surface."""
+
+
+def _surface(folder: Path, report: Mapping[str, Any]) -> tuple[pin.SE3, NominalSurface]:
+    """The surface's pose that the run found, and the surface itself if its file is the one that the run had."""
+    if (place := report.get("place_pose")) is None:
+        raise _NotKnown("the run did not find the surface's place")
+    try:
+        job = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+        part, unit = job["place"]["surface_from_part"], job["surface"]["mesh_unit"]
+        surface_from_part = pin.SE3(pin.rpy.rpyToMatrix(*part["rotation"]), np.array(part["translation"]))
+        file, told = Path(report["mesh"]["file"]), report["mesh"]["sha256"]
+        if hashlib.sha256(file.read_bytes()).hexdigest() != told:
+            raise _NotKnown(f"{file.name} was changed since the run: it is not the surface that was scanned for")
+        nominal = NominalSurface.load(file, unit=unit)
+    except (OSError, ValueError, KeyError, TypeError, CellError) as error:
+        raise _NotKnown(f"the drawn surface cannot be read any more: {error}") from error
+    values = np.array([*(1e-3 * v for v in place["translation_mm"]), *place["rotation_vector_rad"]])
+    return from_ur(values) * surface_from_part.inverse(), nominal
 
 
 def map_picture(scan: Scanned, span_mm: float) -> bytes:
@@ -123,11 +221,10 @@ def view_data(scan: Scanned, span_mm: float) -> Mapping[str, Any]:
     begin, end = (-ends, ends) if ends is not None else (float(low[2]), float(max(high[2], low[2] + 1e-3)))
     share = np.clip((values[chosen] - begin) / (end - begin), 0.0, 1.0)
     shades = np.where(np.isfinite(share), np.nan_to_num(share) * (SHADES - 1), SHADES).astype(np.uint8)
-    palette = matplotlib.colormaps[HEIGHTS if ends is None else COLOURS](np.linspace(0, 1, SHADES))[:, :3]
     return {
         "points": _base64(np.round((points - middle) / step).astype("<i2")),
         "shades": _base64(shades),
-        "palette": _base64(np.vstack([np.round(255 * palette), [115, 115, 115]]).astype(np.uint8)),
+        "palette": _base64(_palette(ends is not None)),
         "step": step,
         "apart": float(np.sqrt(np.prod(np.maximum((high - low)[:2], 0.1)) / max(1, len(points)))),
         "count": len(points),
@@ -135,6 +232,12 @@ def view_data(scan: Scanned, span_mm: float) -> Mapping[str, Any]:
         "from": begin,
         "to": end,
     }
+
+
+def _palette(compared: bool) -> NDArray[np.uint8]:
+    """Colours (256, 3) of the scale, and after them that of a point without a value."""
+    colours = matplotlib.colormaps[COLOURS if compared else HEIGHTS](np.linspace(0, 1, SHADES))[:, :3]
+    return np.vstack([np.round(255 * colours), [115, 115, 115]]).astype(np.uint8)
 
 
 def _base64(values: Any) -> str:
