@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 from base64 import b64encode
+from functools import cache
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
 
 
 def render(package: str, name: str, **values: object) -> str:
@@ -10,8 +15,12 @@ def render(package: str, name: str, **values: object) -> str:
 
     `raw | base64` writes bytes for a `data:` address. Raises `jinja2.UndefinedError` for a value that is not given.
     """
-    # Only who writes a page waits for it.
-    from jinja2 import Environment, PackageLoader, StrictUndefined
+    return _environment(package).get_template(name).render(values)
+
+
+@cache
+def _environment(package: str) -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # only who writes a page waits for it
 
     made = Environment(
         loader=PackageLoader(package, ""),
@@ -21,4 +30,4 @@ def render(package: str, name: str, **values: object) -> str:
         lstrip_blocks=True,
     )
     made.filters["base64"] = lambda raw: b64encode(raw).decode("ascii")
-    return made.get_template(name).render(values)
+    return made
