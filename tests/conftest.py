@@ -60,7 +60,7 @@ GROUPS = (
     (
         "integration/virtual/test_virtual_door.py",
         "unit/cell/run/report/test_report.py",
-        "unit/cell/run/report/page",
+        "unit/cell/run/report/page/test_make.py",
         "unit/cell/run/report/test_figures.py",
         "unit/cell/apps/cli/test_end_screen.py",
         "unit/cell/devices/simulated/test_direct.py",

@@ -43,21 +43,6 @@ def draw(name: str) -> SurfaceMesh:
     return SurfaceMesh(vertices, triangles)
 
 
-def over_triangles(vertices: Floats, triangles: Faces) -> tuple[Floats, Floats, Floats]:
-    """Points spread over each triangle: their weights of its corners (p, 3), x, y (t, p, 2), m, and areas (t, p), m².
-
-    An area is the point's share of the triangle, seen from above.
-    """
-    i, j = np.nonzero(np.add.outer(np.arange(DIVISIONS), np.arange(DIVISIONS)) < DIVISIONS)
-    upper = i + j < DIVISIONS - 1
-    first = np.concatenate([i + 1 / 3, i[upper] + 2 / 3]) / DIVISIONS
-    second = np.concatenate([j + 1 / 3, j[upper] + 2 / 3]) / DIVISIONS
-    weights = np.column_stack([first, second, 1.0 - first - second])
-    corners = vertices[triangles][:, :, :2]
-    areas = 0.5 * np.linalg.det(corners[:, 1:] - corners[:, :1]) / len(weights)
-    return weights, np.einsum("pk,tkc->tpc", weights, corners), np.repeat(areas[:, None], len(weights), axis=1)
-
-
 def _fill_footprint(vertices: Floats, triangles: Faces, half: Floats) -> None:
     """Bring the border's corners to the footprint's sides, and the nearest ones to its corners: decimation cuts them
     off."""
@@ -72,14 +57,19 @@ def _fill_footprint(vertices: Floats, triangles: Faces, half: Floats) -> None:
 
 def _fit_heights(vertices: Floats, triangles: Faces, field: Surface) -> None:
     """Set z so that the integral of the squared normal distance from the closed form is least."""
-    weights, places, areas = over_triangles(vertices, triangles)
+    # Points in the middle of the small triangles into which each is divided, by their weights of its corners.
+    i, j = np.nonzero(np.add.outer(np.arange(DIVISIONS), np.arange(DIVISIONS)) < DIVISIONS)
+    upper = i + j < DIVISIONS - 1
+    first = np.concatenate([i + 1 / 3, i[upper] + 2 / 3]) / DIVISIONS
+    second = np.concatenate([j + 1 / 3, j[upper] + 2 / 3]) / DIVISIONS
+    weights = np.column_stack([first, second, 1.0 - first - second])
+    corners = vertices[triangles][:, :, :2]
     # A hair beyond the border lies the table.
-    heights, normals = field.sample(*(0.999999 * places.reshape(-1, 2)).T)
-    number = areas.size
-    columns = np.repeat(triangles, len(weights), axis=0).ravel()
-    rows = (np.tile(weights, (len(triangles), 1)).ravel(), (np.repeat(np.arange(number), 3), columns))
-    interpolate = scipy.sparse.csr_matrix(rows, shape=(number, len(vertices)))
-    weighted = interpolate.T @ scipy.sparse.diags(areas.ravel() * normals[:, 2])
+    heights, normals = field.sample(*(0.999999 * np.einsum("pk,tkc->tpc", weights, corners).reshape(-1, 2)).T)
+    areas = np.repeat(np.linalg.det(corners[:, 1:] - corners[:, :1]), len(weights))
+    columns, rows = np.repeat(triangles, len(weights), axis=0).ravel(), np.repeat(np.arange(len(heights)), 3)
+    interpolate = scipy.sparse.csr_matrix((np.tile(weights, (len(triangles), 1)).ravel(), (rows, columns)))
+    weighted = interpolate.T @ scipy.sparse.diags(areas * normals[:, 2])
     vertices[:, 2] = scipy.sparse.linalg.spsolve((weighted @ interpolate).tocsc(), weighted @ heights)
 
 

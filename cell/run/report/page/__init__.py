@@ -22,12 +22,7 @@ def render(package: str, name: str, **values: object) -> str:
 def _environment(package: str) -> Environment:
     from jinja2 import Environment, PackageLoader, StrictUndefined  # only who writes a page waits for it
 
-    made = Environment(
-        loader=PackageLoader(package, ""),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    made = Environment(loader=PackageLoader(package, ""), autoescape=True, undefined=StrictUndefined)
+    made.trim_blocks = made.lstrip_blocks = True
     made.filters["base64"] = lambda raw: b64encode(raw).decode("ascii")
     return made

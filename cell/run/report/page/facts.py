@@ -37,7 +37,7 @@ def verdict(report: Mapping[str, Any]) -> RunVerdict:
     """The errors beside the tolerance."""
     bound, truth = report.get("place_bound_95"), report.get("truth")
     tolerance = (report.get("tolerance") or {}).get("translation_mm")
-    outside = [row for row in report.get("measured") or () if not row.get("kept", True)]
+    outside = sum(not row.kept for row in judged(report))
     words = []
     if truth is not None:
         words.append(f"true place error at most {truth['error_mm']['d']['max']:.3f} mm (simulated world)")
@@ -46,9 +46,7 @@ def verdict(report: Mapping[str, Any]) -> RunVerdict:
     if tolerance is not None and (truth is not None or bound is not None):
         words.append(f"tolerance {tolerance:g} mm")
     if outside:
-        words.append(
-            "one figure outside its limit" if len(outside) == 1 else f"{len(outside)} figures outside their limits"
-        )
+        words.append("one figure outside its limit" if outside == 1 else f"{outside} figures outside their limits")
     return RunVerdict("; ".join(words), report["outcome"] in ("placed", "done") and not outside)
 
 
@@ -60,12 +58,10 @@ def identities(folder: Path, report: Mapping[str, Any]) -> list[TableRow]:
     rows.append(("begun", str(report.get("started", "")).replace("T", " ")))
     rows.append(("ended", str(report.get("ended") or "not ended").replace("T", " ")))
     if report.get("kind", "job") == "job":
-        mesh = report.get("mesh") or {}
         rows.append(("job", f"{report.get('job')}, hash {report.get('job_hash')}"))
-        if mesh:
-            rows.append(
-                ("drawn surface", f"{Path(str(mesh.get('file'))).name}, SHA-256 {str(mesh.get('sha256'))[:16]}")
-            )
+        if mesh := report.get("mesh"):
+            name, digest = Path(str(mesh.get("file"))).name, str(mesh.get("sha256"))
+            rows.append(("drawn surface", f"{name}, SHA-256 {digest[:16]}"))
     calibration = _calibration(folder)
     if report.get("calibration_hash"):
         rows.append(("calibration", f"hash {report['calibration_hash']}, {_age(calibration, report)}"))
@@ -108,12 +104,10 @@ def compared(report: Mapping[str, Any]) -> list[TableRow]:
     tolerance = report.get("tolerance") or {}
     if found is not None and report.get("place_pose") and report.get("place_sigma"):
         sigma = report["place_sigma"]
-        for axis, off, one in zip(AXES, found["correction_mm"], sigma["translation_mm"], strict=True):
-            rows.append((f"surface {axis}, from the board", "0 mm", f"{off:+.3f} mm", f"{off:+.3f} mm", "follows it",
-                         f"± {K95 * one:.3f} mm"))  # fmt: skip
-        for axis, off, one in zip(AXES, found["correction_mrad"], sigma["rotation_mrad"], strict=True):
-            rows.append((f"surface about {axis}, from the board", "0 mrad", f"{off:+.3f} mrad", f"{off:+.3f} mrad",
-                         "follows it", f"± {K95 * one:.3f} mrad"))  # fmt: skip
+        for about, unit, sigmas in (("", "mm", "translation_mm"), ("about ", "mrad", "rotation_mrad")):
+            for axis, off, one in zip(AXES, found[f"correction_{unit}"], sigma[sigmas], strict=True):
+                shown, unsure = f"{off:+.3f} {unit}", f"± {K95 * one:.3f} {unit}"
+                rows.append((f"surface {about}{axis}, from the board", f"0 {unit}", shown, shown, "follows it", unsure))
     bound, truth = report.get("place_bound_95"), report.get("truth")
     if bound is not None:
         allowed = f"at most {tolerance['translation_mm']:g} mm" if "translation_mm" in tolerance else ""
@@ -127,13 +121,9 @@ def compared(report: Mapping[str, Any]) -> list[TableRow]:
     if touch is not None:
         felt = (f"{touch[key]:.3f} mm" for key in ("expected_mm", "felt_mm"))
         off, unsure = f"{touch['off_mm']:+.3f} mm", f"± {K95 * touch['sigma_mm']:.3f} mm"
-        rows.append(("first touch above the place", *felt, off, _touch_limit(report), unsure))
+        limit = next((row.cells[2] for row in judged(report) if row.cells[0].startswith("first touch")), "")
+        rows.append(("first touch above the place", *felt, off, limit, unsure))
     return [TableRow(row) for row in rows]
-
-
-def _touch_limit(report: Mapping[str, Any]) -> str:
-    row = next((row for row in report.get("measured") or () if str(row["name"]).startswith("first touch")), None)
-    return "" if row is None else shown_limit(row)
 
 
 def _result(report: Mapping[str, Any], step: str) -> Mapping[str, Any] | None:

@@ -45,8 +45,7 @@ class RunPage:
     what: str
     outcome: str
     simulated: str
-    seed: str
-    level: str
+    world: str
     verdict: RunVerdict
     reason: str
     refused: str
@@ -108,8 +107,7 @@ def _run_page(folder: Path, report: Mapping[str, Any]) -> RunPage:
         what=f"Job {report.get('job')}" if kind == "job" else kind.capitalize(),
         outcome=str(report["outcome"]),
         simulated=simulated_words(report.get("simulated")),
-        seed=str(report.get("seed")),
-        level=str(report.get("level")),
+        world=f"seed {report.get('seed')}, level {report.get('level')}",
         verdict=facts.verdict(report),
         reason=str(report.get("reason") or ""),
         refused=refused,

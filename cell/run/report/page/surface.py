@@ -138,16 +138,9 @@ def map_picture(scan: Scanned, span_mm: float) -> bytes:
         on = np.isfinite(scan.deviation)
         points, values = scan.points[on], scan.deviation[on]
         _draw(
-            figure,
-            left,
-            points,
-            values,
-            "deviation from the drawn surface in mm",
-            cmap=COLOURS,
-            vmin=-span_mm,
-            vmax=span_mm,
-            extend="both",
-        )
+            figure, left, points, values, "deviation from the drawn surface in mm", cmap=COLOURS, vmin=-span_mm,
+            vmax=span_mm, extend="both",
+        )  # fmt: skip
         _label_extremes(left, points, values)
         right.hist(np.clip(values, -span_mm, span_mm), np.linspace(-span_mm, span_mm, BINS), color="0.4")
         right.set_xlim(-span_mm, span_mm)
@@ -181,16 +174,11 @@ def _label_extremes(axes: Axes, points: Vector, values: Vector) -> None:
         x, y = (0.5 * (edge[k] + edge[k + 1]) for edge, k in zip(edges, (i, j), strict=True))
         axes.plot(x, y, marker, color="black", markerfacecolor="none", markersize=9)
         side = "left" if x < np.mean(axes.get_xlim()) else "right"
+        box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8}
         axes.annotate(
-            f"{sure[i, j]:+.3f}",
-            (x, y),
+            f"{sure[i, j]:+.3f}", (x, y), fontsize=9, bbox=box, textcoords="offset points", ha=side, va="center",
             xytext=(9 if side == "left" else -9, 0),
-            textcoords="offset points",
-            ha=side,
-            va="center",
-            fontsize=9,
-            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.8},
-        )
+        )  # fmt: skip
     axes.set_title("▲ ▼ largest and smallest mean of a square", fontsize="medium")
 
 
@@ -217,14 +205,15 @@ def view_data(scan: Scanned, span_mm: float) -> Mapping[str, Any]:
     points = scan.points[chosen]
     low, high = points.min(axis=0), points.max(axis=0)
     middle, step = 0.5 * (low + high), max(float((high - low).max()), 1e-3) / 60_000
-    values, ends = (scan.points[:, 2], None) if scan.deviation is None else (scan.deviation, span_mm)
-    begin, end = (-ends, ends) if ends is not None else (float(low[2]), float(max(high[2], low[2] + 1e-3)))
+    compared = scan.deviation is not None
+    values = scan.points[:, 2] if scan.deviation is None else scan.deviation
+    begin, end = (-span_mm, span_mm) if compared else (float(low[2]), float(max(high[2], low[2] + 1e-3)))
     share = np.clip((values[chosen] - begin) / (end - begin), 0.0, 1.0)
     shades = np.where(np.isfinite(share), np.nan_to_num(share) * (SHADES - 1), SHADES).astype(np.uint8)
     return {
         "points": _base64(np.round((points - middle) / step).astype("<i2")),
         "shades": _base64(shades),
-        "palette": _base64(_palette(ends is not None)),
+        "palette": _base64(_palette(compared)),
         "step": step,
         "apart": float(np.sqrt(np.prod(np.maximum((high - low)[:2], 0.1)) / max(1, len(points)))),
         "count": len(points),

@@ -14,9 +14,13 @@ from cell.run.report.page.course import Past, Timeline, Trend, past_runs, timeli
 from statemachine.journal import Journal
 
 
-def test_steps_follow_each_other_in_the_cells_time_on_the_virtual_clock(folder: Path) -> None:
+def test_steps_follow_each_other_in_the_cells_time_on_the_virtual_clock(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, "run", {"clock": "virtual"})
+    for attempt, error in ((1, "frames were lost"), (2, None)):
+        journal.step_ended(journal.step_started("laser_sweep", attempt), 2.0 * attempt, {}, error)
+    journal.close()
     fault = {"step": "laser_sweep", "attempt": 1, "code": "c", "reason": "r", "remedy": "tried again"}
-    course = timeline(folder, {"clock": "virtual", "faults": [fault]})
+    course = timeline(tmp_path, {"clock": "virtual", "faults": [fault]})
     assert course is not None
     assert [(bar.begin, bar.end, bar.state) for bar in course.bars] == [(0.0, 2.0, "failed"), (2.0, 6.0, "done")]
     assert [mark.at for mark in course.marks] == [2.0]
