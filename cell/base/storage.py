@@ -17,7 +17,6 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 from typing import IO, Any
 
@@ -200,15 +199,14 @@ def require_date(name: str, seconds: float) -> None:
         )
 
 
-LONGEST = 240
-"""Characters of a cell; a reason can be long, and the report has all of it."""
+# A reason can be long, and the report has all of it.
+_TABLE = """<table><caption>{{ title | truncate(240, true, " …", 0) }}</caption>
+{%- for name, value in rows %}<tr><th style='text-align:left'>{{ name | truncate(240, true, " …", 0) }}</th>
+<td>{{ value | truncate(240, true, " …", 0) }}</td></tr>{% endfor %}</table>"""
 
 
 def table(title: str, rows: Iterable[tuple[str, str]]) -> str:
-    """An HTML table of names and values under a title."""
-    lines = "".join(f"<tr><th style='text-align:left'>{_safe(n)}</th><td>{_safe(v)}</td></tr>" for n, v in rows)
-    return f"<table><caption>{_safe(title)}</caption>{lines}</table>"
+    """An HTML table of names and values under a title; of each no more than 240 characters."""
+    from jinja2 import Environment  # only who shows a table waits for it
 
-
-def _safe(text: str) -> str:
-    return escape(text if len(text) <= LONGEST else text[: LONGEST - 2] + " …")
+    return Environment(autoescape=True).from_string(_TABLE).render(title=title, rows=rows)

@@ -247,7 +247,7 @@ def load_job(name: str | Path) -> tuple[Job, Path]:
 def shipped_mesh(mesh: Path) -> str | None:
     """The name of the shipped surface that this file is a copy of, byte for byte; None for one's own."""
     for name in shipped_jobs():
-        shipped = _job_folder() / f"{name}.stl"
+        shipped = _job_folder() / f"{name}.ply"
         if mesh.stat().st_size == shipped.stat().st_size and mesh.read_bytes() == shipped.read_bytes():
             return name
     return None

@@ -49,8 +49,8 @@ def described(folder: Path, config: Changes | None = None, job: Changes | None =
     cell.write_text(changed(default_toml(), config or {}), encoding="utf-8")
     text = changed(job_path("pot").read_text(encoding="utf-8"), job or {})
     own.write_text(text, encoding="utf-8")
-    if 'mesh = "pot.stl"' in text:
-        (folder / "pot.stl").write_bytes((job_path("pot").parent / "pot.stl").read_bytes())
+    if 'mesh = "pot.ply"' in text:
+        (folder / "pot.ply").write_bytes((job_path("pot").parent / "pot.ply").read_bytes())
     return cell, own
 
 

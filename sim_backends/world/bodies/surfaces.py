@@ -3,7 +3,6 @@
 `pot` is a free-form relief without symmetry, `seat` a curved seat with a ledge, a step and a recess whose flanks are
 steep but finite; both cover |x| ≤ 35 mm, |y| ≤ 18 mm. `panel` is a curved sheet with three beads, |y| ≤ 30 mm: wider
 than the scan camera's field. Around them lies the table, z = 0.
-`python -m sim_backends.world.bodies.surfaces pot pot.stl` writes the nominal surface as binary STL in metres.
 
 A surface from a mesh file, as the world needs it: what the cameras see of it, and the ground that a part meets.
 
@@ -12,9 +11,7 @@ between its points is less than what a part can feel."""
 
 from __future__ import annotations
 
-import argparse
-import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from hashlib import sha256
@@ -179,35 +176,6 @@ def _add_walls(vertices: Floats, faces: NDArray[np.intp], index: NDArray[np.intp
     upper, lower = np.roll(border, -1), np.roll(below, -1)
     sides = np.concatenate([np.stack([border, below, lower], -1), np.stack([border, lower, upper], -1)])
     return np.concatenate([vertices, foot]), np.concatenate([faces, sides])
-
-
-def write_stl(path: Path, surface_mesh: SurfaceMesh) -> None:
-    """Write `surface_mesh` as binary STL; coordinates in metres, frame S."""
-    corners = surface_mesh.vertices[surface_mesh.triangles]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    record = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-    records = np.zeros(len(corners), dtype=record)
-    records["normal"], records["corners"] = normals, corners
-    path.write_bytes(b"nominal surface, metres".ljust(80) + struct.pack("<I", len(records)) + records.tobytes())
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Export the nominal mesh of a surface."""
-    parser = argparse.ArgumentParser(prog="surfaces", description="Write a surface as binary STL, in metres.")
-    parser.add_argument("name", choices=sorted(SURFACES))
-    parser.add_argument("file", type=Path)
-    parser.add_argument("--triangles", type=int, default=80_000, help="about this many (default: %(default)s)")
-    parser.add_argument("--walls", action="store_true", help="with the sides down to the table")
-    options = parser.parse_args(argv)
-    written = mesh(options.name, options.triangles, options.walls)
-    write_stl(options.file, written)
-    print(f"{options.file}: {len(written.triangles)} triangles, metres")
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
 
 
 Faces = NDArray[np.int64]

@@ -416,7 +416,7 @@ def test_jobs_are_named_never_addressed(
     text = job_path("pot").read_text()
     for path in (elsewhere / "mine.toml", here / "mine.toml", here / "plain"):
         path.write_text(text + "# secret")
-    (here / "pot.stl").write_bytes(job_path("pot").with_suffix(".stl").read_bytes())
+    (here / "pot.ply").write_bytes(job_path("pot").with_suffix(".ply").read_bytes())
     (here / "linked.toml").symlink_to(elsewhere / "mine.toml")
     os.mkfifo(here / "pipe.toml")
     monkeypatch.chdir(here)

@@ -43,7 +43,7 @@ def folder(placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     text = job_path("pot").read_text(encoding="utf-8").replace('speed = "15 mm/s"', 'speed = "30 mm/s"')
     assert tomllib.loads(text)["scan"]["speed"] == "30 mm/s"
     (tmp_path / "pot.toml").write_text(text, encoding="utf-8")
-    shutil.copy(job_path("pot").parent / "pot.stl", tmp_path)
+    shutil.copy(job_path("pot").parent / "pot.ply", tmp_path)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -6,7 +6,6 @@ Every case goes through the real command line: exit code 2, no traceback, no wor
 from __future__ import annotations
 
 import json
-import struct
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache
@@ -14,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 import typer.main
 
 from cell.apps.cli import main
@@ -53,21 +53,15 @@ def pose(*numbers: float) -> str:
     return f"{{ translation = [{', '.join(moved)}], rotation = [{', '.join(turned)}] }}"
 
 
-def write_stl(path: Path, size: tuple[float, float] = (0.07, 0.036), height: float = 0.008, at: float = 0.0) -> None:
-    """A small binary STL: a slightly bent sheet around (at, 0), m."""
-    x, y = (np.linspace(-side / 2, side / 2, 8) for side in size)
-    grid = np.array([[(a + at, b, height * (1 - (a / size[0]) ** 2)) for b in y] for a in x])
-    corners = [
-        corner
-        for i in range(7)
-        for j in range(7)
-        for corner in (
-            (grid[i, j], grid[i + 1, j], grid[i + 1, j + 1]),
-            (grid[i, j], grid[i + 1, j + 1], grid[i, j + 1]),
-        )
-    ]
-    facets = b"".join(struct.pack("<12fH", 0, 0, 0, *np.ravel(corner), 0) for corner in corners)
-    path.write_bytes(bytes(80) + struct.pack("<I", len(corners)) + facets)
+def write_mesh(path: Path, size: tuple[float, float] = (0.07, 0.036), height: float = 0.008, at: float = 0.0) -> None:
+    """A small mesh: a slightly bent sheet around (at, 0), m."""
+    x, y = (
+        axis.ravel() for axis in np.meshgrid(*(np.linspace(-side / 2, side / 2, 8) for side in size), indexing="ij")
+    )
+    vertices = np.column_stack([x + at, y, height * (1 - (x / size[0]) ** 2)])
+    a = np.arange(64).reshape(8, 8)[:-1, :-1].ravel()
+    faces = np.concatenate([np.column_stack([a, a + 8, a + 9]), np.column_stack([a, a + 9, a + 1])])
+    trimesh.Trimesh(vertices, faces, process=False).export(path)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -82,7 +76,7 @@ def commands_put_together_once() -> Iterator[None]:
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder to work in, with a small mesh beside it all."""
     monkeypatch.chdir(tmp_path)
-    write_stl(tmp_path / "pot.stl")
+    write_mesh(tmp_path / "pot.ply")
     return tmp_path
 
 
@@ -365,10 +359,10 @@ def test_a_wrong_job_does_not_pass_the_check(
 ) -> None:
     (place / "text.stl").write_text("this is no mesh\n" * 40)
     (place / "empty.stl").write_bytes(b"")
-    write_stl(place / "nan.stl", height=float("nan"))
-    write_stl(place / "large.stl", (70.0, 36.0), 8.0)
-    write_stl(place / "aside.stl", at=0.3)
-    write_stl(place / "high.stl", height=0.14)
+    write_mesh(place / "nan.stl", height=float("nan"))
+    write_mesh(place / "large.stl", (70.0, 36.0), 8.0)
+    write_mesh(place / "aside.stl", at=0.3)
+    write_mesh(place / "high.stl", height=0.14)
     (place / "pot.toml").write_text(changed(job_path("pot").read_text(), key, value))
     assert_refused(*cell("check", "-j", "pot.toml"), words)
 
@@ -448,7 +442,7 @@ def test_a_right_job_passes(cell: Run, place: Path, key: str, value: str) -> Non
 
 
 def test_a_mesh_in_millimetres_passes_with_its_unit(cell: Run, place: Path) -> None:
-    write_stl(place / "pot.stl", (70.0, 36.0), 8.0)
+    write_mesh(place / "pot.ply", (70.0, 36.0), 8.0)
     (place / "pot.toml").write_text(changed(job_path("pot").read_text(), "surface.mesh_unit", '"mm"'))
     assert cell("check")[0] == 0
 
@@ -495,7 +489,7 @@ def test_a_file_that_is_none_is_refused(
         (("check", "-j", "."), ("neither a file",)),
         (("check", "-j", "../../pot"), ("neither a file",)),
         (("check", "-j", "gone.toml"), ("gone.toml does not exist", "cell new-job")),
-        (("init", "pot.stl"), ("pot.stl", "is no folder")),
+        (("init", "pot.ply"), ("pot.ply", "is no folder")),
         (("init", "-j", "teapot"), ("teapot",)),
         (("run",), ("there is no cell.toml", "-c FILE", "cell init", "`cell run --sim all`")),
         (("home",), ("there is no cell.toml", "`cell home --sim all`")),
@@ -532,7 +526,7 @@ def test_a_file_that_is_none_is_refused(
         (("report",), ("no run at all",)),
         (("report", "nothing"), ("no run nothing",)),
         (("report", "../../etc"), ("no run ../../etc",)),
-        (("report", "pot.stl"), ("no run pot.stl",)),
+        (("report", "pot.ply"), ("no run pot.ply",)),
         (("report", ""), ("no run",)),
         (("resume", "nothing"), ("no run nothing",)),
         (("abort", "nothing"), ("no run nothing",)),
@@ -542,16 +536,16 @@ def test_a_file_that_is_none_is_refused(
         (("export", "--format", "doc"), ("--format",)),
         (("runs", "-c", "gone.toml"), ("gone.toml does not exist",)),
         (("calibrate", "--from", "gone", "--board", "chessboard:7x6:10mm"), ("gone", "not a folder")),
-        (("calibrate", "--from", "pot.stl", "--board", "chessboard:7x6:10mm"), ("pot.stl", "not a folder")),
+        (("calibrate", "--from", "pot.ply", "--board", "chessboard:7x6:10mm"), ("pot.ply", "not a folder")),
         (("calibrate", "--from", ".", "--board", "chessboard:7x6:10mm"), ("holds no pictures",)),
         (("calibrate", "--from", "."), ("--board",)),
         (("calibrate", "--board", "chessboard:7x6:10mm"), ("--board belongs to --from",)),
         (("calibrate", "--from", ".", "--board", "chess:7x6"), ("chess:7x6",)),
         (("calibrate", "solve", "gone.npz"), ("gone.npz",)),
-        (("calibrate", "solve", "pot.stl"), ("pot.stl",)),
+        (("calibrate", "solve", "pot.ply"), ("pot.ply",)),
         (("sim", "serve", "--job", "teapot"), ("teapot", "pot")),
         (("sim", "fill"), ("there is no cell.toml",)),
-        (("sim", "serve", "--config-out", "pot.stl"), ("exists already",)),
+        (("sim", "serve", "--config-out", "pot.ply"), ("exists already",)),
         (("sim", "serve", "--config-out", "no/such/sim.toml"), ("no/such",)),
         (("fly",), ("No such command",)),
         (("check", "--colour"), ("No such option",)),

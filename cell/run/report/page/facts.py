@@ -1,9 +1,10 @@
-"""The tables of a page: who was there, what was judged, and what was assumed. Values are text, not yet escaped."""
+"""The verdict and the tables of a page: what was used, what was judged, and nominal beside actual; all of it text."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,28 @@ K95 = 1.96
 AXES = "xyz"
 
 
-def verdict(report: Mapping[str, Any]) -> tuple[str, bool]:
-    """The outcome beside the tolerance in one line, and whether it is a good one."""
-    outcome, bound, truth = str(report["outcome"]), report.get("place_bound_95"), report.get("truth")
+@dataclass(frozen=True)
+class RunVerdict:
+    """What a run came to in one line, beside the tolerance, and whether its outcome is a good one."""
+
+    words: str
+    good: bool
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """A row of a table; with `kept` False its figure is outside its limit."""
+
+    cells: Row
+    kept: bool = True
+
+
+def verdict(report: Mapping[str, Any]) -> RunVerdict:
+    """The errors beside the tolerance."""
+    bound, truth = report.get("place_bound_95"), report.get("truth")
     tolerance = (report.get("tolerance") or {}).get("translation_mm")
-    outside = [row for row in report.get("measured") or () if not row.get("kept", True)]
-    words = [outcome]
+    outside = sum(not row.kept for row in judged(report))
+    words = []
     if truth is not None:
         words.append(f"true place error at most {truth['error_mm']['d']['max']:.3f} mm (simulated world)")
     if bound is not None:
@@ -29,13 +46,11 @@ def verdict(report: Mapping[str, Any]) -> tuple[str, bool]:
     if tolerance is not None and (truth is not None or bound is not None):
         words.append(f"tolerance {tolerance:g} mm")
     if outside:
-        words.append(
-            "one figure outside its limit" if len(outside) == 1 else f"{len(outside)} figures outside their limits"
-        )
-    return "; ".join(words), outcome in ("placed", "done") and not outside
+        words.append("one figure outside its limit" if outside == 1 else f"{outside} figures outside their limits")
+    return RunVerdict("; ".join(words), report["outcome"] in ("placed", "done") and not outside)
 
 
-def identities(folder: Path, report: Mapping[str, Any]) -> list[Row]:
+def identities(folder: Path, report: Mapping[str, Any]) -> list[TableRow]:
     """What the run was: cell, devices, job, calibration with its age, configuration, program."""
     rows: list[Row] = [("run", str(report.get("run", folder.name))), ("cell", str(report.get("cell", "")))]
     if words := simulated_words(report.get("simulated")):
@@ -43,12 +58,10 @@ def identities(folder: Path, report: Mapping[str, Any]) -> list[Row]:
     rows.append(("begun", str(report.get("started", "")).replace("T", " ")))
     rows.append(("ended", str(report.get("ended") or "not ended").replace("T", " ")))
     if report.get("kind", "job") == "job":
-        mesh = report.get("mesh") or {}
         rows.append(("job", f"{report.get('job')}, hash {report.get('job_hash')}"))
-        if mesh:
-            rows.append(
-                ("drawn surface", f"{Path(str(mesh.get('file'))).name}, SHA-256 {str(mesh.get('sha256'))[:16]}")
-            )
+        if mesh := report.get("mesh"):
+            name, digest = Path(str(mesh.get("file"))).name, str(mesh.get("sha256"))
+            rows.append(("drawn surface", f"{name}, SHA-256 {digest[:16]}"))
     calibration = _calibration(folder)
     if report.get("calibration_hash"):
         rows.append(("calibration", f"hash {report['calibration_hash']}, {_age(calibration, report)}"))
@@ -59,7 +72,7 @@ def identities(folder: Path, report: Mapping[str, Any]) -> list[Row]:
     if report.get("configuration_hash"):
         rows.append(("configuration", f"hash {report['configuration_hash']}"))
     rows.append(("program", f"assembly-cell {report.get('version', 'of another version')}"))
-    return rows
+    return [TableRow(row) for row in rows]
 
 
 def _calibration(folder: Path) -> dict[str, Any]:
@@ -80,25 +93,21 @@ def _age(calibration: Mapping[str, Any], report: Mapping[str, Any]) -> str:
     return f"{date}, {seconds / size:.0f} {unit} before the run"
 
 
-COMPARED: Row = ("quantity", "nominal", "actual", "deviation", "tolerance", "uncertainty (95 %)")
+def compared(report: Mapping[str, Any]) -> list[TableRow]:
+    """Where the surface was found, where the part ended, and where it was first touched.
 
-
-def compared(report: Mapping[str, Any]) -> list[Row]:
-    """Rows of `COMPARED`: where the surface was found, where the part ended, and where it was first touched.
-
-    The surface may lie anywhere: the part goes with it. What has to keep the tolerance is the part on the surface.
+    Cells: quantity, nominal, actual, deviation, tolerance, uncertainty (95 %). The surface may lie anywhere: the part
+    goes with it. What has to keep the tolerance is the part on the surface.
     """
     rows: list[Row] = []
     found = _result(report, "invert_pose")
     tolerance = report.get("tolerance") or {}
     if found is not None and report.get("place_pose") and report.get("place_sigma"):
         sigma = report["place_sigma"]
-        for axis, off, one in zip(AXES, found["correction_mm"], sigma["translation_mm"], strict=True):
-            rows.append((f"surface {axis}, from the board", "0 mm", f"{off:+.3f} mm", f"{off:+.3f} mm", "follows it",
-                         f"± {K95 * one:.3f} mm"))  # fmt: skip
-        for axis, off, one in zip(AXES, found["correction_mrad"], sigma["rotation_mrad"], strict=True):
-            rows.append((f"surface about {axis}, from the board", "0 mrad", f"{off:+.3f} mrad", f"{off:+.3f} mrad",
-                         "follows it", f"± {K95 * one:.3f} mrad"))  # fmt: skip
+        for about, unit, sigmas in (("", "mm", "translation_mm"), ("about ", "mrad", "rotation_mrad")):
+            for axis, off, one in zip(AXES, found[f"correction_{unit}"], sigma[sigmas], strict=True):
+                shown, unsure = f"{off:+.3f} {unit}", f"± {K95 * one:.3f} {unit}"
+                rows.append((f"surface {about}{axis}, from the board", f"0 {unit}", shown, shown, "follows it", unsure))
     bound, truth = report.get("place_bound_95"), report.get("truth")
     if bound is not None:
         allowed = f"at most {tolerance['translation_mm']:g} mm" if "translation_mm" in tolerance else ""
@@ -112,13 +121,9 @@ def compared(report: Mapping[str, Any]) -> list[Row]:
     if touch is not None:
         felt = (f"{touch[key]:.3f} mm" for key in ("expected_mm", "felt_mm"))
         off, unsure = f"{touch['off_mm']:+.3f} mm", f"± {K95 * touch['sigma_mm']:.3f} mm"
-        rows.append(("first touch above the place", *felt, off, _touch_limit(report), unsure))
-    return rows
-
-
-def _touch_limit(report: Mapping[str, Any]) -> str:
-    row = next((row for row in report.get("measured") or () if str(row["name"]).startswith("first touch")), None)
-    return "" if row is None else shown_limit(row)
+        limit = next((row.cells[2] for row in judged(report) if row.cells[0].startswith("first touch")), "")
+        rows.append(("first touch above the place", *felt, off, limit, unsure))
+    return [TableRow(row) for row in rows]
 
 
 def _result(report: Mapping[str, Any], step: str) -> Mapping[str, Any] | None:
@@ -126,9 +131,9 @@ def _result(report: Mapping[str, Any], step: str) -> Mapping[str, Any] | None:
     return made if isinstance(made, dict) and "summary_missing" not in made else None
 
 
-def judged(report: Mapping[str, Any]) -> list[tuple[Row, bool]]:
+def judged(report: Mapping[str, Any]) -> list[TableRow]:
     """Every figure beside its limit, and whether it keeps it."""
     return [
-        ((str(row["name"]), shown_value(row), shown_limit(row)), bool(row.get("kept", True)))
+        TableRow((str(row["name"]), shown_value(row), shown_limit(row)), bool(row.get("kept", True)))
         for row in report.get("measured") or ()
     ]

@@ -114,7 +114,7 @@ def wait_for_end(folder: Path, before: set[Path]) -> None:
 def test_an_arm_whose_states_all_come_late_does_not_sweep(place: Path) -> None:
     shipped = (files("cell") / "jobs" / "pot.toml").read_text()
     (place / "arm.toml").write_text(
-        shipped.replace('mode = "rail"', 'mode = "arm"').replace("pot.stl", str(files("cell") / "jobs" / "pot.stl"))
+        shipped.replace('mode = "rail"', 'mode = "arm"').replace("pot.ply", str(files("cell") / "jobs" / "pot.ply"))
     )
     report = dry_run(place, "arm.late_states@laser_sweep:0%", job="arm")
     assert report["outcome"] == "faulted"

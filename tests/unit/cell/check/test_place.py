@@ -54,27 +54,27 @@ def test_the_jobs_that_ship_make_sense(name: str, config: CellConfig) -> None:
         ("grasp.sigma", "5 mm", "leave 5 mm open"),
         ("grasp.sigma_angle", "50 mrad", "leave 50 mrad open"),
         ("grasp.size", ["400 mm", "400 mm", "20 mm"], "1 % of the part's footprint"),
-        ("grasp.size", ["70 mm", "36 mm", "1 mm"], "goes through the whole part, 8.39 mm"),
+        ("grasp.size", ["70 mm", "36 mm", "1 mm"], "goes through the whole part, 8.38 mm"),
         ("scan.exposure", "30 ms", "smears a line by 0.45 mm"),
-        ("place.surface_from_part.translation", ["0 mm", "0 mm", "10 mm"], "1.61 mm below .* in the air"),
+        ("place.surface_from_part.translation", ["0 mm", "0 mm", "10 mm"], "1.62 mm below .* in the air"),
         ("place.surface_from_part.translation", ["40 mm", "0 mm", "0 mm"], "43 % of the part's footprint"),
         ("place.surface_from_part.translation", ["300 mm", "0 mm", "0 mm"], "0 % of the part's footprint"),
     ],
 )
 def test_a_senseless_put_down_is_refused_with_its_number(key: str, value: Any, told: str, config: CellConfig) -> None:
-    problems = list(contact_problems(changed(key, value), config, POT.with_suffix(".stl")))
+    problems = list(contact_problems(changed(key, value), config, POT.with_suffix(".ply")))
     assert any(re.search(told, problem) for problem in problems), problems
 
 
 def test_a_part_whose_lowest_plane_ends_over_the_surface_comes_down_onto_it(config: CellConfig) -> None:
     """The surface lies 0.1 mm below that plane, within `place.contact_travel`."""
     higher = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "8.49 mm"])
-    assert under_part(higher, POT.with_suffix(".stl"))[1] == pytest.approx(-0.1e-3, abs=0.02e-3)
-    assert list(contact_problems(higher, config, POT.with_suffix(".stl"))) == []
+    assert under_part(higher, POT.with_suffix(".ply"))[1] == pytest.approx(-0.1e-3, abs=0.02e-3)
+    assert list(contact_problems(higher, config, POT.with_suffix(".ply"))) == []
 
 
 def test_how_deep_the_surface_reaches_into_the_part_is_noted() -> None:
-    mesh: Path = POT.with_suffix(".stl")
+    mesh: Path = POT.with_suffix(".ply")
     deeper = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "-5 mm"])
     assert "13.4 mm into the part's box of 20 mm" in next(contact_notes(deeper, mesh))
 

@@ -261,7 +261,7 @@ def test_a_job_that_does_not_exist_lists_those_that_do() -> None:
 def test_a_job_that_asks_too_much_of_the_cell_is_refused(tmp_path: Path, edit: tuple[str, str], words: str) -> None:
     source = job_path("pot")
     path = tmp_path / "mine.toml"
-    path.write_text(source.read_text().replace(*edit).replace("pot.stl", str(source.parent / "pot.stl")))
+    path.write_text(source.read_text().replace(*edit).replace("pot.ply", str(source.parent / "pot.ply")))
     job, mesh = load_job(path)
     with pytest.raises(ConfigError, match=re.escape(words)):
         require_fit(job, load_config(None), mesh)

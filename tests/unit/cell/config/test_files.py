@@ -116,7 +116,7 @@ def test_check_reads_the_local_files_and_says_which(cell: Callable[..., tuple[in
     told = json.loads(cell("check", "--json")[1])
     assert (told["ok"], told["configuration"], told["job_file"]) == (True, "cell.toml", "pot.toml")
     assert told["job"] == "pot"
-    assert told["mesh"] == "pot.stl"
+    assert told["mesh"] == "pot.ply"
     assert any("192.0.2.10" in note for note in told["notes"])
     Path("cell.toml").write_text(default_toml().replace('lead = "2 mm"', 'lead = "2"'))
     assert cell("check")[0] == 2

@@ -19,8 +19,8 @@ def test_every_shipped_job_is_valid(name: str) -> None:
 
 def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(job_path("pot").read_text().replace("pot.stl", "gone.stl"))
-    with pytest.raises(ConfigError, match=r"gone\.stl"):
+    path.write_text(job_path("pot").read_text().replace("pot.ply", "gone.ply"))
+    with pytest.raises(ConfigError, match=r"gone\.ply"):
         load_job(path)
 
 

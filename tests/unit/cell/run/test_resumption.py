@@ -129,7 +129,7 @@ def test_a_sweep_that_a_fault_ended_is_repeated_only_after_another_look_at_the_b
 def cut_short(folder: Path, **other: Any) -> tuple[UnfinishedRun, Path]:
     """A run with its own copy of a job that was killed after its sweep."""
     jobs = Path(str(files("cell") / "jobs"))
-    for name in ("pot.toml", "pot.stl"):
+    for name in ("pot.toml", "pot.ply"):
         shutil.copyfile(jobs / name, folder / name)
     run = folder / "run"
     run.mkdir()
@@ -145,7 +145,7 @@ def cut_short(folder: Path, **other: Any) -> tuple[UnfinishedRun, Path]:
     return UnfinishedRun.find(run, scripted=True), job
 
 
-@pytest.mark.parametrize("name", ["pot.toml", "pot.stl"])
+@pytest.mark.parametrize("name", ["pot.toml", "pot.ply"])
 def test_a_run_whose_job_was_changed_is_not_resumed(tmp_path: Path, name: str) -> None:
     run, _ = cut_short(tmp_path)
     assert run.job == str(tmp_path / "pot.toml")

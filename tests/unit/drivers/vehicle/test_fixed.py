@@ -72,7 +72,7 @@ def fixed_cell(folder: Path) -> Path:
 
 def job_at(folder: Path, *, target: str = "-1050 mm", start: str = "-600 mm") -> Path:
     """The job `pot` with its target so far from the place, and its start so high."""
-    shutil.copy(JOB_FILE.parent / "pot.stl", folder)
+    shutil.copy(JOB_FILE.parent / "pot.ply", folder)
     text = JOB_FILE.read_text(encoding="utf-8")
     text = text.replace('target = { translation = ["-1050 mm"', f'target = {{ translation = ["{target}"')
     text = text.replace('["-3050 mm", "0 mm", "-600 mm"]', f'["-3050 mm", "0 mm", "{start}"]')

@@ -66,15 +66,15 @@ def test_what_ships_describes_the_stock_cell_to_the_last_bit(job: str) -> None:
 
 
 def test_a_copy_of_a_shipped_mesh_is_known_by_what_is_in_it_not_by_its_name(tmp_path: Path) -> None:
-    own = {"surface": {"mesh": '"mine.stl"'}}
+    own = {"surface": {"mesh": '"mine.ply"'}}
     described(tmp_path, None, own)
     pot = load_job("pot")[1]
-    (tmp_path / "mine.stl").write_bytes(pot.read_bytes())
+    (tmp_path / "mine.ply").write_bytes(pot.read_bytes())
     assert drawing(tmp_path, None, own).station.surface == "pot"
     cell, job = described(tmp_path / "other", None, {"surface": {"mesh_unit": '"mm"'}})
-    write_saddle(job.parent / "pot.stl")
+    write_saddle(job.parent / "pot.ply")
     drawn = Described.of(job).drawing(load_config(cell))
-    assert drawn.station.mesh == str(job.parent / "pot.stl")
+    assert drawn.station.mesh == str(job.parent / "pot.ply")
     middle = np.zeros(1)
     assert World(1, "ideal", drawing=drawn).station.ground.height(middle, middle) == pytest.approx(
         saddle(0.0, 0.0), abs=1e-5

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import struct
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from sim_backends.world.bodies import surfaces
 from sim_backends.world.bodies.surfaces import SURFACES, mesh, surface
 
 NAMES = sorted(SURFACES)
@@ -81,19 +77,6 @@ def test_mesh_lies_on_the_closed_form_and_closes_down_to_the_table(name: str) ->
     assert normals.sum(axis=0) / 2 == pytest.approx(
         [0.0, 0.0, 4 * surface(name).half_x * surface(name).half_y], abs=1e-12
     )
-
-
-def test_exported_stl_is_the_mesh_in_metres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = tmp_path / "pot.stl"
-    assert surfaces.main(["pot", str(file), "--triangles", "5000"]) == 0
-    assert "metres" in capsys.readouterr().out
-    data = file.read_bytes()
-    (count,) = struct.unpack_from("<I", data, 80)
-    expected = mesh("pot", 5000, walls=False)
-    assert count == len(expected.triangles)
-    assert len(data) == 84 + 50 * count
-    first = np.frombuffer(data, dtype="<f4", count=12, offset=84)
-    assert first[3:].reshape(3, 3) == pytest.approx(expected.vertices[expected.triangles[0]], abs=1e-8)
 
 
 def test_unknown_names_and_coarse_meshes_are_refused() -> None:
