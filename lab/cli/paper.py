@@ -29,7 +29,7 @@ def figure2(json: JsonOption = False, out: OutOption = None) -> None:
     result = numbers()
     _show(result, json, out, "figure2")
     if out is not None:
-        from lab.paper.figure2_pictures import draw
+        from lab.paper.figure2 import draw
 
         path = out / "figure2_errors.png"
         draw(path)
@@ -40,7 +40,7 @@ def figure2(json: JsonOption = False, out: OutOption = None) -> None:
 @paper.command()
 def equations(json: JsonOption = False, out: OutOption = None) -> None:
     """Equations (1) to (6) as printed and as corrected, held against ray-traced truth."""
-    from lab.paper.equation_table import equation_table
+    from lab.paper.equations import equation_table
 
     _show(equation_table(), json, out, "equations")
 

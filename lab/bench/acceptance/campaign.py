@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from cell.measure.reconstruction import Cloud
 from drivers.errors import RefusedError
 from lab.bench.acceptance import artefacts
-from lab.paper.rig import Noise, RigSpec, draw_head, observe
-from lab.paper.solved import in_scan_frame, solve
+from lab.paper.rig import Noise, RigSpec, draw_head, in_scan_frame, observe, solve
 from sim_backends.world.levels import deviations
 
 Array = NDArray[np.float64]
