@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.recordings.consistency import board_shifts, odd_turns, orders, turn_votes, weighted_median
+from cell.apps.recordings.consistency import board_shifts, odd_turns, orders, turn_votes, turns_between, weighted_median
 from cell.apps.recordings.conventions import FORM, TRIED, PoseReading, readings_of, why_not
+from cell.apps.recordings.frames import near
 from cell.apps.recordings.series import Series
 from cell.measure.calibration.solve.hand_eye import park_martin
 from cell.measure.geometry.camera import Array
@@ -200,11 +201,12 @@ def _same(a: Fit, b: Fit, boards: dict[int, list[pin.SE3]]) -> bool:
     """True where both readings give the same poses, from another file in another unit maybe."""
     first, second = a.series.poses(a.reading), b.series.poses(b.reading)
     both = [k for k in first if k in second and k in boards]
-    return a.setup == b.setup and len(both) >= 3 and all(
-        _angle(first[k].rotation, second[k].rotation) < SAME_RAD
-        and np.linalg.norm(UNITS[a.unit] * first[k].translation - UNITS[b.unit] * second[k].translation) < SAME_M
-        for k in both
-    )  # fmt: skip
+    poses = [
+        [from_parts(UNITS[fit.unit] * told[k].translation, told[k].rotation) for k in both]
+        for fit, told in ((a, first), (b, second))
+    ]
+    alike = (near(one, other, SAME_M, SAME_RAD) for one, other in zip(*poses, strict=True))
+    return a.setup == b.setup and len(both) >= 3 and all(alike)
 
 
 def _fits_of(one: Series, reading: PoseReading, boards: dict[int, list[pin.SE3]], setup: str | None) -> list[Fit]:
@@ -230,8 +232,8 @@ def _fits_of(one: Series, reading: PoseReading, boards: dict[int, list[pin.SE3]]
         unit = min(offs, key=lambda u: float(np.median(offs[u])))
         # A pose that is far from all others, in another unit for example, tells nothing of the unit of these.
         off = offs[unit]
-        near = np.flatnonzero(off <= max(FAR_RATIO * float(np.median(off)), FAR_SHARE * reach))
-        off, scale, sigma, place = board_shifts([flanges[k] for k in near], [seen[k] for k in near], rotation, None)
+        close = np.flatnonzero(off <= max(FAR_RATIO * float(np.median(off)), FAR_SHARE * reach))
+        off, scale, sigma, place = board_shifts([flanges[k] for k in close], [seen[k] for k in close], rotation, None)
         # The unit nearest to what fits best, where that is a size at all; else that which leaves least.
         if scale > 4 * sigma > 0:
             unit = min(offs, key=lambda u: abs(math.log(scale / UNITS[u])))
@@ -240,7 +242,7 @@ def _fits_of(one: Series, reading: PoseReading, boards: dict[int, list[pin.SE3]]
         small = abs(scale / size - 1) > SCALE_WRONG or scale < SCALE_SIGMAS * sigma
         score = turn + shift / reach + (1.0 if small else 0.0)
         hand = from_parts(place, rotation)
-        stands = from_parts(scale * flanges[near[0]].translation, flanges[near[0]].rotation) * hand * seen[near[0]]
+        stands = from_parts(scale * flanges[close[0]].translation, flanges[close[0]].rotation) * hand * seen[close[0]]
         scaled = scale / size, sigma / size, float(np.median(off))
         found.append(Fit(one, reading, side, unit, turn, shift, score, *scaled, reach, hand, stands))
     return found
@@ -256,8 +258,8 @@ def _rotation(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Ar
     rotation, turn = np.eye(3), math.inf
     for _ in range(3):
         rotation = park_martin([flanges[k] for k in kept], [boards[k] for k in kept])
-        there = [f.rotation @ rotation @ b.rotation for f, b in zip(flanges, boards, strict=True)]
-        apart = np.array([[_angle(a, b) for b in there] for a in there])
+        hand = from_parts((0.0, 0.0, 0.0), rotation)
+        apart = turns_between([f * hand * b for f, b in zip(flanges, boards, strict=True)])
         typical = weighted_median(apart, votes)
         middle = int(np.argmin(typical))
         turn = float(typical[middle])
@@ -271,8 +273,3 @@ def _rotation(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Ar
 def _axes(rotation: Array) -> bool:
     """True for a rotation (3, 3) that only exchanges axes, or none."""
     return bool(np.all((np.abs(rotation) < OWN_TURN) | (np.abs(rotation) > 1 - OWN_TURN)))
-
-
-def _angle(a: Array, b: Array) -> float:
-    """Angle in rad between two rotations (3, 3)."""
-    return math.acos(max(-1.0, min(1.0, 0.5 * (float(np.sum(a * b)) - 1))))

@@ -123,8 +123,7 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     result["notes"] += doubtful
     result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread, *strange]]
     _from_frames(frames, belonging + late, options, result)
-    rms = result.pop("frames_rms")
-    result["frames"] = [frame_dict(frame, rms) for frame in frames]
+    result["frames"] = [frame_dict(frame) for frame in frames]
     return result
 
 

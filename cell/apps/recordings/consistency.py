@@ -51,7 +51,8 @@ def orders(flanges: Sequence[pin.SE3], options: Sequence[Sequence[pin.SE3]]) -> 
     """
     of = np.repeat(np.arange(len(options)), [len(poses) for poses in options])
     first = np.concatenate([[0], np.cumsum([len(poses) for poses in options])[:-1]])
-    apart = np.abs(_turns([flanges[k] for k in of.tolist()]) - _turns([pose for poses in options for pose in poses]))
+    seen = [pose for poses in options for pose in poses]
+    apart = np.abs(turns_between([flanges[k] for k in of.tolist()]) - turns_between(seen))
     best: tuple[float, int, list[int]] | None = None
     references: list[int] = np.unique(np.linspace(0, len(options) - 1, REFERENCES).astype(int)).tolist()
     for k in references:
@@ -111,7 +112,7 @@ def odd_turns(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict[int
     Nothing is odd where most frames disagree with most others: then it is the poses that are read wrongly.
     """
     count = len(flanges)
-    apart, votes = np.abs(_turns(flanges) - _turns(boards)), turn_votes(flanges, boards)
+    apart, votes = np.abs(turns_between(flanges) - turns_between(boards)), turn_votes(flanges, boards)
     odd: dict[int, float] = {}
     index = list(range(count))
     while len(index) > 2:
@@ -201,7 +202,7 @@ def turn_votes(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
 
     By the smaller turn of flange and board: a picture that is the wrong way round must not outvote the others.
     """
-    votes = np.sin(0.5 * np.minimum(_turns(flanges), _turns(boards))) ** 2
+    votes = np.sin(0.5 * np.minimum(turns_between(flanges), turns_between(boards))) ** 2
     np.fill_diagonal(votes, 0.0)
     return np.asarray(votes)
 
@@ -214,7 +215,7 @@ def weighted_median(values: Array, weights: Array) -> Array:
     return np.asarray(np.take_along_axis(np.take_along_axis(values, order, -1), middle[..., None], -1)[..., 0])
 
 
-def _turns(poses: Sequence[pin.SE3]) -> Array:
+def turns_between(poses: Sequence[pin.SE3]) -> Array:
     """Angles (n, n) in rad between the rotations of each two poses."""
     rotations = np.array([p.rotation for p in poses]).reshape(-1, 3, 3)
     traces = np.einsum("aij,bij->ab", rotations, rotations)
