@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -24,13 +24,12 @@ def figure2(json: JsonOption = False, out: OutOption = None) -> None:
 
     With --out it also draws figure2_errors.png.
     """
-    from lab.cli.paper_tables import print_figure2
     from lab.paper.figure2 import figure2 as numbers
 
     result = numbers()
-    _show(result, json, out, "figure2", print_figure2)
+    _show(result, json, out, "figure2")
     if out is not None:
-        from lab.paper.figure2_pictures import draw
+        from lab.paper.figure2 import draw
 
         path = out / "figure2_errors.png"
         draw(path)
@@ -41,26 +40,24 @@ def figure2(json: JsonOption = False, out: OutOption = None) -> None:
 @paper.command()
 def equations(json: JsonOption = False, out: OutOption = None) -> None:
     """Equations (1) to (6) as printed and as corrected, held against ray-traced truth."""
-    from lab.cli.paper_tables import print_equations
-    from lab.paper.equation_table import equation_table
+    from lab.paper.equations import equation_table
 
-    _show(equation_table(), json, out, "equations", print_equations)
+    _show(equation_table(), json, out, "equations")
 
 
 @paper.command()
 def table1(seeds: SeedsOption = 20, json: JsonOption = False, out: OutOption = None) -> None:
     """Section 5.2 and Table 1 in simulation: before and after calibration, outliers found, beside the paper's."""
-    from lab.cli.paper_tables import print_table1
     from lab.paper.table1 import table1 as campaign
 
     with bar() as told:
         result = campaign(range(seeds), 0, lambda done, total: told(done, "heads", total))
-    _show(result, json, out, "table1", print_table1)
+    _show(result, json, out, "table1")
 
 
-def _show(result: dict[str, Any], json: bool, out: Path | None, name: str, table: Any) -> None:
-    """Print as JSON or as a table, and keep the numbers in the folder."""
-    show(result, json, table)
+def _show(result: dict[str, object], json: bool, out: Path | None, name: str) -> None:
+    """Print as JSON or as tables, and keep the numbers in the folder."""
+    show(result, json)
     if out is not None:
         from cell.run.folder import write_json
 

@@ -1,10 +1,11 @@
 """Figure 2 in numbers: what 30 and 35 mm of baseline give, which rule chooses 35 mm, and where the paper is wrong.
 
-docs/explanation/theory.md, section 3; the functions behind it are in `design`, the picture in `figure2_pictures`.
+docs/explanation/theory.md, section 3; the functions behind it are in `design`.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -32,9 +33,9 @@ CLAIMS = ((0.030, 0.5e-3), (0.035, 0.2e-3))
 FOCALS = (6.54e-3, 8e-3, 12e-3, 16e-3)
 GRID = tuple(round(0.005 * k, 3) for k in range(4, 17))
 """Baselines on a 5 mm grid, m."""
-SHOWN_UNIFORMITY = (0.020, 0.030, 0.035, 0.050, 0.080)
 DEMAND = 0.2e-3
 STRUCTURE_CLAIM = 0.1e-3
+LEVELS_MM = (0.02, 0.05, 0.1, 0.2)
 
 
 def smallest_baseline(delta: float, demand: float = DEMAND) -> float | None:
@@ -92,12 +93,7 @@ def figure2() -> dict[str, Any]:
                 / peak_power(Head.at_stand_off(0.030, FOCAL), 0.0, light)
                 - 1
             ),
-            "uniformity": {
-                f"{1e3 * baseline:g}": uniformity(Head.at_stand_off(baseline, FOCAL), light)
-                for baseline in SHOWN_UNIFORMITY
-            },
         },
-        "tan_3_5": [_fixed_theta(baseline) for baseline in BASELINES],
         "statements": statements(),
     }
 
@@ -193,15 +189,42 @@ def _row(baseline: float, light: Light) -> dict[str, float]:
         "uniformity": uniformity(head, light),
         "near_mm": 1e3 * near,
         "far_mm": 1e3 * far,
-        "vanishing_mm": 1e3 * head.vanishing,
     }
 
 
-def _fixed_theta(baseline: float) -> dict[str, float]:
-    head = Head(baseline, FOCAL, float(np.arctan(TAN_THETA)))
-    return {
-        "baseline_mm": 1e3 * baseline,
-        "stand_off_mm": 1e3 * head.stand_off,
-        "largest_dz_mm": 1e3 * largest_dz(head, DELTA),
-        "delta_um_for_0.1_mm": 1e6 * delta_limit(head, STRUCTURE_CLAIM),
-    }
+def draw(path: Path) -> None:
+    """|dX|, |dY|, |dZ| over the sensor, a row for each baseline, all on one colour scale, as an image file."""
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13.5, 8.2), dpi=110, layout="constrained")
+    figure.suptitle(
+        f"Error over the sensor: f = {1e3 * FOCAL:g} mm, light plane meets the axis at 150 mm, "
+        f"stripe error {1e6 * DELTA:.2f} µm (0.1 px of 4.8 µm)"
+    )
+    axes = figure.subplots(2, 3, sharex=True, sharey=True)
+    side = np.linspace(-HALF_SENSOR, HALF_SENSOR, 201)
+    found = [errors(Head.at_stand_off(b, FOCAL), side[None, :], side[:, None], DELTA) for b in BASELINES]
+    top = 1e3 * max(float(maps[name].max()) for maps in found for name in ("dx", "dy", "dz"))
+    shown = None
+    for row, (baseline, maps) in enumerate(zip(BASELINES, found, strict=True)):
+        for column, name in enumerate(("dx", "dy", "dz")):
+            place = axes[row, column]
+            values = 1e3 * maps[name]
+            shown = place.imshow(
+                values, extent=(-1, 1, -1, 1), origin="lower", cmap="viridis", norm=LogNorm(2e-3, top), aspect="equal"
+            )
+            lines = place.contour(1e3 * side, 1e3 * side, values, levels=LEVELS_MM, colors="white", linewidths=0.9)
+            place.clabel(lines, fmt="%g mm", fontsize=8)
+            place.set_title(f"|d{name[1].upper()}|, l = {1e3 * baseline:g} mm: largest {values.max():.3f} mm")
+            place.set_xticks([-1, -0.5, 0, 0.5, 1])
+            place.set_yticks([-1, -0.5, 0, 0.5, 1])
+            if row == 1:
+                place.set_xlabel("x' across the stripe in mm")
+            if column == 0:
+                place.set_ylabel("y' along the stripe in mm")
+    assert shown is not None
+    ticks = [t for t in (0.002, 0.005, 0.01, *LEVELS_MM, 0.5) if t <= top]
+    bar = figure.colorbar(shown, ax=axes, label="largest error in mm for stripe errors of ±δ (log)", shrink=0.85)
+    bar.set_ticks(ticks, labels=[f"{t:g}" for t in ticks])
+    figure.savefig(path)

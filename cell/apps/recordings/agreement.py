@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.recordings.consistency import odd_turns, orders, turn_votes, weighted_median
+from cell.apps.recordings.consistency import board_shifts, odd_turns, orders, turn_votes, turns_between, weighted_median
 from cell.apps.recordings.conventions import FORM, TRIED, PoseReading, readings_of, why_not
+from cell.apps.recordings.frames import near
 from cell.apps.recordings.series import Series
 from cell.measure.calibration.solve.starts import park_martin
 from cell.measure.geometry.camera import Array
@@ -24,7 +25,6 @@ from drivers.errors import RefusedError
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2}
 # So many frames tell the readings apart; more cost time.
 MOST_FRAMES = 24
-REWEIGHTINGS = 25
 # The size of the poses' unit is told from 0 by so many of its σ, and is that of the unit to this share.
 SCALE_SIGMAS, SCALE_WRONG = 4.0, 0.4
 # Boards further off than so many times the median, and than this share of their distance, have no say in it.
@@ -201,11 +201,12 @@ def _same(a: Fit, b: Fit, boards: dict[int, list[pin.SE3]]) -> bool:
     """True where both readings give the same poses, from another file in another unit maybe."""
     first, second = a.series.poses(a.reading), b.series.poses(b.reading)
     both = [k for k in first if k in second and k in boards]
-    return a.setup == b.setup and len(both) >= 3 and all(
-        _angle(first[k].rotation, second[k].rotation) < SAME_RAD
-        and np.linalg.norm(UNITS[a.unit] * first[k].translation - UNITS[b.unit] * second[k].translation) < SAME_M
-        for k in both
-    )  # fmt: skip
+    poses = [
+        [from_parts(UNITS[fit.unit] * told[k].translation, told[k].rotation) for k in both]
+        for fit, told in ((a, first), (b, second))
+    ]
+    alike = (near(one, other, SAME_M, SAME_RAD) for one, other in zip(*poses, strict=True))
+    return a.setup == b.setup and len(both) >= 3 and all(alike)
 
 
 def _fits_of(one: Series, reading: PoseReading, boards: dict[int, list[pin.SE3]], setup: str | None) -> list[Fit]:
@@ -227,12 +228,12 @@ def _fits_of(one: Series, reading: PoseReading, boards: dict[int, list[pin.SE3]]
         rotation, turn, kept = _rotation(flanges, seen)
         reach = float(np.median([np.linalg.norm(b.translation) for b in seen]))
         flanges, seen = [flanges[k] for k in kept], [seen[k] for k in kept]
-        offs = {unit: _shifts(flanges, seen, rotation, size)[0] for unit, size in UNITS.items()}
+        offs = {unit: board_shifts(flanges, seen, rotation, size)[0] for unit, size in UNITS.items()}
         unit = min(offs, key=lambda u: float(np.median(offs[u])))
         # A pose that is far from all others, in another unit for example, tells nothing of the unit of these.
         off = offs[unit]
-        near = np.flatnonzero(off <= max(FAR_RATIO * float(np.median(off)), FAR_SHARE * reach))
-        off, scale, sigma, place = _shifts([flanges[k] for k in near], [seen[k] for k in near], rotation, None)
+        close = np.flatnonzero(off <= max(FAR_RATIO * float(np.median(off)), FAR_SHARE * reach))
+        off, scale, sigma, place = board_shifts([flanges[k] for k in close], [seen[k] for k in close], rotation, None)
         # The unit nearest to what fits best, where that is a size at all; else that which leaves least.
         if scale > 4 * sigma > 0:
             unit = min(offs, key=lambda u: abs(math.log(scale / UNITS[u])))
@@ -241,7 +242,7 @@ def _fits_of(one: Series, reading: PoseReading, boards: dict[int, list[pin.SE3]]
         small = abs(scale / size - 1) > SCALE_WRONG or scale < SCALE_SIGMAS * sigma
         score = turn + shift / reach + (1.0 if small else 0.0)
         hand = from_parts(place, rotation)
-        stands = from_parts(scale * flanges[near[0]].translation, flanges[near[0]].rotation) * hand * seen[near[0]]
+        stands = from_parts(scale * flanges[close[0]].translation, flanges[close[0]].rotation) * hand * seen[close[0]]
         scaled = scale / size, sigma / size, float(np.median(off))
         found.append(Fit(one, reading, side, unit, turn, shift, score, *scaled, reach, hand, stands))
     return found
@@ -257,8 +258,8 @@ def _rotation(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Ar
     rotation, turn = np.eye(3), math.inf
     for _ in range(3):
         rotation = park_martin([flanges[k] for k in kept], [boards[k] for k in kept])
-        there = [f.rotation @ rotation @ b.rotation for f, b in zip(flanges, boards, strict=True)]
-        apart = np.array([[_angle(a, b) for b in there] for a in there])
+        hand = from_parts((0.0, 0.0, 0.0), rotation)
+        apart = turns_between([f * hand * b for f, b in zip(flanges, boards, strict=True)])
         typical = weighted_median(apart, votes)
         middle = int(np.argmin(typical))
         turn = float(typical[middle])
@@ -272,38 +273,3 @@ def _rotation(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Ar
 def _axes(rotation: Array) -> bool:
     """True for a rotation (3, 3) that only exchanges axes, or none."""
     return bool(np.all((np.abs(rotation) < OWN_TURN) | (np.abs(rotation) > 1 - OWN_TURN)))
-
-
-def _angle(a: Array, b: Array) -> float:
-    """Angle in rad between two rotations (3, 3)."""
-    return math.acos(max(-1.0, min(1.0, 0.5 * (float(np.sum(a * b)) - 1))))
-
-
-def _shifts(
-    flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], rotation: Array, size: float | None
-) -> tuple[Array, float, float, Array]:
-    """Distances (n,) in m of the boards' origins from one place, the size of the poses' unit in m with its σ, …
-
-    … and the camera's place (3,) in m in the flange. By least sum of distances; `size` None lets the unit's size be
-    found with the rest.
-    """
-    turns, ways = np.array([f.rotation for f in flanges]), np.array([f.translation for f in flanges])
-    right = turns @ rotation @ np.array([b.translation for b in boards])[:, :, None]
-    whole = np.concatenate([turns, np.broadcast_to(-np.eye(3), turns.shape), ways[:, :, None]], axis=2)
-    right = right[:, :, 0]
-    if size is not None:
-        whole, right = whole[:, :, :6], right + size * ways
-    # An arm's base may be metres away and its unit mm: columns of one size keep the system well conditioned.
-    norms = np.linalg.norm(whole.reshape(-1, whole.shape[2]), axis=0) + 1e-12
-    off = np.ones(len(whole))
-    for _ in range(REWEIGHTINGS):
-        root = np.sqrt(1 / np.maximum(off, 1e-4))[:, None]
-        a = (whole / norms * root[:, :, None]).reshape(-1, len(norms))
-        solution = np.linalg.lstsq(a, -(right * root).ravel(), rcond=None)[0]
-        off = np.linalg.norm(whole / norms @ solution + right, axis=1)
-    place = solution[:3] / norms[:3]
-    if size is not None:
-        return off, size, 0.0, place
-    left = float(np.sum((a @ solution + (right * root).ravel()) ** 2)) / max(1, a.shape[0] - a.shape[1])
-    sigma = math.sqrt(left * float(np.linalg.pinv(a.T @ a)[-1, -1]))
-    return off, float(solution[-1] / norms[-1]), float(sigma / norms[-1]), place

@@ -6,6 +6,7 @@ the hand-eye. It also settles the order of boards that look the same turned.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -50,7 +51,8 @@ def orders(flanges: Sequence[pin.SE3], options: Sequence[Sequence[pin.SE3]]) -> 
     """
     of = np.repeat(np.arange(len(options)), [len(poses) for poses in options])
     first = np.concatenate([[0], np.cumsum([len(poses) for poses in options])[:-1]])
-    apart = np.abs(_turns([flanges[k] for k in of.tolist()]) - _turns([pose for poses in options for pose in poses]))
+    seen = [pose for poses in options for pose in poses]
+    apart = np.abs(turns_between([flanges[k] for k in of.tolist()]) - turns_between(seen))
     best: tuple[float, int, list[int]] | None = None
     references: list[int] = np.unique(np.linspace(0, len(options) - 1, REFERENCES).astype(int)).tolist()
     for k in references:
@@ -110,7 +112,7 @@ def odd_turns(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict[int
     Nothing is odd where most frames disagree with most others: then it is the poses that are read wrongly.
     """
     count = len(flanges)
-    apart, votes = np.abs(_turns(flanges) - _turns(boards)), turn_votes(flanges, boards)
+    apart, votes = np.abs(turns_between(flanges) - turns_between(boards)), turn_votes(flanges, boards)
     odd: dict[int, float] = {}
     index = list(range(count))
     while len(index) > 2:
@@ -158,27 +160,41 @@ def _misplacements(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tup
     For the camera on the flange or standing before it, whichever fits better.
     """
     reach = np.array([np.linalg.norm(b.translation) for b in boards])
-    tried = [_away(poses, boards) for poses in (flanges, [f.inverse() for f in flanges])]
+    both = (flanges, [f.inverse() for f in flanges])
+    # The rotation is Park and Martin's, which wrong positions do not touch.
+    tried = [board_shifts(poses, boards, park_martin(poses, boards), 1.0)[0] for poses in both]
     return min(tried, key=lambda off: float(np.median(off))), reach
 
 
-def _away(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
-    """Distance (n,) in m of each board's origin from the place, in the base, with the least sum of distances.
+def board_shifts(
+    flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], rotation: Array, size: float | None
+) -> tuple[Array, float, float, Array]:
+    """How far boards lie from one place in the base, for the place of the camera that makes this least.
 
-    The rotation is Park and Martin's, which wrong positions do not touch; camera and board place by reweighting.
+    Returns the distances (n,) in m of their origins, the size of the poses' unit in m, its σ, and the camera's place
+    (3,) in m in the flange. `rotation` (3, 3) is flange_from_camera. The sum of the distances is least, by reweighting.
+    With `size` None the unit's size is found with the rest.
     """
-    rotation = park_martin(flanges, boards)
-    # R_F (R_X c + t) + t_F = b, linear in t and b.
-    design = np.array([np.hstack([f.rotation, -np.eye(3)]) for f in flanges])
-    known = np.array(
-        [f.rotation @ rotation @ c.translation + f.translation for f, c in zip(flanges, boards, strict=True)]
-    )
-    off = np.ones(len(flanges))
+    turns, ways = np.array([f.rotation for f in flanges]), np.array([f.translation for f in flanges])
+    right = turns @ rotation @ np.array([b.translation for b in boards])[:, :, None]
+    whole = np.concatenate([turns, np.broadcast_to(-np.eye(3), turns.shape), ways[:, :, None]], axis=2)
+    right = right[:, :, 0]
+    if size is not None:
+        whole, right = whole[:, :, :6], right + size * ways
+    # An arm's base may be metres away and its unit mm: columns of one size keep the system well conditioned.
+    norms = np.linalg.norm(whole.reshape(-1, whole.shape[2]), axis=0) + 1e-12
+    off = np.ones(len(whole))
     for _ in range(REWEIGHTINGS):
         root = np.sqrt(1 / np.maximum(off, LEAST_OFF_M))[:, None]
-        solution = np.linalg.lstsq((design * root[:, :, None]).reshape(-1, 6), -(known * root).ravel(), rcond=None)[0]
-        off = np.linalg.norm(design @ solution + known, axis=1)
-    return off
+        a = (whole / norms * root[:, :, None]).reshape(-1, len(norms))
+        solution = np.linalg.lstsq(a, -(right * root).ravel(), rcond=None)[0]
+        off = np.linalg.norm(whole / norms @ solution + right, axis=1)
+    place = solution[:3] / norms[:3]
+    if size is not None:
+        return off, size, 0.0, place
+    left = float(np.sum((a @ solution + (right * root).ravel()) ** 2)) / max(1, a.shape[0] - a.shape[1])
+    sigma = math.sqrt(left * float(np.linalg.pinv(a.T @ a)[-1, -1]))
+    return off, float(solution[-1] / norms[-1]), float(sigma / norms[-1]), place
 
 
 def turn_votes(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
@@ -186,7 +202,7 @@ def turn_votes(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> Array:
 
     By the smaller turn of flange and board: a picture that is the wrong way round must not outvote the others.
     """
-    votes = np.sin(0.5 * np.minimum(_turns(flanges), _turns(boards))) ** 2
+    votes = np.sin(0.5 * np.minimum(turns_between(flanges), turns_between(boards))) ** 2
     np.fill_diagonal(votes, 0.0)
     return np.asarray(votes)
 
@@ -199,7 +215,7 @@ def weighted_median(values: Array, weights: Array) -> Array:
     return np.asarray(np.take_along_axis(np.take_along_axis(values, order, -1), middle[..., None], -1)[..., 0])
 
 
-def _turns(poses: Sequence[pin.SE3]) -> Array:
+def turns_between(poses: Sequence[pin.SE3]) -> Array:
     """Angles (n, n) in rad between the rotations of each two poses."""
     rotations = np.array([p.rotation for p in poses]).reshape(-1, 3, 3)
     traces = np.einsum("aij,bij->ab", rotations, rotations)

@@ -61,8 +61,8 @@ class RecordedFrame:
 
     `name` is below the folder; `pose_from` the file of the pose, `stripe_from` that of a second picture with the laser,
     `stripe_off` that of the picture without it that was taken off. `stripe_text` says why a line is not believed;
-    `stripe_left_out` how many points on the board are marked, by the mark. `shows`: the frame of the same place that is
-    used in its stead.
+    `stripe_left_out` how many points on the board are marked, by the mark. `rms_px`: by how much the board's points
+    miss their places. `shows`: the frame of the same place that is used in its stead.
     """
 
     path: Path
@@ -77,6 +77,7 @@ class RecordedFrame:
     stripe_off: str = ""
     stripe_text: str = ""
     stripe_left_out: dict[str, int] = field(default_factory=dict)
+    rms_px: float | None = None
     shows: RecordedFrame | None = None
 
     def refuse(self, reason: Reason, text: str) -> None:

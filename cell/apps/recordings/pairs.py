@@ -61,7 +61,6 @@ def calibrate_pairs(pairs: Sequence[Pair]) -> dict[str, Any]:
     """
     _check_unit(pairs)
     result = empty_result(None)
-    del result["frames_rms"]
     stops = grouped(range(len(pairs)), lambda a, b: _one_stop(pairs[a], pairs[b]))
     means = [(mean([pairs[k][0] for k in stop]), mean([pairs[k][1] for k in stop])) for stop in stops]
     odd = _wrong(means)
@@ -131,16 +130,13 @@ def _one_stop(a: Pair, b: Pair) -> bool:
 
 def _check_unit(pairs: Sequence[Pair]) -> None:
     """Refuse positions that cannot be in m. Raises ConfigError."""
-    said = []
     for place, (what, farthest) in enumerate(FARTHEST_M.items()):
         far = float(np.median([np.linalg.norm(pair[place].translation) for pair in pairs]))
         if far > farthest:
-            said.append(f"{what} would be {far:.4g} m (median, allowed {farthest:g} m)")
-    if said:
-        mixed = "" if len(said) == len(FARTHEST_M) else "the two poses of a pair seem to have different units: "
-        raise ConfigError(
-            f"pairs of poses: {mixed}{' and '.join(said)}; positions must be in m: are these in mm? Divide them by 1000"
-        )
+            raise ConfigError(
+                f"pairs of poses: {what} would be {far:.4g} m (median, allowed {farthest:g} m); both positions of a "
+                "pair must be in m: are these in mm? Divide them by 1000"
+            )
 
 
 def _wrong(pairs: Sequence[Pair]) -> dict[int, str]:

@@ -26,17 +26,17 @@ def empty_result(spec: BoardSpec | None) -> dict[str, Any]:
     """The keys of every result, nothing known yet."""
     result: dict[str, Any] = {"board": None if spec is None else spec.name, "frames": [], "laser": None, "poses": None}
     result |= {"unread": [], **dict.fromkeys((*CAMERAS, "hand_eye", "light_plane", "flatness", "noise"))}
-    return result | {"notes": [], "checks": [], "refused": {}, "refused_values": {}, "frames_rms": {}}
+    return result | {"notes": [], "checks": [], "refused": {}, "refused_values": {}}
 
 
-def frame_dict(frame: RecordedFrame, rms: dict[str, float]) -> dict[str, Any]:
-    """What became of one frame; `rms` in px by file name."""
+def frame_dict(frame: RecordedFrame) -> dict[str, Any]:
+    """What became of one frame."""
     return {
         "name": frame.name,
         "used": frame.reason is None,
         "reason": None if frame.reason is None else str(frame.reason),
         "text": frame.text,
-        "rms_px": rms.get(frame.name),
+        "rms_px": frame.rms_px,
         "points": 0 if frame.view is None else len(frame.view.ids),
         "pose": frame.base_from_flange is not None,
         "pose_from": frame.pose_from or None,

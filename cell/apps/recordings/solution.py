@@ -189,7 +189,8 @@ def solve_frames(
             return
         posed = [f for f in posed if f.reason is None]
     rest = used(frames)
-    result["frames_rms"] = {f.name: math.sqrt(2) * r for f, r in zip(rest, chosen.view_rms, strict=True)}
+    for frame, rms in zip(rest, chosen.view_rms, strict=True):
+        frame.rms_px = math.sqrt(2) * float(rms)
     stops = [merged(stop) for stop in by_stop(rest)]
     if len(stops) < len(rest):
         same = "pictures of one stop share its error and count as one frame, their mean"

@@ -8,7 +8,7 @@ are `lab.bench.calibration.observed_cell`'s: the simulator's optics, arm and dev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -120,19 +120,13 @@ class Campaign:
                 for name, t in self.tallies.items()
             ],
             "detectable": list(promised.values()),
-            "bad_at_a_third_percent": round(
-                100
-                * sum(p.bad_at_a_third for p in self.promises.values())
-                / max(1, sum(len(p.sizes) for p in self.promises.values())),
-                1,
-            ),
-            "found_at_detectable_percent": round(
-                100
-                * sum(p.found for p in self.promises.values())
-                / max(1, sum(len(p.sizes) for p in self.promises.values())),
-                1,
-            ),
+            "bad_at_a_third_percent": self._percent([p.bad_at_a_third for p in self.promises.values()]),
+            "found_at_detectable_percent": self._percent([p.found for p in self.promises.values()]),
         }
+
+    def _percent(self, counts: Sequence[int]) -> float:
+        """Of all checks under changes of a stated size."""
+        return round(100 * sum(counts) / max(1, sum(len(p.sizes) for p in self.promises.values())), 1)
 
 
 def disturbances() -> list[Disturbance]:

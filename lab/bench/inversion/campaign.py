@@ -1,4 +1,4 @@
-"""The campaign behind `cell bench inversion`: starts from near and far on every part.
+"""The campaign behind `cell bench inversion`: starts from near and far on every part, and scans to be refused.
 
 A task is one part and one seed. Times are CPU times of one thread, so that a busy machine changes them little. What
 small_gicp and Open3D made of the same clouds and starts is in docs/explanation/libraries.md.
@@ -7,18 +7,23 @@ small_gicp and Open3D made of the same clouds and starts is in docs/explanation/
 from __future__ import annotations
 
 import time
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from cell.measure.inversion import Prior
+from cell.measure.inversion.closest import Array
 from cell.measure.inversion.nominal import Scan
 from cell.measure.inversion.registration import register
 from drivers.errors import RefusedError
 from lab.bench.inversion.parts import PARTS, nominal
-from lab.bench.inversion.scenes import SETTINGS, TRUE, scan, start_away
+from lab.bench.inversion.refusals import CASES, Judged, coverage, judge_case
+from lab.bench.inversion.scenes import RAIL_SIGMA, SETTINGS, STRIPE_SIGMA, TRUE, scan, start_away
+from lab.bench.over_cores import Progress, Task, run_all
 
 STARTS = {"far": (0.008, 20.0), "near": (0.003, 0.8)}
 """Where the search begins: m and degrees from the true pose; the prior's standard deviations are the same."""
@@ -91,3 +96,48 @@ def _figures(group: list[Outcome]) -> dict[str, object]:
 
 def _percent(group: list[Outcome]) -> float:
     return round(100 * sum(o.converged for o in group) / len(group), 1)
+
+
+def campaign(starts: int, cases: int, progress: Progress) -> dict[str, object]:
+    """Rows of `registration`, of `refusals` and the figures of `coverage`."""
+    tasks: list[Task] = [(task, part, seed) for seed in range(starts) for part in PARTS]
+    tasks += [(judge_case, case, seed) for case in CASES for seed in range(cases)]
+    tasks += [(coverage, seed) for seed in range(5 * cases)]
+    found = run_all(_run, tasks, progress=progress)
+    outcomes = [outcome for made in found if isinstance(made, list) for outcome in made]
+    judged = [made for made in found if isinstance(made, Judged)]
+    order = {part: k for k, part in enumerate(PARTS)}
+    outcomes.sort(key=lambda outcome: (order[outcome.part], outcome.start, outcome.seed))
+    return {
+        "registration": table(outcomes),
+        "refusals": [_case_row(case, [j for j in judged if j.case == case]) for case in CASES],
+        "coverage": _coverage([made for made in found if isinstance(made, tuple)]),
+        "assumed_noise": {"stripe_mm": 1e3 * STRIPE_SIGMA, "rail_mm": 1e3 * RAIL_SIGMA, "wild_points_percent": 1.0},
+    }
+
+
+def _run(task: Task) -> Any:
+    return task[0](*task[1:])
+
+
+def _case_row(case: str, judged: list[Judged]) -> dict[str, object]:
+    ended = Counter(j.ended for j in judged)
+    errors = [j.error for j in judged if j.error is not None]
+    reasons = sorted(j.reason for j in judged if j.reason)
+    return {
+        "case": case,
+        **{end: ended[end] for end in ("within", "refused", "outside")},
+        "worst_mm": round(1e3 * max(e[0] for e in errors), 3) if errors else None,
+        "worst_mrad": round(1e3 * max(e[1] for e in errors), 2) if errors else None,
+        "reason": reasons[0] if reasons else None,
+    }
+
+
+def _coverage(scores: list[tuple[Array, float]]) -> dict[str, object]:
+    z = np.array([score for score, _ in scores])
+    held = np.mean([distance < chi2.ppf(0.95, 6) for _, distance in scores])
+    return {
+        "scans": len(scores),
+        "ellipsoid_95_percent": round(100 * float(held), 1),
+        "z_score_rms": [round(float(v), 3) for v in np.sqrt(np.mean(z**2, axis=0))],
+    }

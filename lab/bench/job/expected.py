@@ -21,13 +21,12 @@ from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared
 from cell.measure.calibration.solve.joint import solve_joint, solve_staged
 from cell.measure.calibration.solve.normal import SHARED, AdjustmentState
 from cell.measure.geometry.poses import composition_jacobians, covariance_root, transform
-from cell.measure.inversion import NominalSurface
+from cell.measure.inversion import NominalSurface, PlacePose
 from cell.measure.reconstruction import Cloud, calibration_motions, flange_motions
 from cell.measure.reconstruction.build import ScanGeometry
 from cell.procedures.part_error import part_points
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.interfaces import Vector
-from lab.bench.job.contact import mean_after_contact
 from lab.bench.job.scan_errors import by_pose
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
@@ -36,6 +35,8 @@ from sim_backends.world.scene import draw
 POINTS = 1500
 _STEP = 1e-6
 _DRAWS = 1000
+UNDERSIDE = 400
+"""So many points of the underside are looked at for the first contact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +100,32 @@ def mean_distance(covariances: Vector) -> float:
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     draws = np.random.default_rng(0).standard_normal((_DRAWS, 1, 3, 1))
     return float(np.linalg.norm((roots @ draws)[..., 0], axis=-1).mean())
+
+
+def mean_after_contact(placing: Vector, nominal: NominalSurface, pose: PlacePose) -> float:
+    """Mean distance in m of the part's 45 points from where they belong, once it rests.
+
+    The part comes down until it touches the highest point of the ground under it. So its height error is not the
+    cell's, but what tilt and slope leave of the other five errors.
+
+    `placing` (6, 6) is the covariance of the part's place in the air, base axes, about the surface's origin; down is
+    the base's -z.
+    """
+    values, vectors = np.linalg.eigh(placing)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    steps = np.random.default_rng(0).standard_normal((_DRAWS, 6)) @ root.T
+    every = max(1, len(nominal.samples) // UNDERSIDE)
+    surface = pose.base_from_surface
+    under = transform(surface, nominal.samples[::every]) - surface.translation
+    normals = nominal.normals[nominal.sample_triangles[::every]] @ surface.rotation.T
+    # How far the underside lies over the ground, straight down, where it is displaced by d: n·d / n_z.
+    above = (steps @ by_pose(under).transpose(0, 2, 1)).transpose(1, 0, 2)
+    gaps = np.einsum("kni,ni->kn", above, normals / normals[:, 2:])
+    drop = gaps.min(axis=1)
+    points = transform(surface, part_points(nominal)) - surface.translation
+    ended = (steps @ by_pose(points).transpose(0, 2, 1)).transpose(1, 0, 2)
+    ended[:, :, 2] -= drop[:, None]
+    return float(np.linalg.norm(ended, axis=2).mean())
 
 
 class _Kinematics:

@@ -19,8 +19,7 @@ from cell.measure.geometry.poses import difference
 from cell.measure.inversion import NominalSurface, PlacePose
 from cell.procedures.part_error import part_covariance
 from cell.run.report.truth import pose_of
-from lab.bench.coverage import WANTED, interval
-from lab.bench.job.accuracy import figures
+from lab.bench.job.accuracy import WANTED, figures, interval
 from lab.bench.job.scan_errors import COVERED
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from lab.bench.over_cores import over_cores

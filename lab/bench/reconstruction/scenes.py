@@ -1,7 +1,9 @@
-"""Synthetic organised clouds with known outliers and holes, for `reconstruction`: numbers only, no optics."""
+"""Synthetic organised clouds with known outliers and holes, and how soon a sweep's cloud is there: no optics."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +23,8 @@ LINE_STEP, ROW_STEP = 0.25e-3, 0.078e-3
 SIGMA = 25e-6
 KINDS = ("far", "near", "streak along a line", "streak along a row")
 SURFACES = ("free-form", "steps")
+CAMERAS = ((640, 480), (2048, 1088))
+"""Pictures in px whose sweeps are timed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,3 +113,35 @@ def sweep(lines: int, width: int, rows: int, seed: int) -> tuple[ProfileBuilder,
         level = np.ones(rows)
         profiles.append(StripeProfile("rows", centres, 0.07 * level, 150.0 * level, 2.0 * level, none, none))
     return ProfileBuilder(geometry, lines), profiles
+
+
+def speed(seed: int, tell: Callable[[float, str], None]) -> dict[str, list[dict[str, float]]]:
+    """Milliseconds for each profile, and after the last frame, by camera; `tell` gets the share done and a text."""
+    rows = []
+    for k, (width, height) in enumerate(CAMERAS):
+        tell(k / len(CAMERAS), f"{width}×{height}")
+        builder, profiles = sweep(LINES, width, height, seed)
+        begun = time.perf_counter()
+        for profile in profiles:
+            builder.see(profile)
+        seen = time.perf_counter() - begun
+        flanges, spread = np.tile(np.eye(4), (LINES, 1, 1)), np.full((LINES, 3), 1e-5)
+        wall, processor = [], []
+        # The first compiles.
+        for _ in range(4):
+            begun, cpu = time.perf_counter(), time.process_time()
+            cloud = builder.place(np.arange(LINES), flanges, np.linspace(0.02, 0.08, LINES), spread)
+            wall.append(time.perf_counter() - begun)
+            processor.append(time.process_time() - cpu)
+        rows.append(
+            {
+                "width": width,
+                "rows": height,
+                "lines": LINES,
+                "points": cloud.size,
+                "ms_per_profile": 1e3 * seen / LINES,
+                "ms_after_last_frame": 1e3 * min(wall),
+                "processor_ms_after_last_frame": 1e3 * min(processor),
+            }
+        )
+    return {"speed": rows}

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -10,13 +13,28 @@ import numpy as np
 import pytest
 
 from cell.apps.console.messages import CloudPart, Show, ShownPicture
-from lab.bench.wires.pages import cpu, looking
 from tests.support.console.server import Served, serving
 
 pytestmark = pytest.mark.campaign
 
 ALLOWED = 0.05
 SECONDS, PERIOD_S = 12.0, 0.05
+TICKS = os.sysconf("SC_CLK_TCK")
+READING = """
+import json, sys, threading
+from websockets.sync.client import connect
+host, cookie, key, count = json.loads(sys.stdin.readline())
+def look():
+    with connect(f"ws://{host}/live", additional_headers={"cookie": cookie}, origin=f"http://{host}",
+                 subprotocols=["cell", key], max_size=None, compression=None) as page:
+        for _ in page:
+            pass
+for _ in range(count):
+    threading.Thread(target=look, daemon=True).start()
+sys.stdin.read()
+"""
+"""A program of its own that looks as so many pages do. Its input, which nobody else sees as they do its arguments, is
+a line of JSON: host, cookie, key, count."""
 
 
 @pytest.mark.parametrize("pages", [1, 5])
@@ -46,3 +64,18 @@ def show(server: Served, picture: np.ndarray) -> None:
             server.process.tell(ShownPicture({"type": "picture", "camera": "scan_camera"}, np.roll(picture, n, 1)))
             server.process.tell(CloudPart({"type": "cloud", "reset": n % 100 == 0}, b"\0" * 6400))
         time.sleep(max(0.0, begun + (n + 1) * PERIOD_S - time.monotonic()))
+
+
+def looking(host: str, cookie: str, key: str, pages: int) -> subprocess.Popen[bytes]:
+    """So many pages in a process of their own, which is to be killed."""
+    client = subprocess.Popen([sys.executable, "-c", READING], stdin=subprocess.PIPE)
+    assert client.stdin is not None
+    client.stdin.write(json.dumps([host, cookie, key, pages]).encode() + b"\n")
+    client.stdin.flush()
+    return client
+
+
+def cpu(pid: int) -> float:
+    """Seconds of a core that the process has had, user and system."""
+    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(words[11]) + int(words[12])) / TICKS

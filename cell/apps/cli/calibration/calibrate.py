@@ -23,7 +23,7 @@ from cell.apps.cli.options import (  # fmt: skip
 )
 
 if TYPE_CHECKING:
-    from cell.apps.recordings.attach import Options
+    from cell.apps.recordings.command import Options
     from cell.measure.vision import LaserChannel
 
 
@@ -102,7 +102,7 @@ def calibrate(
             if value:
                 raise ConfigError(f"{name} belongs to --from; the boards on the deck are named in the configuration")
     else:
-        from cell.apps.recordings.attach import Options
+        from cell.apps.recordings.command import Options
         from cell.apps.recordings.known_camera import read_camera
 
         known = None if camera in (None, "pictures") else read_camera(Path(str(camera)))

@@ -8,10 +8,9 @@ import pytest
 
 from cell.measure.geometry.poses import from_parts
 from lab.bench.over_cores import run_all
-from lab.paper import solved
+from lab.paper import rig
 from lab.paper.rig import RigSpec, dot_centres, draw_head
-from lab.paper.spoiled import spoil
-from lab.paper.table1 import SPEC, one_seed
+from lab.paper.table1 import SPEC, one_seed, spoil
 from sim_backends.optics import Board
 
 
@@ -74,20 +73,20 @@ def test_centres_of_dots_are_those_of_their_conics() -> None:
 
 def test_expected_length_of_a_round_error_is_that_of_maxwell() -> None:
     sigma = 2e-5
-    found = solved.expected_length(np.tile(sigma**2 * np.eye(3), (5, 1, 1)))
+    found = rig.expected_length(np.tile(sigma**2 * np.eye(3), (5, 1, 1)))
     assert found == pytest.approx(sigma * np.sqrt(8 / np.pi), rel=1e-9)
     # Along one axis alone it is the mean absolute value of a normal variable; in a plane, Rayleigh's mean.
     line, plane = np.diag([0.0, sigma**2, 0.0])[None], np.diag([sigma**2, 0.0, sigma**2])[None]
-    assert solved.expected_length(line) == pytest.approx(sigma * np.sqrt(2 / np.pi), rel=2e-3)
-    assert solved.expected_length(plane) == pytest.approx(sigma * np.sqrt(np.pi / 2), rel=2e-3)
+    assert rig.expected_length(line) == pytest.approx(sigma * np.sqrt(2 / np.pi), rel=2e-3)
+    assert rig.expected_length(plane) == pytest.approx(sigma * np.sqrt(np.pi / 2), rel=2e-3)
 
 
 def test_alignment_takes_out_a_rigid_motion_and_nothing_else() -> None:
     rng = np.random.default_rng(1)
     points = rng.normal(size=(200, 3))
     moved = points @ pin.exp3(np.array([0.1, 0.2, -0.3])).T + [1.0, 2.0, 3.0]
-    assert np.abs(solved.aligned(moved, points)).max() < 1e-12
-    assert np.linalg.norm(solved.aligned(1.01 * points, points), axis=1).mean() == pytest.approx(
+    assert np.abs(rig.aligned(moved, points)).max() < 1e-12
+    assert np.linalg.norm(rig.aligned(1.01 * points, points), axis=1).mean() == pytest.approx(
         0.01 * np.linalg.norm(points - points.mean(axis=0), axis=1).mean(), rel=1e-3
     )
 

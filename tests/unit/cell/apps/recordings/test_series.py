@@ -15,8 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cell.apps.recordings import frames as recorded_frames
-from cell.apps.recordings.attach import Options, attach_poses
-from cell.apps.recordings.command import calibrate_folder
+from cell.apps.recordings.command import Options, attach_poses, calibrate_folder
 from cell.apps.recordings.conventions import TRIED, check_reading
 from cell.apps.recordings.frames import RecordedFrame, read_frames
 from cell.apps.recordings.series import in_order_of_views, list_folder, match_series, read_series

@@ -8,8 +8,18 @@ import pytest
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.reconstruction import ScanGeometry
 from drivers.errors import RefusedError
-from lab.bench.acceptance import artefacts, form_errors
-from lab.bench.acceptance.campaign import NOISE_FACTOR, _flatness, _probing, _spacing
+from lab.bench.acceptance import artefacts
+from lab.bench.acceptance.campaign import (
+    NOISE_FACTOR,
+    _flatness,
+    _probing,
+    _spacing,
+    cap,
+    fit_sphere,
+    form_95,
+    form_all,
+    plane_deviations,
+)
 from lab.paper.rig import Noise, RigSpec, draw_head
 from sim_backends.world.levels import LEVELS
 
@@ -26,15 +36,15 @@ def ball(count: int = 3000, radius: float = 0.0075) -> np.ndarray:
 
 
 def test_a_perfect_sphere_is_found_and_has_no_form_error() -> None:
-    fit = form_errors.fit_sphere(ball())
+    fit = fit_sphere(ball())
     np.testing.assert_allclose(fit.centre, [0.05, 0.01, 0.13], atol=1e-12)
     assert fit.radius == pytest.approx(0.0075, abs=1e-12)
-    assert form_errors.form_all(fit.deviations) < 1e-11
+    assert form_all(fit.deviations) < 1e-11
 
 
 def test_the_sphere_fit_minimises_the_distances_of_noisy_points() -> None:
     points = ball() + 2e-5 * np.random.default_rng(3).normal(size=(3000, 3))
-    fit = form_errors.fit_sphere(points)
+    fit = fit_sphere(points)
 
     def squares(centre: np.ndarray, radius: float) -> float:
         return float(np.sum((np.linalg.norm(points - centre, axis=1) - radius) ** 2))
@@ -47,33 +57,31 @@ def test_the_sphere_fit_minimises_the_distances_of_noisy_points() -> None:
 
 def test_form_errors_of_a_uniform_band_are_its_width() -> None:
     deviations = np.linspace(-1e-5, 3e-5, 10_001)
-    assert form_errors.form_95(deviations) == pytest.approx(0.95 * 4e-5, rel=1e-3)
-    assert form_errors.form_all(deviations) == pytest.approx(0.997 * 4e-5, rel=1e-3)
+    assert form_95(deviations) == pytest.approx(0.95 * 4e-5, rel=1e-3)
+    assert form_all(deviations) == pytest.approx(0.997 * 4e-5, rel=1e-3)
 
 
 def test_three_points_in_a_thousand_are_let_go_and_no_more() -> None:
     deviations = np.concatenate([np.linspace(-1e-5, 1e-5, 997), [1e-3, -2e-3, 3e-3]])
-    assert form_errors.form_all(deviations) == pytest.approx(2e-5)
-    assert form_errors.form_all(np.concatenate([deviations[3:], [4e-3] * 3])) > 1e-3
+    assert form_all(deviations) == pytest.approx(2e-5)
+    assert form_all(np.concatenate([deviations[3:], [4e-3] * 3])) > 1e-3
 
 
 def test_flatness_does_not_depend_on_the_pose() -> None:
     rng = np.random.default_rng(4)
     points = np.column_stack([rng.uniform(-1, 1, (500, 2)), 1e-3 * rng.uniform(-1, 1, 500)])
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    assert form_errors.form_95(form_errors.plane_deviations(points @ turn.T + 5)) == pytest.approx(
-        form_errors.form_95(form_errors.plane_deviations(points)), rel=1e-9
-    )
+    assert form_95(plane_deviations(points @ turn.T + 5)) == pytest.approx(form_95(plane_deviations(points)), rel=1e-9)
 
 
 def test_the_cap_is_cut_at_its_angle() -> None:
     directions = np.array([[0, 0, -1.0], [np.sin(0.8), 0, -np.cos(0.8)], [np.sin(0.9), 0, -np.cos(0.9)]])
-    assert form_errors.cap(directions, np.zeros(3), np.array([0, 0, -2.0]), 0.85).tolist() == [True, True, False]
+    assert cap(directions, np.zeros(3), np.array([0, 0, -2.0]), 0.85).tolist() == [True, True, False]
 
 
 def test_too_few_points_are_refused() -> None:
     with pytest.raises(RefusedError, match="50 are needed"):
-        form_errors.fit_sphere(ball(20))
+        fit_sphere(ball(20))
 
 
 @pytest.fixture(scope="module")

@@ -11,7 +11,7 @@ import pytest
 
 from cell.config.job import load_job
 from cell.measure.inversion import NominalSurface
-from lab.bench.job.contact import mean_after_contact
+from lab.bench.job.expected import mean_after_contact
 
 JOB, MESH = load_job("pot")
 NOMINAL = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)

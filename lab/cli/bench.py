@@ -1,0 +1,273 @@
+"""The commands of `cell bench`: campaigns and comparisons of accuracy and speed, beside their bounds and peers.
+
+Each imports its bench only when it runs, so that `cell --help` stays quick.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from cell.apps.cli import options
+from cell.apps.cli.options import JobOption, JsonOption, Level, LevelOption, SeedOption
+from lab.cli.shown import bar, counted, show
+
+bench = typer.Typer(
+    help="Campaigns and comparisons: accuracy and speed, beside their bounds and peers.", no_args_is_help=True
+)
+WorldsOption = Annotated[int, typer.Option("--seeds", min=1, max=1000, help="How many worlds: seeds 1 to this.")]
+WorkersOption = Annotated[int, typer.Option("--workers", min=0, max=64, help="Processes; 0 is one a core.")]
+
+
+@bench.command()
+def acceptance(seed: SeedOption = 1, level: LevelOption = Level.nominal, json: JsonOption = False) -> None:
+    """Probing error, sphere spacing error and flatness after VDI/VDE 2634 part 2 and ISO 10360-13, simulated.
+
+    A ball at ten places of the measuring volume, a ball bar at seven, a flat at six; the worst place counts.
+    """
+    from lab.bench.acceptance.campaign import acceptance as campaign
+
+    with bar() as told:
+        result = campaign(seed, level.value, lambda done, total: told(done, "places", total))
+    show(result, json, without=("positions",))
+
+
+@bench.command()
+def accuracy(
+    seeds: WorldsOption = 20,
+    level: Annotated[
+        list[Level] | None, typer.Option("--level", help="How far they deviate from the drawing; may be repeated.")
+    ] = None,
+    job: JobOption = "pot",
+    workers: WorkersOption = 0,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate and run many simulated cells on the virtual clock and measure them against the truth.
+
+    At each level the acceptance tests of `cell bench acceptance` are done too, on the first seed's scan head.
+
+    Exit code 1 when a part was placed outside the job's tolerance, or a limit of level nominal is not kept.
+    """
+    from lab.bench.job.accuracy import campaign
+
+    levels = list(dict.fromkeys(entry.value for entry in level or [Level.nominal]))
+    with bar() as told:
+        told(0, "the first runs are on their way")
+        done = counted(told, (seeds + 1) * len(levels))
+        result = campaign(range(1, seeds + 1), levels, job, done, workers)
+    by_level = result["levels"]
+    show(result if json else by_level, json, without=("per_run", "positions"))
+    outside = sum(entry["outcomes"]["placed_outside_tolerance"] for entry in by_level.values())
+    if outside or not all(entry.get("within_limits", True) for entry in by_level.values()):
+        raise typer.Exit(1)
+
+
+@bench.command()
+def board(
+    views: Annotated[int, typer.Option(min=1, max=10_000, help="Random views for each kind of board and line.")] = 4,
+    seed: Annotated[int, typer.Option(min=0, help="Which random views.")] = 1,
+    kind: Annotated[list[str] | None, typer.Option(help="Only this kind of board; may be given again.")] = None,
+    condition: Annotated[
+        list[str] | None, typer.Option(help="Only conditions with this in their name; may be given again.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """How surely boards are found, under which name their points, how exactly, and whether the covariance is true.
+
+    Exit code 1 when a board, or the order of its points, was taken for another.
+    """
+    from cell.measure.vision.board.view import KINDS
+    from drivers.errors import ConfigError
+    from lab.bench.board.campaign import campaign
+    from lab.bench.board.conditions import CONDITIONS
+
+    kinds = [k for k in KINDS if not kind or k in kind]
+    if kind and len(kinds) != len(set(kind)):
+        raise ConfigError(f"--kind {', '.join(kind)}: allowed are {', '.join(KINDS)}")
+    chosen = [c for c in CONDITIONS if not condition or any(text in c.name for text in condition)]
+    if not chosen:
+        raise ConfigError(f"no condition is named like that; there are: {', '.join(c.name for c in CONDITIONS)}")
+    with bar() as told:
+        report = campaign(views, seed, kinds, chosen, counted(told, views * len(kinds) * len(chosen)))
+    shown = report if json else {**report, "rows": [row for row in report["rows"] if row["kind"] == "all"]}
+    show(shown, json, without=("reasons",))
+    if report["wrong"]:
+        raise typer.Exit(1)
+
+
+@bench.command()
+def calibration(
+    seeds: Annotated[int, typer.Option(min=2, max=1000, help="How many heads are drawn and calibrated.")] = 30,
+    json: JsonOption = False,
+) -> None:
+    """Calibrate many drawn scan heads and compare errors, z-scores and chi² with what the noise allows.
+
+    The observations are drawn by code that shares nothing with the estimator; all figures are of simulation.
+    """
+    from lab.bench.calibration.campaign import campaign
+    from lab.bench.calibration.world import Noise
+
+    with bar() as told:
+        result = campaign(range(1, seeds + 1), Noise(), lambda done: told(done, f"{done} of {seeds} heads", seeds))
+    show(result, json, without=("trials",))
+
+
+@bench.command()
+def endings(
+    count: Annotated[int, typer.Option(min=1, max=1000, help="How many kills, and how many signals and aborts.")] = 40,
+    seed: SeedOption = 3,
+    speed: Annotated[float, typer.Option(min=0.5, max=5, help="How many times faster than the wall.")] = 3.0,
+    json: JsonOption = False,
+) -> None:
+    """End a run at random instants, over all steps, calibration, verification and jogs; exit 1 if anything goes on."""
+    import tempfile
+    from pathlib import Path
+
+    from lab.bench.wires.endings import campaign, summary
+
+    with tempfile.TemporaryDirectory(prefix="cell-endings-") as folder, bar() as told:
+        found = campaign(Path(folder), count, seed, speed, lambda done, text: told(done, text, 2 * count))
+    result = summary(found, seed, speed)
+    show(result, json, without=("endings",))
+    if result["moved_or_shone_after"]:
+        raise typer.Exit(1)
+
+
+@bench.command()
+def inversion(
+    starts: Annotated[int, typer.Option("--starts", min=4, help="Starts for each part, near and far.")] = 40,
+    cases: Annotated[int, typer.Option("--cases", min=1, help="Scans for each case that must not mislead.")] = 20,
+    json: JsonOption = False,
+) -> None:
+    """Find the pose of five parts from near and far, with clutter and 40 % missing, and refuse what must be refused."""
+    from lab.bench.inversion.campaign import campaign
+
+    with bar() as told:
+        report = campaign(starts, cases, lambda done, total: told(done, "", total))
+    show(report, json)
+
+
+@bench.command()
+def realism(
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--effect",
+            help="Just this one; may be repeated. All of them, then together.",
+            autocompletion=options.effects,
+        ),
+    ] = None,
+    seeds: WorldsOption = 20,
+    job: JobOption = "pot",
+    workers: WorkersOption = 0,
+    json: JsonOption = False,
+) -> None:
+    """Put each effect of a workshop into simulated cells and see whether what is stated of the part still holds.
+
+    An effect is well when its count of worlds inside the stated 95 % ellipsoid, or refused by the effect's name, is one
+    that a true share of 90 % explains: 15 of 20 (95 % confidence). Exit code 1 when one is not, or a part was placed
+    outside the job's tolerance.
+    """
+    from drivers.errors import ConfigError
+    from lab.bench.job.realism import ALONE, TOGETHER, campaign, is_well
+    from sim_backends.world.levels import Effects
+
+    known = (ALONE, *Effects.names(), TOGETHER)
+    # No parts of the workshop: a scan camera needs a global shutter, a carriage that droops is a broken one.
+    options = ("rolling_shutter", "droop")
+    chosen = list(dict.fromkeys(effect or [name for name in known if name not in options]))
+    if unknown := [name for name in chosen if name not in known]:
+        raise ConfigError(f"--effect {unknown[0]} is none of {', '.join(known)}")
+    with bar() as told:
+        result = campaign(chosen, range(1, seeds + 1), job, counted(told, len(chosen) * seeds), workers)
+    show(result, json, without=("runs",))
+    if not all(is_well(entry) for entry in result["effects"].values()):
+        raise typer.Exit(1)
+
+
+@bench.command()
+def reconstruction(seed: SeedOption = 1, json: JsonOption = False) -> None:
+    """Milliseconds from the last frame of a sweep to the cloud, on profiles of 480 and of 1088 rows."""
+    from lab.bench.reconstruction.scenes import speed
+
+    with bar() as told:
+        result = speed(seed, told)
+    show(result, json)
+
+
+@bench.command()
+def servo(
+    seconds: Annotated[float, typer.Option(min=2.0, max=600.0, help="How long each of the two streams is.")] = 20.0,
+    seed: SeedOption = 1,
+    json: JsonOption = False,
+) -> None:
+    """Stream to a simulated arm, first alone, then beside perception; exit 1 if that missed and a bare loop did not.
+
+    On a machine where a loop that only sleeps is late as well, there is no verdict: the figures say so.
+    """
+    from lab.bench.wires.servo import measure
+
+    with bar() as told:
+        found = measure(seconds, seed, told)
+    show(found, json)
+    if found["verdict"] == "missed":
+        raise typer.Exit(1)
+
+
+@bench.command()
+def soak(
+    minutes: Annotated[float, typer.Option(min=0.0, max=10000.0, help="For how long jobs are begun.")] = 60.0,
+    job: JobOption = "pot",
+    seed: SeedOption = 1,
+    speed: Annotated[float, typer.Option(min=0.5, max=5.0, help="How many times faster than the wall.")] = 1.0,
+    json: JsonOption = False,
+) -> None:
+    """Repeat a job over the wires of a simulated cell; exit 1 if memory, threads or handles grow from job to job."""
+    from lab.bench.wires.soak import soak as run
+
+    with bar() as told:
+        found = run(minutes, seed, job, told, speed=speed)
+    show(found, json, without=("processes",))
+    if found["verdict"].startswith("grows"):
+        raise typer.Exit(1)
+
+
+@bench.command()
+def stripe(
+    pictures: Annotated[int, typer.Option(min=1, max=100, help="Pictures of 1024 rows for each condition.")] = 3,
+    accuracy: Annotated[bool, typer.Option(help="Errors beside the Cramér–Rao bound.")] = True,
+    profiles: Annotated[bool, typer.Option(help="Other profiles, widths, texture, colour and depth.")] = True,
+    speed: Annotated[bool, typer.Option(help="Time per frame.")] = True,
+    json: JsonOption = False,
+) -> None:
+    """Stripe centres: RMS error, bias and stated deviation beside the bound, and speed."""
+    from lab.bench.stripe import accuracy as stripe_accuracy
+    from lab.bench.stripe import profiles as stripe_profiles
+    from lab.bench.stripe import speed as stripe_speed
+
+    result = {}
+    with bar() as told:
+        if speed:
+            result["speed"] = stripe_speed.compare(told)
+        if accuracy:
+            result["accuracy"] = stripe_accuracy.campaign(told, pictures)
+        if profiles:
+            result["profiles"] = stripe_profiles.campaign(told, pictures)
+    show(result, json)
+
+
+@bench.command()
+def verify(
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="How many worlds.")] = 20,
+    level: LevelOption = Level.nominal,
+    json: JsonOption = False,
+) -> None:
+    """Find 0.2 mm or 0.05° in every part of the chain, over many simulated worlds (no pictures are rendered)."""
+    from lab.bench.calibration.verification import KINDS_OF_CHANGE, campaign, disturbances
+
+    chosen = disturbances()
+    with bar() as told:
+        progress = counted(told, seeds * (len(chosen) + KINDS_OF_CHANGE + 1))
+        found = campaign(range(1, seeds + 1), level.value, chosen, progress)
+    show(found.summary(level.value, seeds), json)
