@@ -24,7 +24,7 @@ from cell.procedures.arm.touch import TouchHeight
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
-from cell.procedures.steps.place import PlaceResult, place
+from cell.procedures.steps.place import PlaceResult, Placing
 from cell.procedures.steps.workplace import Workplace
 from cell.run.resumption import UnfinishedRun
 from drivers.clock import Clock
@@ -86,18 +86,19 @@ class Site:
     def place(self, too_low: float = 0.0, **exchanged: Any) -> PlaceResult:
         """Place where the surface is taken to be `too_low` m below where it truly is."""
         given = {"claw": self.cell.devices.claw, "note": lambda part: self.noted.append(part.state), **exchanged}
-        return place(
+        placing = Placing(
             JOB,
             self.base_from_surface * from_parts((0.0, 0.0, -too_low)),
             STATED,
-            self.mover,
-            self.arm,
-            given["claw"],
-            self.part,
-            lambda: None,
-            lambda share, text: None,
-            given["note"],
+            mover=self.mover,
+            arm=self.arm,
+            claw=given["claw"],
+            part=self.part,
+            check=lambda: None,
+            progress=lambda share, text: None,
+            note=given["note"],
         )
+        return placing.put_down()
 
     @property
     def held(self) -> bool:
