@@ -27,7 +27,7 @@ from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.workplace import Workplace
 from cell.run.folder import new_run
 from cell.run.recorded_work import classify
-from cell.run.report.report import make_report
+from cell.run.report.report import FinishedJob
 from cell.run.report.truth import TruthRecorder, pose_of
 from cell.run.resumption import job_source
 from drivers.errors import CellError
@@ -193,10 +193,11 @@ def reported(
         "calibration_date": work.calibration.date,
     }
     started = time.time() - 31.0
-    report = make_report(
-        folder, config, job, nominal, work.repeatability, result, info, started, witness, frames
+    finished = FinishedJob(
+        folder, config, job, nominal, work.repeatability,
+        result=result, info=info, started=started, witness=witness, frames=frames,
     )  # fmt: skip
-    return Ended(report, folder)
+    return Ended(finished.report(), folder)
 
 
 def with_few_lines(record: JobRecord, lines: int) -> JobRecord:

@@ -32,7 +32,7 @@ DEADLINE_S = 0.5
 """For one answer, wall seconds."""
 ARM_PORTS = {29999: "dashboard", 30001: "primary", 30004: "RTDE"}
 _GVCP_PORT = 3956
-_DISCOVERY = struct.pack(">BBHHH", 0x42, 0x01, 0x0002, 0, 1)
+_DISCOVERY = bytes.fromhex("42 01 0002 0000 0001")
 """Who are you, please answer: sent to one address, as GigE Vision allows."""
 _DISCOVERED, _BEHIND_HEADER = 0x0003, 8
 _MODEL, _SERIAL = slice(104, 136), slice(216, 232)
