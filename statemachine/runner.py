@@ -218,17 +218,10 @@ class Runner:
         self._teller = Teller(self.journal, self.observer, lambda: str(self.sequence.state))
         with SignalWatch() as signals:
             self._watchman = Watchman(
-                policy=self.policy,
-                journal=self.journal,
-                clock=self.clock,
-                control=self.control,
-                classify=self.classify,
-                safe_stop=self.safe_stop,
-                health=self.health,
-                waiting=waiting_on(self.clock),
-                signals=signals,
-                teller=self._teller,
-            )
+                policy=self.policy, journal=self.journal, clock=self.clock, control=self.control,
+                classify=self.classify, safe_stop=self.safe_stop, health=self.health, waiting=waiting_on(self.clock),
+                signals=signals, teller=self._teller,
+            )  # fmt: skip
             self._attempts = Attempts(self.sequence.steps, self.steps, self._watchman)
             yield
 

@@ -197,47 +197,26 @@ class JobRun:
         )  # fmt: skip
         report = finished.report()
         return RunOutcome(
-            report["outcome"],
-            report["reason"],
-            folder,
-            report=report,
-            results=result.results,
-            control=self.run.control,
-            wall_s=time.time() - started,
-        )
+            report["outcome"], report["reason"], folder, report=report, results=result.results,
+            control=self.run.control, wall_s=time.time() - started,
+        )  # fmt: skip
 
     def _workplace(self, folder: Path, whereabouts: Whereabouts, frames: FrameStore) -> Workplace:
         return Workplace(
-            self.config,
-            self.job,
-            self.nominal,
-            calibration=self.calibration,
-            devices=self.devices,
-            frames=frames,
-            folder=folder,
-            whereabouts=whereabouts,
-            earlier=self.earlier,
-            needs_part=self.kind.places,
-            sweeping=self._sweeping,
-            registered=self._registered,
-            pace=self.pace,
-        )
+            self.config, self.job, self.nominal, calibration=self.calibration, devices=self.devices, frames=frames,
+            folder=folder, whereabouts=whereabouts, earlier=self.earlier, needs_part=self.kind.places,
+            sweeping=self._sweeping, registered=self._registered, pace=self.pace,
+        )  # fmt: skip
 
     def _runner(self, here: Workplace, journal: Journal, observer: Observer) -> Runner:
         return Runner(
-            sequence=self.kind.sequence(),
-            steps=self.kind.work(here),
-            policy=self.kind.policy(simulated_person=self.config.cell.confirm == "simulated"),
-            journal=journal,
-            clock=self.devices.clock,
-            classify=partial(classify, following=self.devices.following),
-            safe_stop=lambda reason: stop_cell(self.devices),
-            observer=observer,
-            recover=partial(clear, self.devices),
-            health=lambda: require_healthy(self.devices),
-            control=self.run.control,
+            sequence=self.kind.sequence(), steps=self.kind.work(here),
+            policy=self.kind.policy(simulated_person=self.config.cell.confirm == "simulated"), journal=journal,
+            clock=self.devices.clock, classify=partial(classify, following=self.devices.following),
+            safe_stop=lambda reason: stop_cell(self.devices), observer=observer, recover=partial(clear, self.devices),
+            health=lambda: require_healthy(self.devices), control=self.run.control,
             script=self._in_the_gate(self.script),
-        )
+        )  # fmt: skip
 
     def _open_again(self) -> None:
         """The stop at the end of a good run keeps nobody from going on. One from before the run still does, and one
@@ -364,20 +343,10 @@ class JobWork:
             earlier, why = self.before.sweep(ready.job, cell.config, calibration)
             note(why if earlier is not None else f"{why}: sweeping again")
         job_run = JobRun(
-            run,
-            cell.config,
-            cell.devices,
-            job=ready.job,
-            nominal=ready.nominal,
-            calibration=calibration,
-            info=self.info,
-            kind=ready.kind,
-            script=ready.script,
-            inline=self.inline,
-            earlier=earlier,
-            truth=cell.truth,
+            run, cell.config, cell.devices, job=ready.job, nominal=ready.nominal, calibration=calibration,
+            info=self.info, kind=ready.kind, script=ready.script, inline=self.inline, earlier=earlier, truth=cell.truth,
             pace=cell.pace,
-        )
+        )  # fmt: skip
         try:
             return job_run.perform(cell.runs_folder, cell.whereabouts)
         finally:

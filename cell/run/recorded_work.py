@@ -203,18 +203,11 @@ class RecordedWork:
 
         simulated = self.config is not None and self.config.cell.confirm == "simulated"
         runner = Runner(
-            sequence=Sequence((self.kind,), JobState.DONE),
-            steps={self.kind: begin},
+            sequence=Sequence((self.kind,), JobState.DONE), steps={self.kind: begin},
             policy=Policy((Step(self.kind, math.inf, RETRIES),), grace_s=GRACE_S, simulated_person=simulated),
-            journal=journal,
-            clock=devices.clock,
-            classify=self._classify,
-            safe_stop=safe_stop,
-            observer=self._heard,
-            recover=partial(clear, devices),
-            health=lambda: self.health(devices),
-            control=self.run.control,
-        )
+            journal=journal, clock=devices.clock, classify=self._classify, safe_stop=safe_stop, observer=self._heard,
+            recover=partial(clear, devices), health=lambda: self.health(devices), control=self.run.control,
+        )  # fmt: skip
         result = runner.run_alone()
         if result.unrecorded is not None:
             log.warning("the %s could not be recorded: %s", self.kind, result.unrecorded)

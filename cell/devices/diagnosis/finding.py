@@ -136,6 +136,11 @@ def _look(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
         if there and isinstance(record, CanopenVehicleConfig):
             return _look_at_nodes(record)
         return ("there" if there else f"no interface {place}: see `ip link`"), there
+    return _look_at_host(name, record, place)
+
+
+def _look_at_host(name: str, record: DeviceConfig, place: str) -> tuple[str, bool]:
+    """The same of a device that is reached over the network."""
     host, port = _host_and_port(place)
     if not host:
         return "nothing to ask at such an address; `cell diag` connects to it", True

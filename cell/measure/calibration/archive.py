@@ -117,13 +117,7 @@ def write_archive(path: Path, observations: Observations) -> None:
 def read_archive(path: Path) -> Observations:
     """Read and check it; raises `ConfigError` that says what is missing, of another version or no number."""
     advice = f"give a {SUFFIX} file that `cell calibrate` wrote beside a calibration"
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {name: file[name] for name in file.files}
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path} does not exist; {advice}") from error
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zlib.error, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{path} is no whole archive of observations ({error}); {advice}") from error
+    data = _arrays(path, advice)
     try:
         about = json.loads(str(data["about"]))
         if about["format"] not in (FORMAT, UNSEALED):
@@ -167,6 +161,17 @@ def read_archive(path: Path) -> Observations:
         raise ConfigError(f"{path} lacks {error}; {advice}") from error
     except (ValueError, TypeError, AttributeError, IndexError, ConfigError) as error:
         raise ConfigError(f"{path} cannot be solved: {error}; {advice}") from error
+
+
+def _arrays(path: Path, advice: str) -> dict[str, Any]:
+    """The arrays of the archive by their names; raises `ConfigError` where it is not there or not whole."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path} does not exist; {advice}") from error
+    except (OSError, ValueError, EOFError, KeyError, AttributeError, zlib.error, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{path} is no whole archive of observations ({error}); {advice}") from error
 
 
 def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> PlateLine | None:

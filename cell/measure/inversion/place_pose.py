@@ -259,13 +259,9 @@ class _Inversion:
         unsure = known - np.linalg.inv(board + turn @ found.scan_information @ turn.T)
         random = found.covariance + turn.T @ unsure @ turn
         verdict = judge(
-            turn @ (random + shared) @ turn.T,
-            told,
-            float(1.0 / np.mean(1.0 / found.sigmas**2)),
-            points=len(found.used),
-            radius=nominal.radius,
-            tolerance=self.tolerance,
-        )
+            turn @ (random + shared) @ turn.T, told, float(1.0 / np.mean(1.0 / found.sigmas**2)),
+            points=len(found.used), radius=nominal.radius, tolerance=self.tolerance,
+        )  # fmt: skip
         return pose, random, verdict
 
 

@@ -268,19 +268,11 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         return arrival
     vehicle.enable()
     drive = TargetDrive(
-        here.job,
-        here.config.arm.vehicle_from_base.se3(),
-        vehicle,
-        whereabouts=here.whereabouts,
-        photograph=here.photograph,
-        clock=here.devices.clock,
-        check=context.check,
-        progress=context.progress,
-        note=lambda text: context.note(text=text),
-        hold=context.safe_point,
-        carried=here.mover.solids(),
+        here.job, here.config.arm.vehicle_from_base.se3(), vehicle, whereabouts=here.whereabouts,
+        photograph=here.photograph, clock=here.devices.clock, check=context.check, progress=context.progress,
+        note=lambda text: context.note(text=text), hold=context.safe_point, carried=here.mover.solids(),
         pace=here.mover.pace,
-    )
+    )  # fmt: skip
     return drive.to_target()
 
 

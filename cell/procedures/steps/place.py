@@ -224,17 +224,10 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         pose = carried_on(here, *swept, look.creep)
     expected = expected_touch(here.job, here.nominal, pose, here.repeatability)
     placing = Placing(
-        here.job,
-        pose.base_from_surface,
-        expected,
-        mover=here.mover,
-        arm=here.devices.arm,
-        claw=here.devices.claw,
-        part=here.part,
-        check=context.check,
-        progress=context.progress,
+        here.job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
+        part=here.part, check=context.check, progress=context.progress,
         note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
-    )
+    )  # fmt: skip
     done = replace(placing.put_down(), look=look, pose=pose)
     for note in done.notes:
         context.note(text=note)

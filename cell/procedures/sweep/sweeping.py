@@ -73,15 +73,10 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     shift, variance = shift_by_times([known, TimeBound.of(camera)], scan.speed, errors)
     own = scan.speed * JITTER_S * errors.rate * along
     return swath(
-        times=times[lines],
-        flanges=flanges,
-        rail=np.full(len(lines), rail),
-        line_spread=np.tile(own, (len(lines), 1)),
+        times=times[lines], flanges=flanges, rail=np.full(len(lines), rail), line_spread=np.tile(own, (len(lines), 1)),
         covariance=_covariance(errors, along, (scan.speed * LATENCY_S * errors.rate) ** 2 + variance),
-        lost=collector.lost + uneven,
-        residual=float(np.std(done - steady(times[lines]))),
-        shift=shift,
-    )
+        lost=collector.lost + uneven, residual=float(np.std(done - steady(times[lines]))), shift=shift,
+    )  # fmt: skip
 
 
 def _straight(plan: ScanPlan) -> tuple[Vector, float]:
@@ -156,15 +151,9 @@ def _swath_of(collector: SweepCollector, lines: NDArray[np.intp], camera: str, e
     collector.require_one_clock(camera, errors)
     ids = np.array(collector.frame_ids)
     return partial(
-        Swath,
-        builder=collector.builder,
-        lines=lines,
-        frame_ids=ids[lines],
-        points=sum(collector.counts[k] for k in lines),
-        middle=middle,
-        middle_profile=profile,
-        seen=ids,
-    )
+        Swath, builder=collector.builder, lines=lines, frame_ids=ids[lines],
+        points=sum(collector.counts[k] for k in lines), middle=middle, middle_profile=profile, seen=ids,
+    )  # fmt: skip
 
 
 def _covariance(errors: SweepErrors, along: Vector, variance: float) -> Vector:
@@ -207,15 +196,10 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     along = collector.builder.sweep_direction(base_from_flange)
     spread = errors.rail * along
     return swath(
-        times=times[lines],
-        flanges=np.tile(base_from_flange.homogeneous, (len(lines), 1, 1)),
-        rail=np.array([sweep.position_at(time) for time in times[lines]]),
-        line_spread=np.tile(spread, (len(lines), 1)),
-        covariance=_covariance(errors, along, variance),
-        lost=collector.lost,
-        residual=residual,
-        shift=shift,
-    )
+        times=times[lines], flanges=np.tile(base_from_flange.homogeneous, (len(lines), 1, 1)),
+        rail=np.array([sweep.position_at(time) for time in times[lines]]), line_spread=np.tile(spread, (len(lines), 1)),
+        covariance=_covariance(errors, along, variance), lost=collector.lost, residual=residual, shift=shift,
+    )  # fmt: skip
 
 
 def _sweep_lit(plan: ScanPlan, devices: Devices, collector: SweepCollector) -> Sweep:

@@ -76,9 +76,7 @@ def parts(stream: IO[bytes], told: Parts) -> Iterator[tuple[int, bytes]]:
             index = _summary(stream, size)
             stream.seek(good)
             # Later messages need the channels that stood in it; the index repeats them.
-            for kept, inner in _records(BytesIO(index)):
-                if kept in (SCHEMA, CHANNEL):
-                    yield kept, inner
+            yield from filter(lambda record: record[0] in (SCHEMA, CHANNEL), _records(BytesIO(index)))
         elif kind == DATA_END:
             # 0: not reckoned, in records of older versions.
             expected = int.from_bytes(content[:4], "little")

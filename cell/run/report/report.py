@@ -105,18 +105,11 @@ class FinishedJob:
         ended, result, place = time.time(), self.result, self.job.place
         made = result.results.get("reconstruct")
         return {
-            "run": self.folder.name,
-            "kind": "job",
-            "version": release(),
-            "outcome": result.outcome.value,
-            "reason": result.reason,
-            "code": result.code,
-            "started": when(self.started),
-            "ended": when(ended),
-            "wall_s": round(ended - self.started, 2),
+            "run": self.folder.name, "kind": "job", "version": release(),
+            "outcome": result.outcome.value, "reason": result.reason, "code": result.code,
+            "started": when(self.started), "ended": when(ended), "wall_s": round(ended - self.started, 2),
             **self.info,
-            "steps": _steps(result),
-            "faults": _faults(result),
+            "steps": _steps(result), "faults": _faults(result),
             "refusal": refusal(result, self.folder, self.frames),
             "last_frames": last_frames(result, self.frames),
             "place_pose": None,
@@ -129,7 +122,7 @@ class FinishedJob:
             "assumed_noise": {"level": self.info["level"], "sigmas": _configured_noise(self.config)},
             "scan": made.summary() if isinstance(made, Reconstruction) else None,
             "truth": None,
-        }
+        }  # fmt: skip
 
     def _add_place(self, report: dict[str, Any]) -> None:
         """The place pose, where one was inverted."""

@@ -190,14 +190,9 @@ class SessionRequest:
         from cell.measure.vision.stripe.extract import read_drawn
 
         return SimulatedCell(
-            true,
-            Described.of(self.job),
-            seed=self.seed,
-            level=self.level,
-            speed=self.speed or SIM_SPEED,
-            gige=on_gige(loaded),
-            meanwhile=read_drawn if set(self.only) == set(DEVICES) else None,
-        )
+            true, Described.of(self.job), seed=self.seed, level=self.level, speed=self.speed or SIM_SPEED,
+            gige=on_gige(loaded), meanwhile=read_drawn if set(self.only) == set(DEVICES) else None,
+        )  # fmt: skip
 
     def _mixed(
         self, undo: ExitStack, loaded: CellConfig, folder: Path, simulated: tuple[str, ...], needed: list[str]

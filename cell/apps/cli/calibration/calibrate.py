@@ -26,6 +26,47 @@ if TYPE_CHECKING:
     from cell.apps.recordings.attach import Options
     from cell.measure.vision import LaserChannel
 
+SourceOption = Annotated[
+    Path | None, typer.Option("--from", help="A folder of recorded frames, with flange poses or without.")
+]
+BoardOption = Annotated[
+    str | None, typer.Option("--board", help='The board in the recorded frames, such as "chessboard:7x6:10mm".')
+]
+PlanOption = Annotated[
+    bool, typer.Option("--plan", help="Only say what was understood of the recorded frames, and calibrate nothing.")
+]
+PosesOption = Annotated[
+    str | None,
+    typer.Option(
+        "--poses", help='How the recorded poses are to be read, such as "xyz+rotvec-rad"; else the pictures tell.'
+    ),
+]
+PoseFieldOption = Annotated[
+    str | None, typer.Option("--pose-field", help="Which of several recorded poses is the flange's.")
+]
+SetupOption = Annotated[
+    str | None,
+    typer.Option("--setup", help="Where the camera was: eye-in-hand or eye-to-hand; else the poses tell."),
+]
+CameraOption = Annotated[
+    str | None,
+    typer.Option(
+        "--camera",
+        help='A camera that is known: a file (JSON of an earlier result, or YAML of OpenCV or ROS), or "pictures": '
+        "the arm has no say in it.",
+    ),
+]
+LaserOption = Annotated[
+    str | None,
+    typer.Option(
+        "--laser",
+        help="The laser's colour: red, green, blue, grey; none; or auto: the pictures tell, which is the default.",
+    ),
+]
+DetailsOption = Annotated[
+    bool, typer.Option("--details", help="With --from: every picture, value, check and note as well.")
+]
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file, and those below `cell calibrate`."""
@@ -45,46 +86,15 @@ def calibrate(
     seed: SeedOption = 1,
     level: LevelOption = Level.nominal,
     job: JobOption = "pot",
-    source: Annotated[
-        Path | None, typer.Option("--from", help="A folder of recorded frames, with flange poses or without.")
-    ] = None,
-    board: Annotated[
-        str | None, typer.Option("--board", help='The board in the recorded frames, such as "chessboard:7x6:10mm".')
-    ] = None,
-    plan: Annotated[
-        bool, typer.Option("--plan", help="Only say what was understood of the recorded frames, and calibrate nothing.")
-    ] = False,
-    poses: Annotated[
-        str | None,
-        typer.Option(
-            "--poses", help='How the recorded poses are to be read, such as "xyz+rotvec-rad"; else the pictures tell.'
-        ),
-    ] = None,
-    pose_field: Annotated[
-        str | None, typer.Option("--pose-field", help="Which of several recorded poses is the flange's.")
-    ] = None,
-    setup: Annotated[
-        str | None,
-        typer.Option("--setup", help="Where the camera was: eye-in-hand or eye-to-hand; else the poses tell."),
-    ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            "--camera",
-            help='A camera that is known: a file (JSON of an earlier result, or YAML of OpenCV or ROS), or "pictures": '
-            "the arm has no say in it.",
-        ),
-    ] = None,
-    laser: Annotated[
-        str | None,
-        typer.Option(
-            "--laser",
-            help="The laser's colour: red, green, blue, grey; none; or auto: the pictures tell, which is the default.",
-        ),
-    ] = None,
-    details: Annotated[
-        bool, typer.Option("--details", help="With --from: every picture, value, check and note as well.")
-    ] = False,
+    source: SourceOption = None,
+    board: BoardOption = None,
+    plan: PlanOption = False,
+    poses: PosesOption = None,
+    pose_field: PoseFieldOption = None,
+    setup: SetupOption = None,
+    camera: CameraOption = None,
+    laser: LaserOption = None,
+    details: DetailsOption = False,
     json: JsonOption = False,
 ) -> None:
     """Calibrate rail, cameras, hand-eye and light plane, and store the result.

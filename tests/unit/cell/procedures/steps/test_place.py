@@ -87,17 +87,10 @@ class Site:
         """Place where the surface is taken to be `too_low` m below where it truly is."""
         given = {"claw": self.cell.devices.claw, "note": lambda part: self.noted.append(part.state), **exchanged}
         placing = Placing(
-            JOB,
-            self.base_from_surface * from_parts((0.0, 0.0, -too_low)),
-            STATED,
-            mover=self.mover,
-            arm=self.arm,
-            claw=given["claw"],
-            part=self.part,
-            check=lambda: None,
-            progress=lambda share, text: None,
+            JOB, self.base_from_surface * from_parts((0.0, 0.0, -too_low)), STATED, mover=self.mover, arm=self.arm,
+            claw=given["claw"], part=self.part, check=lambda: None, progress=lambda share, text: None,
             note=given["note"],
-        )
+        )  # fmt: skip
         return placing.put_down()
 
     @property
