@@ -225,10 +225,10 @@ class JobRun:
         if not self.run.control.late:
             self.devices.gate.clear(stops)
 
-    def _facts_after(self, begun: float, here: Workplace) -> dict[str, Any]:
+    def _facts_after(self, begun: float, here: Workplace) -> dict[str, object]:
         """What the report says of the run besides its result; `begun` is a time of the cell's clock."""
         cell_s = round(self.devices.clock.now() - begun, 3)
-        facts = {"cell_s": cell_s, **self._facts(), "part": here.part.state.value}
+        facts: dict[str, object] = {"cell_s": cell_s, **self._facts(), "part": here.part.state.value}
         injectors = (each for each in self.inline if isinstance(each, Injector))
         if missed := {name: why for each in injectors for name, why in each.missed.items()}:
             facts["not_injected"] = [{"fault": name, "why": why} for name, why in missed.items()]

@@ -63,7 +63,7 @@ class FinishedJob:
     nominal: NominalSurface
     repeatability: Vector
     result: RunResult
-    info: dict[str, Any]
+    info: dict[str, object]
     started: float
     witness: TruthRecorder | None
     frames: FrameStore
@@ -73,7 +73,7 @@ class FinishedJob:
 
         Written before the comparison with the truth and the picture as well: what goes wrong with those is told in it.
         """
-        report = self._of_the_run()
+        report: dict[str, Any] = self._of_the_run()
         self._add_place(report)
         report["measured"] = measured(self.result, self.job, None, report["place_bound_95"])
         if self.frames.failure is not None:
@@ -100,7 +100,7 @@ class FinishedJob:
         _write(self.folder, report)
         return report
 
-    def _of_the_run(self) -> dict[str, Any]:
+    def _of_the_run(self) -> dict[str, object]:
         """What every run has, in the order of the file; what is not known yet is None."""
         ended, result, place = time.time(), self.result, self.job.place
         made = result.results.get("reconstruct")
@@ -124,7 +124,7 @@ class FinishedJob:
             "truth": None,
         }  # fmt: skip
 
-    def _add_place(self, report: dict[str, Any]) -> None:
+    def _add_place(self, report: dict[str, object]) -> None:
         """The place pose, where one was inverted."""
         pose = self.result.results.get("invert_pose")
         if not isinstance(pose, PlacePose):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -108,17 +108,12 @@ def calibrate(
     given = {"--board": board, "--plan": plan, "--poses": poses, "--pose-field": pose_field, "--setup": setup}
     given |= {"--camera": camera, "--laser": laser, "--details": details}
     if source is None:
-        for name, value in given.items():
-            if value:
-                raise ConfigError(f"{name} belongs to --from; the boards on the deck are named in the configuration")
+        for name in (name for name, value in given.items() if value):
+            raise ConfigError(f"{name} belongs to --from; the boards on the deck are named in the configuration")
     else:
         from cell.apps.recordings.attach import Options
-        from cell.apps.recordings.known_camera import read_camera
 
-        known = None if camera in (None, "pictures") else read_camera(Path(str(camera)))
-        options = Options(
-            poses, pose_field, _setup(setup), plan, camera=known, hold_camera=camera == "pictures", laser=_laser(laser)
-        )
+        options = Options(poses, pose_field, _setup(setup), plan, laser=_laser(laser), **_camera(camera))
         _from_folder(source, board, options, json, details)
         return
     from cell.apps.cli.calibration.tables import print_examination
@@ -144,6 +139,14 @@ def calibrate(
     else:
         print_calibration(calibration.summary(), str(where))
         print_examination(examination.summary, pictures)
+
+
+def _camera(text: str | None) -> dict[str, Any]:
+    """What of the options tells of a camera that is known."""
+    from cell.apps.recordings.known_camera import read_camera
+
+    known = None if text in (None, "pictures") else read_camera(Path(str(text)))
+    return {"camera": known, "hold_camera": text == "pictures"}
 
 
 def _setup(text: str | None) -> str | None:

@@ -69,7 +69,7 @@ def motion(record: Path) -> dict[str, Any]:
     return {**dict(zip(("times", "joints", "rail", "vehicle"), columns, strict=True)), "steps": steps}
 
 
-def _note_step(steps: list[dict[str, Any]], event: Mapping[str, Any], now: float) -> None:
+def _note_step(steps: list[dict[str, object]], event: Mapping[str, object], now: float) -> None:
     """Add the step that this event begins; or the end, in s, of the newest one."""
     if event["kind"] == "step_started":
         steps.append({"name": event["step"], "begin": now, "end": None})

@@ -116,15 +116,15 @@ class RunView:
             self._step, self._text = None, "writing the report"
             self.ended = self._end(event)
 
-    def _begin(self, row: dict[str, Any]) -> None:
+    def _begin(self, row: dict[str, object]) -> None:
         """The step of this row is active from now on."""
         # What went before without an end of its own, as a calibration does, has ended.
         for before in self._rows.values():
             before["state"] = "done" if before["state"] == "active" else before["state"]
         self._fraction, self._text, self._step_begun = 0.0, "", time.monotonic()
-        row |= {"state": "active", "reason": "", "retries": row["retries"] + (self._attempt > 1)}
+        row |= {"state": "active", "reason": "", "retries": int(str(row["retries"])) + (self._attempt > 1)}
 
-    def _end(self, event: Event) -> dict[str, Any]:
+    def _end(self, event: Event) -> dict[str, object]:
         folder = None if self.run.folder is None else self.run.folder.name
         told = {"outcome": str(event.data["outcome"]), "reason": str(event.data["reason"])}
         return {"run": folder, "kind": self.run.kind, **told, "t": event.at}

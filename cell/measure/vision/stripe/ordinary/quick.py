@@ -268,8 +268,7 @@ def read_quickly(
         contrast = seen_contrast if contrast is None else contrast
         grain = seen_grain if grain is None else grain
     run(found, contrast, _lags(contrast, grain))
-    saturated = np.empty(len(work), np.bool_)
-    excess = 1 + SECOND_ORDER * contrast**2
+    saturated, excess = np.empty(len(work), np.bool_), 1 + SECOND_ORDER * contrast**2
     believe(
         fitted, start, work.shape[1], low, high, least=0.5 * least, excess=excess, double=double, saturated=saturated
     )
@@ -280,7 +279,13 @@ def read_quickly(
     )  # fmt: skip
     if _is_like(profile, like):
         return profile, QuickVerdict.ORDINARY
-    ordinary = (
+    ordinary = _is_ordinary(fitted, start, work, shade=shade, seen=seen, several=several)
+    return profile, QuickVerdict.ORDINARY if ordinary else _not_ordinary(profile, start)
+
+
+def _is_ordinary(fitted: Array, start: Array, work: Image, *, shade: Image, seen: Image, several: bool) -> bool:
+    """Whether the stripe is whole, narrow, unsaturated, Gaussian, the only one, and on an even, plain surface."""
+    return (
         is_line_whole(fitted, start)
         and not is_too_wide(fitted, start)
         and not is_saturated(fitted, start)
@@ -289,10 +294,9 @@ def read_quickly(
         and is_surface_even(shade, fitted)
         and not is_textured(seen)
     )
-    return profile, QuickVerdict.ORDINARY if ordinary else _not_ordinary(profile, start)
 
 
-def _lags(contrast: float, grain: float | None) -> Any:
+def _lags(contrast: float, grain: float | None) -> NDArray[np.float32]:
     """The speckle's correlation by lag; none where there is no speckle."""
     return correlation(grain) if contrast > 0 and grain else NO_LAGS
 
