@@ -298,12 +298,7 @@ class Runner:
         self._teller.tell(Event("run_ended", None, {"outcome": outcome.value, "reason": said}))
         code = "" if end is None else end.code
         return RunResult(
-            outcome,
-            said,
-            code,
-            steps=tuple(self._attempts.records[name] for name in self.sequence.steps),
-            results=dict(self._attempts.results),
-            error=self._watchman.error,
-            signal=self.control.signal,
+            outcome, said, code, steps=tuple(self._attempts.records[name] for name in self.sequence.steps),
+            results=dict(self._attempts.results), error=self._watchman.error, signal=self.control.signal,
             faults=tuple(self._teller.faults),
-        )
+        )  # fmt: skip

@@ -251,18 +251,12 @@ class JobRun:
 
     def _facts(self) -> dict[str, Any]:
         return {
-            "kind": "job",
-            "pid": os.getpid(),
-            "cell": self.config.cell.name,
-            "job": self.job.job.name,
-            "job_kind": self.job.job.kind,
-            **self.info,
-            "speed": self.config.cell.time_scale,
-            "configuration_hash": self.config.calibration_hash(),
-            "calibration_hash": self.calibration.hash(),
+            "kind": "job", "pid": os.getpid(), "cell": self.config.cell.name, "job": self.job.job.name,
+            "job_kind": self.job.job.kind, **self.info, "speed": self.config.cell.time_scale,
+            "configuration_hash": self.config.calibration_hash(), "calibration_hash": self.calibration.hash(),
             "calibration_date": self.calibration.date,
             **({"calibration_edits": list(self.calibration.edits)} if self.calibration.edits else {}),
-        }
+        }  # fmt: skip
 
     def _keep_inputs(self, folder: Path) -> None:
         write_json(folder / "configuration.json", self.config.model_dump(mode="json"))

@@ -150,14 +150,9 @@ def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tu
         frames.keep("stripe", record.results["laser_sweep"].middle)
     before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
     result = RunResult(
-        failure.outcome,
-        failure.reason,
-        failure.code,
-        records(step, faults),
-        before,
-        CellError(failure.reason),
+        failure.outcome, failure.reason, failure.code, records(step, faults), before, CellError(failure.reason),
         faults=faults,
-    )
+    )  # fmt: skip
     return reported(folder, CONFIG, job, nominal, work, result, frames, None)
 
 
@@ -175,23 +170,12 @@ def reported(
 ) -> Ended:
     """The report of a result, with the facts that `cell.run.job_run.JobRun` adds."""
     info: dict[str, Any] = {
-        "kind": "job",
-        "pid": os.getpid(),
-        "part": work.part.state.value,
-        "cell": config.cell.name,
-        "job": job.job.name,
-        "job_kind": job.job.kind,
-        "simulated": simulated,
-        "seed": 2 if simulated else None,
-        "level": "nominal" if simulated else None,
-        "clock": "wall",
-        "cell_s": 12.34,
-        **job_source("pot"),
-        "speed": config.cell.time_scale,
-        "configuration_hash": config.calibration_hash(),
-        "calibration_hash": work.calibration.hash(),
-        "calibration_date": work.calibration.date,
-    }
+        "kind": "job", "pid": os.getpid(), "part": work.part.state.value, "cell": config.cell.name, "job": job.job.name,
+        "job_kind": job.job.kind, "simulated": simulated, "seed": 2 if simulated else None,
+        "level": "nominal" if simulated else None, "clock": "wall", "cell_s": 12.34, **job_source("pot"),
+        "speed": config.cell.time_scale, "configuration_hash": config.calibration_hash(),
+        "calibration_hash": work.calibration.hash(), "calibration_date": work.calibration.date,
+    }  # fmt: skip
     started = time.time() - 31.0
     finished = FinishedJob(
         folder, config, job, nominal, work.repeatability,

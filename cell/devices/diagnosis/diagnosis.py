@@ -171,14 +171,9 @@ def diagnose(
 
     # Looked at only, so it follows nothing: its pictures are of where its own devices stand.
     world = SimulatedCell(
-        config,
-        Described.of("pot"),
-        seed=seed,
-        level=level,
-        speed=speed if whole else config.cell.time_scale,
-        gige=[name for name in on_gige(config) if name in names],
-        simulated=names,
-    )
+        config, Described.of("pot"), seed=seed, level=level, speed=speed if whole else config.cell.time_scale,
+        gige=[name for name in on_gige(config) if name in names], simulated=names,
+    )  # fmt: skip
     try:
         rows = _diagnose(with_endpoints(config, world.endpoints, names if whole else served), only)
     finally:

@@ -88,16 +88,11 @@ def write_archive(path: Path, observations: Observations) -> None:
     """Write it; a reader finds the old file or the new one, never half of one."""
     o = observations
     about = {
-        "format": FORMAT,
-        "made": o.made,
-        "identities": o.identities,
-        "configuration": o.configuration,
-        "kinematics": o.kinematics,
-        "rail_lead": o.rail_lead,
-        "priors": {name: getattr(o.priors, name) for name in PRIORS},
-        "scan_camera": _camera_dict(o.scan_camera),
+        "format": FORMAT, "made": o.made, "identities": o.identities, "configuration": o.configuration,
+        "kinematics": o.kinematics, "rail_lead": o.rail_lead,
+        "priors": {name: getattr(o.priors, name) for name in PRIORS}, "scan_camera": _camera_dict(o.scan_camera),
         "target_camera": _camera_dict(o.target_camera),
-    }
+    }  # fmt: skip
     arrays = _views("scan", [(s.view, s.base_from_flange, s.name) for s in o.scan])
     arrays |= _views("target", [(t.view, t.base_from_flange, t.name) for t in o.target])
     arrays["scan_rail"] = np.array([s.rail_position for s in o.scan])
@@ -141,16 +136,12 @@ def read_archive(path: Path) -> Observations:
                 for view, flange, name in _read_views(data, "target")
                 if view is not None
             ],
-            _camera(about["scan_camera"]),
-            target_camera=_camera(about["target_camera"]),
-            priors=priors,
+            _camera(about["scan_camera"]), target_camera=_camera(about["target_camera"]), priors=priors,
             rail_lead=_positive(about, "rail_lead"),
             identities={str(name): str(serial) for name, serial in about["identities"].items()},
-            configuration=str(about["configuration"]),
-            made=float(about["made"]),
-            kinematics=str(about.get("kinematics", "")),
-            witness=_read_witness(data, about),
-        )
+            configuration=str(about["configuration"]), made=float(about["made"]),
+            kinematics=str(about.get("kinematics", "")), witness=_read_witness(data, about),
+        )  # fmt: skip
         # Last: what is wrong with a figure says more than that something was changed.
         if about["format"] == FORMAT or DIGEST in data:
             require_unchanged(data)
@@ -226,14 +217,9 @@ def _read_views(data: Mapping[str, Any], camera: str) -> list[tuple[BoardView | 
                 raise ValueError(f"{camera}_ids of {name} lie outside 0 to {len(spec.points()) - 1} of {spec.name}")
             size = (int(sizes[k, 0]), int(sizes[k, 1]))
             view = BoardView(
-                spec,
-                size,
-                ids[part],
-                pixels=pixels[part],
-                sigma=sigma[part],
-                order_assumed=bool(assumed[k]),
+                spec, size, ids[part], pixels=pixels[part], sigma=sigma[part], order_assumed=bool(assumed[k]),
                 dot_radius=float(radii[k]),
-            )
+            )  # fmt: skip
             start, k = start + count, k + 1
         made.append((view, _pose(flange, str(name)), str(name)))
     return made

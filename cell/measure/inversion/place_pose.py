@@ -148,19 +148,15 @@ class PlacePose:
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
         return {
-            "points": self.n_points,
-            "rms_mm": round(1e3 * self.rms, 4),
-            "chi2_per_dof": round(self.chi2_per_dof, 3),
-            "share": round(self.share, 4),
-            "coverage": round(self.coverage, 3),
+            "points": self.n_points, "rms_mm": round(1e3 * self.rms, 4), "chi2_per_dof": round(self.chi2_per_dof, 3),
+            "share": round(self.share, 4), "coverage": round(self.coverage, 3),
             "parts_differ": round(self.parts_differ, 3),
             "correction_mm": [round(1e3 * float(v), 3) for v in self.correction[:3]],
             "correction_mrad": [round(1e3 * float(v), 3) for v in self.correction[3:]],
             "sigma_mm": [round(1e3 * float(v), 4) for v in self.sigma[:3]],
-            "sigma_mrad": [round(1e3 * float(v), 4) for v in self.sigma[3:]],
-            "least_known": self.verdict.worst.words,
+            "sigma_mrad": [round(1e3 * float(v), 4) for v in self.sigma[3:]], "least_known": self.verdict.worst.words,
             "decided_by_board": list(self.verdict.unseen),
-        }
+        }  # fmt: skip
 
 
 Resolve = Callable[[NDArray[np.intp], NDArray[np.intp]], Array]

@@ -246,22 +246,16 @@ def information(path: Path) -> dict[str, Any]:
     except CellError as error:
         raise CellError(f"{path}: {error}") from error
     return {
-        "file": str(path),
-        "bytes": path.stat().st_size,
-        "whole": told.whole and counts.total() > 0,
-        "closed": told.closed,
-        "damaged": told.damaged,
-        "lost_bytes": told.lost,
-        "messages": counts.total(),
+        "file": str(path), "bytes": path.stat().st_size, "whole": told.whole and counts.total() > 0,
+        "closed": told.closed, "damaged": told.damaged, "lost_bytes": told.lost, "messages": counts.total(),
         "begun_ns": times[0] if times else None,
         "span_s": round(1e-9 * (times[1] - times[0]), 3) if times else None,
-        "dropped": end.get("dropped"),
-        "cpu_s": end.get("cpu_s"),
+        "dropped": end.get("dropped"), "cpu_s": end.get("cpu_s"),
         "channels": [
             {"topic": topic, "schema": schemas[topic], "messages": counts[topic], "bytes": sizes[topic]}
             for topic in sorted(counts)
         ],
-    }
+    }  # fmt: skip
 
 
 ERROR_FLAG = 0x20000000

@@ -279,14 +279,10 @@ class Recorder(logging.Handler):
         camera = self._camera_of(what, frame)
         at = self._times.of(frame.mid_exposure)
         told = {
-            "file": picture.name,
-            "frame_id": frame.frame_id,
-            "exposure": frame.exposure,
-            "device_time": frame.device_time,
-            "host_time": frame.host_time,
-            "received": frame.received,
+            "file": picture.name, "frame_id": frame.frame_id, "exposure": frame.exposure,
+            "device_time": frame.device_time, "host_time": frame.host_time, "received": frame.received,
             "lost_before": frame.lost_before,
-        }
+        }  # fmt: skip
         self._json(f"/{camera}/frame", at, told)
         self._put(f"/{camera}/calibration", at, partial(self._sketch.lens, camera=camera))
         self._put(f"/{camera}/image", at, partial(self._sketch.image, camera=camera, picture=picture))

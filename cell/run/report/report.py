@@ -179,17 +179,8 @@ def _steps(result: RunResult) -> list[dict[str, Any]]:
 
 
 def _faults(result: RunResult) -> list[dict[str, Any]]:
-    return [
-        {
-            "at": when(fault.at),
-            "step": fault.step,
-            "attempt": fault.attempt,
-            "code": fault.code,
-            "reason": fault.reason,
-            "remedy": fault.remedy,
-        }
-        for fault in result.faults
-    ]
+    names = ("step", "attempt", "code", "reason", "remedy")
+    return [{"at": when(fault.at), **{name: getattr(fault, name) for name in names}} for fault in result.faults]
 
 
 def _pose(pose: PlacePose, job: Job) -> dict[str, Any]:

@@ -70,14 +70,9 @@ class Opened:
     def mover(self, job: Job | None, hold: Callable[[], None] = lambda: None) -> Mover:
         """Planned moves of the arm; with a job, its part is in the claw. `hold` is called before each free motion."""
         return Mover(
-            self.devices.arm,
-            self.devices.clock,
-            self.config,
-            job=job,
-            hold=hold,
-            interlocks=self.devices.interlocks,
+            self.devices.arm, self.devices.clock, self.config, job=job, hold=hold, interlocks=self.devices.interlocks,
             pace=self.pace,
-        )
+        )  # fmt: skip
 
     @property
     def world(self) -> dict[str, Any]:

@@ -136,16 +136,9 @@ def dry_run(
     for text in inject or ():
         Injection.parse(text, find_kind(loaded.job.kind).names)
     opened = partial(
-        Cell.open,
-        config,
-        sim="all",
-        seed=seed,
-        level=level.value,
-        speed=speed,
-        job=job,
-        confirm=None if confirm is None else confirm.value,
-        clock=(clock or CellClock.wall).value,
-    )
+        Cell.open, config, sim="all", seed=seed, level=level.value, speed=speed, job=job,
+        confirm=None if confirm is None else confirm.value, clock=(clock or CellClock.wall).value,
+    )  # fmt: skip
     if console:
         from cell.apps.cli.commands.console import require_installed, run_shown
 
@@ -184,15 +177,11 @@ def resume(
     simulated, clock = before.info["simulated"], before.info.get("clock", "wall")
     whole = simulated is True
     opened = partial(
-        Cell.open,
-        config,
-        sim="all" if whole else simulated or "none",
-        seed=before.info.get("seed") or 1,
+        Cell.open, config, sim="all" if whole else simulated or "none", seed=before.info.get("seed") or 1,
         level=before.info.get("level") or "nominal",
-        speed=before.info.get("speed") if whole and clock == "wall" else None,
-        job=before.job if simulated else "pot",
+        speed=before.info.get("speed") if whole and clock == "wall" else None, job=before.job if simulated else "pot",
         clock=clock,
-    )
+    )  # fmt: skip
     _perform(opened, lambda cell, display: cell.resume(before.folder, display, at_start=at_start), json, noise)
 
 

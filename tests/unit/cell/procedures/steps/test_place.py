@@ -239,15 +239,9 @@ def test_a_job_with_an_empty_claw_ends_before_anything_moves() -> None:
     site = Site()
     site.cell.devices.claw.bare.release()
     here = Workplace(
-        CONFIG,
-        JOB,
-        NOMINAL,
-        cast(Any, None),
-        site.cell.devices,
-        NoFrames(),
-        Path(),
+        CONFIG, JOB, NOMINAL, cast(Any, None), site.cell.devices, NoFrames(), Path(),
         Whereabouts(site.cell.devices.vehicle),
-    )
+    )  # fmt: skip
     before = site.arm.state().joints
     context = StepContext(drive_to_target.STEP.policy, 1, 1e9, {}, site.cell.clock, lambda event: None)
     with pytest.raises(RefusedError, match="the claw holds no part"):
