@@ -52,15 +52,9 @@ class Attempts:
         started, begun = clock.now(), time.monotonic()
         deadline = started + step.deadline_s * (clock.rate if step.on_wall else 1.0)
         context = StepContext(
-            step,
-            number,
-            deadline,
-            results=dict(self.results),
-            clock=clock,
-            tell=teller.tell,
-            control=watchman.control,
+            step, number, deadline, results=dict(self.results), clock=clock, tell=teller.tell, control=watchman.control,
             look=watchman.waiting.look,
-        )
+        )  # fmt: skip
         key = watchman.journal.step_started(step.name, number)
         teller.tell(Event("step_started", step.name, {"attempt": number}))
         watchman.error = None

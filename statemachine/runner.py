@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 from statemachine.attempts import Attempts, Recover, hold, performed
@@ -117,9 +118,26 @@ _END_TRIGGERS = {
 }
 
 
+@dataclass(frozen=True)
+class LoneResult:
+    """What a step made that was done alone, or the `end` it came to.
+
+    `error` is the exception behind the end, and `judged` what that means by itself. `abandoned` says that the step is
+    still busy after its stop, `unrecorded` why its end is not in the journal.
+    """
+
+    made: object
+    end: Failure | None
+    error: BaseException | None
+    judged: Failure | None
+    abandoned: bool
+    unrecorded: JournalError | None
+
+
 @dataclass
 class Runner:
-    """Runs one job. `run()` is called once; what a person or another program asks comes through `control`.
+    """Runs one job, or one step alone. Either is called once; what a person or another program asks comes through
+    `control`.
 
     `steps` maps step names to what does them. `safe_stop(reason)` brings the cell to rest: laser off, everything
     stopped. It must be idempotent and leave a cell that can go on, since it is called when a step fails or is cut
@@ -155,22 +173,8 @@ class Runner:
         Raises nothing: every exception of a step, of the journal or of the runner itself becomes an outcome, after
         the safe stop.
         """
-        self._teller = Teller(self.journal, self.observer, lambda: str(self.sequence.state))
-        self.sequence.on_change = self._teller.changed
-        with SignalWatch() as signals:
-            self._watchman = Watchman(
-                policy=self.policy,
-                journal=self.journal,
-                clock=self.clock,
-                control=self.control,
-                classify=self.classify,
-                safe_stop=self.safe_stop,
-                health=self.health,
-                waiting=waiting_on(self.clock),
-                signals=signals,
-                teller=self._teller,
-            )
-            self._attempts = Attempts(self.sequence.steps, self.steps, self._watchman)
+        with self._watching():
+            self.sequence.on_change = self._teller.changed
             for name, result in (done or {}).items():
                 self.sequence.facts.done.add(name)
                 self._attempts.resume(name, result)
@@ -180,6 +184,46 @@ class Runner:
                 self._watchman.error = error
                 end = Failure(Outcome.FAULTED, f"the run could not go on: {error}", "run.internal")
             return self._finish(end)
+
+    def run_alone(self) -> LoneResult:
+        """Do the only step, within a run that others begin and end, and may go on with.
+
+        The cell is brought to rest where the step failed or somebody asks for the end; otherwise it is left as it is.
+        Raises nothing that the step or the journal raises.
+        """
+        (name,) = self.sequence.steps
+        with self._watching():
+            watchman, attempts = self._watchman, self._attempts
+            end: Failure | None = None
+            unrecorded: JournalError | None = None
+            self.sequence.fire(JobTrigger.START)
+            try:
+                end = performed(self.policy.of(name), attempts, self.recover, self.sequence, watchman=watchman)
+                end = end or watchman.asked()
+            # Its end cannot be recorded; what it ended with counts.
+            except JournalError as failure:
+                unrecorded = failure
+                if name not in attempts.results:
+                    watchman.error = watchman.error or failure
+                    end = Failure(Outcome.FAULTED, str(watchman.error))
+            if end is not None and not watchman.at_rest:
+                watchman.halt(end.reason)
+            error = watchman.error
+            judged = None if error is None else watchman.classified(error)
+            return LoneResult(attempts.results.get(name), end, error, judged, watchman.abandoned, unrecorded=unrecorded)
+
+    @contextmanager
+    def _watching(self) -> Iterator[None]:
+        """Set up what watches, for a whole run and for a step alone."""
+        self._teller = Teller(self.journal, self.observer, lambda: str(self.sequence.state))
+        with SignalWatch() as signals:
+            self._watchman = Watchman(
+                policy=self.policy, journal=self.journal, clock=self.clock, control=self.control,
+                classify=self.classify, safe_stop=self.safe_stop, health=self.health, waiting=waiting_on(self.clock),
+                signals=signals, teller=self._teller,
+            )  # fmt: skip
+            self._attempts = Attempts(self.sequence.steps, self.steps, self._watchman)
+            yield
 
     # --- the walk through the sequence ---
 
@@ -254,12 +298,7 @@ class Runner:
         self._teller.tell(Event("run_ended", None, {"outcome": outcome.value, "reason": said}))
         code = "" if end is None else end.code
         return RunResult(
-            outcome,
-            said,
-            code,
-            steps=tuple(self._attempts.records[name] for name in self.sequence.steps),
-            results=dict(self._attempts.results),
-            error=self._watchman.error,
-            signal=self.control.signal,
+            outcome, said, code, steps=tuple(self._attempts.records[name] for name in self.sequence.steps),
+            results=dict(self._attempts.results), error=self._watchman.error, signal=self.control.signal,
             faults=tuple(self._teller.faults),
-        )
+        )  # fmt: skip

@@ -82,7 +82,7 @@ class Watchman:
     """Watches over one run, with what the `Runner` was given.
 
     `error` is the exception behind the newest end. `abandoned` says that work did not end after its stop: it still goes
-    on in a thread that nobody waits for.
+    on in a thread that nobody waits for. `at_rest` says that no work has begun since the newest stop.
     """
 
     policy: Policy
@@ -97,6 +97,7 @@ class Watchman:
     teller: Teller
     error: BaseException | None = field(default=None, init=False)
     abandoned: bool = field(default=False, init=False)
+    at_rest: bool = field(default=False, init=False)
     _polls: int = field(default=0, init=False)
     _ailment: Exception | None = field(default=None, init=False)
 
@@ -110,6 +111,7 @@ class Watchman:
         cause: Failure | None = None
         trouble: str | None = None
         held = self.control.held_s
+        self.at_rest = False
 
         def cut() -> str | None:
             nonlocal cause, trouble
@@ -201,6 +203,7 @@ class Watchman:
 
     def halt(self, reason: str) -> str | None:
         """Call `safe_stop` where no signal reaches it; what went wrong with it, or None."""
+        self.at_rest = True
         until = self.clock.now() + self.policy.stop_deadline_s * self.clock.rate
         late = f"it did not end within {self.policy.stop_deadline_s:g} s"
         call = self.waiting.do(

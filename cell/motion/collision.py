@@ -254,7 +254,7 @@ class CollisionModel:
 
     def touching(self, joints: Joints, allowed: Sequence[Pair] = ()) -> list[Pair]:
         """The pairs closer than the margin at the joint angles (6,) rad, without the `allowed` ones."""
-        pin.computeCollisions(self._model, self._data, self._geometry, self._geometry_data, _array(joints), False)
+        self._collide(joints, first_only=False)
         excused = {frozenset(pair) for pair in allowed}
         results = self._geometry_data.collisionResults
         return [
@@ -266,10 +266,13 @@ class CollisionModel:
     def free(self, joints: Joints, allowed: Sequence[Pair] = ()) -> bool:
         """True when no pair touches but the `allowed` ones; faster than `touching` where nothing is allowed."""
         if not allowed:
-            return not pin.computeCollisions(
-                self._model, self._data, self._geometry, self._geometry_data, _array(joints), True
-            )
+            return not self._collide(joints, first_only=True)
         return not self.touching(joints, allowed)
+
+    def _collide(self, joints: Joints, *, first_only: bool) -> bool:
+        """Whether any two bodies collide; with `first_only` the pairs after the first are not looked at."""
+        data = self._model, self._data, self._geometry, self._geometry_data
+        return bool(pin.computeCollisions(*data, _array(joints), first_only))
 
     def distance(self, joints: Joints) -> tuple[float, Pair]:
         """Smallest distance in m between two bodies and their names; about 10 ms, for reports."""

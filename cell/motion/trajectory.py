@@ -280,7 +280,7 @@ class FlangeTrack:
         host's; `longest_gap` is in s."""
         device = np.array([state.device_time for state in states])
         kept = np.flatnonzero(np.diff(device, prepend=-np.inf) > 0)
-        self._name, self._longest_gap = name, longest_gap
+        self.name, self._longest_gap = name, longest_gap
         if len(kept) < LEAST_STATES:
             raise self._fault(f"only {len(kept)} states of the arm came during the motion, at least {LEAST_STATES}")
         self.times: Vector = np.array([clocks.host_time(time) for time in device[kept]])
@@ -326,7 +326,7 @@ class FlangeTrack:
 
     def _fault(self, text: str) -> DeviceFault:
         return DeviceFault(
-            self._name,
+            self.name,
             "arm.states_lost",
             text,
             recoverable=True,

@@ -41,7 +41,7 @@ from cell.run.record.recorder import Recorder, recorded
 from cell.run.record.replay import save as save_perception
 from cell.run.recorded_work import classify, clear, outcome_of
 from cell.run.report.figures import following_words, told
-from cell.run.report.report import make_report
+from cell.run.report.report import FinishedJob
 from cell.run.report.truth import TruthRecorder
 from cell.run.resumption import UnfinishedRun, job_source
 from cell.run.runs import Run
@@ -184,67 +184,57 @@ class JobRun:
         observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
         with FrameStore(folder / "frames", None if record is None else record.frame) as frames:
             self.run.frames = frames
-            here = Workplace(
-                self.config,
-                self.job,
-                self.nominal,
-                calibration=self.calibration,
-                devices=self.devices,
-                frames=frames,
-                folder=folder,
-                whereabouts=whereabouts,
-                earlier=self.earlier,
-                needs_part=self.kind.places,
-                sweeping=self._sweeping,
-                registered=self._registered,
-                pace=self.pace,
-            )
-            runner = Runner(
-                sequence=self.kind.sequence(),
-                steps=self.kind.work(here),
-                policy=self.kind.policy(simulated_person=self.config.cell.confirm == "simulated"),
-                journal=journal,
-                clock=self.devices.clock,
-                classify=partial(classify, following=self.devices.following),
-                safe_stop=lambda reason: stop_cell(self.devices),
-                observer=each_of(observers),
-                recover=partial(clear, self.devices),
-                health=lambda: require_healthy(self.devices),
-                control=self.run.control,
-                script=self._in_the_gate(self.script),
-            )
-            result = runner.run()
+            here = self._workplace(folder, whereabouts, frames)
+            result = self._runner(here, journal, each_of(observers)).run()
         save_perception(folder, result)
-        good = result.outcome in (Outcome.PLACED, Outcome.DONE)
-        if good and open_before:
-            # The stop at the end of a good run keeps nobody from going on. One from before the run still does, and one
-            # that a person asked for meanwhile.
-            stops = self.devices.gate.stops
-            if not self.run.control.late:
-                self.devices.gate.clear(stops)
+        if open_before and result.outcome in (Outcome.PLACED, Outcome.DONE):
+            self._open_again()
         if result.outcome is not Outcome.PLACED:
             result = replace(result, reason=here.part.told(result.reason))
+        finished = FinishedJob(
+            folder, self.config, self.job, nominal=self.nominal, repeatability=here.repeatability, result=result,
+            info=self._facts_after(begun, here), started=started, witness=witness, frames=frames,
+        )  # fmt: skip
+        report = finished.report()
+        return RunOutcome(
+            report["outcome"], report["reason"], folder, report=report, results=result.results,
+            control=self.run.control, wall_s=time.time() - started,
+        )  # fmt: skip
+
+    def _workplace(self, folder: Path, whereabouts: Whereabouts, frames: FrameStore) -> Workplace:
+        return Workplace(
+            self.config, self.job, self.nominal, calibration=self.calibration, devices=self.devices, frames=frames,
+            folder=folder, whereabouts=whereabouts, earlier=self.earlier, needs_part=self.kind.places,
+            sweeping=self._sweeping, registered=self._registered, pace=self.pace,
+        )  # fmt: skip
+
+    def _runner(self, here: Workplace, journal: Journal, observer: Observer) -> Runner:
+        return Runner(
+            sequence=self.kind.sequence(), steps=self.kind.work(here),
+            policy=self.kind.policy(simulated_person=self.config.cell.confirm == "simulated"), journal=journal,
+            clock=self.devices.clock, classify=partial(classify, following=self.devices.following),
+            safe_stop=lambda reason: stop_cell(self.devices), observer=observer, recover=partial(clear, self.devices),
+            health=lambda: require_healthy(self.devices), control=self.run.control,
+            script=self._in_the_gate(self.script),
+        )  # fmt: skip
+
+    def _open_again(self) -> None:
+        """The stop at the end of a good run keeps nobody from going on. One from before the run still does, and one
+        that a person asked for meanwhile."""
+        stops = self.devices.gate.stops
+        if not self.run.control.late:
+            self.devices.gate.clear(stops)
+
+    def _facts_after(self, begun: float, here: Workplace) -> dict[str, object]:
+        """What the report says of the run besides its result; `begun` is a time of the cell's clock."""
         cell_s = round(self.devices.clock.now() - begun, 3)
-        facts = {"cell_s": cell_s, **self._facts(), "part": here.part.state.value}
-        if missed := {
-            name: why for each in self.inline if isinstance(each, Injector) for name, why in each.missed.items()
-        }:
+        facts: dict[str, object] = {"cell_s": cell_s, **self._facts(), "part": here.part.state.value}
+        injectors = (each for each in self.inline if isinstance(each, Injector))
+        if missed := {name: why for each in injectors for name, why in each.missed.items()}:
             facts["not_injected"] = [{"fault": name, "why": why} for name, why in missed.items()]
         if self.devices.following is not None:
             facts["following"] = self._following(self.devices.following)
-        report = make_report(
-            folder, self.config, self.job, nominal=self.nominal, repeatability=here.repeatability, result=result,
-            info=facts, started=started, witness=witness, frames=frames,
-        )  # fmt: skip
-        return RunOutcome(
-            report["outcome"],
-            report["reason"],
-            folder,
-            report=report,
-            results=result.results,
-            control=self.run.control,
-            wall_s=time.time() - started,
-        )
+        return facts
 
     def _sweeping(self, collector: SweepCollector, base_from_surface: pin.SE3) -> None:
         self.run.registered = None
@@ -261,18 +251,12 @@ class JobRun:
 
     def _facts(self) -> dict[str, Any]:
         return {
-            "kind": "job",
-            "pid": os.getpid(),
-            "cell": self.config.cell.name,
-            "job": self.job.job.name,
-            "job_kind": self.job.job.kind,
-            **self.info,
-            "speed": self.config.cell.time_scale,
-            "configuration_hash": self.config.calibration_hash(),
-            "calibration_hash": self.calibration.hash(),
+            "kind": "job", "pid": os.getpid(), "cell": self.config.cell.name, "job": self.job.job.name,
+            "job_kind": self.job.job.kind, **self.info, "speed": self.config.cell.time_scale,
+            "configuration_hash": self.config.calibration_hash(), "calibration_hash": self.calibration.hash(),
             "calibration_date": self.calibration.date,
             **({"calibration_edits": list(self.calibration.edits)} if self.calibration.edits else {}),
-        }
+        }  # fmt: skip
 
     def _keep_inputs(self, folder: Path) -> None:
         write_json(folder / "configuration.json", self.config.model_dump(mode="json"))
@@ -353,20 +337,10 @@ class JobWork:
             earlier, why = self.before.sweep(ready.job, cell.config, calibration)
             note(why if earlier is not None else f"{why}: sweeping again")
         job_run = JobRun(
-            run,
-            cell.config,
-            cell.devices,
-            job=ready.job,
-            nominal=ready.nominal,
-            calibration=calibration,
-            info=self.info,
-            kind=ready.kind,
-            script=ready.script,
-            inline=self.inline,
-            earlier=earlier,
-            truth=cell.truth,
+            run, cell.config, cell.devices, job=ready.job, nominal=ready.nominal, calibration=calibration,
+            info=self.info, kind=ready.kind, script=ready.script, inline=self.inline, earlier=earlier, truth=cell.truth,
             pace=cell.pace,
-        )
+        )  # fmt: skip
         try:
             return job_run.perform(cell.runs_folder, cell.whereabouts)
         finally:

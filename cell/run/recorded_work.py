@@ -12,7 +12,8 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,14 +40,11 @@ from drivers.errors import (
     RefusedError,
 )
 from drivers.interfaces import Frame
-from statemachine.attempts import Attempts, performed
 from statemachine.control import CancelToken
 from statemachine.journal import Journal, JournalError
-from statemachine.sequence import JobState, JobTrigger, Sequence
+from statemachine.runner import LoneResult, Runner
+from statemachine.sequence import JobState, Sequence
 from statemachine.step import Event, Failure, Outcome, Policy, Step, StepContext
-from statemachine.waiting import waiting_on
-from statemachine.watch import SignalWatch
-from statemachine.watchman import Teller, Watchman
 
 CONFIRMED_BY_A_PERSON = frozenset(("arm.protective_stop",))
 """Faults that no program may clear by itself: the maker asks that a person looks at the arm first."""
@@ -191,71 +189,41 @@ class RecordedWork:
         """Do it under the same watch as a job's step: a fault that a person may clear is asked about, then it is done
         again from its beginning.
         """
-        control, devices = self.run.control, self.devices
-        problems: list[str] = []
-        stopped = ever_stopped = False
+        devices = self.devices
+        safe_stop, stops, open_before = _SafeStop(devices), 0, devices.gate.is_open
 
-        def begin(context: StepContext) -> object:
+        def begin(context: StepContext) -> Made:
+            nonlocal stops
             with devices.gate.entered(context.token):
                 context.check()
-                return work(Hands(context.check, context.safe_point, context.progress, frames.keep))
+                made = work(Hands(context.check, context.safe_point, context.progress, frames.keep))
+            # A stop that a person asks for from here on is not cleared.
+            stops = devices.gate.stops
+            return made
 
-        def stop(reason: str) -> None:
-            nonlocal stopped, ever_stopped
-            stopped = ever_stopped = True
-            problems[:] = ["the safe stop did not end"]
-            problems[:] = devices.stop()
-
-        def recover(error: BaseException, token: CancelToken, confirmed: bool) -> None:
-            nonlocal stopped
-            stopped = False
-            clear(devices, error, token, confirmed)
-
-        sequence = Sequence((self.kind,), JobState.DONE)
-        step = Step(self.kind, math.inf, RETRIES)
         simulated = self.config is not None and self.config.cell.confirm == "simulated"
-        open_before, end = devices.gate.is_open, None
-        with SignalWatch() as signals:
-            watchman = Watchman(
-                policy=Policy((step,), grace_s=GRACE_S, simulated_person=simulated),
-                journal=journal,
-                clock=devices.clock,
-                control=control,
-                classify=self._classify,
-                safe_stop=stop,
-                health=lambda: self.health(devices),
-                waiting=waiting_on(devices.clock),
-                signals=signals,
-                teller=Teller(journal, self._heard, lambda: sequence.state),
-            )
-            attempts = Attempts(sequence.steps, {self.kind: begin}, watchman)
-            sequence.fire(JobTrigger.START)
-            try:
-                end = performed(step, attempts, recover, sequence, watchman)
-                stops = devices.gate.stops
-                # A stop that a person asks for from here on is not cleared.
-                end = end or watchman.asked()
-            # Its end cannot be recorded; what it ended with counts.
-            except JournalError as failure:
-                log.warning("the %s could not be recorded: %s", self.kind, failure)
-                if self.kind not in attempts.results:
-                    watchman.error = watchman.error or failure
-                    end = Failure(Outcome.FAULTED, str(watchman.error))
-            if end is None:
-                if open_before and ever_stopped:
-                    # The stops of attempts that were recovered from keep nobody from going on.
-                    devices.gate.clear(stops)
-                made: Made = attempts.results[self.kind]  # type: ignore[assignment]
-                return made
-            if not stopped or self.kind in attempts.results:
-                watchman.halt(end.reason)
-        if watchman.abandoned:
-            problems.append(f"the {self.kind} was still busy {GRACE_S:g} s after the stop")
-        raise self._ended(end, watchman, problems)
+        runner = Runner(
+            sequence=Sequence((self.kind,), JobState.DONE), steps={self.kind: begin},
+            policy=Policy((Step(self.kind, math.inf, RETRIES),), grace_s=GRACE_S, simulated_person=simulated),
+            journal=journal, clock=devices.clock, classify=self._classify, safe_stop=safe_stop, observer=self._heard,
+            recover=partial(clear, devices), health=lambda: self.health(devices), control=self.run.control,
+        )  # fmt: skip
+        result = runner.run_alone()
+        if result.unrecorded is not None:
+            log.warning("the %s could not be recorded: %s", self.kind, result.unrecorded)
+        if result.end is not None:
+            raise self._ended(result.end, result, safe_stop.problems)
+        if open_before and safe_stop.called:
+            # The stops of attempts that were recovered from keep nobody from going on.
+            devices.gate.clear(stops)
+        made: Made = result.made  # type: ignore[assignment]
+        return made
 
-    def _ended(self, end: Failure, watchman: Watchman, problems: list[str]) -> BaseException:
+    def _ended(self, end: Failure, result: LoneResult, problems: list[str]) -> BaseException:
         """What the end of work is raised as: its own error, unless somebody asked for it or the stop failed."""
-        control, error = self.run.control, watchman.error
+        control, error = self.run.control, result.error
+        if result.abandoned:
+            problems = [*problems, f"the {self.kind} was still busy {GRACE_S:g} s after the stop"]
         unconfirmed = f"; not confirmed: {'; '.join(problems)}" if problems else ""
         if (asked := control.token.reason) is not None:
             text = f"{self.kind} {asked}" if control.signal is not None else f"{self.kind} ended: {asked}"
@@ -265,7 +233,7 @@ class RecordedWork:
             fault = stop_not_confirmed(f"{self.kind}: {end.reason}{unconfirmed}")
             fault.__cause__ = error
             return fault
-        if isinstance(error, CellError) and end.reason != watchman.classified(error).reason:
+        if isinstance(error, CellError) and result.judged is not None and end.reason != result.judged.reason:
             # Nobody confirmed it, or it could not be cleared.
             error.args = (end.reason,)
         return error
@@ -280,6 +248,20 @@ class RecordedWork:
         # Steps and states are those of a job.
         if not event.kind.startswith(("step_", "state")):
             self.run.tell(event)
+
+
+@dataclass(eq=False)
+class _SafeStop:
+    """Brings the cell to rest; `problems` are what the newest stop did not confirm."""
+
+    devices: Devices
+    called: bool = False
+    problems: list[str] = field(default_factory=list)
+
+    def __call__(self, reason: str) -> None:
+        self.called = True
+        self.problems = ["the safe stop did not end"]
+        self.problems = self.devices.stop()
 
 
 def _last(action: Callable[[], object], ended: BaseException | None) -> None:

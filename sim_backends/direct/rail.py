@@ -308,8 +308,8 @@ class DirectRail:
             begin,
             lambda: self.counted(clock.now()),
             lambda: model.home_switch(clock.now()),
-            self.forget_zero,
-            self.setup.max_speed,
+            forget=self.forget_zero,
+            speed=self.setup.max_speed,
         )
         self._motion = RailMove(self, None, asked=check)
         return self._motion

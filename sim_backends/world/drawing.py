@@ -250,7 +250,7 @@ STOCK = Drawing(
 )  # fmt: skip
 """The cell that the shipped configuration and the job `pot` describe."""
 
-Part = TypeVar("Part", Drawing, CellDrawing, StationDrawing, CameraDrawing, RailDrawing)
+Part = TypeVar("Part", bound=Drawing | CellDrawing | StationDrawing | CameraDrawing | RailDrawing)
 
 
 def settled(drawn: Part, stock: Part) -> Part:

@@ -177,17 +177,10 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
     deck = (sigma.deck_board_translation, sigma.deck_board_rotation)
     grasp = "grasp" if parts == 0 else f"grasp.{parts}"
     return Scene(
-        seed=seed,
-        level=level,
-        drawing=drawing,
-        deviations=sigma,
-        effects=effects,
-        world_from_vehicle_start=_start(d, sigma, drawing, world_from_place),
-        vehicle_from_base=cell.vehicle_from_base,
-        world_from_place=world_from_place,
-        world_from_table=surface @ inverse(station.place_from_surface),
-        world_from_surface=surface,
-        world_from_board=world_from_place @ station.place_from_board,
+        seed=seed, level=level, drawing=drawing, deviations=sigma, effects=effects,
+        world_from_vehicle_start=_start(d, sigma, drawing, world_from_place), vehicle_from_base=cell.vehicle_from_base,
+        world_from_place=world_from_place, world_from_table=surface @ inverse(station.place_from_surface),
+        world_from_surface=surface, world_from_board=world_from_place @ station.place_from_board,
         base_from_fine_board=d.moved("fine_board", cell.base_from_fine_board, *deck),
         base_from_deck_board=d.moved("deck_board", cell.base_from_deck_board, *deck),
         flange_from_scan_camera=d.moved(
@@ -197,27 +190,20 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
             "target_mount", cell.target.mounting, sigma.target_mount_translation, sigma.target_mount_rotation
         ),
         flange_from_part=d.moved(grasp, station.flange_from_part, sigma.grasp_translation, sigma.grasp_rotation),
-        scan_lens=_lens(d, "scan_lens", sigma, cell.scan),
-        target_lens=_lens(d, "target_lens", sigma, cell.target),
-        light_plane_normal=normal,
-        light_plane_distance=distance,
-        laser_origin=origin,
+        scan_lens=_lens(d, "scan_lens", sigma, cell.scan), target_lens=_lens(d, "target_lens", sigma, cell.target),
+        light_plane_normal=normal, light_plane_distance=distance, laser_origin=origin,
         rail_direction=rotation(d.vector("rail_direction", sigma.rail_direction)) @ RAIL_DIRECTION,
         rail_lead_error=d.scalar("rail_lead", sigma.rail_lead),
         rail_periodic_amplitude=abs(d.scalar("rail_periodic", sigma.rail_periodic)),
         rail_periodic_phase=float(stream(seed, "rail_phase").uniform(0.0, 2.0 * np.pi)),
-        rail_backlash=abs(d.scalar("rail_backlash", sigma.rail_backlash)),
-        dh_factory=_dh_factory(d, sigma),
-        dh_error=_dh_error(d, sigma),
-        odometry_scale=d.scalar("odometry_scale", sigma.odometry_scale),
+        rail_backlash=abs(d.scalar("rail_backlash", sigma.rail_backlash)), dh_factory=_dh_factory(d, sigma),
+        dh_error=_dh_error(d, sigma), odometry_scale=d.scalar("odometry_scale", sigma.odometry_scale),
         odometry_yaw=d.scalar("odometry_yaw", sigma.odometry_yaw),
         suspension=(not cell.fixed) * np.abs(d.vector("suspension", sigma.suspension, 2)),
         light_level=1.0 + d.scalar("light_level", sigma.ambient),
-        light_gradient=d.vector("light_gradient", sigma.ambient, 2),
-        scan_clock=_clock(d, "scan_clock", sigma, effects),
-        target_clock=_clock(d, "target_clock", sigma, effects),
-        workshop=_workshop(d, effects),
-    )
+        light_gradient=d.vector("light_gradient", sigma.ambient, 2), scan_clock=_clock(d, "scan_clock", sigma, effects),
+        target_clock=_clock(d, "target_clock", sigma, effects), workshop=_workshop(d, effects),
+    )  # fmt: skip
 
 
 def _start(d: _Draws, sigma: Deviations, drawing: Drawing, world_from_place: Pose) -> Pose:

@@ -27,7 +27,7 @@ from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.workplace import Workplace
 from cell.run.folder import new_run
 from cell.run.recorded_work import classify
-from cell.run.report.report import make_report
+from cell.run.report.report import FinishedJob
 from cell.run.report.truth import TruthRecorder, pose_of
 from cell.run.resumption import job_source
 from drivers.errors import CellError
@@ -150,14 +150,9 @@ def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tu
         frames.keep("stripe", record.results["laser_sweep"].middle)
     before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
     result = RunResult(
-        failure.outcome,
-        failure.reason,
-        failure.code,
-        records(step, faults),
-        before,
-        CellError(failure.reason),
+        failure.outcome, failure.reason, failure.code, records(step, faults), before, CellError(failure.reason),
         faults=faults,
-    )
+    )  # fmt: skip
     return reported(folder, CONFIG, job, nominal, work, result, frames, None)
 
 
@@ -175,28 +170,18 @@ def reported(
 ) -> Ended:
     """The report of a result, with the facts that `cell.run.job_run.JobRun` adds."""
     info: dict[str, Any] = {
-        "kind": "job",
-        "pid": os.getpid(),
-        "part": work.part.state.value,
-        "cell": config.cell.name,
-        "job": job.job.name,
-        "job_kind": job.job.kind,
-        "simulated": simulated,
-        "seed": 2 if simulated else None,
-        "level": "nominal" if simulated else None,
-        "clock": "wall",
-        "cell_s": 12.34,
-        **job_source("pot"),
-        "speed": config.cell.time_scale,
-        "configuration_hash": config.calibration_hash(),
-        "calibration_hash": work.calibration.hash(),
-        "calibration_date": work.calibration.date,
-    }
+        "kind": "job", "pid": os.getpid(), "part": work.part.state.value, "cell": config.cell.name, "job": job.job.name,
+        "job_kind": job.job.kind, "simulated": simulated, "seed": 2 if simulated else None,
+        "level": "nominal" if simulated else None, "clock": "wall", "cell_s": 12.34, **job_source("pot"),
+        "speed": config.cell.time_scale, "configuration_hash": config.calibration_hash(),
+        "calibration_hash": work.calibration.hash(), "calibration_date": work.calibration.date,
+    }  # fmt: skip
     started = time.time() - 31.0
-    report = make_report(
-        folder, config, job, nominal, work.repeatability, result, info, started, witness, frames
+    finished = FinishedJob(
+        folder, config, job, nominal, work.repeatability,
+        result=result, info=info, started=started, witness=witness, frames=frames,
     )  # fmt: skip
-    return Ended(report, folder)
+    return Ended(finished.report(), folder)
 
 
 def with_few_lines(record: JobRecord, lines: int) -> JobRecord:

@@ -45,7 +45,8 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH) -> l
 def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
     """What a person would type after a run that ended so; None where there is nothing to add."""
     outcome, kind, name = report["outcome"], report.get("kind", "job"), folder.name.split("-")[-1]
-    again = "cell dry-run" if report.get("simulated") is True else "cell run"
+    look = "cell diag: the state of every device; "
+    again, see = ("cell dry-run", "") if report.get("simulated") is True else ("cell run", look)
     if job := report.get("for_job"):
         return f"cell diag: the state of every device; put that right, then {again} -j {_job({'job_file': job})}"
     if kind != "job":
@@ -67,7 +68,6 @@ def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
         case "refused":
             return f"picture.png shows why; put that right, then {again} -j {_job(report)}"
         case "faulted":
-            see = "" if report.get("simulated") is True else "cell diag: the state of every device; "
             return f"{see}cell resume {name}: go on with the job"
         case "aborted":
             return f"cell resume {name}: go on with the job"

@@ -47,11 +47,16 @@ def size_words(longest: float) -> str:
 
 def job_text(job: Job, heading: Sequence[str]) -> str:
     """The file of a job. `heading` are the lines of comment at its top: where it comes from, what was decided."""
-    approach, photo, surface, scan = job.approach, job.photo, job.surface, job.scan
-    grasp, place = job.grasp, job.place
     lines = [f"# {line}" for line in heading]
-    lines += [
-        "",
+    lines += ["", *_station_lines(job), "", *_scan_lines(job), "", *_part_lines(job)]
+    for obstacle in job.obstacle:
+        lines += ["", "[[obstacle]]", *_obstacle(obstacle)]
+    return "\n".join(lines) + "\n"
+
+
+def _station_lines(job: Job) -> list[str]:
+    approach, photo = job.approach, job.photo
+    return [
         "[job]",
         f'name = "{job.job.name}"',
         *([] if job.job.kind == "place" else [f'kind = "{job.job.kind}"']),
@@ -74,7 +79,12 @@ def job_text(job: Job, heading: Sequence[str]) -> str:
         f"max_obliquity = {deg(photo.max_obliquity)}",
         f"max_residual = {photo.max_residual:.6g}                  # RMS of the dots, px",
         f"count = {photo.count}                           # photographs that are averaged",
-        "",
+    ]
+
+
+def _scan_lines(job: Job) -> list[str]:
+    surface, scan = job.surface, job.scan
+    return [
         "[surface]",
         f'mesh = "{surface.mesh}"        # beside this file: what of the mesh the sweeps see, in its own frame',
         f'mesh_unit = "{surface.mesh_unit}"',
@@ -91,7 +101,12 @@ def job_text(job: Job, heading: Sequence[str]) -> str:
         f'mode = "{scan.mode}"                       # "rail", or "arm": the arm moves the scan head',
         f"largest_hole = {mm(scan.largest_hole)}             # across, that is interpolated",
         f"swath = [{', '.join(_swath(swath) for swath in scan.swath)}]",
-        "",
+    ]
+
+
+def _part_lines(job: Job) -> list[str]:
+    grasp, place = job.grasp, job.place
+    return [
         "[grasp]",
         f"flange_from_part = {pose_text(grasp.flange_from_part)}",
         f"size = [{', '.join(map(mm, grasp.size))}]",
@@ -108,9 +123,6 @@ def job_text(job: Job, heading: Sequence[str]) -> str:
         f"tolerance = {mm(place.tolerance)}",
         f'tolerance_angle = "{1e3 * place.tolerance_angle:.6g} mrad"',
     ]
-    for obstacle in job.obstacle:
-        lines += ["", "[[obstacle]]", *_obstacle(obstacle)]
-    return "\n".join(lines) + "\n"
 
 
 def mm(metres: float) -> str:

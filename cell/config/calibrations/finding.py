@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from cell.config.calibrations.store import CalibrationEdited, CellCalibration, name_of, read_calibration
-from drivers.errors import CalibrationStale, NotConnectedError
+from drivers.errors import CalibrationStale, CellError, NotConnectedError
 
 
 def find_calibration(
@@ -30,14 +30,7 @@ def find_calibration(
     found, unreadable, edited = _stored(folder, identities)
     own = [entry for entry in found if entry.identities == identities]
     if not own:
-        devices = ", ".join(f"{name} {serial}" for name, serial in sorted(identities.items()))
-        raise CalibrationStale(
-            f"{folder} holds no calibration of these devices ({devices}), of {len(found)} stored"
-            + (f" and {len(unreadable)} unreadable ({', '.join(name for name, _ in unreadable)})" if unreadable else "")
-            + _exchanged(found, identities)
-            + "; run `cell calibrate`"
-            + "".join(f". {why}" for _, why in unreadable)
-        )
+        raise _none_of_these(folder, identities, found, unreadable)
     current = [entry for entry in own if entry.configuration == configuration]
     if not current:
         raise CalibrationStale(
@@ -45,20 +38,8 @@ def find_calibration(
             f"{configuration}): optics, mounting, rail or boards were changed since; run `cell calibrate`"
         )
     fitting = [entry for entry in current if entry.kinematics == kinematics]
-    if not fitting and untold and current[-1].kinematics:
-        raise NotConnectedError(
-            "arm",
-            f"its port 30001 was not read now: {untold}; the calibration of {current[-1].date} was made with the "
-            f"table that it told then ({current[-1].kinematics}), and whether it fits is not known. See that the arm "
-            "is on and that port open, then connect anew",
-        )
     if not fitting:
-        raise CalibrationStale(
-            f"the calibration of {current[-1].date} was made with another kinematics of the arm "
-            f"({current[-1].kinematics or 'it does not say which'}; the arm now has "
-            f"{kinematics or 'none that is known'}): the arm or its controller was exchanged, or the arm was "
-            "calibrated anew, or its port 30001 could be read then and not now; run `cell calibrate`"
-        )
+        raise _other_kinematics(current[-1], kinematics, untold)
     newest = max(fitting, key=lambda entry: entry.made)
     age = time.time() - newest.made
     if age > max_age:
@@ -73,6 +54,37 @@ def find_calibration(
         )
     notes = (f"{error} It is passed over, and the calibration of {newest.date} is used." for error in edited)
     return replace(newest, scan=replace(newest.scan, unread=(*newest.scan.unread, *notes)))
+
+
+def _none_of_these(
+    folder: Path, identities: dict[str, str], found: list[CellCalibration], unreadable: list[tuple[str, str]]
+) -> CalibrationStale:
+    """Nothing stored is of these devices: what is stored instead, and what could not be read."""
+    devices = ", ".join(f"{name} {serial}" for name, serial in sorted(identities.items()))
+    return CalibrationStale(
+        f"{folder} holds no calibration of these devices ({devices}), of {len(found)} stored"
+        + (f" and {len(unreadable)} unreadable ({', '.join(name for name, _ in unreadable)})" if unreadable else "")
+        + _exchanged(found, identities)
+        + "; run `cell calibrate`"
+        + "".join(f". {why}" for _, why in unreadable)
+    )
+
+
+def _other_kinematics(newest: CellCalibration, kinematics: str, untold: str) -> CellError:
+    """The arm's table is another one now; or the arm did not tell it, so that nobody knows."""
+    if untold and newest.kinematics:
+        return NotConnectedError(
+            "arm",
+            f"its port 30001 was not read now: {untold}; the calibration of {newest.date} was made with the "
+            f"table that it told then ({newest.kinematics}), and whether it fits is not known. See that the arm "
+            "is on and that port open, then connect anew",
+        )
+    return CalibrationStale(
+        f"the calibration of {newest.date} was made with another kinematics of the arm "
+        f"({newest.kinematics or 'it does not say which'}; the arm now has "
+        f"{kinematics or 'none that is known'}): the arm or its controller was exchanged, or the arm was "
+        "calibrated anew, or its port 30001 could be read then and not now; run `cell calibrate`"
+    )
 
 
 def _stored(

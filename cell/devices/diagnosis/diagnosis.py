@@ -155,8 +155,7 @@ def diagnose(
 
     Raises only for a wrong configuration, an unknown device, or devices that another process holds.
     """
-    if unknown := [name for name in only if name not in DEVICES]:
-        raise ConfigError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
+    _require_known(only)
     names = simulated_of(sim, path)
     whole = set(names) == set(DEVICES)
     _, config = config_to_open(path, simulated=whole)
@@ -172,14 +171,9 @@ def diagnose(
 
     # Looked at only, so it follows nothing: its pictures are of where its own devices stand.
     world = SimulatedCell(
-        config,
-        Described.of("pot"),
-        seed=seed,
-        level=level,
-        speed=speed if whole else config.cell.time_scale,
-        gige=[name for name in on_gige(config) if name in names],
-        simulated=names,
-    )
+        config, Described.of("pot"), seed=seed, level=level, speed=speed if whole else config.cell.time_scale,
+        gige=[name for name in on_gige(config) if name in names], simulated=names,
+    )  # fmt: skip
     try:
         rows = _diagnose(with_endpoints(config, world.endpoints, names if whole else served), only)
     finally:
@@ -189,6 +183,11 @@ def diagnose(
         if row.device in on_arm:
             row.state = f"{row.state}; what is shown is the real arm's output, the {row.device} is to be simulated"
     return rows
+
+
+def _require_known(only: Collection[str]) -> None:
+    if unknown := [name for name in only if name not in DEVICES]:
+        raise ConfigError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
 
 
 def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:

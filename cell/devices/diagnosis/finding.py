@@ -32,7 +32,7 @@ DEADLINE_S = 0.5
 """For one answer, wall seconds."""
 ARM_PORTS = {29999: "dashboard", 30001: "primary", 30004: "RTDE"}
 _GVCP_PORT = 3956
-_DISCOVERY = struct.pack(">BBHHH", 0x42, 0x01, 0x0002, 0, 1)
+_DISCOVERY = bytes.fromhex("42 01 0002 0000 0001")
 """Who are you, please answer: sent to one address, as GigE Vision allows."""
 _DISCOVERED, _BEHIND_HEADER = 0x0003, 8
 _MODEL, _SERIAL = slice(104, 136), slice(216, 232)
@@ -136,6 +136,11 @@ def _look(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
         if there and isinstance(record, CanopenVehicleConfig):
             return _look_at_nodes(record)
         return ("there" if there else f"no interface {place}: see `ip link`"), there
+    return _look_at_host(name, record, place)
+
+
+def _look_at_host(name: str, record: DeviceConfig, place: str) -> tuple[str, bool]:
+    """The same of a device that is reached over the network."""
     host, port = _host_and_port(place)
     if not host:
         return "nothing to ask at such an address; `cell diag` connects to it", True

@@ -88,16 +88,11 @@ def write_archive(path: Path, observations: Observations) -> None:
     """Write it; a reader finds the old file or the new one, never half of one."""
     o = observations
     about = {
-        "format": FORMAT,
-        "made": o.made,
-        "identities": o.identities,
-        "configuration": o.configuration,
-        "kinematics": o.kinematics,
-        "rail_lead": o.rail_lead,
-        "priors": {name: getattr(o.priors, name) for name in PRIORS},
-        "scan_camera": _camera_dict(o.scan_camera),
+        "format": FORMAT, "made": o.made, "identities": o.identities, "configuration": o.configuration,
+        "kinematics": o.kinematics, "rail_lead": o.rail_lead,
+        "priors": {name: getattr(o.priors, name) for name in PRIORS}, "scan_camera": _camera_dict(o.scan_camera),
         "target_camera": _camera_dict(o.target_camera),
-    }
+    }  # fmt: skip
     arrays = _views("scan", [(s.view, s.base_from_flange, s.name) for s in o.scan])
     arrays |= _views("target", [(t.view, t.base_from_flange, t.name) for t in o.target])
     arrays["scan_rail"] = np.array([s.rail_position for s in o.scan])
@@ -117,13 +112,7 @@ def write_archive(path: Path, observations: Observations) -> None:
 def read_archive(path: Path) -> Observations:
     """Read and check it; raises `ConfigError` that says what is missing, of another version or no number."""
     advice = f"give a {SUFFIX} file that `cell calibrate` wrote beside a calibration"
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            data = {name: file[name] for name in file.files}
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path} does not exist; {advice}") from error
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zlib.error, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{path} is no whole archive of observations ({error}); {advice}") from error
+    data = _arrays(path, advice)
     try:
         about = json.loads(str(data["about"]))
         if about["format"] not in (FORMAT, UNSEALED):
@@ -147,16 +136,12 @@ def read_archive(path: Path) -> Observations:
                 for view, flange, name in _read_views(data, "target")
                 if view is not None
             ],
-            _camera(about["scan_camera"]),
-            target_camera=_camera(about["target_camera"]),
-            priors=priors,
+            _camera(about["scan_camera"]), target_camera=_camera(about["target_camera"]), priors=priors,
             rail_lead=_positive(about, "rail_lead"),
             identities={str(name): str(serial) for name, serial in about["identities"].items()},
-            configuration=str(about["configuration"]),
-            made=float(about["made"]),
-            kinematics=str(about.get("kinematics", "")),
-            witness=_read_witness(data, about),
-        )
+            configuration=str(about["configuration"]), made=float(about["made"]),
+            kinematics=str(about.get("kinematics", "")), witness=_read_witness(data, about),
+        )  # fmt: skip
         # Last: what is wrong with a figure says more than that something was changed.
         if about["format"] == FORMAT or DIGEST in data:
             require_unchanged(data)
@@ -167,6 +152,17 @@ def read_archive(path: Path) -> Observations:
         raise ConfigError(f"{path} lacks {error}; {advice}") from error
     except (ValueError, TypeError, AttributeError, IndexError, ConfigError) as error:
         raise ConfigError(f"{path} cannot be solved: {error}; {advice}") from error
+
+
+def _arrays(path: Path, advice: str) -> dict[str, Any]:
+    """The arrays of the archive by their names; raises `ConfigError` where it is not there or not whole."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path} does not exist; {advice}") from error
+    except (OSError, ValueError, EOFError, KeyError, AttributeError, zlib.error, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{path} is no whole archive of observations ({error}); {advice}") from error
 
 
 def _read_witness(data: Mapping[str, Any], about: Mapping[str, Any]) -> PlateLine | None:
@@ -221,14 +217,9 @@ def _read_views(data: Mapping[str, Any], camera: str) -> list[tuple[BoardView | 
                 raise ValueError(f"{camera}_ids of {name} lie outside 0 to {len(spec.points()) - 1} of {spec.name}")
             size = (int(sizes[k, 0]), int(sizes[k, 1]))
             view = BoardView(
-                spec,
-                size,
-                ids[part],
-                pixels=pixels[part],
-                sigma=sigma[part],
-                order_assumed=bool(assumed[k]),
+                spec, size, ids[part], pixels=pixels[part], sigma=sigma[part], order_assumed=bool(assumed[k]),
                 dot_radius=float(radii[k]),
-            )
+            )  # fmt: skip
             start, k = start + count, k + 1
         made.append((view, _pose(flange, str(name)), str(name)))
     return made

@@ -148,19 +148,15 @@ class PlacePose:
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
         return {
-            "points": self.n_points,
-            "rms_mm": round(1e3 * self.rms, 4),
-            "chi2_per_dof": round(self.chi2_per_dof, 3),
-            "share": round(self.share, 4),
-            "coverage": round(self.coverage, 3),
+            "points": self.n_points, "rms_mm": round(1e3 * self.rms, 4), "chi2_per_dof": round(self.chi2_per_dof, 3),
+            "share": round(self.share, 4), "coverage": round(self.coverage, 3),
             "parts_differ": round(self.parts_differ, 3),
             "correction_mm": [round(1e3 * float(v), 3) for v in self.correction[:3]],
             "correction_mrad": [round(1e3 * float(v), 3) for v in self.correction[3:]],
             "sigma_mm": [round(1e3 * float(v), 4) for v in self.sigma[:3]],
-            "sigma_mrad": [round(1e3 * float(v), 4) for v in self.sigma[3:]],
-            "least_known": self.verdict.worst.words,
+            "sigma_mrad": [round(1e3 * float(v), 4) for v in self.sigma[3:]], "least_known": self.verdict.worst.words,
             "decided_by_board": list(self.verdict.unseen),
-        }
+        }  # fmt: skip
 
 
 Resolve = Callable[[NDArray[np.intp], NDArray[np.intp]], Array]
@@ -191,75 +187,88 @@ def invert_pose(
     Raises `RefusedError` when the scan does not fit the surface, covers too little of it or contradicts the board, and
     `NotObservable` when three standard deviations exceed `tolerance` in some direction, which is named.
     """
-    demands = demands or Demands()
-    scan = Scan.of(cloud, most_points)
-    found = register(scan, nominal, prior, start)
-    pose = found.base_from_surface
-    local = (scan.points[found.used] - pose.translation) @ pose.rotation
-    coverage = nominal.coverage(local, 0.0025)
-    numbers = fit_figures(coverage, found.share, found.rms, found.chi2_per_dof, demands)
-    with _shown(pose, *numbers):
-        require_fit(found, coverage, demands)
-        require_whole(scan, pose, nominal, tolerance, demands)
+    inversion = _Inversion(Scan.of(cloud, most_points), nominal, prior, tolerance, demands or Demands())
+    found, coverage, numbers = inversion.fitted(start)
     lines, rows = cloud.subsample(most_points)
     displaced = [resolve(lines, rows) for resolve in (calibration, sweeps) if resolve is not None]
     if sweeps is not None:
-        found = balance(found, scan, displaced[-1][found.used], prior)
-        pose = found.base_from_surface
+        found = balance(found, inversion.scan, displaced[-1][found.used], prior)
+    pose = found.base_from_surface
     explained = np.concatenate(displaced, axis=2) if displaced else None
     with _shown(pose, *numbers):
-        parts = dissent(scan, pose, nominal, tolerance, explained)
-        parts_differ = require_agreement(parts, tolerance, demands)
+        parts = dissent(inversion.scan, pose, nominal, tolerance, explained)
+        parts_differ = require_agreement(parts, tolerance, inversion.demands)
+    shared = _shared(found, displaced, systematic)
+    if len(cloud.each_sweep()) == 1:
+        # What several sweeps differ by is told apart from the pose already.
+        shared = shared + parts.covariance(tolerance)
+    with _shown(pose, *numbers):
+        disagreement = require_board(shared, prior, difference(pose, prior.base_from_surface))
+        pose, random, verdict = inversion.settled(found, shared)
+    with _shown(pose, *numbers):
+        verdict.require()
+    return PlacePose(
+        base_from_surface=pose, random=np.asarray(random), systematic=np.asarray(shared),
+        covariance=np.asarray(random + shared), verdict=verdict, rms=found.rms, chi2_per_dof=found.chi2_per_dof,
+        n_points=len(found.used), share=found.share, coverage=coverage, parts_differ=parts_differ,
+        correction=difference(pose, prior.base_from_surface), disagreement=disagreement,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _Inversion:
+    """One scan of the surface, what is known of its pose before, and what is asked of the result."""
+
+    scan: Scan
+    nominal: NominalSurface
+    prior: Prior
+    tolerance: Tolerance
+    demands: Demands
+
+    def fitted(self, start: pin.SE3 | None) -> tuple[Registration, float, tuple[Measured, ...]]:
+        """The surface registered in the scan, how much of it is covered, and the figures that every refusal shows."""
+        found = register(self.scan, self.nominal, self.prior, start)
+        pose = found.base_from_surface
+        local = (self.scan.points[found.used] - pose.translation) @ pose.rotation
+        coverage = self.nominal.coverage(local, 0.0025)
+        numbers = fit_figures(coverage, found.share, found.rms, found.chi2_per_dof, self.demands)
+        with _shown(pose, *numbers):
+            require_fit(found, coverage, self.demands)
+            require_whole(self.scan, pose, self.nominal, self.tolerance, self.demands)
+        return found, coverage, numbers
+
+    def settled(self, found: Registration, shared: Array) -> tuple[pin.SE3, Array, PoseVerdict]:
+        """The pose, gone back to the board's where too few points tell a motion; its own covariance; and its verdict.
+
+        `shared` (6, 6) is the covariance of what all points share, base axes.
+        """
+        pose, nominal, prior = found.base_from_surface, self.nominal, self.prior
+        turn = np.kron(np.eye(2), pose.rotation.T)
+        ways: Array = np.concatenate([found.normals, np.cross(found.arms, found.normals)], axis=1) @ turn.T
+        told, pull = determined(ways / found.sigmas[:, None], nominal.radius)
+        board = turn @ prior.information() @ turn.T
+        require_alone(self.scan, pose, nominal, prior, told)
+        # Where only a few points tell a motion, the scan counts as if it told nothing: the board decides.
+        known = np.linalg.inv(board + told)
+        correction = difference(pose, prior.base_from_surface)
+        pose = perturbed(pose, -turn.T @ known @ (np.eye(6) - pull) @ board @ turn @ correction)
+        unsure = known - np.linalg.inv(board + turn @ found.scan_information @ turn.T)
+        random = found.covariance + turn.T @ unsure @ turn
+        verdict = judge(
+            turn @ (random + shared) @ turn.T, told, float(1.0 / np.mean(1.0 / found.sigmas**2)),
+            points=len(found.used), radius=nominal.radius, tolerance=self.tolerance,
+        )  # fmt: skip
+        return pose, random, verdict
+
+
+def _shared(found: Registration, displaced: list[Array], systematic: Array | None) -> Array:
+    """Covariance (6, 6) of what all points share: `systematic`, what displaces them together, and the patches."""
     _, by_patches = shared_by_patches(found)
     shared = np.zeros((6, 6)) if systematic is None else found.gain @ systematic @ found.gain.T
     for moved in displaced:
         by_parameter = found.follow @ np.einsum("ni,nim->nm", found.normals, moved[found.used])
         shared = shared + by_parameter @ by_parameter.T
-    shared = shared + by_patches
-    if len(cloud.each_sweep()) == 1:
-        # What several sweeps differ by is told apart from the pose already.
-        shared = shared + parts.covariance(tolerance)
-    correction = difference(pose, prior.base_from_surface)
-    with _shown(pose, *numbers):
-        disagreement = require_board(shared, prior, correction)
-    turn = np.kron(np.eye(2), pose.rotation.T)
-    ways: Array = np.concatenate([found.normals, np.cross(found.arms, found.normals)], axis=1) @ turn.T
-    told, pull = determined(ways / found.sigmas[:, None], nominal.radius)
-    board = turn @ prior.information() @ turn.T
-    with _shown(pose, *numbers):
-        require_alone(scan, pose, nominal, prior, told)
-    # Where only a few points tell a motion, the scan counts as if it told nothing: the pose goes back to the board's.
-    known = np.linalg.inv(board + told)
-    pose = perturbed(pose, -turn.T @ known @ (np.eye(6) - pull) @ board @ turn @ correction)
-    correction = difference(pose, prior.base_from_surface)
-    unsure = known - np.linalg.inv(board + turn @ found.scan_information @ turn.T)
-    random = found.covariance + turn.T @ unsure @ turn
-    covariance = random + shared
-    verdict = judge(
-        turn @ covariance @ turn.T,
-        told,
-        float(1.0 / np.mean(1.0 / found.sigmas**2)),
-        points=len(found.used),
-        radius=nominal.radius,
-        tolerance=tolerance,
-    )
-    with _shown(pose, *numbers):
-        verdict.require()
-    return PlacePose(
-        base_from_surface=pose,
-        random=np.asarray(random),
-        systematic=np.asarray(shared),
-        covariance=np.asarray(covariance),
-        verdict=verdict,
-        rms=found.rms,
-        chi2_per_dof=found.chi2_per_dof,
-        n_points=len(found.used),
-        share=found.share,
-        coverage=coverage,
-        parts_differ=parts_differ,
-        correction=correction,
-        disagreement=disagreement,
-    )
+    return shared + by_patches
 
 
 @contextmanager

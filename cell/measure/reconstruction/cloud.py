@@ -144,10 +144,8 @@ def merge(clouds: Sequence[Cloud]) -> Cloud:
         raise ValueError("there are no clouds to merge")
     if len(clouds) == 1:
         return clouds[0]
-    if len({cloud.shape[1] for cloud in clouds}) > 1:
-        raise ValueError(
-            f"clouds of {sorted({c.shape[1] for c in clouds})} rows cannot be merged: one camera, one size"
-        )
+    if len(sizes := {cloud.shape[1] for cloud in clouds}) > 1:
+        raise ValueError(f"clouds of {sorted(sizes)} rows cannot be merged: one camera, one size")
     if any(len(cloud.flanges) != cloud.shape[0] for cloud in clouds):
         raise ValueError("a cloud that does not know where the flange stood cannot be merged with others")
     first_line = np.concatenate([[0], np.cumsum([cloud.shape[0] for cloud in clouds])])

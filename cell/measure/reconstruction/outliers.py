@@ -233,6 +233,16 @@ def _quiet_around(values: Array, kept: Array, noise: Array, most: float, line: i
 
 
 @compiled
+def _local_scale(sizes: Array, count: int, level: float) -> float:
+    """That of the first `count` deviations, by their quartile; at least the global `level`."""
+    if count == 0:
+        return level
+    _sort(sizes, count)
+    scale: float = max(level, SCALE_OF_QUARTILE * sizes[count // 4])
+    return scale
+
+
+@compiled
 def _judge(
     values: Array, kept: Array, noise: Array, level: float, first: int, last: int, supported: Mask, outliers: Mask
 ) -> None:
@@ -265,8 +275,4 @@ def _judge(
                     if not np.isnan(known[i - first + 2, j]):
                         sizes[count] = known[i - first + 2, j]
                         count += 1
-            scale = level
-            if count > 0:
-                _sort(sizes, count)
-                scale = max(level, SCALE_OF_QUARTILE * sizes[count // 4])
-            outliers[line, row] = abs(own) > THRESHOLD * scale
+            outliers[line, row] = abs(own) > THRESHOLD * _local_scale(sizes, count, level)

@@ -50,9 +50,7 @@ def write_ply(
         columns.append(("quality", "<f4", np.asarray(quality, dtype=np.float64).reshape(-1)))
     for name, values in (scalars or {}).items():
         columns.append((name, np.dtype(values.dtype).newbyteorder("<").str.lstrip("|"), values.reshape(-1)))
-    for name, _, values in columns:
-        if len(values) != len(xyz):
-            raise ValueError(f"{name} has {len(values)} values for {len(xyz)} points")
+    _require_as_many(columns, len(xyz))
     keep = np.isfinite(xyz).all(axis=1)
     records = np.empty(int(keep.sum()), dtype=[(name, kind) for name, kind, _ in columns])
     for name, _, values in columns:
@@ -63,6 +61,12 @@ def write_ply(
     header += [f"property {_WORDS[kind.lstrip('<')]} {name}" for name, kind, _ in columns]
     path.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace") + records.tobytes())
     return len(records)
+
+
+def _require_as_many(columns: Sequence[tuple[str, str, NDArray[np.generic]]], points: int) -> None:
+    for name, _, values in columns:
+        if len(values) != points:
+            raise ValueError(f"{name} has {len(values)} values for {points} points")
 
 
 def write_cloud(path: Path, cloud: Cloud, simulated: Sequence[str] = ()) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import pinocchio as pin
 
@@ -65,55 +65,116 @@ class VehicleArrival:
         )
 
 
-def drive_to_target(
-    job: Job,
-    vehicle_from_base: pin.SE3,
-    vehicle: Vehicle,
-    whereabouts: Whereabouts,
-    photograph: Callable[[], BoardFix],
-    clock: Clock,
-    check: Callable[[], None],
-    progress: Callable[[float, str], None],
-    note: Callable[[str], None],
-    hold: Callable[[], None] = lambda: None,
-    carried: Sequence[Body] = (),
-    pace: Pace | None = None,
-) -> VehicleArrival:
-    """Bring the vehicle to the job's target to within its tolerance and brake it there.
+@dataclass(eq=False)
+class TargetDrive:
+    """One drive of the vehicle to the job's target: what it is driven with, and who is told and asked meanwhile.
 
-    The arm stands in its looking pose already and the vehicle is enabled. On odometry alone it goes no further than the
-    staging pose, and only when `whereabouts` knows where it stands. `photograph` gives the board in the base; `check`
-    raises when the run is to end; `note` takes what is worth keeping; `hold` is called before
-    each way, with the vehicle at rest: a paused run waits in it. `carried` are arm, tool and part as they stand, in the
-    arm base, which are kept off the station as the vehicle itself is. `pace` says how fast each way is driven, of the
-    job's `approach.speed`.
-    Raises `RefusedError` when the vehicle neither sees the board nor knows where it stands, when its way leads too
-    close to the station, and when the tolerance is not met after five tries.
+    `photograph` gives the board in the base. `check` raises when the run is to end. `note` takes what is worth keeping.
+    `hold` is called before each way, with the vehicle at rest: a paused run waits in it. `carried` are arm, tool and
+    part as they stand, in the arm base: they are kept off the station as the vehicle itself is. `pace` says how fast
+    each way is driven, of the job's `approach.speed`.
     """
-    way = Way(job, vehicle_from_base, whereabouts, carried)
-    sent: Planar | None = None
 
-    def place_from_vehicle(fix: BoardFix) -> Planar:
-        return Planar.of((vehicle_from_base * fix.base_from_board * job.place_from_board.inverse()).inverse())
+    job: Job
+    vehicle_from_base: pin.SE3
+    vehicle: Vehicle
+    whereabouts: Whereabouts
+    photograph: Callable[[], BoardFix]
+    clock: Clock
+    check: Callable[[], None]
+    progress: Callable[[float, str], None]
+    note: Callable[[str], None]
+    hold: Callable[[], None] = lambda: None
+    carried: Sequence[Body] = ()
+    pace: Pace = field(default_factory=Pace)
+    _sent: Planar | None = field(default=None, init=False)
 
-    def look() -> BoardFix:
-        fix = photograph()
-        if (doubt := whereabouts.see(place_from_vehicle(fix))) is not None:
-            note(doubt)
+    def __post_init__(self) -> None:
+        self._way = Way(self.job, self.vehicle_from_base, self.whereabouts, self.carried)
+        self._target = Planar.of(self.job.approach.target.se3())
+
+    def to_target(self) -> VehicleArrival:
+        """Bring the vehicle to the job's target to within its tolerance and brake it there.
+
+        The arm stands in its looking pose already and the vehicle is enabled. On odometry alone it goes no further than
+        the staging pose, and only when `whereabouts` knows where it stands.
+        Raises `RefusedError` when the vehicle neither sees the board nor knows where it stands, when its way leads too
+        close to the station, and when the tolerance is not met after five tries.
+        """
+        self._require_known_place()
+        staging = Planar.of(self.job.approach.staging.se3())
+        if (staging.inverse() * self.whereabouts.pose()).x < 0:
+            self.progress(0.1, "driving on odometry")
+            self._go(staging)
+        approach = self.job.approach
+        for count in range(1, 2 * MAX_TRIES):
+            self.progress(min(0.9, 0.3 + 0.15 * count), "looking at the board")
+            self.clock.sleep(SETTLE_S)
+            fix = self._look_again()
+            base_from_place = fix.base_from_board * self.job.place_from_board.inverse()
+            error = self._target.inverse() * self._place_from_vehicle(fix)
+            near = abs(error.x) < 0.8 * approach.tolerance and abs(error.y) < 0.8 * approach.tolerance
+            if near and abs(error.yaw) < 0.5 * approach.tolerance_angle:
+                self.vehicle.brake()
+                return VehicleArrival(base_from_place, fix, error.x, error.y, error_yaw=error.yaw, photographs=count)
+            self._correct(error, near)
+        self.vehicle.brake()
+        remedy = self._remedy_of_a_miss()
+        raise _off_target(error, self.job, fix, who="the vehicle", after=f" after {count} photographs", remedy=remedy)
+
+    def _require_known_place(self) -> None:
+        """By the board, where it is in sight already, or by odometry."""
+        self.progress(0.05, "looking whether the board is in sight already")
+        try:
+            self._look()
+        except RefusedError as unseen:
+            try:
+                self.whereabouts.pose()
+            except RefusedError as unknown:
+                text = f"{unknown}; and it does not see the board: {unseen}. {next_step(self.job)}"
+                raise RefusedError(text).showing(*unseen.numbers, seen=unseen.seen) from unknown
+
+    def _correct(self, error: Planar, near: bool) -> None:
+        """Drive what `error`, the vehicle's pose in its target's frame, asks for; `near` where it only has to turn."""
+        if near:
+            self.hold()
+            self._way.require_turn(self._target.yaw)
+            turn_to(self.vehicle, self.whereabouts, self._target.yaw, self.clock, self.check)
+        elif abs(error.y) > 0.8 * self.job.approach.tolerance and error.x > -0.5 * BACK_UP:
+            self.progress(0.5, "backing up")
+            self._go(self._target * Planar(-BACK_UP, 0.0, 0.0))
+            self._go(self._target)
+        else:
+            self._go(self._target)
+
+    def _go(self, goal: Planar) -> None:
+        self._sent = goal
+        self.hold()
+        self._way.require_line(goal)
+        speed = self.job.approach.speed * self.pace.share
+        drive_line(self.vehicle, self.whereabouts, goal, speed=speed, clock=self.clock, check=self.check)
+
+    def _look(self) -> BoardFix:
+        fix = self.photograph()
+        if (doubt := self.whereabouts.see(self._place_from_vehicle(fix))) is not None:
+            self.note(doubt)
         return fix
 
-    def look_again() -> BoardFix:
-        way_so_far = whereabouts.way
+    def _look_again(self) -> BoardFix:
+        """Where the board was to be seen; from where the vehicle was sent, if it is not."""
+        way_so_far = self.whereabouts.way
         try:
             try:
-                return look()
+                return self._look()
             except RefusedError:
-                if sent is None or abs((sent.inverse() * whereabouts.pose()).x) < PASSED:
+                if self._sent is None or abs((self._sent.inverse() * self.whereabouts.pose()).x) < PASSED:
                     raise
-                note("the board is not seen, and the vehicle stands elsewhere than it was sent: it is brought there")
-                go(sent)
-                clock.sleep(SETTLE_S)
-                return look()
+                self.note(
+                    "the board is not seen, and the vehicle stands elsewhere than it was sent: it is brought there"
+                )
+                self._go(self._sent)
+                self.clock.sleep(SETTLE_S)
+                return self._look()
         except RefusedError as unseen:
             raise RefusedError(
                 f"after {way_so_far:.2f} m on odometry the board is not seen from where it should be: {unseen}. Look "
@@ -121,65 +182,27 @@ def drive_to_target(
                 "at its start, and do its wheels slip?"
             ).showing(*unseen.numbers, seen=unseen.seen) from unseen
 
-    def go(goal: Planar) -> None:
-        nonlocal sent
-        sent = goal
-        hold()
-        way.require_line(goal)
-        speed = approach.speed * (1.0 if pace is None else pace.share)
-        drive_line(vehicle, whereabouts, goal, speed=speed, clock=clock, check=check)
-
-    approach = job.approach
-    staging, target = Planar.of(approach.staging.se3()), Planar.of(approach.target.se3())
-    progress(0.05, "looking whether the board is in sight already")
-    try:
-        look()
-    except RefusedError as unseen:
-        try:
-            whereabouts.pose()
-        except RefusedError as unknown:
-            text = f"{unknown}; and it does not see the board: {unseen}. {next_step(job)}"
-            raise RefusedError(text).showing(*unseen.numbers, seen=unseen.seen) from unknown
-    if (staging.inverse() * whereabouts.pose()).x < 0:
-        progress(0.1, "driving on odometry")
-        go(staging)
-    for count in range(1, 2 * MAX_TRIES):
-        progress(min(0.9, 0.3 + 0.15 * count), "looking at the board")
-        clock.sleep(SETTLE_S)
-        fix = look_again()
-        base_from_place = fix.base_from_board * job.place_from_board.inverse()
-        error = target.inverse() * place_from_vehicle(fix)
-        near = abs(error.x) < 0.8 * approach.tolerance and abs(error.y) < 0.8 * approach.tolerance
-        if near and abs(error.yaw) < 0.5 * approach.tolerance_angle:
-            vehicle.brake()
-            return VehicleArrival(base_from_place, fix, error.x, error.y, error_yaw=error.yaw, photographs=count)
-        if near:
-            hold()
-            way.require_turn(target.yaw)
-            turn_to(vehicle, whereabouts, target.yaw, clock, check)
-        elif abs(error.y) > 0.8 * approach.tolerance and error.x > -0.5 * BACK_UP:
-            progress(0.5, "backing up")
-            go(target * Planar(-BACK_UP, 0.0, 0.0))
-            go(target)
-        else:
-            go(target)
-    vehicle.brake()
-    one, two = (place_from_vehicle(photograph()) for _ in range(2))
-    apart, turned = max(abs(one.x - two.x), abs(one.y - two.y)), abs(wrap(one.yaw - two.yaw))
-    remedy = "check the floor and the wheels"
-    if max(apart / approach.tolerance, turned / approach.tolerance_angle) > UNSTEADY:
-        remedy = (
+    def _remedy_of_a_miss(self) -> str:
+        """What to look at where the tolerance was not met: two photographs of the braked vehicle tell."""
+        approach = self.job.approach
+        one, two = (self._place_from_vehicle(self.photograph()) for _ in range(2))
+        apart, turned = max(abs(one.x - two.x), abs(one.y - two.y)), abs(wrap(one.yaw - two.yaw))
+        if max(apart / approach.tolerance, turned / approach.tolerance_angle) <= UNSTEADY:
+            return "check the floor and the wheels"
+        return (
             f"while it stands, the board's place changes by {1e3 * apart:.1f} mm and {math.degrees(turned):.2f} deg "
             "from photograph to photograph: see whether warm air shimmers before the camera, a fan blows, or board or "
             "camera are loose; the wheels are not the cause"
         )
-    raise _off_target(error, job, fix, who="the vehicle", after=f" after {count} photographs", remedy=remedy)
+
+    def _place_from_vehicle(self, fix: BoardFix) -> Planar:
+        return Planar.of((self.vehicle_from_base * fix.base_from_board * self.job.place_from_board.inverse()).inverse())
 
 
 def stand_at_target(
     job: Job, vehicle_from_base: pin.SE3, vehicle: Vehicle, whereabouts: Whereabouts, photograph: Callable[[], BoardFix]
 ) -> VehicleArrival:
-    """What `drive_to_target` is for an arm on a fixed frame: look whether the station stands where the job has it.
+    """What `TargetDrive` is for an arm on a fixed frame: look whether the station stands where the job has it.
 
     Raises `RefusedError` with how far it is off when that is more than the job's tolerance.
     """
@@ -244,20 +267,13 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         context.note(text=arrival.told())
         return arrival
     vehicle.enable()
-    return drive_to_target(
-        here.job,
-        here.config.arm.vehicle_from_base.se3(),
-        vehicle,
-        whereabouts=here.whereabouts,
-        photograph=here.photograph,
-        clock=here.devices.clock,
-        check=context.check,
-        progress=context.progress,
-        note=lambda text: context.note(text=text),
-        hold=context.safe_point,
-        carried=here.mover.solids(),
+    drive = TargetDrive(
+        here.job, here.config.arm.vehicle_from_base.se3(), vehicle, whereabouts=here.whereabouts,
+        photograph=here.photograph, clock=here.devices.clock, check=context.check, progress=context.progress,
+        note=lambda text: context.note(text=text), hold=context.safe_point, carried=here.mover.solids(),
         pace=here.mover.pace,
-    )
+    )  # fmt: skip
+    return drive.to_target()
 
 
 STEP = JobStep(Step("drive_to_target", 180.0, 1, ("DeadlineError",)), _at, VehicleArrival)

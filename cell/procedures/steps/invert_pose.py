@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -13,6 +14,7 @@ from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion import invert_pose as register
 from cell.measure.inversion.effects.causes import find_causes, likeliest
 from cell.measure.inversion.effects.during_sweep import (
+    Droop,
     Head,
     find_droop,
     find_rocking,
@@ -21,7 +23,6 @@ from cell.measure.inversion.effects.during_sweep import (
     words,
 )
 from cell.measure.reconstruction.cloud import Indices
-from cell.measure.reconstruction.seams import Motions
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace
@@ -62,25 +63,11 @@ def invert_pose(
     Raises `RefusedError` when scan, surface and board do not fit together or the vehicle rocks too much, and
     `NotObservable` when a direction is not known to the job's tolerance.
     """
-    board_from_surface = job.place_from_board.inverse() * job.surface.place_from_surface.se3()
-    expected = fix.base_from_board * board_from_surface
-    surface = job.surface
-    mounting = np.diag([surface.prior_sigma**2] * 3 + [surface.prior_sigma_angle**2] * 3)
-    spread = compose_covariance(fix.base_from_board, fix.covariance, board_from_surface, mounting)
-
-    def registered(sweeps: Motions, systematic: Vector, calibration: Motions = scan.by_calibration) -> PlacePose:
-        return register(
-            scan.cloud,
-            nominal,
-            Prior(expected, spread),
-            Tolerance(job.place.tolerance, job.place.tolerance_angle),
-            systematic=systematic,
-            calibration=calibration,
-            sweeps=sweeps,
-        )
-
+    prior = _prior(fix, job)
+    tolerance = Tolerance(job.place.tolerance, job.place.tolerance_angle)
+    registered = partial(register, scan.cloud, nominal, prior, tolerance)
     try:
-        found = registered(scan.by_poses, kinematic)
+        found = registered(systematic=kinematic, calibration=scan.by_calibration, sweeps=scan.by_poses)
     except RefusedError as refused:
         pose = refused.seen.get("pose")
         if not isinstance(pose, pin.SE3) or isinstance(refused, NotObservable):
@@ -90,27 +77,45 @@ def invert_pose(
         told = type(refused)(f"{refused}{text and '. '}{text}".replace("?.", "?"), *refused.numbers)
         raise told.showing(seen=refused.seen) from refused
     droop = None if taken.head is None else find_droop(scan.cloud, nominal, found.base_from_surface, taken.head)
-
-    def by_calibration(lines: Indices, rows: Indices) -> Vector:
-        moved = [scan.by_calibration(lines, rows)] + ([] if droop is None else [droop.motions(scan.cloud, lines, rows)])
-        return np.concatenate(moved, axis=2)
-
+    by_calibration = partial(_by_calibration_and_droop, scan, droop)
     if droop is not None:
         try:
-            found = replace(registered(scan.by_poses, kinematic, by_calibration), notes=(droop.words,))
+            found = registered(systematic=kinematic, calibration=by_calibration, sweeps=scan.by_poses)
         except NotObservable as refused:
-            told = NotObservable(f"{refused}. Before: {droop.words}", *refused.numbers)
-            raise told.showing(seen=refused.seen) from refused
+            raise _told_before(refused, droop.words) from refused
+        found = replace(found, notes=(droop.words,))
     if (rocking := find_rocking(scan.cloud, nominal, found.base_from_surface, taken.times)) is None:
         return found
-    times, vehicle, hz = taken.times, taken.base_from_vehicle, rocking.hz
+    by_poses = partial(_by_poses_and_rocking, scan, taken, rocking.hz)
+    unknown = rocking_covariance(rocking, taken.base_from_vehicle, prior.base_from_surface.translation)
+    still = registered(systematic=kinematic + unknown, calibration=by_calibration, sweeps=by_poses)
+    return replace(still, notes=(*found.notes, words(rocking)))
 
-    def by_poses(lines: Indices, rows: Indices) -> Vector:
-        shaken = rocking_motions(scan.cloud, lines, rows, base_from_vehicle=vehicle, times=times, hz=hz)
-        return np.concatenate([scan.by_poses(lines, rows), shaken], axis=2)
 
-    unknown = rocking_covariance(rocking, vehicle, expected.translation)
-    return replace(registered(by_poses, kinematic + unknown, by_calibration), notes=(*found.notes, words(rocking)))
+def _prior(fix: BoardFix, job: Job) -> Prior:
+    """Where the surface is by the board's pose, and by how the job says the surface is mounted beside it."""
+    surface = job.surface
+    board_from_surface = job.place_from_board.inverse() * surface.place_from_surface.se3()
+    mounting = np.diag([surface.prior_sigma**2] * 3 + [surface.prior_sigma_angle**2] * 3)
+    spread = compose_covariance(fix.base_from_board, fix.covariance, board_from_surface, mounting)
+    return Prior(fix.base_from_board * board_from_surface, spread)
+
+
+def _by_calibration_and_droop(scan: Reconstruction, droop: Droop | None, lines: Indices, rows: Indices) -> Vector:
+    moved = [scan.by_calibration(lines, rows)] + ([] if droop is None else [droop.motions(scan.cloud, lines, rows)])
+    return np.concatenate(moved, axis=2)
+
+
+def _by_poses_and_rocking(scan: Reconstruction, taken: LineTimes, hz: float, lines: Indices, rows: Indices) -> Vector:
+    vehicle = taken.base_from_vehicle
+    shaken = rocking_motions(scan.cloud, lines, rows, base_from_vehicle=vehicle, times=taken.times, hz=hz)
+    return np.concatenate([scan.by_poses(lines, rows), shaken], axis=2)
+
+
+def _told_before(refused: NotObservable, before: str) -> NotObservable:
+    """The refusal with what is known of the scan already."""
+    told = NotObservable(f"{refused}. Before: {before}", *refused.numbers)
+    return told.showing(seen=refused.seen)
 
 
 def _slipped(here: Workplace, sweep: SweepRecord) -> Vector:
@@ -134,8 +139,7 @@ def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: Boa
         if not sweep.notes:
             raise
         # What is known too little may be where the laser points, which no more scanning mends.
-        told = NotObservable(f"{refused}. Before: {'; '.join(sweep.notes)}", *refused.numbers)
-        raise told.showing(seen=refused.seen) from refused
+        raise _told_before(refused, "; ".join(sweep.notes)) from refused
 
 
 def _at(here: Workplace, context: StepContext) -> PlacePose:

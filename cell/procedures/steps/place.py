@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,7 +26,7 @@ from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.second_look import SecondLook, require_in_place
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import Measured, RefusedError
-from drivers.interfaces import Arm, Claw, Vector
+from drivers.interfaces import Arm, ArmState, Claw, Vector
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
 
@@ -71,96 +71,139 @@ class PlaceResult:
         }
 
 
-def place(
-    job: Job,
-    base_from_surface: pin.SE3,
-    expected: TouchHeight,
-    mover: Mover,
-    arm: Arm,
-    claw: Claw,
-    part: PartProgress,
-    check: Callable[[], None],
-    progress: Callable[[float, str], None],
-    note: Callable[[PartProgress], None],
-) -> PlaceResult:
-    """Put the part onto the surface whose pose was measured.
+@dataclass(frozen=True, eq=False)
+class Placing:
+    """One part to be put onto the surface whose pose was measured: with what, and who is told and asked meanwhile.
 
-    Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes by
-    `contact_force`; afterwards the arm folds. `expected` is where the part is to touch first. `part` follows what
-    becomes of the part; `note` is called before the claw is told to release it, and again as soon as it has, before
-    anything else is done.
-    Raises `RefusedError` before anything moves when the part is not held any more; with the part still held and lifted
-    when contact comes too early, that is with `contact_force` more than `contact_travel` above where it was expected,
-    does not come at all, or begins where the stated uncertainty of the place does not allow it.
+    `expected` is where the part is to touch first. `part` follows what becomes of the part. `note` is called before the
+    claw is told to release it, and again as soon as it has, before anything else is done. `check` raises when the run
+    is to end.
     """
-    require_held(part)
-    plan = job.place
-    base_from_part = base_from_surface * plan.surface_from_part.se3()
-    part_from_flange = job.grasp.flange_from_part.se3().inverse()
 
-    def flange_at(height: float) -> pin.SE3:
-        return base_from_part * from_parts((0.0, 0.0, height)) * part_from_flange
+    job: Job
+    base_from_surface: pin.SE3
+    expected: TouchHeight
+    mover: Mover
+    arm: Arm
+    claw: Claw
+    part: PartProgress
+    check: Callable[[], None]
+    progress: Callable[[float, str], None]
+    note: Callable[[PartProgress], None]
 
-    above, below = flange_at(plan.approach), flange_at(-plan.contact_travel)
+    def put_down(self) -> PlaceResult:
+        """Put the part onto the surface, and fold the arm.
 
-    def depth() -> float:
-        on_flange = (flange_at(0.0).inverse() * from_ur(arm.state().flange)).translation
-        return float(on_flange @ job.grasp.flange_from_part.se3().rotation[:, 2])
+        Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes
+        by `contact_force`.
+        Raises `RefusedError` before anything moves when the part is not held any more; with the part still held and
+        lifted when contact comes too early, that is with `contact_force` more than `contact_travel` above where it was
+        expected, does not come at all, or begins where the stated uncertainty of the place does not allow it.
+        """
+        require_held(self.part)
+        self._approach()
+        self._descend()
+        contact, states = self._feel()
+        reached = from_ur(self.arm.state().flange)
+        off = self._depth()
+        self._require_contact(contact, off)
+        touch = self._require_expected(states)
+        self._release(reached)
+        self._retreat()
+        return PlaceResult(reached, contact, off, touch)
 
-    progress(0.05, "approaching")
-    mover.to(above, "the approach pose")
-    check()
-    if not claw.holding:
-        raise RefusedError("the claw does not hold the part any more before the descent; look where it was lost")
-    progress(0.4, "descending")
-    arm.zero_force()
-    stopped = mover.line(
-        flange_at(plan.contact_travel), plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force
-    )
-    # At rest a lighter touch is felt than on the way; taken as zero, it would be pressed on without an end.
-    if stopped or not np.linalg.norm(arm.state().wrench[:3]) <= plan.contact_force:
-        height = depth()
-        mover.line(above, plan.speed, TOUCHES)
-        raise RefusedError(
-            f"the part touched something more than {1e3 * plan.contact_travel:.2f} mm above the place pose; it was "
-            "lifted again, still held. Look what lies on the place",
-            Measured("contact, above the place pose", 1e3 * height, "mm", most=1e3 * plan.contact_travel),
+    @property
+    def _base_from_part(self) -> pin.SE3:
+        return self.base_from_surface * self.job.place.surface_from_part.se3()
+
+    def _flange_at(self, height: float) -> pin.SE3:
+        """Base from flange, with the part this far, m, above the place."""
+        return self._base_from_part * from_parts((0.0, 0.0, height)) * self.job.grasp.flange_from_part.se3().inverse()
+
+    def _depth(self) -> float:
+        """How far, m, the flange is from where it is with the part in place, along the normal."""
+        on_flange = (self._flange_at(0.0).inverse() * from_ur(self.arm.state().flange)).translation
+        return float(on_flange @ self.job.grasp.flange_from_part.se3().rotation[:, 2])
+
+    def _lift(self) -> None:
+        plan = self.job.place
+        self.mover.line(self._flange_at(plan.approach), plan.speed, TOUCHES)
+
+    def _approach(self) -> None:
+        self.progress(0.05, "approaching")
+        self.mover.to(self._flange_at(self.job.place.approach), "the approach pose")
+        self.check()
+        if not self.claw.holding:
+            raise RefusedError("the claw does not hold the part any more before the descent; look where it was lost")
+
+    def _descend(self) -> None:
+        """The fast part, to just above the place."""
+        plan = self.job.place
+        self.progress(0.4, "descending")
+        self.arm.zero_force()
+        stopped = self.mover.line(
+            self._flange_at(plan.contact_travel), plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force
         )
-    progress(0.6, "feeling for contact")
-    with arm.record() as states:
-        contact = mover.line(below, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
-    reached = from_ur(arm.state().flange)
-    off = depth()
-    if not contact:
-        mover.line(above, plan.speed, TOUCHES)
-        raise RefusedError(
-            f"no contact within {1e3 * plan.contact_travel:.2f} mm of the place pose (the part stopped "
-            f"{1e3 * off:+.2f} mm from it along the normal); it was lifted again, still held. "
-            "Is the part the right one, and whole?",
-            Measured("reached without contact", 1e3 * off, "mm"),
-        )
-    touched = felt_touch(states, flange_at(0.0).translation, base_from_part.rotation[:, 2])
-    touch = None if touched is None else TouchCheck(touched, expected)
-    if touch is not None:
+        # At rest a lighter touch is felt than on the way; taken as zero, it would be pressed on without an end.
+        if stopped or not np.linalg.norm(self.arm.state().wrench[:3]) <= plan.contact_force:
+            height = self._depth()
+            self._lift()
+            raise RefusedError(
+                f"the part touched something more than {1e3 * plan.contact_travel:.2f} mm above the place pose; it was "
+                "lifted again, still held. Look what lies on the place",
+                Measured("contact, above the place pose", 1e3 * height, "mm", most=1e3 * plan.contact_travel),
+            )
+
+    def _feel(self) -> tuple[bool, Sequence[ArmState]]:
+        """The slow part: whether the part came into contact, and the arm's states on the way."""
+        plan = self.job.place
+        self.progress(0.6, "feeling for contact")
+        below = self._flange_at(-plan.contact_travel)
+        with self.arm.record() as states:
+            contact = self.mover.line(below, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
+        return contact, states
+
+    def _require_contact(self, contact: bool, off: float) -> None:
+        if not contact:
+            self._lift()
+            raise RefusedError(
+                f"no contact within {1e3 * self.job.place.contact_travel:.2f} mm of the place pose (the part stopped "
+                f"{1e3 * off:+.2f} mm from it along the normal); it was lifted again, still held. "
+                "Is the part the right one, and whole?",
+                Measured("reached without contact", 1e3 * off, "mm"),
+            )
+
+    def _require_expected(self, states: Sequence[ArmState]) -> TouchCheck | None:
+        """Where the part touched first, beside where the scan says; None from an arm that tells too few states."""
+        at = self._flange_at(0.0).translation
+        touched = felt_touch(states, at, self._base_from_part.rotation[:, 2])
+        if touched is None:
+            return None
+        touch = TouchCheck(touched, self.expected)
         try:
             touch.require()
         except RefusedError:
-            mover.line(above, plan.speed, TOUCHES)
+            self._lift()
             raise
-    progress(0.8, "releasing")
-    part.state, part.where = PartState.UNKNOWN, reached * job.grasp.flange_from_part.se3()
-    # Whoever finds this run cut short here must not take the part as still held.
-    note(part)
-    claw.release()
-    part.state = PartState.RELEASED
-    note(part)
-    mover.leave_part(part.where)
-    progress(0.9, "retreating")
-    mover.line(above, plan.speed, TOUCHES)
-    progress(0.95, "folding the arm")
-    mover.to_joints(HOME)
-    part.left = True
-    return PlaceResult(reached, contact, off, touch)
+        return touch
+
+    def _release(self, reached: pin.SE3) -> None:
+        self.progress(0.8, "releasing")
+        part = self.part
+        part.state, part.where = PartState.UNKNOWN, reached * self.job.grasp.flange_from_part.se3()
+        # Whoever finds this run cut short here must not take the part as still held.
+        self.note(part)
+        self.claw.release()
+        part.state = PartState.RELEASED
+        self.note(part)
+        self.mover.leave_part(part.where)
+
+    def _retreat(self) -> None:
+        self.progress(0.9, "retreating")
+        self._lift()
+        self.progress(0.95, "folding the arm")
+        self.mover.to_joints(HOME)
+        self.part.left = True
 
 
 def require_held(part: PartProgress) -> None:
@@ -180,19 +223,12 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         swept = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
         pose = carried_on(here, *swept, look.creep)
     expected = expected_touch(here.job, here.nominal, pose, here.repeatability)
-    done = place(
-        here.job,
-        pose.base_from_surface,
-        expected,
-        mover=here.mover,
-        arm=here.devices.arm,
-        claw=here.devices.claw,
-        part=here.part,
-        check=context.check,
-        progress=context.progress,
+    placing = Placing(
+        here.job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
+        part=here.part, check=context.check, progress=context.progress,
         note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
-    )
-    done = replace(done, look=look, pose=pose)
+    )  # fmt: skip
+    done = replace(placing.put_down(), look=look, pose=pose)
     for note in done.notes:
         context.note(text=note)
     return done

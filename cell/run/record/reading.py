@@ -52,11 +52,7 @@ def parts(stream: IO[bytes], told: Parts) -> Iterator[tuple[int, bytes]]:
     `told` says afterwards how the file ended. `CellError` for a file that never was a record.
     """
     size = stream.seek(0, 2)
-    stream.seek(0)
-    start = stream.read(len(MAGIC))
-    if not MAGIC.startswith(start):
-        raise CellError("it does not begin as an MCAP file does")
-    good, crc, summary = stream.tell(), zlib.crc32(start), False
+    good, crc, summary = *_begin(stream), False
     while len(head := stream.read(_HEAD.size)) == _HEAD.size:
         kind, length = _HEAD.unpack(head)
         content = stream.read(min(length, LONGEST))
@@ -68,17 +64,16 @@ def parts(stream: IO[bytes], told: Parts) -> Iterator[tuple[int, bytes]]:
                 good += _HEAD.size + (yield from _inside(content))
             break
         here, good = good, stream.tell()
-        if kind == CHUNK and _crc_fits(content):
-            yield from _inside(content)
-        elif kind == CHUNK:
-            told.damaged.append(f"the chunk at byte {here}, {len(content)} bytes long")
-            told.lost += len(content)
-            index = _summary(stream, size)
-            stream.seek(good)
-            # Later messages need the channels that stood in it; the index repeats them.
-            for kept, inner in _records(BytesIO(index)):
-                if kept in (SCHEMA, CHANNEL):
-                    yield kept, inner
+        if kind == CHUNK:
+            if _crc_fits(content):
+                yield from _inside(content)
+            else:
+                told.damaged.append(f"the chunk at byte {here}, {len(content)} bytes long")
+                told.lost += len(content)
+                index = _summary(stream, size)
+                stream.seek(good)
+                # Later messages need the channels that stood in it; the index repeats them.
+                yield from filter(lambda record: record[0] in (SCHEMA, CHANNEL), _records(BytesIO(index)))
         elif kind == DATA_END:
             # 0: not reckoned, in records of older versions.
             expected = int.from_bytes(content[:4], "little")
@@ -96,6 +91,15 @@ def parts(stream: IO[bytes], told: Parts) -> Iterator[tuple[int, bytes]]:
             yield kind, content
         crc = zlib.crc32(content, zlib.crc32(head, crc))
     told.lost += size - good
+
+
+def _begin(stream: IO[bytes]) -> tuple[int, int]:
+    """How long the file's first word is, and its CRC; `CellError` where it is another one."""
+    stream.seek(0)
+    start = stream.read(len(MAGIC))
+    if not MAGIC.startswith(start):
+        raise CellError("it does not begin as an MCAP file does")
+    return stream.tell(), zlib.crc32(start)
 
 
 @contextmanager
@@ -242,22 +246,16 @@ def information(path: Path) -> dict[str, Any]:
     except CellError as error:
         raise CellError(f"{path}: {error}") from error
     return {
-        "file": str(path),
-        "bytes": path.stat().st_size,
-        "whole": told.whole and counts.total() > 0,
-        "closed": told.closed,
-        "damaged": told.damaged,
-        "lost_bytes": told.lost,
-        "messages": counts.total(),
+        "file": str(path), "bytes": path.stat().st_size, "whole": told.whole and counts.total() > 0,
+        "closed": told.closed, "damaged": told.damaged, "lost_bytes": told.lost, "messages": counts.total(),
         "begun_ns": times[0] if times else None,
         "span_s": round(1e-9 * (times[1] - times[0]), 3) if times else None,
-        "dropped": end.get("dropped"),
-        "cpu_s": end.get("cpu_s"),
+        "dropped": end.get("dropped"), "cpu_s": end.get("cpu_s"),
         "channels": [
             {"topic": topic, "schema": schemas[topic], "messages": counts[topic], "bytes": sizes[topic]}
             for topic in sorted(counts)
         ],
-    }
+    }  # fmt: skip
 
 
 ERROR_FLAG = 0x20000000

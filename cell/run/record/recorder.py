@@ -58,23 +58,26 @@ def plain(value: object) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist()) if value.size <= MOST_NUMBERS else f"{'×'.join(map(str, value.shape))} numbers"
-    if isinstance(value, Enum):
-        return plain(value.value)
-    if isinstance(value, pin.SE3):
-        return plain(value.homogeneous)
-    if isinstance(value, bytes | bytearray):
-        return value.hex()
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, Mapping):
         return {str(key): plain(each) for key, each in value.items()}
     if isinstance(value, list | tuple | set | frozenset):
         return [plain(each) for each in value]
-    return str(value)
+    return plain(_simpler(value))
+
+
+def _simpler(value: object) -> object:
+    """The same as numbers, lists or text."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, np.ndarray):
+        return value.tolist() if value.size <= MOST_NUMBERS else f"{'×'.join(map(str, value.shape))} numbers"
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, pin.SE3):
+        return value.homogeneous
+    return value.hex() if isinstance(value, bytes | bytearray) else str(value)
 
 
 _ENCODER = json.JSONEncoder(allow_nan=False, separators=(",", ":"), default=plain)
@@ -276,14 +279,10 @@ class Recorder(logging.Handler):
         camera = self._camera_of(what, frame)
         at = self._times.of(frame.mid_exposure)
         told = {
-            "file": picture.name,
-            "frame_id": frame.frame_id,
-            "exposure": frame.exposure,
-            "device_time": frame.device_time,
-            "host_time": frame.host_time,
-            "received": frame.received,
+            "file": picture.name, "frame_id": frame.frame_id, "exposure": frame.exposure,
+            "device_time": frame.device_time, "host_time": frame.host_time, "received": frame.received,
             "lost_before": frame.lost_before,
-        }
+        }  # fmt: skip
         self._json(f"/{camera}/frame", at, told)
         self._put(f"/{camera}/calibration", at, partial(self._sketch.lens, camera=camera))
         self._put(f"/{camera}/image", at, partial(self._sketch.image, camera=camera, picture=picture))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,76 +49,92 @@ TABLE_1_HANDSCAN: dict[str, tuple[float, float]] = {
 log = logging.getLogger(__name__)
 
 
-def make_report(
-    folder: Path,
-    config: CellConfig,
-    job: Job,
-    nominal: NominalSurface,
-    repeatability: Vector,
-    result: RunResult,
-    info: dict[str, Any],
-    started: float,
-    witness: TruthRecorder | None,
-    frames: FrameStore,
-) -> dict[str, Any]:
-    """Everything about a run as JSON-ready data; also `report.json` and `picture.png` in its folder.
+@dataclass(frozen=True, eq=False)
+class FinishedJob:
+    """A job's run that has come to its `result`, from which its report is made.
 
-    Written before the comparison with the truth and the picture as well: what goes wrong with those is told in it.
+    `repeatability` is the arm's covariance (6, 6), m² and rad². `info` are facts for the report. `started` is a time of
+    the wall. `witness` recorded the truth of a simulated cell.
     """
-    ended = time.time()
-    pose, made = (result.results.get(name) for name in ("invert_pose", "reconstruct"))
-    report: dict[str, Any] = {
-        "run": folder.name,
-        "kind": "job",
-        "version": release(),
-        "outcome": result.outcome.value,
-        "reason": result.reason,
-        "code": result.code,
-        "started": when(started),
-        "ended": when(ended),
-        "wall_s": round(ended - started, 2),
-        **info,
-        "steps": _steps(result),
-        "faults": _faults(result),
-        "refusal": refusal(result, folder, frames),
-        "last_frames": last_frames(result, frames),
-        "place_pose": None,
-        "place_pose_units": {"translation_mm": "mm", "rotation_vector_rad": "rad"},
-        "place_sigma": None,
-        "place_sigma_units": {"translation_mm": "mm", "rotation_mrad": "mrad"},
-        "place_bound_95": None,
-        "tolerance": {"translation_mm": 1e3 * job.place.tolerance, "rotation_mrad": 1e3 * job.place.tolerance_angle},
-        "measured": [],
-        "assumed_noise": {"level": info["level"], "sigmas": _configured_noise(config)},
-        "scan": made.summary() if isinstance(made, Reconstruction) else None,
-        "truth": None,
-    }
-    if isinstance(pose, PlacePose):
-        # Where something creeps, the part went elsewhere than where the sweep saw the place.
-        pose = getattr(result.results.get("place"), "pose", None) or pose
-        report["place_pose"] = _pose(pose, job)
-        report["place_sigma"] = _sigma(pose)
-        report["place_bound_95"] = stated_bound(job, nominal, pose, repeatability, job.grasp.covariance)
-    report["measured"] = measured(result, job, None, report["place_bound_95"])
-    if frames.failure is not None:
-        report["frames_missing"] = frames.failure
-    _write(folder, sealed(strict(timeless(report))))
-    if witness is not None:
-        try:
-            _add_truth(report, job, nominal, repeatability=repeatability, result=result, witness=witness)
-        except Exception as error:
-            report["truth_missing"] = f"{type(error).__name__}: {error}"
-    report["measured"] = measured(result, job, report["truth"], report["place_bound_95"])
-    try:
-        # Drawing is the slowest thing to load, and a command that jogs or stops the cell does not draw.
-        from cell.run.report.pictures import draw_run
 
-        draw_run(folder / "picture.png", job, nominal, result=result, report=report, frames=frames)
-    except Exception as error:
-        report["picture_missing"] = f"{type(error).__name__}: {error}"
-    report = sealed(strict(timeless(report)))
-    _write(folder, report)
-    return report
+    folder: Path
+    config: CellConfig
+    job: Job
+    nominal: NominalSurface
+    repeatability: Vector
+    result: RunResult
+    info: dict[str, object]
+    started: float
+    witness: TruthRecorder | None
+    frames: FrameStore
+
+    def report(self) -> dict[str, Any]:
+        """Everything about the run as JSON-ready data; also `report.json` and `picture.png` in its folder.
+
+        Written before the comparison with the truth and the picture as well: what goes wrong with those is told in it.
+        """
+        report: dict[str, Any] = self._of_the_run()
+        self._add_place(report)
+        report["measured"] = measured(self.result, self.job, None, report["place_bound_95"])
+        if self.frames.failure is not None:
+            report["frames_missing"] = self.frames.failure
+        _write(self.folder, sealed(strict(timeless(report))))
+        if self.witness is not None:
+            try:
+                _add_truth(
+                    report, self.job, self.nominal,
+                    repeatability=self.repeatability, result=self.result, witness=self.witness,
+                )  # fmt: skip
+            except Exception as error:
+                report["truth_missing"] = f"{type(error).__name__}: {error}"
+        report["measured"] = measured(self.result, self.job, report["truth"], report["place_bound_95"])
+        try:
+            # Drawing is the slowest thing to load, and a command that jogs or stops the cell does not draw.
+            from cell.run.report.pictures import draw_run
+
+            picture = self.folder / "picture.png"
+            draw_run(picture, self.job, self.nominal, result=self.result, report=report, frames=self.frames)
+        except Exception as error:
+            report["picture_missing"] = f"{type(error).__name__}: {error}"
+        report = sealed(strict(timeless(report)))
+        _write(self.folder, report)
+        return report
+
+    def _of_the_run(self) -> dict[str, object]:
+        """What every run has, in the order of the file; what is not known yet is None."""
+        ended, result, place = time.time(), self.result, self.job.place
+        made = result.results.get("reconstruct")
+        return {
+            "run": self.folder.name, "kind": "job", "version": release(),
+            "outcome": result.outcome.value, "reason": result.reason, "code": result.code,
+            "started": when(self.started), "ended": when(ended), "wall_s": round(ended - self.started, 2),
+            **self.info,
+            "steps": _steps(result), "faults": _faults(result),
+            "refusal": refusal(result, self.folder, self.frames),
+            "last_frames": last_frames(result, self.frames),
+            "place_pose": None,
+            "place_pose_units": {"translation_mm": "mm", "rotation_vector_rad": "rad"},
+            "place_sigma": None,
+            "place_sigma_units": {"translation_mm": "mm", "rotation_mrad": "mrad"},
+            "place_bound_95": None,
+            "tolerance": {"translation_mm": 1e3 * place.tolerance, "rotation_mrad": 1e3 * place.tolerance_angle},
+            "measured": [],
+            "assumed_noise": {"level": self.info["level"], "sigmas": _configured_noise(self.config)},
+            "scan": made.summary() if isinstance(made, Reconstruction) else None,
+            "truth": None,
+        }  # fmt: skip
+
+    def _add_place(self, report: dict[str, object]) -> None:
+        """The place pose, where one was inverted."""
+        pose = self.result.results.get("invert_pose")
+        if not isinstance(pose, PlacePose):
+            return
+        # Where something creeps, the part went elsewhere than where the sweep saw the place.
+        pose = getattr(self.result.results.get("place"), "pose", None) or pose
+        report["place_pose"] = _pose(pose, self.job)
+        report["place_sigma"] = _sigma(pose)
+        covariance = self.job.grasp.covariance
+        report["place_bound_95"] = stated_bound(self.job, self.nominal, pose, self.repeatability, covariance)
 
 
 def _write(folder: Path, report: dict[str, Any]) -> None:
@@ -162,17 +179,8 @@ def _steps(result: RunResult) -> list[dict[str, Any]]:
 
 
 def _faults(result: RunResult) -> list[dict[str, Any]]:
-    return [
-        {
-            "at": when(fault.at),
-            "step": fault.step,
-            "attempt": fault.attempt,
-            "code": fault.code,
-            "reason": fault.reason,
-            "remedy": fault.remedy,
-        }
-        for fault in result.faults
-    ]
+    names = ("step", "attempt", "code", "reason", "remedy")
+    return [{"at": when(fault.at), **{name: getattr(fault, name) for name in names}} for fault in result.faults]
 
 
 def _pose(pose: PlacePose, job: Job) -> dict[str, Any]:

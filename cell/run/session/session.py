@@ -70,14 +70,9 @@ class Opened:
     def mover(self, job: Job | None, hold: Callable[[], None] = lambda: None) -> Mover:
         """Planned moves of the arm; with a job, its part is in the claw. `hold` is called before each free motion."""
         return Mover(
-            self.devices.arm,
-            self.devices.clock,
-            self.config,
-            job=job,
-            hold=hold,
-            interlocks=self.devices.interlocks,
+            self.devices.arm, self.devices.clock, self.config, job=job, hold=hold, interlocks=self.devices.interlocks,
             pace=self.pace,
-        )
+        )  # fmt: skip
 
     @property
     def world(self) -> dict[str, Any]:
@@ -118,73 +113,88 @@ SIM_SPEED = 3.0
 """How many times faster than the wall a simulated cell runs unless told otherwise."""
 
 
-def open_devices(
-    undo: ExitStack,
-    config: str | Path | None,
-    *,
-    sim: Sim,
-    seed: int,
-    level: str,
-    speed: float | None,
-    job: str | Path,
-    confirm: Confirm | None,
-    only: Collection[str],
-    clock: str,
-    truth: str | Path | None = None,
-) -> Opened:
-    """Connect as `Cell.open` says, and raise what it says. What is to be undone if the rest fails goes to `undo`."""
-    if clock not in ("wall", "virtual"):
-        raise ConfigError(f'clock="{clock}" is not offered: "wall" keeps time with the wall, "virtual" does not wait')
-    given = None if config is None else Path(config)
-    names = simulated_of(sim, given)
-    whole = set(names) == set(DEVICES)
-    if clock == "virtual" and (not whole or speed is not None):
-        wrong = "speed means nothing on it" if whole else 'only a simulated cell, sim="all", has one'
-        raise ConfigError(f'clock="virtual": {wrong}; leave that out')
-    if truth is not None and not whole:
-        raise ConfigError("truth describes a cell that is all simulated; leave it out where devices are real")
-    path, loaded = config_to_open(given, simulated=whole, confirm=confirm)
-    # So that whatever keeps the configuration keeps what was simulated.
-    loaded = loaded.model_copy(update={"cell": loaded.cell.model_copy(update={"sim": names})})
-    folder = beside(path)
-    true = loaded if truth is None else load_config(Path(truth))
+@dataclass(frozen=True, kw_only=True)
+class SessionRequest:
+    """Which cell is to be opened, and how: the arguments of `Cell.open`, which tells them."""
+
+    config: str | Path | None
+    sim: Sim
+    seed: int
+    level: str
+    speed: float | None
+    job: str | Path
+    confirm: Confirm | None
+    only: Collection[str]
+    clock: str
+    truth: str | Path | None = None
+
+    def open(self, undo: ExitStack) -> Opened:
+        """Connect as `Cell.open` says, and raise what it says. What is to be undone if that fails goes to `undo`."""
+        given = None if self.config is None else Path(self.config)
+        names = simulated_of(self.sim, given)
+        whole = set(names) == set(DEVICES)
+        self._require_sense(whole)
+        path, loaded = config_to_open(given, simulated=whole, confirm=self.confirm)
+        # So that whatever keeps the configuration keeps what was simulated.
+        loaded = loaded.model_copy(update={"cell": loaded.cell.model_copy(update={"sim": names})})
+        folder = beside(path)
+        true = loaded if self.truth is None else load_config(Path(self.truth))
+        if self.clock == "virtual":
+            return self._virtual(loaded, true, folder)
+        needed = connected_for(loaded, self.only)
+        for name in needed:
+            if missing := (whole or name not in names) and loaded.make(name).missing():
+                raise NotConnectedError(name, missing)
+        world: SimulatedCell | None = None
+        if whole:
+            world = self._world(loaded, true)
+            undo.callback(world.close)
+            loaded = with_endpoints(loaded, world.endpoints)
+        else:
+            require_real_addresses(loaded, names)
+        if beside_real := tuple(name for name in names if name in needed and not whole):
+            return self._mixed(undo, loaded, folder, beside_real, needed)
+        lock = undo.enter_context(CellLock(loaded, needed))
+        devices = connect(loaded, needed)
+        undo.callback(devices.close)
+        return Opened(loaded, folder, lock, devices, world)
+
+    def _require_sense(self, whole: bool) -> None:
+        """Raise `ConfigError` for arguments that do not go together; `whole` for a cell that is all simulated."""
+        if self.clock not in ("wall", "virtual"):
+            raise ConfigError(
+                f'clock="{self.clock}" is not offered: "wall" keeps time with the wall, "virtual" does not wait'
+            )
+        if self.clock == "virtual" and (not whole or self.speed is not None):
+            wrong = "speed means nothing on it" if whole else 'only a simulated cell, sim="all", has one'
+            raise ConfigError(f'clock="virtual": {wrong}; leave that out')
+        if self.truth is not None and not whole:
+            raise ConfigError("truth describes a cell that is all simulated; leave it out where devices are real")
+
     # The world takes long to load, and real devices have none; over wires it is in another process.
-    if clock == "virtual":
+
+    def _virtual(self, loaded: CellConfig, true: CellConfig, folder: Path) -> Opened:
         from cell.devices.simulated.described import Described
         from cell.devices.simulated.direct import VirtualCell
 
-        virtual = VirtualCell(loaded, seed, level, Described.of(job), true)
+        virtual = VirtualCell(loaded, self.seed, self.level, Described.of(self.job), true)
         return Opened(loaded, folder, nullcontext(), virtual.devices, virtual)
-    needed = connected_for(loaded, only)
-    for name in needed:
-        if missing := (whole or name not in names) and loaded.make(name).missing():
-            raise NotConnectedError(name, missing)
-    world: SimulatedCell | None = None
-    if whole:
+
+    def _world(self, loaded: CellConfig, true: CellConfig) -> SimulatedCell:
         from cell.devices.simulated.described import Described
         from cell.measure.vision.stripe.extract import read_drawn
 
-        world = SimulatedCell(
-            true,
-            Described.of(job),
-            seed=seed,
-            level=level,
-            speed=speed or SIM_SPEED,
-            gige=on_gige(loaded),
-            meanwhile=read_drawn if set(only) == set(DEVICES) else None,
-        )
-        undo.callback(world.close)
-        loaded = with_endpoints(loaded, world.endpoints)
-    else:
-        require_real_addresses(loaded, names)
-    if beside_real := tuple(name for name in names if name in needed and not whole):
+        return SimulatedCell(
+            true, Described.of(self.job), seed=self.seed, level=self.level, speed=self.speed or SIM_SPEED,
+            gige=on_gige(loaded), meanwhile=read_drawn if set(self.only) == set(DEVICES) else None,
+        )  # fmt: skip
+
+    def _mixed(
+        self, undo: ExitStack, loaded: CellConfig, folder: Path, simulated: tuple[str, ...], needed: list[str]
+    ) -> Opened:
         from cell.devices.simulated.mixed import MixedCell
 
-        if speed not in (None, loaded.cell.time_scale):
-            raise ConfigError(f"speed={speed:g}: real devices keep the wall's time; leave that out")
-        mixed = MixedCell(undo, loaded, job, seed=seed, level=level, simulated=beside_real, needed=needed)
+        if self.speed not in (None, loaded.cell.time_scale):
+            raise ConfigError(f"speed={self.speed:g}: real devices keep the wall's time; leave that out")
+        mixed = MixedCell(undo, loaded, self.job, seed=self.seed, level=self.level, simulated=simulated, needed=needed)
         return Opened(mixed.config, folder, mixed.lock, mixed.devices, mixed.world)
-    lock = undo.enter_context(CellLock(loaded, needed))
-    devices = connect(loaded, needed)
-    undo.callback(devices.close)
-    return Opened(loaded, folder, lock, devices, world)

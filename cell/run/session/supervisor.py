@@ -39,7 +39,7 @@ from cell.run.jogging import arm_is_ready, begin_program
 from cell.run.recorded_work import Hands
 from cell.run.resumption import UnfinishedRun
 from cell.run.runs import Run, Runs
-from cell.run.session.session import Opened, open_devices
+from cell.run.session.session import Opened, SessionRequest
 from drivers.errors import CalibrationStale, ConfigError
 from statemachine.runner import NO_SCRIPT, Event, Script
 from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
@@ -122,19 +122,10 @@ class Cell:
         `NotConnectedError` or `DeviceFault` that names the device that does not answer.
         """
         with EndSignals(), ExitStack() as undo:
-            made = open_devices(
-                undo,
-                config,
-                sim=sim,
-                seed=seed,
-                level=level,
-                speed=speed,
-                job=job,
-                confirm=confirm,
-                only=only,
-                clock=clock,
-                truth=truth,
-            )
+            made = SessionRequest(
+                config=config, sim=sim, seed=seed, level=level, speed=speed, job=job, confirm=confirm, only=only,
+                clock=clock, truth=truth,
+            ).open(undo)  # fmt: skip
             cell = cls(made.config, made.folder, made.lock, made.devices, made.simulated)
             undo.pop_all()
         # After the context above has given the handlers back: of two that are nested the outer one would win.

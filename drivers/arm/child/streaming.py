@@ -119,7 +119,9 @@ class Streaming:
 
     def _send(self, course: _Course, trajectory: JointTrajectory) -> bool:
         """Send the next point; False when the controller does not take it."""
-        if not self._control.servoJ(list(trajectory.at(course.elapsed)), 0.0, 0.0, PERIOD, _LOOKAHEAD, _GAIN):
+        unused_speed = unused_acceleration = 0.0
+        how = unused_speed, unused_acceleration, PERIOD, _LOOKAHEAD, _GAIN
+        if not self._control.servoJ(list(trajectory.at(course.elapsed)), *how):
             return False
         self._sent.append(time.monotonic())
         course.cycle += 1

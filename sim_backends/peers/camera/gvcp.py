@@ -97,10 +97,8 @@ class Leader:
 
 def packets(block_id: int, leader: Leader, pixels: bytes, packet_size: int) -> Iterator[bytes]:
     """A picture's packets in order: leader, pixels, trailer."""
-    head = struct.pack(
-        ">HHQIIIIIHH", 0, _IMAGE, leader.timestamp, leader.pixel_format, leader.width, leader.height, leader.left,
-        leader.top, 0, 0,
-    )  # fmt: skip
+    window = leader.width, leader.height, leader.left, leader.top
+    head = struct.pack(">HHQIIIIIHH", 0, _IMAGE, leader.timestamp, leader.pixel_format, *window, 0, 0)
     yield _packet(block_id, _LEADER, 0, head)
     room = packet_size - _IP_UDP_GVSP
     number = 0

@@ -182,7 +182,8 @@ class TmclModule:
                 return self._reply(refusal.status, command, 0)
 
     def _reply(self, status: int, command: int, value: int) -> bytes:
-        body = struct.pack(">BBBBi", self._globals[76], self._globals[66], status, command, value)
+        host, module = self._globals[76], self._globals[66]
+        body = bytes((host, module, status, command)) + struct.pack(">i", value)
         return body + bytes([sum(body) & 0xFF])
 
     def _run(self, command: int, kind: int, motor: int, value: int) -> int:

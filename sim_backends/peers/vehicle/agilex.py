@@ -188,7 +188,7 @@ class _Cyclic:
 
 
 def _system_state(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
-    return struct.pack(">BBHHxB", f.state, f.mode, round(f.volts * 10.0), f.errors, count)
+    return bytes((f.state, f.mode)) + struct.pack(">HHxB", round(f.volts * 10.0), f.errors, count)
 
 
 def _motion_state(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
@@ -204,7 +204,8 @@ def _odometry(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
 
 
 def _battery(f: VehicleReadings, p: VehicleParams, count: int) -> bytes:
-    return struct.pack(">BBhhh", 87, 100, round(f.volts * 10.0), _i16(10.0 * _amperes(f.speed)), 250)
+    charge, health = 87, 100
+    return bytes((charge, health)) + struct.pack(">hhh", round(f.volts * 10.0), _i16(10.0 * _amperes(f.speed)), 250)
 
 
 def _motor_motion(side: int) -> _Encoder:

@@ -901,3 +901,43 @@ def test_a_word_of_another_process_counts_for_the_question_that_it_names_and_no_
     request(tmp_path, "confirm", "Bob", second)
     control.obey(journal.take_requests())
     assert control.answer() == "Bob"
+
+
+def alone(folder, work=None):
+    """A bench whose runner has one step, which others' run goes on after."""
+    bench = Bench(folder, place=work)
+    bench.runner.sequence = Sequence(("place",))
+    return bench
+
+
+def test_a_step_alone_that_succeeds_leaves_the_cell_and_the_run_as_they_are(tmp_path):
+    bench = alone(tmp_path)
+    result = bench.runner.run_alone()
+    assert (result.made, result.end) == ("made by place", None)
+    assert bench.log == ["place"]
+    assert not bench.runner.control.over
+
+
+def test_after_a_step_alone_that_fails_the_cell_is_brought_to_rest_once(tmp_path):
+    bench = alone(tmp_path, failing(ValueError("no")))
+    result = bench.runner.run_alone()
+    assert (result.end.outcome, result.end.reason, str(result.error)) == (Outcome.REFUSED, "no", "no")
+    assert bench.log == ["place", "stop: place failed"]
+
+
+def test_who_asks_for_the_end_just_after_a_step_alone_has_the_cell_brought_to_rest(tmp_path):
+    bench = alone(tmp_path)
+    control = bench.runner.control
+    bench.runner.observer = lambda event: event.kind == "step_done" and control.abort("by a person")
+    assert bench.runner.run_alone().end.outcome is Outcome.ABORTED
+    assert bench.log == ["place", "stop: by a person"]
+
+
+def test_a_recovery_that_fails_alone_is_stopped_after(tmp_path):
+    """The stop of the failed attempt came before it: what the recovery began is not at rest."""
+    bench = alone(tmp_path, failing(ConnectionError("lost")))
+    bench.policy("place", 5.0, 1)
+    bench.runner.recover = lambda error, token, confirmed: failing(OSError("jammed"))(None)
+    result = bench.runner.run_alone()
+    assert "the recovery failed: jammed" in result.end.reason
+    assert [line.split(":")[0] for line in bench.log] == ["place", "stop", "stop"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -26,6 +26,47 @@ if TYPE_CHECKING:
     from cell.apps.recordings.command import Options
     from cell.measure.vision import LaserChannel
 
+SourceOption = Annotated[
+    Path | None, typer.Option("--from", help="A folder of recorded frames, with flange poses or without.")
+]
+BoardOption = Annotated[
+    str | None, typer.Option("--board", help='The board in the recorded frames, such as "chessboard:7x6:10mm".')
+]
+PlanOption = Annotated[
+    bool, typer.Option("--plan", help="Only say what was understood of the recorded frames, and calibrate nothing.")
+]
+PosesOption = Annotated[
+    str | None,
+    typer.Option(
+        "--poses", help='How the recorded poses are to be read, such as "xyz+rotvec-rad"; else the pictures tell.'
+    ),
+]
+PoseFieldOption = Annotated[
+    str | None, typer.Option("--pose-field", help="Which of several recorded poses is the flange's.")
+]
+SetupOption = Annotated[
+    str | None,
+    typer.Option("--setup", help="Where the camera was: eye-in-hand or eye-to-hand; else the poses tell."),
+]
+CameraOption = Annotated[
+    str | None,
+    typer.Option(
+        "--camera",
+        help='A camera that is known: a file (JSON of an earlier result, or YAML of OpenCV or ROS), or "pictures": '
+        "the arm has no say in it.",
+    ),
+]
+LaserOption = Annotated[
+    str | None,
+    typer.Option(
+        "--laser",
+        help="The laser's colour: red, green, blue, grey; none; or auto: the pictures tell, which is the default.",
+    ),
+]
+DetailsOption = Annotated[
+    bool, typer.Option("--details", help="With --from: every picture, value, check and note as well.")
+]
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands of this file, and those below `cell calibrate`."""
@@ -45,46 +86,15 @@ def calibrate(
     seed: SeedOption = 1,
     level: LevelOption = Level.nominal,
     job: JobOption = "pot",
-    source: Annotated[
-        Path | None, typer.Option("--from", help="A folder of recorded frames, with flange poses or without.")
-    ] = None,
-    board: Annotated[
-        str | None, typer.Option("--board", help='The board in the recorded frames, such as "chessboard:7x6:10mm".')
-    ] = None,
-    plan: Annotated[
-        bool, typer.Option("--plan", help="Only say what was understood of the recorded frames, and calibrate nothing.")
-    ] = False,
-    poses: Annotated[
-        str | None,
-        typer.Option(
-            "--poses", help='How the recorded poses are to be read, such as "xyz+rotvec-rad"; else the pictures tell.'
-        ),
-    ] = None,
-    pose_field: Annotated[
-        str | None, typer.Option("--pose-field", help="Which of several recorded poses is the flange's.")
-    ] = None,
-    setup: Annotated[
-        str | None,
-        typer.Option("--setup", help="Where the camera was: eye-in-hand or eye-to-hand; else the poses tell."),
-    ] = None,
-    camera: Annotated[
-        str | None,
-        typer.Option(
-            "--camera",
-            help='A camera that is known: a file (JSON of an earlier result, or YAML of OpenCV or ROS), or "pictures": '
-            "the arm has no say in it.",
-        ),
-    ] = None,
-    laser: Annotated[
-        str | None,
-        typer.Option(
-            "--laser",
-            help="The laser's colour: red, green, blue, grey; none; or auto: the pictures tell, which is the default.",
-        ),
-    ] = None,
-    details: Annotated[
-        bool, typer.Option("--details", help="With --from: every picture, value, check and note as well.")
-    ] = False,
+    source: SourceOption = None,
+    board: BoardOption = None,
+    plan: PlanOption = False,
+    poses: PosesOption = None,
+    pose_field: PoseFieldOption = None,
+    setup: SetupOption = None,
+    camera: CameraOption = None,
+    laser: LaserOption = None,
+    details: DetailsOption = False,
     json: JsonOption = False,
 ) -> None:
     """Calibrate rail, cameras, hand-eye and light plane, and store the result.
@@ -98,17 +108,12 @@ def calibrate(
     given = {"--board": board, "--plan": plan, "--poses": poses, "--pose-field": pose_field, "--setup": setup}
     given |= {"--camera": camera, "--laser": laser, "--details": details}
     if source is None:
-        for name, value in given.items():
-            if value:
-                raise ConfigError(f"{name} belongs to --from; the boards on the deck are named in the configuration")
+        for name in (name for name, value in given.items() if value):
+            raise ConfigError(f"{name} belongs to --from; the boards on the deck are named in the configuration")
     else:
         from cell.apps.recordings.command import Options
-        from cell.apps.recordings.known_camera import read_camera
 
-        known = None if camera in (None, "pictures") else read_camera(Path(str(camera)))
-        options = Options(
-            poses, pose_field, _setup(setup), plan, camera=known, hold_camera=camera == "pictures", laser=_laser(laser)
-        )
+        options = Options(poses, pose_field, _setup(setup), plan, laser=_laser(laser), **_camera(camera))
         _from_folder(source, board, options, json, details)
         return
     from cell.apps.cli.calibration.tables import print_examination
@@ -134,6 +139,14 @@ def calibrate(
     else:
         print_calibration(calibration.summary(), str(where))
         print_examination(examination.summary, pictures)
+
+
+def _camera(text: str | None) -> dict[str, Any]:
+    """What of the options tells of a camera that is known."""
+    from cell.apps.recordings.known_camera import read_camera
+
+    known = None if text in (None, "pictures") else read_camera(Path(str(text)))
+    return {"camera": known, "hold_camera": text == "pictures"}
 
 
 def _setup(text: str | None) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -27,40 +27,45 @@ def print_recorded(result: Result, details: bool = False) -> None:
             say(f"{frame['name']} not used: {frame['text']}")
     _say_poses(say, result)
     if details:
-        if result["board"] is not None:
-            rows = [
-                (
-                    f["name"],
-                    f["points"],
-                    f["pose_from"],
-                    f["stripe_from"] or ("here" if f["stripe"] else ""),
-                    f["rms_px"],
-                )
-                for f in frames
-            ]
-            console.print(_table("recorded frames", ("picture", "points", "pose", "stripe", "RMS in px"), rows))
-        for part, name in PARTS.items():
-            found = result[part] or result["refused_values"].get(part)
-            if found is not None:
-                title = name if result[part] is not None else f"{name}, REFUSED"
-                console.print(_table(title, ("quantity", "value"), _plain(found)))
-        if result["flatness"] is not None:
-            flat = result["flatness"]
-            frames_flat = [(f["name"], f["rms_mm"]) for f in flat["per_frame"]]
-            whole = [("all frames", flat["rms_mm"]), ("95 % within", flat["p95_mm"])]
-            title = f"flatness of the board in the {flat['frame']}, end to end, mm"
-            console.print(_table(title, ("points of", "RMS"), frames_flat + whole))
-        checks = [
-            (PARTS[c["part"]], c["name"], c["value"], c["doubt_from"], c["refused_from"], c["unit"], c["verdict"])
-            for c in result["checks"]
-        ]
-        console.print(_table("checks", ("of", "what", "found", "doubtful from", "refused from", "unit", ""), checks))
-        for note in result["notes"]:
-            say(note)
+        _print_details(console, say, result)
     for line in verdicts(result):
         say(line)
     if not details:
         say("More with --details.")
+
+
+def _print_details(console: Console, say: Callable[[str], None], result: Result) -> None:
+    """Every picture, value, check and note."""
+    if result["board"] is not None:
+        rows = [
+            (
+                f["name"],
+                f["points"],
+                f["pose_from"],
+                f["stripe_from"] or ("here" if f["stripe"] else ""),
+                f["rms_px"],
+            )
+            for f in result["frames"]
+        ]
+        console.print(_table("recorded frames", ("picture", "points", "pose", "stripe", "RMS in px"), rows))
+    for part, name in PARTS.items():
+        found = result[part] or result["refused_values"].get(part)
+        if found is not None:
+            title = name if result[part] is not None else f"{name}, REFUSED"
+            console.print(_table(title, ("quantity", "value"), _plain(found)))
+    if result["flatness"] is not None:
+        flat = result["flatness"]
+        frames_flat = [(f["name"], f["rms_mm"]) for f in flat["per_frame"]]
+        whole = [("all frames", flat["rms_mm"]), ("95 % within", flat["p95_mm"])]
+        title = f"flatness of the board in the {flat['frame']}, end to end, mm"
+        console.print(_table(title, ("points of", "RMS"), frames_flat + whole))
+    checks = [
+        (PARTS[c["part"]], c["name"], c["value"], c["doubt_from"], c["refused_from"], c["unit"], c["verdict"])
+        for c in result["checks"]
+    ]
+    console.print(_table("checks", ("of", "what", "found", "doubtful from", "refused from", "unit", ""), checks))
+    for note in result["notes"]:
+        say(note)
 
 
 def verdicts(result: Result) -> list[str]:

@@ -39,7 +39,8 @@ def list_calibrations(config: ConfigOption = None, json: JsonOption = False) -> 
     if json:
         print_json(rows)
         return
-    table = new_table(f"calibrations in {_folder(config)}", "made", "name", "hash", "chi²/dof", "found since")
+    columns = ("made", "name", "hash", "chi²/dof", "found since")
+    table = new_table(f"calibrations in {_folder(config)}", *columns)
     for row in rows:
         if "unreadable" in row:
             table.add_row("", row["name"], "", "", row["unreadable"])

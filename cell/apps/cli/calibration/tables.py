@@ -17,7 +17,8 @@ def print_examination(figures: Mapping[str, Any], pictures: Sequence[Path]) -> N
     _coverage(console, figures)
     influence = figures["influence"]
     title = f"place error left by the calibration: {influence['total_mm']:.4f} mm RMS at the job's points"
-    table = new_table(title, "of", ">sigma", "unit", ">alone mm", ">total if known mm")
+    columns = ("of", ">sigma", "unit", ">alone mm", ">total if known mm")
+    table = new_table(title, *columns)
     for row in influence["groups"]:
         table.add_row(f"[bold]{row['name']}[/]", "", "", f"{row['alone_mm']:.4f}", f"{row['if_known_mm']:.4f}")
     table.add_section()

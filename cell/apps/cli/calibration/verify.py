@@ -66,7 +66,8 @@ def print_verification(summary: Mapping[str, Any]) -> None:
         )
     console.print(table)
     title = f"changes that show in {summary['detectable_share']:.0%} of checks like this one"
-    seen = new_table(title, "part", "change", ">from", ">wanted", "unit")
+    columns = ("part", "change", ">from", ">wanted", "unit")
+    seen = new_table(title, *columns)
     for row in summary["detectable"]:
         size = "none" if row["size"] is None else f"{row['size']:.3f}"
         enough = row["size"] is not None and row["size"] <= row["wanted"]
@@ -81,13 +82,7 @@ def print_verification(summary: Mapping[str, Any]) -> None:
         for row in summary["suspects"]:
             change = ", ".join(f"{name} {value:+.3f}" for name, value in row["change"].items())
             most = row["place_error_at_most_mm"]
-            suspects.add_row(
-                row["part"],
-                f"{row['probability']:.0%}",
-                f"{row['place_error_mm']:.3f}",
-                f"{most:.3f}",
-                f"{most / allowed:.0%}",
-                change,
-            )
+            error = f"{row['place_error_mm']:.3f}", f"{most:.3f}", f"{most / allowed:.0%}"
+            suspects.add_row(row["part"], f"{row['probability']:.0%}", *error, change)
         console.print(suspects)
     console.print(summary["reason"], style="green" if summary["good"] else "red", markup=False, soft_wrap=True)

@@ -28,31 +28,34 @@ if TYPE_CHECKING:
     from cell.apps.commission.sequence import Commissioning
 
 
+OnlyArgument = Annotated[list[str] | None, typer.Argument(help="Only these checks; without any, all of them.")]
+TruthOption = Annotated[
+    Path | None, typer.Option(help="With --sim: the simulated cell is the one of this configuration, not of --config.")
+]
+ClockOption = Annotated[CellClock, typer.Option(help='With --sim: "virtual" is without wires and without waiting.')]
+ConfirmOption = Annotated[
+    Confirm | None, typer.Option(help="Who confirms: with --sim a simulated person unless told otherwise.")
+]
+
+
 def register(app: typer.Typer) -> None:
     """Add the command of this file."""
     app.command()(commission)
 
 
 def commission(
-    only: Annotated[list[str] | None, typer.Argument(help="Only these checks; without any, all of them.")] = None,
+    only: OnlyArgument = None,
     config: ConfigOption = None,
     job: JobOption = "pot",
     until: Annotated[str | None, typer.Option(help="Stop after the check of this name.")] = None,
     again: Annotated[bool, typer.Option("--again", help="Do these checks again, also those that are good.")] = False,
     show: Annotated[bool, typer.Option("--list", help="Only say how the checks stand; nothing is connected.")] = False,
     sim: SimOption = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(help="With --sim: the simulated cell is the one of this configuration, not of --config."),
-    ] = None,
+    truth: TruthOption = None,
     seed: SeedOption = 1,
     level: LevelOption = Level.nominal,
-    clock: Annotated[
-        CellClock, typer.Option(help='With --sim: "virtual" is without wires and without waiting.')
-    ] = CellClock.wall,
-    confirm: Annotated[
-        Confirm | None, typer.Option(help="Who confirms: with --sim a simulated person unless told otherwise.")
-    ] = None,
+    clock: ClockOption = CellClock.wall,
+    confirm: ConfirmOption = None,
     json: JsonOption = False,
 ) -> None:
     """Take a cell into service: checks in a safe order, each confirmed before its axis first moves.
@@ -71,21 +74,11 @@ def commission(
         raise ConfigError("--truth and --confirm simulated are for a cell that is all simulated; give --sim all")
     checks = chosen(only or (), until)
     console = Console(stderr=json, highlight=False)
-    options: dict[str, Any] = {
-        "job": job,
-        "sim": sim,
-        "seed": seed,
-        "level": level.value,
-        "clock": clock.value,
-        "truth": truth,
-    }
     by_itself = confirm is not Confirm.person and (sim == "all" or (sim is None and confirms_itself(config)))
     made = begin(
-        config,
-        _person(by_itself, console),
-        _Page(console, CHECKS),
-        **options,
-    )
+        config, _person(by_itself, console), _Page(console, CHECKS),
+        job=job, sim=sim, seed=seed, level=level.value, clock=clock.value, truth=truth,
+    )  # fmt: skip
     made.desk.heard = tell_question
     if show:
         _list(made, checks, json)
@@ -105,16 +98,16 @@ def commission(
         }
         print_json({"good": good, "mended": made.progress.mended, "checks": rows, "protocol": str(protocol)})
     else:
-        for entry in made.progress.mended:
-            console.print(
-                f"found and mended: {entry['name']}: {entry['what']}; configured {entry['told']}, "
-                f"measured {entry['found']}",
-                style="yellow",
-                markup=False,
-            )
+        _print_mended(made, console)
         console.print(f"protocol: {protocol}", markup=False)
     if not good:
         raise typer.Exit(1)
+
+
+def _print_mended(made: Commissioning, console: Console) -> None:
+    for entry in made.progress.mended:
+        text = f"{entry['name']}: {entry['what']}; configured {entry['told']}, measured {entry['found']}"
+        console.print(f"found and mended: {text}", style="yellow", markup=False)
 
 
 def _person(simulated: bool, console: Console) -> Any:

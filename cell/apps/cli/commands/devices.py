@@ -233,16 +233,12 @@ def _print_table(rows: list[Diagnosis]) -> None:
         mark = "[green]ok[/]" if row.ok else "[red]fails[/]"
         mark += "\n[yellow]simulated[/]" if row.simulated else ""
         identity = "\n".join(part for part in (row.model, row.serial, row.firmware) if part)
-        table.add_row(
-            f"{row.device}\n{mark}",
-            identity,
-            row.address,
-            f"{row.p50_text}\n{row.p99_text}",
-            row.errors_text,
-            row.state,
-        )
+        times = f"{row.p50_text}\n{row.p99_text}"
+        cells = f"{row.device}\n{mark}", identity, row.address, times, row.errors_text, row.state
+        table.add_row(*cells)
     console.print(table)
-    figures = new_table("figures and what they may be", "device", "figure", ">value", "unit", ">allowed", "")
+    columns = ("device", "figure", ">value", "unit", ">allowed", "")
+    figures = new_table("figures and what they may be", *columns)
     outside: list[str] = []
     for row in rows:
         for reading in row.readings:

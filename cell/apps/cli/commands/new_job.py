@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cell.apps.cli.options import ConfigOption, JsonOption, print_json
 
-Answer = Annotated[str | None, typer.Option()]
+if TYPE_CHECKING:
+    from cell.apps.new_job.make import Made
+
+UnitOption = Annotated[
+    str | None, typer.Option(help="Of the mesh: mm, m or inch. Told by its size where that is clear.")
+]
+BoardPlaceOption = Annotated[
+    str | None, typer.Option(help='Its pose in the place frame: "x mm, y mm, z mm; roll deg, pitch deg, yaw deg".')
+]
+PriorOption = Annotated[str | None, typer.Option(help="How exactly the board tells where the surface is, 1 sigma.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -19,9 +29,7 @@ def register(app: typer.Typer) -> None:
 
 def new_job(
     mesh: Annotated[str | None, typer.Option(help="STL, PLY, OBJ or STEP of what the part is placed onto.")] = None,
-    unit: Annotated[
-        str | None, typer.Option(help="Of the mesh: mm, m or inch. Told by its size where that is clear.")
-    ] = None,
+    unit: UnitOption = None,
     bodies: Annotated[str | None, typer.Option(help='Which bodies of the mesh: "all", or numbers such as 1,2.')] = None,
     up: Annotated[str | None, typer.Option(help="Axis of the mesh that points up: z, -z, x, -x, y or -y.")] = None,
     turn: Annotated[str | None, typer.Option(help='Turn about it, such as "90 deg", or auto.')] = None,
@@ -29,13 +37,9 @@ def new_job(
     name: Annotated[str | None, typer.Option(help="Of the job and its files; else that of the mesh.")] = None,
     like: Annotated[str | None, typer.Option(help="A job at the same station: its way, photograph and speeds.")] = None,
     board: Annotated[str | None, typer.Option(help="The board beside the place.")] = None,
-    board_place: Annotated[
-        str | None, typer.Option(help='Its pose in the place frame: "x mm, y mm, z mm; roll deg, pitch deg, yaw deg".')
-    ] = None,
+    board_place: BoardPlaceOption = None,
     place: Annotated[str | None, typer.Option(help="Pose of the surface's origin in the place frame.")] = None,
-    prior: Annotated[
-        str | None, typer.Option(help="How exactly the board tells where the surface is, 1 sigma.")
-    ] = None,
+    prior: PriorOption = None,
     prior_angle: Annotated[str | None, typer.Option(help="And how it is turned, 1 sigma.")] = None,
     part_size: Annotated[str | None, typer.Option(help='The part in the claw: "70 mm, 36 mm, 20 mm".')] = None,
     grasp: Annotated[str | None, typer.Option(help="Pose of the part's origin in the flange's frame.")] = None,
@@ -72,23 +76,25 @@ def new_job(
         if not json:
             typer.echo(text)
 
-    def ask(question: str, default: str | None) -> str:
-        answer: str = typer.prompt(question, default=default, err=json)
-        return answer
-
     source = find_config(config, simulated=True)
-    made = make_job(Asker(given, None if yes else ask, tell), load_config(source), folder, overwrite)
+    made = make_job(
+        Asker(given, None if yes else partial(typer.prompt, err=json), tell), load_config(source), folder, overwrite
+    )
     if json:
         print_json(
             {"job": str(made.job), "mesh": str(made.mesh), "picture": str(made.picture), "seen": round(made.seen, 3),
              "expected": made.place.summary(), "told": told, "notes": list(made.notes)}
         )  # fmt: skip
-        return
+    else:
+        _print_made(made, "" if source is None or config is None else f" -c {config}")
+
+
+def _print_made(made: Made, where: str) -> None:
+    """What was made, for people, and the commands that come next, with the option `where`."""
     for note in made.notes:
         typer.echo(f"note: {note}")
     typer.echo(f"surface: {100 * made.seen:.0f} % of it is seen; {made.place.verdict.worst.words}")
     for free in made.place.verdict.unseen:
         typer.echo(f"note: {free} is told by the board alone, not by the scan")
     typer.echo(f"wrote {made.job} and {made.mesh}")
-    where = "" if source is None or config is None else f" -c {config}"
     typer.echo(f"next: cell check{where} -j {made.job}, then cell dry-run{where} -j {made.job} --clock virtual")

@@ -37,6 +37,32 @@ UntilOption = Annotated[
 AtStartOption = Annotated[
     bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
 ]
+SpeedOption = Annotated[
+    float | None, typer.Option("--speed", min=0.1, max=20, help="How many times faster than the wall.")
+]
+ClockOption = Annotated[
+    CellClock | None,
+    typer.Option(
+        help='"virtual": without wires and without waiting; the same seed, the same bytes. "wall" unless something '
+        "is missing to speak with a device."
+    ),
+]
+InjectOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--inject",
+        help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.',
+        autocompletion=completing.faults,
+    ),
+]
+ConfirmOption = Annotated[
+    Confirm | None,
+    typer.Option(help='"simulated": the dry run confirms by itself what a person has to; else `cell confirm`.'),
+]
+ConsoleOption = Annotated[
+    bool,
+    typer.Option("--console", help="Show it in a browser, until its page is closed; or, with --no-open, ended."),
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -81,35 +107,14 @@ def dry_run(
     config: ConfigOption = None,
     seed: SeedOption = 1,
     level: LevelOption = Level.nominal,
-    speed: Annotated[
-        float | None, typer.Option("--speed", min=0.1, max=20, help="How many times faster than the wall.")
-    ] = None,
-    clock: Annotated[
-        CellClock | None,
-        typer.Option(
-            help='"virtual": without wires and without waiting; the same seed, the same bytes. "wall" unless something '
-            "is missing to speak with a device."
-        ),
-    ] = None,
-    inject: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--inject",
-            help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.',
-            autocompletion=completing.faults,
-        ),
-    ] = None,
-    confirm: Annotated[
-        Confirm | None,
-        typer.Option(help='"simulated": the dry run confirms by itself what a person has to; else `cell confirm`.'),
-    ] = None,
+    speed: SpeedOption = None,
+    clock: ClockOption = None,
+    inject: InjectOption = None,
+    confirm: ConfirmOption = None,
     until: UntilOption = None,
     json: JsonOption = False,
     noise: NoiseOption = False,
-    console: Annotated[
-        bool,
-        typer.Option("--console", help="Show it in a browser, until its page is closed; or, with --no-open, ended."),
-    ] = False,
+    console: ConsoleOption = False,
     no_open: Annotated[bool, typer.Option("--no-open", help="With --console: print the page's link only.")] = False,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="With --console: where the page is.")] = 0,
 ) -> None:
@@ -131,16 +136,9 @@ def dry_run(
     for text in inject or ():
         Injection.parse(text, find_kind(loaded.job.kind).names)
     opened = partial(
-        Cell.open,
-        config,
-        sim="all",
-        seed=seed,
-        level=level.value,
-        speed=speed,
-        job=job,
-        confirm=None if confirm is None else confirm.value,
-        clock=(clock or CellClock.wall).value,
-    )
+        Cell.open, config, sim="all", seed=seed, level=level.value, speed=speed, job=job,
+        confirm=None if confirm is None else confirm.value, clock=(clock or CellClock.wall).value,
+    )  # fmt: skip
     if console:
         from cell.apps.cli.commands.console import require_installed, run_shown
 
@@ -179,15 +177,11 @@ def resume(
     simulated, clock = before.info["simulated"], before.info.get("clock", "wall")
     whole = simulated is True
     opened = partial(
-        Cell.open,
-        config,
-        sim="all" if whole else simulated or "none",
-        seed=before.info.get("seed") or 1,
+        Cell.open, config, sim="all" if whole else simulated or "none", seed=before.info.get("seed") or 1,
         level=before.info.get("level") or "nominal",
-        speed=before.info.get("speed") if whole and clock == "wall" else None,
-        job=before.job if simulated else "pot",
+        speed=before.info.get("speed") if whole and clock == "wall" else None, job=before.job if simulated else "pot",
         clock=clock,
-    )
+    )  # fmt: skip
     _perform(opened, lambda cell, display: cell.resume(before.folder, display, at_start=at_start), json, noise)
 
 

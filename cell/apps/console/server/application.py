@@ -22,7 +22,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from cell.apps.console.server.access import HEADERS, Access, Bucket
+from cell.apps.console.server.access import HEADERS, Access, Bucket, PageSession
 from cell.apps.console.server.commands import checked_command
 from cell.apps.console.server.pages import PROTOCOL, Pages
 from cell.apps.console.view.archive import Archive
@@ -89,6 +89,16 @@ class AccessGuard:
         else:
             await PlainTextResponse(refusal[1] + "\n", refusal[0], {"connection": "close"})(scope, receive, sent)
 
+    def _session(self, scope: Scope, headers: Mapping[str, str], plain: bool) -> PageSession | None:
+        """Whose request it is; None when it is no session's."""
+        path, session = scope["path"], self._access.session(headers.get("cookie", ""))
+        # The page itself and its files say nothing of the cell.
+        if session is None or (plain and (path == "/" or path.startswith("/static/"))):
+            return session
+        asked: list[str] = scope["subprotocols"] if scope["type"] == "websocket" else []
+        key = asked[1] if len(asked) == 2 and asked[0] == PROTOCOL else headers.get(KEY, "")
+        return self._access.opened(key, _asked(scope, "ticket") if plain and SHOWN.fullmatch(path) else "")
+
     def _unknown(self, scope: Scope, headers: Mapping[str, str], plain: bool) -> tuple[int, str] | None:
         """Status and words when this is no session's, or more than one session may ask for."""
         path, live = scope["path"], scope["type"] == "websocket"
@@ -96,15 +106,7 @@ class AccessGuard:
             return 400, f"this address has {len(path)} characters; at most {MOST_PATH} are allowed"
         if plain and path == ENTER:
             return None if self._strangers.take() else (429, "too many requests; wait a moment")
-        session = self._access.session(headers.get("cookie", ""))
-        asked: list[str] = scope["subprotocols"] if live else []
-        key = asked[1] if len(asked) == 2 and asked[0] == PROTOCOL else headers.get(KEY, "")
-        ticket = _asked(scope, "ticket") if plain and SHOWN.fullmatch(path) else ""
-        # The page itself and its files say nothing of the cell.
-        shell = plain and (path == "/" or path.startswith("/static/"))
-        if session is not None and not shell:
-            session = self._access.opened(key, ticket)
-        if session is None:
+        if (session := self._session(scope, headers, plain)) is None:
             return 401, LOST
         scope["session"] = session
         if (plain and not session.requests.take()) or (live and not session.links.take()):

@@ -51,10 +51,7 @@ def motion(record: Path) -> dict[str, Any]:
     for topic, at, message in told:
         now = round(1e-9 * (at - begun), 3)
         if topic == EVENT:
-            if message["kind"] == "step_started":
-                steps.append({"name": message["step"], "begin": now, "end": None})
-            elif message["kind"] in ("step_done", "step_failed") and steps:
-                steps[-1]["end"] = now
+            _note_step(steps, message, now)
             continue
         if topic == VEHICLE:
             vehicle = [round(float(message[key]), 5) for key in ("x", "y", "yaw")]
@@ -70,6 +67,14 @@ def motion(record: Path) -> dict[str, Any]:
             rows.append(row)
     columns = [list(column) for column in zip(*rows, strict=True)] or [[], [], [], []]
     return {**dict(zip(("times", "joints", "rail", "vehicle"), columns, strict=True)), "steps": steps}
+
+
+def _note_step(steps: list[dict[str, object]], event: Mapping[str, object], now: float) -> None:
+    """Add the step that this event begins; or the end, in s, of the newest one."""
+    if event["kind"] == "step_started":
+        steps.append({"name": event["step"], "begin": now, "end": None})
+    elif event["kind"] in ("step_done", "step_failed") and steps:
+        steps[-1]["end"] = now
 
 
 if __name__ == "__main__":

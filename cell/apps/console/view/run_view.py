@@ -90,12 +90,8 @@ class RunView:
         row = self._row_of(step) if step and _is_step(event) else None
         match event.kind:
             case "step_started" if row is not None:
-                # What went before without an end of its own, as a calibration does, has ended.
-                for before in self._rows.values():
-                    before["state"] = "done" if before["state"] == "active" else before["state"]
-                self._step, self._attempt, self._fraction, self._text = step, int(str(data["attempt"])), 0.0, ""
-                self._step_begun = time.monotonic()
-                row |= {"state": "active", "reason": "", "retries": row["retries"] + (self._attempt > 1)}
+                self._step, self._attempt = step, int(str(data["attempt"]))
+                self._begin(row)
             case "progress":
                 self._step = step
                 self._fraction, self._text = float(str(data["fraction"])), str(data["text"])
@@ -117,10 +113,21 @@ class RunView:
             case "paused" | "going_on":
                 self._held = event.kind == "paused"
         if event.kind == "run_ended":
-            folder = None if self.run.folder is None else self.run.folder.name
             self._step, self._text = None, "writing the report"
-            told = {"outcome": str(data["outcome"]), "reason": str(data["reason"])}
-            self.ended = {"run": folder, "kind": self.run.kind, **told, "t": event.at}
+            self.ended = self._end(event)
+
+    def _begin(self, row: dict[str, object]) -> None:
+        """The step of this row is active from now on."""
+        # What went before without an end of its own, as a calibration does, has ended.
+        for before in self._rows.values():
+            before["state"] = "done" if before["state"] == "active" else before["state"]
+        self._fraction, self._text, self._step_begun = 0.0, "", time.monotonic()
+        row |= {"state": "active", "reason": "", "retries": int(str(row["retries"])) + (self._attempt > 1)}
+
+    def _end(self, event: Event) -> dict[str, object]:
+        folder = None if self.run.folder is None else self.run.folder.name
+        told = {"outcome": str(event.data["outcome"]), "reason": str(event.data["reason"])}
+        return {"run": folder, "kind": self.run.kind, **told, "t": event.at}
 
 
 def words(event: Event) -> str:

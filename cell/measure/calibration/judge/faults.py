@@ -68,14 +68,19 @@ def refuse_exchanged(names: Sequence[str], flanges: Sequence[pin.SE3], boards: S
             text = " and ".join(f"those of {names[i]} and {names[j]} are exchanged" for i, j in pairs)
             raise RefusedError(f"{found}; {text}: {advice}")
     for shift, words in ((1, "one late"), (-1, "one early")):
-        order = [(i + shift) % count for i in range(count)]
-        moved = np.array([
-            np.median([_apart(flanges, boards, i, p=order[i], j=j, q=order[j]) for j in range(count) if j != i])
-            for i in range(count)
-        ])  # fmt: skip
-        if np.mean(moved < LARGEST_TURN) > 0.7:
+        if np.mean(_own_shifted(flanges, boards, shift) < LARGEST_TURN) > 0.7:
             raise RefusedError(f"{found}; the frames come {words}: {advice}")
     raise RefusedError(f"{found}; {advice}, and see that the board lies still")
+
+
+def _own_shifted(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], shift: int) -> NDArray[np.float64]:
+    """Of each flange (n,), rad: the median `_apart` if each had the picture so many places later."""
+    count = len(flanges)
+    order = [(i + shift) % count for i in range(count)]
+    return np.array([
+        np.median([_apart(flanges, boards, i, p=order[i], j=j, q=order[j]) for j in range(count) if j != i])
+        for i in range(count)
+    ])  # fmt: skip
 
 
 def _apart(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3], i: int, p: int, j: int, q: int) -> float:

@@ -103,23 +103,32 @@ def solve_staged(
     )
     plane, paper = None, None
     if stripe and any(o.profile is not None for o in observations):
-        everywhere = [
-            (
-                o.base_from_flange * hand_eye.flange_from_camera * from_parts(o.rail_position * hand_eye.rail_direction)
-            ).inverse()
-            * hand_eye.base_from_board
-            for o in observations
-        ]
-        for k, pose in zip([k for k, o in enumerate(observations) if o.view is not None], poses, strict=True):
-            everywhere[k] = pose
-        stand_in = [o.view if o.view is not None else views[0] for o in observations]
-        plane = plane_from_board(camera, everywhere, stand_in, [o.profile for o in observations])
-        paper = paper_plane_of(camera, everywhere, observations, plane.rows)
-        if paper is not None:
-            plane = replace(plane, plane=paper.plane, rms=paper.rms)
-        rows, nothing = iter(plane.rows), np.empty(0, dtype=np.intp)
-        plane = replace(plane, rows=[nothing if o.same_rest else next(rows) for o in every])
+        plane, paper = _light_plane(camera, hand_eye, poses, every)
     return Staged(camera, view_rms, poses, hand_eye=hand_eye, plane=plane, paper=paper)
+
+
+def _light_plane(
+    camera: CameraModel, hand_eye: HandEye, poses: Sequence[pin.SE3], every: Sequence[ScanObservation]
+) -> tuple[PlaneStart, PaperPlane | None]:
+    """From the stripes of `every` observation, and the board's poses at those that see it; with the paper's light."""
+    observations = [o for o in every if not o.same_rest]
+    everywhere = [
+        (
+            o.base_from_flange * hand_eye.flange_from_camera * from_parts(o.rail_position * hand_eye.rail_direction)
+        ).inverse()
+        * hand_eye.base_from_board
+        for o in observations
+    ]
+    for k, pose in zip([k for k, o in enumerate(observations) if o.view is not None], poses, strict=True):
+        everywhere[k] = pose
+    first = next(o.view for o in observations if o.view is not None)
+    stand_in = [o.view if o.view is not None else first for o in observations]
+    plane = plane_from_board(camera, everywhere, stand_in, [o.profile for o in observations])
+    paper = paper_plane_of(camera, everywhere, observations, plane.rows)
+    if paper is not None:
+        plane = replace(plane, plane=paper.plane, rms=paper.rms)
+    rows, nothing = iter(plane.rows), np.empty(0, dtype=np.intp)
+    return replace(plane, rows=[nothing if o.same_rest else next(rows) for o in every]), paper
 
 
 def paper_plane_of(

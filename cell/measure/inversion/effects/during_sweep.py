@@ -73,6 +73,18 @@ def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.S
     known = [sweep for sweep in made if sweep is not None]
     if sum(len(sweep.times) for sweep in known) < LEAST_LINES:
         return None
+    best, hz = _strongest(known)
+    # Each sweep brings a phase of its own, and chance with it.
+    if best < EVIDENCE * len(known):
+        return None
+    height = max(float(np.hypot(*sweep.waves(hz)[1])) for sweep in known)
+    if height < LEAST_M or max(sweep.overtones(hz) for sweep in known) > LARGEST_OVERTONES:
+        return None
+    return Rocking(hz, height, float(np.median([sweep.speed for sweep in known])) / hz)
+
+
+def _strongest(known: list[_Sweep]) -> tuple[float, float]:
+    """The frequency, Hz, that explains most of the sweeps' heights, after the evidence for it."""
     fastest = min(FASTEST_HZ, *(0.45 / sweep.apart for sweep in known))
     best, hz = 0.0, 0.0
     for candidate in np.arange(SLOWEST_HZ, fastest, STEP_HZ):
@@ -81,13 +93,7 @@ def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.S
         evidence = (sum(float(sweep.heights @ sweep.heights) for sweep in known) - left) / (left / free)
         if evidence > best:
             best, hz = evidence, float(candidate)
-    # Each sweep brings a phase of its own, and chance with it.
-    if best < EVIDENCE * len(known):
-        return None
-    height = max(float(np.hypot(*sweep.waves(hz)[1])) for sweep in known)
-    if height < LEAST_M or max(sweep.overtones(hz) for sweep in known) > LARGEST_OVERTONES:
-        return None
-    return Rocking(hz, height, float(np.median([sweep.speed for sweep in known])) / hz)
+    return best, hz
 
 
 @dataclass(frozen=True, eq=False)

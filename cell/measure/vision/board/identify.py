@@ -85,17 +85,7 @@ def by_outline(spec: BoardSpec, places: Places, least_share: float = LEAST_SHARE
         # Neighbours along the diagonals are a lattice of their own.
         template = np.column_stack([(template[:, 0] + template[:, 1]) // 2, (template[:, 1] - template[:, 0]) // 2])
     number = {tuple(p): tuple(q) for p, q in zip(template.tolist(), spec.lattice().tolist(), strict=True)}
-    best: list[Places] = []
-    most = 0
-    for change in _changes():
-        moved = places @ change.T
-        for shift in _shifts(moved, template):
-            found = moved + shift
-            hits = sum(tuple(p) in number for p in found.tolist())
-            if hits > most:
-                most, best = hits, [found]
-            elif hits == most and hits > 0:
-                best.append(found)
+    most, best = _most_inside(places, template)
     outside = len(places) - most
     if most < least_share * len(template) or outside > max(2, MOST_OUTSIDE * most):
         raise PictureRefused(
@@ -112,6 +102,22 @@ def by_outline(spec: BoardSpec, places: Places, least_share: float = LEAST_SHARE
             f"{spec.name}, so their order is not certain; show the whole board, or name the board that it is",
         )
     return [np.array([number.get(tuple(p), (-1, -1)) for p in f.tolist()], dtype=np.intp) for f in orders]
+
+
+def _most_inside(places: Places, template: Places) -> tuple[int, list[Places]]:
+    """How many of the places fall into the template at most, and all ways (n, 2) to lay them so; none without any."""
+    inside, most = {tuple(p) for p in template.tolist()}, 0
+    best: list[Places] = []
+    for change in _changes():
+        moved = places @ change.T
+        for shift in _shifts(moved, template):
+            found = moved + shift
+            hits = sum(tuple(p) in inside for p in found.tolist())
+            if hits > most:
+                most, best = hits, [found]
+            elif hits == most and hits > 0:
+                best.append(found)
+    return most, best
 
 
 def _size(places: Places) -> str:

@@ -130,12 +130,7 @@ def parse_board(text: str, single_tag: bool = False) -> BoardSpec:
     """
     parts = text.strip().split(":")
     if single_tag and parts[0] == "apriltag":
-        if len(parts) != 3 or parts[1] not in FAMILIES:
-            raise ConfigError(f"board {text!r}: a tag is named apriltag:FAMILY:SIDE with {', '.join(FAMILIES)}")
-        side = _length(text, parts[2], "side")
-        return BoardSpec(
-            "aprilgrid", 1, 1, side / MARKER_SHARE["aprilgrid"], marker=side, dictionary=f"DICT_APRILTAG_{parts[1]}"
-        )
+        return _single_tag(text, parts)
     if len(parts) < 3:
         raise ConfigError(f"board {text!r} has {len(parts)} of at least 3 parts: {FORM}")
     kind = next((k for k in KINDS if k == parts[0]), None)
@@ -166,6 +161,13 @@ def parse_board(text: str, single_tag: bool = False) -> BoardSpec:
     if not marker < pitch:
         raise ConfigError(f"board {text!r}: the marker ({marker * 1e3:g} mm) must be smaller than its pitch")
     return BoardSpec(kind, cols, rows, pitch=pitch, marker=marker, dictionary=dictionary)
+
+
+def _single_tag(text: str, parts: list[str]) -> BoardSpec:
+    if len(parts) != 3 or parts[1] not in FAMILIES:
+        raise ConfigError(f"board {text!r}: a tag is named apriltag:FAMILY:SIDE with {', '.join(FAMILIES)}")
+    side, dictionary = _length(text, parts[2], "side"), f"DICT_APRILTAG_{parts[1]}"
+    return BoardSpec("aprilgrid", 1, 1, side / MARKER_SHARE["aprilgrid"], marker=side, dictionary=dictionary)
 
 
 def _length(board: str, text: str, what: str) -> float:

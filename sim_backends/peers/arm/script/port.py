@@ -33,6 +33,8 @@ _MODELS = {
     **dict.fromkeys(("UR3", "UR3e"), 3), "UR16e": 4, "UR20": 7, "UR30": 8,
 }  # fmt: skip
 """The controller's numbers of the models; the newer names of a model have its number."""
+_USUAL = (0.0, 48.0, 30.0, 30.0)
+"""Current, A, voltage, V, and the temperatures, °C, of a joint."""
 _RUNNING, _OFF = 253, 239
 """What joints and tool say of themselves."""
 _TEXT, _POPUP, _VERSION, _SAFETY, _ERROR, _KEY, _EXCEPTION = 0, 2, 3, 5, 6, 7, 10
@@ -56,39 +58,40 @@ def message(kind: str, words: str, time: float, line: int = 0, column: int = 0) 
         return _message(_TEXT, text, time)
     if kind == "popup":
         title = b"Popup"
-        return _message(_POPUP, struct.pack(">IB3?B", 0, 0, False, False, False, len(title)) + title + text, time)
+        warning = error = blocking = False
+        flags = bytes((warning, error, blocking))
+        return _message(_POPUP, struct.pack(">IB", 0, 0) + flags + bytes((len(title),)) + title + text, time)
     if kind == "failed":
         return _message(_EXCEPTION, struct.pack(">ii", line, column) + text, time)
     if kind in ("read-only", "warning"):
         code, level = (_READ_ONLY, _VIOLATION) if kind == "read-only" else (_STOPPED, _WARNING)
-        return _message(_ERROR, struct.pack(">iiiII", code, 0, level, 0, 0) + text, time)
+        return _message(_ERROR, struct.pack(">iii", code, 0, level) + struct.pack(">II", 0, 0) + text, time)
     title = f"PROGRAM_XXX_{kind.upper()}".encode()
     return _message(_KEY, struct.pack(">iiB", 0, 0, len(title)) + title + text, time)
 
 
 def safety_message(mode: int, time: float) -> bytes:
     """The message that the safety system has changed to `mode`."""
-    return _message(_SAFETY, struct.pack(">iiBII", 0, 0, mode, 0, 0), time)
+    return _message(_SAFETY, struct.pack(">iiB", 0, 0, mode) + struct.pack(">II", 0, 0), time)
 
 
 def robot_state(model: ArmModel, runtime_state: int, analog_out: list[float]) -> bytes:
     """The state package with all its parts; `runtime_state` is that of RTDE."""
-    return robot_mode(
-        model,
-        runtime_state,
+    others = (
         _joints(model),
         _cartesian(model),
         _kinematics(model.params.dh),
         _part(9, bytes(48)),
         _masterboard(model, analog_out),
-        _part(2, struct.pack(">bbddfBffB", 0, 0, 0.0, 0.0, 48.0, 0, 0.0, 30.0, _mode(model))),
+        _part(2, bytes(18) + struct.pack(">fBff", 48.0, 0, 0.0, 30.0) + bytes((_mode(model),))),
         _configuration(model),
         _part(7, struct.pack(">7d", *model.felt, 0.0)),
         _part(8, bytes(4)),
         _part(10, bytes(38)),
-        _part(11, struct.pack(">?iiiff", False, 115200, 0, 1, 1.5, 3.5)),
+        _part(11, bytes((False,)) + struct.pack(">iii", 115200, 0, 1) + struct.pack(">ff", 1.5, 3.5)),
         _part(12, bytes(3)),
     )
+    return robot_mode(model, runtime_state, *others)
 
 
 def robot_mode(model: ArmModel, runtime_state: int, *others: bytes) -> bytes:
@@ -108,15 +111,15 @@ def _mode(model: ArmModel) -> int:
 
 def _joints(model: ArmModel) -> bytes:
     q, qd = model.drive.q.tolist(), model.drive.qd.tolist()
-    each = (struct.pack(">dddffffB", a, a, v, 0.0, 48.0, 30.0, 30.0, _mode(model)) for a, v in zip(q, qd, strict=True))
-    return _part(1, b"".join(each))
+    usual = struct.pack(">ffffB", *_USUAL, _mode(model))
+    return _part(1, b"".join(struct.pack(">ddd", a, a, v) + usual for a, v in zip(q, qd, strict=True)))
 
 
 def _masterboard(model: ArmModel, analog_out: list[float]) -> bytes:
     digital = struct.pack(">II", model.digital_inputs, model.digital_outputs)
     analog = struct.pack(">bbddbbdd", 0, 0, 0.0, 0.0, 0, 0, *analog_out)
     supply = struct.pack(">ffff", 30.0, 48.0 if model.power is not Power.OFF else 0.0, 0.5, 0.0)
-    safety = struct.pack(">BBbIBBB", model.safety_mode, model.safety_mode == 2, 0, 0, 0, 0, 0)
+    safety = bytes((model.safety_mode, model.safety_mode == 2)) + bytes(8)
     return _part(3, digital + analog + supply + safety)
 
 

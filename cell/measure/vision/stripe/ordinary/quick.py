@@ -230,9 +230,12 @@ def read_quickly(
 ) -> tuple[StripeProfile, QuickVerdict]:
     """The profile by search and fit of a Gaussian, and whether this is enough for the picture."""
     work, shade = _lines(image, axis), _lines(dark, axis)
-    seen = work if dark is None else _above(work, shade)
-    noise = like.noise if like is not None else None
+    noise, speckle = (None, None) if like is None else (like.noise, like.speckle)
     noise2, whole = noise or pixel_noise(work, settings.gain_dn, settings.read_noise_dn**2)
+    gain, frames = settings.gain_dn, settings.dark_frames
+    seen, of_dark = work, (0.0, 0.0)
+    if dark is not None:
+        seen, of_dark = _above(work, shade), (noise2 / frames, gain * (1 + 1 / frames))
     least = max(settings.least_peak_dn, 5 * sqrt(whole))
     start = np.zeros((len(work), find.CANDIDATES, find.START))
     cut, cut_at = np.empty((len(work), find.CUT), np.uint8), np.full(len(work), find.NOWHERE)
@@ -244,8 +247,6 @@ def read_quickly(
     found, widths = survey(start, low, high)
     _refuse_blinded(image, start, found, settings.saturation_dn)
     fitted = np.full((fit.FITTED, len(work)), np.nan)
-    gain, frames = settings.gain_dn, settings.dark_frames
-    of_dark = (0.0, 0.0) if dark is None else (noise2 / frames, gain * (1 + 1 / frames))
 
     def run(which: NDArray[np.intp], contrast: float, rho: Any) -> None:
         fit.fit_lines(
@@ -254,7 +255,6 @@ def read_quickly(
             noise=(noise2, gain, contrast), dark_noise=of_dark, rho=rho, steps=settings.steps, out=fitted,
         )  # fmt: skip
 
-    speckle = like.speckle if like is not None else None
     contrast, grain = settings.speckle_contrast, settings.speckle_grain_px
     if contrast is None or (contrast > 0 and grain is None):
         if speckle is None:
@@ -267,30 +267,25 @@ def read_quickly(
         widths = np.minimum(np.maximum(widths * widening, low), high)
         contrast = seen_contrast if contrast is None else contrast
         grain = seen_grain if grain is None else grain
-    rho = correlation(grain) if contrast > 0 and grain else NO_LAGS
-    run(found, contrast, rho)
-    saturated = np.empty(len(work), np.bool_)
-    excess = 1 + SECOND_ORDER * contrast**2
+    run(found, contrast, _lags(contrast, grain))
+    saturated, excess = np.empty(len(work), np.bool_), 1 + SECOND_ORDER * contrast**2
     believe(
         fitted, start, work.shape[1], low, high, least=0.5 * least, excess=excess, double=double, saturated=saturated
     )
     centres, sigma, amplitude, width = (fitted[k] for k in (fit.FIT_CENTRE, fit.SIGMA, fit.AMPLITUDE, fit.WIDTH))
     profile = StripeProfile(
-        axis,
-        centres,
-        sigma,
-        amplitude=amplitude,
-        width=width,
-        saturated=saturated,
-        double=double,
-        speckle=speckle,
+        axis, centres, sigma, amplitude=amplitude, width=width, saturated=saturated, double=double, speckle=speckle,
         noise=(noise2, whole),
-    )
-    if like is not None and like.speckle is not None:
+    )  # fmt: skip
+    if _is_like(profile, like):
         return profile, QuickVerdict.ORDINARY
-    if like is not None and max(profile.valid.mean(), like.valid.mean()) < HARDLY_ANY:
-        return profile, QuickVerdict.ORDINARY
-    ordinary = (
+    ordinary = _is_ordinary(fitted, start, work, shade=shade, seen=seen, several=several)
+    return profile, QuickVerdict.ORDINARY if ordinary else _not_ordinary(profile, start)
+
+
+def _is_ordinary(fitted: Array, start: Array, work: Image, *, shade: Image, seen: Image, several: bool) -> bool:
+    """Whether the stripe is whole, narrow, unsaturated, Gaussian, the only one, and on an even, plain surface."""
+    return (
         is_line_whole(fitted, start)
         and not is_too_wide(fitted, start)
         and not is_saturated(fitted, start)
@@ -299,10 +294,24 @@ def read_quickly(
         and is_surface_even(shade, fitted)
         and not is_textured(seen)
     )
-    if ordinary:
-        return profile, QuickVerdict.ORDINARY
+
+
+def _lags(contrast: float, grain: float | None) -> NDArray[np.float32]:
+    """The speckle's correlation by lag; none where there is no speckle."""
+    return correlation(grain) if contrast > 0 and grain else NO_LAGS
+
+
+def _is_like(profile: StripeProfile, like: StripeProfile | None) -> bool:
+    """Whether it is to be taken as the one before it was: that one was measured, or both show hardly a line."""
+    if like is None:
+        return False
+    return like.speckle is not None or max(profile.valid.mean(), like.valid.mean()) < HARDLY_ANY
+
+
+def _not_ordinary(profile: StripeProfile, start: Array) -> QuickVerdict:
+    """By the share of its lines that have a second peak, which the search may have followed."""
     second = float(np.mean(start[profile.valid, 1, find.ENERGY] > 0)) if profile.valid.any() else 1.0
-    return profile, QuickVerdict.UNMISTAKABLE if second < MISTAKABLE else QuickVerdict.NOT_ORDINARY
+    return QuickVerdict.UNMISTAKABLE if second < MISTAKABLE else QuickVerdict.NOT_ORDINARY
 
 
 def _lines(part: Any, axis: Axis) -> Any:

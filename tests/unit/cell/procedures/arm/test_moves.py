@@ -11,7 +11,7 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import LEAST, Mover, Pace
-from cell.procedures.steps.drive_to_target import drive_to_target
+from cell.procedures.steps.drive_to_target import TargetDrive
 from drivers.errors import ConfigError
 from tests.unit.cell.procedures.drive.test_way import JOB, VEHICLE_FROM_BASE, Site
 
@@ -52,11 +52,12 @@ def test_the_vehicle_drives_at_a_share_of_the_jobs_speed() -> None:
         site.whereabouts.say_at_start()
         site.vehicle.enable()
         site.whereabouts.enter(JOB)
-        drive_to_target(
-            JOB, VEHICLE_FROM_BASE, site.vehicle, site.whereabouts, site.photograph, site.cell.clock,
-            lambda: speeds.append(abs(site.vehicle.state().speed)),
-            lambda share, text: None, site.notes.append, pace=pace,
+        drive = TargetDrive(
+            JOB, VEHICLE_FROM_BASE, site.vehicle, site.whereabouts, site.photograph, clock=site.cell.clock, pace=pace,
+            check=lambda: speeds.append(abs(site.vehicle.state().speed)),
+            progress=lambda share, text: None, note=site.notes.append,
         )  # fmt: skip
+        drive.to_target()
         return max(speeds)
 
     for share in (1.0, 0.5):

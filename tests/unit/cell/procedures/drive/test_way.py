@@ -29,7 +29,7 @@ from cell.procedures.drive.way import (
     turn_to,
     wrap,
 )
-from cell.procedures.steps.drive_to_target import VehicleArrival, drive_to_target
+from cell.procedures.steps.drive_to_target import TargetDrive, VehicleArrival
 from drivers.errors import DeviceFault, RefusedError
 from drivers.interfaces import VehicleState
 from sim_backends.world.drawing import inverse
@@ -173,10 +173,11 @@ class Site:
     def run(self, job: Job = JOB) -> VehicleArrival:
         self.vehicle.enable()
         self.whereabouts.enter(job)
-        return drive_to_target(
-            job, VEHICLE_FROM_BASE, self.vehicle, self.whereabouts, self.photograph, self.cell.clock, _never,
-            lambda share, text: None, self.notes.append,
+        drive = TargetDrive(
+            job, VEHICLE_FROM_BASE, self.vehicle, self.whereabouts, self.photograph, clock=self.cell.clock,
+            check=_never, progress=lambda share, text: None, note=self.notes.append,
         )  # fmt: skip
+        return drive.to_target()
 
     def turn(self, angle: float) -> None:
         """As `cell jog vehicle` does."""

@@ -24,7 +24,7 @@ from cell.procedures.arm.touch import TouchHeight
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
-from cell.procedures.steps.place import PlaceResult, place
+from cell.procedures.steps.place import PlaceResult, Placing
 from cell.procedures.steps.workplace import Workplace
 from cell.run.resumption import UnfinishedRun
 from drivers.clock import Clock
@@ -86,18 +86,12 @@ class Site:
     def place(self, too_low: float = 0.0, **exchanged: Any) -> PlaceResult:
         """Place where the surface is taken to be `too_low` m below where it truly is."""
         given = {"claw": self.cell.devices.claw, "note": lambda part: self.noted.append(part.state), **exchanged}
-        return place(
-            JOB,
-            self.base_from_surface * from_parts((0.0, 0.0, -too_low)),
-            STATED,
-            self.mover,
-            self.arm,
-            given["claw"],
-            self.part,
-            lambda: None,
-            lambda share, text: None,
-            given["note"],
-        )
+        placing = Placing(
+            JOB, self.base_from_surface * from_parts((0.0, 0.0, -too_low)), STATED, mover=self.mover, arm=self.arm,
+            claw=given["claw"], part=self.part, check=lambda: None, progress=lambda share, text: None,
+            note=given["note"],
+        )  # fmt: skip
+        return placing.put_down()
 
     @property
     def held(self) -> bool:
@@ -245,15 +239,9 @@ def test_a_job_with_an_empty_claw_ends_before_anything_moves() -> None:
     site = Site()
     site.cell.devices.claw.bare.release()
     here = Workplace(
-        CONFIG,
-        JOB,
-        NOMINAL,
-        cast(Any, None),
-        site.cell.devices,
-        NoFrames(),
-        Path(),
+        CONFIG, JOB, NOMINAL, cast(Any, None), site.cell.devices, NoFrames(), Path(),
         Whereabouts(site.cell.devices.vehicle),
-    )
+    )  # fmt: skip
     before = site.arm.state().joints
     context = StepContext(drive_to_target.STEP.policy, 1, 1e9, {}, site.cell.clock, lambda event: None)
     with pytest.raises(RefusedError, match="the claw holds no part"):
