@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from cell.base.compiled import compiled
 from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Shape
-from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY, Array, Floats, Image, Integers, Shade
+from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY, Array, Floats, Image, Shade, Whole
 from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH, WIDTH_PRIOR
 from cell.measure.vision.stripe.ordinary.lanes import LAGS
 
@@ -66,7 +66,7 @@ class _Seen(NamedTuple):
 
 
 @compiled
-def neighbours(start: Array, double: NDArray[np.bool_], most: int) -> Integers:
+def neighbours(start: Array, double: NDArray[np.bool_], most: int) -> Whole:
     """Lines (m,) of some `most` pairs of a line and the next, all over the picture, that show one peak, unsaturated."""
     lines = len(start)
     clear = np.zeros(lines, np.bool_)
@@ -110,7 +110,7 @@ def _whitened(
 
 @compiled
 def _residuals(
-    image: Image, dark: Shade, pairs: Integers, fitted: Array, noise2: float, gain: float, contrast2: float,
+    image: Image, dark: Shade, pairs: Whole, fitted: Array, noise2: float, gain: float, contrast2: float,
     table: Array,
 ) -> int:  # fmt: skip
     """Power, product, shared power, width, amplitude and level of each pair r, r + 1 in the picture, into `table`."""
@@ -192,7 +192,7 @@ def _rounded(value: float, step: float) -> float:
 
 
 def measure_speckle(
-    image: Image, dark: Shade, pairs: Integers, widths: Array, fitted: Array, noise2: float, gain: float,
+    image: Image, dark: Shade, pairs: Whole, widths: Array, fitted: Array, noise2: float, gain: float,
     contrast: float,
 ) -> Speckle | None:  # fmt: skip
     """The speckle in the lines `pairs` and the ones after them, whose peaks have `widths` (lines,) in px.

@@ -16,7 +16,7 @@ from cell.base.compiled import compiled, compiled_fast
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
-Integers = NDArray[np.int64]
+Whole = NDArray[np.int64]
 Image = NDArray[np.uint8]
 Shade = Image | Floats
 """A picture without the laser; of one pixel where there is none."""
@@ -99,7 +99,7 @@ def _prominent(row: Image, low: int, high: int, rises: Image) -> int:
 
 
 @compiled
-def width_of(above: float) -> float:
+def width_of(above: float | np.float32) -> float:
     """The stripe's σ in px, of which this many pixels lie above half of the peak."""
     return max(float(above), 1.0) / 2.355
 
@@ -107,7 +107,7 @@ def width_of(above: float) -> float:
 @compiled_fast
 def _measure(
     image: Image, dark: Shade, r: int, place: int, saturation: int, least_peak: float, window: Floats, start: Array,
-    k: int,
+    k: int | np.intp,
 ) -> bool:  # fmt: skip
     """Start values of the peak at `place` in line `r` into start[r, k]; False when it does not stand `least_peak` above
     both its sides. Without views of the arrays, whose bookkeeping would cost as much as the sums.

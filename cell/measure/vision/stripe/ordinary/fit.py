@@ -11,19 +11,8 @@ import numpy as np
 
 from cell.base.compiled import compiled, compiled_fast
 from cell.measure.vision.stripe.ordinary import lanes as lane
-from cell.measure.vision.stripe.ordinary.find import (
-    BACKGROUND,
-    CENTRE,
-    CORE,
-    CUT,
-    HEIGHT,
-    Array,
-    Floats,
-    Image,
-    Integers,
-    Shade,
-)
-from cell.measure.vision.stripe.ordinary.lanes import HALF, LANES, MIDDLE, ROWS
+from cell.measure.vision.stripe.ordinary.find import BACKGROUND, CENTRE, CORE, CUT, HEIGHT, Array, Image, Shade, Whole
+from cell.measure.vision.stripe.ordinary.lanes import HALF, LANES, MIDDLE, ROWS, Floats
 
 # Rows of the result. SIGMA is the centre's standard deviation with the noise as it is correlated, FISHER without.
 FIT_CENTRE, SIGMA, AMPLITUDE, WIDTH, LEVEL, SLOPE, CHI2, FISHER = range(8)
@@ -36,9 +25,7 @@ NEAREST = 0.499
 
 
 @compiled
-def _begin(
-    s: Floats, start: Array, widths: Array, log_widths: Array, lines: Integers, n: int, origins: Integers
-) -> int:
+def _begin(s: Floats, start: Array, widths: Array, log_widths: Array, lines: Whole, n: int, origins: Whole) -> int:
     """Starts of the lanes from their `lines`' peaks in `find_lines`, and their origins (LANES,).
 
     Returns how far from its origin, in px, the lane looks that looks farthest.
@@ -66,7 +53,7 @@ def _begin(
 
 
 @compiled
-def _gather(picture: Shade, lines: Integers, origins: Integers, half: int, into: Floats) -> None:
+def _gather(picture: Shade, lines: Whole, origins: Whole, half: int, into: Floats) -> None:
     """The pixels −half − 1 … half around the origins of the lanes' `lines`; a line's ends are repeated outside."""
     n, size, k = picture.shape[1], 2 * half + 2, MIDDLE - half - 1
     for j in range(LANES):
@@ -105,8 +92,8 @@ def _darken(shade: Floats, half: int, dark_noise: tuple[float, float], values: F
 
 @compiled
 def fit_lines(
-    image: Image, cut: Image, cut_at: Integers, dark: Shade, start: Array, widths: Array, log_widths: Array,
-    which: Integers, saturation: int, noise: tuple[float, float, float], dark_noise: tuple[float, float], rho: Floats,
+    image: Image, cut: Image, cut_at: Whole, dark: Shade, start: Array, widths: Array, log_widths: Array,
+    which: Whole, saturation: int, noise: tuple[float, float, float], dark_noise: tuple[float, float], rho: Floats,
     steps: int, out: Array,
 ) -> None:  # fmt: skip
     """Weighted maximum likelihood of the lines `which`: Fisher scoring on centre, amplitude, log width and background.

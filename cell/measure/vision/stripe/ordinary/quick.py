@@ -24,7 +24,7 @@ from cell.measure.vision.stripe.careful.follow import choose, survey
 from cell.measure.vision.stripe.careful.speckle import ASSUMED_GRAIN, correlation, measure_speckle, neighbours
 from cell.measure.vision.stripe.ordinary import find, fit
 from cell.measure.vision.stripe.ordinary import search as stripe_search
-from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY, Floats, Integers, Shade
+from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY, Floats, Shade, Whole
 from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH
 from cell.measure.vision.stripe.planes import pixel_noise
 from cell.measure.vision.stripe.profile import Array, Axis, Image, StripeProfile, StripeSettings
@@ -193,7 +193,7 @@ def is_textured(image: Image) -> bool:
 
 
 @compiled
-def _trimmed(counts: Integers, total: int) -> float:
+def _trimmed(counts: Whole, total: int) -> float:
     """Mean square of what was counted, without what is far beyond its median."""
     median, below = 0, int(counts[0])
     while 2 * below < total:

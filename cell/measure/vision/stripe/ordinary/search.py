@@ -22,8 +22,8 @@ from cell.measure.vision.stripe.ordinary.find import (
     Array,
     Floats,
     Image,
-    Integers,
     Shade,
+    Whole,
     find_line,
     first_at,
     largest,
@@ -95,7 +95,7 @@ def _near(seen: Image, r: int, guess: int, top: int) -> int:
 
 
 @compiled_fast
-def _note_brightest(seen: Image, first: int, size: int, least_peak: float, notes: Integers) -> None:
+def _note_brightest(seen: Image, first: int, size: int, least_peak: float, notes: Whole) -> None:
     """Where the lines `first` on are brightest, and the largest value farther than SEARCH from there, into `notes`.
 
     A line is read once where its brightest pixel is near that of the line before. Of a line that does not reach
@@ -129,7 +129,7 @@ def _note_brightest(seen: Image, first: int, size: int, least_peak: float, notes
 
 @compiled_fast
 def _keep(
-    image: Image, dark: Shade, first: int, size: int, notes: Integers, window: Floats, cut: Image, cut_at: Integers
+    image: Image, dark: Shade, first: int, size: int, notes: Whole, window: Floats, cut: Image, cut_at: Whole
 ) -> None:
     """The pixels around the lines' noted places: above the dark frame into `window` (PIXELS, LANES), raw into `cut`."""
     n = image.shape[1]
@@ -152,7 +152,7 @@ def _keep(
 
 @compiled
 def _take(
-    image: Image, first: int, size: int, saturation: int, least_peak: float, notes: Integers, window: Floats,
+    image: Image, first: int, size: int, saturation: int, least_peak: float, notes: Whole, window: Floats,
     s: Floats, start: Array,
 ) -> None:  # fmt: skip
     """Start values of the ordinary lines among the lanes, from their sums; the others are noted as open."""
@@ -178,7 +178,7 @@ def _take(
 @compiled
 def find_lines(
     image: Image, seen: Image, dark: Shade, saturation: int, least_peak: float, start: Array, cut: Image,
-    cut_at: Integers,
+    cut_at: Whole,
 ) -> bool:  # fmt: skip
     """Start values of the lines of `image` (lines, n) into `start` (lines, CANDIDATES, START), which is 0 before.
 
