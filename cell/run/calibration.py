@@ -86,7 +86,7 @@ def stored(cell: Opened) -> CellCalibration:
     return found
 
 
-def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
+def calibrate(cell: Opened, run: Run[object], job: str | Path) -> CellCalibration:
     """Move through the calibration poses, solve, and store the result and what it came from, recorded in `run`.
 
     `job` names the part that may be in the claw.
@@ -141,7 +141,7 @@ def kept_if_refused(folder: Path, name: str) -> Iterator[None]:
         raise
 
 
-def verify(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) -> Verification:
+def verify(cell: Opened, run: Run[object], calibration: CellCalibration, job: Job) -> Verification:
     """Look at the deck boards again, recorded in `run`: how good `calibration` is, and what place error of `job`.
 
     What it finds out about the laser is kept with the stored calibration.
@@ -165,7 +165,7 @@ def verify(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) 
     return made
 
 
-def time_stamps(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) -> CellCalibration:
+def time_stamps(cell: Opened, run: Run[object], calibration: CellCalibration, job: Job) -> CellCalibration:
     """Sweep to and fro over the fine board, recorded in `run`: `calibration`, stored with how late the scan camera's
     time stamps come. `job` names the part that may be in the claw.
     """

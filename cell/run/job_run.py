@@ -145,7 +145,7 @@ class JobRun:
     `truth` asks a simulated world. `pace` says how fast arm and vehicle go, of what is planned.
     """
 
-    run: Run[Any]
+    run: Run[object]
     config: CellConfig
     devices: Devices
     job: Job

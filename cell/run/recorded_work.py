@@ -134,7 +134,7 @@ class RecordedWork:
     `health(devices)` is called about ten times a second, and raises what must end the work whatever it does.
     """
 
-    run: Run[Any]
+    run: Run[object]
     kind: str
     devices: Devices
     root: Path

@@ -105,7 +105,7 @@ class Opened:
         return partial(ask_truth, self.config.cell.truth) if self.config.cell.truth else None
 
     def recorded(
-        self, run: Run[Any], kind: str, work: Callable[[Hands], Made], info: dict[str, Any] | None = None
+        self, run: Run[object], kind: str, work: Callable[[Hands], Made], info: dict[str, Any] | None = None
     ) -> Made:
         """Do work outside a job in a run that was begun, and record it; raises what `RecordedWork.perform` does."""
         health = require_no_emergency_stop if kind in ("jog", "recovery") else require_healthy

@@ -193,7 +193,7 @@ class Cell:
         return self._here.mover(job, hold)
 
     @property
-    def current(self) -> Run[Any] | None:
+    def current(self) -> Run[object] | None:
         """The run that is going on, or None."""
         return self._runs.current
 

@@ -151,7 +151,7 @@ class Console:
         """For a job that somebody else than a page begins: a refusal is asked about at the page, if one is open."""
         return self.desk.questions.script(find_kind(load_job(job)[0].job.kind).names, lambda: self.seen)
 
-    def began(self, run: Run[Any], job: str | None) -> None:
+    def began(self, run: Run[object], job: str | None) -> None:
         """A run was begun by somebody else than a page; it is shown as well."""
         self.desk.questions.hold(run)
         self._look.began(run, job)

@@ -48,7 +48,7 @@ class ConsoleController:
         cell: Cell,
         job: str,
         say: Callable[[str, dict[str, Any]], None],
-        began: Callable[[Run[Any], str | None], None] = lambda run, job: None,
+        began: Callable[[Run[object], str | None], None] = lambda run, job: None,
     ) -> None:
         self.cell = cell
         self.job = job
@@ -245,7 +245,7 @@ class ConsoleController:
         """Begin it in a thread of its own, and give what refuses it at once."""
         begun = threading.Event()
         failed: list[CellError] = []
-        runs: list[Run[Any]] = []
+        runs: list[Run[object]] = []
 
         def perform() -> None:
             try:
@@ -268,7 +268,7 @@ class ConsoleController:
         elif failed:
             raise failed[0]
 
-    def _running(self, what: str, act: Callable[[Run[Any]], None]) -> str:
+    def _running(self, what: str, act: Callable[[Run[object]], None]) -> str:
         if (run := self.cell.current) is None:
             raise InterlockError("cell", f"nothing is going on that could {what}")
         act(run)

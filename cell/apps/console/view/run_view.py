@@ -24,7 +24,7 @@ KEPT_FAULTS = 8
 class RunView:
     """One run that was begun. `expected` are the seconds that its steps took the last time, by their names."""
 
-    def __init__(self, run: Run[Any], steps: Sequence[str], job: str | None, expected: Mapping[str, float]) -> None:
+    def __init__(self, run: Run[object], steps: Sequence[str], job: str | None, expected: Mapping[str, float]) -> None:
         self.run = run
         self.faults: list[dict[str, Any]] = []
         self.asked: dict[str, Any] | None = None
@@ -163,7 +163,7 @@ class Pictures:
         self._given: Frame | None = None
         self._found: object = None
 
-    def newest(self, run: Run[Any]) -> tuple[dict[str, Any], NDArray[np.uint8]] | None:
+    def newest(self, run: Run[object]) -> tuple[dict[str, Any], NDArray[np.uint8]] | None:
         """Header and grey image (rows, columns), a copy; None when nothing new was looked at."""
         last = None if run.frames is None else run.frames.last
         found = None if run.frames is None else run.frames.found
@@ -213,7 +213,7 @@ class GrowingCloud:
         self._points: list[NDArray[np.float32]] = []
         self._told: object = None
 
-    def increment(self, run: Run[Any], flange: NDArray[np.float64] | None, rail: object) -> Sent | None:
+    def increment(self, run: Run[object], flange: NDArray[np.float64] | None, rail: object) -> Sent | None:
         """The lines that came since; `flange` (4, 4) is base_from_flange now and `rail` the rail's motion."""
         present = run.sweeping
         if present is None:
@@ -246,7 +246,7 @@ class GrowingCloud:
         self._points.append(rows[:, :3])
         return {**header, "count": len(rows)}, rows.tobytes()
 
-    def final(self, run: Run[Any]) -> Sent | None:
+    def final(self, run: Run[object]) -> Sent | None:
         """All points anew, with their distances from the surface where it was found; once, as soon as it was."""
         found, present = run.registered, run.sweeping
         if found is None or found is self._told or present is None or not self._points:
