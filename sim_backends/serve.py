@@ -211,7 +211,7 @@ def _bound(stack: contextlib.ExitStack, peer: P) -> P:
     return peer
 
 
-def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, Any]], None] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, object]], None] | None = None) -> int:
     """Serve until told to end; `ready` is told the endpoints first. Exit code 0, or 2 for a wrong option."""
     options = _options(argv)
     # Pictures are computed beside threads that answer devices' requests within milliseconds.

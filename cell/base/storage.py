@@ -82,7 +82,7 @@ def sync_files(folder: Path) -> None:
         os.close(handle)
 
 
-def write_json(path: Path, data: Any) -> None:
+def write_json(path: Path, data: object) -> None:
     """Write strict JSON by `replacing`. A digest that `data` has is made anew, so that it fits.
 
     Raises `CellError` for a number that is none, such as NaN, for which JSON has no word: nothing is written then.
@@ -105,12 +105,12 @@ def sealed(data: Mapping[str, Any], *, parts: bool = False) -> dict[str, Any]:
     return {**content, DIGEST: digest(kept), **({PARTS: _parts(kept)} if parts else {})}
 
 
-def unsealed(data: Mapping[str, Any]) -> dict[str, Any]:
+def unsealed(data: Mapping[str, object]) -> dict[str, object]:
     """The content of a sealed file."""
     return {key: value for key, value in data.items() if key not in (DIGEST, PARTS)}
 
 
-def is_intact(data: Mapping[str, Any]) -> bool:
+def is_intact(data: Mapping[str, object]) -> bool:
     """Whether data have the digest that they were sealed with, or none."""
     return DIGEST not in data or data[DIGEST] == digest(unsealed(data))
 
@@ -120,7 +120,7 @@ def digest(data: Any) -> str:
     return hashlib.sha256(json.dumps(_undated(data), sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def _undated(data: Any) -> Any:
+def _undated(data: object) -> Any:
     if isinstance(data, dict):
         return {key: _undated(value) for key, value in data.items() if key not in UNDATED}
     return [_undated(value) for value in data] if isinstance(data, list) else data
@@ -142,7 +142,7 @@ class Stored:
     sealed: bool
     changed: tuple[str, ...]
 
-    def require(self) -> dict[str, Any]:
+    def require(self) -> dict[str, object]:
         """The content; `EditedError` where it is not as it was written."""
         if self.changed:
             raise EditedError(f"it was changed after it was written: {', '.join(self.changed)}")
@@ -180,7 +180,7 @@ def sealed_arrays(arrays: Mapping[str, Any]) -> str:
     )
 
 
-def require_unchanged(arrays: dict[str, Any]) -> None:
+def require_unchanged(arrays: dict[str, object]) -> None:
     """Take the digests out of an archive's arrays; `EditedError` names what does not fit, or that there is none."""
     if DIGEST not in arrays:
         raise EditedError("its digest is missing")

@@ -35,7 +35,7 @@ def below(folder: Path, *names: str) -> Path | None:
         return None
 
 
-def read_toml(path: Path, what: str, how_to_make: str) -> dict[str, Any]:
+def read_toml(path: Path, what: str, how_to_make: str) -> dict[str, object]:
     """Parse a TOML file; every way that this fails is a `ConfigError` that names the file."""
     try:
         if path.is_dir():
@@ -72,7 +72,7 @@ def _what_is_wrong(message: str, text: str) -> str:
     return f", line {line}, column {column}: {lines[line - 1].strip()[:80]!r}; {hint}"
 
 
-def validate(kind: type[T], data: dict[str, Any], where: str) -> T:
+def validate(kind: type[T], data: dict[str, object], where: str) -> T:
     """Check parsed data against a record type; all problems go into one `ConfigError`, a line each."""
     try:
         return kind.model_validate(data)

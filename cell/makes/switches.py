@@ -141,7 +141,7 @@ def _at_url(record: Any, endpoint: Mapping[str, Any]) -> Any:
     return record.model_copy(update={"url": endpoint["url"]})
 
 
-def _at_address(record: RobotiqClawConfig, endpoint: Mapping[str, Any]) -> RobotiqClawConfig:
+def _at_address(record: RobotiqClawConfig, endpoint: Mapping[str, object]) -> RobotiqClawConfig:
     return record.model_copy(update={"address": endpoint["address"]})
 
 

@@ -36,7 +36,7 @@ class Installed:
         """Whether a configuration can name it."""
         return self.state == "ok"
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For JSON."""
         return asdict(self)
 

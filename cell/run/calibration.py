@@ -10,7 +10,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from cell.base.storage import sealed, write_json
 from cell.base.version import release
@@ -190,7 +189,7 @@ def time_stamps(cell: Opened, run: Run[object], calibration: CellCalibration, jo
 
 
 @contextmanager
-def recorded_maintenance(root: Path, facts: Mapping[str, Any], reason: str, lift: Sequence[str]) -> Iterator[None]:
+def recorded_maintenance(root: Path, facts: Mapping[str, object], reason: str, lift: Sequence[str]) -> Iterator[None]:
     """A run of kind "maintenance" below `root` for as long as the context is open. `CellError` if it cannot be kept."""
     started = time.time()
     facts = {"kind": "maintenance", "pid": os.getpid(), **facts, "maintenance": reason, "lifted": list(lift)}

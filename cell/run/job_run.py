@@ -259,7 +259,7 @@ class JobRun:
         except CellError as error:
             return {"missing": str(error)}
 
-    def _facts(self) -> dict[str, Any]:
+    def _facts(self) -> dict[str, object]:
         return {
             "kind": "job",
             "pid": os.getpid(),

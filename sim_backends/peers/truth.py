@@ -105,7 +105,7 @@ class FollowingPeer:
         self._world, self._following = world, following
         self._server = TcpServer("following", self._serve)
         self.address = self._server.address
-        self._operations: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
+        self._operations: dict[str, Callable[[Mapping[str, object]], dict[str, object]]] = {
             "time": lambda request: {"time": world.clock.now()},
             "begin": self._begin,
             "tell": self._tell,
@@ -146,7 +146,7 @@ class FollowingPeer:
     def _tell(self, request: Mapping[str, Any]) -> dict[str, Any]:
         return {"wrenches": self._following.tell(request["device"], request["rows"])}
 
-    def _board(self, request: Mapping[str, Any]) -> dict[str, Any]:
+    def _board(self, request: Mapping[str, object]) -> dict[str, object]:
         pose = np.array(request["base_from_board"], dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ValueError("base_from_board is a pose, 4 by 4")

@@ -42,7 +42,7 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH) -> l
     return [*head, *steps, *([""] * bool(measured)), *measured, "", *tail]
 
 
-def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
+def next_step(report: Mapping[str, object], folder: Path) -> str | None:
     """What a person would type after a run that ended so; None where there is nothing to add."""
     outcome, kind, name = report["outcome"], report.get("kind", "job"), folder.name.split("-")[-1]
     again = "cell dry-run" if report.get("simulated") is True else "cell run"
@@ -94,7 +94,7 @@ def duration(seconds: float | None) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def _facts(report: Mapping[str, Any]) -> str:
+def _facts(report: Mapping[str, object]) -> str:
     kind = str(report.get("kind", "job"))
     facts = [f"job {report.get('job')}" if kind == "job" else kind]
     if words := simulated_words(report.get("simulated")):
@@ -191,7 +191,7 @@ def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False)
     _print_noise(console, report.get("assumed_noise") or {})
 
 
-def print_late(report: Mapping[str, Any]) -> None:
+def print_late(report: Mapping[str, object]) -> None:
     """Say that the program was asked to end when the run had come to its end already. Writes to standard error."""
     part = "the part had been placed" if report["outcome"] == "placed" else f"the run had ended {report['outcome']}"
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -217,7 +217,7 @@ def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:
         console.print(after if len(after) <= room else after[: room - 2].rstrip() + " …", markup=False, soft_wrap=True)
 
 
-def _simulated(row: Mapping[str, Any]) -> str:
+def _simulated(row: Mapping[str, object]) -> str:
     which = row.get("simulated")
     if not isinstance(which, list):
         return "(sim)" if which else ""

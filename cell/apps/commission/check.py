@@ -95,7 +95,7 @@ class Result:
         self.findings.append(finding)
         self.verdict = CheckVerdict.WRONG
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """JSON-ready."""
         return {
             "verdict": self.verdict.value,
@@ -225,7 +225,7 @@ def done_well(standing: str) -> bool:
     return standing == CheckVerdict.GOOD
 
 
-def _at(tables: dict[str, Any], key: str) -> Any:
+def _at(tables: dict[str, object], key: str) -> Any:
     value: Any = tables
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None

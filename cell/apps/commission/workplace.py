@@ -206,7 +206,7 @@ class CommissionWorkplace:
 
     # --- pictures ---
 
-    def keep(self, result: Result, name: str, frame: Frame, marks: Any = None) -> None:
+    def keep(self, result: Result, name: str, frame: Frame, marks: object = None) -> None:
         """Keep a picture for the protocol, with points (n, 2) px marked in it, and the whole frame in the run."""
         if self.hands is not None:
             self.hands.keep(name, frame)
@@ -219,7 +219,7 @@ class CommissionWorkplace:
             result.pictures.append(told)
 
 
-def _shown(image: Image, marks: Any) -> Any:
+def _shown(image: Image, marks: object) -> Any:
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     share = min(1.0, WIDEST_PICTURE / image.shape[1])
     small = cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)

@@ -90,7 +90,7 @@ def checked(record: type[BaseModel], key: str) -> Callable[[str], Any]:
     return parse
 
 
-def three(record: type[BaseModel], key: str) -> Callable[[str], Any]:
+def three(record: type[BaseModel], key: str) -> Callable[[str], object]:
     """Parses three values, such as "70 mm, 36 mm, 20 mm", by the rule of the key."""
     adapter = _rule(record, key)
 

@@ -139,7 +139,7 @@ class Diagnosis:
         """Counters for people."""
         return ", ".join(f"{name} {count}" for name, count in sorted(self.errors.items())) or "none"
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For JSON."""
         told = asdict(self)
         for row, reading in zip(told["readings"], self.readings, strict=True):

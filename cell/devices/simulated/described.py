@@ -112,7 +112,7 @@ def _steps(rail: RailConfig) -> int:
     return rail.steps_per_turn if isinstance(rail, TmclRailConfig) else STOCK.cell.rail.steps_per_turn
 
 
-def _wire(record: DeviceConfig) -> dict[str, Any]:
+def _wire(record: DeviceConfig) -> dict[str, object]:
     """How a device is wired that does not hang on the arm, as its peer takes it."""
     wire: dict[str, Any] = {"make": record.driver}
     match record:

@@ -269,7 +269,7 @@ class SimulatedCell:
         """Process id of the simulated cell."""
         return self._process.pid
 
-    def _read_endpoints(self) -> dict[str, Any]:
+    def _read_endpoints(self) -> dict[str, object]:
         assert self._process.stdout is not None
         deadline = time.monotonic() + START_TIMEOUT_S
         line = b""

@@ -264,7 +264,7 @@ def _axis(text: str) -> Any:
     return text
 
 
-def _finite(data: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Array:
+def _finite(data: Mapping[str, object], name: str, shape: tuple[int, ...]) -> Array:
     array = np.asarray(data[name], dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, not {array.shape}")

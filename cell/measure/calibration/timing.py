@@ -22,7 +22,7 @@ class Shutter:
     sigma: float
     link: dict[str, str]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For storage."""
         return dict(vars(self))
 
@@ -60,7 +60,7 @@ class StampTiming:
     made: float
     link: dict[str, str]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For storage."""
         return dict(vars(self))
 

@@ -66,7 +66,7 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
     return written
 
 
-def _comment(deviations: NDArray[np.float64] | None, report: dict[str, Any]) -> str:
+def _comment(deviations: NDArray[np.float64] | None, report: dict[str, object]) -> str:
     lines = ["frame: arm base", simulated_words(report.get("simulated"))]
     lines += [] if deviations is None else ["quality: distance from the nominal surface in metres"]
     return "\n".join(line for line in lines if line)

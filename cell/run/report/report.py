@@ -120,7 +120,7 @@ def make_report(
     return report
 
 
-def _write(folder: Path, report: dict[str, Any]) -> None:
+def _write(folder: Path, report: dict[str, object]) -> None:
     """The report as a file; a disk that takes none of it does not hide how the run ended."""
     try:
         write_json(folder / REPORT, report)
@@ -144,7 +144,7 @@ def strict(data: Any) -> Any:
     return data if data is None or isinstance(data, str | int | float) else str(data)
 
 
-def _steps(result: RunResult) -> list[dict[str, Any]]:
+def _steps(result: RunResult) -> list[dict[str, object]]:
     rows = []
     for step in result.steps:
         made = result.results.get(step.name)
@@ -161,7 +161,7 @@ def _steps(result: RunResult) -> list[dict[str, Any]]:
     return rows
 
 
-def _faults(result: RunResult) -> list[dict[str, Any]]:
+def _faults(result: RunResult) -> list[dict[str, object]]:
     return [
         {
             "at": when(fault.at),
@@ -175,7 +175,7 @@ def _faults(result: RunResult) -> list[dict[str, Any]]:
     ]
 
 
-def _pose(pose: PlacePose, job: Job) -> dict[str, Any]:
+def _pose(pose: PlacePose, job: Job) -> dict[str, object]:
     base_from_part = pose.base_from_surface * job.place.surface_from_part.se3()
     values = to_ur(base_from_part)
     return {
@@ -185,7 +185,7 @@ def _pose(pose: PlacePose, job: Job) -> dict[str, Any]:
     }
 
 
-def _sigma(pose: PlacePose) -> dict[str, Any]:
+def _sigma(pose: PlacePose) -> dict[str, object]:
     sigma = np.sqrt(np.diag(pose.covariance))
     return {
         "frame": "arm base, about the surface's origin",
@@ -194,7 +194,7 @@ def _sigma(pose: PlacePose) -> dict[str, Any]:
     }
 
 
-def _configured_noise(config: CellConfig) -> dict[str, Any]:
+def _configured_noise(config: CellConfig) -> dict[str, object]:
     arm = config.arm
     return {
         "arm_repeatability": {

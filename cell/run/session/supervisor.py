@@ -289,7 +289,7 @@ class Cell:
         kind: str,
         work: Callable[[Hands], Made],
         observer: Observer | None = None,
-        info: dict[str, Any] | None = None,
+        info: dict[str, object] | None = None,
         stops: int | None = None,
     ) -> Made:
         """Do work outside a job, such as a jog, as a recorded run, and wait for its end. `stops` as in `begin`."""

@@ -29,7 +29,7 @@ _OUT_DOUBLE = ctypes.POINTER(c_double)
 _OUT_UINT64 = ctypes.POINTER(c_uint64)
 _OUT_SIZE = ctypes.POINTER(c_size_t)
 
-_MAY_FAIL: dict[str, tuple[Any, ...]] = {
+_MAY_FAIL: dict[str, tuple[object, ...]] = {
     "arv_gv_device_new": (_POINTER, _POINTER, _POINTER),
     "arv_gv_device_leave_control": (c_int, _POINTER),
     "arv_gv_device_get_timestamp_tick_frequency": (c_uint64, _POINTER),
@@ -79,7 +79,7 @@ _MAY_FAIL: dict[str, tuple[Any, ...]] = {
 }
 """Functions whose last argument is the error: result, then arguments without it."""
 
-_CANNOT_FAIL: dict[str, tuple[Any, ...]] = {
+_CANNOT_FAIL: dict[str, tuple[object, ...]] = {
     "arv_camera_gv_set_packet_size_adjustment": (_NOTHING, _POINTER, c_int),
     "arv_camera_gv_set_stream_options": (_NOTHING, _POINTER, c_int),
     "arv_gv_device_is_controller": (c_int, _POINTER),
@@ -159,8 +159,8 @@ class Aravis:
     """The loaded library: `call` and `plain` by the C function's name, with the arguments in its order."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
-        self._may_fail: dict[str, Callable[..., Any]] = {}
-        self._cannot_fail: dict[str, Callable[..., Any]] = {}
+        self._may_fail: dict[str, Callable[..., object]] = {}
+        self._cannot_fail: dict[str, Callable[..., object]] = {}
         for name, (result, *arguments) in _MAY_FAIL.items():
             function = getattr(library, name)
             function.restype = result
@@ -183,11 +183,11 @@ class Aravis:
             raise AravisError(name, code, text or f"error {code}")
         return result
 
-    def plain(self, name: str, *arguments: Any) -> Any:
+    def plain(self, name: str, *arguments: object) -> Any:
         """Call a function that does not report errors."""
         return self._cannot_fail[name](*arguments)
 
-    def set_property(self, thing: Any, name: str, kind: str, value: float) -> None:
+    def set_property(self, thing: object, name: str, kind: str, value: float) -> None:
         """Set a property of an object; `kind` is "int", "uint", "double" or the name of an enumeration of Aravis."""
         number = _BASIC[kind] if kind in _BASIC else self.plain(f"arv_{kind}_get_type")
         packed = GValue()

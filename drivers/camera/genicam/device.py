@@ -151,7 +151,7 @@ class GenicamDevice:
             with self._words(function, arguments):
                 return self.library.call(f"arv_camera_{function}", self.camera, *arguments)
 
-    def plain(self, function: str, *arguments: Any) -> None:
+    def plain(self, function: str, *arguments: object) -> None:
         """Set something in the library that the camera is not asked about."""
         with self._lock:
             self.library.plain(f"arv_camera_{function}", self.camera, *arguments)

@@ -326,7 +326,7 @@ class FramePeer:
     # --- requests ---
 
     def _answer(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
-        operations: dict[str, Callable[[FrameSession, dict[str, Any]], dict[str, Any]]] = {
+        operations: dict[str, Callable[[FrameSession, dict[str, object]], dict[str, object]]] = {
             "identify": self._identify,
             "configure": self._configure,
             "start": self._start,
@@ -357,7 +357,7 @@ class FramePeer:
             **self._latch(session, request),
         }
 
-    def _configure(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _configure(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         if session.running:
             raise Rejected("configure while free-running: stop first")
         camera = self.camera
@@ -375,21 +375,21 @@ class FramePeer:
         session.run(camera.frame_rate)
         return {"exposure_s": camera.exposure, "frame_rate_hz": camera.frame_rate, "next_frame_id": first}
 
-    def _stop(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _stop(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         session.halt()
         return {}
 
-    def _trigger(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _trigger(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         if session.running:
             raise Rejected("trigger while free-running: stop first")
         first = self.camera.next_frame_id
         session.trigger()
         return {"next_frame_id": first}
 
-    def _latch(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _latch(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         return {"device_ns": self.camera.spec.device_ns(self._clock.now())}
 
-    def _rate(self, request: dict[str, Any], key: str) -> float:
+    def _rate(self, request: dict[str, object], key: str) -> float:
         return number(request, key, self.camera.frame_rate, _SLOWEST, high=self.camera.spec.frame_rate_max, unit="Hz")
 
     def _set(self, exposure: float, frame_rate: float) -> None:

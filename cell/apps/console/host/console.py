@@ -230,7 +230,7 @@ class Console:
         self.link = f"{base}/enter?token=" + (token or "TOKEN-OF-THE-FILE")
         self._told(self.link)
 
-    def _begin(self, number: int, work: Callable[[], dict[str, Any]]) -> None:
+    def _begin(self, number: int, work: Callable[[], dict[str, object]]) -> None:
         if not self._working.acquire(blocking=False):
             busy = {"ok": False, "error": "busy", "text": "too much is being asked at once; wait a moment"}
             self._server.tell(Answer(number, 429, busy))

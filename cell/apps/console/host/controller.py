@@ -128,7 +128,7 @@ class ConsoleController:
         """A page says that the button is up."""
         self.presses.end(client, "the button was let go of")
 
-    def jogging(self) -> dict[str, Any] | None:
+    def jogging(self) -> dict[str, object] | None:
         """What is moved by holding now."""
         press = self.presses.present
         if press is None or press.ended is not None or press.beat is None:

@@ -349,7 +349,7 @@ class Manual:
             return "the way of one press ends here; press again"
         return why or "manual mode was switched off"
 
-    def _begin(self, press: Press, device: Any) -> Motion:
+    def _begin(self, press: Press, device: object) -> Motion:
         if press.device == "rail":
             return self._begin_rail(press.sign, device)
         if press.device == "arm":
@@ -363,7 +363,7 @@ class Manual:
         motion: Motion = rail.move_to(rail.travel[1] if sign > 0 else rail.travel[0], speed)
         return motion
 
-    def _begin_arm(self, press: Press, arm: Any) -> Motion:
+    def _begin_arm(self, press: Press, arm: object) -> Motion:
         if "vehicle" in self._cell.devices and self._cell.devices.vehicle.state().braked is not True:
             self._cell.devices.vehicle.recover()
         turning = press.axis.startswith("j")

@@ -49,8 +49,8 @@ class CellObserver:
         self._pictures = Pictures()
         self._cloud = GrowingCloud()
         self._now = SceneNow()
-        self._last: dict[str, Any] | None = None
-        self._faults: list[dict[str, Any]] = []
+        self._last: dict[str, object] | None = None
+        self._faults: list[dict[str, object]] = []
         self._count = 0
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._perform, name="console look", daemon=True)

@@ -39,7 +39,7 @@ class Questions:
         """This is the run that asks."""
         self._run = run
 
-    def present(self, view: RunView | None) -> dict[str, Any] | None:
+    def present(self, view: RunView | None) -> dict[str, object] | None:
         """The question as the page shows it, or None."""
         if (refusal := self._refusal) is not None:
             return refusal
@@ -112,7 +112,7 @@ def _measured(error: BaseException | None) -> tuple[Measured, ...]:
     return error.numbers if isinstance(error, RefusedError) else ()
 
 
-def _numbers(error: BaseException | None) -> list[dict[str, Any]]:
+def _numbers(error: BaseException | None) -> list[dict[str, object]]:
     rows = [number.as_dict() for number in _measured(error)]
     return [{"name": row["name"], "value": row["value"], "limit": row["limit"], "unit": row["unit"], "ok": row["kept"]}
             for row in rows]  # fmt: skip

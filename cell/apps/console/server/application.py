@@ -46,7 +46,7 @@ REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 )
 
-Ask = Callable[[str, Mapping[str, Any]], Awaitable[tuple[int, Mapping[str, Any]]]]
+Ask = Callable[[str, Mapping[str, object]], Awaitable[tuple[int, Mapping[str, object]]]]
 """What a page, by its id, wants done: status and answer."""
 
 
@@ -192,7 +192,7 @@ class Application:
     async def _trend(self, request: Request) -> Response:
         return await self._from_archive(Archive.trend)
 
-    async def _from_archive(self, what: Callable[[Archive], Any]) -> Response:
+    async def _from_archive(self, what: Callable[[Archive], object]) -> Response:
         return _json(await run_in_threadpool(what, self._archive))
 
     async def _run(self, request: Request) -> Response:
@@ -259,7 +259,7 @@ def _asked(scope: Scope, name: str) -> str:
     return str(parse_qs(scope["query_string"].decode("latin-1")).get(name, [""])[0])
 
 
-def _json(words: Any, status: int = 200) -> Response:
+def _json(words: object, status: int = 200) -> Response:
     return JSONResponse(words, status, {"cache-control": "no-store"})
 
 

@@ -85,7 +85,7 @@ MESSAGES: dict[str, type[PageMessage]] = {
 """Of the live link, by `type`; `stop` is not among them, either."""
 
 
-def checked_command(words: Mapping[str, Any]) -> dict[str, Any]:
+def checked_command(words: Mapping[str, object]) -> dict[str, object]:
     """The arguments of a command, with those that were left out; `ConfigError` says what is wrong with it."""
     return _checked(COMMANDS, "do", words)
 

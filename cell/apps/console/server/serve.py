@@ -163,10 +163,10 @@ class Server:
             self._waiting.pop(number, None)
         return told.status, told.words
 
-    async def _do(self, client: str, words: Mapping[str, Any]) -> tuple[int, Mapping[str, Any]]:
+    async def _do(self, client: str, words: Mapping[str, object]) -> tuple[int, Mapping[str, object]]:
         return await self._ask(lambda number: Do(number, client, words))
 
-    async def _of_job(self, job: str) -> tuple[int, Mapping[str, Any]]:
+    async def _of_job(self, job: str) -> tuple[int, Mapping[str, object]]:
         return await self._ask(lambda number: AskCell(number, job))
 
     async def _stop(self) -> str | None:
@@ -249,7 +249,7 @@ class Server:
             future.set_result(message)
 
 
-def packed(header: Mapping[str, Any], payload: bytes) -> bytes:
+def packed(header: Mapping[str, object], payload: bytes) -> bytes:
     """A binary message: length of the header, the header, the payload (docs/reference/console.md)."""
     words = json.dumps(header).encode()
     return struct.pack("<I", len(words)) + words + payload

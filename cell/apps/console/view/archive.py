@@ -101,7 +101,7 @@ class Archive:
         folders = reversed(list_runs(self._root)[-MOST_RUNS:])
         return [self._row(folder) for folder in folders if self._folder(folder.name) is not None]
 
-    def trend(self) -> list[dict[str, Any]]:
+    def trend(self) -> list[dict[str, object]]:
         """Jobs, oldest first."""
         keys = ("run", "started", "job", "outcome", "d_mean_mm", "expected_mm", "duration_s")
         return [{key: row[key] for key in keys} for row in reversed(self.runs()) if row["kind"] == "job"]

@@ -114,7 +114,7 @@ class Readings:
             "holding": self._held,
         }
 
-    def safety(self) -> dict[str, Any]:
+    def safety(self) -> dict[str, object]:
         """The arm's safety state, the vehicle's emergency stop, and whether a stop holds direct commands."""
         return {
             "arm": None if self.arm is None else self.arm.safety.value,
@@ -184,7 +184,7 @@ LENGTHS = [0.1 * MM, 1 * MM, 10 * MM, 50 * MM]
 ANGLES = [0.1 * DEG, 1 * DEG, 5 * DEG]
 
 
-def cell_facts(cell: Cell, job: str) -> dict[str, Any]:
+def cell_facts(cell: Cell, job: str) -> dict[str, object]:
     """The answer of `/api/cell` (docs/reference/console.md), with the station of `job`; `ConfigError` for one that is
     none."""
     config, simulated = cell.config, cell.simulated
@@ -226,7 +226,7 @@ def jobs(own: str) -> list[str]:
     return list(dict.fromkeys((own, *here, *shipped_jobs())))
 
 
-def _jogs(cell: Cell, name: str) -> list[dict[str, Any]]:
+def _jogs(cell: Cell, name: str) -> list[dict[str, object]]:
     device: Any = getattr(cell.devices, name)
     attended = isinstance(device.bare if isinstance(device, Gated) else device, Attended)
     length = {"device": name, "unit": "m", "most": MAX_LENGTH_MM * MM, "steps": LENGTHS}

@@ -39,7 +39,7 @@ class RunView:
         self._attempt, self._fraction, self._text = 1, 0.0, ""
         self._rows = {name: _row(name) for name in steps}
 
-    def news(self) -> list[dict[str, Any]]:
+    def news(self) -> list[dict[str, object]]:
         """Take what has happened since, and give it in words for a list."""
         told: list[dict[str, Any]] = []
         while (event := self._events.take(0.0)) is not None:
@@ -55,7 +55,7 @@ class RunView:
         """Whether the run has ended and everything that it told was taken."""
         return self.run.done and self._events.closed
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For the page: see docs/reference/console.md."""
         run = self.run
         paused = run.control.paused()
@@ -152,7 +152,7 @@ STRIPE_POINTS = 160
 ROWS = 12
 """Each so many-th row of a profile is shown."""
 
-Sent = tuple[dict[str, Any], bytes]
+Sent = tuple[dict[str, object], bytes]
 
 
 class Pictures:

@@ -112,7 +112,7 @@ class PlateLine:
     sigma: Array
     edge: Edge | None = None
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For storage."""
         rows = self.rows
         values = {"columns": self.columns[rows].tolist(), "sigma": self.sigma[rows].tolist()}
