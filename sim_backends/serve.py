@@ -191,7 +191,7 @@ class ServedCell:
             if peer is not None:
                 peer.clear()
 
-    def truth(self) -> dict[str, Any]:
+    def truth(self) -> dict[str, object]:
         """As `world.truth`, and how real devices were followed where there are any."""
         told = truth(self.world)
         return {**told, "following": self.following.figures()} if self.following.devices else told
@@ -273,7 +273,7 @@ def _watch_stdin(ended: threading.Event) -> None:
     ended.set()
 
 
-def _table(endpoints: dict[str, Any]) -> str:
+def _table(endpoints: dict[str, object]) -> str:
     lines = []
     for name, value in endpoints.items():
         text = " ".join(str(part) for part in value.values()) if isinstance(value, dict) else str(value)

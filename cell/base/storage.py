@@ -19,9 +19,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any, NoReturn
 
 from drivers.errors import CellError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 DIGEST, PARTS = "sha256", "sha256_of"
 """Keys of a file: the digest of all the rest, and short ones of its parts, by which an edit can be located."""
@@ -97,7 +101,7 @@ def write_json(path: Path, data: object) -> None:
         file.write(f"{text}\n".encode())
 
 
-def sealed(data: Mapping[str, Any], *, parts: bool = False) -> dict[str, Any]:
+def sealed(data: Mapping[str, object], *, parts: bool = False) -> dict[str, object]:
     """The data with their digest; with `parts` also the digests of what lies one and two levels deep."""
     content = unsealed(data)
     # As a reader gets it: JSON knows neither tuples nor keys that are numbers.
@@ -115,18 +119,18 @@ def is_intact(data: Mapping[str, object]) -> bool:
     return DIGEST not in data or data[DIGEST] == digest(unsealed(data))
 
 
-def digest(data: Any) -> str:
+def digest(data: object) -> str:
     """SHA-256 of JSON data, whatever the order of its keys."""
     return hashlib.sha256(json.dumps(_undated(data), sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def _undated(data: object) -> Any:
+def _undated(data: object) -> object:
     if isinstance(data, dict):
         return {key: _undated(value) for key, value in data.items() if key not in UNDATED}
     return [_undated(value) for value in data] if isinstance(data, list) else data
 
 
-def _parts(data: dict[str, Any]) -> dict[str, str]:
+def _parts(data: dict[str, object]) -> dict[str, str]:
     made: dict[str, str] = {}
     for key, value in data.items():
         below = {f"{key}.{name}": part for name, part in value.items()} if isinstance(value, dict) else {key: value}
@@ -166,11 +170,11 @@ def read_json(path: Path) -> Stored:
     return Stored(content, True, tuple(changed) if before and changed else ("its content or its digest",))
 
 
-def _no_number(text: str) -> Any:
+def _no_number(text: str) -> NoReturn:
     raise ValueError(f"it holds {text}, which is no number")
 
 
-def sealed_arrays(arrays: Mapping[str, Any]) -> str:
+def sealed_arrays(arrays: Mapping[str, NDArray[np.generic]]) -> str:
     """What a NumPy archive keeps under `DIGEST`: SHA-256 of each array's type, shape and numbers by its name."""
     return json.dumps(
         {
@@ -180,7 +184,7 @@ def sealed_arrays(arrays: Mapping[str, Any]) -> str:
     )
 
 
-def require_unchanged(arrays: dict[str, object]) -> None:
+def require_unchanged(arrays: dict[str, NDArray[np.generic]]) -> None:
     """Take the digests out of an archive's arrays; `EditedError` names what does not fit, or that there is none."""
     if DIGEST not in arrays:
         raise EditedError("its digest is missing")

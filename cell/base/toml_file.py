@@ -6,9 +6,10 @@ import json
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 from cell.base.units import KEPT, shown
 from drivers.errors import CellError, ConfigError
@@ -96,7 +97,7 @@ def _key(place: tuple[int | str, ...]) -> str:
     return f"{key}: "
 
 
-def wording(problem: Any) -> str:
+def wording(problem: ErrorDetails) -> str:
     """What is wrong, for each kind of problem that a record's types can have."""
     kind, value, context = problem["type"], shown(problem.get("input")), problem.get("ctx", {})
     match kind:

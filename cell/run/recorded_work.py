@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from cell.base.lateness import LATENESS, MOST_S
 from cell.base.storage import sealed, write_json
@@ -138,7 +138,7 @@ class RecordedWork:
     kind: str
     devices: Devices
     root: Path
-    info: Mapping[str, Any]
+    info: Mapping[str, object]
     health: Callable[[Devices], None] = require_healthy
     config: CellConfig | None = None
 

@@ -16,6 +16,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol, TypeVar
 
+import serial
+
 from drivers.errors import UNTOLD, ConfigError, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import Identity, LinkStatistics
 from drivers.last_words import descriptor_of
@@ -156,7 +158,7 @@ class RelayPort:
             pass
 
     @contextmanager
-    def _held(self) -> Iterator[Any]:
+    def _held(self) -> Iterator[serial.Serial]:
         """The port, for this thread alone and with nothing late in it; what fails inside is told as a lost link."""
         line = self._line
         with line.lock:
@@ -180,7 +182,7 @@ class RelayPort:
                 ) from error
 
 
-def _drain(port: Any) -> None:
+def _drain(port: serial.Serial) -> None:
     """Throw away what came too late for the command that asked for it."""
     if not port.in_waiting:
         return

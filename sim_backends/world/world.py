@@ -248,7 +248,7 @@ class World:
         )
 
 
-def truth(world: World) -> dict[str, Any]:
+def truth(world: World) -> dict[str, object]:
     """Everything true about `world` now; see the keys."""
     t = world.clock.now()
     scene = world.scene

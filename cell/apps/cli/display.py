@@ -74,7 +74,7 @@ def next_step(report: Mapping[str, object], folder: Path) -> str | None:
     return f"cell abort {name}, if it is still going on; cell resume {name}, if its process died"
 
 
-def _job(report: Mapping[str, Any]) -> str:
+def _job(report: Mapping[str, object]) -> str:
     """The job as one would name it: the shipped ones by their names, others by their files."""
     from cell.config.job import job_path, shipped_jobs
 
@@ -125,7 +125,7 @@ def _seconds(value: float | None) -> str:
     return "" if value is None else f"{value:.2f} s"
 
 
-def _figure(row: Mapping[str, Any]) -> str:
+def _figure(row: Mapping[str, object]) -> str:
     mark = "  " if row.get("kept", True) else "! "
     name = textwrap.shorten(str(row.get("name")), 46, placeholder=" …")
     return f"{mark}{name:<46} {shown_value(row):>11}  {shown_limit(row)}".rstrip()

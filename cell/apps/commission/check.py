@@ -146,7 +146,7 @@ VERSION = 1
 class Progress:
     """The results so far, in `folder`; `cell` says which cell they are of (name, simulated or not, which world)."""
 
-    def __init__(self, folder: Path, cell: dict[str, Any], job: Job) -> None:
+    def __init__(self, folder: Path, cell: dict[str, object], job: Job) -> None:
         """Read what is there; `ConfigError` when that is none. `job` is the key "job" of checks."""
         self.folder = folder
         self.cell = cell
@@ -196,7 +196,7 @@ class Progress:
         self._data["results"][check.name] = stored
         self._write()
 
-    def keep_mended(self, check: CommissionCheck, finding: dict[str, Any], backup: str) -> None:
+    def keep_mended(self, check: CommissionCheck, finding: dict[str, object], backup: str) -> None:
         """Store that a finding was written into the configuration, and where its old text is."""
         entry = {"check": check.name, "when": time.strftime("%Y-%m-%d %H:%M:%S"), "backup": backup, **finding}
         self._data["mended"].append(entry)

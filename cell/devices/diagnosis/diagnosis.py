@@ -214,7 +214,7 @@ def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:
     return rows
 
 
-def _open_and_ask(name: str, address: str, build: Callable[[], Any], clock: Clock) -> tuple[Diagnosis, Any]:
+def _open_and_ask(name: str, address: str, build: Callable[[], Device], clock: Clock) -> tuple[Diagnosis, Any]:
     try:
         device = build()
     except CellError as error:

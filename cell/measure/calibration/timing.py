@@ -80,7 +80,7 @@ class StampTiming:
         """When it was made, for people."""
         return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.made))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """For reports and people, units in the names."""
         return {
             "late_ms": round(1e3 * self.late, 4),

@@ -32,7 +32,7 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
     report = read_report(folder)
     deviations = _deviations(cloud, report, job)
     colours = None if deviations is None else deviation_colours(deviations, limit)
-    written: dict[str, Any] = {"run": folder.name, "format": kind, "file": str(out), "points": len(cloud.points)}
+    written: dict[str, object] = {"run": folder.name, "format": kind, "file": str(out), "points": len(cloud.points)}
     if kind == "e57":
         written["points"] = write_e57(out, cloud, colours)
     elif kind == "ply":

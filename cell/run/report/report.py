@@ -55,7 +55,7 @@ def make_report(
     nominal: NominalSurface,
     repeatability: Vector,
     result: RunResult,
-    info: dict[str, Any],
+    info: dict[str, object],
     started: float,
     witness: TruthRecorder | None,
     frames: FrameStore,
@@ -129,7 +129,7 @@ def _write(folder: Path, report: dict[str, object]) -> None:
         log.error("the report could not be written: %s", error)
 
 
-def strict(data: Any) -> Any:
+def strict(data: object) -> Any:
     """The same data as strict JSON has it: a number that is none becomes None, what JSON does not know becomes text."""
     if isinstance(data, dict):
         return {str(key): strict(value) for key, value in data.items()}

@@ -172,7 +172,7 @@ class Aravis:
             function.argtypes = arguments
             self._cannot_fail[name] = function
 
-    def call(self, name: str, *arguments: Any) -> Any:
+    def call(self, name: str, *arguments: object) -> Any:
         """Call a function that may fail; raises `AravisError`."""
         error = ctypes.POINTER(_GError)()
         result = self._may_fail[name](*arguments, ctypes.byref(error))

@@ -143,7 +143,7 @@ class GenicamDevice:
             return True
         return bool(self.library.plain("arv_gv_device_is_controller", self._device))
 
-    def call(self, function: str, *arguments: Any) -> Any:
+    def call(self, function: str, *arguments: object) -> Any:
         """Ask the library's camera; `DeviceFault` camera.lost when it is silent, camera.refused when it says no."""
         with self._lock:
             if self.camera is None:
@@ -228,7 +228,7 @@ class GenicamDevice:
         return ""
 
     @contextmanager
-    def _words(self, function: str, arguments: tuple[Any, ...]) -> Iterator[None]:
+    def _words(self, function: str, arguments: tuple[object, ...]) -> Iterator[None]:
         try:
             yield
         except AravisError as error:

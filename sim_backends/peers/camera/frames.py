@@ -22,7 +22,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,13 +40,13 @@ class Rejected(Exception):
     """A request cannot be carried out; the text goes to the client."""
 
 
-def message(header: dict[str, Any], payload: bytes = b"") -> bytes:
+def message(header: dict[str, object], payload: bytes = b"") -> bytes:
     """The bytes of one message."""
     text = json.dumps(header).encode("utf-8")
     return _PREFIX.pack(MAGIC, len(text), len(payload)) + text + payload
 
 
-def receive(connection: socket.socket) -> dict[str, Any] | None:
+def receive(connection: socket.socket) -> dict[str, object] | None:
     """The next request's header; None at the end of the connection.
 
     A header that is no JSON object comes back as a request that nobody knows. Raises Rejected when the stream is not
@@ -72,7 +71,7 @@ def receive(connection: socket.socket) -> dict[str, Any] | None:
     return request if isinstance(request, dict) else {"op": "a header that is not a JSON object"}
 
 
-def number(request: dict[str, Any], key: str, default: float, low: float, high: float, unit: str) -> float:
+def number(request: dict[str, object], key: str, default: float, low: float, high: float, unit: str) -> float:
     """The value of `key`, or `default` when it is not given; Rejected unless a number from `low` to `high`."""
     value = request.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -273,7 +272,7 @@ class FramePeer:
             self._turn_away(connection)
             return
 
-        def send(header: dict[str, Any]) -> None:
+        def send(header: dict[str, object]) -> None:
             if not self.camera.silent:
                 with session.sending:
                     connection.sendall(message(header))
@@ -304,7 +303,7 @@ class FramePeer:
 
     def _turn_away(self, connection: socket.socket) -> None:
         connection.settimeout(2.0)
-        request: dict[str, Any] = {}
+        request: dict[str, object] = {}
         with contextlib.suppress(OSError, Rejected):
             request = receive(connection) or {}
         error = f"camera {self.camera.spec.serial} is in use by another client: close that one first"
@@ -325,7 +324,7 @@ class FramePeer:
 
     # --- requests ---
 
-    def _answer(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _answer(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         operations: dict[str, Callable[[FrameSession, dict[str, object]], dict[str, object]]] = {
             "identify": self._identify,
             "configure": self._configure,
@@ -342,7 +341,7 @@ class FramePeer:
         except Rejected as error:
             return {"ok": False, "error": str(error)}
 
-    def _identify(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _identify(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         spec = self.camera.spec
         return {
             "model": spec.model,
@@ -366,7 +365,7 @@ class FramePeer:
         self._set(exposure, self._rate(request, "frame_rate_hz"))
         return {"exposure_s": camera.exposure, "frame_rate_hz": camera.frame_rate}
 
-    def _start(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _start(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         if session.running:
             raise Rejected("the camera is free-running already: stop first")
         camera = self.camera

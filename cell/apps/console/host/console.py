@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.host.link import ServerProcess
@@ -201,7 +201,7 @@ class Console:
         for row in self.desk.holders.rows():
             self.desk.left(row["id"])
 
-    def _say(self, client: str, words: dict[str, Any]) -> None:
+    def _say(self, client: str, words: dict[str, object]) -> None:
         self._server.tell(Say(client, words))
 
     def _heard(self, message: object) -> None:
@@ -237,7 +237,7 @@ class Console:
             return
         threading.Thread(target=self._answer, args=(number, work), name="console command", daemon=True).start()
 
-    def _answer(self, number: int, work: Callable[[], dict[str, Any]]) -> None:
+    def _answer(self, number: int, work: Callable[[], dict[str, object]]) -> None:
         status, answer = 200, {}
         try:
             answer = work()

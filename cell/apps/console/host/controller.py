@@ -35,7 +35,7 @@ SOON_S = 0.1
 """Wall seconds that a command which begins something waits for a refusal, before it answers "starting"."""
 
 Words = Mapping[str, Any]
-Answer = dict[str, Any]
+Answer = dict[str, object]
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class ConsoleController:
         self,
         cell: Cell,
         job: str,
-        say: Callable[[str, dict[str, Any]], None],
+        say: Callable[[str, dict[str, object]], None],
         began: Callable[[Run[object], str | None], None] = lambda run, job: None,
     ) -> None:
         self.cell = cell
@@ -135,7 +135,7 @@ class ConsoleController:
             return None
         return {"device": press.device, "axis": press.axis, "sign": press.sign}
 
-    def told(self, last: dict[str, Any] | None) -> dict[str, Any] | None:
+    def told(self, last: dict[str, object] | None) -> dict[str, object] | None:
         """How the last run ended; a verification with what it found."""
         if last is None or self._found is None or last["run"] != self._found[0]:
             return last

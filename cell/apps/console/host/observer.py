@@ -91,7 +91,7 @@ class CellObserver:
         if view is not None and self._count % EVERY == 0:
             self._show(view.run)
 
-    def _state(self, view: RunView | None, told: dict[str, Any] | None) -> dict[str, Any]:
+    def _state(self, view: RunView | None, told: dict[str, Any] | None) -> dict[str, object]:
         readings, desk = self._readings, self._desk
         faults = [*self._faults, *(view.faults if view is not None and told is not None else [])]
         return {
@@ -168,7 +168,7 @@ class CellObserver:
                 self._tell(CloudPart({**header, "run": folder}, payload))
 
 
-def _figure(view: RunView) -> dict[str, Any] | None:
+def _figure(view: RunView) -> dict[str, object] | None:
     """A placed job's place error in mm: the true one where a simulated world tells it, else the stated bound."""
     if view.ended is None or view.ended["outcome"] != "placed" or view.run.folder is None:
         return None

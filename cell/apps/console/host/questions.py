@@ -46,7 +46,7 @@ class Questions:
         if view is None or view.asked is None:
             return None
         run = view.run
-        choices: list[dict[str, Any]] = [{"choice": CONFIRM}, {"choice": ABORT}]
+        choices: list[dict[str, object]] = [{"choice": CONFIRM}, {"choice": ABORT}]
         return {"kind": "confirm", **view.asked, "numbers": [], "picture": _picture(run), "choices": choices}
 
     def decide(self, run: Run[object], number: int, choice: str, step: str | None, by: str, reason: str) -> str:

@@ -16,7 +16,7 @@ import tempfile
 import threading
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cell.config.cell_config import CONFIGURATION
 from drivers.errors import CellError, InterlockError
@@ -117,7 +117,7 @@ class Rehearsals:
         """Show its progress until its last word, which is given; None when it ends without one."""
         for line in process.stdout or ():
             with suppress(ValueError, TypeError):
-                told: dict[str, Any] = json.loads(line)
+                told: dict[str, object] = json.loads(line)
                 if "fraction" not in told:
                     return told
                 self.present = {**(self.present or {}), **told}

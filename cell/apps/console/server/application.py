@@ -130,10 +130,10 @@ class Application:
         access: Access,
         pages: Pages,
         archive: Archive,
-        cell: Mapping[str, Any],
+        cell: Mapping[str, object],
         do: Ask,
         stop: Callable[[], Awaitable[str | None]],
-        of_job: Callable[[str], Awaitable[tuple[int, Mapping[str, Any]]]],
+        of_job: Callable[[str], Awaitable[tuple[int, Mapping[str, object]]]],
     ) -> None:
         self._access = access
         self._pages = pages
@@ -267,7 +267,7 @@ def _no(kind: str, text: str, status: int) -> Response:
     return _json({"ok": False, "error": kind, "text": text}, status)
 
 
-def _found(words: Any) -> Response:
+def _found(words: object) -> Response:
     return _no("missing", "there is no such run, or it left none of this", 404) if words is None else _json(words)
 
 

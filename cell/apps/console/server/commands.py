@@ -90,12 +90,12 @@ def checked_command(words: Mapping[str, object]) -> dict[str, object]:
     return _checked(COMMANDS, "do", words)
 
 
-def checked_message(words: Mapping[str, Any]) -> dict[str, Any]:
+def checked_message(words: Mapping[str, object]) -> dict[str, Any]:
     """The same of a message of the live link."""
     return _checked(MESSAGES, "type", words)
 
 
-def _checked(schemas: Mapping[str, type[PageMessage]], kind: str, words: Mapping[str, Any]) -> dict[str, Any]:
+def _checked(schemas: Mapping[str, type[PageMessage]], kind: str, words: Mapping[str, object]) -> dict[str, object]:
     name = words.get(kind)
     schema = schemas.get(name) if isinstance(name, str) else None
     if schema is None:

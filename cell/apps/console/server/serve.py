@@ -26,6 +26,7 @@ from typing import Any
 import cv2
 import numpy as np
 import uvicorn
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from cell.apps.console.messages import (
@@ -149,7 +150,7 @@ class Server:
             while True:
                 self._pipe.send(self._unsent.get())
 
-    async def _ask(self, make: Callable[[int], object]) -> tuple[int, Mapping[str, Any]]:
+    async def _ask(self, make: Callable[[int], object]) -> tuple[int, Mapping[str, object]]:
         number = next(self._numbers)
         answer: asyncio.Future[Answer] = self._loop.create_future()
         if not self._tell(make(number)):
@@ -255,11 +256,11 @@ def packed(header: Mapping[str, object], payload: bytes) -> bytes:
     return struct.pack("<I", len(words)) + words + payload
 
 
-def _entering(app: Any, renew: Callable[[], None]) -> Any:
+def _entering(app: ASGIApp, renew: Callable[[], None]) -> ASGIApp:
     """Asks for a new link whenever one was used."""
 
-    async def entered(scope: Any, receive: Any, send: Any) -> None:
-        async def sent(message: Any) -> None:
+    async def entered(scope: Scope, receive: Receive, send: Send) -> None:
+        async def sent(message: Message) -> None:
             if message["type"] == "http.response.start" and scope["path"] == "/enter" and message["status"] == 200:
                 renew()
             await send(message)

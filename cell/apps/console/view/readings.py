@@ -102,7 +102,7 @@ class Readings:
         self._faults[name] = None
         return told
 
-    def motion(self) -> dict[str, Any]:
+    def motion(self) -> dict[str, object]:
         """Joints, flange, rail, vehicle, laser, for the state."""
         vehicle = self.vehicle
         return {
@@ -122,9 +122,9 @@ class Readings:
             "stopped": not self._devices.gate.is_open,
         }
 
-    def devices(self, held_by: str) -> dict[str, Any]:
+    def devices(self, held_by: str) -> dict[str, object]:
         """Each device's row: state in words, whether it is well, link, last error."""
-        rows: dict[str, Any] = {}
+        rows: dict[str, object] = {}
         for device in self._devices:
             name = device.name
             fault = self._faults.get(name) or self._ailing(name)
@@ -168,7 +168,7 @@ class Readings:
         return ""
 
 
-def _vehicle(state: VehicleState) -> dict[str, Any]:
+def _vehicle(state: VehicleState) -> dict[str, object]:
     return {
         "x": round(state.x, 5),
         "y": round(state.y, 5),

@@ -26,9 +26,9 @@ class RunView:
 
     def __init__(self, run: Run[object], steps: Sequence[str], job: str | None, expected: Mapping[str, float]) -> None:
         self.run = run
-        self.faults: list[dict[str, Any]] = []
-        self.asked: dict[str, Any] | None = None
-        self.ended: dict[str, Any] | None = None
+        self.faults: list[dict[str, object]] = []
+        self.asked: dict[str, object] | None = None
+        self.ended: dict[str, object] | None = None
         self._job = job
         self._expected = expected
         self._begun = time.time()
@@ -41,7 +41,7 @@ class RunView:
 
     def news(self) -> list[dict[str, object]]:
         """Take what has happened since, and give it in words for a list."""
-        told: list[dict[str, Any]] = []
+        told: list[dict[str, object]] = []
         while (event := self._events.take(0.0)) is not None:
             self._take(event)
             if event.kind != "progress":
@@ -163,7 +163,7 @@ class Pictures:
         self._given: Frame | None = None
         self._found: object = None
 
-    def newest(self, run: Run[object]) -> tuple[dict[str, Any], NDArray[np.uint8]] | None:
+    def newest(self, run: Run[object]) -> tuple[dict[str, object], NDArray[np.uint8]] | None:
         """Header and grey image (rows, columns), a copy; None when nothing new was looked at."""
         last = None if run.frames is None else run.frames.last
         found = None if run.frames is None else run.frames.found

@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -201,7 +200,7 @@ def _sheet(config: CellConfig, job: Job | None) -> dict[str, object]:
     return {"corners": [-laser.baseline, 0.0, 0.0, x, -half, depth, x, half, depth]}
 
 
-def _camera(camera: CameraConfig, flange_from_camera: pin.SE3, depth: float) -> dict[str, Any]:
+def _camera(camera: CameraConfig, flange_from_camera: pin.SE3, depth: float) -> dict[str, object]:
     """Its mounting, and the half width and half height of what it sees at `depth` m."""
     half = 0.5 * depth * camera.pixel / camera.focal_length
     return {

@@ -271,7 +271,7 @@ def sigmas(covariance: Array) -> dict[str, float]:
     return dict(zip(PARAMETERS, np.sqrt(np.maximum(0.0, np.diag(covariance))).tolist(), strict=True))
 
 
-def _camera_dict(camera: CameraModel) -> dict[str, Any]:
+def _camera_dict(camera: CameraModel) -> dict[str, object]:
     return {"width": camera.width, "height": camera.height, "parameters": camera.parameters.tolist()}
 
 
