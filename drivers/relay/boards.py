@@ -14,7 +14,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 import serial
 
@@ -43,7 +43,7 @@ class _Line:
     def __init__(self, baud: int) -> None:
         self.baud = baud
         self.lock = threading.Lock()
-        self.port: Any = None
+        self.port: serial.Serial | None = None
         self.opened = 0
         self.users = 0
         self.at_loss: list[Callable[[], None]] = []

@@ -22,6 +22,8 @@ CONTROL_PRIVILEGE = 0x0A00
 PRIMARY_APPLICATION_ADDRESS = 0x0A14
 """Bootstrap register: IPv4 address of the application that controls the camera; GigE Vision 1.1 and later."""
 
+Handle = int
+"""Address of an object of the library."""
 _POINTER, _TEXT, _NOTHING = c_void_p, c_char_p, None
 _OUT_INT = ctypes.POINTER(c_int)
 _OUT_INT64 = ctypes.POINTER(c_int64)
@@ -187,7 +189,7 @@ class Aravis:
         """Call a function that does not report errors."""
         return self._cannot_fail[name](*arguments)
 
-    def set_property(self, thing: object, name: str, kind: str, value: float) -> None:
+    def set_property(self, thing: Handle, name: str, kind: str, value: float) -> None:
         """Set a property of an object; `kind` is "int", "uint", "double" or the name of an enumeration of Aravis."""
         number = _BASIC[kind] if kind in _BASIC else self.plain(f"arv_{kind}_get_type")
         packed = GValue()
@@ -195,7 +197,7 @@ class Aravis:
         self.plain(f"g_value_set_{kind if kind in _BASIC else 'enum'}", ctypes.byref(packed), value)
         self.plain("g_object_set_property", thing, name.encode(), ctypes.byref(packed))
 
-    def open_gige(self, host: str) -> Any:
+    def open_gige(self, host: str) -> Handle:
         """The device at the IPv4 address `host`; only that address is spoken to."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:
             # Connecting a datagram socket sends nothing; it tells which of this computer's addresses leads there.
@@ -203,7 +205,8 @@ class Aravis:
             own, _ = route.getsockname()
         ends = [self.plain("g_inet_address_new_from_string", end.encode()) for end in (own, host)]
         try:
-            return self.call("arv_gv_device_new", *ends)
+            device: Handle = self.call("arv_gv_device_new", *ends)
+            return device
         finally:
             for end in ends:
                 self.plain("g_object_unref", end)

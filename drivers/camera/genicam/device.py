@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any, Protocol
 
-from drivers.camera.genicam.aravis import CONTROL_PRIVILEGE, PRIMARY_APPLICATION_ADDRESS, Aravis, AravisError
+from drivers.camera.genicam.aravis import CONTROL_PRIVILEGE, PRIMARY_APPLICATION_ADDRESS, Aravis, AravisError, Handle
 from drivers.clock import Clock, ClockMap, Latch
 from drivers.errors import DeviceFault, NotConnectedError
 from drivers.interfaces import Frame, Identity
@@ -37,7 +37,7 @@ class Place(Protocol):
     control: bool
     absent: str
 
-    def open(self, library: Aravis) -> Any:
+    def open(self, library: Aravis) -> Handle:
         """The library's device."""
 
 
@@ -53,7 +53,7 @@ class GigePlace:
             "camera tells its address nowhere but in its maker's tool, nothing is searched for here"
         )
 
-    def open(self, library: Aravis) -> Any:
+    def open(self, library: Aravis) -> Handle:
         """Speaks to this address alone."""
         return library.open_gige(str(ipaddress.IPv4Address(self.text)))
 
@@ -71,9 +71,10 @@ class UsbPlace:
             "that no other program has it open"
         )
 
-    def open(self, library: Aravis) -> Any:
+    def open(self, library: Aravis) -> Handle:
         """Asks the computer's own USB devices."""
-        return library.call("arv_uv_device_new_from_guid", self.guid.encode())
+        device: Handle = library.call("arv_uv_device_new_from_guid", self.guid.encode())
+        return device
 
 
 class GenicamDevice:
@@ -89,8 +90,8 @@ class GenicamDevice:
         self.library = library
         self._lock = threading.RLock()
         self._abandoned = False
-        self._device: Any = None
-        self.camera: Any = None
+        self._device: Handle | None = None
+        self.camera: Handle | None = None
         self._holds = not look and place.control
         try:
             self._device = place.open(library)

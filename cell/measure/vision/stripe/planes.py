@@ -13,7 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cell.base.compiled import compiled
 from cell.measure.vision.pictures import Image, PictureRefused, Reason, Taken
@@ -103,7 +103,7 @@ def read_colours(path: Path) -> Taken:
     return np.ascontiguousarray(image[:, :, 2::-1] if image.shape[2] >= 3 else image[:, :, 0])
 
 
-def as_picture(image: object, saturation: float = FULL, full: float | None = None) -> Picture:
+def as_picture(image: ArrayLike, saturation: float = FULL, full: float | None = None) -> Picture:
     """A picture (h, w), (h, w, 1), (h, w, 3) or (h, w, 4) of uint8 or uint16, red first, alpha left out.
 
     12 bits in 16 may lie at either end, 10 and 14 as well: the range is taken from the values. `saturation` is in DN
