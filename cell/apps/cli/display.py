@@ -16,6 +16,7 @@ from cell.apps.cli.options import new_table
 from cell.config.files import DEVICES
 from cell.run.folder import wall_seconds
 from cell.run.report.figures import following_words, noise_rows, shown_limit, shown_value, simulated_words
+from drivers.errors import MeasuredRow
 
 WIDTH, HEIGHT = 80, 23
 """What a screen holds; its last line is left to the prompt."""
@@ -125,7 +126,7 @@ def _seconds(value: float | None) -> str:
     return "" if value is None else f"{value:.2f} s"
 
 
-def _figure(row: Mapping[str, object]) -> str:
+def _figure(row: MeasuredRow) -> str:
     mark = "  " if row.get("kept", True) else "! "
     name = textwrap.shorten(str(row.get("name")), 46, placeholder=" …")
     return f"{mark}{name:<46} {shown_value(row):>11}  {shown_limit(row)}".rstrip()

@@ -12,7 +12,7 @@ from cell.measure.inversion import PlacePose, fit_figures
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.place import PlaceResult
-from drivers.errors import Measured, RefusedError
+from drivers.errors import Measured, MeasuredRow, RefusedError
 from statemachine.runner import RunResult
 from statemachine.step import Outcome
 
@@ -63,7 +63,7 @@ def last_frames(result: RunResult, frames: FrameStore) -> list[str]:
 
 def measured(
     result: RunResult, job: Job, truth: Mapping[str, Any] | None, bound: Mapping[str, Any] | None
-) -> list[dict[str, object]]:
+) -> list[MeasuredRow]:
     """Every figure that the run was or can be judged by, beside its limit: what decided a refusal comes first."""
     fix, pose, placed = (result.results.get(name) for name in ("board_photo", "invert_pose", "place"))
     found = list(RefusalEvidence.of(result).numbers)
