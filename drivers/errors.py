@@ -28,7 +28,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, TypedDict
 
 
 class CellError(Exception):
@@ -93,6 +93,17 @@ class CalibrationStale(CellError):
     """The stored calibration is missing, foreign or was made under another configuration."""
 
 
+class MeasuredRow(TypedDict):
+    """A `Measured` as reports have it; `bound` is "at least", "at most", "about" or None."""
+
+    name: str
+    value: float | None
+    limit: float | None
+    bound: str | None
+    unit: str
+    kept: bool
+
+
 @dataclass(frozen=True)
 class Measured:
     """A number in `unit` beside what it is held against: at least `least`, at most `most`, or `about` so much."""
@@ -104,8 +115,8 @@ class Measured:
     most: float | None = None
     about: float | None = None
 
-    def as_dict(self) -> dict[str, object]:
-        """JSON-ready: name, value, limit, bound ("at least", "at most", "about" or None), unit, kept."""
+    def as_dict(self) -> MeasuredRow:
+        """JSON-ready."""
         bounds = (("at least", self.least), ("at most", self.most), ("about", self.about))
         bound, limit = next(((word, limit) for word, limit in bounds if limit is not None), (None, None))
         value, limit = (None if number is None else float(number) for number in (self.value, limit))

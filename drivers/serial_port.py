@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import serial
 
 from drivers.errors import NotConnectedError
@@ -15,7 +13,9 @@ FAILURES = (serial.SerialException, OSError)
 """What a port raises when its other end is gone."""
 
 
-def open_port(name: str, url: str, *, baud: int, timeout: float, parity: str = "none", stop_bits: int = 1) -> Any:
+def open_port(
+    name: str, url: str, *, baud: int, timeout: float, parity: str = "none", stop_bits: int = 1
+) -> serial.Serial:
     """A device file or pyserial URL, opened; `timeout` in wall seconds is that of a read.
 
     No other program that asks for a lock has the port meanwhile. Raises `NotConnectedError` for the device `name`.

@@ -191,7 +191,7 @@ class ServedCell:
             if peer is not None:
                 peer.clear()
 
-    def truth(self) -> dict[str, Any]:
+    def truth(self) -> dict[str, object]:
         """As `world.truth`, and how real devices were followed where there are any."""
         told = truth(self.world)
         return {**told, "following": self.following.figures()} if self.following.devices else told
@@ -211,7 +211,7 @@ def _bound(stack: contextlib.ExitStack, peer: P) -> P:
     return peer
 
 
-def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, Any]], None] | None = None) -> int:
+def main(argv: Sequence[str] | None = None, ready: Callable[[dict[str, object]], None] | None = None) -> int:
     """Serve until told to end; `ready` is told the endpoints first. Exit code 0, or 2 for a wrong option."""
     options = _options(argv)
     # Pictures are computed beside threads that answer devices' requests within milliseconds.
@@ -273,7 +273,7 @@ def _watch_stdin(ended: threading.Event) -> None:
     ended.set()
 
 
-def _table(endpoints: dict[str, Any]) -> str:
+def _table(endpoints: dict[str, object]) -> str:
     lines = []
     for name, value in endpoints.items():
         text = " ".join(str(part) for part in value.values()) if isinstance(value, dict) else str(value)

@@ -72,7 +72,7 @@ class StepRow:
     ended: float | None
     state: str
     duration_s: float | None
-    result: dict[str, Any] | None
+    result: dict[str, object] | None
     error: str | None
 
 
@@ -208,7 +208,7 @@ class JournalRecord:
         return self.run.ended is not None
 
     @property
-    def done(self) -> dict[str, dict[str, Any]]:
+    def done(self) -> dict[str, dict[str, object]]:
         """The steps that succeeded, with the summaries of their results, in the order of their end."""
         return {step.name: step.result or {} for step in self.steps if step.state == "done"}
 
@@ -224,7 +224,7 @@ def read(folder: Path, *, whole: bool = False) -> JournalRecord:
         if whole and (found := base.execute("PRAGMA quick_check(1)").fetchone()) != ("ok",):
             raise JournalError(f"the journal in {folder} is damaged: {found[0] if found else 'no word of it'}")
 
-        def may(value: Any, kind: type[str] | type[float]) -> Any:
+        def may(value: object, kind: type[str] | type[float]) -> Any:
             return _is(value, kind, needed=False)
 
         runs = tuple(
@@ -276,7 +276,7 @@ def _crc(*values: object) -> int:
     return zlib.crc32(json.dumps(values, default=str).encode())
 
 
-def _is(value: Any, kind: type[str] | type[float], *, needed: bool = True) -> Any:
+def _is(value: object, kind: type[str] | type[float], *, needed: bool = True) -> Any:
     """The value; `ValueError` where it is no text or no number, or missing."""
     if value is None and not needed:
         return None
@@ -287,7 +287,7 @@ def _is(value: Any, kind: type[str] | type[float], *, needed: bool = True) -> An
     return value
 
 
-def _table(text: Any) -> dict[str, Any]:
+def _table(text: object) -> dict[str, object]:
     data = json.loads(_is(text, str))
     if not isinstance(data, dict):
         raise ValueError(f"{str(data)[:40]} is no table")

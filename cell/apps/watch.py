@@ -102,7 +102,7 @@ def shared(config: CellConfig, name: str) -> bool:
 class _Watched:
     """One device: how it is connected, the connection, and the newest that it told."""
 
-    connect: Callable[[], Any]
+    connect: Callable[[], object]
     device: Any = None
     state: Any = None
     why: str = ""

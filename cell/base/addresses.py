@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ipaddress
 import re
-from typing import Any
 from urllib.parse import urlsplit
 
 from pydantic import AfterValidator
@@ -146,8 +145,8 @@ def checked_folder(text: str) -> str:
     return text
 
 
-Host: Any = AfterValidator(checked_host)
-Endpoint: Any = AfterValidator(checked_endpoint)
-Port: Any = AfterValidator(checked_port)
-Name: Any = AfterValidator(checked_name)
-Folder: Any = AfterValidator(checked_folder)
+Host = AfterValidator(checked_host)
+Endpoint = AfterValidator(checked_endpoint)
+Port = AfterValidator(checked_port)
+Name = AfterValidator(checked_name)
+Folder = AfterValidator(checked_folder)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 try:
     import numba
@@ -27,18 +27,20 @@ if not AVAILABLE:
         stacklevel=2,
     )
 
+Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
-def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+
+def compiled(function: Kernel) -> Kernel:
     """Compile on first use, without the interpreter's lock, kept on disk where that can be written."""
     return _compile(function, fastmath=False)
 
 
-def compiled_fast(function: Callable[..., Any]) -> Callable[..., Any]:
+def compiled_fast(function: Kernel) -> Kernel:
     """As `compiled`, with sums in any order: for loops over pixels that hold no NaN."""
     return _compile(function, fastmath=True)
 
 
-def is_kept(function: Callable[..., Any]) -> bool:
+def is_kept(function: Callable[..., object]) -> bool:
     """Whether what `compiled` gave lies compiled on disk, in some version; True where nothing can be compiled."""
     if not AVAILABLE:
         return True
@@ -46,12 +48,12 @@ def is_kept(function: Callable[..., Any]) -> bool:
     return folder is None or any(Path(folder).glob(f"*.{function.__name__}-*.nbi"))
 
 
-def _compile(function: Callable[..., Any], fastmath: bool) -> Callable[..., Any]:
+def _compile(function: Kernel, fastmath: bool) -> Kernel:
     if not AVAILABLE:
         return function
     options: dict[str, Any] = {"nogil": True, "fastmath": fastmath, "error_model": "numpy"}
     try:
-        made = numba.njit(cache=True, **options)(function)
+        made: Kernel = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # No writable place for the cache.
         made = numba.njit(**options)(function)
-    return made  # type: ignore[no-any-return]
+    return made

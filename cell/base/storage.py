@@ -18,9 +18,13 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any, NoReturn
 
 from drivers.errors import CellError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 DIGEST, PARTS = "sha256", "sha256_of"
 """Keys of a file: the digest of all the rest, and short ones of its parts, by which an edit can be located."""
@@ -81,7 +85,7 @@ def sync_files(folder: Path) -> None:
         os.close(handle)
 
 
-def write_json(path: Path, data: Any) -> None:
+def write_json(path: Path, data: object) -> None:
     """Write strict JSON by `replacing`. A digest that `data` has is made anew, so that it fits.
 
     Raises `CellError` for a number that is none, such as NaN, for which JSON has no word: nothing is written then.
@@ -96,7 +100,7 @@ def write_json(path: Path, data: Any) -> None:
         file.write(f"{text}\n".encode())
 
 
-def sealed(data: Mapping[str, Any], *, parts: bool = False) -> dict[str, Any]:
+def sealed(data: Mapping[str, object], *, parts: bool = False) -> dict[str, object]:
     """The data with their digest; with `parts` also the digests of what lies one and two levels deep."""
     content = unsealed(data)
     # As a reader gets it: JSON knows neither tuples nor keys that are numbers.
@@ -104,28 +108,28 @@ def sealed(data: Mapping[str, Any], *, parts: bool = False) -> dict[str, Any]:
     return {**content, DIGEST: digest(kept), **({PARTS: _parts(kept)} if parts else {})}
 
 
-def unsealed(data: Mapping[str, Any]) -> dict[str, Any]:
+def unsealed(data: Mapping[str, object]) -> dict[str, object]:
     """The content of a sealed file."""
     return {key: value for key, value in data.items() if key not in (DIGEST, PARTS)}
 
 
-def is_intact(data: Mapping[str, Any]) -> bool:
+def is_intact(data: Mapping[str, object]) -> bool:
     """Whether data have the digest that they were sealed with, or none."""
     return DIGEST not in data or data[DIGEST] == digest(unsealed(data))
 
 
-def digest(data: Any) -> str:
+def digest(data: object) -> str:
     """SHA-256 of JSON data, whatever the order of its keys."""
     return hashlib.sha256(json.dumps(_undated(data), sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
-def _undated(data: Any) -> Any:
+def _undated(data: object) -> object:
     if isinstance(data, dict):
         return {key: _undated(value) for key, value in data.items() if key not in UNDATED}
     return [_undated(value) for value in data] if isinstance(data, list) else data
 
 
-def _parts(data: dict[str, Any]) -> dict[str, str]:
+def _parts(data: dict[str, object]) -> dict[str, str]:
     made: dict[str, str] = {}
     for key, value in data.items():
         below = {f"{key}.{name}": part for name, part in value.items()} if isinstance(value, dict) else {key: value}
@@ -141,7 +145,7 @@ class Stored:
     sealed: bool
     changed: tuple[str, ...]
 
-    def require(self) -> dict[str, Any]:
+    def require(self) -> dict[str, object]:
         """The content; `EditedError` where it is not as it was written."""
         if self.changed:
             raise EditedError(f"it was changed after it was written: {', '.join(self.changed)}")
@@ -165,11 +169,11 @@ def read_json(path: Path) -> Stored:
     return Stored(content, True, tuple(changed) if before and changed else ("its content or its digest",))
 
 
-def _no_number(text: str) -> Any:
+def _no_number(text: str) -> NoReturn:
     raise ValueError(f"it holds {text}, which is no number")
 
 
-def sealed_arrays(arrays: Mapping[str, Any]) -> str:
+def sealed_arrays(arrays: Mapping[str, NDArray[np.generic]]) -> str:
     """What a NumPy archive keeps under `DIGEST`: SHA-256 of each array's type, shape and numbers by its name."""
     return json.dumps(
         {
@@ -179,7 +183,7 @@ def sealed_arrays(arrays: Mapping[str, Any]) -> str:
     )
 
 
-def require_unchanged(arrays: dict[str, Any]) -> None:
+def require_unchanged(arrays: dict[str, NDArray[np.generic]]) -> None:
     """Take the digests out of an archive's arrays; `EditedError` names what does not fit, or that there is none."""
     if DIGEST not in arrays:
         raise EditedError("its digest is missing")

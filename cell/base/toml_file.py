@@ -6,9 +6,10 @@ import json
 import re
 import tomllib
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic_core import ErrorDetails
 
 from cell.base.units import KEPT, shown
 from drivers.errors import CellError, ConfigError
@@ -35,7 +36,7 @@ def below(folder: Path, *names: str) -> Path | None:
         return None
 
 
-def read_toml(path: Path, what: str, how_to_make: str) -> dict[str, Any]:
+def read_toml(path: Path, what: str, how_to_make: str) -> dict[str, object]:
     """Parse a TOML file; every way that this fails is a `ConfigError` that names the file."""
     try:
         if path.is_dir():
@@ -72,7 +73,7 @@ def _what_is_wrong(message: str, text: str) -> str:
     return f", line {line}, column {column}: {lines[line - 1].strip()[:80]!r}; {hint}"
 
 
-def validate(kind: type[T], data: dict[str, Any], where: str) -> T:
+def validate(kind: type[T], data: dict[str, object], where: str) -> T:
     """Check parsed data against a record type; all problems go into one `ConfigError`, a line each."""
     try:
         return kind.model_validate(data)
@@ -96,7 +97,7 @@ def _key(place: tuple[int | str, ...]) -> str:
     return f"{key}: "
 
 
-def wording(problem: Any) -> str:
+def wording(problem: ErrorDetails) -> str:
     """What is wrong, for each kind of problem that a record's types can have."""
     kind, value, context = problem["type"], shown(problem.get("input")), problem.get("ctx", {})
     match kind:

@@ -97,7 +97,7 @@ def _converted(text: str, unit: str) -> tuple[float, float]:
     return float(there.magnitude), float(there.to_base_units().magnitude)
 
 
-def quantity(unit: str, low: float = -math.inf, high: float = math.inf) -> Any:
+def quantity(unit: str, low: float = -math.inf, high: float = math.inf) -> BeforeValidator:
     """Validator for a field of type float that is written with a unit; bounds as in `parse_quantity`."""
 
     def check(text: object, info: ValidationInfo) -> float:
@@ -108,7 +108,7 @@ def quantity(unit: str, low: float = -math.inf, high: float = math.inf) -> Any:
     return BeforeValidator(check)
 
 
-def number(low: float, high: float) -> Any:
+def number(low: float, high: float) -> BeforeValidator:
     """Validator for a field of type float that is a plain number from `low` to `high`."""
 
     def check(value: object) -> float:
@@ -123,7 +123,7 @@ def number(low: float, high: float) -> Any:
     return BeforeValidator(check)
 
 
-def whole(low: int, high: int, *, allowed: tuple[int, ...] = (), meaning: str = "") -> Any:
+def whole(low: int, high: int, *, allowed: tuple[int, ...] = (), meaning: str = "") -> BeforeValidator:
     """Validator for a field of type int from `low` to `high`, or one of `allowed`; `meaning` tells what they are."""
     text = f" (allowed: {', '.join(map(str, allowed))})" if allowed else range_text(low, high)
 

@@ -17,7 +17,7 @@ import tomllib
 from collections.abc import Collection, Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import pinocchio as pin
@@ -209,7 +209,7 @@ def load_config(path: Path | None) -> CellConfig:
     return validate(CellConfig, tables_of(path), "the default configuration" if path is None else str(path))
 
 
-def tables_of(path: Path | None) -> dict[str, Any]:
+def tables_of(path: Path | None) -> dict[str, object]:
     """The tables of a configuration as they are written; without a path, of the one that ships."""
     return tomllib.loads(default_toml()) if path is None else read_toml(path, "configuration", "cell init")
 

@@ -19,7 +19,7 @@ from cell.measure.geometry.poses import to_ur
 from cell.motion.kinematics import HOME, arm_kinematics
 from drivers.clock import Clock
 from drivers.errors import ConfigError
-from drivers.interfaces import Arm, Camera, Claw, Laser, Rail, Vector, Vehicle
+from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vector, Vehicle
 from drivers.link_table import LinkTable
 
 INTERFACES: dict[str, type] = {
@@ -36,7 +36,7 @@ INTERFACES: dict[str, type] = {
 def connect(
     config: CellConfig,
     only: Collection[str] = tuple(DEVICES),
-    otherwise: Callable[[str, Clock], Any | None] = lambda name, clock: None,
+    otherwise: Callable[[str, Clock], Device | None] = lambda name, clock: None,
 ) -> Devices:
     """Connect these devices, behind a gate; when one fails, those connected are closed and the error goes on.
 

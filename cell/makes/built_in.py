@@ -6,7 +6,7 @@ Drivers are imported when a device is connected: reading a configuration needs n
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self, TypeVar
 
 from pydantic import StrictBool, model_validator
 
@@ -238,10 +238,10 @@ def _claw(name: str, config: ArmOutputClawConfig, around: Surroundings) -> ArmSw
 Record = TypeVar("Record", bound=DeviceConfig)
 
 
-def _with(*keys: str) -> Callable[[Record, Mapping[str, Any]], Record]:
+def _with(*keys: str) -> Callable[[Record, Mapping[str, object]], Record]:
     """A record whose `keys` are those of the simulated peer."""
 
-    def simulated(record: Record, endpoint: Mapping[str, Any]) -> Record:
+    def simulated(record: Record, endpoint: Mapping[str, object]) -> Record:
         return record.model_copy(update={key: endpoint[key] for key in keys})
 
     return simulated

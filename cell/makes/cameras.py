@@ -8,7 +8,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, StringConstraints
 
@@ -158,7 +158,7 @@ def _without_aravis() -> str:
     return ""
 
 
-def _served(record: GigeCameraConfig, endpoint: Mapping[str, Any]) -> GigeCameraConfig:
+def _served(record: GigeCameraConfig, endpoint: Mapping[str, object]) -> GigeCameraConfig:
     return record.model_copy(update={"address": endpoint["address"]})
 
 

@@ -319,7 +319,7 @@ class Make(Generic[Record, Connected]):
     calibrated: frozenset[str] = frozenset()
     calibrated_since: frozenset[str] = frozenset()
     identity: Callable[[Connected], str] = serial_number
-    simulated: Callable[[Record, Mapping[str, Any]], Record] | None = None
+    simulated: Callable[[Record, Mapping[str, object]], Record] | None = None
     on_arm: bool = False
     missing: Callable[[], str] = lambda: ""
     replays: bool = False

@@ -194,7 +194,7 @@ def _modbus(name: str, config: ModbusRailConfig, around: Surroundings) -> Modbus
     )
 
 
-def _at_url(record: ModbusRailConfig, endpoint: Mapping[str, Any]) -> ModbusRailConfig:
+def _at_url(record: ModbusRailConfig, endpoint: Mapping[str, object]) -> ModbusRailConfig:
     return record.model_copy(update={"url": endpoint["url"]})
 
 

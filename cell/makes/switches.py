@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, TypeVar
 
 from cell.base.addresses import Endpoint, Port
 from cell.base.units import whole
@@ -137,11 +137,14 @@ def _robotiq(name: str, config: RobotiqClawConfig, around: Surroundings) -> Robo
     return RobotiqClaw(name, config.address, grip, clock=around.clock, control=not around.look)
 
 
-def _at_url(record: Any, endpoint: Mapping[str, Any]) -> Any:
+Board = TypeVar("Board", bound=OnBoard)
+
+
+def _at_url(record: Board, endpoint: Mapping[str, object]) -> Board:
     return record.model_copy(update={"url": endpoint["url"]})
 
 
-def _at_address(record: RobotiqClawConfig, endpoint: Mapping[str, Any]) -> RobotiqClawConfig:
+def _at_address(record: RobotiqClawConfig, endpoint: Mapping[str, object]) -> RobotiqClawConfig:
     return record.model_copy(update={"address": endpoint["address"]})
 
 

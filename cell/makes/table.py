@@ -36,7 +36,7 @@ class Installed:
         """Whether a configuration can name it."""
         return self.state == "ok"
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For JSON."""
         return asdict(self)
 
@@ -70,13 +70,13 @@ def make_of(kind: str, name: str) -> AnyMake:
     raise ConfigError(f'no {kind} "{name}" is installed; known: {known}')
 
 
-def record_of(kind: str) -> Callable[[Any, Any, ValidationInfo], DeviceConfig]:
+def record_of(kind: str) -> Callable[[object, object, ValidationInfo], DeviceConfig]:
     """A pydantic validator that reads a device's table as the record of the make that its `driver` names.
 
     Without `driver` it is the built-in make of that kind.
     """
 
-    def read(value: Any, _handler: Any, info: ValidationInfo) -> DeviceConfig:
+    def read(value: object, _handler: object, info: ValidationInfo) -> DeviceConfig:
         if isinstance(value, KINDS[kind]):
             return value
         default = next(make for make in BUILT_IN if make.kind == kind)
@@ -153,6 +153,6 @@ def _source(entry: EntryPoint) -> str:
     return entry.value if entry.dist is None else f"{entry.dist.name} {entry.dist.version}"
 
 
-def _wrong_driver(kind: Any, value: Any, context: dict[str, Any]) -> ValidationError:
+def _wrong_driver(kind: str, value: object, context: dict[str, Any]) -> ValidationError:
     details: InitErrorDetails = {"type": kind, "loc": ("driver",), "input": value, "ctx": context}
     return ValidationError.from_exception_data("driver", [details])

@@ -71,7 +71,7 @@ def search(
     space.setBounds(bounds)
     left = effort.looks
 
-    def looked(state: Any) -> bool:
+    def looked(state: object) -> bool:
         nonlocal left
         left -= 1
         return free(_joints(state))

@@ -7,7 +7,6 @@ stands beside the true error.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -42,7 +41,7 @@ def part_points(nominal: NominalSurface) -> Vector:
 
 def stated_bound(
     job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vector, grasp: Vector | None = None
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """Bounds in mm that hold for 95 % of the part's 45 points, by axis of the surface's frame and for D.
 
     From the pose's own covariance, from `placing`, the (6, 6) covariance of the flange each time the arm comes to

@@ -10,7 +10,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from cell.base.storage import sealed, write_json
 from cell.base.version import release
@@ -86,7 +85,7 @@ def stored(cell: Opened) -> CellCalibration:
     return found
 
 
-def calibrate(cell: Opened, run: Run[Any], job: str | Path) -> CellCalibration:
+def calibrate(cell: Opened, run: Run[object], job: str | Path) -> CellCalibration:
     """Move through the calibration poses, solve, and store the result and what it came from, recorded in `run`.
 
     `job` names the part that may be in the claw.
@@ -141,7 +140,7 @@ def kept_if_refused(folder: Path, name: str) -> Iterator[None]:
         raise
 
 
-def verify(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) -> Verification:
+def verify(cell: Opened, run: Run[object], calibration: CellCalibration, job: Job) -> Verification:
     """Look at the deck boards again, recorded in `run`: how good `calibration` is, and what place error of `job`.
 
     What it finds out about the laser is kept with the stored calibration.
@@ -165,7 +164,7 @@ def verify(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) 
     return made
 
 
-def time_stamps(cell: Opened, run: Run[Any], calibration: CellCalibration, job: Job) -> CellCalibration:
+def time_stamps(cell: Opened, run: Run[object], calibration: CellCalibration, job: Job) -> CellCalibration:
     """Sweep to and fro over the fine board, recorded in `run`: `calibration`, stored with how late the scan camera's
     time stamps come. `job` names the part that may be in the claw.
     """
@@ -190,7 +189,7 @@ def time_stamps(cell: Opened, run: Run[Any], calibration: CellCalibration, job: 
 
 
 @contextmanager
-def recorded_maintenance(root: Path, facts: Mapping[str, Any], reason: str, lift: Sequence[str]) -> Iterator[None]:
+def recorded_maintenance(root: Path, facts: Mapping[str, object], reason: str, lift: Sequence[str]) -> Iterator[None]:
     """A run of kind "maintenance" below `root` for as long as the context is open. `CellError` if it cannot be kept."""
     started = time.time()
     facts = {"kind": "maintenance", "pid": os.getpid(), **facts, "maintenance": reason, "lifted": list(lift)}

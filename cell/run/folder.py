@@ -109,7 +109,7 @@ def _lives(pid: object, since: float) -> bool:
     return words[0] != "Z" and begun < since + 1.0
 
 
-def _info(folder: Path) -> dict[str, Any]:
+def _info(folder: Path) -> dict[str, object]:
     try:
         return read(folder).run.info
     except (JournalError, ValueError, TypeError):
@@ -194,7 +194,7 @@ def _from_journal(folder: Path) -> dict[str, Any]:
     }
 
 
-def run_row(folder: Path) -> dict[str, Any]:
+def run_row(folder: Path) -> dict[str, object]:
     """A run in a few facts, for a list; one that cannot be read has the outcome "unreadable" and says why."""
     try:
         report = read_report(folder)

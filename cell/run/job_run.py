@@ -64,7 +64,7 @@ class ReadyJob:
     kind: Kind
     nominal: NominalSurface
     script: Script
-    info: dict[str, Any]
+    info: dict[str, object]
 
     @classmethod
     def read(
@@ -79,7 +79,7 @@ class ReadyJob:
         kind = find_kind(job.job.kind).until(until)
         kind.require_steps(script.after)
         nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
-        info: dict[str, Any] = dict(job_source(file))
+        info: dict[str, object] = dict(job_source(file))
         # A resumed run must end where this one was to end, and be looked at as this one was.
         if until is not None:
             info["until"] = until
@@ -145,18 +145,18 @@ class JobRun:
     `truth` asks a simulated world. `pace` says how fast arm and vehicle go, of what is planned.
     """
 
-    run: Run[Any]
+    run: Run[object]
     config: CellConfig
     devices: Devices
     job: Job
     nominal: NominalSurface
     calibration: CellCalibration
-    info: Mapping[str, Any]
+    info: Mapping[str, object]
     kind: Kind
     script: Script = NO_SCRIPT
     inline: tuple[Observer, ...] = ()
     earlier: StoredSweep | None = None
-    truth: Callable[[], dict[str, Any]] | None = None
+    truth: Callable[[], dict[str, object]] | None = None
     pace: Pace = field(default_factory=Pace)
 
     def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
@@ -249,7 +249,7 @@ class JobRun:
         except CellError as error:
             return {"missing": str(error)}
 
-    def _facts(self) -> dict[str, Any]:
+    def _facts(self) -> dict[str, object]:
         return {
             "kind": "job", "pid": os.getpid(), "cell": self.config.cell.name, "job": self.job.job.name,
             "job_kind": self.job.job.kind, **self.info, "speed": self.config.cell.time_scale,
@@ -304,7 +304,7 @@ class JobWork:
     cell: Opened
     file: str | Path
     ready: ReadyJob
-    info: Mapping[str, Any]
+    info: Mapping[str, object]
     stored: CellCalibration | None
     before: UnfinishedRun | None
     inline: tuple[Observer, ...]

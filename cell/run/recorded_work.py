@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from cell.base.lateness import LATENESS, MOST_S
 from cell.base.storage import sealed, write_json
@@ -132,11 +132,11 @@ class RecordedWork:
     `health(devices)` is called about ten times a second, and raises what must end the work whatever it does.
     """
 
-    run: Run[Any]
+    run: Run[object]
     kind: str
     devices: Devices
     root: Path
-    info: Mapping[str, Any]
+    info: Mapping[str, object]
     health: Callable[[Devices], None] = require_healthy
     config: CellConfig | None = None
 

@@ -90,7 +90,7 @@ FACTS: dict[str, tuple[type, ...]] = {
 """What a journal tells of a run that a resumed one goes by, where it is there."""
 
 
-def _require_facts(folder: Path, info: dict[str, Any]) -> None:
+def _require_facts(folder: Path, info: dict[str, object]) -> None:
     """`ConfigError` when the journal does not tell which job it was, or tells anything as what it cannot be."""
     for name in ("job_file", "job_hash", "simulated"):
         if name not in info:

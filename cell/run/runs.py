@@ -14,7 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from cell.procedures.sweep.swath import Sweeping
 
 
-Result = TypeVar("Result")
+Result = TypeVar("Result", covariant=True)
 
 POLL_S = 0.05
 KEPT_EVENTS = 1000
@@ -181,13 +181,13 @@ class Runs:
     def __init__(self, name: str) -> None:
         self._name = name
         self._beginning = threading.Lock()
-        self._run: Run[Any] | None = None
+        self._run: Run[object] | None = None
         self._stops = 0
-        self._stopped: Run[Any] | None = None
+        self._stopped: Run[object] | None = None
         self._closed = False
 
     @property
-    def current(self) -> Run[Any] | None:
+    def current(self) -> Run[object] | None:
         """The run that is going on, or None."""
         run = self._run
         return None if run is None or run.done else run

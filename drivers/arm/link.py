@@ -17,7 +17,6 @@ import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-from typing import Any
 
 from drivers.arm.feed import UNANSWERED, ChildReply, ChildRequest, ChildSetup, Ended, Lost, Snapshot
 from drivers.errors import Aborted, DeviceFault, NotConnectedError
@@ -97,7 +96,7 @@ class ArmLink:
         """Process id of the child."""
         return self._process.pid
 
-    def call(self, name: str, *arguments: Any, deadline: float) -> tuple[str, str] | None:
+    def call(self, name: str, *arguments: object, deadline: float) -> tuple[str, str] | None:
         """Have the child do something; None, or the problem as (code, text).
 
         Raises the link's `DeviceFault` when it is lost, or not answered within `deadline` wall seconds: then the child
@@ -117,7 +116,7 @@ class ArmLink:
             self._raise_if_lost()
         return pending.problem
 
-    def tell(self, name: str, *arguments: Any) -> None:
+    def tell(self, name: str, *arguments: object) -> None:
         """Tell the child something that it does not answer; raises the link's `DeviceFault` when it is lost."""
         self._raise_if_lost()
         self._transmit(ChildRequest(UNANSWERED, name, arguments))

@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import Any
 
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.factory import Forward, flange_agrees, require_same_flange, require_same_payload, same_payload
@@ -180,7 +179,7 @@ class ArmSession:
 
     # --- asking ---
 
-    def ask(self, name: str, *arguments: Any, deadline: float = CALL_S) -> None:
+    def ask(self, name: str, *arguments: object, deadline: float = CALL_S) -> None:
         """Have the child do something; see `ArmLink.call`. `Aborted` when a stop overtook it."""
         self.require_control()
         self.require_link()

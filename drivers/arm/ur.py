@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -297,7 +296,7 @@ class UrArm:
 
     # --- inside ---
 
-    def _start(self, what: str, name: str, *arguments: Any) -> UrMotion:
+    def _start(self, what: str, name: str, *arguments: object) -> UrMotion:
         self._session.require_control()
         with self._starting:
             self._session.require_remote()

@@ -14,7 +14,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
+
+import serial
 
 from drivers.errors import UNTOLD, ConfigError, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import Identity, LinkStatistics
@@ -41,7 +43,7 @@ class _Line:
     def __init__(self, baud: int) -> None:
         self.baud = baud
         self.lock = threading.Lock()
-        self.port: Any = None
+        self.port: serial.Serial | None = None
         self.opened = 0
         self.users = 0
         self.at_loss: list[Callable[[], None]] = []
@@ -156,7 +158,7 @@ class RelayPort:
             pass
 
     @contextmanager
-    def _held(self) -> Iterator[Any]:
+    def _held(self) -> Iterator[serial.Serial]:
         """The port, for this thread alone and with nothing late in it; what fails inside is told as a lost link."""
         line = self._line
         with line.lock:
@@ -180,7 +182,7 @@ class RelayPort:
                 ) from error
 
 
-def _drain(port: Any) -> None:
+def _drain(port: serial.Serial) -> None:
     """Throw away what came too late for the command that asked for it."""
     if not port.in_waiting:
         return

@@ -13,7 +13,6 @@ import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import (
@@ -63,7 +62,7 @@ class AgilexVehicle:
         max_speed: float,
         max_yaw_rate: float,
         clock: Clock,
-        bus_options: Mapping[str, Any] | None = None,
+        bus_options: Mapping[str, object] | None = None,
     ) -> None:
         self.name = name
         self.statistics = LinkStatistics()

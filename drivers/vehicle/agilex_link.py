@@ -11,7 +11,7 @@ import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from importlib.resources import as_file, files
-from typing import Any, cast
+from typing import cast
 
 import can
 import cantools
@@ -40,7 +40,7 @@ class AgilexLink:
         channel: str,
         *,
         bitrate: int,
-        options: Mapping[str, Any],
+        options: Mapping[str, object],
         database: Database,
         wanted: frozenset[str],
         receive: Callable[[str, dict[str, float]], None],

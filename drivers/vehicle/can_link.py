@@ -48,7 +48,7 @@ class CanLink:
         channel: str,
         *,
         bitrate: int,
-        options: Mapping[str, Any],
+        options: Mapping[str, object],
         receive: Callable[[can.Message], None],
         idle: Callable[[float], None],
         statistics: LinkStatistics,
@@ -139,7 +139,7 @@ class CanLink:
                 self._last_words.close()
             self._bus.shutdown()
 
-    def _open(self, interface: str, channel: str, bitrate: int, options: Mapping[str, Any]) -> can.BusABC:
+    def _open(self, interface: str, channel: str, bitrate: int, options: Mapping[str, object]) -> can.BusABC:
         settings: dict[str, Any] = {"bitrate": bitrate, **options}
         if interface == "slcan" and channel.startswith("socket://"):
             # The default waits 2 s for a serial adapter to boot, which one behind a socket has done already.

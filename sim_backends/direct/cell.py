@@ -7,7 +7,7 @@ The faults that devices without wires can be made to have: those of the models. 
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Protocol
 
 from sim_backends.clock import SteppedClock
 from sim_backends.direct.arm import DirectArm
@@ -103,7 +103,7 @@ class DirectCell:
         self.target_camera = DirectCamera("target_camera", "target", self.world, self.clock, setup.camera, wire=wire)
         self._ticking: tuple[Ticking, ...] = (self.arm, self.vehicle)
 
-    def truth(self) -> dict[str, Any]:
+    def truth(self) -> dict[str, object]:
         """Everything true about the world now; see `sim_backends.world.world`."""
         return truth(self.world)
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from drivers.clock import Latch
 from drivers.errors import DeviceFault, LimitError
 from drivers.interfaces import Vector
 
@@ -40,7 +41,7 @@ class SweepLine(Protocol):
 class HostTimeMap(Protocol):
     """The way from a device's clock to the host's, from latches (host before, device, host after), s."""
 
-    def add(self, latches: Iterable[Any]) -> None:
+    def add(self, latches: Iterable[Latch]) -> None:
         """Take the latches of one moment."""
 
     def host_time(self, device: float) -> float:
@@ -145,7 +146,7 @@ class CameraSetup:
     """`clock_map` makes an empty map for one camera, `latch` what is added to it."""
 
     clock_map: Callable[[], HostTimeMap]
-    latch: Callable[[float, float, float], Any]
+    latch: Callable[[float, float, float], Latch]
 
 
 @dataclass(frozen=True)

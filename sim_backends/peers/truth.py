@@ -37,7 +37,7 @@ class TruthPeer:
 
     def __init__(
         self,
-        truth: Callable[[], dict[str, Any]],
+        truth: Callable[[], dict[str, object]],
         fault: Callable[[str], None],
         reset: Callable[[], None],
         make_ready: Callable[[str], None],
@@ -60,7 +60,7 @@ class TruthPeer:
                 reply = self._answer(line)
                 connection.sendall(json.dumps(reply, default=_plain).encode("utf-8") + b"\n")
 
-    def _answer(self, line: bytes) -> dict[str, Any]:
+    def _answer(self, line: bytes) -> dict[str, object]:
         try:
             request = json.loads(line)
             operation = request["op"]
@@ -83,7 +83,7 @@ class TruthPeer:
         return _refusal(f"unknown op {operation!r}; known: truth, fault, make_ready, reset")
 
 
-def _refusal(error: str) -> dict[str, Any]:
+def _refusal(error: str) -> dict[str, object]:
     return {"ok": False, "error": error}
 
 
@@ -105,7 +105,7 @@ class FollowingPeer:
         self._world, self._following = world, following
         self._server = TcpServer("following", self._serve)
         self.address = self._server.address
-        self._operations: dict[str, Callable[[Mapping[str, Any]], dict[str, Any]]] = {
+        self._operations: dict[str, Callable[[Mapping[str, object]], dict[str, object]]] = {
             "time": lambda request: {"time": world.clock.now()},
             "begin": self._begin,
             "tell": self._tell,
@@ -128,7 +128,7 @@ class FollowingPeer:
             while line := lines.readline(_LONGEST_READINGS):
                 connection.sendall(json.dumps(self._answer(line)).encode() + b"\n")
 
-    def _answer(self, line: bytes) -> dict[str, Any]:
+    def _answer(self, line: bytes) -> dict[str, object]:
         try:
             request = json.loads(line)
             operation = self._operations[request["op"]]
@@ -146,7 +146,7 @@ class FollowingPeer:
     def _tell(self, request: Mapping[str, Any]) -> dict[str, Any]:
         return {"wrenches": self._following.tell(request["device"], request["rows"])}
 
-    def _board(self, request: Mapping[str, Any]) -> dict[str, Any]:
+    def _board(self, request: Mapping[str, object]) -> dict[str, object]:
         pose = np.array(request["base_from_board"], dtype=np.float64)
         if pose.shape != (4, 4) or not np.isfinite(pose).all():
             raise ValueError("base_from_board is a pose, 4 by 4")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from sim_backends.peers.arm.robotiq import RobotiqPeer
 from sim_backends.peers.rail.tmcl import TmclPeer
@@ -48,11 +48,11 @@ def rail_peer(world: World) -> TmclPeer | ModbusPeer:
     return ModbusPeer(ModbusDriveServer(world.rail, world.clock, wire), wire["unit"])
 
 
-def switch_peers(world: World) -> tuple[list[Peer], dict[str, dict[str, Any]]]:
+def switch_peers(world: World) -> tuple[list[Peer], dict[str, dict[str, object]]]:
     """Peers for laser and claw, and their endpoints by device. Raises ValueError for a make that has none."""
     wires = {name: wire for name, wire in world.scene.drawing.cell.wires.items() if name in ("laser", "claw")}
     peers: list[Peer] = []
-    endpoints: dict[str, dict[str, Any]] = {}
+    endpoints: dict[str, dict[str, object]] = {}
     # Relays of one board are on one line.
     for make, place in dict.fromkeys((wire["make"], wire["place"]) for wire in wires.values()):
         on_it = {name: wire for name, wire in wires.items() if (wire["make"], wire["place"]) == (make, place)}

@@ -96,7 +96,7 @@ TEXT_M, TEXT_RAD = 5e-6, 1e-9
 """A pose written in hundredths of a millimetre and in degrees is this near to the one that was meant, m and rad."""
 
 
-Box = dict[str, list[Any]]
+Box = dict[str, list[object]]
 """Something solid: "pose" of its middle, four rows of four, and the "size" of its edges, m."""
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,7 +126,7 @@ class WorldFollowing:
         wanted = self._world.scene.world_from_board @ inverse(base_from_board)
         vehicle.shift = wanted @ inverse(self._world.world_from_base(t)) @ vehicle.shift
 
-    def figures(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, object]:
         """How late the readings came, how far apart, how long pictures waited (ms on the wall), and how many were not
         made."""
         devices = {

@@ -173,7 +173,7 @@ class World:
         """The lens of "scan" or "target" as warm as it is at `t`."""
         return self._cameras.lens(camera, self.warmth(t))
 
-    def light_plane(self, t: float) -> dict[str, Any]:
+    def light_plane(self, t: float) -> dict[str, object]:
         """The light sheet as warm as it is at `t`: normal (3,) and distance, m, of its plane in the scan camera's
         frame, and its bow y²/r, with y across the fan's middle and r along it from the laser."""
         laser = self._cameras.laser(self.warmth(t))
@@ -248,7 +248,7 @@ class World:
         )
 
 
-def truth(world: World) -> dict[str, Any]:
+def truth(world: World) -> dict[str, object]:
     """Everything true about `world` now; see the keys."""
     t = world.clock.now()
     scene = world.scene
@@ -323,7 +323,7 @@ def _nested(values: Pose) -> Any:
     return np.asarray(values).tolist()
 
 
-def _lens(lens: Lens) -> dict[str, Any]:
+def _lens(lens: Lens) -> dict[str, object]:
     return {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy, "dist": list(lens.dist)}
 
 

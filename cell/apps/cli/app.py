@@ -44,7 +44,7 @@ _WORDS = (
 class App(typer.Typer):
     """The table of commands. Called, it runs one and exits; a wrong command line is a `ConfigError`."""
 
-    def __call__(self, *args: Any, **settings: Any) -> Any:
+    def __call__(self, *args: object, **settings: object) -> object:
         """Run the command of `sys.argv`."""
         try:
             code = super().__call__(*args, **{**settings, "standalone_mode": False})

@@ -16,6 +16,7 @@ from cell.apps.cli.options import new_table
 from cell.config.files import DEVICES
 from cell.run.folder import wall_seconds
 from cell.run.report.figures import following_words, noise_rows, shown_limit, shown_value, simulated_words
+from drivers.errors import MeasuredRow
 
 WIDTH, HEIGHT = 80, 23
 """What a screen holds; its last line is left to the prompt."""
@@ -42,7 +43,7 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH) -> l
     return [*head, *steps, *([""] * bool(measured)), *measured, "", *tail]
 
 
-def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
+def next_step(report: Mapping[str, object], folder: Path) -> str | None:
     """What a person would type after a run that ended so; None where there is nothing to add."""
     outcome, kind, name = report["outcome"], report.get("kind", "job"), folder.name.split("-")[-1]
     look = "cell diag: the state of every device; "
@@ -74,7 +75,7 @@ def next_step(report: Mapping[str, Any], folder: Path) -> str | None:
     return f"cell abort {name}, if it is still going on; cell resume {name}, if its process died"
 
 
-def _job(report: Mapping[str, Any]) -> str:
+def _job(report: Mapping[str, object]) -> str:
     """The job as one would name it: the shipped ones by their names, others by their files."""
     from cell.config.job import job_path, shipped_jobs
 
@@ -94,7 +95,7 @@ def duration(seconds: float | None) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def _facts(report: Mapping[str, Any]) -> str:
+def _facts(report: Mapping[str, object]) -> str:
     kind = str(report.get("kind", "job"))
     facts = [f"job {report.get('job')}" if kind == "job" else kind]
     if words := simulated_words(report.get("simulated")):
@@ -125,7 +126,7 @@ def _seconds(value: float | None) -> str:
     return "" if value is None else f"{value:.2f} s"
 
 
-def _figure(row: Mapping[str, Any]) -> str:
+def _figure(row: MeasuredRow) -> str:
     mark = "  " if row.get("kept", True) else "! "
     name = textwrap.shorten(str(row.get("name")), 46, placeholder=" …")
     return f"{mark}{name:<46} {shown_value(row):>11}  {shown_limit(row)}".rstrip()
@@ -191,7 +192,7 @@ def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False)
     _print_noise(console, report.get("assumed_noise") or {})
 
 
-def print_late(report: Mapping[str, Any]) -> None:
+def print_late(report: Mapping[str, object]) -> None:
     """Say that the program was asked to end when the run had come to its end already. Writes to standard error."""
     part = "the part had been placed" if report["outcome"] == "placed" else f"the run had ended {report['outcome']}"
     console = Console(stderr=True, soft_wrap=True, highlight=False)
@@ -217,7 +218,7 @@ def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:
         console.print(after if len(after) <= room else after[: room - 2].rstrip() + " …", markup=False, soft_wrap=True)
 
 
-def _simulated(row: Mapping[str, Any]) -> str:
+def _simulated(row: Mapping[str, object]) -> str:
     which = row.get("simulated")
     if not isinstance(which, list):
         return "(sim)" if which else ""

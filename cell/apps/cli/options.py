@@ -11,9 +11,13 @@ import json
 import tomllib
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.table import Table
 
 MOST_RUNS = 50
 
@@ -141,19 +145,19 @@ SimOption = Annotated[
 ]
 
 
-def print_json(data: Any) -> None:
+def print_json(data: object) -> None:
     """Write JSON to standard output."""
     typer.echo(json.dumps(data, indent=2))
 
 
-def wide_console(least: int = 120) -> Any:
+def wide_console(least: int = 120) -> Console:
     """A rich console for wide tables: at least `least` columns also where the output is no terminal."""
     from rich.console import Console
 
     return Console(width=max(Console().width, least))
 
 
-def new_table(title: str | None, *columns: str, **looks: Any) -> Any:
+def new_table(title: str | None, *columns: str, **looks: Any) -> Table:
     """A rich table without rows; columns that begin with '>' are numbers, flush right. `looks` are the table's own."""
     from rich.table import Table
 

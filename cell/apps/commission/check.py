@@ -95,7 +95,7 @@ class Result:
         self.findings.append(finding)
         self.verdict = CheckVerdict.WRONG
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """JSON-ready."""
         return {
             "verdict": self.verdict.value,
@@ -146,7 +146,7 @@ VERSION = 1
 class Progress:
     """The results so far, in `folder`; `cell` says which cell they are of (name, simulated or not, which world)."""
 
-    def __init__(self, folder: Path, cell: dict[str, Any], job: Job) -> None:
+    def __init__(self, folder: Path, cell: dict[str, object], job: Job) -> None:
         """Read what is there; `ConfigError` when that is none. `job` is the key "job" of checks."""
         self.folder = folder
         self.cell = cell
@@ -196,7 +196,7 @@ class Progress:
         self._data["results"][check.name] = stored
         self._write()
 
-    def keep_mended(self, check: CommissionCheck, finding: dict[str, Any], backup: str) -> None:
+    def keep_mended(self, check: CommissionCheck, finding: dict[str, object], backup: str) -> None:
         """Store that a finding was written into the configuration, and where its old text is."""
         entry = {"check": check.name, "when": time.strftime("%Y-%m-%d %H:%M:%S"), "backup": backup, **finding}
         self._data["mended"].append(entry)
@@ -225,7 +225,7 @@ def done_well(standing: str) -> bool:
     return standing == CheckVerdict.GOOD
 
 
-def _at(tables: dict[str, Any], key: str) -> Any:
+def _at(tables: dict[str, object], key: str) -> Any:
     value: Any = tables
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None

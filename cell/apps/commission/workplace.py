@@ -11,11 +11,12 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 import pinocchio as pin
+from numpy.typing import ArrayLike
 
 from cell.apps.commission.check import Result
 from cell.apps.commission.person import Person
@@ -206,7 +207,7 @@ class CommissionWorkplace:
 
     # --- pictures ---
 
-    def keep(self, result: Result, name: str, frame: Frame, marks: Any = None) -> None:
+    def keep(self, result: Result, name: str, frame: Frame, marks: ArrayLike | None = None) -> None:
         """Keep a picture for the protocol, with points (n, 2) px marked in it, and the whole frame in the run."""
         if self.hands is not None:
             self.hands.keep(name, frame)
@@ -219,7 +220,7 @@ class CommissionWorkplace:
             result.pictures.append(told)
 
 
-def _shown(image: Image, marks: Any) -> Any:
+def _shown(image: Image, marks: ArrayLike | None) -> cv2.typing.MatLike:
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     share = min(1.0, WIDEST_PICTURE / image.shape[1])
     small = cv2.resize(picture, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)

@@ -30,7 +30,7 @@ class ServerSetup:
     cert: str | None
     key: str | None
     runs: str
-    cell: Mapping[str, Any]
+    cell: Mapping[str, object]
 
 
 # --- server to cell ---
@@ -63,7 +63,7 @@ class Do:
 
     number: int
     client: str
-    words: Mapping[str, Any]
+    words: Mapping[str, object]
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Beat:
     """A button is held; with `end` it is not any more."""
 
     client: str
-    words: Mapping[str, Any]
+    words: Mapping[str, object]
     end: bool = False
 
 
@@ -92,7 +92,7 @@ class Answer:
 
     number: int
     status: int
-    words: Mapping[str, Any]
+    words: Mapping[str, object]
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class Say:
     """To one page."""
 
     client: str
-    words: Mapping[str, Any]
+    words: Mapping[str, object]
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ class ShownPicture:
 class CloudPart:
     """An increment of the cloud."""
 
-    header: Mapping[str, Any]
+    header: Mapping[str, object]
     payload: bytes
 
 

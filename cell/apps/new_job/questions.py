@@ -84,17 +84,17 @@ def checked(record: type[BaseModel], key: str) -> Callable[[str], Any]:
     """Parses a value by the rule of the key of a job's section."""
     adapter = _rule(record, key)
 
-    def parse(text: str) -> Any:
+    def parse(text: str) -> object:
         return _by(adapter, text.strip())
 
     return parse
 
 
-def three(record: type[BaseModel], key: str) -> Callable[[str], Any]:
+def three(record: type[BaseModel], key: str) -> Callable[[str], object]:
     """Parses three values, such as "70 mm, 36 mm, 20 mm", by the rule of the key."""
     adapter = _rule(record, key)
 
-    def parse(text: str) -> Any:
+    def parse(text: str) -> object:
         parts = [part.strip() for part in text.split(",")]
         if len(parts) != 3:
             raise ValueError(f'{shown(text)} has {len(parts)} values; write three, such as "70 mm, 36 mm, 20 mm"')

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -62,8 +61,8 @@ class Rays:
         self._corners = corners
         self._faces = faces
         self._smooth: Array | None = None
-        made: Any = trimesh.Trimesh(vertices, faces, process=False)
-        self._rays: Any = RayMeshIntersector(made)
+        made = trimesh.Trimesh(vertices, faces, process=False)
+        self._rays = RayMeshIntersector(made)
 
     def hits(self, origins: Array, ways: Array) -> tuple[NDArray[np.int64], Array]:
         """The first triangle (n,) that rays from `origins` (n, 3) along unit `ways` (n, 3) meet, −1 for none, and how

@@ -196,7 +196,7 @@ class CellCalibration:
         """What its file is called: the serial numbers that it belongs to."""
         return name_of(self.identities)
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For storage."""
         return {
             "format": FORMAT if self.sealed else UNSEALED,

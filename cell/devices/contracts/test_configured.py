@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -21,7 +20,7 @@ from cell.devices.contracts.vehicle import VehicleContract
 from cell.devices.lock import CellLock
 from cell.devices.simulated.process import cause_fault, clear_faults
 from drivers.clock import Clock
-from drivers.interfaces import Arm
+from drivers.interfaces import Arm, Device
 
 pytestmark = pytest.mark.skipif(
     "CELL_CONTRACTS" not in os.environ, reason="CELL_CONTRACTS names no configuration: no device is touched"
@@ -55,7 +54,7 @@ class ServedFaults:
             self.arm.recover(confirmed=True)
 
 
-def bench_of(config: CellConfig, name: str) -> Iterator[Bench[Any]]:
+def bench_of(config: CellConfig, name: str) -> Iterator[Bench[Device]]:
     """The bench of one device; what hangs on the arm brings the arm with it."""
     clock = Clock(config.cell.time_scale)
     with ExitStack() as over:
@@ -76,7 +75,7 @@ class _Configured:
 
     @pytest.fixture(scope="class")
     @classmethod
-    def bench(cls, configured: CellConfig) -> Iterator[Bench[Any]]:
+    def bench(cls, configured: CellConfig) -> Iterator[Bench[Device]]:
         """The device of this name."""
         yield from bench_of(configured, cls.NAME)
 
@@ -100,7 +99,7 @@ class TestVehicle(_Configured, VehicleContract):
 
     @pytest.fixture(scope="class")
     @classmethod
-    def bench(cls, configured: CellConfig) -> Iterator[Bench[Any]]:
+    def bench(cls, configured: CellConfig) -> Iterator[Bench[Device]]:
         """The vehicle, where there is one that drives."""
         if not configured.vehicle.DRIVES:
             pytest.skip("the arm stands on a fixed frame: there is no vehicle")

@@ -139,7 +139,7 @@ class Diagnosis:
         """Counters for people."""
         return ", ".join(f"{name} {count}" for name, count in sorted(self.errors.items())) or "none"
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For JSON."""
         told = asdict(self)
         for row, reading in zip(told["readings"], self.readings, strict=True):
@@ -213,7 +213,7 @@ def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:
     return rows
 
 
-def _open_and_ask(name: str, address: str, build: Callable[[], Any], clock: Clock) -> tuple[Diagnosis, Any]:
+def _open_and_ask(name: str, address: str, build: Callable[[], Device], clock: Clock) -> tuple[Diagnosis, Any]:
     try:
         device = build()
     except CellError as error:

@@ -35,7 +35,7 @@ class Found:
     ok: bool
     write: str = ""
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For JSON."""
         return asdict(self)
 

@@ -9,7 +9,6 @@ import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -112,9 +111,9 @@ def _steps(rail: RailConfig) -> int:
     return rail.steps_per_turn if isinstance(rail, TmclRailConfig) else STOCK.cell.rail.steps_per_turn
 
 
-def _wire(record: DeviceConfig) -> dict[str, Any]:
+def _wire(record: DeviceConfig) -> dict[str, object]:
     """How a device is wired that does not hang on the arm, as its peer takes it."""
-    wire: dict[str, Any] = {"make": record.driver}
+    wire: dict[str, object] = {"make": record.driver}
     match record:
         case ModbusRailConfig():
             return wire | record.model_dump(mode="json", include={"unit", "counts_per_turn", "registers"})
@@ -133,7 +132,7 @@ def _turning_track(vehicle: VehicleConfig) -> float:
     return vehicle.track if isinstance(vehicle, CanopenVehicleConfig) else TURNS_WIDER * vehicle.track
 
 
-def _vehicle(record: VehicleConfig) -> dict[str, Any]:
+def _vehicle(record: VehicleConfig) -> dict[str, dict[str, object]]:
     """The vehicle's wire, for its peer; none for the stock cell's."""
     match record:
         case FixedVehicleConfig():

@@ -232,7 +232,7 @@ class DeviceFollowing:
 
     def figures(self) -> dict[str, Any]:
         """How late readings reach the world, for report and screen: see docs/reference/report.md."""
-        told: dict[str, Any] = self._link.ask(op="figures")["figures"]
+        told: dict[str, object] = self._link.ask(op="figures")["figures"]
         return {**told, "clocks_known_ms": round(1e3 * self._clocks_known, 4)}
 
     def board_seen(self, base_from_board: pin.SE3) -> None:

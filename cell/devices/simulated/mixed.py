@@ -17,7 +17,6 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +29,7 @@ from cell.devices.simulated.process import SimulatedCell, WorldConnector, WorldL
 from cell.makes.built_in import ArmOutputClawConfig, ArmOutputLaserConfig
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, ConfigError
-from drivers.interfaces import ArmMotion, ArmState, Vector
+from drivers.interfaces import ArmMotion, ArmState, Device, Vector
 from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
 
 Sim = str | Sequence[str] | None
@@ -231,7 +230,7 @@ class MixedCell:
         self.lock = undo.enter_context(CellLock(self.config, needed))
         link = self.world.link
 
-        def otherwise(name: str, clock: Clock) -> Any | None:
+        def otherwise(name: str, clock: Clock) -> Device | None:
             if name not in simulated:
                 return None
             if link is not None and DEVICES[name] == "camera":
@@ -255,7 +254,7 @@ def _addressed(config: CellConfig, simulated: Collection[str]) -> list[str]:
     return [name for name in simulated if not config.make(name).on_arm or "arm" in simulated]
 
 
-def _switched(config: CellConfig, name: str, link: WorldLink | None, clock: Clock) -> Any | None:
+def _switched(config: CellConfig, name: str, link: WorldLink | None, clock: Clock) -> Device | None:
     """A laser or claw that hangs on the arm's connectors, and is simulated while the arm is real; None for others."""
     if not config.make(name).on_arm:
         return None

@@ -85,7 +85,7 @@ class WorldLink:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._file = self._socket.makefile("rwb")
 
-    def ask(self, **request: Any) -> dict[str, Any]:
+    def ask(self, **request: object) -> dict[str, Any]:
         """The answer to a request; `DeviceFault` (sim.lost) when none comes, or when it was refused."""
         with self._asking:
             try:
@@ -166,7 +166,7 @@ class Simulation(Protocol):
         """For journal and report: `simulated` (true, or which devices beside real ones), `seed`, `level` and `clock`,
         "wall" or "virtual"."""
 
-    def truth(self) -> dict[str, Any]:
+    def truth(self) -> dict[str, object]:
         """Everything true about the world now."""
 
     def require_fault(self, name: str) -> None:
@@ -240,7 +240,7 @@ class SimulatedCell:
         which: bool | list[str] = True if is_whole(self) else list(self.simulated)
         return {"simulated": which, **{key: self.endpoints[key] for key in ("seed", "level")}, "clock": "wall"}
 
-    def truth(self) -> dict[str, Any]:
+    def truth(self) -> dict[str, object]:
         """Everything true about the world now; `CellError` when it does not answer."""
         return ask_truth(self.endpoints["truth"]["address"])
 
@@ -269,7 +269,7 @@ class SimulatedCell:
         """Process id of the simulated cell."""
         return self._process.pid
 
-    def _read_endpoints(self) -> dict[str, Any]:
+    def _read_endpoints(self) -> dict[str, object]:
         assert self._process.stdout is not None
         deadline = time.monotonic() + START_TIMEOUT_S
         line = b""

@@ -24,7 +24,7 @@ from cell.measure.calibration.drift.reference_plate import PlateLine, read_edge
 from cell.measure.calibration.solve.adjustment import Priors
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.vision.board.view import BoardView, parse_board
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.extract import Axis, StripeProfile
 from drivers.errors import ConfigError
 
 
@@ -251,11 +251,11 @@ def _read_profiles(data: Mapping[str, Any], views: int) -> list[StripeProfile | 
     return [None if axis == "" else StripeProfile(_axis(axis), *next(rest)) for axis in axes]
 
 
-def _axis(text: str) -> Any:
-    return text
+def _axis(text: str) -> Axis:
+    return "columns" if text == "columns" else "rows"
 
 
-def _finite(data: Mapping[str, Any], name: str, shape: tuple[int, ...]) -> Array:
+def _finite(data: Mapping[str, object], name: str, shape: tuple[int, ...]) -> Array:
     array = np.asarray(data[name], dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
@@ -279,7 +279,7 @@ def _pose(matrix: Array, name: str) -> pin.SE3:
     return pin.SE3(rotation, matrix[:3, 3].copy())
 
 
-def _camera_dict(camera: CameraModel) -> dict[str, Any]:
+def _camera_dict(camera: CameraModel) -> dict[str, object]:
     return {"width": camera.width, "height": camera.height, "parameters": camera.parameters.tolist()}
 
 

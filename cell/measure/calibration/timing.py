@@ -22,7 +22,7 @@ class Shutter:
     sigma: float
     link: dict[str, str]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For storage."""
         return dict(vars(self))
 
@@ -60,7 +60,7 @@ class StampTiming:
     made: float
     link: dict[str, str]
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For storage."""
         return dict(vars(self))
 
@@ -80,7 +80,7 @@ class StampTiming:
         """When it was made, for people."""
         return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.made))
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """For reports and people, units in the names."""
         return {
             "late_ms": round(1e3 * self.late, 4),

@@ -16,6 +16,10 @@ from numpy.typing import NDArray
 from drivers.errors import RefusedError
 
 Image = NDArray[np.uint8]
+Taken = Image | NDArray[np.uint16]
+"""A picture as a camera takes it, grey or in colours."""
+Dark = Taken | NDArray[np.float32] | NDArray[np.float64]
+"""One without the laser, or the mean of several."""
 Found = TypeVar("Found")
 
 BLACK_DN = 10

@@ -244,7 +244,7 @@ def noise_found(joint: Joint) -> dict[str, float]:
     }
 
 
-def paper_check(joint: Joint, observations: Observations) -> dict[str, Any] | None:
+def paper_check(joint: Joint, observations: Observations) -> dict[str, object] | None:
     """The light plane by the paper's six steps, with the adjusted camera and boards, beside the adjusted plane.
 
     `apart_mrad` between the normals, `apart_mm` between the planes at the middle of the stripe's points; None where the

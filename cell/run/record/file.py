@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from cell.base.storage import sync_folder
 from drivers.errors import CellError
@@ -220,7 +220,7 @@ class RecordFile:
 class _Out:
     """The library's writer, and the channels that it knows by now."""
 
-    def __init__(self, stream: Any, facts: dict[str, str]) -> None:
+    def __init__(self, stream: IO[bytes], facts: dict[str, str]) -> None:
         # Here, in the writer's thread: a job's start does not wait for these packages.
         from mcap.writer import CompressionType, Writer
 

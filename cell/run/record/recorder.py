@@ -148,7 +148,7 @@ _said: set[str] = set()
 
 @contextmanager
 def recorded(
-    folder: Path, run: Run[Any], config: CellConfig, devices: Devices, calibration: CellCalibration | None = None
+    folder: Path, run: Run[object], config: CellConfig, devices: Devices, calibration: CellCalibration | None = None
 ) -> Iterator[Recorder | None]:
     """While the context is open, all that happens goes to `record.mcap` in `folder`; None where nothing does."""
     record = begin_record(folder, run, config, devices, calibration)
@@ -160,7 +160,7 @@ def recorded(
 
 
 def begin_record(
-    folder: Path, run: Run[Any], config: CellConfig, devices: Devices, calibration: CellCalibration | None = None
+    folder: Path, run: Run[object], config: CellConfig, devices: Devices, calibration: CellCalibration | None = None
 ) -> Recorder | None:
     """Begin to record; None where the configuration says so or, said once in a process, packages are not installed."""
     if not config.cell.record:
@@ -185,7 +185,7 @@ class Recorder(logging.Handler):
     def __init__(
         self,
         folder: Path,
-        run: Run[Any],
+        run: Run[object],
         config: CellConfig,
         devices: Devices,
         calibration: CellCalibration | None,

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from cell.base.storage import replacing
 from cell.run.record.file import CHUNK_BYTES, require_packages
@@ -64,7 +64,7 @@ class _WholeError(Exception):
 class _Copy:
     """A new file with the same schemas, channels and messages."""
 
-    def __init__(self, out: Any) -> None:
+    def __init__(self, out: IO[bytes]) -> None:
         from mcap.writer import CompressionType, Writer
 
         self.messages = 0

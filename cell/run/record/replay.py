@@ -66,7 +66,7 @@ def save(folder: Path, result: RunResult) -> None:
     sweep, scan = made.get(SweepRecord), made.get(Reconstruction)
     if not isinstance(fix, BoardFix) or not isinstance(sweep, SweepRecord) or not (scan or refused):
         return
-    data: dict[str, Any] = {
+    data: dict[str, object] = {
         "format": FORMAT,
         "photograph": {
             "files": [f"board-{fix.number:02d}-{frame.frame_id:06d}.png" for frame in fix.frames],

@@ -12,7 +12,7 @@ from cell.measure.inversion import PlacePose, fit_figures
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.place import PlaceResult
-from drivers.errors import Measured, RefusedError
+from drivers.errors import Measured, MeasuredRow, RefusedError
 from statemachine.runner import RunResult
 from statemachine.step import Outcome
 
@@ -41,7 +41,7 @@ def ended_in(result: RunResult) -> str | None:
     return next((step.name for step in reversed(result.steps) if step.state == "failed"), None)
 
 
-def refusal(result: RunResult, folder: Path, frames: FrameStore) -> dict[str, Any] | None:
+def refusal(result: RunResult, folder: Path, frames: FrameStore) -> dict[str, object] | None:
     """The report's part of this name: why, in which step, on which numbers, and the files that show it."""
     if result.outcome is not Outcome.REFUSED:
         return None
@@ -63,7 +63,7 @@ def last_frames(result: RunResult, frames: FrameStore) -> list[str]:
 
 def measured(
     result: RunResult, job: Job, truth: Mapping[str, Any] | None, bound: Mapping[str, Any] | None
-) -> list[dict[str, Any]]:
+) -> list[MeasuredRow]:
     """Every figure that the run was or can be judged by, beside its limit: what decided a refusal comes first."""
     fix, pose, placed = (result.results.get(name) for name in ("board_photo", "invert_pose", "place"))
     found = list(RefusalEvidence.of(result).numbers)

@@ -32,7 +32,7 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
     report = read_report(folder)
     deviations = _deviations(cloud, report, job)
     colours = None if deviations is None else deviation_colours(deviations, limit)
-    written: dict[str, Any] = {"run": folder.name, "format": kind, "file": str(out), "points": len(cloud.points)}
+    written: dict[str, object] = {"run": folder.name, "format": kind, "file": str(out), "points": len(cloud.points)}
     if kind == "e57":
         written["points"] = write_e57(out, cloud, colours)
     elif kind == "ply":
@@ -66,7 +66,7 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
     return written
 
 
-def _comment(deviations: NDArray[np.float64] | None, report: dict[str, Any]) -> str:
+def _comment(deviations: NDArray[np.float64] | None, report: dict[str, object]) -> str:
     lines = ["frame: arm base", simulated_words(report.get("simulated"))]
     lines += [] if deviations is None else ["quality: distance from the nominal surface in metres"]
     return "\n".join(line for line in lines if line)

@@ -5,20 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from drivers.errors import MeasuredRow
 
-def shown_value(row: Mapping[str, Any]) -> str:
+
+def shown_value(row: MeasuredRow) -> str:
     """The value with its unit: three digits that say something."""
     return f"{_digits(row['value'])} {row['unit']}".strip()
 
 
-def shown_limit(row: Mapping[str, Any]) -> str:
+def shown_limit(row: MeasuredRow) -> str:
     """What the value is held against, or nothing."""
     if row["limit"] is None:
         return ""
     return f"{row['bound']} {_digits(row['limit'])} {row['unit']}".strip()
 
 
-def told(row: Mapping[str, Any]) -> str:
+def told(row: MeasuredRow) -> str:
     """Value and limit in one."""
     return ", ".join(part for part in (shown_value(row), shown_limit(row)) if part)
 

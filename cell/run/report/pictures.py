@@ -99,7 +99,7 @@ def draw_board(axes: Axes, board: BoardPanel) -> None:
 
 
 def draw_surface(
-    figure: Figure, axes: Axes, surface: SurfacePanel, span_mm: float, seams: Sequence[Mapping[str, Any]]
+    figure: Figure, axes: Axes, surface: SurfacePanel, span_mm: float, seams: Sequence[Mapping[str, object]]
 ) -> None:
     """A map of the scanned points from above, means over squares: their deviation from the drawn surface within
     ±`span_mm`, or their height where no place of the surface was found."""

@@ -137,7 +137,7 @@ class FinishedJob:
         report["place_bound_95"] = stated_bound(self.job, self.nominal, pose, self.repeatability, covariance)
 
 
-def _write(folder: Path, report: dict[str, Any]) -> None:
+def _write(folder: Path, report: dict[str, object]) -> None:
     """The report as a file; a disk that takes none of it does not hide how the run ended."""
     try:
         write_json(folder / REPORT, report)
@@ -146,7 +146,7 @@ def _write(folder: Path, report: dict[str, Any]) -> None:
         log.error("the report could not be written: %s", error)
 
 
-def strict(data: Any) -> Any:
+def strict(data: object) -> Any:
     """The same data as strict JSON has it: a number that is none becomes None, what JSON does not know becomes text."""
     if isinstance(data, dict):
         return {str(key): strict(value) for key, value in data.items()}
@@ -161,7 +161,7 @@ def strict(data: Any) -> Any:
     return data if data is None or isinstance(data, str | int | float) else str(data)
 
 
-def _steps(result: RunResult) -> list[dict[str, Any]]:
+def _steps(result: RunResult) -> list[dict[str, object]]:
     rows = []
     for step in result.steps:
         made = result.results.get(step.name)
@@ -178,12 +178,12 @@ def _steps(result: RunResult) -> list[dict[str, Any]]:
     return rows
 
 
-def _faults(result: RunResult) -> list[dict[str, Any]]:
+def _faults(result: RunResult) -> list[dict[str, object]]:
     names = ("step", "attempt", "code", "reason", "remedy")
     return [{"at": when(fault.at), **{name: getattr(fault, name) for name in names}} for fault in result.faults]
 
 
-def _pose(pose: PlacePose, job: Job) -> dict[str, Any]:
+def _pose(pose: PlacePose, job: Job) -> dict[str, object]:
     base_from_part = pose.base_from_surface * job.place.surface_from_part.se3()
     values = to_ur(base_from_part)
     return {
@@ -193,7 +193,7 @@ def _pose(pose: PlacePose, job: Job) -> dict[str, Any]:
     }
 
 
-def _sigma(pose: PlacePose) -> dict[str, Any]:
+def _sigma(pose: PlacePose) -> dict[str, object]:
     sigma = np.sqrt(np.diag(pose.covariance))
     return {
         "frame": "arm base, about the surface's origin",
@@ -202,7 +202,7 @@ def _sigma(pose: PlacePose) -> dict[str, Any]:
     }
 
 
-def _configured_noise(config: CellConfig) -> dict[str, Any]:
+def _configured_noise(config: CellConfig) -> dict[str, object]:
     arm = config.arm
     return {
         "arm_repeatability": {

@@ -25,7 +25,7 @@ class TruthRecorder:
     def __init__(self, ask: Callable[[], dict[str, Any]]) -> None:
         """`ask()` gives the whole truth; see `sim_backends.world.world`."""
         self.ask = ask
-        self.at_sweep: dict[str, Any] | None = None
+        self.at_sweep: dict[str, object] | None = None
 
     def __call__(self, event: Event) -> None:
         """Take an event of the runner."""
@@ -38,7 +38,7 @@ def pose_of(truth: dict[str, Any], name: str) -> pin.SE3:
     return from_matrix(truth["poses"][name])
 
 
-def pose_error(pose: PlacePose, truth: dict[str, Any]) -> dict[str, Any]:
+def pose_error(pose: PlacePose, truth: dict[str, object]) -> dict[str, object]:
     """How far the inverted pose of the surface is from the true one at the sweep, arm base axes; also when refused."""
     error = difference(pose.base_from_surface, pose_of(truth, "base_from_surface"))
     return {
@@ -47,7 +47,7 @@ def pose_error(pose: PlacePose, truth: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def sensor_error(cloud: Cloud, nominal: NominalSurface, truth: dict[str, Any]) -> dict[str, float] | None:
+def sensor_error(cloud: Cloud, nominal: NominalSurface, truth: dict[str, object]) -> dict[str, float] | None:
     """Distance of 1000 cloud points from the true surface, the arm's and the hand-eye's error included; mm."""
     lines, rows = cloud.valid.nonzero()
     points = transform(pose_of(truth, "base_from_surface").inverse(), cloud.points[lines, rows])
@@ -59,7 +59,7 @@ def sensor_error(cloud: Cloud, nominal: NominalSurface, truth: dict[str, Any]) -
     return {"mean": float(distance.mean()), "p85": float(np.percentile(distance, 85))}
 
 
-def place_error(job: Job, nominal: NominalSurface, truth: dict[str, Any]) -> dict[str, Any]:
+def place_error(job: Job, nominal: NominalSurface, truth: dict[str, object]) -> dict[str, object]:
     """How far the part's 45 points ended from where they belong on the true surface, in the surface's axes, mm."""
     points = part_points(nominal)
     ended = transform(pose_of(truth, "surface_from_part"), points)

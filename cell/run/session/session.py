@@ -6,12 +6,12 @@ Opening a cell: its devices, real or simulated, over wires or on the virtual clo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from cell.config.cell_config import (
     DEVICES,
@@ -75,21 +75,21 @@ class Opened:
         )  # fmt: skip
 
     @property
-    def world(self) -> dict[str, Any]:
+    def world(self) -> dict[str, object]:
         """Whether this cell is simulated, and which world; and the interlocks that do not hold, if any."""
-        facts: dict[str, Any] = {"simulated": False, "seed": None, "level": None, "clock": "wall"}
+        facts: dict[str, object] = {"simulated": False, "seed": None, "level": None, "clock": "wall"}
         if self.simulated is not None:
             facts = self.simulated.facts
         lifted = sorted(self.devices.interlocks.names_lifted)
         return {**facts, "interlocks_lifted": lifted} if lifted else facts
 
     @property
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> dict[str, object]:
         """The cell's name and its world, for the record of work outside a job."""
         return {"cell": self.config.cell.name, **self.world}
 
     @property
-    def truth(self) -> Callable[[], dict[str, Any]] | None:
+    def truth(self) -> Callable[[], dict[str, object]] | None:
         """How the report asks a simulated world for its truth; None where there is none."""
         # Beside a real scan camera the simulated world has nothing to do with where the part comes to lie.
         if self.simulated is not None and "scan_camera" in self.simulated.simulated:
@@ -100,7 +100,7 @@ class Opened:
         return partial(ask_truth, self.config.cell.truth) if self.config.cell.truth else None
 
     def recorded(
-        self, run: Run[Any], kind: str, work: Callable[[Hands], Made], info: dict[str, Any] | None = None
+        self, run: Run[object], kind: str, work: Callable[[Hands], Made], info: Mapping[str, object] | None = None
     ) -> Made:
         """Do work outside a job in a run that was begun, and record it; raises what `RecordedWork.perform` does."""
         health = require_no_emergency_stop if kind in ("jog", "recovery") else require_healthy

@@ -12,7 +12,7 @@ with Cell.open("cell.toml", sim="all", seed=7) as cell:
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
@@ -184,7 +184,7 @@ class Cell:
         return self._here.mover(job, hold)
 
     @property
-    def current(self) -> Run[Any] | None:
+    def current(self) -> Run[object] | None:
         """The run that is going on, or None."""
         return self._runs.current
 
@@ -280,7 +280,7 @@ class Cell:
         kind: str,
         work: Callable[[Hands], Made],
         observer: Observer | None = None,
-        info: dict[str, Any] | None = None,
+        info: Mapping[str, object] | None = None,
         stops: int | None = None,
     ) -> Made:
         """Do work outside a job, such as a jog, as a recorded run, and wait for its end. `stops` as in `begin`."""
@@ -324,7 +324,7 @@ class Cell:
         `script` looks at results between the steps and decides about refusals.
         """
         loaded, _ = load_job(job)
-        info: dict[str, Any] = {}
+        info: dict[str, object] = {}
         inline: tuple[Observer, ...] = ()
         if inject:
             injector = Injector.scheduled(inject, find_kind(loaded.job.kind).names, self.simulated)

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any
+from typing import TYPE_CHECKING
 
 from drivers.arm.child.program import KICK_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
 from drivers.arm.child.streaming import Streaming
@@ -29,6 +29,9 @@ from drivers.arm.feed import (
 from drivers.arm.motion import JointTrajectory, pose_difference
 from drivers.clock import Clock
 
+if TYPE_CHECKING:
+    from rtde_control import RTDEControlInterface
+
 _PLACE_TOLERANCE, _TURN_TOLERANCE = 1e-3, 2e-3
 
 
@@ -38,7 +41,7 @@ class ControlThread:
     def __init__(
         self,
         setup: ChildSetup,
-        control: Any,
+        control: RTDEControlInterface,
         latest: Callable[[], Snapshot],
         send: Callable[[ChildReply | Ended], None],
         lose: Callable[[str], None],

@@ -27,7 +27,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from types import FrameType
-from typing import Any
 
 from rtde_control import RTDEControlInterface
 from rtde_io import RTDEIOInterface
@@ -116,7 +115,7 @@ class Child:
         self._control = ControlThread(setup, control, lambda: self._snapshot, self._send, self._lose)
         threading.Thread(target=self._watch_arm, name="arm state", daemon=True).start()
 
-    def _take_control(self) -> Any:
+    def _take_control(self) -> RTDEControlInterface | None:
         """The control interface, or None while the arm is not ready for one: its state is still served.
 
         An arm that another client holds refuses here, before anything on it has been changed.
@@ -277,7 +276,7 @@ class Child:
         self._outbox.put(message)
 
 
-def _prepare(control: Any, setup: ChildSetup) -> None:
+def _prepare(control: RTDEControlInterface, setup: ChildSetup) -> None:
     mass, centre = setup.payload
     steps: list[tuple[str, Callable[[], bool]]] = [
         ("the zero tool centre point", lambda: control.setTcp([0.0] * 6)),

@@ -8,7 +8,6 @@ import os
 import signal
 import socket
 import time
-from typing import Any
 
 from rtde_io import RTDEIOInterface
 from rtde_receive import RTDEReceiveInterface
@@ -76,7 +75,7 @@ def _terminal(index: int) -> tuple[str, int]:
     return kind, index % 8
 
 
-def switch_output(io: Any, index: int, value: bool) -> bool:
+def switch_output(io: RTDEIOInterface, index: int, value: bool) -> bool:
     """Set digital output `index`."""
     kind, number = _terminal(index)
     return bool(getattr(io, f"set{kind.capitalize()}DigitalOut")(number, value))

@@ -7,7 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING
 
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.faults import LATE_S, late_words
@@ -15,6 +15,9 @@ from drivers.arm.feed import MODE_RUNNING, PLAYING, STOPPED, ChildSetup, Six, Sn
 from drivers.arm.motion import largest_difference
 from drivers.clock import Clock
 from drivers.errors import DeviceError
+
+if TYPE_CHECKING:
+    from rtde_control import RTDEControlInterface
 
 PERIOD = 0.002
 """The arm's cycle, in s on the wall."""
@@ -40,7 +43,7 @@ class ControlProgram:
     `to_stop` is set as long as whatever moves is to come to rest.
     """
 
-    def __init__(self, setup: ChildSetup, interface: Any, latest: Callable[[], Snapshot]) -> None:
+    def __init__(self, setup: ChildSetup, interface: RTDEControlInterface, latest: Callable[[], Snapshot]) -> None:
         self.to_stop = threading.Event()
         self._setup = setup
         self._control = interface

@@ -10,12 +10,15 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING
 
 from drivers.arm.child.program import BRAKING_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
 from drivers.arm.feed import ChildSetup, Six, Snapshot, StreamTiming
 from drivers.arm.motion import JointTrajectory
 from drivers.clock import Clock
+
+if TYPE_CHECKING:
+    from rtde_control import RTDEControlInterface
 
 _LOOKAHEAD, _GAIN = 0.05, 500
 _SERVO_BRAKING = 10.0
@@ -48,8 +51,9 @@ class Streaming:
     """Streams through ur-rtde's control `interface`, beside which `program` watches and stops the arm."""
 
     def __init__(
-        self, setup: ChildSetup, interface: Any, program: ControlProgram, latest: Callable[[], Snapshot]
-    ) -> None:
+        self, setup: ChildSetup, interface: RTDEControlInterface, program: ControlProgram,
+        latest: Callable[[], Snapshot],
+    ) -> None:  # fmt: skip
         self._setup = setup
         self._control = interface
         self._program = program

@@ -15,13 +15,12 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.camera.genicam.aravis import Aravis, AravisError, BufferStatus
+from drivers.camera.genicam.aravis import Aravis, AravisError, BufferStatus, Handle
 from drivers.camera.genicam.device import GenicamDevice
 from drivers.errors import CellError
 from drivers.interfaces import Image, LinkStatistics
@@ -266,7 +265,7 @@ class Acquisition:
         ):
             self._library.set_property(self._stream, name, kind, value)
 
-    def _push(self, buffer: Any) -> None:
+    def _push(self, buffer: Handle) -> None:
         self._library.plain("arv_stream_push_buffer", self._stream, buffer)
 
     def _empty(self) -> None:
@@ -286,7 +285,7 @@ class Acquisition:
                 if buffer is not None:
                     self._push(buffer)
 
-    def _look_at(self, buffer: Any) -> None:
+    def _look_at(self, buffer: Handle) -> None:
         library = self._library
         status = BufferStatus(library.plain("arv_buffer_get_status", buffer))
         if status is not BufferStatus.SUCCESS:
@@ -310,7 +309,7 @@ class Acquisition:
             )
         )
 
-    def _image(self, buffer: Any) -> Image:
+    def _image(self, buffer: Handle) -> Image:
         library = self._library
         x, y, width, height = (ctypes.c_int() for _ in range(4))
         library.plain("arv_buffer_get_image_region", buffer, *map(ctypes.byref, (x, y, width, height)))

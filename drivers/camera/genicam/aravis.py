@@ -22,6 +22,8 @@ CONTROL_PRIVILEGE = 0x0A00
 PRIMARY_APPLICATION_ADDRESS = 0x0A14
 """Bootstrap register: IPv4 address of the application that controls the camera; GigE Vision 1.1 and later."""
 
+Handle = int
+"""Address of an object of the library."""
 _POINTER, _TEXT, _NOTHING = c_void_p, c_char_p, None
 _OUT_INT = ctypes.POINTER(c_int)
 _OUT_INT64 = ctypes.POINTER(c_int64)
@@ -29,7 +31,7 @@ _OUT_DOUBLE = ctypes.POINTER(c_double)
 _OUT_UINT64 = ctypes.POINTER(c_uint64)
 _OUT_SIZE = ctypes.POINTER(c_size_t)
 
-_MAY_FAIL: dict[str, tuple[Any, ...]] = {
+_MAY_FAIL: dict[str, tuple[object, ...]] = {
     "arv_gv_device_new": (_POINTER, _POINTER, _POINTER),
     "arv_gv_device_leave_control": (c_int, _POINTER),
     "arv_gv_device_get_timestamp_tick_frequency": (c_uint64, _POINTER),
@@ -79,7 +81,7 @@ _MAY_FAIL: dict[str, tuple[Any, ...]] = {
 }
 """Functions whose last argument is the error: result, then arguments without it."""
 
-_CANNOT_FAIL: dict[str, tuple[Any, ...]] = {
+_CANNOT_FAIL: dict[str, tuple[object, ...]] = {
     "arv_camera_gv_set_packet_size_adjustment": (_NOTHING, _POINTER, c_int),
     "arv_camera_gv_set_stream_options": (_NOTHING, _POINTER, c_int),
     "arv_gv_device_is_controller": (c_int, _POINTER),
@@ -159,8 +161,8 @@ class Aravis:
     """The loaded library: `call` and `plain` by the C function's name, with the arguments in its order."""
 
     def __init__(self, library: ctypes.CDLL) -> None:
-        self._may_fail: dict[str, Callable[..., Any]] = {}
-        self._cannot_fail: dict[str, Callable[..., Any]] = {}
+        self._may_fail: dict[str, Callable[..., object]] = {}
+        self._cannot_fail: dict[str, Callable[..., object]] = {}
         for name, (result, *arguments) in _MAY_FAIL.items():
             function = getattr(library, name)
             function.restype = result
@@ -172,7 +174,7 @@ class Aravis:
             function.argtypes = arguments
             self._cannot_fail[name] = function
 
-    def call(self, name: str, *arguments: Any) -> Any:
+    def call(self, name: str, *arguments: object) -> Any:
         """Call a function that may fail; raises `AravisError`."""
         error = ctypes.POINTER(_GError)()
         result = self._may_fail[name](*arguments, ctypes.byref(error))
@@ -183,11 +185,11 @@ class Aravis:
             raise AravisError(name, code, text or f"error {code}")
         return result
 
-    def plain(self, name: str, *arguments: Any) -> Any:
+    def plain(self, name: str, *arguments: object) -> Any:
         """Call a function that does not report errors."""
         return self._cannot_fail[name](*arguments)
 
-    def set_property(self, thing: Any, name: str, kind: str, value: float) -> None:
+    def set_property(self, thing: Handle, name: str, kind: str, value: float) -> None:
         """Set a property of an object; `kind` is "int", "uint", "double" or the name of an enumeration of Aravis."""
         number = _BASIC[kind] if kind in _BASIC else self.plain(f"arv_{kind}_get_type")
         packed = GValue()
@@ -195,7 +197,7 @@ class Aravis:
         self.plain(f"g_value_set_{kind if kind in _BASIC else 'enum'}", ctypes.byref(packed), value)
         self.plain("g_object_set_property", thing, name.encode(), ctypes.byref(packed))
 
-    def open_gige(self, host: str) -> Any:
+    def open_gige(self, host: str) -> Handle:
         """The device at the IPv4 address `host`; only that address is spoken to."""
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as route:
             # Connecting a datagram socket sends nothing; it tells which of this computer's addresses leads there.
@@ -203,7 +205,8 @@ class Aravis:
             own, _ = route.getsockname()
         ends = [self.plain("g_inet_address_new_from_string", end.encode()) for end in (own, host)]
         try:
-            return self.call("arv_gv_device_new", *ends)
+            device: Handle = self.call("arv_gv_device_new", *ends)
+            return device
         finally:
             for end in ends:
                 self.plain("g_object_unref", end)

@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any, Protocol
 
-from drivers.camera.genicam.aravis import CONTROL_PRIVILEGE, PRIMARY_APPLICATION_ADDRESS, Aravis, AravisError
+from drivers.camera.genicam.aravis import CONTROL_PRIVILEGE, PRIMARY_APPLICATION_ADDRESS, Aravis, AravisError, Handle
 from drivers.clock import Clock, ClockMap, Latch
 from drivers.errors import DeviceFault, NotConnectedError
 from drivers.interfaces import Frame, Identity
@@ -37,7 +37,7 @@ class Place(Protocol):
     control: bool
     absent: str
 
-    def open(self, library: Aravis) -> Any:
+    def open(self, library: Aravis) -> Handle:
         """The library's device."""
 
 
@@ -53,7 +53,7 @@ class GigePlace:
             "camera tells its address nowhere but in its maker's tool, nothing is searched for here"
         )
 
-    def open(self, library: Aravis) -> Any:
+    def open(self, library: Aravis) -> Handle:
         """Speaks to this address alone."""
         return library.open_gige(str(ipaddress.IPv4Address(self.text)))
 
@@ -71,9 +71,10 @@ class UsbPlace:
             "that no other program has it open"
         )
 
-    def open(self, library: Aravis) -> Any:
+    def open(self, library: Aravis) -> Handle:
         """Asks the computer's own USB devices."""
-        return library.call("arv_uv_device_new_from_guid", self.guid.encode())
+        device: Handle = library.call("arv_uv_device_new_from_guid", self.guid.encode())
+        return device
 
 
 class GenicamDevice:
@@ -89,8 +90,8 @@ class GenicamDevice:
         self.library = library
         self._lock = threading.RLock()
         self._abandoned = False
-        self._device: Any = None
-        self.camera: Any = None
+        self._device: Handle | None = None
+        self.camera: Handle | None = None
         self._holds = not look and place.control
         try:
             self._device = place.open(library)
@@ -143,7 +144,7 @@ class GenicamDevice:
             return True
         return bool(self.library.plain("arv_gv_device_is_controller", self._device))
 
-    def call(self, function: str, *arguments: Any) -> Any:
+    def call(self, function: str, *arguments: object) -> Any:
         """Ask the library's camera; `DeviceFault` camera.lost when it is silent, camera.refused when it says no."""
         with self._lock:
             if self.camera is None:
@@ -151,7 +152,7 @@ class GenicamDevice:
             with self._words(function, arguments):
                 return self.library.call(f"arv_camera_{function}", self.camera, *arguments)
 
-    def plain(self, function: str, *arguments: Any) -> None:
+    def plain(self, function: str, *arguments: object) -> None:
         """Set something in the library that the camera is not asked about."""
         with self._lock:
             self.library.plain(f"arv_camera_{function}", self.camera, *arguments)
@@ -228,7 +229,7 @@ class GenicamDevice:
         return ""
 
     @contextmanager
-    def _words(self, function: str, arguments: tuple[Any, ...]) -> Iterator[None]:
+    def _words(self, function: str, arguments: tuple[object, ...]) -> Iterator[None]:
         try:
             yield
         except AravisError as error:

@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
@@ -219,7 +218,7 @@ class ModbusLink:
         self._in_step = True
         self._quiet_since = 0.0
         self._last_words: LastWords | None = None
-        self._port: Any = open_port(name, url, baud=baud, timeout=self._timeout_s, parity=parity, stop_bits=stop_bits)
+        self._port = open_port(name, url, baud=baud, timeout=self._timeout_s, parity=parity, stop_bits=stop_bits)
 
     @property
     def stops(self) -> int:

@@ -11,7 +11,7 @@ import struct
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import TypeVar
 
 import can
 import canopen
@@ -34,6 +34,8 @@ from drivers.vehicle.cia402.drive import (
     SYNC,
     Entry,
 )
+
+Answer = TypeVar("Answer")
 
 SETUP = "vehicle.setup"
 TOLD_ONCE = ("vehicle.command_lost", "vehicle.disturbed", "vehicle.two_vehicles", "vehicle.units")
@@ -128,7 +130,7 @@ class CanopenBus:
         channel: str,
         *,
         bitrate: int,
-        options: Mapping[str, Any],
+        options: Mapping[str, object],
         own: int,
         nodes: tuple[int, int],
         take: Callable[[int, int, bytes], None],
@@ -237,7 +239,7 @@ class CanopenBus:
         request = struct.pack("<BHB2s2x", _SET_TWO_BYTES, entry.index, entry.sub, entry.pack(value))
         self.send(SDO_REQUEST + node, request)
 
-    def _ask(self, node: int, what: str, ask: Callable[[Any], Any]) -> Any:
+    def _ask(self, node: int, what: str, ask: Callable[[SdoClient], Answer]) -> Answer:
         for tries in range(_TRIES):
             try:
                 with self._asking:

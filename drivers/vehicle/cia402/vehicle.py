@@ -10,7 +10,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import can
 
@@ -88,7 +87,7 @@ class CanopenVehicle:
         clock: Clock,
         bitrate: int = 500_000,
         look: bool = False,
-        bus_options: Mapping[str, Any] | None = None,
+        bus_options: Mapping[str, object] | None = None,
     ) -> None:
         self.name = name
         self.statistics = LinkStatistics()

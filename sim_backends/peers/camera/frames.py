@@ -22,7 +22,6 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,13 +40,13 @@ class Rejected(Exception):
     """A request cannot be carried out; the text goes to the client."""
 
 
-def message(header: dict[str, Any], payload: bytes = b"") -> bytes:
+def message(header: dict[str, object], payload: bytes = b"") -> bytes:
     """The bytes of one message."""
     text = json.dumps(header).encode("utf-8")
     return _PREFIX.pack(MAGIC, len(text), len(payload)) + text + payload
 
 
-def receive(connection: socket.socket) -> dict[str, Any] | None:
+def receive(connection: socket.socket) -> dict[str, object] | None:
     """The next request's header; None at the end of the connection.
 
     A header that is no JSON object comes back as a request that nobody knows. Raises Rejected when the stream is not
@@ -72,7 +71,7 @@ def receive(connection: socket.socket) -> dict[str, Any] | None:
     return request if isinstance(request, dict) else {"op": "a header that is not a JSON object"}
 
 
-def number(request: dict[str, Any], key: str, default: float, low: float, high: float, unit: str) -> float:
+def number(request: dict[str, object], key: str, default: float, low: float, high: float, unit: str) -> float:
     """The value of `key`, or `default` when it is not given; Rejected unless a number from `low` to `high`."""
     value = request.get(key, default)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
@@ -273,7 +272,7 @@ class FramePeer:
             self._turn_away(connection)
             return
 
-        def send(header: dict[str, Any]) -> None:
+        def send(header: dict[str, object]) -> None:
             if not self.camera.silent:
                 with session.sending:
                     connection.sendall(message(header))
@@ -304,7 +303,7 @@ class FramePeer:
 
     def _turn_away(self, connection: socket.socket) -> None:
         connection.settimeout(2.0)
-        request: dict[str, Any] = {}
+        request: dict[str, object] = {}
         with contextlib.suppress(OSError, Rejected):
             request = receive(connection) or {}
         error = f"camera {self.camera.spec.serial} is in use by another client: close that one first"
@@ -325,8 +324,8 @@ class FramePeer:
 
     # --- requests ---
 
-    def _answer(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
-        operations: dict[str, Callable[[FrameSession, dict[str, Any]], dict[str, Any]]] = {
+    def _answer(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
+        operations: dict[str, Callable[[FrameSession, dict[str, object]], dict[str, object]]] = {
             "identify": self._identify,
             "configure": self._configure,
             "start": self._start,
@@ -342,7 +341,7 @@ class FramePeer:
         except Rejected as error:
             return {"ok": False, "error": str(error)}
 
-    def _identify(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _identify(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         spec = self.camera.spec
         return {
             "model": spec.model,
@@ -357,7 +356,7 @@ class FramePeer:
             **self._latch(session, request),
         }
 
-    def _configure(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _configure(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         if session.running:
             raise Rejected("configure while free-running: stop first")
         camera = self.camera
@@ -366,7 +365,7 @@ class FramePeer:
         self._set(exposure, self._rate(request, "frame_rate_hz"))
         return {"exposure_s": camera.exposure, "frame_rate_hz": camera.frame_rate}
 
-    def _start(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _start(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         if session.running:
             raise Rejected("the camera is free-running already: stop first")
         camera = self.camera
@@ -375,21 +374,21 @@ class FramePeer:
         session.run(camera.frame_rate)
         return {"exposure_s": camera.exposure, "frame_rate_hz": camera.frame_rate, "next_frame_id": first}
 
-    def _stop(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _stop(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         session.halt()
         return {}
 
-    def _trigger(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _trigger(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         if session.running:
             raise Rejected("trigger while free-running: stop first")
         first = self.camera.next_frame_id
         session.trigger()
         return {"next_frame_id": first}
 
-    def _latch(self, session: FrameSession, request: dict[str, Any]) -> dict[str, Any]:
+    def _latch(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         return {"device_ns": self.camera.spec.device_ns(self._clock.now())}
 
-    def _rate(self, request: dict[str, Any], key: str) -> float:
+    def _rate(self, request: dict[str, object], key: str) -> float:
         return number(request, key, self.camera.frame_rate, _SLOWEST, high=self.camera.spec.frame_rate_max, unit="Hz")
 
     def _set(self, exposure: float, frame_rate: float) -> None:

@@ -104,7 +104,7 @@ def _values(part: str, found: Result | None) -> str:
     return f"normal {', '.join(f'{v:.4f}' for v in found['normal'])}, distance {found['distance_mm']:.2f}{place} mm"
 
 
-def _say_poses(say: Any, result: Result) -> None:
+def _say_poses(say: Callable[[str], None], result: Result) -> None:
     poses = result["poses"]
     if poses is not None and poses.get("reading") is not None:
         chosen = "as given" if "poses" in poses["given"] else "chosen by the pictures"
@@ -120,9 +120,9 @@ def _say_poses(say: Any, result: Result) -> None:
         say(f"not understood: {file['name']}: {file['reason']}")
 
 
-def _plain(found: Result) -> list[tuple[str, Any]]:
+def _plain(found: Result) -> list[tuple[str, object]]:
     """Numbers and lists of numbers of a part, without what is nested deeper."""
-    rows: list[tuple[str, Any]] = []
+    rows: list[tuple[str, object]] = []
     for key, value in found.items():
         if isinstance(value, Mapping):
             rows += [(f"{key} {name}", v) for name, v in value.items() if isinstance(v, (int, float))]
@@ -131,14 +131,14 @@ def _plain(found: Result) -> list[tuple[str, Any]]:
     return rows
 
 
-def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Table:
+def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> Table:
     table = Table(*columns, title=title)
     for row in rows:
         table.add_row(*map(_shown, row))
     return table
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     if isinstance(value, list):
         return ", ".join(map(_shown, value))
     if isinstance(value, float):

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.host.link import ServerProcess
@@ -151,7 +151,7 @@ class Console:
         """For a job that somebody else than a page begins: a refusal is asked about at the page, if one is open."""
         return self.desk.questions.script(find_kind(load_job(job)[0].job.kind).names, lambda: self.seen)
 
-    def began(self, run: Run[Any], job: str | None) -> None:
+    def began(self, run: Run[object], job: str | None) -> None:
         """A run was begun by somebody else than a page; it is shown as well."""
         self.desk.questions.hold(run)
         self._look.began(run, job)
@@ -201,7 +201,7 @@ class Console:
         for row in self.desk.holders.rows():
             self.desk.left(row["id"])
 
-    def _say(self, client: str, words: dict[str, Any]) -> None:
+    def _say(self, client: str, words: dict[str, object]) -> None:
         self._server.tell(Say(client, words))
 
     def _heard(self, message: object) -> None:
@@ -230,14 +230,14 @@ class Console:
         self.link = f"{base}/enter?token=" + (token or "TOKEN-OF-THE-FILE")
         self._told(self.link)
 
-    def _begin(self, number: int, work: Callable[[], dict[str, Any]]) -> None:
+    def _begin(self, number: int, work: Callable[[], dict[str, object]]) -> None:
         if not self._working.acquire(blocking=False):
             busy = {"ok": False, "error": "busy", "text": "too much is being asked at once; wait a moment"}
             self._server.tell(Answer(number, 429, busy))
             return
         threading.Thread(target=self._answer, args=(number, work), name="console command", daemon=True).start()
 
-    def _answer(self, number: int, work: Callable[[], dict[str, Any]]) -> None:
+    def _answer(self, number: int, work: Callable[[], dict[str, object]]) -> None:
         status, answer = 200, {}
         try:
             answer = work()

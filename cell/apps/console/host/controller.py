@@ -35,7 +35,7 @@ SOON_S = 0.1
 """Wall seconds that a command which begins something waits for a refusal, before it answers "starting"."""
 
 Words = Mapping[str, Any]
-Answer = dict[str, Any]
+Answer = dict[str, object]
 
 log = logging.getLogger(__name__)
 
@@ -47,8 +47,8 @@ class ConsoleController:
         self,
         cell: Cell,
         job: str,
-        say: Callable[[str, dict[str, Any]], None],
-        began: Callable[[Run[Any], str | None], None] = lambda run, job: None,
+        say: Callable[[str, dict[str, object]], None],
+        began: Callable[[Run[object], str | None], None] = lambda run, job: None,
     ) -> None:
         self.cell = cell
         self.job = job
@@ -128,14 +128,14 @@ class ConsoleController:
         """A page says that the button is up."""
         self.presses.end(client, "the button was let go of")
 
-    def jogging(self) -> dict[str, Any] | None:
+    def jogging(self) -> dict[str, object] | None:
         """What is moved by holding now."""
         press = self.presses.present
         if press is None or press.ended is not None or press.beat is None:
             return None
         return {"device": press.device, "axis": press.axis, "sign": press.sign}
 
-    def told(self, last: dict[str, Any] | None) -> dict[str, Any] | None:
+    def told(self, last: dict[str, object] | None) -> dict[str, object] | None:
         """How the last run ended; a verification with what it found."""
         if last is None or self._found is None or last["run"] != self._found[0]:
             return last
@@ -245,7 +245,7 @@ class ConsoleController:
         """Begin it in a thread of its own, and give what refuses it at once."""
         begun = threading.Event()
         failed: list[CellError] = []
-        runs: list[Run[Any]] = []
+        runs: list[Run[object]] = []
 
         def perform() -> None:
             try:
@@ -268,7 +268,7 @@ class ConsoleController:
         elif failed:
             raise failed[0]
 
-    def _running(self, what: str, act: Callable[[Run[Any]], None]) -> str:
+    def _running(self, what: str, act: Callable[[Run[object]], None]) -> str:
         if (run := self.cell.current) is None:
             raise InterlockError("cell", f"nothing is going on that could {what}")
         act(run)

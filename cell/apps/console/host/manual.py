@@ -28,7 +28,7 @@ from cell.devices.gate.gate import Gated
 from cell.run.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM, Jog, begin_program, moved
 from cell.run.recorded_work import CONFIRMED_BY_A_PERSON, Hands
 from drivers.errors import Aborted, CellError, ConfigError, DeviceError, DeviceFault, InterlockError, LimitError
-from drivers.interfaces import ATTENDED_S, Attended, Motion
+from drivers.interfaces import ATTENDED_S, Arm, Attended, Motion, Rail
 
 if TYPE_CHECKING:
     from cell.run.session.supervisor import Cell
@@ -356,14 +356,13 @@ class Manual:
             return self._begin_arm(press, device)
         raise InterlockError(press.device, "is moved by steps only")
 
-    def _begin_rail(self, sign: int, rail: Any) -> Motion:
+    def _begin_rail(self, sign: int, rail: Rail) -> Motion:
         if not rail.state().homed:
             raise InterlockError("rail", "is not homed, so its limits are not known; home it first")
         speed = self.speed * rail_hold_speed(self._cell.config.rail)
-        motion: Motion = rail.move_to(rail.travel[1] if sign > 0 else rail.travel[0], speed)
-        return motion
+        return rail.move_to(rail.travel[1] if sign > 0 else rail.travel[0], speed)
 
-    def _begin_arm(self, press: Press, arm: Any) -> Motion:
+    def _begin_arm(self, press: Press, arm: Arm) -> Motion:
         if "vehicle" in self._cell.devices and self._cell.devices.vehicle.state().braked is not True:
             self._cell.devices.vehicle.recover()
         turning = press.axis.startswith("j")
@@ -374,23 +373,20 @@ class Manual:
             if press.over() is not None:
                 break
             try:
-                motion: Motion = self._turn(press, arm, way) if turning else self._line(press, arm, way)
-                return motion
+                return self._turn(press, arm, way) if turning else self._line(press, arm, way)
             except (InterlockError, LimitError, ConfigError) as error:
                 refused = error
         raise refused or InterlockError("arm", str(press.ended))
 
-    def _turn(self, press: Press, arm: Any, way: float) -> Motion:
+    def _turn(self, press: Press, arm: Arm, way: float) -> Motion:
         goal = arm.state().joints.copy()
         goal[int(press.axis[1]) - 1] += press.sign * way
-        motion: Motion = arm.move_joints(goal, self.speed * HOLD_TURN, TURN_ACCELERATION)
-        return motion
+        return arm.move_joints(goal, self.speed * HOLD_TURN, TURN_ACCELERATION)
 
-    def _line(self, press: Press, arm: Any, way: float) -> Motion:
+    def _line(self, press: Press, arm: Arm, way: float) -> Motion:
         goal = arm.state().flange.copy()
         goal["xyz".index(press.axis)] += press.sign * way
-        motion: Motion = arm.move_linear(np.asarray(goal), self.speed * HOLD_SPEED, LINE_ACCELERATION)
-        return motion
+        return arm.move_linear(np.asarray(goal), self.speed * HOLD_SPEED, LINE_ACCELERATION)
 
     def _require_on(self) -> None:
         if not self.on:

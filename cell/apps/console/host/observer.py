@@ -45,12 +45,12 @@ class CellObserver:
         self._virtual = cell.simulated is not None and cell.simulated.facts.get("clock") == "virtual"
         self._readings = Readings(cell.config, cell.devices, simulated)
         self._view: RunView | None = None
-        self._named: tuple[Run[Any], str | None] | None = None
+        self._named: tuple[Run[object], str | None] | None = None
         self._pictures = Pictures()
         self._cloud = GrowingCloud()
         self._now = SceneNow()
-        self._last: dict[str, Any] | None = None
-        self._faults: list[dict[str, Any]] = []
+        self._last: dict[str, object] | None = None
+        self._faults: list[dict[str, object]] = []
         self._count = 0
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._perform, name="console look", daemon=True)
@@ -64,7 +64,7 @@ class CellObserver:
         self._over.set()
         self._thread.join(2.0)
 
-    def began(self, run: Run[Any], job: str | None) -> None:
+    def began(self, run: Run[object], job: str | None) -> None:
         """This run was begun, of this job if it is one."""
         self._named = run, job
 
@@ -91,7 +91,7 @@ class CellObserver:
         if view is not None and self._count % EVERY == 0:
             self._show(view.run)
 
-    def _state(self, view: RunView | None, told: dict[str, Any] | None) -> dict[str, Any]:
+    def _state(self, view: RunView | None, told: dict[str, Any] | None) -> dict[str, object]:
         readings, desk = self._readings, self._desk
         faults = [*self._faults, *(view.faults if view is not None and told is not None else [])]
         return {
@@ -130,7 +130,7 @@ class CellObserver:
         self._faults = [*self._faults, *({**fault, "over": True} for fault in view.faults)][-8:]
         self._view = None
 
-    def _viewed(self, run: Run[Any]) -> RunView:
+    def _viewed(self, run: Run[object]) -> RunView:
         named = self._named
         job = named[1] if named is not None and named[0] is run else None
         if run.kind == "job" and job is None:
@@ -154,7 +154,7 @@ class CellObserver:
                     return {step["name"]: float(step["wall_s"]) for step in report["steps"]}
         return {}
 
-    def _show(self, run: Run[Any]) -> None:
+    def _show(self, run: Run[object]) -> None:
         newest = self._pictures.newest(run)
         if newest is not None:
             self._tell(ShownPicture(*newest))
@@ -168,7 +168,7 @@ class CellObserver:
                 self._tell(CloudPart({**header, "run": folder}, payload))
 
 
-def _figure(view: RunView) -> dict[str, Any] | None:
+def _figure(view: RunView) -> dict[str, object] | None:
     """A placed job's place error in mm: the true one where a simulated world tells it, else the stated bound."""
     if view.ended is None or view.ended["outcome"] != "placed" or view.run.folder is None:
         return None

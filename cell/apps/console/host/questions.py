@@ -20,7 +20,7 @@ class Questions:
     """The question of the run that goes on, if it has one; `script` is what a job is begun with, so that it asks."""
 
     def __init__(self) -> None:
-        self._run: Run[Any] | None = None
+        self._run: Run[object] | None = None
         self._lock = threading.Lock()
         self._numbers = 0
         self._refusal: dict[str, Any] | None = None
@@ -35,21 +35,21 @@ class Questions:
         self._run = None
         return Script(on_refusal=lambda name, failure: self._ask(name, failure, steps) if seen() else None)
 
-    def hold(self, run: Run[Any]) -> None:
+    def hold(self, run: Run[object]) -> None:
         """This is the run that asks."""
         self._run = run
 
-    def present(self, view: RunView | None) -> dict[str, Any] | None:
+    def present(self, view: RunView | None) -> dict[str, object] | None:
         """The question as the page shows it, or None."""
         if (refusal := self._refusal) is not None:
             return refusal
         if view is None or view.asked is None:
             return None
         run = view.run
-        choices: list[dict[str, Any]] = [{"choice": CONFIRM}, {"choice": ABORT}]
+        choices: list[dict[str, object]] = [{"choice": CONFIRM}, {"choice": ABORT}]
         return {"kind": "confirm", **view.asked, "numbers": [], "picture": _picture(run), "choices": choices}
 
-    def decide(self, run: Run[Any], number: int, choice: str, step: str | None, by: str, reason: str) -> str:
+    def decide(self, run: Run[object], number: int, choice: str, step: str | None, by: str, reason: str) -> str:
         """A person's answer; `ConfigError` when it fits no question, or names nobody and no reason."""
         by, reason = " ".join(by.split()), " ".join(reason.split())
         if not by or not reason:
@@ -68,7 +68,7 @@ class Questions:
             self._answered.set()
         return f"again from {step}" if choice == AGAIN else "the run ends"
 
-    def _confirm(self, run: Run[Any], number: int, choice: str, said: str) -> str:
+    def _confirm(self, run: Run[object], number: int, choice: str, said: str) -> str:
         if choice == ABORT:
             run.abort(said)
             return "the run ends"
@@ -112,13 +112,13 @@ def _measured(error: BaseException | None) -> tuple[Measured, ...]:
     return error.numbers if isinstance(error, RefusedError) else ()
 
 
-def _numbers(error: BaseException | None) -> list[dict[str, Any]]:
+def _numbers(error: BaseException | None) -> list[dict[str, object]]:
     rows = [number.as_dict() for number in _measured(error)]
     return [{"name": row["name"], "value": row["value"], "limit": row["limit"], "unit": row["unit"], "ok": row["kept"]}
             for row in rows]  # fmt: skip
 
 
-def _picture(run: Run[Any] | None) -> str | None:
+def _picture(run: Run[object] | None) -> str | None:
     """Where the page finds what was looked at last."""
     if run is None or run.folder is None or run.frames is None or not run.frames.recent:
         return None

@@ -16,7 +16,7 @@ import tempfile
 import threading
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cell.config.files import CONFIGURATION
 from drivers.errors import CellError, InterlockError
@@ -38,7 +38,7 @@ class Rehearsals:
         self._lock = threading.Lock()
         self._process: subprocess.Popen[str] | None = None
         self._cancelled = False
-        self.present: dict[str, Any] | None = None
+        self.present: dict[str, object] | None = None
 
     def begin(self, job: str, seed: int) -> str:
         """Begin one; `InterlockError` while another one is computed."""
@@ -77,7 +77,7 @@ class Rehearsals:
             log.warning("dry run of %s: %s: %s", job, outcome, error)
             self.present = {**about, "outcome": outcome, "reason": "" if self._cancelled else str(error)}
 
-    def _computed(self, job: str, seed: int) -> dict[str, Any]:
+    def _computed(self, job: str, seed: int) -> dict[str, object]:
         cell = self._cell
         config = cell.folder / CONFIGURATION
         level = "nominal" if cell.simulated is None else str(cell.simulated.facts["level"])
@@ -113,18 +113,18 @@ class Rehearsals:
             raise CellError(str(told["error"]))
         return told
 
-    def _heard(self, process: subprocess.Popen[str]) -> dict[str, Any] | None:
+    def _heard(self, process: subprocess.Popen[str]) -> dict[str, object] | None:
         """Show its progress until its last word, which is given; None when it ends without one."""
         for line in process.stdout or ():
             with suppress(ValueError, TypeError):
-                told: dict[str, Any] = json.loads(line)
+                told: dict[str, object] = json.loads(line)
                 if "fraction" not in told:
                     return told
                 self.present = {**(self.present or {}), **told}
         return None
 
 
-def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, Any]:
+def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, object]:
     """The dry run itself, in this process: name, outcome and reason of the run."""
 
     def tell(fraction: float, text: str) -> None:

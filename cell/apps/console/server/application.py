@@ -46,7 +46,7 @@ REPORT_POLICY = (
     "sandbox allow-scripts; default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 )
 
-Ask = Callable[[str, Mapping[str, Any]], Awaitable[tuple[int, Mapping[str, Any]]]]
+Ask = Callable[[str, Mapping[str, object]], Awaitable[tuple[int, Mapping[str, object]]]]
 """What a page, by its id, wants done: status and answer."""
 
 
@@ -132,10 +132,10 @@ class Application:
         access: Access,
         pages: Pages,
         archive: Archive,
-        cell: Mapping[str, Any],
+        cell: Mapping[str, object],
         do: Ask,
         stop: Callable[[], Awaitable[str | None]],
-        of_job: Callable[[str], Awaitable[tuple[int, Mapping[str, Any]]]],
+        of_job: Callable[[str], Awaitable[tuple[int, Mapping[str, object]]]],
     ) -> None:
         self._access = access
         self._pages = pages
@@ -194,7 +194,7 @@ class Application:
     async def _trend(self, request: Request) -> Response:
         return await self._from_archive(Archive.trend)
 
-    async def _from_archive(self, what: Callable[[Archive], Any]) -> Response:
+    async def _from_archive(self, what: Callable[[Archive], object]) -> Response:
         return _json(await run_in_threadpool(what, self._archive))
 
     async def _run(self, request: Request) -> Response:
@@ -261,7 +261,7 @@ def _asked(scope: Scope, name: str) -> str:
     return str(parse_qs(scope["query_string"].decode("latin-1")).get(name, [""])[0])
 
 
-def _json(words: Any, status: int = 200) -> Response:
+def _json(words: object, status: int = 200) -> Response:
     return JSONResponse(words, status, {"cache-control": "no-store"})
 
 
@@ -269,7 +269,7 @@ def _no(kind: str, text: str, status: int) -> Response:
     return _json({"ok": False, "error": kind, "text": text}, status)
 
 
-def _found(words: Any) -> Response:
+def _found(words: object) -> Response:
     return _no("missing", "there is no such run, or it left none of this", 404) if words is None else _json(words)
 
 

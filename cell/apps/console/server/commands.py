@@ -85,17 +85,17 @@ MESSAGES: dict[str, type[PageMessage]] = {
 """Of the live link, by `type`; `stop` is not among them, either."""
 
 
-def checked_command(words: Mapping[str, Any]) -> dict[str, Any]:
+def checked_command(words: Mapping[str, object]) -> dict[str, object]:
     """The arguments of a command, with those that were left out; `ConfigError` says what is wrong with it."""
     return _checked(COMMANDS, "do", words)
 
 
-def checked_message(words: Mapping[str, Any]) -> dict[str, Any]:
+def checked_message(words: Mapping[str, object]) -> dict[str, Any]:
     """The same of a message of the live link."""
     return _checked(MESSAGES, "type", words)
 
 
-def _checked(schemas: Mapping[str, type[PageMessage]], kind: str, words: Mapping[str, Any]) -> dict[str, Any]:
+def _checked(schemas: Mapping[str, type[PageMessage]], kind: str, words: Mapping[str, object]) -> dict[str, object]:
     name = words.get(kind)
     schema = schemas.get(name) if isinstance(name, str) else None
     if schema is None:

@@ -8,7 +8,6 @@ import json
 import secrets
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -65,7 +64,7 @@ class Pages:
         """Of all pages."""
         return [page.mailbox for page in self._pages.values()]
 
-    def say(self, client: str, words: Mapping[str, Any]) -> None:
+    def say(self, client: str, words: Mapping[str, object]) -> None:
         """Something to one page, if it is still there."""
         if (page := self._pages.get(client)) is not None:
             page.mailbox.say(json.dumps(words))
@@ -76,7 +75,7 @@ class Pages:
         for mailbox in self.mailboxes:
             mailbox.show(camera, packed)
 
-    def cloud(self, header: Mapping[str, Any], packed: bytes) -> None:
+    def cloud(self, header: Mapping[str, object], packed: bytes) -> None:
         """An increment of the cloud, to all, and kept for those that come later."""
         if header.get("reset"):
             self._cloud.clear()
@@ -155,7 +154,7 @@ class Pages:
             self._tell(Beat(page.id, words, end=words["type"] == "jog_end"))
 
 
-def _words(text: object) -> dict[str, Any] | None:
+def _words(text: object) -> dict[str, object] | None:
     """A message of a page; None when it is none."""
     if not isinstance(text, str) or len(text.encode()) > MOST_BYTES:
         return None

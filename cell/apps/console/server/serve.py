@@ -26,6 +26,7 @@ from typing import Any
 import cv2
 import numpy as np
 import uvicorn
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from cell.apps.console.messages import (
@@ -149,7 +150,7 @@ class Server:
             while True:
                 self._pipe.send(self._unsent.get())
 
-    async def _ask(self, make: Callable[[int], object]) -> tuple[int, Mapping[str, Any]]:
+    async def _ask(self, make: Callable[[int], object]) -> tuple[int, Mapping[str, object]]:
         number = next(self._numbers)
         answer: asyncio.Future[Answer] = self._loop.create_future()
         if not self._tell(make(number)):
@@ -163,10 +164,10 @@ class Server:
             self._waiting.pop(number, None)
         return told.status, told.words
 
-    async def _do(self, client: str, words: Mapping[str, Any]) -> tuple[int, Mapping[str, Any]]:
+    async def _do(self, client: str, words: Mapping[str, object]) -> tuple[int, Mapping[str, object]]:
         return await self._ask(lambda number: Do(number, client, words))
 
-    async def _of_job(self, job: str) -> tuple[int, Mapping[str, Any]]:
+    async def _of_job(self, job: str) -> tuple[int, Mapping[str, object]]:
         return await self._ask(lambda number: AskCell(number, job))
 
     async def _stop(self) -> str | None:
@@ -249,17 +250,17 @@ class Server:
             future.set_result(message)
 
 
-def packed(header: Mapping[str, Any], payload: bytes) -> bytes:
+def packed(header: Mapping[str, object], payload: bytes) -> bytes:
     """A binary message: length of the header, the header, the payload (docs/reference/console.md)."""
     words = json.dumps(header).encode()
     return struct.pack("<I", len(words)) + words + payload
 
 
-def _entering(app: Any, renew: Callable[[], None]) -> Any:
+def _entering(app: ASGIApp, renew: Callable[[], None]) -> ASGIApp:
     """Asks for a new link whenever one was used."""
 
-    async def entered(scope: Any, receive: Any, send: Any) -> None:
-        async def sent(message: Any) -> None:
+    async def entered(scope: Scope, receive: Receive, send: Send) -> None:
+        async def sent(message: Message) -> None:
             if message["type"] == "http.response.start" and scope["path"] == "/enter" and message["status"] == 200:
                 renew()
             await send(message)

@@ -38,13 +38,13 @@ def moves(record: Path) -> bool:
         return False
 
 
-def motion(record: Path) -> dict[str, Any]:
+def motion(record: Path) -> dict[str, object]:
     """Ten times a second from the record's beginning, as docs/reference/console.md has it: joints in rad, rail in m,
     vehicle in m and rad; None where not told yet. Raises `CellError` for a file that is no record."""
     told = sorted(messages(record, (JOINTS, VEHICLE, EVENT)), key=lambda message: message[1])
     begun = told[0][1] if told else 0
-    rows: list[tuple[float, Any, Any, Any]] = []
-    steps: list[dict[str, Any]] = []
+    rows: list[tuple[float, list[float] | None, float | None, list[float] | None]] = []
+    steps: list[dict[str, object]] = []
     joints: list[float] | None = None
     rail: float | None = None
     vehicle: list[float] | None = None
@@ -106,12 +106,12 @@ class Archive:
         folders = reversed(list_runs(self._root)[-MOST_RUNS:])
         return [self._row(folder) for folder in folders if self._folder(folder.name) is not None]
 
-    def trend(self) -> list[dict[str, Any]]:
+    def trend(self) -> list[dict[str, object]]:
         """Jobs, oldest first."""
         keys = ("run", "started", "job", "outcome", "d_mean_mm", "expected_mm", "duration_s")
         return [{key: row[key] for key in keys} for row in reversed(self.runs()) if row["kind"] == "job"]
 
-    def run(self, name: str) -> dict[str, Any] | None:
+    def run(self, name: str) -> dict[str, object] | None:
         """One run's report and the names of its pictures."""
         if (folder := self._folder(name)) is None:
             return None
@@ -168,7 +168,7 @@ class Archive:
             printed.seek(0)
             return printed.read() if done else None
 
-    def replay(self, name: str) -> dict[str, Any] | None:
+    def replay(self, name: str) -> dict[str, object] | None:
         """How the cell moved in a run; None for one whose record does not tell.
 
         A record has tens of megabytes: it is read by a process of its own that gives way, and what it told is kept.

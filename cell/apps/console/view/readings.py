@@ -102,7 +102,7 @@ class Readings:
         self._faults[name] = None
         return told
 
-    def motion(self) -> dict[str, Any]:
+    def motion(self) -> dict[str, object]:
         """Joints, flange, rail, vehicle, laser, for the state."""
         vehicle = self.vehicle
         return {
@@ -114,7 +114,7 @@ class Readings:
             "holding": self._held,
         }
 
-    def safety(self) -> dict[str, Any]:
+    def safety(self) -> dict[str, object]:
         """The arm's safety state, the vehicle's emergency stop, and whether a stop holds direct commands."""
         return {
             "arm": None if self.arm is None else self.arm.safety.value,
@@ -122,9 +122,9 @@ class Readings:
             "stopped": not self._devices.gate.is_open,
         }
 
-    def devices(self, held_by: str) -> dict[str, Any]:
+    def devices(self, held_by: str) -> dict[str, object]:
         """Each device's row: state in words, whether it is well, link, last error."""
-        rows: dict[str, Any] = {}
+        rows: dict[str, object] = {}
         for device in self._devices:
             name = device.name
             fault = self._faults.get(name) or self._ailing(name)
@@ -168,7 +168,7 @@ class Readings:
         return ""
 
 
-def _vehicle(state: VehicleState) -> dict[str, Any]:
+def _vehicle(state: VehicleState) -> dict[str, object]:
     return {
         "x": round(state.x, 5),
         "y": round(state.y, 5),
@@ -184,7 +184,7 @@ LENGTHS = [0.1 * MM, 1 * MM, 10 * MM, 50 * MM]
 ANGLES = [0.1 * DEG, 1 * DEG, 5 * DEG]
 
 
-def cell_facts(cell: Cell, job: str) -> dict[str, Any]:
+def cell_facts(cell: Cell, job: str) -> dict[str, object]:
     """The answer of `/api/cell` (docs/reference/console.md), with the station of `job`; `ConfigError` for one that is
     none."""
     config, simulated = cell.config, cell.simulated
@@ -226,7 +226,7 @@ def jobs(own: str) -> list[str]:
     return list(dict.fromkeys((own, *here, *shipped_jobs())))
 
 
-def _jogs(cell: Cell, name: str) -> list[dict[str, Any]]:
+def _jogs(cell: Cell, name: str) -> list[dict[str, object]]:
     device: Any = getattr(cell.devices, name)
     attended = isinstance(device.bare if isinstance(device, Gated) else device, Attended)
     length = {"device": name, "unit": "m", "most": MAX_LENGTH_MM * MM, "steps": LENGTHS}

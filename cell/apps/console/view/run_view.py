@@ -24,11 +24,11 @@ KEPT_FAULTS = 8
 class RunView:
     """One run that was begun. `expected` are the seconds that its steps took the last time, by their names."""
 
-    def __init__(self, run: Run[Any], steps: Sequence[str], job: str | None, expected: Mapping[str, float]) -> None:
+    def __init__(self, run: Run[object], steps: Sequence[str], job: str | None, expected: Mapping[str, float]) -> None:
         self.run = run
-        self.faults: list[dict[str, Any]] = []
-        self.asked: dict[str, Any] | None = None
-        self.ended: dict[str, Any] | None = None
+        self.faults: list[dict[str, object]] = []
+        self.asked: dict[str, object] | None = None
+        self.ended: dict[str, object] | None = None
         self._job = job
         self._expected = expected
         self._begun = time.time()
@@ -39,9 +39,9 @@ class RunView:
         self._attempt, self._fraction, self._text = 1, 0.0, ""
         self._rows = {name: _row(name) for name in steps}
 
-    def news(self) -> list[dict[str, Any]]:
+    def news(self) -> list[dict[str, object]]:
         """Take what has happened since, and give it in words for a list."""
-        told: list[dict[str, Any]] = []
+        told: list[dict[str, object]] = []
         while (event := self._events.take(0.0)) is not None:
             self._take(event)
             if event.kind != "progress":
@@ -55,7 +55,7 @@ class RunView:
         """Whether the run has ended and everything that it told was taken."""
         return self.run.done and self._events.closed
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For the page: see docs/reference/console.md."""
         run = self.run
         paused = run.control.paused()
@@ -159,7 +159,7 @@ STRIPE_POINTS = 160
 ROWS = 12
 """Each so many-th row of a profile is shown."""
 
-Sent = tuple[dict[str, Any], bytes]
+Sent = tuple[dict[str, object], bytes]
 
 
 class Pictures:
@@ -170,7 +170,7 @@ class Pictures:
         self._given: Frame | None = None
         self._found: object = None
 
-    def newest(self, run: Run[Any]) -> tuple[dict[str, Any], NDArray[np.uint8]] | None:
+    def newest(self, run: Run[object]) -> tuple[dict[str, object], NDArray[np.uint8]] | None:
         """Header and grey image (rows, columns), a copy; None when nothing new was looked at."""
         last = None if run.frames is None else run.frames.last
         found = None if run.frames is None else run.frames.found
@@ -220,7 +220,7 @@ class GrowingCloud:
         self._points: list[NDArray[np.float32]] = []
         self._told: object = None
 
-    def increment(self, run: Run[Any], flange: NDArray[np.float64] | None, rail: object) -> Sent | None:
+    def increment(self, run: Run[object], flange: NDArray[np.float64] | None, rail: object) -> Sent | None:
         """The lines that came since; `flange` (4, 4) is base_from_flange now and `rail` the rail's motion."""
         present = run.sweeping
         if present is None:
@@ -253,7 +253,7 @@ class GrowingCloud:
         self._points.append(rows[:, :3])
         return {**header, "count": len(rows)}, rows.tobytes()
 
-    def final(self, run: Run[Any]) -> Sent | None:
+    def final(self, run: Run[object]) -> Sent | None:
         """All points anew, with their distances from the surface where it was found; once, as soon as it was."""
         found, present = run.registered, run.sweeping
         if found is None or found is self._told or present is None or not self._points:

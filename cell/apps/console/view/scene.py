@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -44,7 +43,7 @@ MOST_TRIANGLES = 8_000
 SMALLEST_M, LARGEST_M = 0.005, 5.0
 
 
-def link_meshes(folder: Path) -> list[dict[str, Any]]:
+def link_meshes(folder: Path) -> list[dict[str, object]]:
     """The files of `folder` as JSON objects: `on`, one of `NAMES`, flat `vertices` in m and `triangles`.
 
     Raises `ConfigError` for a folder that is not there, a file of another name, two of one name, and one that is no
@@ -76,7 +75,7 @@ def link_meshes(folder: Path) -> list[dict[str, Any]]:
     return [_drawn(name, path) for name, path in found.items()]
 
 
-def _drawn(name: str, path: Path) -> dict[str, Any]:
+def _drawn(name: str, path: Path) -> dict[str, object]:
     import trimesh
 
     try:
@@ -123,7 +122,7 @@ SIGHT_M = {"scan": 0.15, "target": 0.30}
 
 def scene(
     config: CellConfig, job: str | Path | None = None, table: LinkTable | None = None, meshes: Path | None = None
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """What stands and moves in the cell, as a JSON object (docs/reference/console.md); without a job neither part nor
     station.
 
@@ -168,7 +167,7 @@ def scene(
     }
 
 
-def _station(config: CellConfig, job: Job, mesh: Path) -> dict[str, Any]:
+def _station(config: CellConfig, job: Job, mesh: Path) -> dict[str, object]:
     """What stands at the station, in the place frame, and where that is while nothing was measured yet."""
     vertices, triangles = coarser(*read_mesh(mesh, job.surface.mesh_unit))
     place_from_surface = job.surface.place_from_surface.se3()
@@ -192,7 +191,7 @@ def _station(config: CellConfig, job: Job, mesh: Path) -> dict[str, Any]:
     }
 
 
-def _sheet(config: CellConfig, job: Job | None) -> dict[str, Any]:
+def _sheet(config: CellConfig, job: Job | None) -> dict[str, object]:
     """The laser's fan in the scan camera's frame: from the laser to both ends of the stripe, a bit below the work."""
     laser, camera = config.laser, config.scan_camera
     depth = 1.1 * (SIGHT_M["scan"] if job is None else job.scan.stand_off)
@@ -201,7 +200,7 @@ def _sheet(config: CellConfig, job: Job | None) -> dict[str, Any]:
     return {"corners": [-laser.baseline, 0.0, 0.0, x, -half, depth, x, half, depth]}
 
 
-def _camera(camera: CameraConfig, flange_from_camera: pin.SE3, depth: float) -> dict[str, Any]:
+def _camera(camera: CameraConfig, flange_from_camera: pin.SE3, depth: float) -> dict[str, object]:
     """Its mounting, and the half width and half height of what it sees at `depth` m."""
     half = 0.5 * depth * camera.pixel / camera.focal_length
     return {
@@ -211,7 +210,7 @@ def _camera(camera: CameraConfig, flange_from_camera: pin.SE3, depth: float) -> 
     }
 
 
-def _body(body: Body) -> dict[str, Any]:
+def _body(body: Body) -> dict[str, object]:
     """`parent` 0 is the base (the place frame at the station), 1 … 6 a joint, 7 the flange."""
     return {
         "name": body.name,
@@ -240,12 +239,12 @@ class SceneNow:
 
     def __init__(self) -> None:
         self._way: Vector | None = None
-        self._path: dict[str, Any] | None = None
+        self._path: dict[str, object] | None = None
         self._count = 0
         # The same table that the planner is given, at the place's own frame.
         self._table = station_bodies(pin.SE3.Identity(), pin.SE3.Identity())[0]
 
-    def as_dict(self, situation: Situation) -> dict[str, Any]:
+    def as_dict(self, situation: Situation) -> dict[str, object]:
         """`place` (base_from_place) once the board was measured, `part` (base_from_part) once it was let go, each 16
         numbers or None, and `path`, the flange's points (m) on the way that the arm follows now, or None."""
         told = {body.name: body for body in situation.station}
@@ -258,7 +257,7 @@ class SceneNow:
     def _place(self, table: Body | None) -> list[float] | None:
         return None if table is None else numbers(table.placement * self._table.placement.inverse())
 
-    def _followed(self, situation: Situation) -> dict[str, Any] | None:
+    def _followed(self, situation: Situation) -> dict[str, object] | None:
         way, motion = situation.way, situation.last
         if way is None or motion is None or motion.done:
             return None

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -43,7 +42,7 @@ class Suspect:
     change: Array
     spread: Array
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For reports, units in the names."""
         return {"part": self.part, "probability": round(self.probability, 3), "change": _named(self.change)}
 
@@ -57,7 +56,7 @@ class Figure:
     sigma: float
     unit: str
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For reports."""
         return {"name": self.name, "value": round(self.value, 5), "sigma": round(self.sigma, 5), "unit": self.unit}
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -125,7 +124,7 @@ class Detectable:
         shown = f"{_shown(self.size, self.change.unit):.3f}"
         return f"up to {shown} mm{self.change.where}" if self.change.unit == "m" else f"up to {shown}°"
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For reports, sizes in mm or degrees; None for one that is infinite."""
         return {
             "part": self.change.part,

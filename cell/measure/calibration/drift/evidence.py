@@ -76,7 +76,7 @@ class Reference:
             stripe_scale=priors.stripe_scale,
         )
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For storage."""
         return {
             "base_from_board": self.base_from_board.homogeneous.tolist(),

@@ -112,7 +112,7 @@ class PlateLine:
     sigma: Array
     edge: Edge | None = None
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For storage."""
         rows = self.rows
         values = {"columns": self.columns[rows].tolist(), "sigma": self.sigma[rows].tolist()}
@@ -216,7 +216,7 @@ class ConfirmedTurn:
             raise ValueError(f"a confirmed turn of {turn} ± {sigma} rad")
         return cls(plate, turn, sigma, made)
 
-    def summary(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, object]:
         """For reports and people, units in the names."""
         return {
             "turned_mrad": round(1e3 * self.turn, 4),

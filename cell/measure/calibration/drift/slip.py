@@ -12,7 +12,6 @@ from the same pose, and needs no plate."""
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -189,7 +188,7 @@ class WitnessCheck:
             f"{1e3 * self.board.turn:+.2f} ± {1e3 * self.board.sigma:.2f} mrad by the board"
         )
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For reports."""
         figures = {"plate": self.plate, "board": self.board}
         made = {f"{name}_mrad": round(1e3 * one.turn, 4) for name, one in figures.items()}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -30,7 +29,7 @@ MARGIN_PITCHES = 0.8
 
 def advice(
     joint: Joint, board: BoardSpec, rail_travel: tuple[float, float], place_rms: Callable[[Array], float]
-) -> list[dict[str, Any]]:
+) -> list[dict[str, object]]:
     """Candidates, best first: `what` to do, the total in mm that would result (`then_mm`), and the `gain` as a share.
 
     `place_rms` takes a covariance (27, 27) to m. Four views each, so that the gains compare; `kind` is "views", or

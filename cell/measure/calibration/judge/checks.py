@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 Part = Literal["intrinsics", "hand_eye", "light_plane"]
 Verdict = Literal["ok", "doubt", "refused"]
@@ -46,7 +46,7 @@ class QualityCheck:
         )
         return f"{self.part.replace('_', '-')}: {self.name} is {figure}: {self.says}"
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For the JSON."""
         return {
             "part": self.part,

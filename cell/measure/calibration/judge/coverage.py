@@ -173,7 +173,7 @@ def place_rms(by_parameter: Array, covariance: Array) -> float:
     return float(np.sqrt(np.einsum("nik,kl,nil->", by_parameter, known, by_parameter) / len(by_parameter)))
 
 
-def influences(by_parameter: Array, covariance: Array) -> dict[str, Any]:
+def influences(by_parameter: Array, covariance: Array) -> dict[str, object]:
     """`total_mm`, and `parameters` and `groups` sorted by what they do alone, each with `alone_mm` and `if_known_mm`.
 
     `alone_mm` is the RMS displacement of the points by one deviation with all else exact; `if_known_mm` the total that

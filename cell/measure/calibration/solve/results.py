@@ -158,7 +158,7 @@ class ScanCalibration:
                 made.append(replace(self.geometry(), light_plane=plane))
         return made
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For storage. What was found out since the calibration has its key only where there is any."""
         found = {"confirmed": self.confirmed, "timing": self.timing, "shutter": self.shutter}
         refused = {"refused": self.refused} if self.refused else {}
@@ -244,7 +244,7 @@ class TargetCalibration:
             Reference.of(joint.adjusted),
         )
 
-    def as_dict(self) -> dict[str, Any]:
+    def as_dict(self) -> dict[str, object]:
         """For storage."""
         return {
             "camera": _camera_dict(self.camera),
@@ -271,7 +271,7 @@ def sigmas(covariance: Array) -> dict[str, float]:
     return dict(zip(PARAMETERS, np.sqrt(np.maximum(0.0, np.diag(covariance))).tolist(), strict=True))
 
 
-def _camera_dict(camera: CameraModel) -> dict[str, Any]:
+def _camera_dict(camera: CameraModel) -> dict[str, object]:
     return {"width": camera.width, "height": camera.height, "parameters": camera.parameters.tolist()}
 
 

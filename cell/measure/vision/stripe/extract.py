@@ -17,11 +17,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.measure.vision.pictures import Dark, Taken
 from cell.measure.vision.stripe.careful.careful import read_carefully
 from cell.measure.vision.stripe.careful.follow import DOUBLE
 from cell.measure.vision.stripe.careful.surroundings import widen_what_departs
@@ -40,8 +40,8 @@ TRUSTED_SHARE = 0.98
 
 
 def extract(
-    image: Any,
-    dark: NDArray[np.floating] | NDArray[np.uint8] | NDArray[np.uint16] | None = None,
+    image: Taken,
+    dark: Dark | None = None,
     axis: Axis = "rows",
     settings: StripeSettings | None = None,
     *,
@@ -67,7 +67,7 @@ def extract(
             return _carefully(picture, dark, axis, settings=settings, laser=laser, like=like, starts=None)
         dark = None if dark is None else _whole(_same_range(dark, picture, settings))
         image = _whole(picture)
-    profile, verdict = read_quickly(image, dark, axis, settings, like)
+    profile, verdict = read_quickly(np.asarray(image, np.uint8), dark, axis, settings, like)
     widen_what_departs(profile.centres, profile.sigma)
     if verdict is QuickVerdict.ORDINARY:
         return profile
@@ -90,8 +90,8 @@ def _trusted(profile: StripeProfile) -> bool:
 
 
 def _carefully(
-    picture: Picture, dark: Any, axis: Axis, settings: StripeSettings, laser: LaserChannel, like: StripeProfile | None,
-    starts: Array | None,
+    picture: Picture, dark: Dark | None, axis: Axis, settings: StripeSettings, laser: LaserChannel,
+    like: StripeProfile | None, starts: Array | None,
 ) -> StripeProfile:  # fmt: skip
     """The profile of a picture by the careful way."""
     refuse_white(picture.saturated)
@@ -109,14 +109,14 @@ def _carefully(
     )  # fmt: skip
 
 
-def subtracted(image: Any, dark: Any, settings: StripeSettings) -> tuple[Picture, Picture | None]:
+def subtracted(image: Taken, dark: Dark | None, settings: StripeSettings) -> tuple[Picture, Picture | None]:
     """A picture and the one without the laser, in the same DN. Raises ValueError as `extract` does."""
     _check(image, dark)
     picture = as_picture(image, settings.saturation_dn)
     return picture, None if dark is None else _same_range(dark, picture, settings)
 
 
-def _same_range(dark: Any, picture: Picture, settings: StripeSettings) -> Picture:
+def _same_range(dark: Dark, picture: Picture, settings: StripeSettings) -> Picture:
     """The dark frame in the DN of the picture; of numbers with a fraction, they are taken to be those of 8 bits."""
     if dark.dtype in (np.uint8, np.uint16):
         off = as_picture(dark, settings.saturation_dn, picture.full)
@@ -140,7 +140,7 @@ def _whole(grey: Picture) -> Image:
     return np.where(grey.saturated, 255, np.clip(np.rint(grey.value), 0, 254)).astype(np.uint8)
 
 
-def _check(image: Any, dark: Any) -> None:
+def _check(image: Taken, dark: Dark | None) -> None:
     if image.dtype not in (np.uint8, np.uint16) or image.ndim not in (2, 3):
         raise ValueError(
             f"the stripe needs an 8-bit or 16-bit image, grey or RGB, not {image.dtype} of shape {image.shape}"
@@ -155,8 +155,9 @@ LEAST_POINTS = 30
 
 
 def read_stripe(
-    image: Any, off: Any = None, laser: LaserChannel | str = LaserChannel.AUTO, settings: StripeSettings | None = None
-) -> StripeProfile | None:
+    image: Taken, off: Dark | None = None, laser: LaserChannel | str = LaserChannel.AUTO,
+    settings: StripeSettings | None = None,
+) -> StripeProfile | None:  # fmt: skip
     """The stripe of `image` (h, w), (h, w, 3) or (h, w, 4), red first, along rows or columns, whichever it follows.
 
     `off` is a picture of the same view without the laser, `laser` the channel to read it in. None where no line of
@@ -182,8 +183,6 @@ def read_stripe(
 
 BLOCK = 16
 """Pictures for which what was measured holds: 1.6 mm of a sweep at .1 mm a profile."""
-
-Dark = NDArray[np.floating[Any]] | NDArray[np.uint8]
 
 
 class StripeStream:

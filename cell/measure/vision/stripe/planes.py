@@ -13,10 +13,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cell.base.compiled import compiled
-from cell.measure.vision.pictures import PictureRefused, Reason
+from cell.measure.vision.pictures import Image, PictureRefused, Reason, Taken
 
 FULL = 255.0
 NEAR_FULL = 0.985
@@ -88,7 +88,7 @@ class Picture:
         return value, np.asarray(~self.saturated[:, :, shares != 0].any(axis=2))
 
 
-def read_colours(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def read_colours(path: Path) -> Taken:
     """The picture of a file as it was taken: (h, w), or (h, w, 3) with red first; 8 or 16 bits.
 
     Raises `PictureRefused` for a file that is no picture.
@@ -103,7 +103,7 @@ def read_colours(path: Path) -> NDArray[np.uint8] | NDArray[np.uint16]:
     return np.ascontiguousarray(image[:, :, 2::-1] if image.shape[2] >= 3 else image[:, :, 0])
 
 
-def as_picture(image: Any, saturation: float = FULL, full: float | None = None) -> Picture:
+def as_picture(image: ArrayLike, saturation: float = FULL, full: float | None = None) -> Picture:
     """A picture (h, w), (h, w, 1), (h, w, 3) or (h, w, 4) of uint8 or uint16, red first, alpha left out.
 
     12 bits in 16 may lie at either end, 10 and 14 as well: the range is taken from the values. `saturation` is in DN
@@ -143,7 +143,7 @@ def range_of(image: NDArray[np.uint16]) -> int:
     return 65535
 
 
-def _grey(image: Any) -> bool:
+def _grey(image: Taken) -> bool:
     """True when the three channels are one."""
     few = image[::7, ::7]
     if not (np.array_equal(few[:, :, 0], few[:, :, 1]) and np.array_equal(few[:, :, 0], few[:, :, 2])):
@@ -157,14 +157,14 @@ DOUBT = 0.3
 
 
 @compiled
-def pixel_noise(image: Any, gain_dn: float, declared_dn2: float) -> tuple[float, float]:
+def pixel_noise(image: Image, gain_dn: float, declared_dn2: float) -> tuple[float, float]:
     """(variance without photons, whole variance) of a pixel of an 8-bit image's background, DN².
 
     The first is at least `declared_dn2`, more where the picture is noisier than its photons explain.
     """
     lines, n = image.shape
     # Neighbours two by two, counted by how far they differ.
-    counts: Any = np.zeros(256, np.int64)
+    counts = np.zeros(256, np.int64)
     total, pairs = 0, 0
     for r in range(0, lines, max(1, lines // SAMPLED_LINES)):
         for i in range(0, n - 1, 2):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntFlag
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +69,7 @@ def marks_of(profile: StripeProfile) -> NDArray[np.uint8]:
     return marks
 
 
-def _steps(profile: StripeProfile, rows: NDArray[np.intp]) -> Any:
+def _steps(profile: StripeProfile, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
     """True (len(rows) − 1,) where the centre jumps from one line that has a stripe to the next."""
     centre, sigma = profile.centres[rows], profile.sigma[rows]
     apart = np.diff(rows)
@@ -79,7 +79,7 @@ def _steps(profile: StripeProfile, rows: NDArray[np.intp]) -> Any:
     return np.abs(move - slope * apart) > np.where(apart <= LONGEST_GAP, limit, 0.0)
 
 
-def _edges(profile: StripeProfile, rows: NDArray[np.intp]) -> Any:
+def _edges(profile: StripeProfile, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
     """True (len(rows) − 1,) where the stripe is much brighter on one side of a line than on the other."""
     bright = np.log(np.maximum(profile.amplitude[rows], 1e-3))
     sides = np.lib.stride_tricks.sliding_window_view(bright, SIDE)
@@ -87,10 +87,10 @@ def _edges(profile: StripeProfile, rows: NDArray[np.intp]) -> Any:
     scatter = np.median(np.abs(np.diff(bright))) / 0.6745 / np.sqrt(2)
     change = np.zeros(len(rows) - 1)
     change[SIDE - 1 : SIDE - 1 + len(before)] = np.abs(after - before)
-    return change > max(BRIGHTER, BRIGHTER_SCATTERS * float(scatter) / np.sqrt(SIDE))
+    return np.asarray(change > max(BRIGHTER, BRIGHTER_SCATTERS * float(scatter) / np.sqrt(SIDE)))
 
 
-def _near(rows: NDArray[np.intp], jumps: Any, lines: int) -> Any:
+def _near(rows: NDArray[np.intp], jumps: NDArray[np.bool_], lines: int) -> NDArray[np.bool_]:
     """True (lines,) within NEAR of the jumps between `rows`."""
     near = np.zeros(lines + 2 * NEAR + 1, np.bool_)
     for first, last in zip(rows[:-1][jumps], rows[1:][jumps], strict=True):

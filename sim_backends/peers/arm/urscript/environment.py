@@ -14,11 +14,12 @@ import math
 import operator
 import random
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, SupportsIndex, TypeAlias
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sim_backends.models.arm_kinematics import (
     Matrix,
@@ -35,56 +36,62 @@ MOST_ELEMENTS, MOST_CHARACTERS, MOST_INTEGER = 100_000, 1_000_000, 2**63
 """What a variable may hold; a controller's own limits are lower, and a program that exceeds them ends."""
 
 
-class List(list[Any]):
+Value: TypeAlias = "bool | int | float | str | List | Struct | None"
+Commands = Mapping[str, Callable[..., object]]
+"""What a script may call, by name; what they return, a script takes as it is."""
+
+
+class List(list[Value]):
     """A list or, as a list of lists, a matrix."""
 
-    def __getitem__(self, index: Any) -> Any:
+    def __getitem__(self, index: SupportsIndex | float | slice) -> Any:
         """The element at a whole number, counted from 0; negative ones do not exist."""
         return list.__getitem__(self, index if isinstance(index, slice) else _whole(index))
 
-    def __setitem__(self, index: Any, value: Any) -> None:
+    def __setitem__(self, index: SupportsIndex | float | slice, value: Any) -> None:
         """Change the element at a whole number."""
         list.__setitem__(self, _whole(index), value)
 
-    def _each(self, other: Any, act: Callable[[Any, Any], Any]) -> List:
+    def _each(self, other: object, act: Callable[[object, object], Value]) -> List:
         if isinstance(other, list):
             if len(other) != len(self):
                 raise TypeError(f"lists of {len(self)} and {len(other)} elements")
             return type(self)(map(act, self, other))
         return type(self)(act(mine, other) for mine in self)
 
-    def __add__(self, other: Any) -> List:
+    def __add__(self, other: object) -> Any:
         """Element by element."""
         return self._each(other, operator.add)
 
-    def __sub__(self, other: Any) -> List:
+    def __sub__(self, other: object) -> List:
         """Element by element."""
         return self._each(other, operator.sub)
 
-    def __mul__(self, other: Any) -> List:
+    def __mul__(self, other: object) -> List:
         """By a number, or element by element."""
         return self._each(other, operator.mul)
 
     __rmul__ = __mul__
     __radd__ = __add__
 
-    def __truediv__(self, other: Any) -> List:
+    def __truediv__(self, other: object) -> List:
         """By a number, or element by element."""
         return self._each(other, operator.truediv)
 
     def __neg__(self) -> List:
         """Each element's opposite."""
-        return type(self)(-value for value in self)
+        values: Iterable[Any] = self
+        return type(self)(-value for value in values)
 
     def u_length(self) -> int:
         """How many elements."""
         return len(self)
 
-    def u_append(self, value: Any) -> None:
+    def u_append(self, value: Value) -> None:
         """Add `value` at the end."""
         self.append(value)
 
-    def u_pop(self) -> Any:
+    def u_pop(self) -> Value:
         """Take the last element away."""
         return self.pop()
 
@@ -96,7 +103,7 @@ class List(list[Any]):
 class ScriptPose(List):
     """Place in m and rotation vector in rad: p[x, y, z, rx, ry, rz]."""
 
-    def __init__(self, values: Iterable[Any]) -> None:
+    def __init__(self, values: Iterable[Value]) -> None:
         super().__init__(values)
         if len(self) != 6:
             raise TypeError(f"a pose of {len(self)} numbers")
@@ -105,23 +112,23 @@ class ScriptPose(List):
 class Struct:
     """Named members, made by struct(name = value, …)."""
 
-    def __init__(self, **members: Any) -> None:
+    def __init__(self, **members: Value) -> None:
         for name, value in members.items():
             setattr(self, f"u_{name}", value)
 
-    def members(self) -> dict[str, Any]:
+    def members(self) -> dict[str, Value]:
         """The members by name."""
         return {name[2:]: value for name, value in vars(self).items()}
 
 
-def own(value: Any) -> tuple[Any, int]:
+def own(value: Value) -> tuple[Value, int]:
     """A copy of a list or struct, anything else as it is, and how many values that are: an assignment or a call gives
     a variable a value of its own. `ValueError` for one that is too large.
     """
     return _copied(value, 0)
 
 
-def _copied(value: Any, count: int) -> tuple[Any, int]:
+def _copied(value: Value, count: int) -> tuple[Value, int]:
     count += 1
     if count > MOST_ELEMENTS:
         raise ValueError(f"a list or struct of more than {MOST_ELEMENTS} values")
@@ -143,7 +150,7 @@ def _copied(value: Any, count: int) -> tuple[Any, int]:
     return type(value)(elements), count
 
 
-def shown(value: Any) -> str:
+def shown(value: Value) -> str:
     """`value` as textmsg and to_str write it."""
     if isinstance(value, bool) or value is None:
         return str(value)
@@ -283,7 +290,7 @@ class InputWatchdog:
             self._act()
 
 
-def matrix(pose: Any) -> Matrix:
+def matrix(pose: List) -> Matrix:
     """A script's pose as (4, 4)."""
     return matrix_from_pose(np.array(pose, float))
 
@@ -293,24 +300,24 @@ def as_pose(base_from_tool: Matrix) -> ScriptPose:
     return ScriptPose(pose_from_matrix(base_from_tool).tolist())
 
 
-def numbers(values: Any) -> List:
+def numbers(values: ArrayLike) -> List:
     """An array as a script's list."""
     return List(np.asarray(values, float).tolist())
 
 
-def _norm(value: Any) -> float:
+def _norm(value: float | list[float]) -> float:
     return math.hypot(*value) if isinstance(value, list) else abs(value)
 
 
-def _distance(a: Any, b: Any, first: int) -> float:
+def _distance(a: List, b: List, first: int) -> float:
     return math.dist(a[first : first + 3], b[first : first + 3])
 
 
-def _turn_between(a: Any, b: Any) -> float:
+def _turn_between(a: List, b: List) -> float:
     return math.hypot(*rotation_vector(matrix(a)[:3, :3].T.dot(matrix(b)[:3, :3])))
 
 
-def _interpolate(a: Any, b: Any, share: float) -> ScriptPose:
+def _interpolate(a: List, b: List, share: float) -> ScriptPose:
     start, end = matrix(a), matrix(b)
     turn = rotation_vector(start[:3, :3].T.dot(end[:3, :3]))
     between = np.eye(4)
@@ -319,25 +326,25 @@ def _interpolate(a: Any, b: Any, share: float) -> ScriptPose:
     return as_pose(between)
 
 
-def _pose_add(a: Any, b: Any) -> ScriptPose:
+def _pose_add(a: List, b: List) -> ScriptPose:
     sum_ = np.eye(4)
     sum_[:3, :3] = matrix(a)[:3, :3].dot(matrix(b)[:3, :3])
     sum_[:3, 3] = matrix(a)[:3, 3] + matrix(b)[:3, 3]
     return as_pose(sum_)
 
 
-def _rpy2rotvec(rpy: Any) -> List:
+def _rpy2rotvec(rpy: Sequence[float]) -> List:
     roll, pitch, yaw = (rotation_matrix(angle * axis) for angle, axis in zip(rpy, np.eye(3), strict=True))
     return numbers(rotation_vector(yaw.dot(pitch).dot(roll)))
 
 
-def _rotvec2rpy(vector: Any) -> List:
+def _rotvec2rpy(vector: Sequence[float]) -> List:
     r = rotation_matrix(np.array(vector, float))
     pitch = math.atan2(-r[2, 0], math.hypot(r[0, 0], r[1, 0]))
     return List([math.atan2(r[2, 1], r[2, 2]), pitch, math.atan2(r[1, 0], r[0, 0])])
 
 
-def _twist(frame: Any, twist: Any) -> List:
+def _twist(frame: List, twist: Sequence[float]) -> List:
     """A wrench, given in `frame`, in the frame that `frame` is given in."""
     place, force, torque = matrix(frame), np.array(twist[:3], float), np.array(twist[3:], float)
     turned = place[:3, :3].dot(force)
@@ -360,18 +367,18 @@ def _integer_to_bits(value: int) -> List:
     return List(bool(value >> bit & 1) for bit in range(32))
 
 
-def _bits_to_integer(bits: Any) -> int:
+def _bits_to_integer(bits: Sequence[object]) -> int:
     word = sum(bool(bit) << place for place, bit in enumerate(bits[:32]))
     return int(struct.unpack("i", struct.pack("I", word))[0])
 
 
-def _make_list(length: int, value: Any, capacity: int = 0) -> List:
+def _make_list(length: int, value: Value, capacity: int = 0) -> List:
     if length > MOST_ELEMENTS:
         raise ValueError(f"a list of {length} elements, at most {MOST_ELEMENTS}")
     return List([value] * length)
 
 
-def _size(values: Any) -> Any:
+def _size(values: List) -> List | int:
     """Rows and columns of a matrix, the length of a list."""
     return List([len(values), len(values[0])]) if values and isinstance(values[0], list) else len(values)
 
@@ -380,7 +387,7 @@ def _str_sub(text: str, index: int, length: int = -1) -> str:
     return text[index:] if length < 0 else text[index : index + length]
 
 
-def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
+def commands(environment: Environment) -> Commands:
     """By name; they need nothing of `environment`."""
     return {
         "sin": math.sin, "cos": math.cos, "tan": math.tan, "asin": math.asin, "acos": math.acos, "atan": math.atan,

@@ -13,10 +13,10 @@ from typing import Any
 from sim_backends.peers.arm.script.context import Context, Job, ProgramError
 from sim_backends.peers.arm.urscript import environment as arithmetic
 from sim_backends.peers.arm.urscript import motions, sensing, settings, sockets
-from sim_backends.peers.arm.urscript.environment import Environment, List, ScriptPose, own
+from sim_backends.peers.arm.urscript.environment import Commands, Environment, List, ScriptPose, Value, own
 from sim_backends.peers.arm.urscript.translate import ScriptError, translate
 
-Thread = Generator[None, None, Any]
+Thread = Generator[None, None, object]
 _MOST_TURNS = 20000
 """Turns of a program's loops and calls of its functions in one cycle; a controller calls more an infinite loop."""
 _VALUES_A_TURN = 1000
@@ -24,7 +24,7 @@ _VALUES_A_TURN = 1000
 _MOST_THREADS = 100
 _MAIN = -1
 """The program's own thread; scripts take 0 for no thread."""
-_LIBRARIES: tuple[Callable[[Environment], dict[str, Callable[..., Any]]], ...] = (
+_LIBRARIES: tuple[Callable[[Environment], Commands], ...] = (
     arithmetic.commands,
     motions.commands,
     sensing.commands,
@@ -129,7 +129,7 @@ class Machine:
 
     # --- what the program calls ---
 
-    def _own(self, value: Any) -> Any:
+    def _own(self, value: Value) -> Value:
         copied, count = own(value)
         self._turn(count // _VALUES_A_TURN)
         return copied
@@ -146,12 +146,12 @@ class Machine:
         self._threads[number] = thread
         return number
 
-    def _kill(self, number: Any) -> None:
+    def _kill(self, number: int) -> None:
         thread = self._threads.pop(number, None)
         if thread is not None and number != self._environment.thread:
             thread.close()
 
-    def _join(self, number: Any) -> Job:
+    def _join(self, number: int) -> Job:
         while number in self._threads:
             yield
 

@@ -7,8 +7,7 @@ every way point.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from sim_backends.models.arm_motion import (
 )
 from sim_backends.peers.arm.script.context import CYCLE, Job, ProgramError
 from sim_backends.peers.arm.script.motion import tool_contact
-from sim_backends.peers.arm.urscript.environment import Environment, ScriptPose, matrix
+from sim_backends.peers.arm.urscript.environment import Commands, Environment, List, ScriptPose, Value, matrix
 
 _MOST_ACCELERATION = 8.0
 """rad/s², of which the moves that plan for themselves take a share."""
@@ -41,16 +40,16 @@ def _timed(length: float, t: float, speed: float, acceleration: float) -> tuple[
     return cruise, cruise / (_RAMPS * t)
 
 
-def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
+def commands(environment: Environment) -> Commands:
     """By name; those that take time are generator functions."""
     parts = (_moves, _optimized_moves, _stops, _streams, _compliance, _waits)
     return {name: command for part in parts for name, command in part(environment).items()}
 
 
-def _moves(e: Environment) -> dict[str, Callable[..., Any]]:
+def _moves(e: Environment) -> Mapping[str, Callable[..., Job]]:
     """Moves to a target at a speed."""
 
-    def movej(q: Any, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Job:
+    def movej(q: List, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Job:
         goal = _joints(e, q)
         limit = e.context.model.params.joint_limit
         farthest = int(np.abs(goal).argmax())
@@ -59,34 +58,34 @@ def _moves(e: Environment) -> dict[str, Callable[..., Any]]:
         length = float(np.abs(goal - e.context.model.drive.q).max())
         yield from e.move(JointMove(goal, *_timed(length, t, v, a)))
 
-    def movel(pose: Any, a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Job:
+    def movel(pose: List, a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Job:
         goal, here = _tool(e, pose), e.context.model.drive.base_from_tcp()
         length = math.dist(goal[:3, 3], here[:3, 3])
         yield from e.move(LinearMove(goal, *_timed(length, t, v, a), slows=True))
 
-    def movep(pose: Any, a: float = 1.2, v: float = 0.25, r: float = 0) -> Job:
+    def movep(pose: List, a: float = 1.2, v: float = 0.25, r: float = 0) -> Job:
         yield from movel(pose, a, v)
 
-    def movec(pose_via: Any, pose_to: Any, a: float = 1.2, v: float = 0.25, r: float = 0, mode: float = 0) -> Job:
+    def movec(pose_via: List, pose_to: List, a: float = 1.2, v: float = 0.25, r: float = 0, mode: float = 0) -> Job:
         yield from e.move(ArcMove(_tool(e, pose_via)[:3, 3], _tool(e, pose_to), v, a, fixed=mode == 1))
 
     return {"movej": movej, "movel": movel, "movep": movep, "movec": movec}
 
 
-def _optimized_moves(e: Environment) -> dict[str, Callable[..., Any]]:
+def _optimized_moves(e: Environment) -> Commands:
     """Moves that plan for themselves: `a` and `v` are shares of the most."""
     moves = _moves(e)
 
-    def optimovej(q: Any, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
+    def optimovej(q: List, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
         yield from moves["movej"](q, a * _MOST_ACCELERATION, v * _leading(e))
 
-    def optimovel(pose: Any, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
+    def optimovel(pose: List, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
         yield from moves["movel"](pose, 2.5 * a, v)
 
     return {"optimovej": optimovej, "optimovel": optimovel}
 
 
-def _stops(e: Environment) -> dict[str, Callable[..., Any]]:
+def _stops(e: Environment) -> Commands:
     """Stops of what moves."""
 
     def stopj(a: float = 2.0) -> Job:
@@ -98,11 +97,11 @@ def _stops(e: Environment) -> dict[str, Callable[..., Any]]:
     return {"stopj": stopj, "stopl": stopl}
 
 
-def _streams(e: Environment) -> dict[str, Callable[..., Any]]:
+def _streams(e: Environment) -> Commands:
     """Targets and speeds that are sent anew in each cycle."""
 
     def servoj(
-        q: Any, a: float = 0, v: float = 0, t: float = CYCLE, lookahead_time: float = 0.1, gain: float = 300
+        q: List, a: float = 0, v: float = 0, t: float = CYCLE, lookahead_time: float = 0.1, gain: float = 300
     ) -> Job:
         lag = max(e.context.model.params.tracking_lag, lookahead_time * 300.0 / max(gain, 1.0))
         motion, target = e.context.model.motion, _joints(e, q)
@@ -112,19 +111,19 @@ def _streams(e: Environment) -> dict[str, Callable[..., Any]]:
             motion = Servo(target, lag)
         yield from e.stream(motion, t, lasting=True)
 
-    def speedj(qd: Any, a: float = 1.4, t: float = 0) -> Job:
+    def speedj(qd: List, a: float = 1.4, t: float = 0) -> Job:
         yield from _speed(e, JointSpeed(_six(qd), a), t)
 
-    def speedl(xd: Any, a: float = 1.2, t: float = 0, aRot: float = 0) -> Job:
+    def speedl(xd: List, a: float = 1.2, t: float = 0, aRot: float = 0) -> Job:
         yield from _speed(e, LinearSpeed(_six(xd), a), t)
 
     return {"servoj": servoj, "speedj": speedj, "speedl": speedl}
 
 
-def _compliance(e: Environment) -> dict[str, Callable[..., Any]]:
+def _compliance(e: Environment) -> Commands:
     """Force mode, and what touches the tool."""
 
-    def force_mode(task_frame: Any, selection_vector: Any, wrench: Any, type: float, limits: Any) -> None:
+    def force_mode(task_frame: List, selection_vector: List, wrench: List, type: float, limits: List) -> None:
         e.force = ForceMode(matrix(task_frame), _six(selection_vector), _six(wrench), _six(limits))
 
     def end_force_mode() -> Job:
@@ -132,13 +131,13 @@ def _compliance(e: Environment) -> dict[str, Callable[..., Any]]:
             e.force = None
             yield from e.move(StopMotion(10.0, linear=True))
 
-    def contact(direction: Any = (0.0,) * 6) -> int:
+    def contact(direction: Sequence[Value] = (0.0,) * 6) -> int:
         return tool_contact(e.context, _six(direction))
 
     return {"force_mode": force_mode, "end_force_mode": end_force_mode, "tool_contact": contact}
 
 
-def _waits(_: Environment) -> dict[str, Callable[..., Any]]:
+def _waits(_: Environment) -> Commands:
     """Cycles that pass."""
 
     def sleep(t: float) -> Job:
@@ -151,11 +150,11 @@ def _waits(_: Environment) -> dict[str, Callable[..., Any]]:
     return {"sleep": sleep, "sync": sync}
 
 
-def _joints(e: Environment, target: Any) -> Vector:
+def _joints(e: Environment, target: List) -> Vector:
     return e.context.solve(matrix(target)) if isinstance(target, ScriptPose) else _six(target)
 
 
-def _tool(e: Environment, target: Any) -> Matrix:
+def _tool(e: Environment, target: List) -> Matrix:
     return matrix(target) if isinstance(target, ScriptPose) else e.context.forward(_six(target))
 
 
@@ -178,7 +177,7 @@ def _leading(e: Environment) -> float:
     return float(e.context.model.params.speed_limits.min())
 
 
-def _six(values: Any) -> Vector:
+def _six(values: Sequence[Value]) -> Vector:
     array = np.array(values, float)
     if array.shape != (6,) or not np.isfinite(array).all():
         raise ProgramError(f"{list(values)} are not six finite numbers")

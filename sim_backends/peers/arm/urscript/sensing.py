@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
 from sim_backends.models.arm import Safety
 from sim_backends.models.arm_kinematics import Matrix, Vector, invert
 from sim_backends.peers.arm.script.context import CYCLE, ProgramError
-from sim_backends.peers.arm.urscript.environment import Environment, List, as_pose, matrix, numbers
+from sim_backends.peers.arm.urscript.environment import Commands, Environment, List, as_pose, matrix, numbers
 
 _ZEROS = [0.0] * 6
 
 
-def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
+def commands(environment: Environment) -> Commands:
     """By name; actual and target are one, as on an arm that follows exactly."""
     return {**_of_joints(environment), **_of_tool(environment), **_of_load(environment), **_kinematics(environment)}
 
 
-def _of_joints(e: Environment) -> dict[str, Callable[..., Any]]:
+def _of_joints(e: Environment) -> Commands:
     """Where the joints are, and whether they may be there."""
 
     def joints() -> List:
@@ -30,7 +28,7 @@ def _of_joints(e: Environment) -> dict[str, Callable[..., Any]]:
     def speeds() -> List:
         return numbers(e.context.model.drive.qd)
 
-    def within_limits(q: Any) -> bool:
+    def within_limits(q: List) -> bool:
         target = np.array(q if len(q) == 6 else [], float)
         return bool((np.abs(target) <= e.context.model.params.joint_limit).all())
 
@@ -52,7 +50,7 @@ def _of_joints(e: Environment) -> dict[str, Callable[..., Any]]:
     }  # fmt: skip
 
 
-def _of_tool(e: Environment) -> dict[str, Callable[..., Any]]:
+def _of_tool(e: Environment) -> Commands:
     """Where tool and flange are, and how fast."""
 
     def tool() -> List:
@@ -75,7 +73,7 @@ def _of_tool(e: Environment) -> dict[str, Callable[..., Any]]:
     }  # fmt: skip
 
 
-def _of_load(e: Environment) -> dict[str, Callable[..., Any]]:
+def _of_load(e: Environment) -> Commands:
     """What the tool weighs, and what it feels."""
 
     def torques() -> List:
@@ -93,10 +91,10 @@ def _of_load(e: Environment) -> dict[str, Callable[..., Any]]:
     }
 
 
-def _kinematics(e: Environment) -> dict[str, Callable[..., Any]]:
+def _kinematics(e: Environment) -> Commands:
     """From joints to poses and back."""
 
-    def inverse(x: Any, qnear: Any, tcp: Any) -> Vector:
+    def inverse(x: List, qnear: List | None, tcp: List | None) -> Vector:
         near = None if qnear is None else np.array(qnear, float)
         target = matrix(x)
         if tcp is not None:
@@ -104,22 +102,22 @@ def _kinematics(e: Environment) -> dict[str, Callable[..., Any]]:
         return e.context.solve(target, near)
 
     def get_inverse_kin(
-        x: Any,
-        qnear: Any = None,
+        x: List,
+        qnear: List | None = None,
         maxPositionError: float = 1e-10,
         maxOrientationError: float = 1e-10,
-        tcp: Any = None,
+        tcp: List | None = None,
     ) -> List:
         return numbers(inverse(x, qnear, tcp))
 
-    def has_solution(x: Any, qnear: Any = None, *others: Any, tcp: Any = None) -> bool:
+    def has_solution(x: List, qnear: List | None = None, *others: object, tcp: List | None = None) -> bool:
         try:
             inverse(x, qnear, tcp)
         except ProgramError:
             return False
         return True
 
-    def get_forward_kin(q: Any = None, tcp: Any = None) -> List:
+    def get_forward_kin(q: List | None = None, tcp: List | None = None) -> List:
         drive = e.context.model.drive
         place: Matrix = e.context.model.kinematics.forward(drive.q if q is None else np.array(q, float))
         return as_pose(place.dot(drive.flange_from_tcp if tcp is None else matrix(tcp)))

@@ -12,7 +12,7 @@ import numpy as np
 
 from sim_backends.peers.arm.rtde.variables import REGISTERS
 from sim_backends.peers.arm.script.context import Job, ProgramError
-from sim_backends.peers.arm.urscript.environment import Environment, InputWatchdog, matrix, shown
+from sim_backends.peers.arm.urscript.environment import Commands, Environment, InputWatchdog, List, Value, matrix, shown
 
 _KINDS = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}
 """First bit and number of the digital inputs and outputs of each kind."""
@@ -31,7 +31,7 @@ _WITHOUT_EFFECT = (
 """Each has what it sets in something that the simulated arm has not."""
 
 
-def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
+def commands(environment: Environment) -> Commands:
     """By name; those that take time are generator functions."""
     e = environment
     return {
@@ -49,56 +49,56 @@ def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
     }
 
 
-def _no_effect(*values: Any, **named: Any) -> None:
+def _no_effect(*values: object, **named: object) -> None:
     pass
 
 
-def _payload(e: Environment, mass: float, cog: Any) -> None:
+def _payload(e: Environment, mass: float, cog: List | None) -> None:
     if not 0 <= mass <= 1000:
         raise ProgramError(f"a payload of {mass:g} kg")
     centre = e.context.model.payload[1] if cog is None else np.array(cog, float)
     e.context.model.payload = (float(mass), centre)
 
 
-def _terminals(e: Environment) -> dict[str, Callable[..., Any]]:
-    def place(kind: str, number: Any) -> int:
+def _terminals(e: Environment) -> Commands:
+    def place(kind: str, number: float) -> int:
         first, count = _KINDS[kind]
         if not 0 <= number < count:
             raise ProgramError(f"there is no {kind} terminal {shown(number)}")
         return first + int(number)
 
     def setter(kind: str) -> Callable[..., None]:
-        def set_output(n: Any, b: Any) -> None:
+        def set_output(n: float, b: Value) -> None:
             bit = 1 << place(kind, n)
             e.context.model.write_digital_outputs(bit, bit if b else 0)
 
         return set_output
 
-    def reader(kind: str, outputs: bool) -> Callable[[Any], bool]:
-        def read(n: Any) -> bool:
+    def reader(kind: str, outputs: bool) -> Callable[[float], bool]:
+        def read(n: float) -> bool:
             model = e.context.model
             return bool((model.digital_outputs if outputs else model.digital_inputs) >> place(kind, n) & 1)
 
         return read
 
-    def held(kind: str) -> Callable[[Any, Any], None]:
+    def held(kind: str) -> Callable[[float, float], None]:
         return lambda outputId, state: e.outputs.choose(place(kind, outputId), int(state))
 
-    def set_digital_out(n: Any, b: Any) -> None:
+    def set_digital_out(n: float, b: Value) -> None:
         """The old numbering: 8 and 9 are the tool's."""
         kind, number = ("tool", n - 8) if n in (8, 9) else ("standard", n)
         setter(kind)(number, b)
 
-    def get_digital_in(n: Any) -> bool:
+    def get_digital_in(n: float) -> bool:
         kind, number = ("tool", n - 8) if n in (8, 9) else ("standard", n)
         return reader(kind, outputs=False)(number)
 
-    def set_analog(n: Any, f: float) -> None:
+    def set_analog(n: float, f: float) -> None:
         if n not in (0, 1) or not 0 <= f <= 1:
             raise ProgramError(f"analog output {shown(n)} cannot be {shown(f)}")
         e.context.registers.analog_out[int(n)] = float(f)
 
-    found: dict[str, Callable[..., Any]] = {
+    found: dict[str, Callable[..., object]] = {
         "set_digital_out": set_digital_out, "get_digital_in": get_digital_in,
         "get_digital_out": lambda n: reader("standard", outputs=True)(n),
         "set_analog_out": set_analog, "set_standard_analog_out": set_analog,
@@ -114,12 +114,12 @@ def _terminals(e: Environment) -> dict[str, Callable[..., Any]]:
     return found
 
 
-def _registers(e: Environment) -> dict[str, Callable[..., Any]]:
-    def reader(bank: str, count: int = REGISTERS) -> Callable[[Any], Any]:
+def _registers(e: Environment) -> Commands:
+    def reader(bank: str, count: int = REGISTERS) -> Callable[[float], object]:
         return lambda address: getattr(e.context.registers, bank)[_address(address, count)]
 
-    def writer(bank: str, make: Callable[[Any], Any], count: int = REGISTERS) -> Callable[[Any, Any], None]:
-        def write(address: Any, value: Any) -> None:
+    def writer(bank: str, make: Callable[[Any], object], count: int = REGISTERS) -> Callable[[float, Value], None]:
+        def write(address: float, value: Value) -> None:
             getattr(e.context.registers, bank)[_address(address, count)] = make(value)
 
         return write
@@ -153,11 +153,13 @@ def _registers(e: Environment) -> dict[str, Callable[..., Any]]:
     }
 
 
-def _screen(e: Environment) -> dict[str, Callable[..., Any]]:
-    def textmsg(s1: Any, s2: Any = "") -> None:
+def _screen(e: Environment) -> Commands:
+    def textmsg(s1: Value, s2: Value = "") -> None:
         e.announce("text", shown(s1) + shown(s2))
 
-    def popup(s: Any, title: str = "Popup", warning: bool = False, error: bool = False, blocking: bool = False) -> Job:
+    def popup(
+        s: Value, title: str = "Popup", warning: bool = False, error: bool = False, blocking: bool = False
+    ) -> Job:
         e.announce("popup", f"{title}: {shown(s)}")
         e.popup_open = bool(blocking)
         while e.popup_open:
@@ -166,7 +168,7 @@ def _screen(e: Environment) -> dict[str, Callable[..., Any]]:
     return {"textmsg": textmsg, "popup": popup}
 
 
-def _address(address: Any, count: int) -> int:
+def _address(address: float, count: int) -> int:
     if not 0 <= address < count or int(address) != address:
         raise ProgramError(f"register {shown(address)} does not exist: 0 to {count - 1}")
     return int(address)

@@ -11,10 +11,9 @@ import socket
 import struct
 from collections.abc import Callable, Generator
 from contextlib import suppress
-from typing import Any
 
 from sim_backends.peers.arm.script.context import CYCLE
-from sim_backends.peers.arm.urscript.environment import Environment, List, shown
+from sim_backends.peers.arm.urscript.environment import Commands, Environment, List, Value, shown
 
 _NAME = "socket_0"
 _CONNECTING_S = 2.0
@@ -101,20 +100,20 @@ class _Connections:
             self.close(name)
 
 
-def commands(environment: Environment) -> dict[str, Callable[..., Any]]:
+def commands(environment: Environment) -> Commands:
     """By name; those that take time are generator functions."""
     links = _Connections(environment)
     environment.on_close(links.close_all)
     return {**_sending(links), **_reading_numbers(links), **_reading_text(links)}
 
 
-def _sending(links: _Connections) -> dict[str, Callable[..., Any]]:
+def _sending(links: _Connections) -> Commands:
     """To open, to close and to send."""
 
     def socket_open(address: str, port: int, socket_name: str = _NAME) -> Generator[None, None, bool]:
         return (yield from links.open(address, port, socket_name))
 
-    def send(text: Any, socket_name: str = _NAME) -> bool:
+    def send(text: Value, socket_name: str = _NAME) -> bool:
         return links.send(socket_name, shown(text).encode())
 
     return {
@@ -128,7 +127,7 @@ def _sending(links: _Connections) -> dict[str, Callable[..., Any]]:
     }
 
 
-def _reading_numbers(links: _Connections) -> dict[str, Callable[..., Any]]:
+def _reading_numbers(links: _Connections) -> Commands:
     """To read numbers."""
 
     def read_integers(number: int, socket_name: str = _NAME, timeout: float = 2) -> Generator[None, None, List]:
@@ -154,7 +153,7 @@ def _reading_numbers(links: _Connections) -> dict[str, Callable[..., Any]]:
     }
 
 
-def _reading_text(links: _Connections) -> dict[str, Callable[..., Any]]:
+def _reading_text(links: _Connections) -> Commands:
     """To read text, and to ask a server for one of its variables."""
 
     def read_line(socket_name: str = _NAME, timeout: float = 2) -> Generator[None, None, str]:

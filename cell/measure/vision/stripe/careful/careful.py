@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -41,8 +41,8 @@ MISFIT_SIGMAS = 3.0
 
 @compiled
 def believe(
-    fitted: Any, start: Any, length: int, narrowest: float, widest: float, least: float, excess: float, double: Any,
-    saturated: Any,
+    fitted: Array, start: Array, length: int, narrowest: float, widest: float, least: float, excess: float,
+    double: NDArray[np.bool_], saturated: NDArray[np.bool_],
 ) -> None:  # fmt: skip
     """Put NaN into the lines of `fitted` (FITTED, lines) that are no stripe of a picture of `length` px a line.
 

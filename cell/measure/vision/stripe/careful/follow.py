@@ -12,7 +12,6 @@ the stripe runs; where they say nothing, the peak with more energy stays, and th
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -22,6 +21,7 @@ from cell.base.compiled import compiled
 from cell.measure.vision.stripe.ordinary.find import CENTRE, ENERGY, WIDTH
 
 Array = NDArray[np.float64]
+Places = NDArray[np.intp]
 
 SCALES = (0.8, 1.4, 2.4, 4.0, 7.0, 12.0, 20.0, 30.0)
 """Stripe widths σ in px that are looked for."""
@@ -157,7 +157,7 @@ def follow(found: Candidates, spacing: float = 1.0) -> StripeChain:
     return _believed(found, order, chosen, piece)
 
 
-def _believed(found: Candidates, rows: Any, which: Any, piece: Any) -> StripeChain:
+def _believed(found: Candidates, rows: Places, which: Places, piece: Places) -> StripeChain:
     """Without the pieces that noise may have made."""
     if not len(rows):
         return StripeChain(rows, which, piece, 0.0)
@@ -181,7 +181,9 @@ def _believed(found: Candidates, rows: Any, which: Any, piece: Any) -> StripeCha
 
 
 @compiled
-def _chain(rows: Any, place: Any, gain: Any, there: Any, scale: Any, spacing: float) -> Any:
+def _chain(
+    rows: Places, place: Array, gain: Array, there: NDArray[np.bool_], scale: Array, spacing: float
+) -> tuple[Array, Places, Places, NDArray[np.bool_]]:
     """Best sums that end at each candidate (m, CANDIDATES), where they come from, and whether by a jump."""
     m, count = place.shape
     best = np.zeros((m, count))
@@ -246,7 +248,7 @@ def choose(start: Array) -> NDArray[np.bool_]:
     return double
 
 
-def _line_through(x: Any, y: Any) -> tuple[float, float]:
+def _line_through(x: Array, y: Array) -> tuple[float, float]:
     """Slope and value at 0 of a line that one bad point in four does not move: medians of slopes and of values."""
     i, j = np.triu_indices(len(x), 1)
     slope = float(np.median((y[j] - y[i]) / (x[j] - x[i])))
@@ -254,7 +256,7 @@ def _line_through(x: Any, y: Any) -> tuple[float, float]:
 
 
 @compiled
-def survey(start: Any, low: float, high: float) -> tuple[Any, Any]:
+def survey(start: Array, low: float, high: float) -> tuple[NDArray[np.int64], Array]:
     """What the lines say together: those found (m,) and how wide the stripe is about each line (lines,).
 
     The width in px is the running mean over 15 lines of the start widths within low … high, which are counts of pixels

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 import scipy
@@ -289,8 +288,10 @@ def fit_shape(
 
 @compiled
 def _improve(
-    lines: NDArray[np.intp], table: Any, pixels: Any, noise: Any, expected: Array, limits: Any, found: Array,
-    good: NDArray[np.bool_], going: NDArray[np.bool_], inverses: Array,
+    lines: NDArray[np.intp], table: tuple[float, float, Array, Array],
+    pixels: tuple[Array, NDArray[np.bool_], Array, Array, Array, Array], noise: tuple[float, float], expected: Array,
+    limits: tuple[float, float, float], found: Array, good: NDArray[np.bool_], going: NDArray[np.bool_],
+    inverses: Array,
 ) -> None:  # fmt: skip  # pragma: no cover
     """One step of each of `lines` in `found` (m, PARAMETERS), its covariance before it in `inverses` (m, 5, 5).
 

@@ -16,14 +16,14 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 from math import exp, log, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cell.base.compiled import compiled
 from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Shape
-from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY
+from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY, Array, Floats, Image, Shade, Whole
 from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH, WIDTH_PRIOR
 from cell.measure.vision.stripe.ordinary.lanes import LAGS
 
@@ -66,7 +66,7 @@ class _Seen(NamedTuple):
 
 
 @compiled
-def neighbours(start: Any, double: Any, most: int) -> Any:
+def neighbours(start: Array, double: NDArray[np.bool_], most: int) -> Whole:
     """Lines (m,) of some `most` pairs of a line and the next, all over the picture, that show one peak, unsaturated."""
     lines = len(start)
     clear = np.zeros(lines, np.bool_)
@@ -88,7 +88,7 @@ def neighbours(start: Any, double: Any, most: int) -> Any:
 
 @compiled
 def _whitened(
-    image: Any, dark: Any, r: int, fitted: Any, noise2: float, gain: float, contrast2: float, errors: Any
+    image: Image, dark: Shade, r: int, fitted: Array, noise2: float, gain: float, contrast2: float, errors: Array
 ) -> tuple[int, int]:
     """Residuals of line r into `errors` (n,) where its core is; first and last column + 1 of it, 0, 0 if it leaves."""
     n = image.shape[1]
@@ -110,8 +110,9 @@ def _whitened(
 
 @compiled
 def _residuals(
-    image: Any, dark: Any, pairs: Any, fitted: Any, noise2: float, gain: float, contrast2: float, table: Any
-) -> int:
+    image: Image, dark: Shade, pairs: Whole, fitted: Array, noise2: float, gain: float, contrast2: float,
+    table: Array,
+) -> int:  # fmt: skip
     """Power, product, shared power, width, amplitude and level of each pair r, r + 1 in the picture, into `table`."""
     errors = np.zeros((2, image.shape[1]))
     used = 0
@@ -191,8 +192,9 @@ def _rounded(value: float, step: float) -> float:
 
 
 def measure_speckle(
-    image: Any, dark: Any, pairs: Any, widths: Any, fitted: Any, noise2: float, gain: float, contrast: float
-) -> Speckle | None:
+    image: Image, dark: Shade, pairs: Whole, widths: Array, fitted: Array, noise2: float, gain: float,
+    contrast: float,
+) -> Speckle | None:  # fmt: skip
     """The speckle in the lines `pairs` and the ones after them, whose peaks have `widths` (lines,) in px.
 
     All of them are `fitted` with `contrast`. None when they are too few. Anything else that the model does not explain,
@@ -225,12 +227,10 @@ def measure_speckle(
 
 
 @lru_cache(maxsize=256)
-def correlation(grain: float) -> Any:
+def correlation(grain: float) -> Floats:
     """Correlations (LAGS,) of speckle at lags 1, 2, … px."""
     return np.exp(-(np.arange(1, LAGS + 1) ** 2) / (4 * grain**2)).astype(np.float32)
 
-
-Array = NDArray[np.float64]
 
 ALIKE = 0.35
 """Lines whose amplitude differs from the typical one by no more than this share are compared with it."""

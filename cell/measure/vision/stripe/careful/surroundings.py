@@ -12,8 +12,6 @@ lines beside it, which the spot does not reach, tell. What departs keeps its cen
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -144,7 +142,7 @@ ROUNDS, SCALED, TUKEY = 5, 3, 4.685
 
 
 @compiled
-def widen_what_departs(centres: Any, sigma: Any) -> None:
+def widen_what_departs(centres: Array, sigma: Array) -> None:
     """Widen `sigma` (lines,) px, in place, of those `centres` (lines,) px that depart from their neighbours' curve.
 
     Where an edge breaks the line a centre may go on from either side: the nearest of three curves counts. NaN where
@@ -187,14 +185,14 @@ def widen_what_departs(centres: Any, sigma: Any) -> None:
 
 
 @compiled
-def _at(curve: Any, line: int) -> float:
+def _at(curve: Array, line: int) -> float:
     """The curve's place, px, in a line."""
     t = (line - curve[3]) / BESIDE
     return float(curve[0] + t * (curve[1] + t * curve[2]))
 
 
 @compiled
-def _curve(centres: Any, sigma: Any, begin: int, rounds: int) -> Any:
+def _curve(centres: Array, sigma: Array, begin: int, rounds: int) -> Array:
     """Parabola through the lines from `begin` to `begin + BLOCK` and those beside: three coefficients, its origin (0
     where too few lines have a centre) and the lines' scatter about it, px. Of one round it is not robust."""
     made = np.zeros(5)

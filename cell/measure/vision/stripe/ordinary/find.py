@@ -9,11 +9,17 @@ by the compiler, which costs as much as the loop. Unsigned indices save the ques
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import NDArray
 
 from cell.base.compiled import compiled, compiled_fast
+
+Array = NDArray[np.float64]
+Floats = NDArray[np.float32]
+Whole = NDArray[np.int64]
+Image = NDArray[np.uint8]
+Shade = Image | Floats
+"""A picture without the laser; of one pixel where there is none."""
 
 # Start values of a candidate: start[line, candidate, …]; an energy of 0 says that there is none.
 CENTRE, WIDTH, HEIGHT, BACKGROUND, ENERGY, CORE = range(6)
@@ -31,7 +37,7 @@ TRIES = 3
 
 
 @compiled_fast
-def largest(picture: Any, r: int, low: int, high: int) -> int:
+def largest(picture: Image, r: int, low: int, high: int) -> int:
     """Largest value of the pixels low … high − 1 of line `r`, 0 when there are none."""
     top = np.uint8(0)
     for i in range(np.uint64(low), np.uint64(max(low, high))):
@@ -40,14 +46,14 @@ def largest(picture: Any, r: int, low: int, high: int) -> int:
 
 
 @compiled_fast
-def largest_outside(picture: Any, r: int, low: int, high: int) -> int:
+def largest_outside(picture: Image, r: int, low: int, high: int) -> int:
     """Largest value of line `r` outside of low … high."""
     n = picture.shape[1]
     return int(max(largest(picture, r, 0, low), largest(picture, r, min(n, high + 1), n)))
 
 
 @compiled
-def first_at(picture: Any, r: int, top: int) -> int:
+def first_at(picture: Image, r: int, top: int) -> int:
     """Where line `r` first reaches its largest value `top`: block by block, for a block's maximum is quickly had."""
     begin = 0
     while begin + BLOCK < picture.shape[1] and largest(picture, r, begin, begin + BLOCK) < top:
@@ -58,7 +64,7 @@ def first_at(picture: Any, r: int, top: int) -> int:
 
 
 @compiled_fast
-def _rises(row: Any, begin: int, end: int, rises: Any) -> int:
+def _rises(row: Image, begin: int, end: int, rises: Image) -> int:
     """How far each pixel of row[begin:end] stands above both its neighbours at ±SEARCH, into `rises`; the largest."""
     size = end - begin
     if size <= 0:
@@ -75,7 +81,7 @@ def _rises(row: Any, begin: int, end: int, rises: Any) -> int:
 
 
 @compiled_fast
-def _prominent(row: Any, low: int, high: int, rises: Any) -> int:
+def _prominent(row: Image, low: int, high: int, rises: Image) -> int:
     """Where, outside low … high, a pixel stands farthest above its neighbours at ±SEARCH; −1 when none does."""
     n = len(row)
     best, place = 0, -1
@@ -93,15 +99,16 @@ def _prominent(row: Any, low: int, high: int, rises: Any) -> int:
 
 
 @compiled
-def width_of(above: float) -> float:
+def width_of(above: float | np.float32) -> float:
     """The stripe's σ in px, of which this many pixels lie above half of the peak."""
     return max(float(above), 1.0) / 2.355
 
 
 @compiled_fast
 def _measure(
-    image: Any, dark: Any, r: int, place: int, saturation: int, least_peak: float, window: Any, start: Any, k: int
-) -> bool:
+    image: Image, dark: Shade, r: int, place: int, saturation: int, least_peak: float, window: Floats, start: Array,
+    k: int | np.intp,
+) -> bool:  # fmt: skip
     """Start values of the peak at `place` in line `r` into start[r, k]; False when it does not stand `least_peak` above
     both its sides. Without views of the arrays, whose bookkeeping would cost as much as the sums.
     """
@@ -148,7 +155,7 @@ def _measure(
     start[r, k, WIDTH] = width
     start[r, k, HEIGHT] = peak - background
     start[r, k, BACKGROUND] = background
-    start[r, k, ENERGY] = max(total, 1e-6)
+    start[r, k, ENERGY] = max(float(total), 1e-6)
     start[r, k, CORE] = core
     return True
 
@@ -167,8 +174,9 @@ def rival_limit(background: float, height: float, least_peak: float) -> float:
 
 @compiled
 def find_line(
-    image: Any, seen: Any, dark: Any, r: int, saturation: int, least_peak: float, window: Any, rises: Any, start: Any
-) -> bool:
+    image: Image, seen: Image, dark: Shade, r: int, saturation: int, least_peak: float, window: Floats,
+    rises: Image, start: Array,
+) -> bool:  # fmt: skip
     """Start values of line `r` into start[r] (CANDIDATES, START), which is 0 before, as `find_lines` says.
 
     True when it has two peaks. `window` (n,) and `rises` (n,) are overwritten.

@@ -7,14 +7,12 @@ Fisher scoring on centre, amplitude, width and linear background, `LANES` lines 
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from cell.base.compiled import compiled, compiled_fast
 from cell.measure.vision.stripe.ordinary import lanes as lane
-from cell.measure.vision.stripe.ordinary.find import BACKGROUND, CENTRE, CORE, CUT, HEIGHT
-from cell.measure.vision.stripe.ordinary.lanes import HALF, LANES, MIDDLE, ROWS
+from cell.measure.vision.stripe.ordinary.find import BACKGROUND, CENTRE, CORE, CUT, HEIGHT, Array, Image, Shade, Whole
+from cell.measure.vision.stripe.ordinary.lanes import HALF, LANES, MIDDLE, ROWS, Floats
 
 # Rows of the result. SIGMA is the centre's standard deviation with the noise as it is correlated, FISHER without.
 FIT_CENTRE, SIGMA, AMPLITUDE, WIDTH, LEVEL, SLOPE, CHI2, FISHER = range(8)
@@ -27,7 +25,7 @@ NEAREST = 0.499
 
 
 @compiled
-def _begin(s: Any, start: Any, widths: Any, log_widths: Any, lines: Any, n: int, origins: Any) -> int:
+def _begin(s: Floats, start: Array, widths: Array, log_widths: Array, lines: Whole, n: int, origins: Whole) -> int:
     """Starts of the lanes from their `lines`' peaks in `find_lines`, and their origins (LANES,).
 
     Returns how far from its origin, in px, the lane looks that looks farthest.
@@ -55,7 +53,7 @@ def _begin(s: Any, start: Any, widths: Any, log_widths: Any, lines: Any, n: int,
 
 
 @compiled
-def _gather(picture: Any, lines: Any, origins: Any, half: int, into: Any) -> None:
+def _gather(picture: Shade, lines: Whole, origins: Whole, half: int, into: Floats) -> None:
     """The pixels −half − 1 … half around the origins of the lanes' `lines`; a line's ends are repeated outside."""
     n, size, k = picture.shape[1], 2 * half + 2, MIDDLE - half - 1
     for j in range(LANES):
@@ -69,7 +67,7 @@ def _gather(picture: Any, lines: Any, origins: Any, half: int, into: Any) -> Non
 
 
 @compiled_fast
-def _weigh(s: Any, half: int, saturation: float, values: Any, variance: Any) -> None:
+def _weigh(s: Floats, half: int, saturation: float, values: Floats, variance: Floats) -> None:
     """A huge variance for what is not to be used, saturated pixels and those beyond a lane's reach; 0 for the others,
     which are counted."""
     masked, zero, one, limit = np.float32(lane.MASKED), np.float32(0.0), np.float32(1.0), np.float32(saturation)
@@ -83,7 +81,7 @@ def _weigh(s: Any, half: int, saturation: float, values: Any, variance: Any) -> 
 
 
 @compiled_fast
-def _darken(shade: Any, half: int, dark_noise: Any, values: Any, variance: Any) -> None:
+def _darken(shade: Floats, half: int, dark_noise: tuple[float, float], values: Floats, variance: Floats) -> None:
     """Take the dark frame's pixels off, and add their variance."""
     constant, slope = np.float32(dark_noise[0]), np.float32(dark_noise[1])
     for k in range(MIDDLE - half - 1, MIDDLE + half + 1):
@@ -94,8 +92,9 @@ def _darken(shade: Any, half: int, dark_noise: Any, values: Any, variance: Any) 
 
 @compiled
 def fit_lines(
-    image: Any, cut: Any, cut_at: Any, dark: Any, start: Any, widths: Any, log_widths: Any, which: Any,
-    saturation: int, noise: Any, dark_noise: Any, rho: Any, steps: int, out: Any,
+    image: Image, cut: Image, cut_at: Whole, dark: Shade, start: Array, widths: Array, log_widths: Array,
+    which: Whole, saturation: int, noise: tuple[float, float, float], dark_noise: tuple[float, float], rho: Floats,
+    steps: int, out: Array,
 ) -> None:  # fmt: skip
     """Weighted maximum likelihood of the lines `which`: Fisher scoring on centre, amplitude, log width and background.
 

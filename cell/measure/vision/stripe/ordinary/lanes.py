@@ -8,11 +8,12 @@ under g and three under 1 are the whole normal matrix.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import NDArray
 
 from cell.base.compiled import compiled_fast
+
+Floats = NDArray[np.float32]
 
 LANES = 32
 LAGS = 6
@@ -50,9 +51,9 @@ NUMBERS = 47 * LANES
 
 
 @compiled_fast
-def exponential(x: Any) -> Any:
+def exponential(x: np.float32) -> np.float32:
     """The exponential to 2e-7, for the vector unit: the library's is called lane by lane."""
-    whole = np.floor(x * np.float32(1.442695041) + np.float32(0.5))
+    whole: np.float32 = np.floor(x * np.float32(1.442695041) + np.float32(0.5))
     r = x - whole * np.float32(0.6931471806)
     value = r * np.float32(1 / 720) + np.float32(1 / 120)
     value = value * r + np.float32(1 / 24)
@@ -64,7 +65,7 @@ def exponential(x: Any) -> Any:
 
 
 @compiled_fast
-def _begin(s: Any) -> None:
+def _begin(s: Floats) -> None:
     """Model and Gaussian at the origin; the Gaussian at x ± 1 is that at x times a ratio, which shrinks evenly."""
     half = np.float32(0.5)
     for j in range(LANES):
@@ -87,7 +88,9 @@ def _begin(s: Any) -> None:
 
 
 @compiled_fast
-def accumulate(s: Any, values: Any, variance: Any, half: int, noise2: Any, gain: Any, contrast2: Any) -> None:
+def accumulate(
+    s: Floats, values: Floats, variance: Floats, half: int, noise2: np.float32, gain: np.float32, contrast2: np.float32
+) -> None:
     """The sums of all lanes over the pixels −half − 1 … half around their origins, in DN² as in `fit_lines`."""
     zero, one, faint = np.float32(0.0), np.float32(1.0), np.float32(FAINT)
     _begin(s)
@@ -141,7 +144,7 @@ def accumulate(s: Any, values: Any, variance: Any, half: int, noise2: Any, gain:
 
 
 @compiled_fast
-def step_on(s: Any) -> float:
+def step_on(s: Floats) -> float:
     """Solve by Cholesky factors, take the step in the lanes that go on; how many of them are not done yet."""
     tiny, one = np.float32(1e-12), np.float32(1.0)
     third, three = np.float32(0.3), np.float32(3.0)
@@ -219,7 +222,10 @@ def step_on(s: Any) -> float:
 
 
 @compiled_fast
-def influence(s: Any, variance: Any, half: int, noise2: Any, gain: Any, contrast2: Any, rho: Any, moved: Any) -> None:
+def influence(
+    s: Floats, variance: Floats, half: int, noise2: np.float32, gain: np.float32, contrast2: np.float32, rho: Floats,
+    moved: Floats,
+) -> None:  # fmt: skip
     """Variance of the centre in `VARIANCE` for noise whose speckle part is correlated by `rho` at lags 1 … `LAGS`.
 
     The influence of a pixel on the centre is its weight times its derivatives times the centre's row of the inverse.

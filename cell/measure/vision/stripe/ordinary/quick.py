@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.base.compiled import compiled
-from cell.measure.vision.pictures import PictureRefused, Reason
+from cell.measure.vision.pictures import Dark, PictureRefused, Reason
 from cell.measure.vision.stripe.careful.careful import believe
 from cell.measure.vision.stripe.careful.follow import choose, survey
 from cell.measure.vision.stripe.careful.speckle import ASSUMED_GRAIN, correlation, measure_speckle, neighbours
 from cell.measure.vision.stripe.ordinary import find, fit
 from cell.measure.vision.stripe.ordinary import search as stripe_search
-from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY
+from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY, Floats, Shade, Whole
 from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH
 from cell.measure.vision.stripe.planes import pixel_noise
 from cell.measure.vision.stripe.profile import Array, Axis, Image, StripeProfile, StripeSettings
@@ -49,7 +49,7 @@ TEXTURE_DN2, TEXTURE_RATIO = 1.0, 2.0
 
 
 @compiled
-def is_profile_gaussian(image: Any, dark: Any, fitted: Any, start: Any) -> bool:
+def is_profile_gaussian(image: Image, dark: Shade, fitted: Array, start: Array) -> bool:
     """True when the mean residual of some fitted lines, registered at their centres, is no more than their noise."""
     lines, n = image.shape
     sums, squares, counts = np.zeros(BINS), np.zeros(BINS), np.zeros(BINS)
@@ -95,7 +95,7 @@ def is_profile_gaussian(image: Any, dark: Any, fitted: Any, start: Any) -> bool:
 
 
 @compiled
-def is_line_whole(fitted: Any, start: Any) -> bool:
+def is_line_whole(fitted: Array, start: Array) -> bool:
     """True when few lines with a peak are no stripe, and few stripes stand where neither neighbour has its."""
     lines = fitted.shape[1]
     peaks, found, broken = 0, 0, 0
@@ -118,7 +118,7 @@ def is_line_whole(fitted: Any, start: Any) -> bool:
 
 
 @compiled
-def is_too_wide(fitted: Any, start: Any) -> bool:
+def is_too_wide(fitted: Array, start: Array) -> bool:
     """True when the stripes that were found are wider than the search's window takes, or hardly any was."""
     found, wide = 0, 0
     for r in range(fitted.shape[1]):
@@ -129,7 +129,7 @@ def is_too_wide(fitted: Any, start: Any) -> bool:
 
 
 @compiled
-def is_saturated(fitted: Any, start: Any) -> bool:
+def is_saturated(fitted: Array, start: Array) -> bool:
     """True when the cores of most stripes are saturated: what flanks look like is seldom a Gaussian."""
     found, hidden = 0, 0
     for r in range(fitted.shape[1]):
@@ -140,7 +140,7 @@ def is_saturated(fitted: Any, start: Any) -> bool:
 
 
 @compiled
-def is_surface_even(dark: Any, fitted: Any) -> bool:
+def is_surface_even(dark: Shade, fitted: Array) -> bool:
     """True when the picture without the laser shows no edges of the surface's albedo under the stripe, or is dark."""
     found, uneven, total = 0, 0, 0.0
     n = dark.shape[1]
@@ -161,7 +161,7 @@ def is_surface_even(dark: Any, fitted: Any) -> bool:
 
 
 @compiled
-def has_rivals(fitted: Any, start: Any) -> bool:
+def has_rivals(fitted: Array, start: Array) -> bool:
     """True when centres jump and many lines have a second peak: the wrong one may have been taken."""
     rivals, found, jumps, before = 0, 0, 0, -1
     for r in range(fitted.shape[1]):
@@ -176,11 +176,11 @@ def has_rivals(fitted: Any, start: Any) -> bool:
 
 
 @compiled
-def is_textured(image: Any) -> bool:
+def is_textured(image: Image) -> bool:
     """True when pixels of the background differ more from those some px away than from the next ones."""
     lines, n = image.shape
-    near: Any = np.zeros(1024, np.int64)
-    far: Any = np.zeros(1024, np.int64)
+    near = np.zeros(1024, np.int64)
+    far = np.zeros(1024, np.int64)
     total = 0
     for r in range(lines // (2 * SAMPLED_LINES), lines, max(1, lines // SAMPLED_LINES)):
         for i in range(FAR_LAG, n - FAR_LAG, 3):
@@ -193,7 +193,7 @@ def is_textured(image: Any) -> bool:
 
 
 @compiled
-def _trimmed(counts: Any, total: int) -> float:
+def _trimmed(counts: Whole, total: int) -> float:
     """Mean square of what was counted, without what is far beyond its median."""
     median, below = 0, int(counts[0])
     while 2 * below < total:
@@ -226,7 +226,7 @@ class QuickVerdict(Enum):
 
 
 def read_quickly(
-    image: Image, dark: Any, axis: Axis, settings: StripeSettings, like: StripeProfile | None
+    image: Image, dark: Dark | None, axis: Axis, settings: StripeSettings, like: StripeProfile | None
 ) -> tuple[StripeProfile, QuickVerdict]:
     """The profile by search and fit of a Gaussian, and whether this is enough for the picture."""
     work, shade = _lines(image, axis), _lines(dark, axis)
@@ -248,7 +248,7 @@ def read_quickly(
     _refuse_blinded(image, start, found, settings.saturation_dn)
     fitted = np.full((fit.FITTED, len(work)), np.nan)
 
-    def run(which: NDArray[np.intp], contrast: float, rho: Any) -> None:
+    def run(which: NDArray[np.intp], contrast: float, rho: Floats) -> None:
         fit.fit_lines(
             work, cut, cut_at, dark=shade, start=start, widths=widths, log_widths=np.log(widths), which=which,
             saturation=settings.saturation_dn,
@@ -314,7 +314,7 @@ def _not_ordinary(profile: StripeProfile, start: Array) -> QuickVerdict:
     return QuickVerdict.UNMISTAKABLE if second < MISTAKABLE else QuickVerdict.NOT_ORDINARY
 
 
-def _lines(part: Any, axis: Axis) -> Any:
+def _lines(part: Dark | None, axis: Axis) -> Any:
     """A picture with the stripe's lines as its rows; a picture of one pixel stands for no dark frame."""
     if part is None:
         return np.zeros((1, 1), np.uint8)
@@ -323,7 +323,7 @@ def _lines(part: Any, axis: Axis) -> Any:
     return np.ascontiguousarray(part) if axis == "rows" else cv2.transpose(part)
 
 
-def _above(work: Image, shade: Any) -> Image:
+def _above(work: Image, shade: Shade) -> Image:
     """What lies above the dark frame, for the search; where both are saturated nothing does."""
     flat = shade if shade.dtype == np.uint8 else np.clip(np.rint(shade), 0, 255).astype(np.uint8)
     return np.asarray(cv2.subtract(work, flat), dtype=np.uint8)

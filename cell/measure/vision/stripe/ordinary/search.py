@@ -7,8 +7,6 @@ which would say the same of them.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from cell.base.compiled import compiled, compiled_fast
@@ -21,6 +19,11 @@ from cell.measure.vision.stripe.ordinary.find import (
     HEIGHT,
     SEARCH,
     WIDTH,
+    Array,
+    Floats,
+    Image,
+    Shade,
+    Whole,
     find_line,
     first_at,
     largest,
@@ -43,7 +46,7 @@ _SUMS = 9
 
 
 @compiled_fast
-def _sum_windows(window: Any, s: Any) -> None:
+def _sum_windows(window: Floats, s: Floats) -> None:
     """The sums (_SUMS, LANES) of the windows (PIXELS, LANES) around the lanes' peaks."""
     quarter, half, fifth = np.float32(0.25), np.float32(0.5), np.float32(0.2)
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -69,7 +72,7 @@ def _sum_windows(window: Any, s: Any) -> None:
 
 
 @compiled_fast
-def _look_beside(window: Any, s: Any) -> None:
+def _look_beside(window: Floats, s: Floats) -> None:
     """The largest value of each window outside of what belongs to its peak, which is `reach_of` its width."""
     zero, one, four = np.float32(0.0), np.float32(1.0), np.float32(4.0)
     share = np.float32(4.0 / 2.355)
@@ -83,7 +86,7 @@ def _look_beside(window: Any, s: Any) -> None:
 
 
 @compiled
-def _near(seen: Any, r: int, guess: int, top: int) -> int:
+def _near(seen: Image, r: int, guess: int, top: int) -> int:
     """Where line `r` first reaches `top` within SEARCH of a guess, else where it does at all."""
     for i in range(max(0, guess - SEARCH), min(seen.shape[1], guess + SEARCH + 1)):
         if seen[r, i] >= top:
@@ -92,7 +95,7 @@ def _near(seen: Any, r: int, guess: int, top: int) -> int:
 
 
 @compiled_fast
-def _note_brightest(seen: Any, first: int, size: int, least_peak: float, notes: Any) -> None:
+def _note_brightest(seen: Image, first: int, size: int, least_peak: float, notes: Whole) -> None:
     """Where the lines `first` on are brightest, and the largest value farther than SEARCH from there, into `notes`.
 
     A line is read once where its brightest pixel is near that of the line before. Of a line that does not reach
@@ -125,7 +128,9 @@ def _note_brightest(seen: Any, first: int, size: int, least_peak: float, notes: 
 
 
 @compiled_fast
-def _keep(image: Any, dark: Any, first: int, size: int, notes: Any, window: Any, cut: Any, cut_at: Any) -> None:
+def _keep(
+    image: Image, dark: Shade, first: int, size: int, notes: Whole, window: Floats, cut: Image, cut_at: Whole
+) -> None:
     """The pixels around the lines' noted places: above the dark frame into `window` (PIXELS, LANES), raw into `cut`."""
     n = image.shape[1]
     for j in range(size):
@@ -147,8 +152,9 @@ def _keep(image: Any, dark: Any, first: int, size: int, notes: Any, window: Any,
 
 @compiled
 def _take(
-    image: Any, first: int, size: int, saturation: int, least_peak: float, notes: Any, window: Any, s: Any, start: Any
-) -> None:
+    image: Image, first: int, size: int, saturation: int, least_peak: float, notes: Whole, window: Floats,
+    s: Floats, start: Array,
+) -> None:  # fmt: skip
     """Start values of the ordinary lines among the lanes, from their sums; the others are noted as open."""
     n = image.shape[1]
     for j in range(size):
@@ -171,8 +177,9 @@ def _take(
 
 @compiled
 def find_lines(
-    image: Any, seen: Any, dark: Any, saturation: int, least_peak: float, start: Any, cut: Any, cut_at: Any
-) -> bool:
+    image: Image, seen: Image, dark: Shade, saturation: int, least_peak: float, start: Array, cut: Image,
+    cut_at: Whole,
+) -> bool:  # fmt: skip
     """Start values of the lines of `image` (lines, n) into `start` (lines, CANDIDATES, START), which is 0 before.
 
     `dark` has one pixel where there is no dark frame, `seen` is what lies above it. The brightest peak comes first;
