@@ -22,9 +22,14 @@ if TYPE_CHECKING:
         Surroundings,
         VehicleConfig,
     )
+    from cell.measure.inversion.place_pose import PlacePose
     from cell.procedures.arm.photograph import BoardFix
+    from cell.procedures.steps.drive_to_target import VehicleArrival
     from cell.procedures.steps.kinds import PLACE, Kind
+    from cell.procedures.steps.place import PlaceResult
+    from cell.procedures.steps.reconstruct import Reconstruction
     from cell.procedures.steps.workplace import JobStep
+    from cell.procedures.sweep.stored_sweep import SweepRecord
     from cell.run.events import (
         Confirmed,
         ConfirmNeeded,
@@ -75,6 +80,11 @@ _PLACES = {
     "cell.procedures.steps.workplace": ("JobStep",),
     "cell.procedures.steps.kinds": ("Kind", "PLACE"),
     "cell.procedures.arm.photograph": ("BoardFix",),
+    "cell.procedures.sweep.stored_sweep": ("SweepRecord",),
+    "cell.procedures.steps.reconstruct": ("Reconstruction",),
+    "cell.measure.inversion.place_pose": ("PlacePose",),
+    "cell.procedures.steps.place": ("PlaceResult",),
+    "cell.procedures.steps.drive_to_target": ("VehicleArrival",),
     "cell.makes.built_in": ("ArmOutputClawConfig", "OnArm"),
     "cell.makes.make": (
         "Make", "Surroundings",
@@ -119,7 +129,10 @@ __all__ = [
     "NotObservable",
     "Noted",
     "OnArm",
+    "PlacePose",
+    "PlaceResult",
     "RailConfig",
+    "Reconstruction",
     "RefusedError",
     "Run",
     "RunEnded",
@@ -134,6 +147,8 @@ __all__ = [
     "StepProgress",
     "StepStarted",
     "Surroundings",
+    "SweepRecord",
+    "VehicleArrival",
     "VehicleConfig",
     "quantity",
     "whole",

@@ -308,7 +308,7 @@ def faults() -> str:
     from cell.run.recorded_work import CONFIRMED_BY_A_PERSON
 
     text = "# Fault codes\n\n" + NOTE
-    text += "The texts are those of the source; … stands for a value. "
+    text += "What happened and what to do are the words of who raises the fault; … stands for a value. "
     text += "[Recover from a fault](../how-to/recover.md) says how.\n\n"
     found = causes()
     for device in sorted({code.split(".")[0] for code in found}):

@@ -24,13 +24,14 @@ class Lateness:
     def __init__(self) -> None:
         self._late: deque[float] = deque(maxlen=KEPT)
         self._users = 0
+        self.rate = 1.0
         self._lock = threading.Lock()
         self._over = threading.Event()
 
-    def begin(self) -> None:
-        """Measure from now on."""
+    def begin(self, rate: float = 1.0) -> None:
+        """Measure from now on; the cell's clock runs at `rate` times the wall's pace."""
         with self._lock:
-            self._users += 1
+            self._users, self.rate = self._users + 1, rate
             if self._users == 1:
                 self._late.clear()
                 self._over = threading.Event()

@@ -46,7 +46,7 @@ from cell.run.report.truth import TruthRecorder
 from cell.run.resumption import UnfinishedRun, job_source
 from cell.run.runs import Run
 from cell.run.session.session import Opened
-from drivers.errors import CellError
+from drivers.errors import CalibrationStale, CellError
 from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
 from statemachine.runner import NO_SCRIPT, Event, Runner, Script
@@ -297,7 +297,8 @@ def each_of(observers: tuple[Observer, ...]) -> Observer:
 class JobWork:
     """A job, read as `ready` from `file`, for a run of this cell; `info` goes into the journal and the report.
 
-    `stored` is its calibration; without one it is calibrated first. `before` is the run that this one resumes,
+    `stored` is its calibration, or why there is none: then it is calibrated first. `before` is the run that this one
+    resumes,
     `at_start` somebody's word that the vehicle stands at the job's start pose, for this run alone.
     """
 
@@ -305,7 +306,7 @@ class JobWork:
     file: str | Path
     ready: ReadyJob
     info: Mapping[str, object]
-    stored: CellCalibration | None
+    stored: CellCalibration | CalibrationStale
     before: UnfinishedRun | None
     inline: tuple[Observer, ...]
     at_start: bool
@@ -325,8 +326,10 @@ class JobWork:
         if self.at_start:
             cell.whereabouts.say_at_start()
         calibration = self.stored
-        if calibration is None:
-            note("this simulated cell has no calibration yet: calibrating first")
+        if isinstance(calibration, CalibrationStale):
+            why = str(calibration).partition("; run `cell calibrate`")[0]
+            none = "this simulated cell has no calibration yet"
+            note(f"{none if 'holds no calibration of these devices' in why else why}: calibrating first")
             begun = time.time()
             try:
                 calibration = sessions.calibrate(cell, run, self.file)

@@ -64,9 +64,15 @@ def classify(error: BaseException, following: DeviceFollowing | None = None) -> 
     if notes := getattr(error, "__notes__", ()):
         failure = replace(failure, reason="; ".join([failure.reason, *notes]))
     unheard = isinstance(error, DeadlineError | NotConnectedError) or failure.code in UNHEARD
-    if unheard and (late := LATENESS.worst) > MOST_S and BUSY not in failure.reason:
-        said = failure.reason.rstrip(".")
-        failure = replace(failure, reason=f"{said}. {BUSY.capitalize()}: it woke up {1e3 * late:.0f} ms late.")
+    hurried = LATENESS.rate > 1.0 and isinstance(error, RefusedError | DeviceFault)
+    if (unheard or hurried) and (late := LATENESS.worst) > MOST_S and BUSY not in failure.reason:
+        said = f"{failure.reason.rstrip('.')}. {BUSY.capitalize()}: it woke up {1e3 * late:.0f} ms late."
+        if LATENESS.rate > 1.0:
+            said += (
+                f" The simulated cell keeps {LATENESS.rate:g} times the wall's pace: `--speed 1` gives it more time, "
+            )
+            said += "`--clock virtual` all that it needs."
+        failure = replace(failure, reason=said)
     if not failure.needs_person or following is None:
         return failure
     names = ", ".join(following.simulated)

@@ -14,23 +14,25 @@ _UNLOCK_S = 20.0
 _FAULTS: dict[str, tuple[str, bool, str]] = {
     "arm.protective_stop": (
         "the arm is in protective stop", True,
-        "Look for what it ran into and clear the way; then a person confirms: `cell confirm`, recover(confirmed=True).",
+        "Look for what it ran into and clear the way; then a person confirms: `cell confirm`.",
     ),
     "arm.emergency_stop": (
         "the emergency stop is pressed", False,
-        "Make the cell safe, release the button, switch the arm on at the pendant, brakes too, then recover().",
+        "Make the cell safe, release the button, switch the arm on at the pendant, brakes too, then `cell recover`.",
     ),
     "arm.safeguard_stop": ("the safeguard is open", False, "Close and acknowledge the safeguard, then go on."),
     "arm.safety_fault": ("the arm's safety system reports a fault", False, "Read the pendant's log; restart the arm."),
     "arm.recovery_mode": (
         "the arm is in recovery mode: it stands outside its safety limits", False,
-        "At the pendant, move it back by hand into the limits of its safety configuration, then recover().",
+        "At the pendant, move it back by hand into the limits of its safety configuration, then `cell recover`.",
     ),
     "arm.not_powered": (
-        "the arm is not powered", False, "Power it on and release its brakes at the pendant, then recover().",
+        "the arm is not powered", False, "Power it on and release its brakes at the pendant, then `cell recover`.",
     ),
-    "arm.program_stopped": ("the control program does not run on the arm", True, "recover() starts it again."),
-    "arm.not_arrived": ("the motion ended away from its target", True, "See what hinders the arm, then recover()."),
+    "arm.program_stopped": ("the control program does not run on the arm", True, "`cell recover` starts it again."),
+    "arm.not_arrived": (
+        "the motion ended away from its target", True, "See what hinders the arm, then `cell recover`.",
+    ),
     "arm.not_stopped": ("the arm does not come to rest", False, "Use the emergency stop."),
     "arm.not_safe": (
         "the arm is not known to be safe", False, "Use the emergency stop; see that it stands and the laser is off.",
@@ -45,7 +47,7 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
     ),
     "arm.wrong_payload": (
         "the controller reckons with another payload than this driver has set", True,
-        "Somebody has set it at the pendant or by a program: see what the arm carries, then recover() sets it again.",
+        "Somebody has set it at the pendant or by a program: see what the arm carries; `cell recover` sets it again.",
     ),
     "arm.local_control": (
         "the arm is in local control", False,
@@ -56,9 +58,9 @@ _FAULTS: dict[str, tuple[str, bool, str]] = {
         "The program was suspended, or this computer is too busy or swaps. End other programs, then go on.",
     ),
     "arm.link_lost": (
-        "the link to the arm was lost", True, "See that the arm is on and connected, then recover() or connect again.",
+        "the link to the arm was lost", True, "See that the arm is on and connected, then `cell recover`.",
     ),
-    "arm.refused": ("the arm refused a command", True, "See that the target can be reached, then recover()."),
+    "arm.refused": ("the arm refused a command", True, "See that the target can be reached, then `cell recover`."),
 }  # fmt: skip
 
 
@@ -83,7 +85,7 @@ def late_words(seconds: float) -> str:
 
 def fault(device: str, code: str, text: str = "") -> DeviceFault:
     """The `DeviceFault` for a code of the child process, with its text added."""
-    what, recoverable, hint = _FAULTS.get(code, ("the arm driver failed", True, "recover() starts it again."))
+    what, recoverable, hint = _FAULTS.get(code, ("the arm driver failed", True, "`cell recover` starts it again."))
     if _BUSY in text:
         hint = hint.replace(
             "Look for what it ran into and clear the way",

@@ -217,7 +217,7 @@ class ArmLink:
                 "arm.link_closed" if self._closing else "arm.link_lost",
                 f"the link to the arm at {self._address} was lost: {reason}",
                 recoverable=True,
-                hint="See that the arm is on and connected, then recover() or connect again.",
+                hint="See that the arm is on and connected, then `cell recover`.",
             )
             waiting = list(self._pending.values())
             self._pending.clear()

@@ -88,7 +88,7 @@ class CanLink:
                 f"the CAN bus at {self._address} failed: {self._failure or 'the receive thread has ended'}; "
                 f"{self._alone}",
                 recoverable=True,
-                hint="Check the adapter and its cable, then enable() the vehicle, which opens the bus again.",
+                hint="Check the adapter and its cable, then `cell recover`, which opens the bus again.",
             )
 
     @contextmanager

@@ -88,7 +88,7 @@ def emergency_stop(name: str) -> DeviceFault:
         "vehicle.emergency_stop",
         "the emergency stop is pressed",
         recoverable=False,
-        hint="Release the button when it is safe, then enable() the vehicle.",
+        hint="Release the button when it is safe, then `cell recover`.",
     )
 
 

@@ -74,7 +74,7 @@ class DirectVehicle:
                 "vehicle.emergency_stop",
                 "the emergency stop is pressed",
                 recoverable=False,
-                hint="Release the button when it is safe, then enable() the vehicle.",
+                hint="Release the button when it is safe, then `cell recover`.",
             )
         if feedback.state is not ChassisState.OK:
             driven = now - self._driven < REST_AFTER_S

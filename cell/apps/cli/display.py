@@ -21,33 +21,41 @@ from drivers.errors import MeasuredRow
 WIDTH, HEIGHT = 80, 23
 """What a screen holds; its last line is left to the prompt."""
 REASON_LINES = 3
+"""Of the reason on that screen, at least; where there is less else to show, it has more."""
 LABEL = 10
 """Columns of the words at the left edge."""
 
 
-def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH) -> list[str]:
-    """The lines for a report, at most `HEIGHT` of at most `width` columns; a longer path or command goes on below."""
+def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH, *, whole: bool = False) -> list[str]:
+    """The lines for a report, at most `HEIGHT` of at most `width` columns; a longer path or command goes on below.
+
+    With `whole` nothing of the reason or the figures is left out, however many lines that takes.
+    """
     width = max(width, 60)
-    outcome = str(report["outcome"])
-    head = _cut_lines(f"{outcome}  {report.get('reason', '')}", width, REASON_LINES)
-    head.append(_cut(_facts(report), width))
-    steps = _steps(report)
+    steps, measured = _steps(report), list(report.get("measured") or ())
     followed = report.get("following")
     late = _labelled("followed", following_words(followed), width) if followed else []
     tail = [*_trouble(report, width), *late, *_labelled("report", _shown_path(folder), width)]
     if (advice := next_step(report, folder)) is not None:
         tail += _labelled("next", advice, width)
-    blanks = 2 if report.get("measured") else 1
-    room = HEIGHT - len(head) - len(steps) - len(tail) - blanks
-    measured = [_cut(_figure(row), width) for row in (report.get("measured") or ())[: max(0, room)]]
-    return [*head, *steps, *([""] * bool(measured)), *measured, "", *tail]
+    room = HEIGHT - 1 - len(steps) - len(tail) - (2 if measured else 1)
+    text, shown = (
+        f"{report['outcome']}  {report.get('reason', '')}",
+        room - max(0, min(len(measured), room - REASON_LINES)),
+    )
+    most = len(text) if whole else max(REASON_LINES, shown)
+    head = [*_cut_lines(text, width, most), _cut(_facts(report), width)]
+    figures = [_cut(_figure(row), width) for row in measured]
+    fit = len(figures) if whole else max(0, room + 1 - len(head))
+    more = f"  … and {len(figures) - fit} more: cell report {folder.name.split('-')[-1]}" if len(figures) > fit else ""
+    return [*head, *steps, *([""] * bool(figures[:fit])), *figures[:fit], more, *tail]
 
 
 def next_step(report: Mapping[str, object], folder: Path) -> str | None:
     """What a person would type after a run that ended so; None where there is nothing to add."""
     outcome, kind, name = report["outcome"], report.get("kind", "job"), folder.name.split("-")[-1]
     look = "cell diag: the state of every device; "
-    again, see = ("cell dry-run", "") if report.get("simulated") is True else ("cell run", look)
+    again, see = (_dry_run(report), "") if report.get("simulated") is True else ("cell run", look)
     if job := report.get("for_job"):
         return f"cell diag: the state of every device; put that right, then {again} -j {_job({'job_file': job})}"
     if kind != "job":
@@ -73,6 +81,14 @@ def next_step(report: Mapping[str, object], folder: Path) -> str | None:
         case "aborted":
             return f"cell resume {name}: go on with the job"
     return f"cell abort {name}, if it is still going on; cell resume {name}, if its process died"
+
+
+def _dry_run(report: Mapping[str, object]) -> str:
+    """The command that runs in the same simulated world; what is the default is not named."""
+    usual = {"seed": 1, "level": "nominal", "clock": "wall"}
+    return " ".join(
+        ["cell dry-run", *(f"--{key} {report[key]}" for key in usual if report.get(key, usual[key]) != usual[key])]
+    )
 
 
 def _job(report: Mapping[str, object]) -> str:
@@ -176,11 +192,14 @@ def _cut(text: str, width: int) -> str:
 COLOURS = {"placed": "green", "done": "green", "refused": "yellow", "faulted": "red", "aborted": "magenta"}
 
 
-def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False) -> None:
-    """The end of a run for people, on one screen; with `noise` the noise that is assumed and the seams below it."""
+def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False, whole: bool = False) -> None:
+    """The end of a run for people, on one screen; `whole` leaves out nothing.
+
+    With `noise` the noise that is assumed and the seams stand below it.
+    """
     console = Console(highlight=False)
     outcome = str(report["outcome"])
-    first, *others = end_screen(report, Path(folder), console.width)
+    first, *others = end_screen(report, Path(folder), console.width, whole=whole)
     console.print(f"[bold {COLOURS.get(outcome, 'white')}]{outcome}[/]", end="")
     console.print(first.removeprefix(outcome), markup=False, soft_wrap=True)
     for line in others:

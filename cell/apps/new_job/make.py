@@ -5,6 +5,7 @@ Nothing is written before the job has passed the checks of `cell check`; nothing
 
 from __future__ import annotations
 
+import math
 import shlex
 import tempfile
 from dataclasses import dataclass, replace
@@ -89,7 +90,16 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         asker.tell("checking the job as the cell does, and whether the surface looks the same elsewhere …")
         notes = _checked(asker, there / targets[0].name, config, proposal)
         nominal = NominalSurface.load(there / targets[1].name, "mm")
-        found = _place(asker, proposal, nominal, config)
+        notes = [*proposal.notes, *notes, *told_by_few(proposal.seen, nominal)]
+        try:
+            found = _place(asker, proposal, nominal, config)
+        except RefusedError:
+            for note in notes:
+                asker.tell(f"note: {note}")
+            picture = targets[2].with_stem(f"{name}-refused")
+            draw_proposal(picture, proposal, nominal, config, f"job {name}, as it was refused: nothing has moved")
+            asker.tell(f"picture: {picture}; look at what the sweeps would see")
+            raise
         draw_proposal(targets[2], proposal, nominal, config, f"job {name}, as proposed: nothing has moved")
         asker.tell(f"picture: {targets[2]}; look at it")
         if asker.ask is not None and asker.get("write", "Write the job", "yes", choice("yes", "no")) == "no":
@@ -103,7 +113,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         name=name,
         seen=proposal.share,
         place=found,
-        notes=(*proposal.notes, *notes, *told_by_few(proposal.seen, nominal)),
+        notes=tuple(notes),
     )
 
 
@@ -154,19 +164,19 @@ def _place(asker: Asker, proposal: Proposal, nominal: NominalSurface, config: Ce
         _require_single(rivals(proposal.seen, nominal, job), job)
         return place_from(proposal.seen, nominal, job, config)
     except NotObservable as error:
-        angle = 1e3 * job.place.tolerance_angle / 3
-        shift = 1e3 * job.place.tolerance / 3
+        shift, angle = (_below(1e3 * allowed / 3) for allowed in (job.place.tolerance, job.place.tolerance_angle))
         told = NotObservable(
-            f"this surface does not tell where it is, which is known before anything is swept: {error}. Where it is "
-            f'fixed to the board more exactly than stated, say so: --prior "{shift:.2g} mm" or less, --prior-angle '
-            f'"{angle:.2g} mrad" or less, and the board decides; where the part may lie shifted or turned by so much, '
-            f"say that: --tolerance, --tolerance-angle. Nothing was written. Again: {_again(asker)}",
+            f"this surface does not tell where it is, which is known before anything is swept: {error}. Slopes, cones "
+            "and fillets that the head sees tell it; upright walls, which it does not see, and flat tops do not. Where "
+            f'the surface is fixed to the board more exactly than stated, say so: --prior "{shift} mm", --prior-angle '
+            f'"{angle} mrad", or less, and the board decides; where the part may lie shifted or turned by so much, '
+            f"say that: --tolerance, --tolerance-angle. No job was written. Again: {_again(asker)}",
             *error.numbers,
         )
         raise told from error
     except RefusedError as error:
         raise RefusedError(
-            f"the proposed scan would be refused: {error}. Nothing was written. Again: {_again(asker)}"
+            f"the proposed scan would be refused: {error}. No job was written. Again: {_again(asker)}"
         ) from error
 
 
@@ -177,9 +187,9 @@ def _require_single(others: list[tuple[Array, float]], job: Job) -> None:
     (x, y, z), turned = 1e3 * others[0][0], others[0][1]
     away = float(np.linalg.norm(others[0][0]))
     limit = (
-        f'--prior "{1e3 * away / 6:.2g} mm"'
+        f'--prior "{_below(1e3 * away / 6)} mm"'
         if away > job.place.tolerance
-        else f'--prior-angle "{1e3 * turned / 6:.2g} mrad"'
+        else f'--prior-angle "{_below(1e3 * turned / 6)} mrad"'
     )
     raise RefusedError(
         f"the surface looks the same elsewhere: shifted by ({x:.1f}, {y:.1f}, {z:.1f}) mm and turned by "
@@ -187,6 +197,12 @@ def _require_single(others: list[tuple[Array, float]], job: Job) -> None:
         f"places), and the board leaves that open. Take in an end or a feature that comes once; or, where it is fixed "
         f"to the board as exactly, say {limit} or less"
     )
+
+
+def _below(most: float) -> str:
+    """A number to propose that is well inside `most`: a tenth less, rounded down to two digits."""
+    digit = 10.0 ** (math.floor(math.log10(0.9 * most)) - 1)
+    return f"{math.floor(0.9 * most / digit) * digit:.2g}"
 
 
 def _again(asker: Asker) -> str:

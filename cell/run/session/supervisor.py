@@ -80,7 +80,7 @@ class Cell:
         self._signals = EndSignals()
         self._fed = simulated is None or simulated.facts.get("clock") != "virtual"
         if self._fed:
-            LATENESS.begin()
+            LATENESS.begin(config.cell.time_scale)
 
     @classmethod
     def open(
@@ -371,13 +371,14 @@ class Cell:
             from cell.devices.simulated.described import Described
 
             self.simulated.make_ready(Described.of(job))
-        stored: CellCalibration | None = None
+        stored: CellCalibration | CalibrationStale
         try:
             stored = self.calibration()
         except CalibrationStale as error:
             # A simulated cell is calibrated by itself, but never over what a person has edited.
             if isinstance(error, CalibrationEdited) or not is_whole(self.simulated):
                 raise
+            stored = error
         info |= {**self._here.world, **ready.info}
         work = JobWork(self._here, job, ready, info, stored=stored, before=before, inline=inline, at_start=at_start)
         return self.begin("job", work.perform, observer, stops)

@@ -191,7 +191,7 @@ def test_a_start_is_said_at_once_and_once_and_a_run_ends_with_its_figure(browser
 
     page.route("**/api/do", slow)
     shown = page.evaluate(
-        "() => { const b = document.getElementById('start'); b.click(); b.click();"
+        "() => { const b = document.getElementById('start'); b.click(); b.click(); b.form.requestSubmit();"
         " const of = (id) => document.getElementById(id);"
         " return [of('state').textContent, of('run-text').textContent, b.disabled, of('answer').hidden]; }"
     )

@@ -24,6 +24,7 @@ from cell.apps.cli.options import (  # fmt: skip
     SimOption,
     print_json,
 )
+from sim_backends.faults import FAULT_NAMES
 
 if TYPE_CHECKING:
     from cell.config.cell_config import CellConfig
@@ -51,7 +52,8 @@ InjectOption = Annotated[
     list[str] | None,
     typer.Option(
         "--inject",
-        help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable.',
+        help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable. What can be '
+        f"injected, not named as the codes that are reported: {', '.join(FAULT_NAMES)}.",
         autocompletion=completing.faults,
     ),
 ]

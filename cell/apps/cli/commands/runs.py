@@ -163,7 +163,7 @@ def report(
     if json:
         print_json(data)
     else:
-        print_report(data, str(folder), noise=noise)
+        print_report(data, str(folder), noise=noise, whole=True)
 
 
 def folder_of_runs(config: Path | None) -> Path:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cell.base.lateness import Lateness
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.devices.devices import Devices
@@ -18,7 +19,8 @@ from cell.measure.vision import parse_board
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.boards import collect_scan, look_for
-from cell.run.recorded_work import Hands, RecordedWork
+from cell.run import recorded_work
+from cell.run.recorded_work import Hands, RecordedWork, classify
 from cell.run.runs import Run
 from drivers.camera.folder import read_image
 from drivers.errors import RefusedError
@@ -89,3 +91,20 @@ def test_work_that_looks_at_nothing_leaves_no_folder_for_it(tmp_path: Path) -> N
     report, folder = recorded(tmp_path, VirtualCell(CONFIG, seed=4, level="ideal"), work)
     assert not (folder / "frames").exists()
     assert "last_frames" not in report
+
+
+@pytest.mark.parametrize(
+    ("rate", "late", "words"),
+    [(3.0, 0.4, "woke up 400 ms late. The simulated cell keeps 3 times the wall's pace: `--speed 1`"), (3.0, 0.01, ""),
+     (1.0, 0.4, "")],
+)  # fmt: skip
+def test_a_refusal_of_a_cell_that_outran_its_computer_says_so(
+    rate: float, late: float, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lateness = Lateness()
+    lateness.rate = rate
+    monkeypatch.setattr(recorded_work, "LATENESS", lateness)
+    monkeypatch.setattr(Lateness, "worst", late)
+    reason = classify(RefusedError("the board is not seen")).reason
+    assert reason.startswith("the board is not seen")
+    assert words in reason and (bool(words) or "late" not in reason)

@@ -124,7 +124,7 @@ def test_the_last_velocity_is_not_kept_alive_by_whatever_ends_it(bench: Bench, e
 def test_a_stop_that_nobody_confirms_is_told_bars_driving_meanwhile_and_the_brake_locks_all_the_same(
     bench: Bench,
 ) -> None:
-    bench.until(lambda: bench.vehicle.state(1.0).speed == 0.0)
+    bench.until(lambda: bench.vehicle._feedback.stands(0.0))
     bench.bus.talking = False  # its newest word, that it stands, is from before the stop
     problems: list[Exception] = []
 

@@ -82,7 +82,7 @@ def test_the_noise_is_shown_where_it_is_asked_for(
     ("make", "words"),
     [
         (report_runs.placed, "cell export"),
-        (report_runs.no_board, "picture.png shows why; put that right, then cell dry-run -j pot"),
+        (report_runs.no_board, "picture.png shows why; put that right, then cell dry-run --seed"),
         (report_runs.faulted, "cell resume"),
         (report_runs.aborted, "cell resume"),
     ],
@@ -115,12 +115,32 @@ def test_a_stale_calibration_asks_for_a_new_one(tmp_path: Path) -> None:
     assert "cell calibrate, then cell run -j pot" in "\n".join(end_screen(report, tmp_path))
 
 
+def test_a_simulated_run_is_repeated_in_its_own_world(tmp_path: Path) -> None:
+    report = {
+        "outcome": "refused", "reason": "no", "job": "pot", "simulated": True, "seed": 7, "level": "workshop",
+        "clock": "virtual",
+    }  # fmt: skip
+    text = " ".join("\n".join(end_screen(report, tmp_path)).split())
+    assert "then cell dry-run --seed 7 --level workshop --clock virtual -j pot" in text
+
+
+def test_what_a_screen_leaves_out_is_counted_and_the_report_has_it(ends: Ends) -> None:
+    run = ends(report_runs.placed)
+    rows = [{**run.report["measured"][0], "name": f"figure {k}"} for k in range(30)]
+    long = {**run.report, "measured": rows, "reason": "it is so. " * 60}
+    short, whole = (end_screen(long, run.folder, whole=whole) for whole in (False, True))
+    named = [line for line in short if "figure " in line]
+    assert len(short) <= HEIGHT
+    assert any(f"and {30 - len(named)} more: cell report" in line for line in short)
+    assert [sum("figure " in line for line in whole), " ".join(whole).count("it is so.")] == [30, 60]
+
+
 def test_a_reason_however_long_leaves_room_for_the_rest(ends: Ends) -> None:
     run = ends(report_runs.faulted)
     many = [{**run.report["faults"][0]}] * 30
     lines = end_screen({**run.report, "reason": "word " * 400, "faults": many}, run.folder)
     assert len(lines) <= HEIGHT
-    assert lines[2].endswith("…")
+    assert sum(line.startswith("word ") and line.endswith("…") for line in lines) == 1
     assert any(line.startswith("faults    30: ") for line in lines)
 
 
@@ -235,6 +255,8 @@ def test_a_report_with_rows_that_are_none_is_refused(tmp_path: Path) -> None:
 def test_a_long_reason_keeps_what_to_do_about_it(tmp_path: Path) -> None:
     remedy = "Scan more of the surface, or photograph the board more often"
     reason = f"{'; '.join(f'translation {k} is not determined: 0.181 mm > 0.1 mm' for k in range(9))}. {remedy}"
-    lines = end_screen({"outcome": "refused", "reason": reason}, tmp_path)
+    rows = [{"name": f"figure {k}", "value": 0.1, "unit": "mm", "limit": None} for k in range(20)]
+    lines = end_screen({"outcome": "refused", "reason": reason, "measured": rows}, tmp_path)
     assert lines[2] == remedy
     assert lines[1].endswith(" …")
+    assert remedy in " ".join(end_screen({"outcome": "refused", "reason": reason}, tmp_path))

@@ -337,6 +337,19 @@ def test_what_is_not_known_of_a_rate_grows_with_the_time(placed_pot: JobRecord) 
     np.testing.assert_allclose(np.einsum("nim,njm->nij", moved, moved), expected, atol=1e-18)
 
 
+def test_a_cloud_that_crept_is_put_back_to_where_it_was_in_the_middle_of_the_sweep(placed_pot: JobRecord) -> None:
+    cloud, times = placed_pot.results["reconstruct"].cloud, placed_pot.results["laser_sweep"].times
+    origin, since = cloud.points[cloud.valid].mean(axis=0), float(times.mean())
+    creep = Creep(np.array([3e-4, -2e-4, 1e-4, 0.0, 0.0, 2e-3]), np.zeros((6, 6)), origin, since)
+    seconds = (times - since)[:, None, None]
+    arms = cloud.points - origin
+    turned = 2e-3 * np.stack([-arms[..., 1], arms[..., 0], np.zeros(arms.shape[:2])], axis=-1)
+    crept = replace(cloud, points=cloud.points + seconds * (np.array([3e-4, -2e-4, 1e-4]) + turned))
+    # What is left is of second order: the arms are those of points that crept.
+    left = (creep.undone(crept, times).points - cloud.points)[cloud.valid]
+    assert np.abs(left).max() < 1e-6 < np.abs((crept.points - cloud.points)[cloud.valid]).max()
+
+
 def test_a_place_that_creeps_is_carried_on_to_the_time_of_the_contact(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
