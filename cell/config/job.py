@@ -82,8 +82,10 @@ class SurfaceSection(Table):
 
 
 class SwathSection(Table):
-    """One sweep of several: `across` along the surface's y axis from its middle, the head turned about the surface's x
-    axis (`roll`) and y axis (`pitch`) through the middle of what it scans."""
+    """One sweep of several: `across` along the surface's y axis, from its middle.
+
+    The head is turned about the surface's x axis (`roll`) and y axis (`pitch`), through the middle of what it scans.
+    """
 
     across: Annotated[float, quantity("mm", -200, 200)] = 0.0
     roll: Annotated[float, quantity("deg", -40, 40)] = 0.0
