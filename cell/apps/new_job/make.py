@@ -19,7 +19,7 @@ from cell.apps.new_job.observability import known, place_from, sight_problems, t
 from cell.apps.new_job.picture import draw_proposal
 from cell.apps.new_job.proposal import Proposal, propose
 from cell.apps.new_job.questions import Asker, choice
-from cell.apps.new_job.surface import about, written
+from cell.apps.new_job.surface import Laid, about, written
 from cell.apps.new_job.sweeps import FITS, Array, rivals
 from cell.apps.new_job.text import job_text, pose_text
 from cell.base.units import parse_quantity
@@ -63,20 +63,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     job = station(asker, like, name, targets[1].name, laid)
     step = asker.get("step", "Lines of the scan, how far apart", "0.5 mm", lambda t: parse_quantity(t, "mm", *STEP_MM))
 
-    def reachable(tried: Job) -> str | None:
-        return next(iter(sweep_problems(tried, config, laid.box)), None)
-
-    asker.tell("choosing sweeps …")
-    proposal = propose(laid, job, config, step=step, reachable=reachable, tell=asker.progress)
-    if proposal.open and asker.given.get("turn") is None:
-        # The light comes aslant from behind: from the other side it falls on other flanks.
-        asker.tell("choosing sweeps from the other side as well …")
-        other = propose(about(laid), job, config, step=step, reachable=reachable, tell=asker.progress)
-        if not other.open:
-            laid, proposal = (
-                about(laid),
-                replace(other, notes=(*other.notes, "turned by half a turn, to see more flanks")),
-            )
+    laid, proposal = _proposed(asker, laid, job, config, step=step)
     heading = [
         f"Place onto the surface of {mesh.name}. Written by `cell new-job`; change what is not as it is.",
         f"Of the mesh, in {unit}, what the sweeps see is in {targets[1].name}: surface_from_mesh =",
@@ -115,6 +102,24 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         place=found,
         notes=tuple(notes),
     )
+
+
+def _proposed(asker: Asker, laid: Laid, job: Job, config: CellConfig, *, step: float) -> tuple[Laid, Proposal]:
+    """The sweeps for the mesh as it lies, or turned by half a turn where only that determines the place."""
+
+    def reachable(tried: Job) -> str | None:
+        return next(iter(sweep_problems(tried, config, laid.box)), None)
+
+    asker.tell("choosing sweeps …")
+    proposal = propose(laid, job, config, step=step, reachable=reachable, tell=asker.progress)
+    if not proposal.open or asker.given.get("turn") is not None:
+        return laid, proposal
+    # The light comes aslant from behind: from the other side it falls on other flanks.
+    asker.tell("choosing sweeps from the other side as well …")
+    other = propose(about(laid), job, config, step=step, reachable=reachable, tell=asker.progress)
+    if other.open:
+        return laid, proposal
+    return about(laid), replace(other, notes=(*other.notes, "turned by half a turn, to see more flanks"))
 
 
 def _read(text: str) -> Drawn:

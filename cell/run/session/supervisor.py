@@ -97,29 +97,27 @@ class Cell:
         clock: str = "wall",
         truth: str | Path | None = None,
     ) -> Cell:
-        """Connect to every device of the cell, or of a simulated one that is started for it with `sim="all"`.
+        """Connect to the cell's devices and hold them; or start a simulated cell and hold that.
 
-        `sim` may also name some devices, in a list or with commas: those are simulated, the others real, in one cell.
-        The simulated world then follows what the real ones measure of themselves. Without `sim` it is `cell.sim` of
-        the configuration; "none" is all real. A mix that physics does not allow is a `ConfigError`.
+        Args:
+            config: The cell's configuration. Without it, `cell.toml` of the present folder; where there is none, only
+                a simulated cell is opened, as it ships. Runs and calibrations go beside the file, else to the folder.
+            sim: "all", "none", or the devices that are simulated, as a list or with commas; a simulated world then
+                follows what the real ones measure of themselves. Without it, `cell.sim` of the configuration.
+            seed: Which simulated world, 0 to 999999.
+            level: How far that world deviates from the drawing: "ideal", "nominal", "harsh" or "workshop".
+            speed: How many times faster than the wall a simulated cell over wires runs, 0.1 to 20; without it 3.
+            job: Whose station, surface and part a simulated cell has at first.
+            confirm: Instead of `cell.confirm`: who answers for a person; "simulated" in a simulated cell only.
+            only: The devices to connect, and what they hang on. Others may be off: asked, they are not connected.
+            clock: "wall": over the devices' real protocols. "virtual": models in this process, without wires or
+                waiting; the same seed and stored calibration give the same course, to the byte.
+            truth: Another configuration, by which the simulated cell is built: one that is not as it was written down.
 
-        With `only` these devices are held and connected (with one that hangs on the arm, the arm as well): the others
-        may be switched off, and what is asked of them is a `NotConnectedError`.
-
-        A simulated cell is the one that the configuration and `job` describe: its station and the part in its claw are
-        that job's, until another one is run. What cannot be simulated as it is described is refused. It is reached
-        over the devices' real protocols, and runs `speed` times as fast as the wall (three times unless told
-        otherwise). With `clock="virtual"` its models are in this process behind the devices' interfaces, without wires
-        and without waiting: the same seed then takes the same course, to the byte.
-
-        `truth` is another configuration, by which the simulated cell is built while the product works with `config`: a
-        cell that is not as it was written down.
-
-        Without `config` it is `cell.toml` of the present folder; where there is none, only a simulated cell is opened,
-        with the configuration that ships. Runs and calibrations go beside the file, or below the present folder.
-        `confirm`, if given, stands for `cell.confirm`: "simulated" only for a simulated cell.
-        Raises `ConfigError` before anything is started, `InterlockError` when another process holds the cell,
-        `NotConnectedError` or `DeviceFault` that names the device that does not answer.
+        Raises:
+            ConfigError: What is asked for cannot be, by physics or by the files; nothing was started.
+            InterlockError: Another process holds the cell.
+            NotConnectedError, DeviceFault: This device does not answer.
         """
         with EndSignals(), ExitStack() as undo:
             made = SessionRequest(
@@ -201,9 +199,13 @@ class Cell:
         stop_cell(self.devices)
 
     def clear_stop(self, by: str) -> None:
-        """A person, `by` name, has seen that the cell may move again after a stop: direct commands pass again.
+        """Let direct commands pass again after a stop. A new run needs no such word, and says it for nobody else.
 
-        A new run needs no such word, and says it for nobody else. `ConfigError` when nobody is named.
+        Args:
+            by: The person who has seen that the cell may move again.
+
+        Raises:
+            ConfigError: Nobody is named.
         """
         if not by.strip():
             raise ConfigError("clear_stop needs the name of the person who has looked at the cell")
@@ -215,8 +217,14 @@ class Cell:
         """Inside this context the interlocks named in `lift` do not hold (docs/reference/interlocks.md lists them).
 
         On a person's responsibility, and recorded: in the log of the run that is going on, else as a run of its own;
-        runs that are begun meanwhile say so in their report. `ConfigError` without a reason, or for a name that is
-        none or that nobody can lift.
+        runs that are begun meanwhile say so in their report.
+
+        Args:
+            reason: Why, for the record.
+            lift: Names of interlocks.
+
+        Raises:
+            ConfigError: No reason, or a name that is none or that nobody can lift.
         """
         if not reason.strip() or not lift:
             raise ConfigError("maintenance needs a reason, and the names of the interlocks to lift")
@@ -298,7 +306,14 @@ class Cell:
         until: str | None = None,
         script: Script = NO_SCRIPT,
     ) -> RunOutcome:
-        """`start` a job and wait for its end. Raises only for what is wrong before anything moves."""
+        """`start` a job, with the same arguments, and wait for its end.
+
+        Returns:
+            How the run ended, with its report. However it ends, nothing is raised.
+
+        Raises:
+            CellError: What is wrong before anything moves, as `start` does.
+        """
         return self.start(job, observer, inject, at_start=at_start, until=until, script=script).result()
 
     def start(
@@ -311,17 +326,24 @@ class Cell:
         until: str | None = None,
         script: Script = NO_SCRIPT,
     ) -> Run[RunOutcome]:
-        """Begin a job and hold it: `pause`, `go_on`, `confirm`, `abort`, `events`, `result`. It writes its own folder.
+        """Begin a job. A simulated cell is set up for it and its claw filled, and calibrated first if need be.
 
-        `at_start` is somebody's word that the vehicle stands at the job's start pose. Without it a run drives only when
-        the vehicle sees the board, or when this `Cell` has seen it before.
+        Args:
+            job: A job's file, or a name: NAME.toml of the present folder, else the job that ships.
+            observer: Called with each event, in the run's own thread.
+            inject: Faults of a simulated cell and when, such as "arm.protective_stop@laser_sweep:40%".
+            at_start: Somebody's word that the vehicle stands at the job's start pose. Without it a run drives only when
+                the vehicle sees the board, or when this `Cell` has seen it before.
+            until: The step after which the run ends, done; `RunOutcome.results` has what the steps made.
+            script: Looks at results between the steps, and decides about refusals.
 
-        At a simulated cell the job's station is set up and its part put into the claw, where that is not so already.
-        One that has no calibration is calibrated first; one with any real device is not: `CalibrationStale`. `inject`
-        schedules faults of a simulated cell, such as "arm.protective_stop@laser_sweep:40%".
+        Returns:
+            The run: `pause`, `go_on`, `confirm`, `abort`, `events`, `result`. It writes its own folder.
 
-        With `until` the run ends, done, after the step of that name; `RunOutcome.results` has what the steps made.
-        `script` looks at results between the steps and decides about refusals.
+        Raises:
+            ConfigError: The job, or how it was asked for, is wrong.
+            CalibrationStale: A cell with a real device has no calibration that holds.
+            InterlockError: Another run is going on.
         """
         loaded, _ = load_job(job)
         info: dict[str, object] = {}
@@ -340,11 +362,19 @@ class Cell:
         at_start: bool = False,
         script: Script = NO_SCRIPT,
     ) -> RunOutcome:
-        """Do the job of a run that was aborted, faulted or cut short, as a new run; without `run` the newest.
+        """Do the job of a run that was aborted, faulted or cut short, as a new run, and wait for its end.
 
         The vehicle stays where it stands if it sees the board from there, and what was swept is not swept again if
-        the board has not moved. `at_start` as in `run`. It ends after the same step as that run was to end; one that a
-        script looked at is resumed with its `script` only. Raises `ConfigError` when there is nothing to resume.
+        the board has not moved. It ends after the same step as that run was to end.
+
+        Args:
+            run: The run's name, the end of it, or its folder; without it the newest.
+            observer: As in `start`.
+            at_start: As in `start`.
+            script: As in `start`; a run that a script looked at is resumed with one only.
+
+        Raises:
+            ConfigError: There is nothing to resume.
         """
         folder = find_run(self.runs_folder, None if run is None else str(run), "job")
         before = UnfinishedRun.find(folder, scripted=not script.idle)
@@ -392,7 +422,12 @@ class Cell:
     def calibrate(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:
         """Move through the calibration poses over the deck boards, solve, and store the result and what it came from.
 
-        `job` names the part that may be in the claw, so that it does not touch anything on the way.
+        Args:
+            observer: As in `start`.
+            job: Whose part may be in the claw: it touches nothing on the way.
+
+        Raises:
+            RefusedError: A measurement is not good enough; what was stored before stays.
         """
         stops = self.stops
         load_job(job)
@@ -401,9 +436,15 @@ class Cell:
     def verify(self, observer: Observer | None = None, job: str | Path = "pot") -> Verification:
         """Look at the deck boards again and say how good the stored calibration is today.
 
-        Raises `CalibrationStale` when there is none, or one without a reference; `RefusedError` when a board is not
-        seen. `job` names the part that may be in the claw and what the place error is reckoned for. A turn of the laser
-        that the board confirms is kept with the calibration, for jobs.
+        A turn of the laser that the board confirms is kept with the calibration, for jobs.
+
+        Args:
+            observer: As in `start`.
+            job: Whose part may be in the claw, and for whose place the error is computed.
+
+        Raises:
+            CalibrationStale: There is no calibration, or one without a reference.
+            RefusedError: A board is not seen.
         """
         stops = self.stops
         loaded, _ = load_job(job)
@@ -413,11 +454,18 @@ class Cell:
         ).result()
 
     def time_stamps(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:
-        """Measure how late the scan camera's time stamps come, by sweeps to and fro over the fine board; kept with the
-        stored calibration, which is returned with it, and reckoned with by every sweep of the rail from then on.
+        """Measure how late the scan camera's time stamps come, by sweeps to and fro over the fine board.
 
-        Raises `CalibrationStale` when there is no calibration, `RefusedError` for a rolling shutter, for stamps that no
-        correction mends, and when the sweeps do not tell. `job` names the part that may be in the claw.
+        Args:
+            observer: As in `start`.
+            job: Whose part may be in the claw.
+
+        Returns:
+            The stored calibration with the delay, by which every later sweep of the rail corrects its times.
+
+        Raises:
+            CalibrationStale: There is no calibration.
+            RefusedError: A rolling shutter, stamps that no correction mends, or sweeps that do not tell.
         """
         stops = self.stops
         loaded, _ = load_job(job)
@@ -427,9 +475,15 @@ class Cell:
         ).result()
 
     def recover(self, by: str, observer: Observer | None = None) -> None:
-        """A person, `by` name, has looked at the cell: unlock the arm's protective stop, connect a lost link, clear the
-        vehicle's fault. Nothing moves. `ConfigError` when nobody is named; `DeviceFault` for what only the pendant or
-        the emergency stop's button clears.
+        """Unlock the arm's protective stop, connect a lost link, clear the vehicle's fault. Nothing moves.
+
+        Args:
+            by: The person who has looked at the cell.
+            observer: As in `start`.
+
+        Raises:
+            ConfigError: Nobody is named.
+            DeviceFault: Only the pendant or the emergency stop's button clears it.
         """
         if not by.strip():
             raise ConfigError("recover needs the name of the person who has looked at the cell")
@@ -444,7 +498,16 @@ class Cell:
         self.perform("recovery", work, observer, {"by": by})
 
     def home(self, device: str | None = None, observer: Observer | None = None) -> None:
-        """Home the rail and fold the arm above the deck, or only the `device` of that name, "rail" or "arm"."""
+        """Home the rail and fold the arm above the deck.
+
+        Args:
+            device: "rail" or "arm": that one only.
+            observer: As in `start`.
+
+        Raises:
+            ConfigError: Another device is named.
+            InterlockError: Another run is going on, or the arm must not move now.
+        """
         stops = self.stops
         if device not in (None, *HOMED):
             raise ConfigError(f'"{device}" has no home; {" and ".join(HOMED)} have')
