@@ -70,6 +70,16 @@ class TmclRailConfig(RailConfig):
     reference_mode: Annotated[int, whole(1, 255, allowed=REFERENCE_MODES, meaning=MODES_TOLD)] = 5
     reversed: StrictBool = False
 
+    @property
+    def counted(self) -> tuple[int, int]:
+        """See `RailConfig`."""
+        return self.steps_per_turn, self.microsteps
+
+    @property
+    def turned_round(self) -> bool:
+        """See `RailConfig`."""
+        return self.reversed
+
     @model_validator(mode="after")
     def _countable(self) -> Self:
         low, high = self.travel
@@ -97,6 +107,8 @@ class UrArmConfig(ArmConfig):
 class AgilexVehicleConfig(CanVehicleConfig):
     """A carrier that speaks AgileX protocol v2 on CAN."""
 
+    MODEL: ClassVar[str] = "AgileX v2"
+
     driver: Literal["agilex"] = "agilex"
 
 
@@ -115,6 +127,10 @@ class FixedVehicleConfig(VehicleConfig):
     max_speed: Annotated[float, quantity("m/s", 0.01, 1.5)] = 1.5
     max_yaw_rate: Annotated[float, quantity("deg/s", 25, 90)] = 1.0
     lean_sigma: Annotated[float, quantity("mrad/m", 0, 20)] = 0.0
+
+    def wire(self) -> dict[str, object]:
+        """See `DeviceConfig`."""
+        return {"make": self.driver}
 
 
 class StreamCameraConfig(CameraConfig):

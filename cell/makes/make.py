@@ -81,6 +81,14 @@ class DeviceConfig(Table):
         """What this computer knows the device by: one program at a time holds it."""
         return real_path(self.place)
 
+    def wire(self) -> dict[str, object]:
+        """How the device is wired, as its simulated peer takes it; empty where no peer has to be told."""
+        return {}
+
+    def answers(self) -> tuple[str, bool] | None:
+        """Whether the device answers where it is, in words; nothing is set. None: it is asked as any address."""
+        return None
+
 
 OfMake = TypeVar("OfMake", bound=DeviceConfig)
 
@@ -110,6 +118,21 @@ class RailConfig(DeviceConfig):
     max_speed: Annotated[float, quantity("mm/s", 0.1, 500)]
     acceleration: Annotated[float, quantity("mm/s^2", 1, 10_000)]
     late: Late = 0.0
+
+    @property
+    def counted(self) -> tuple[int, int] | None:
+        """Steps of a turn that the drive counts, and microsteps of a step; None where the make does not say."""
+        return None
+
+    @property
+    def turned_round(self) -> bool:
+        """Whether the drive is to turn its motor the other way round."""
+        return False
+
+    @property
+    def untold_serial(self) -> str | None:
+        """What stands for the serial number of a drive that tells none; None for one that tells it."""
+        return None
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -170,14 +193,22 @@ class ArmConfig(DeviceConfig):
 
 
 class VehicleConfig(DeviceConfig):
-    """The carrier. One that does not drive (`DRIVES`) stands at the target of every job."""
+    """The carrier. One that does not drive (`DRIVES`) stands at the target of every job. As it turns, its wheels slide
+    sideways (`SLIDES`) or roll. `MODEL` is what the make calls itself; without it that is `driver`."""
 
     DRIVES: ClassVar[bool] = True
+    SLIDES: ClassVar[bool] = True
+    MODEL: ClassVar[str] = ""
 
     track: Annotated[float, quantity("mm", 100, 3000)]
     max_speed: Annotated[float, quantity("m/s", 0.01, 1.5)]
     max_yaw_rate: Annotated[float, quantity("deg/s", 25, 90)]
     lean_sigma: Annotated[float, quantity("mrad/m", 0, 20)] = 0.0004
+
+    @property
+    def count_length(self) -> float:
+        """In what the way of a side is told, m."""
+        return 0.001
 
 
 class CameraConfig(DeviceConfig):

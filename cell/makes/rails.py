@@ -11,6 +11,7 @@ from cell.base.addresses import Port
 from cell.base.toml_file import Table
 from cell.base.units import whole
 from cell.makes.make import AnyMake, Late, Make, RailConfig, Surroundings
+from drivers.errors import UNTOLD
 
 if TYPE_CHECKING:
     from drivers.rail.modbus.link import Action, Flag, Number, Rate, RegisterMap
@@ -127,6 +128,20 @@ class ModbusRailConfig(RailConfig):
     serial: Annotated[str, StringConstraints(max_length=40)] = ""
     late: Late = 0.001
     registers: RegistersConfig
+
+    @property
+    def counted(self) -> tuple[int, int]:
+        """See `RailConfig`."""
+        return self.counts_per_turn, 1
+
+    @property
+    def untold_serial(self) -> str | None:
+        """See `RailConfig`."""
+        return (self.serial or UNTOLD) if self.registers.serial is None else None
+
+    def wire(self) -> dict[str, object]:
+        """See `DeviceConfig`."""
+        return {"make": self.driver} | self.model_dump(mode="json", include={"unit", "counts_per_turn", "registers"})
 
     @model_validator(mode="after")
     def _countable(self) -> Self:

@@ -40,6 +40,10 @@ class OnBoard(DeviceConfig):
         """The port, by the name of what it is."""
         return real_path(self.url)
 
+    def wire(self) -> dict[str, object]:
+        """See `DeviceConfig`."""
+        return {"make": self.driver, "place": self.held, "relay": self.relay}
+
 
 class NumatoLaserConfig(OnBoard, LaserConfig):
     """A laser on a relay of a Numato board."""
@@ -79,6 +83,10 @@ class NumatoClawConfig(OnBoard, ClawConfig):
     held_is: Literal["high", "low"] = "high"
     baud: Annotated[int, whole(9600, 921600, allowed=NUMATO_BAUDS)] = 19200
 
+    def wire(self) -> dict[str, object]:
+        """See `DeviceConfig`."""
+        return super().wire() | {"feedback": self.feedback, "active_high": self.held_is == "high"}
+
 
 class RobotiqClawConfig(ClawConfig):
     """A Robotiq gripper, on the socket of its program on the arm's controller; `inside`: it holds by spreading."""
@@ -90,6 +98,10 @@ class RobotiqClawConfig(ClawConfig):
     speed: Count = 128
     force: Count = 64
     inside: bool = False
+
+    def wire(self) -> dict[str, object]:
+        """See `DeviceConfig`."""
+        return {"make": self.driver, "place": self.address}
 
 
 def line_problems(records: Mapping[str, DeviceConfig]) -> Iterator[str]:

@@ -81,6 +81,10 @@ class CanopenVehicleConfig(CanVehicleConfig):
         "never run on a real drive: the first time with the wheels off the floor, and look which way each turns"
     )
 
+    # Two driven wheels slide by far less sideways than four.
+    SLIDES: ClassVar[bool] = False
+    MODEL: ClassVar[str] = "CiA 402"
+
     driver: Literal["canopen"] = "canopen"
     left_node: Node
     right_node: Node
@@ -130,6 +134,29 @@ class CanopenVehicleConfig(CanVehicleConfig):
                 f"{MOST_RPM:g}); is gear turns of the motor per turn of the wheel?"
             )
         return self
+
+    @property
+    def count_length(self) -> float:
+        """See `VehicleConfig`."""
+        return self.wheels().count_length
+
+    def wire(self) -> dict[str, object]:
+        """See `DeviceConfig`."""
+        keys = {
+            "left_node", "right_node", "wheel_radius", "gear", "counts_per_turn", "velocity_unit", "left_reversed",
+            "right_reversed",
+        }  # fmt: skip
+        lines = {
+            "brake_bit": self.brake_bit if self.brake == "output" else None,
+            "brake_locks": self.brake_locks == "high",
+            "stop_bit": self.stop_input,
+            "stop_active": self.stop_pressed == "high",
+        }
+        return {"make": self.driver, **self.model_dump(include=keys), **lines}
+
+    def answers(self) -> tuple[str, bool]:
+        """See `DeviceConfig`."""
+        return look_at_nodes(self)
 
     def wheels(self) -> WheelDrives:
         """The drives as their driver takes them."""

@@ -19,11 +19,9 @@ from cell.config.cell_config import DEVICES, CellConfig, find_config, load_confi
 from cell.devices.diagnosis.local_devices import ROOT, Found, barred, cameras, can_interfaces, opened_by, serial_ports
 from cell.devices.lock import who_holds
 from cell.makes.built_in import TmclRailConfig
-from cell.makes.make import DeviceConfig, Surroundings
-from cell.makes.rails import ModbusRailConfig
+from cell.makes.make import DeviceConfig, RailConfig, Surroundings, of_make
 from cell.makes.switches import OnBoard
 from cell.makes.table import make_of
-from cell.makes.vehicles import CanopenVehicleConfig
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError
 from drivers.interfaces import LinkStatistics
@@ -68,16 +66,17 @@ def find(path: Path | None, ports: Collection[str] = (), *, ask: bool = False, r
 def ask_module(port: str, config: CellConfig | None) -> Found:
     """Ask a serial port for a TMCL module's version, with the rail's configured speed and address, else the usual.
 
-    Where the configured rail is a drive on Modbus, it is that drive that is asked for.
+    Where the configured rail is of another make, it is that one that is asked for.
     """
     from drivers.rail.tmcl.link import TmclLink
 
     busy = _held(port) or ("" if "://" in port else barred(port) or opened_by(port))
-    if config is not None and isinstance(config.rail, ModbusRailConfig):
-        return Found("Modbus drive", port, busy, False) if busy else _ask_drive(port, config.rail)
+    if config is not None and not isinstance(config.rail, TmclRailConfig):
+        kind = f"rail ({config.rail.driver})"
+        return Found(kind, port, busy, False) if busy else _ask_rail(kind, port, config.rail)
     if busy:
         return Found("TMCL module", port, busy, False)
-    rail = config.rail if config is not None and isinstance(config.rail, TmclRailConfig) else None
+    rail = None if config is None else of_make(config.rail, TmclRailConfig)
     baud, address = (_TMCL_BAUD, _TMCL_ADDRESS) if rail is None else (rail.baud, rail.address)
     try:
         link = TmclLink(
@@ -94,19 +93,19 @@ def ask_module(port: str, config: CellConfig | None) -> Found:
     )
 
 
-def _ask_drive(port: str, record: ModbusRailConfig) -> Found:
-    """Ask a serial port for the configured drive: only reading, by the addresses of its map."""
+def _ask_rail(kind: str, port: str, record: RailConfig) -> Found:
+    """Ask a serial port for the configured rail, by its own driver, which only looks."""
     make = make_of("rail", record.driver)
     try:
-        rail = make.connect("rail", record.model_copy(update={"url": port}), Surroundings(Clock(), look=True))
+        rail = make.connect("rail", record.model_copy(update={record.ADDRESS: port}), Surroundings(Clock(), look=True))
         try:
             state = rail.state()
         finally:
             rail.close()
     except CellError as error:
-        return Found("Modbus drive", port, str(error), False)
-    told = f"number {record.unit} answers: at {1e3 * state.position:.2f} mm, {'homed' if state.homed else 'not homed'}"
-    return Found("Modbus drive", port, told, True, f'[rail] url = "{port}"')
+        return Found(kind, port, str(error), False)
+    told = f"answers: at {1e3 * state.position:.2f} mm, {'homed' if state.homed else 'not homed'}"
+    return Found(kind, port, told, True, f'[rail] {record.ADDRESS} = "{port}"')
 
 
 def configured(config: CellConfig, root: Path = ROOT) -> list[Found]:
@@ -133,8 +132,8 @@ def _look(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
         return problem or "there, and this user may open it", not problem
     if getattr(record, "interface", "") == "socketcan":
         there = (root / "sys/class/net" / place).exists()
-        if there and isinstance(record, CanopenVehicleConfig):
-            return _look_at_nodes(record)
+        if there and (answer := record.answers()) is not None:
+            return answer
         return ("there" if there else f"no interface {place}: see `ip link`"), there
     return _look_at_host(name, record, place)
 
@@ -157,18 +156,12 @@ def _look_at_host(name: str, record: DeviceConfig, place: str) -> tuple[str, boo
         )
     if port is None:
         return "nothing to ask at such an address; `cell diag` connects to it", True
-    if isinstance(record, CanopenVehicleConfig):
-        return _look_at_nodes(record)
+    if (answers := record.answers()) is not None:
+        return answers
     problem = _try_port(host, port)
     if problem and DEVICES[name] == "camera" and (answer := gige_camera(host)):
         return f'{problem}; but {answer}: driver = "gige", address = "{host}"', False
     return problem or "answers", not problem
-
-
-def _look_at_nodes(record: CanopenVehicleConfig) -> tuple[str, bool]:
-    from cell.makes.vehicles import look_at_nodes
-
-    return look_at_nodes(record)
 
 
 def _look_at_arm(host: str) -> tuple[str, bool]:

@@ -16,11 +16,8 @@ from numpy.typing import NDArray
 
 from cell.config.cell_config import CALIBRATION_DEPTHS, DEVICES, CellConfig
 from cell.config.job import Job, load_job, shipped_mesh
-from cell.makes.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, FixedVehicleConfig, OnArm, TmclRailConfig
-from cell.makes.make import CameraConfig, DeviceConfig, Pose, RailConfig, VehicleConfig
-from cell.makes.rails import ModbusRailConfig
-from cell.makes.switches import NumatoClawConfig, OnBoard, RobotiqClawConfig
-from cell.makes.vehicles import CanopenVehicleConfig
+from cell.makes.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, OnArm
+from cell.makes.make import CameraConfig, Pose
 from cell.measure.geometry.poses import from_parts, transform
 from drivers.errors import ConfigError
 from sim_backends.optics.scene import KINDS, Board
@@ -73,13 +70,15 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
     arm, rail, laser, claw = config.arm, config.rail, config.laser, config.claw
     low, high = rail.travel
     margin = 0.1 * (high - low)
+    # A real rail that does not say how it counts is followed: how it is driven does not show.
+    steps, _ = rail.counted or (STOCK.cell.rail.steps_per_turn, 1)
     return drawn.CellDrawing(
         arm=arm.model,
         payload=arm.payload,
         payload_centre=arm.payload_centre,
         vehicle_from_base=_matrix(arm.vehicle_from_base.se3()),
-        track=_turning_track(config.vehicle),
-        rail=drawn.RailDrawing(rail.lead, _steps(rail), rail.travel, (low + margin, high - margin), reverses(rail)),
+        track=(TURNS_WIDER if config.vehicle.SLIDES else 1.0) * config.vehicle.track,
+        rail=drawn.RailDrawing(rail.lead, steps, rail.travel, (low + margin, high - margin), rail.turned_round),
         scan=_camera(config.scan_camera, SCAN_FOCUS),
         target=_camera(config.target_camera, TARGET_FOCUS),
         baseline=laser.baseline,
@@ -92,64 +91,9 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         base_from_fine_board=_matrix(config.calibration.fine.base_from_board.se3()),
         deck_board=config.calibration.large.board,
         base_from_deck_board=_matrix(config.calibration.large.base_from_board.se3()),
-        wires=_vehicle(config.vehicle)
-        | {name: wire for name in ("rail", "laser", "claw") if (wire := _wire(config.device(name)))},
+        wires={name: wire for name in ("vehicle", "rail", "laser", "claw") if (wire := config.device(name).wire())},
         obstacles=_boxes({o.name: (o.base_from_centre, o.size) for o in config.obstacle}),
     )
-
-
-def reverses(rail: RailConfig) -> bool:
-    """Whether the configuration has the drive turn its motor the other way round."""
-    return isinstance(rail, TmclRailConfig) and rail.reversed
-
-
-def _steps(rail: RailConfig) -> int:
-    """Steps of a turn that a drive counts at its coarsest."""
-    if isinstance(rail, ModbusRailConfig):
-        return rail.counts_per_turn
-    # A real rail of another make is followed: how it is driven does not show.
-    return rail.steps_per_turn if isinstance(rail, TmclRailConfig) else STOCK.cell.rail.steps_per_turn
-
-
-def _wire(record: DeviceConfig) -> dict[str, object]:
-    """How a device is wired that does not hang on the arm, as its peer takes it."""
-    wire: dict[str, object] = {"make": record.driver}
-    match record:
-        case ModbusRailConfig():
-            return wire | record.model_dump(mode="json", include={"unit", "counts_per_turn", "registers"})
-        case RobotiqClawConfig():
-            return wire | {"place": record.address}
-        case NumatoClawConfig():
-            lines = {"feedback": record.feedback, "active_high": record.held_is == "high"}
-            return wire | {"place": record.held, "relay": record.relay, **lines}
-        case OnBoard():
-            return wire | {"place": record.held, "relay": record.relay}
-    return {}
-
-
-def _turning_track(vehicle: VehicleConfig) -> float:
-    """The track that counts when it turns: two driven wheels slide by far less sideways than four."""
-    return vehicle.track if isinstance(vehicle, CanopenVehicleConfig) else TURNS_WIDER * vehicle.track
-
-
-def _vehicle(record: VehicleConfig) -> dict[str, dict[str, object]]:
-    """The vehicle's wire, for its peer; none for the stock cell's."""
-    match record:
-        case FixedVehicleConfig():
-            return {"vehicle": {"make": "fixed"}}
-        case CanopenVehicleConfig():
-            keys = {
-                "left_node", "right_node", "wheel_radius", "gear", "counts_per_turn", "velocity_unit", "left_reversed",
-                "right_reversed",
-            }  # fmt: skip
-            lines = {
-                "brake_bit": record.brake_bit if record.brake == "output" else None,
-                "brake_locks": record.brake_locks == "high",
-                "stop_bit": record.stop_input,
-                "stop_active": record.stop_pressed == "high",
-            }
-            return {"vehicle": {"make": "canopen", **record.model_dump(include=keys), **lines}}
-    return {}
 
 
 def _station(job: Job, mesh: Path, drives: bool) -> drawn.StationDrawing:
@@ -215,7 +159,7 @@ def _makes(config: CellConfig, simulated: Collection[str]) -> Iterator[str]:
                 f'{name}.driver = "{make.name}": nothing simulates this make; for a simulated cell name one that is '
                 "simulated (the built-in ones are)"
             )
-        elif name in ("laser", "claw") and not make.on_arm and not _wire(config.device(name)):
+        elif name in ("laser", "claw") and not make.on_arm and not config.device(name).wire():
             yield f'{name}.driver = "{make.name}": nothing simulates what this make hangs on; name a built-in one'
 
 

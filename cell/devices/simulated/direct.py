@@ -13,16 +13,13 @@ import numpy as np
 from cell.config.cell_config import DEVICES, CellConfig
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.devices import Devices
-from cell.devices.simulated.described import Described, reverses
-from cell.makes.built_in import TmclRailConfig
-from cell.makes.make import MOST_PAYLOAD, RailConfig, of_make
-from cell.makes.rails import ModbusRailConfig
-from cell.makes.vehicles import CanopenVehicleConfig
+from cell.devices.simulated.described import Described
+from cell.makes.make import MOST_PAYLOAD
 from cell.motion.kinematics import MODELS
 from drivers.arm.faults import fault
 from drivers.arm.motion import ArmLimits
 from drivers.clock import ClockMap, Latch
-from drivers.errors import UNTOLD, ConfigError
+from drivers.errors import ConfigError
 from drivers.rail.motion import CarriageWatch
 from drivers.rail.sweep import EvenMotion
 from drivers.rail.zero_check import ZeroCheck
@@ -32,11 +29,6 @@ from sim_backends.direct import cell
 from sim_backends.direct.cell import DirectCell
 from sim_backends.direct.product import ArmSetup, CameraSetup, DirectSetup, RailSetup, VehicleSetup
 from sim_backends.direct.switches import DirectClaw, DirectLaser
-
-AGILEX_COUNT_M = 0.001
-"""In which AgileX v2 tells the way of a side."""
-_VEHICLES = {"agilex": "AgileX v2", "canopen": "CiA 402"}
-"""What the makes call themselves."""
 
 
 class VirtualCell(DirectCell):
@@ -110,8 +102,10 @@ class VirtualCell(DirectCell):
 
 def setup_of(config: CellConfig) -> DirectSetup:
     """What the devices are given: the configuration's values and the drivers' logic."""
-    count = config.vehicle.wheels().count_length if isinstance(config.vehicle, CanopenVehicleConfig) else AGILEX_COUNT_M
     arm, rail, vehicle = config.arm, config.rail, config.vehicle
+    count = vehicle.count_length
+    if rail.counted is None:
+        raise ConfigError(f'rail.driver = "{rail.driver}" does not say how it counts; name another make, or use wires')
     return DirectSetup(
         ArmSetup(
             ArmLimits(
@@ -126,15 +120,15 @@ def setup_of(config: CellConfig) -> DirectSetup:
         ),
         RailSetup(
             rail.lead,
-            *_counted(rail),
+            *rail.counted,
             rail.travel,
             rail.max_speed,
             rail.acceleration,
-            reverses(rail),
+            rail.turned_round,
             EvenMotion.of,
             CarriageWatch,
             ZeroCheck,
-            _serial(rail),
+            rail.untold_serial,
         ),
         VehicleSetup(
             vehicle.max_speed,
@@ -142,23 +136,8 @@ def setup_of(config: CellConfig) -> DirectSetup:
             PlanarOdometry(vehicle.track, count),
             trouble=lambda bits: system_trouble(bits, commanded=True),
             error=lambda name, bits, trouble, driven: vehicle_error(name, bits, trouble, driven=driven),
-            make=_VEHICLES.get(vehicle.driver, vehicle.driver),
+            make=vehicle.MODEL or vehicle.driver,
             count=count,
         ),
         CameraSetup(ClockMap, Latch),
     )
-
-
-def _counted(rail: RailConfig) -> tuple[int, int]:
-    """Steps of a turn and microsteps of a step that positions are counted in."""
-    if isinstance(rail, ModbusRailConfig):
-        return rail.counts_per_turn, 1
-    counted = of_make(rail, TmclRailConfig)
-    return counted.steps_per_turn, counted.microsteps
-
-
-def _serial(rail: RailConfig) -> str | None:
-    """What the driver would tell for a drive that does not tell its serial number; None for one that does."""
-    if isinstance(rail, ModbusRailConfig) and rail.registers.serial is None:
-        return rail.serial or UNTOLD
-    return None
