@@ -52,6 +52,12 @@ joints[0] += 2.0
 with laser.lit():
     arm.move_joints(joints, 0.2, 1.0).wait(60.0)
 """
+LIT = """
+arm = assembly.connect_one(config, "arm", clock)
+laser = assembly.connect_one(config, "laser", clock, arm=arm)
+with laser.lit():
+    clock.sleep(1e6)
+"""
 FROZEN = {DRIVE: "vehicle.owner_frozen", MOVE: "rail.owner_frozen", LIT_ARM: "arm.owner_frozen"}
 """The fault that the process is told once it runs again."""
 
@@ -75,8 +81,10 @@ def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, di
         (SEARCH, lambda truth: truth["rail_moving"]),
         (MOVE, lambda truth: truth["rail_moving"] and truth["rail"]["carriage"] > 0.001),
         (LIT_ARM, lambda truth: truth["arm"]["moving"] and truth["laser_on"]),
+        # Of an arm at rest no program ends, with which the controller would switch the laser off by itself.
+        (LIT, lambda truth: truth["laser_on"]),
     ],
-    ids=["vehicle", "rail searching its switch", "rail", "arm and laser"],
+    ids=["vehicle", "rail searching its switch", "rail", "arm and laser", "laser alone"],
 )
 def test_half_a_second_after_the_last_sign_of_life_all_is_safe(
     serving: tuple[Path, dict[str, Any]],
