@@ -210,4 +210,4 @@ def test_a_job_whose_first_calibration_fails_ends_as_any_run(
     said = " ".join(capsys.readouterr().out.split())
     assert (ended.value.code, said.split()[0]) == (1, "refused")
     assert "in the calibration before the job: 3 of 20 calibration views show the board" in said
-    assert "put that right, then cell dry-run -j pot" in said
+    assert "put that right, then cell dry-run --seed 3 --clock virtual -j pot" in said
