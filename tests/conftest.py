@@ -7,6 +7,7 @@ other, because they share what is made once for a worker, or because devices ove
 from __future__ import annotations
 
 import os
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -89,8 +90,11 @@ GROUPS = (
     ("unit/cell/devices/gate/test_interlocks.py",),
     ("unit/cell/measure/calibration/solve/test_joint.py", "unit/cell/measure/calibration/judge/test_scale.py"),
 )
-"""Groups of files or folders in the order in which they begin, the wires first. Other files over the wires end the
-first one; any other is a group of its own, after them."""
+"""Groups of files or folders in the order in which they begin, the wires first. Any other file over the wires, wherever
+it is, ends the group of its device, or the first; what only computes is a group of its own, after them."""
+
+DEVICES = {"rail": 1, "vehicle": 1, "arm": 2, "camera": 2, "relay": 2, "claw": 2, "switches": 2}
+"""The group of a file over the wires by the folder that it is in, such as `unit/drivers/rail`."""
 
 VIRTUAL_JOB = 3
 """The group whose files share `placed_pot`."""
@@ -99,7 +103,7 @@ HERE = Path(__file__).parent
 PLACES = {HERE / name: (number, k) for number, group in enumerate(GROUPS) for k, name in enumerate(group)}
 WIRES = HERE / "integration" / "wire"
 SCREENS = (HERE / "integration" / "browser", HERE / "integration" / "console")
-ON_THE_WALL = (WIRES, *SCREENS, HERE / "unit" / "drivers" / "vehicle" / "test_agilex.py")
+ON_THE_WALL = (*SCREENS, HERE / "unit" / "drivers" / "vehicle" / "test_agilex.py")
 WHOLE_CELL, COMPUTES = 5, 19
 """How much nicer than a single device, whose times are compared to milliseconds, the others are: a whole cell keeps
 deadlines of seconds on the wall, and what only computes gets what the others leave."""
@@ -107,12 +111,21 @@ ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Linear algebra of more workers than cores waits for itself where each has as many threads as there are cores."""
 
 
+@cache
+def over_wires(file: Path) -> bool:
+    """Whether devices over their wires are in the file: it is in their folder, or says so with the marker `wire`."""
+    return file.is_relative_to(WIRES) or "pytest.mark.wire" in file.read_text(encoding="utf-8")
+
+
 def place(file: Path) -> tuple[int, int]:
     """Which group a file belongs to, and where in it it comes."""
     for found in (file, file.parent):
         if found in PLACES:
             return PLACES[found]
-    return (0, len(GROUPS[0])) if file.is_relative_to(WIRES) else (len(GROUPS), 0)
+    if not over_wires(file):
+        return len(GROUPS), 0
+    group = next((DEVICES[name] for name in file.relative_to(HERE).parts if name in DEVICES), 0)
+    return group, len(GROUPS[group])
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -124,7 +137,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items.sort(key=lambda item: place(item.path))
     again = config.pluginmanager.hasplugin("rerunfailures")
     for item in items:
-        if again and any(item.path.is_relative_to(folder) for folder in ON_THE_WALL):
+        if again and (over_wires(item.path) or any(map(item.path.is_relative_to, ON_THE_WALL))):
             item.add_marker(pytest.mark.flaky(reruns=3, reruns_delay=5))
 
 
