@@ -10,18 +10,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from cell.base.units import quantity, whole
-    from cell.makes.built_in import ArmOutputClawConfig, OnArm
-    from cell.makes.make import (
-        ArmConfig,
-        CameraConfig,
-        ClawConfig,
-        LaserConfig,
-        Make,
-        RailConfig,
-        Surroundings,
-        VehicleConfig,
-    )
     from cell.measure.inversion.place_pose import PlacePose
     from cell.procedures.arm.photograph import BoardFix
     from cell.procedures.steps.drive_to_target import VehicleArrival
@@ -49,6 +37,8 @@ if TYPE_CHECKING:
     from cell.run.job_run import RunOutcome
     from cell.run.runs import Run
     from cell.run.session.supervisor import Cell
+    from drivers.arm.make import ArmOutputClawConfig
+    from drivers.common.units import quantity, whole
     from drivers.errors import (
         Aborted,
         CalibrationStale,
@@ -63,6 +53,17 @@ if TYPE_CHECKING:
         NotConnectedError,
         NotObservable,
         RefusedError,
+    )
+    from drivers.make import (
+        ArmConfig,
+        CameraConfig,
+        ClawConfig,
+        LaserConfig,
+        Make,
+        OnArm,
+        RailConfig,
+        Surroundings,
+        VehicleConfig,
     )
     from statemachine.runner import Again, Script
     from statemachine.step import Step
@@ -85,12 +86,12 @@ _PLACES = {
     "cell.measure.inversion.place_pose": ("PlacePose",),
     "cell.procedures.steps.place": ("PlaceResult",),
     "cell.procedures.steps.drive_to_target": ("VehicleArrival",),
-    "cell.makes.built_in": ("ArmOutputClawConfig", "OnArm"),
-    "cell.makes.make": (
-        "Make", "Surroundings",
+    "drivers.arm.make": ("ArmOutputClawConfig",),
+    "drivers.make": (
+        "Make", "OnArm", "Surroundings",
         "ArmConfig", "CameraConfig", "ClawConfig", "LaserConfig", "RailConfig", "VehicleConfig",
     ),
-    "cell.base.units": ("quantity", "whole"),
+    "drivers.common.units": ("quantity", "whole"),
     "drivers.errors": (
         "Aborted", "CalibrationStale", "CellError", "ConfigError", "DeadlineError", "DeviceError", "DeviceFault",
         "InterlockError", "Interrupted", "LimitError", "NotConnectedError", "NotObservable", "RefusedError",

@@ -18,7 +18,7 @@ import typer
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from cell.base.units import parse_quantity
+from drivers.common.units import parse_quantity
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
@@ -53,7 +53,7 @@ def comments(text: str) -> dict[str, str]:
 
 
 def limits(metadata: tuple[Any, ...]) -> dict[str, Any]:
-    """What a validator of `cell.base.units` was made with: low, high, unit, allowed."""
+    """What a validator of `drivers.common.units` was made with: low, high, unit, allowed."""
     functions = [each.func for each in metadata if inspect.isfunction(getattr(each, "func", None))]
     found = [dict(inspect.getclosurevars(each).nonlocals) for each in functions]
     return next((each for each in found if "low" in each), {})
@@ -125,7 +125,7 @@ def records(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
 
 def known_records(of: type[BaseModel] | None = None) -> list[type[BaseModel]]:
     """All records that are imported."""
-    from cell.base.toml_file import Table
+    from drivers.make import Table
 
     found = [each for part in (of or Table).__subclasses__() for each in (part, *known_records(part))]
     return list(dict.fromkeys(found))
@@ -145,9 +145,8 @@ def inner(models: list[type[BaseModel]], told: dict[str, str]) -> str:
 
 def cell_toml() -> str:
     """The page of `cell.toml`."""
-    from cell.config.cell_config import DEVICES, CellConfig, CellSection, default_toml
-    from cell.makes.built_in import BUILT_IN
-    from cell.makes.make import CalibrationConfig
+    from cell.config.cell_config import DEVICES, CalibrationConfig, CellConfig, CellSection, default_toml
+    from cell.makes import BUILT_IN
 
     told = comments(default_toml())
     text = "# cell.toml\n\n" + NOTE

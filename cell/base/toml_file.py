@@ -8,22 +8,16 @@ import tomllib
 from pathlib import Path
 from typing import TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from cell.base.units import KEPT, shown
+from drivers.common.units import KEPT, shown
 from drivers.errors import CellError, ConfigError
 
 T = TypeVar("T", bound=BaseModel)
 
 LARGEST_BYTES = 1_000_000
 _WHERE = re.compile(r"\(at line (\d+), column (\d+)\)")
-
-
-class Table(BaseModel):
-    """A TOML table: frozen, and with no keys but the known ones."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 def below(folder: Path, *names: str) -> Path | None:

@@ -16,7 +16,6 @@ from cell.check.reach import reach_problems
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
 from cell.config.job import Job
-from cell.makes.make import CameraConfig
 from cell.measure.geometry.poses import transform
 from cell.measure.vision import BoardSpec, parse_board
 from cell.measure.vision.board.view import centre_of
@@ -24,6 +23,7 @@ from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.steps.kinds import find_kind
 from drivers.errors import ConfigError
+from drivers.make import CameraConfig
 
 RAMP_MARGIN = 0.0005
 """What the rail's driver adds to each ramp of a sweep, m."""

@@ -15,7 +15,6 @@ import pinocchio as pin
 
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
-from cell.makes.make import MOST_PAYLOAD
 from cell.measure.geometry.poses import from_parts, transform
 from cell.measure.inversion.nominal import read_mesh
 from cell.measure.vision import parse_board
@@ -23,6 +22,7 @@ from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import Body, station_bodies, vehicle_bodies
 from cell.procedures.drive.way import MAX_HEADING, Planar, wrap
 from drivers.interfaces import Vector
+from drivers.make import MOST_PAYLOAD
 
 G = 9.81
 REACTION_S = 0.05

@@ -23,30 +23,58 @@ import numpy as np
 import pinocchio as pin
 from pydantic import AfterValidator, SerializeAsAny, WrapValidator, model_validator
 
-from cell.base.addresses import Folder, Name, checked_endpoint, checked_folder, is_example
-from cell.base.toml_file import Table, read_toml, validate
-from cell.base.units import number, quantity, shown
+from cell.base.toml_file import read_toml, validate
 from cell.config.files import CONFIGURATION, DEVICES, RUNS, beside, find_config, runs_folder
-from cell.makes.built_in import BUILT_IN
-from cell.makes.make import (
-    AnyMake,
-    ArmConfig,
-    CalibrationConfig,
-    CameraConfig,
-    ClawConfig,
-    DeviceConfig,
-    LaserConfig,
-    Pose,
-    RailConfig,
-    VehicleConfig,
-)
-from cell.makes.switches import line_problems
-from cell.makes.table import make_of, record_of
+from cell.makes import BUILT_IN, make_of, record_of
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import BASE, Body, Mounted, box
+from drivers.common.addresses import Folder, Name, checked_endpoint, checked_folder, is_example
+from drivers.common.units import number, quantity, shown
 from drivers.errors import ConfigError
+from drivers.make import (
+    AnyMake,
+    ArmConfig,
+    CameraConfig,
+    ClawConfig,
+    DeviceConfig,
+    LaserConfig,
+    PhotoExposure,
+    Pose,
+    RailConfig,
+    Scatter,
+    Table,
+    VehicleConfig,
+)
+from drivers.relay.make import line_problems
+
+
+class PlateConfig(Table):
+    """A calibration board fixed on the vehicle's deck."""
+
+    board: Annotated[str, AfterValidator(lambda text: checked_board(text))]
+    base_from_board: Pose
+
+
+class CalibrationConfig(Table):
+    """How the cell calibrates itself."""
+
+    fine: PlateConfig
+    large: PlateConfig
+    max_age: Annotated[float, quantity("day", 0.01, 3650)]
+    stripe_exposure: PhotoExposure
+    rail_sigma: Scatter
+
+
+def checked_board(text: str) -> str:
+    """A board's name, once it is known to be well formed."""
+    try:
+        parse_board(text)
+    except ConfigError as error:
+        raise ValueError(str(error)) from error
+    return text
+
 
 Side = Annotated[float, quantity("mm", 1, 10_000)]
 

@@ -62,7 +62,7 @@ def runs_folder(path: Path | None) -> Path:
     with suppress(OSError, ValueError, RecursionError, AttributeError):
         named = {} if path is None else tomllib.loads(path.read_text(encoding="utf-8")).get("cell", {})
         if isinstance(told := named.get("runs"), str) and told != RUNS:
-            from cell.base.addresses import checked_folder
+            from drivers.common.addresses import checked_folder
 
             runs = checked_folder(told)
     return beside(path) / runs

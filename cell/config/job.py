@@ -15,12 +15,12 @@ import pinocchio as pin
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, model_validator
 
-from cell.base.addresses import Name
-from cell.base.toml_file import Table, below, read_toml, validate
-from cell.base.units import number, quantity, shown, whole
-from cell.config.cell_config import StationObstacle, once_each
-from cell.makes.make import Exposure, Mounting, Pose, checked_board
+from cell.base.toml_file import below, read_toml, validate
+from cell.config.cell_config import StationObstacle, checked_board, once_each
+from drivers.common.addresses import Name
+from drivers.common.units import number, quantity, shown, whole
 from drivers.errors import ConfigError
+from drivers.make import Exposure, Mounting, Pose, Table
 
 LEAST_LINES, MOST_LINES = 10, 20_000
 """Lines of one sweep: fewer show no surface, more do not fit into memory."""

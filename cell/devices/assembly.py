@@ -13,14 +13,13 @@ from cell.devices.gate.gated import GatedArm, GatedClaw, GatedRail, GatedVehicle
 from cell.devices.gate.interlocks import Interlocks, Situation
 from cell.devices.gate.rules import RULES, Ways
 from cell.devices.gate.scan_head import GatedCamera, GatedLaser
-from cell.makes.built_in import OnArm
-from cell.makes.make import Surroundings
 from cell.measure.geometry.poses import to_ur
-from cell.motion.kinematics import HOME, arm_kinematics
+from cell.motion.kinematics import HOME, MODELS, arm_kinematics
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vector, Vehicle
 from drivers.link_table import LinkTable
+from drivers.make import OnArm, Surroundings
 
 INTERFACES: dict[str, type] = {
     "rail": Rail,
@@ -80,7 +79,14 @@ def connect_one(config: CellConfig, name: str, clock: Clock, *, arm: Arm | None 
     around = Surroundings(clock, look, arm)
     if DEVICES[name] == "arm":
         # Its own process switches the laser off when this one dies.
-        around = Surroundings(clock, look, None, safe_off_outputs(config), lambda table: _forward(config, table))
+        around = Surroundings(
+            clock,
+            look,
+            None,
+            safe_off_outputs(config),
+            MODELS[config.arm.model].reach,
+            lambda table: _forward(config, table),
+        )
     make = config.make(name)
     device = make.connect(name, config.device(name), around)
     if missing := [method for method in methods(INTERFACES[make.kind]) if not hasattr(device, method)]:

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pinocchio as pin
 
-from cell.base.units import parse_quantity
 from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import parse_board
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, turn_to
 from cell.run.recorded_work import Hands
+from drivers.common.units import parse_quantity
 from drivers.errors import ConfigError, DeviceFault, LimitError
 from drivers.interfaces import Arm, ArmSafety, Vector
 from statemachine.step import Observer

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from cell import PLACE, BoardFix, Kind, Make, RefusedError
+from cell import PLACE, BoardFix, Kind, Make, RefusedError, makes
 from cell.config.cell_config import default_toml, load_config
-from cell.makes import table
-from cell.makes.built_in import ArmOutputClawConfig
+from drivers.arm.make import ArmOutputClawConfig
 from tests.project.test_readme import block
 
 
@@ -65,7 +64,7 @@ def test_the_make_of_the_tutorial_is_taken(tmp_path: Path, monkeypatch: pytest.M
     make: Make[Any, Any] = defined(page, "MAKE")
     assert (name, where) == (f"{make.kind}.{make.name}", "acme_claw:MAKE")
     monkeypatch.setattr(EntryPoint, "load", lambda self: make)
-    monkeypatch.setattr(table, "entry_points", lambda group: [EntryPoint(name, where, group)])
+    monkeypatch.setattr(makes, "entry_points", lambda group: [EntryPoint(name, where, group)])
     file = tmp_path / "cell.toml"
     before, claw, after = default_toml().partition("[claw]")
     file.write_text(before + claw + after.replace("arm_output", "acme", 1), encoding="utf-8")

@@ -10,9 +10,9 @@ RAIL = '''
 
 from typing import Annotated, ClassVar, Literal
 
-from cell.makes.make import RailConfig
-from cell.makes.make import Make
-from cell.base.units import quantity
+from drivers.make import RailConfig
+from drivers.make import Make
+from drivers.common.units import quantity
 from drivers.errors import InterlockError, LimitError
 from drivers.interfaces import Identity, LinkStatistics, RailState
 

@@ -21,11 +21,10 @@ from numpy.typing import ArrayLike
 from cell.apps.commission.check import Result
 from cell.apps.commission.person import Person
 from cell.config.calibrations.store import nominal_camera
-from cell.config.cell_config import CameraConfig, load_config
+from cell.config.cell_config import CameraConfig, PlateConfig, load_config
 from cell.config.job import Job, load_job
 from cell.devices.devices import Devices
 from cell.devices.simulated.process import cause_fault, make_ready
-from cell.makes.make import PlateConfig
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import BoardSpec, BoardView, board_pose, find_board, parse_board

@@ -13,14 +13,14 @@ from cell.apps.new_job.mesh_file import Drawn, MeshBody
 from cell.apps.new_job.questions import Asker, checked, choice, pose, pose_words, three
 from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, overlapping, raised, turned_over
 from cell.apps.new_job.text import METRES, deg, mm, possible_units, size_words, told_by_size
-from cell.base.addresses import checked_name
-from cell.base.units import parse_quantity, shown
 from cell.config.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
-from cell.makes.make import Mounting, Pose
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
+from drivers.common.addresses import checked_name
+from drivers.common.units import parse_quantity, shown
 from drivers.errors import ConfigError
+from drivers.make import Mounting, Pose
 
 LISTED = 9
 """Bodies that are told one by one."""

@@ -22,13 +22,13 @@ from cell.apps.new_job.questions import Asker, choice
 from cell.apps.new_job.surface import Laid, about, written
 from cell.apps.new_job.sweeps import FITS, Array, rivals
 from cell.apps.new_job.text import job_text, pose_text
-from cell.base.units import parse_quantity
 from cell.check.fit import require_fit
 from cell.check.reach import sweep_problems
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, load_job
 from cell.devices.simulated.described import Described
 from cell.measure.inversion import NominalSurface, PlacePose
+from drivers.common.units import parse_quantity
 from drivers.errors import CellError, ConfigError, NotObservable, RefusedError
 
 STEP_MM = (0.1, 2.0)

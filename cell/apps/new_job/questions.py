@@ -15,9 +15,9 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from cell.base.toml_file import wording
-from cell.base.units import shown
-from cell.makes.make import Mounting, Pose
+from drivers.common.units import shown
 from drivers.errors import ConfigError
+from drivers.make import Mounting, Pose
 
 PROGRESS_S = 3.0
 

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 
 from cell.config.cell_config import StationObstacle
 from cell.config.job import Job, SwathSection
-from cell.makes.make import Pose
 from drivers.errors import ConfigError
+from drivers.make import Pose
 
 METRES = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
 LIKELY = (0.015, 0.45)

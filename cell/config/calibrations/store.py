@@ -19,7 +19,6 @@ import numpy as np
 
 from cell.base.storage import read_json, require_date, sealed, table, write_json
 from cell.config.cell_config import CellConfig
-from cell.makes.make import CameraConfig, DeviceConfig, RailConfig
 from cell.measure.calibration import Priors, ScanCalibration, ScanObservation, TargetCalibration, TargetObservation
 from cell.measure.calibration.archive import SUFFIX, Observations, write_archive
 from cell.measure.calibration.drift.reference_plate import PlateLine
@@ -30,6 +29,7 @@ from cell.measure.calibration.timing import StampTiming
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from drivers.errors import CalibrationStale, ConfigError
+from drivers.make import CameraConfig, DeviceConfig, RailConfig
 
 LENS = range(4, 9)
 """Parameters of a lens that a calibration may leave as they are; all others it must have estimated."""

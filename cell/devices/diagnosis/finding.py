@@ -14,17 +14,17 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from urllib.parse import urlsplit
 
-from cell.base.addresses import is_example
 from cell.config.cell_config import DEVICES, CellConfig, find_config, load_config
 from cell.devices.diagnosis.local_devices import ROOT, Found, barred, cameras, can_interfaces, opened_by, serial_ports
 from cell.devices.lock import who_holds
-from cell.makes.built_in import TmclRailConfig
-from cell.makes.make import DeviceConfig, RailConfig, Surroundings, of_make
-from cell.makes.switches import OnBoard
-from cell.makes.table import make_of
+from cell.makes import make_of
 from drivers.clock import Clock
+from drivers.common.addresses import is_example
 from drivers.errors import CellError, ConfigError
 from drivers.interfaces import LinkStatistics
+from drivers.make import DeviceConfig, RailConfig, Surroundings, of_make
+from drivers.rail.tmcl.make import TmclRailConfig
+from drivers.relay.make import OnBoard
 
 DEADLINE_S = 0.5
 """For one answer, wall seconds."""

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from cell.config.cell_config import CALIBRATION_DEPTHS, DEVICES, CellConfig
 from cell.config.job import Job, load_job, shipped_mesh
-from cell.makes.built_in import ArmOutputClawConfig, ArmOutputLaserConfig, OnArm
-from cell.makes.make import CameraConfig, Pose
 from cell.measure.geometry.poses import from_parts, transform
+from drivers.arm.make import ArmOutputClawConfig, ArmOutputLaserConfig
 from drivers.errors import ConfigError
+from drivers.make import CameraConfig, OnArm, Pose
 from sim_backends.optics.scene import KINDS, Board
 from sim_backends.world import drawing as drawn
 from sim_backends.world.bodies.surfaces import surface

@@ -14,12 +14,12 @@ from cell.config.cell_config import DEVICES, CellConfig
 from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.devices import Devices
 from cell.devices.simulated.described import Described
-from cell.makes.make import MOST_PAYLOAD
 from cell.motion.kinematics import MODELS
 from drivers.arm.faults import fault
 from drivers.arm.motion import ArmLimits
 from drivers.clock import ClockMap, Latch
 from drivers.errors import ConfigError
+from drivers.make import MOST_PAYLOAD
 from drivers.rail.motion import CarriageWatch
 from drivers.rail.sweep import EvenMotion
 from drivers.rail.zero_check import ZeroCheck

@@ -29,9 +29,9 @@ from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
 from cell.devices.gate.gated import GatedArm
 from cell.devices.simulated.process import WorldLink
-from cell.makes.built_in import OnArm
 from drivers.errors import CellError, DeadlineError, DeviceFault
 from drivers.interfaces import ArmState, Camera, Frame, FrameStream, Identity, Vector
+from drivers.make import OnArm
 
 Rows = list[list[float]]
 

@@ -26,7 +26,7 @@ from cell.devices.gate.gated import GatedArm
 from cell.devices.lock import CellLock
 from cell.devices.simulated.following import DeviceFollowing, FollowedCamera
 from cell.devices.simulated.process import SimulatedCell, WorldConnector, WorldLink, on_gige, with_endpoints
-from cell.makes.built_in import ArmOutputClawConfig, ArmOutputLaserConfig
+from drivers.arm.make import ArmOutputClawConfig, ArmOutputLaserConfig
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, ConfigError
 from drivers.interfaces import ArmMotion, ArmState, Device, Vector

@@ -209,7 +209,7 @@ def _print_found(found: list[Found]) -> None:
 
 def devices(json: JsonOption = False) -> None:
     """List the makes of devices that `driver = "…"` can name, where each comes from, and what is wrong with it."""
-    from cell.makes.table import installed
+    from cell.makes import installed
 
     rows = installed()
     if json:

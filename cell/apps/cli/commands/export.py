@@ -40,10 +40,10 @@ def export(
     json: JsonOption = False,
 ) -> None:
     """Write a run's cloud as PLY, E57 or mesh, coloured by its deviation from the nominal surface, in metres."""
-    from cell.base.units import parse_quantity
     from cell.config.cell_config import beside, find_config, load_config
     from cell.run.folder import find_run
     from cell.run.report.export import SUFFIXES, export_run
+    from drivers.common.units import parse_quantity
     from drivers.errors import ConfigError
 
     try:

@@ -11,10 +11,10 @@ import numpy as np
 
 from cell.apps.commission.check import CommissionCheck, Finding, Result
 from cell.apps.commission.workplace import CommissionWorkplace, camera_of, centred_view, eye_of
-from cell.makes.built_in import OnArm
 from cell.measure.vision import extract
 from drivers.errors import RefusedError
 from drivers.interfaces import Frame, Image
+from drivers.make import OnArm
 
 LEAST_ROWS_SHARE = 0.25
 """Of the picture's rows that a stripe has to cross to be one."""

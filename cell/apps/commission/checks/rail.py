@@ -8,9 +8,9 @@ import numpy as np
 
 from cell.apps.commission.check import CommissionCheck, Finding, Result
 from cell.apps.commission.workplace import CommissionWorkplace, centred_view, eye_of, see
-from cell.makes.make import RailConfig
 from drivers.errors import DeviceFault, LimitError, RefusedError
 from drivers.interfaces import Nudged, Vector
+from drivers.make import RailConfig
 
 STEP, FIRST_STEP = 0.005, 0.001
 SPEED = 0.005

@@ -23,7 +23,6 @@ from cell.base.toml_file import below
 from cell.config.cell_config import CellConfig, deck_plates, mounted, station_obstacles, vehicle_obstacles
 from cell.config.job import Job, load_job
 from cell.devices.gate.interlocks import Situation
-from cell.makes.make import CameraConfig
 from cell.measure.inversion.nominal import read_mesh
 from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
@@ -33,6 +32,7 @@ from cell.procedures.arm.photograph import base_from_place_at_target
 from drivers.errors import ConfigError
 from drivers.interfaces import Vector
 from drivers.link_table import LinkTable
+from drivers.make import CameraConfig
 
 LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 """Fixed to the base, then to what each joint turns."""

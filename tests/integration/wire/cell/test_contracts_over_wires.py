@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.makes.table import make_of
+from cell.makes import make_of
 from tests.support.wire.cells import served
 
 pytestmark = pytest.mark.wire

@@ -23,11 +23,11 @@ from pymodbus.framer import FramerRTU
 
 from cell.devices.contracts import Bench, Faults
 from cell.devices.contracts.rail import RailContract
-from cell.makes.rails import ModbusRailConfig, register_map
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import LinkStatistics, Rail
 from drivers.rail.modbus.link import Action, ModbusLink, ModbusRefused
+from drivers.rail.modbus.make import ModbusRailConfig, register_map
 from drivers.rail.modbus.rail import ModbusRail
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams

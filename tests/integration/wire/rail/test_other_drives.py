@@ -11,10 +11,10 @@ from pathlib import Path
 import can
 import pytest
 
-from cell.makes.vehicles import look_at_nodes
 from drivers.clock import Clock
 from drivers.errors import DeviceFault
 from drivers.vehicle.cia402.feedback import WheelDrives
+from drivers.vehicle.cia402.make import look_at_nodes
 from drivers.vehicle.cia402.setup import Watchdog
 from drivers.vehicle.cia402.vehicle import CanopenVehicle
 from tests.support.wire.other_drives import OtherDrives

@@ -17,7 +17,6 @@ from cell.check.fit import require_fit
 from cell.config.cell_config import CellConfig, StationObstacle, default_toml, load_config, validate
 from cell.config.job import Job, job_path, load_job
 from cell.devices.simulated.direct import VirtualCell
-from cell.makes.make import Pose
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.inversion import NominalSurface
 from cell.measure.vision import parse_board
@@ -27,6 +26,7 @@ from cell.motion.trajectory import Trajectory
 from cell.procedures.arm.moves import Mover
 from cell.procedures.drive.way import Planar, Upright, Way, Whereabouts
 from drivers.errors import ConfigError, InterlockError, RefusedError
+from drivers.make import Pose
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 
 JOB, MESH = load_job("pot")

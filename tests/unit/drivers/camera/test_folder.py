@@ -13,13 +13,13 @@ from cell.config.cell_config import default_toml, load_config
 from cell.devices.assembly import connect, connect_one
 from cell.devices.contracts import Bench
 from cell.devices.contracts.device import CameraContract
-from cell.makes.make import Surroundings
-from cell.makes.table import installed, make_of
+from cell.makes import installed, make_of
 from drivers.camera.folder import RecordedCamera
 from drivers.camera.genicam import aravis
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault, LimitError, NotConnectedError, RefusedError
 from drivers.interfaces import Camera
+from drivers.make import Surroundings
 
 RATE_HZ, EXPOSURE_S = 10.0, 0.005
 

@@ -18,9 +18,9 @@ from cell.apps.commission.measuring import against_drawing, axes_from_shifts, so
 from cell.apps.commission.sequence import CHECKS, edited, table, write_changes
 from cell.config.cell_config import default_toml, load_config
 from cell.config.job import load_job
-from cell.makes.make import CameraConfig
 from cell.measure.geometry.poses import from_parts
 from drivers.errors import ConfigError, RefusedError
+from drivers.make import CameraConfig
 from sim_backends.clock import SteppedClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from tests.support import ROOT

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from cell.config.cell_config import default_toml, load_config
-from cell.makes.table import make_of
-from cell.makes.vehicles import CanopenVehicleConfig
+from cell.makes import make_of
 from drivers.errors import ConfigError, DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.cia402.drive import (
@@ -21,6 +20,7 @@ from drivers.vehicle.cia402.drive import (
     STATUS,
 )
 from drivers.vehicle.cia402.feedback import DriveFeedback, UnitCheck, WheelDrives
+from drivers.vehicle.cia402.make import CanopenVehicleConfig
 from tests.support import ROOT
 from tests.support.inner_bus import Hand
 

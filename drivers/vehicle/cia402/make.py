@@ -1,4 +1,4 @@
-"""Vehicles on CAN: what every one of them says of its bus, and the record of two wheel drives on CANopen CiA 402.
+"""The make `canopen` of vehicles, two wheel drives of CiA 402: its record in `cell.toml`, and how it is connected.
 
 Which CANopen nodes are on the configured bus: the configured ones are asked who they are, the others only heard.
 
@@ -16,11 +16,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import model_validator
 
-from cell.base.addresses import checked_can
-from cell.base.units import number, quantity, whole
-from cell.makes.make import Make, Surroundings, VehicleConfig, real_path
+from drivers.common.units import number, quantity, whole
 from drivers.errors import CellError
 from drivers.interfaces import LinkStatistics
+from drivers.make import AnyMake, Make, Surroundings, with_endpoint
 from drivers.vehicle.cia402.drive import (
     DEVICE_TYPE,
     DRIVE_PROFILE,
@@ -31,6 +30,7 @@ from drivers.vehicle.cia402.drive import (
     VENDOR,
     Entry,
 )
+from drivers.vehicle.make import CanVehicleConfig
 
 if TYPE_CHECKING:
     import can
@@ -47,31 +47,6 @@ COARSEST_COUNT = 0.0005
 
 Node = Annotated[int, whole(1, 127)]
 Bit = Annotated[int, whole(0, 31)]
-
-
-class CanVehicleConfig(VehicleConfig):
-    """A carrier on a CAN bus."""
-
-    ADDRESS: ClassVar[str] = "channel"
-
-    interface: str
-    channel: str
-    bitrate: Annotated[float, quantity("kbit/s", 10, 1000)]
-
-    @model_validator(mode="after")
-    def _reachable(self) -> Self:
-        checked_can(self.interface, self.channel, self.bitrate)
-        return self
-
-    @property
-    def place(self) -> str:
-        """The channel, without the speed of a serial line behind it."""
-        return self.channel.partition("@")[0]
-
-    @property
-    def held(self) -> str:
-        """Interface and channel: two interfaces may count their channels alike."""
-        return f"{self.interface}:{real_path(self.place)}"
 
 
 class CanopenVehicleConfig(CanVehicleConfig):
@@ -183,7 +158,7 @@ MOST_RPM = 20_000.0
 """Of a motor that drives a wheel."""
 
 
-def _canopen(name: str, config: CanopenVehicleConfig, around: Surroundings) -> CanopenVehicle:
+def _connect(name: str, config: CanopenVehicleConfig, around: Surroundings) -> CanopenVehicle:
     from drivers.vehicle.cia402.setup import Watchdog
     from drivers.vehicle.cia402.vehicle import CanopenVehicle
 
@@ -205,16 +180,10 @@ def _missing() -> str:
     return "" if importlib.util.find_spec("canopen") else "pip install 'assembly-cell[canopen]'"
 
 
-CANOPEN: Make[CanopenVehicleConfig, CanopenVehicle] = Make(
-    "vehicle",
-    "canopen",
-    CanopenVehicleConfig,
-    _canopen,
-    simulated=lambda record, endpoint: record.model_copy(
-        update={key: endpoint[key] for key in ("interface", "channel")}
-    ),
-    missing=_missing,
-)
+CANOPEN: AnyMake = Make(
+    "vehicle", "canopen", CanopenVehicleConfig, _connect,
+    simulated=with_endpoint("interface", "channel"), missing=_missing,
+)  # fmt: skip
 
 
 LISTEN_S, ANSWER_S = 1.2, 0.5

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import StringConstraints, model_validator
 
-from cell.base.addresses import Port
-from cell.base.toml_file import Table
-from cell.base.units import whole
-from cell.makes.make import AnyMake, Late, Make, RailConfig, Surroundings
+from drivers.common.addresses import Port
+from drivers.common.units import whole
 from drivers.errors import UNTOLD
+from drivers.make import AnyMake, Late, Make, RailConfig, Surroundings, Table, with_endpoint
 
 if TYPE_CHECKING:
     from drivers.rail.modbus.link import Action, Flag, Number, Rate, RegisterMap
@@ -186,7 +185,7 @@ def _parts(config: RegistersConfig) -> Iterator[tuple[str, Any]]:
             yield name, made(getattr(config, name))
 
 
-def _modbus(name: str, config: ModbusRailConfig, around: Surroundings) -> ModbusRail:
+def _connect(name: str, config: ModbusRailConfig, around: Surroundings) -> ModbusRail:
     from drivers.rail.modbus.rail import ModbusRail
 
     return ModbusRail(
@@ -209,10 +208,7 @@ def _modbus(name: str, config: ModbusRailConfig, around: Surroundings) -> Modbus
     )
 
 
-def _at_url(record: ModbusRailConfig, endpoint: Mapping[str, object]) -> ModbusRailConfig:
-    return record.model_copy(update={"url": endpoint["url"]})
-
-
 MODBUS: AnyMake = Make(
-    "rail", "modbus", ModbusRailConfig, _modbus, frozenset(("lead", "counts_per_turn", "registers")), simulated=_at_url
-)
+    "rail", "modbus", ModbusRailConfig, _connect, frozenset(("lead", "counts_per_turn", "registers")),
+    simulated=with_endpoint("url"),
+)  # fmt: skip

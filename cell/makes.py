@@ -14,9 +14,22 @@ from typing import Any
 from pydantic import ValidationError, ValidationInfo
 from pydantic_core import InitErrorDetails
 
-from cell.makes.built_in import BUILT_IN, OnArm
-from cell.makes.make import KINDS, AnyMake, DeviceConfig, Make
+from drivers.arm.make import ON_OUTPUTS, UR
+from drivers.camera.genicam.make import GIGE, USB3
+from drivers.camera.make import FOLDER, STREAM, V4L2
+from drivers.claw.make import ROBOTIQ
 from drivers.errors import ConfigError
+from drivers.make import KINDS, AnyMake, DeviceConfig, Make, OnArm
+from drivers.rail.modbus.make import MODBUS
+from drivers.rail.tmcl.make import TMCL
+from drivers.relay.make import RELAYS
+from drivers.vehicle.cia402.make import CANOPEN
+from drivers.vehicle.make import AGILEX, FIXED
+
+BUILT_IN: tuple[AnyMake, ...] = (
+    TMCL, UR, AGILEX, FIXED, CANOPEN, STREAM, *ON_OUTPUTS, GIGE, USB3, V4L2, FOLDER, MODBUS, *RELAYS, ROBOTIQ,
+)  # fmt: skip
+"""The makes that come with the cell. Of each kind the first is taken where a table names no `driver`."""
 
 GROUP = "assembly_cell.devices"
 """Entry points that bring a make, named KIND.NAME; each leads to a `Make`."""

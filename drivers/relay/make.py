@@ -1,16 +1,24 @@
-"""Makes of lasers and claws that do not hang on the arm: relay boards on a serial port, and a gripper on its socket."""
+"""The makes `numato` and `lcus` of lasers and claws: relays of a board on a serial port."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-from cell.base.addresses import Endpoint, Port
-from cell.base.units import whole
-from cell.makes.make import AnyMake, ClawConfig, DeviceConfig, LaserConfig, Make, Surroundings, real_path
+from drivers.common.addresses import Port
+from drivers.common.units import whole
+from drivers.make import (
+    AnyMake,
+    ClawConfig,
+    DeviceConfig,
+    LaserConfig,
+    Make,
+    Surroundings,
+    real_path,
+    with_endpoint,
+)
 
 if TYPE_CHECKING:
-    from drivers.claw.robotiq import RobotiqClaw
     from drivers.relay.switched import BoardClaw, BoardLaser
 
 NUMATO_BAUDS = (9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
@@ -18,7 +26,6 @@ NUMATO_BAUDS = (9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
 
 NumatoRelay = Annotated[int, whole(0, 31, meaning=": relays as the board counts them, from 0")]
 NumatoInput = Annotated[int, whole(0, 31, meaning=": the board's GPIO as it counts them, from 0")]
-Count = Annotated[int, whole(0, 255, meaning=" as the gripper counts it: 0 open, slowest, weakest; 255 the other end")]
 
 
 class OnBoard(DeviceConfig):
@@ -88,22 +95,6 @@ class NumatoClawConfig(OnBoard, ClawConfig):
         return super().wire() | {"feedback": self.feedback, "active_high": self.held_is == "high"}
 
 
-class RobotiqClawConfig(ClawConfig):
-    """A Robotiq gripper, on the socket of its program on the arm's controller; `inside`: it holds by spreading."""
-
-    driver: Literal["robotiq"] = "robotiq"
-    address: Annotated[str, Endpoint]
-    open_at: Count = 0
-    closed_at: Count = 255
-    speed: Count = 128
-    force: Count = 64
-    inside: bool = False
-
-    def wire(self) -> dict[str, object]:
-        """See `DeviceConfig`."""
-        return {"make": self.driver, "place": self.address}
-
-
 def line_problems(records: Mapping[str, DeviceConfig]) -> Iterator[str]:
     """What is wrong with how devices share serial ports: only relays of one board, of one make, at one speed, may."""
     boards = {name: record for name, record in records.items() if isinstance(record, OnBoard)}
@@ -128,7 +119,7 @@ def _laser(name: str, config: NumatoLaserConfig | LcusLaserConfig, around: Surro
     return BoardLaser(board, config.relay, control=not around.look)
 
 
-def _numato_claw(name: str, config: NumatoClawConfig, around: Surroundings) -> BoardClaw:
+def _claw(name: str, config: NumatoClawConfig, around: Surroundings) -> BoardClaw:
     from drivers.relay.boards import open_numato
     from drivers.relay.switched import BoardClaw
 
@@ -142,29 +133,10 @@ def _numato_claw(name: str, config: NumatoClawConfig, around: Surroundings) -> B
     )
 
 
-def _robotiq(name: str, config: RobotiqClawConfig, around: Surroundings) -> RobotiqClaw:
-    from drivers.claw.robotiq import Grip, RobotiqClaw
-
-    grip = Grip(config.open_at, config.closed_at, config.speed, config.force, config.inside)
-    return RobotiqClaw(name, config.address, grip, clock=around.clock, control=not around.look)
-
-
-Board = TypeVar("Board", bound=OnBoard)
-
-
-def _at_url(record: Board, endpoint: Mapping[str, object]) -> Board:
-    return record.model_copy(update={"url": endpoint["url"]})
-
-
-def _at_address(record: RobotiqClawConfig, endpoint: Mapping[str, object]) -> RobotiqClawConfig:
-    return record.model_copy(update={"address": endpoint["address"]})
-
-
 _OPTICS = frozenset(("baseline", "tan_theta"))
 
-SWITCH_MAKES: tuple[AnyMake, ...] = (
-    Make("laser", "numato", NumatoLaserConfig, _laser, _OPTICS, simulated=_at_url),
-    Make("laser", "lcus", LcusLaserConfig, _laser, _OPTICS, simulated=_at_url),
-    Make("claw", "numato", NumatoClawConfig, _numato_claw, simulated=_at_url),
-    Make("claw", "robotiq", RobotiqClawConfig, _robotiq, simulated=_at_address),
+RELAYS: tuple[AnyMake, ...] = (
+    Make("laser", "numato", NumatoLaserConfig, _laser, _OPTICS, simulated=with_endpoint("url")),
+    Make("laser", "lcus", LcusLaserConfig, _laser, _OPTICS, simulated=with_endpoint("url")),
+    Make("claw", "numato", NumatoClawConfig, _claw, simulated=with_endpoint("url")),
 )

@@ -16,10 +16,10 @@ from cell.devices.contracts.device import ClawContract, LaserContract
 from cell.devices.contracts.rail import RailContract
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
-from cell.makes.built_in import BUILT_IN
-from cell.makes.rails import register_map
+from cell.makes import BUILT_IN
 from drivers.errors import ConfigError
 from drivers.rail.modbus.link import Number
+from drivers.rail.modbus.make import register_map
 from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.world.drawing import read
 from sim_backends.world.world import World

@@ -1,4 +1,4 @@
-"""Promises of `cell.base.units`."""
+"""Promises of `drivers.common.units`."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 import pytest
 
-from cell.base import units
-from cell.base.units import parse_quantity
+from drivers.common import units
+from drivers.common.units import parse_quantity
 
 
 @pytest.mark.parametrize(

@@ -14,18 +14,19 @@ import pytest
 from cell.config.cell_config import CellConfig, default_toml, load_config
 from cell.devices.assembly import connect_one, safe_off_outputs
 from cell.devices.simulated.process import with_endpoints
-from cell.makes.built_in import BUILT_IN, TmclRailConfig
-from cell.makes.make import KINDS
-from cell.makes.table import installed
+from cell.makes import BUILT_IN, installed
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from drivers.interfaces import Rail
+from drivers.make import KINDS
+from drivers.rail.tmcl.make import TmclRailConfig
 from tests.support.packages import RAIL, install, with_acme_rail
 
 TWIN = """
 from typing import Literal
-from cell.makes.built_in import BUILT_IN, TmclRailConfig
-from cell.makes.make import Make
+from cell.makes import BUILT_IN
+from drivers.rail.tmcl.make import TmclRailConfig
+from drivers.make import Make
 
 class TwinConfig(TmclRailConfig):
     driver: Literal["twin"] = "twin"
@@ -94,8 +95,9 @@ def test_a_calibration_of_one_make_does_not_fit_another_with_the_same_values(sit
 
 BEAM = """
 from typing import Literal
-from cell.makes.built_in import BUILT_IN, ArmOutputLaserConfig
-from cell.makes.make import Make
+from cell.makes import BUILT_IN
+from drivers.arm.make import ArmOutputLaserConfig
+from drivers.make import Make
 
 class BeamConfig(ArmOutputLaserConfig):
     driver: Literal["beam"] = "beam"
@@ -204,9 +206,9 @@ def test_the_command_lists_what_is_installed_with_its_source(site: Path, tmp_pat
 
 ARM = """
 from typing import Annotated, Literal
-from cell.makes.make import ArmConfig
-from cell.makes.built_in import UrArmConfig
-from cell.makes.make import Make
+from drivers.make import ArmConfig
+from drivers.arm.make import UrArmConfig
+from drivers.make import Make
 from drivers.interfaces import LinkStatistics
 
 

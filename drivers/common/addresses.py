@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 from pydantic import AfterValidator
 
-from cell.base.units import shown
+from drivers.common.units import shown
 
 _LABEL = re.compile(r"(?!-)[A-Za-z0-9_-]{1,63}(?<!-)")
 _PORT_FILE = re.compile(r"/dev/[^\s/][^\s]*[^\s/]|/dev/[^\s/]|COM[1-9]\d{0,2}")

@@ -1,4 +1,4 @@
-"""Makes of cameras that can be bought, and recordings: their records in `cell.toml` and how each is connected.
+"""The makes `gige` and `usb3` of cameras: their records in `cell.toml`, and how they are connected.
 
 docs/how-to/cameras.md tells what each key does, and what of it has run on what.
 """
@@ -6,23 +6,16 @@ docs/how-to/cameras.md tells what each key does, and what of it has run on what.
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, StringConstraints
 
-from cell.base.units import number, quantity, whole
-from cell.makes.make import AnyMake, CameraConfig, Make, Surroundings
+from drivers.common.units import number, quantity, whole
+from drivers.make import OPTICS, AnyMake, CameraConfig, Make, Surroundings, with_endpoint
 
 if TYPE_CHECKING:
-    from drivers.camera.folder import RecordedCamera
     from drivers.camera.genicam.camera import GenicamCamera
     from drivers.camera.genicam.device import Place
-    from drivers.camera.v4l2 import V4l2Camera
-
-OPTICS = frozenset(("width", "height", "pixel", "focal_length", "flange_from_camera"))
-"""On these a calibration depends, whatever the camera's make."""
 
 PixelFormat = Literal[
     "Mono8", "Mono10", "Mono10Packed", "Mono10p", "Mono12", "Mono12Packed", "Mono12p", "Mono16",
@@ -39,12 +32,6 @@ def _ipv4(text: str) -> str:
         raise ValueError(f'"{text}" is no IPv4 address, such as "192.168.1.20"; a GigE camera has no name') from error
     if address.is_unspecified or address.is_multicast or address == ipaddress.IPv4Address("255.255.255.255"):
         raise ValueError(f'"{text}" is not the address of one camera; write its own, such as "192.168.1.20"')
-    return text
-
-
-def _path(text: str) -> str:
-    if not text.strip() or "\0" in text:
-        raise ValueError(f'"{text}" is no path')
     return text
 
 
@@ -80,26 +67,6 @@ class Usb3CameraConfig(GenicamConfig):
     guid: Annotated[str, StringConstraints(pattern=r"[0-9A-Fa-f]{12}")]
 
 
-class V4l2CameraConfig(CameraConfig):
-    """A camera behind a device file of Linux."""
-
-    ADDRESS: ClassVar[str] = "device"
-
-    driver: Literal["v4l2"] = "v4l2"
-    device: Annotated[str, StringConstraints(pattern=r"/dev/[\w./-]+")]
-    pixel_format: Literal["GREY", "YUYV", "MJPG"] = "YUYV"
-    gain: Annotated[float, number(0, 100_000)] | None = None
-
-
-class FolderCameraConfig(CameraConfig):
-    """Recorded pictures with their times in `times.csv`, in a folder seen from where the program is started."""
-
-    ADDRESS: ClassVar[str] = "folder"
-
-    driver: Literal["folder"] = "folder"
-    folder: Annotated[str, AfterValidator(_path)]
-
-
 def _genicam(name: str, config: GenicamConfig, place: Place, around: Surroundings) -> GenicamCamera:
     from drivers.camera.genicam.acquisition import Network
     from drivers.camera.genicam.camera import GenicamCamera
@@ -133,21 +100,6 @@ def _usb3(name: str, config: Usb3CameraConfig, around: Surroundings) -> GenicamC
     return _genicam(name, config, UsbPlace(config.guid), around)
 
 
-def _v4l2(name: str, config: V4l2CameraConfig, around: Surroundings) -> V4l2Camera:
-    from drivers.camera.v4l2 import V4l2Camera
-
-    return V4l2Camera(
-        name, config.device, clock=around.clock, shape=(config.height, config.width), fourcc=config.pixel_format,
-        gain=config.gain, look=around.look,
-    )  # fmt: skip
-
-
-def _folder(name: str, config: FolderCameraConfig, around: Surroundings) -> RecordedCamera:
-    from drivers.camera.folder import RecordedCamera
-
-    return RecordedCamera(name, Path(config.folder), clock=around.clock, shape=(config.height, config.width))
-
-
 def _without_aravis() -> str:
     from drivers.camera.genicam.aravis import AravisMissing, load
 
@@ -158,15 +110,9 @@ def _without_aravis() -> str:
     return ""
 
 
-def _served(record: GigeCameraConfig, endpoint: Mapping[str, object]) -> GigeCameraConfig:
-    return record.model_copy(update={"address": endpoint["address"]})
-
-
 _REGION = OPTICS | {"offset", "pixel_format"}
 
 GIGE: AnyMake = Make(
-    "camera", "gige", GigeCameraConfig, _gige, _REGION, simulated=_served, missing=_without_aravis
-)  # fmt: skip
+    "camera", "gige", GigeCameraConfig, _gige, _REGION, simulated=with_endpoint("address"), missing=_without_aravis
+)
 USB3: AnyMake = Make("camera", "usb3", Usb3CameraConfig, _usb3, _REGION, missing=_without_aravis)
-V4L2: AnyMake = Make("camera", "v4l2", V4l2CameraConfig, _v4l2, OPTICS | {"pixel_format"})
-FOLDER: AnyMake = Make("camera", "folder", FolderCameraConfig, _folder, OPTICS, replays=True)

@@ -1,11 +1,10 @@
 """What a make is: everything that the cell has to know to work with one product behind one of its devices.
 
 A package brings a make by an entry point of the group `assembly_cell.devices`, named KIND.NAME, that leads to a `Make`.
+The makes that come with the cell are in `make.py` beside their drivers. Reading a configuration imports only these.
 
-What the cell has to know of each kind of device, whatever its make: how it is mounted and what it may do.
-
-A make's record adds where the device is and how it is set up: `cell.makes.built_in` has those of the makes that come
-with the cell. Ranges are those of the devices, so that what passes here can be asked of them."""
+The records here hold what the cell has to know of each kind of device: how it is mounted and what it may do. A make's
+record adds where the device is and how it is set up. Ranges are those of the devices."""
 
 from __future__ import annotations
 
@@ -18,11 +17,10 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from pydantic import AfterValidator, ValidationInfo, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, model_validator
 
-from cell.base.toml_file import Table
-from cell.base.units import number, quantity, whole
 from drivers.clock import Clock
+from drivers.common.units import number, quantity, whole
 from drivers.errors import ConfigError
 from drivers.interfaces import Arm, Device, Vector
 from drivers.link_table import LinkTable
@@ -36,6 +34,12 @@ PhotoExposure = Annotated[float, quantity("ms", 0.01, 100)]
 """Of a photograph, which is taken at 10 Hz."""
 Scatter = Annotated[float, quantity("mm", 0.0001, 2)]
 AngleScatter = Annotated[float, quantity("mrad", 0.0001, 10)]
+
+
+class Table(BaseModel):
+    """A TOML table: frozen, and with no keys but the known ones."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Pose(Table):
@@ -241,6 +245,10 @@ class CameraConfig(DeviceConfig):
         return self
 
 
+OPTICS = frozenset(("width", "height", "pixel", "focal_length", "flange_from_camera"))
+"""On these a calibration depends, whatever the camera's make."""
+
+
 class LaserConfig(DeviceConfig):
     """The line laser with its nominal place in the scan camera's frame.
 
@@ -261,32 +269,20 @@ class ClawConfig(DeviceConfig):
     """The claw."""
 
 
-class PlateConfig(Table):
-    """A calibration board fixed on the vehicle's deck."""
-
-    board: Annotated[str, AfterValidator(lambda text: checked_board(text))]
-    base_from_board: Pose
+Connector = Annotated[int, whole(0, 17, meaning=": 0-7 standard, 8-15 configurable, 16-17 tool")]
 
 
-class CalibrationConfig(Table):
-    """How the cell calibrates itself."""
+class OnArm(DeviceConfig):
+    """A device that an output of the arm switches."""
 
-    fine: PlateConfig
-    large: PlateConfig
-    max_age: Annotated[float, quantity("day", 0.01, 3650)]
-    stripe_exposure: PhotoExposure
-    rail_sigma: Scatter
+    ADDRESS: ClassVar[str] = "output"
 
+    output: Connector
 
-def checked_board(text: str) -> str:
-    """A board's name, once it is known to be well formed."""
-    from cell.measure.vision.board.view import parse_board
-
-    try:
-        parse_board(text)
-    except ConfigError as error:
-        raise ValueError(str(error)) from error
-    return text
+    @property
+    def place(self) -> str:
+        """The arm's output."""
+        return f"arm output {self.output}"
 
 
 KINDS: dict[str, type[DeviceConfig]] = {
@@ -309,14 +305,15 @@ class Surroundings:
 
     `look`: nothing on the device is to be set, started or ended, by `close` neither. `arm` is there for makes that
     hang on the arm's connectors. An arm switches `safe_off_outputs` off when the link to it or this program is lost;
-    `forward_of` is the cell's model of it, made from the table that its controller tells, or None: joints (6,) in rad
-    to the flange's pose (6,) in m and rad.
+    its flange reaches `reach` m from its base; `forward_of` is the cell's model of it, made from the table that its
+    controller tells, or None: joints (6,) in rad to the flange's pose (6,) in m and rad.
     """
 
     clock: Clock
     look: bool = False
     arm: Arm | None = None
     safe_off_outputs: tuple[int, ...] = ()
+    reach: float = math.inf
     forward_of: Callable[[LinkTable | None], Callable[[Vector], Vector]] | None = None
 
     def require_arm(self) -> Arm:
@@ -357,3 +354,12 @@ class Make(Generic[Record, Connected]):
 
 
 AnyMake = Make[Any, Any]
+
+
+def with_endpoint(*keys: str) -> Callable[[Record, Mapping[str, object]], Record]:
+    """A make's `simulated`: the record with these keys as the peer has them."""
+
+    def simulated(record: Record, endpoint: Mapping[str, object]) -> Record:
+        return record.model_copy(update={key: endpoint[key] for key in keys})
+
+    return simulated
