@@ -82,10 +82,9 @@ def connect_one(config: CellConfig, name: str, clock: Clock, *, arm: Arm | None 
         around = Surroundings(
             clock,
             look,
-            None,
-            safe_off_outputs(config),
-            MODELS[config.arm.model].reach,
-            lambda table: _forward(config, table),
+            safe_off_outputs=safe_off_outputs(config),
+            reach=MODELS[config.arm.model].reach,
+            forward_of=lambda table: _forward(config, table),
         )
     make = config.make(name)
     device = make.connect(name, config.device(name), around)
