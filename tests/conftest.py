@@ -60,9 +60,9 @@ GROUPS = (
     # The virtual job, and what is told of its ends.
     (
         "integration/virtual/test_virtual_door.py",
-        "unit/cell/run/report/test_report.py",
-        "unit/cell/run/report/page/test_make.py",
-        "unit/cell/run/report/test_figures.py",
+        "unit/cell/run/report",
+        "unit/cell/run/report/page",
+        "unit/cell/run/test_job_run.py",
         "unit/cell/apps/cli/test_display.py",
         "unit/cell/devices/simulated/test_direct.py",
         "integration/virtual/test_described_jobs.py",
@@ -78,7 +78,7 @@ GROUPS = (
         "unit/cell/procedures/steps/test_workplace.py",
         "unit/cell/measure/calibration/drift/test_timing_fit.py",
         "unit/drivers/vehicle/test_fixed.py",
-        "unit/cell/run/record/test_recorder.py",
+        "unit/cell/run/record",
     ),
     # Each worker gets two groups at first: a short one for the first, the screens for that of the arm.
     ("unit/cell/measure/calibration/test_archive.py",),

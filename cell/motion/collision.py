@@ -105,9 +105,7 @@ class Mounted:
 
 
 def tool_bodies(
-    part_size: Sequence[float] | None = None,
-    flange_from_part: pin.SE3 | None = None,
-    mounted: Mounted | None = None,
+    part_size: Sequence[float] | None = None, flange_from_part: pin.SE3 | None = None, mounted: Mounted | None = None
 ) -> list[Body]:
     """Claw, rail with the scan head over its whole travel, target camera, and the part when it is held.
 

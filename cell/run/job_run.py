@@ -41,8 +41,7 @@ from cell.run.record.recorder import Recorder, recorded
 from cell.run.record.replay import save as save_perception
 from cell.run.recorded_work import classify, clear, outcome_of
 from cell.run.report.figures import following_words, told
-from cell.run.report.report import FinishedJob
-from cell.run.report.truth import TruthRecorder
+from cell.run.report.report import FinishedJob, TruthRecorder
 from cell.run.resumption import UnfinishedRun, job_source
 from cell.run.runs import Run
 from cell.run.session.session import Opened

@@ -5,6 +5,7 @@ What a step returns or raises is the product's; only the runner's record of it i
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import time
@@ -27,8 +28,7 @@ from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.workplace import Workplace
 from cell.run.folder import new_run
 from cell.run.recorded_work import classify
-from cell.run.report.report import FinishedJob
-from cell.run.report.truth import TruthRecorder, pose_of
+from cell.run.report.report import FinishedJob, TruthRecorder, pose_of
 from cell.run.resumption import job_source
 from drivers.errors import CellError
 from lab.bench.job.whole_job import JobRecord
@@ -272,3 +272,11 @@ def crippled(record: JobRecord, root: Path) -> Ended:
     result = RunResult(Outcome.PLACED, "all steps done", "", records(None), record.results)
     witness = TruthRecorder(partial(ask_truth, "127.0.0.1:1"))
     return reported(folder, CONFIG, job, nominal, work, result, frames, witness)
+
+
+def read_strictly(path: Path) -> dict[str, Any]:
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is no JSON")
+
+    report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
+    return report

@@ -11,12 +11,7 @@ from drivers.errors import CalibrationStale, CellError, NotConnectedError
 
 
 def find_calibration(
-    folder: Path,
-    identities: dict[str, str],
-    configuration: str,
-    max_age: float,
-    kinematics: str = "",
-    untold: str = "",
+    folder: Path, identities: dict[str, str], configuration: str, max_age: float, kinematics: str = "", untold: str = ""
 ) -> CellCalibration:
     """The stored calibration of these devices under this configuration, not older than `max_age` s.
 

@@ -248,7 +248,7 @@ class CellCalibration:
             "scan_quality": _quality(scan.quality),
             "target_camera": _lens(target.camera),
             "target_hand_eye": {
-                "translation_mm": [round(1e3 * float(v), 4) for v in target.flange_from_camera.translation],
+                "translation_mm": [round(1e3 * float(v), 4) for v in target.flange_from_camera.translation]
             },
             "target_quality": _quality(target.quality),
             "shutter": None if scan.shutter is None else scan.shutter.summary(),

@@ -1,13 +1,10 @@
-"""The file `record.mcap`, written by a thread of its own: whoever puts something in never waits for the disk.
+"""The file `record.mcap` and its channels (docs/reference/record.md), written by a thread of its own.
 
-Messages are made by that thread, too: what is put in is how to make them. Chunks are small and go to the system once a
-second, so that a run that is cut off loses little; `cell.run.record.repair` closes its file. They are not compressed:
-the pictures are, and the rest is little.
-
-The channels of a record: their topics, what their messages are, in which schema. docs/reference/record.md has them
-as a table.
-
-Geometry is in Foxglove's Protobuf schemas, which viewers know; what only this cell knows is JSON with a schema."""
+That thread makes the messages, too: what is put in is how to make them, and nobody waits for the disk. Chunks are small
+and go to the system once a second, so that a run that is cut off loses little. They are not compressed: the pictures
+are, and the rest is little. Geometry is in Foxglove's Protobuf schemas; what only this cell
+knows is JSON with a schema.
+"""
 
 from __future__ import annotations
 

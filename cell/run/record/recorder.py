@@ -17,12 +17,13 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import DEVICES, CellConfig, deck_plates, mounted
@@ -32,12 +33,14 @@ from cell.motion.collision import Body, arm_bodies, tool_bodies, vehicle_bodies
 from cell.procedures.frame_store import FrameFile
 from cell.procedures.observed import RailPath, TimedCloud
 from cell.run.record.file import CAMERAS, COMMANDED, FILE, RecordFile, missing
-from cell.run.record.sketch import Sketch
 from cell.run.runs import Run
 from drivers.clock import Clock
 from drivers.interfaces import ArmState, Frame, RailState
 from statemachine.step import Event
 from statemachine.waiting import WaitableClock
+
+if TYPE_CHECKING:
+    from cell.run.record.drawing import Drawing
 
 MOST_NUMBERS = 2000
 """Of an array that goes into a message; of a larger one its shape is told."""
@@ -183,17 +186,12 @@ class Recorder(logging.Handler):
     """A record that is going on; `close` ends it."""
 
     def __init__(
-        self,
-        folder: Path,
-        run: Run[object],
-        config: CellConfig,
-        devices: Devices,
-        calibration: CellCalibration | None,
+        self, folder: Path, run: Run[object], config: CellConfig, devices: Devices, calibration: CellCalibration | None
     ) -> None:
         super().__init__(logging.INFO)
         self._run, self._devices = run, devices
         self._times = Times(devices.clock)
-        self._sketch = Sketch(config, devices, calibration)
+        self._config, self._calibration = config, calibration
         facts = {"run": folder.name, "cell": config.cell.name, "clock": self._times.name}
         self.file = RecordFile(folder / FILE, facts, lossless=self._times.virtual)
         self._due: dict[str, float] = {}
@@ -218,8 +216,9 @@ class Recorder(logging.Handler):
         super().close()
 
     def _listen(self) -> None:
-        self._put("/tf", self._times.now(), self._sketch.arm_frames)
-        self._put("/tf", self._times.now(), partial(self._sketch.rail_at, position=0.0))
+        at = self._times.now()
+        self._put("/tf", at, lambda draw: draw.arm(at))
+        self._put("/tf", at, lambda draw: draw.scan_camera(at, 0.0))
         self._look_around()
         self._devices.gate.listener = self
         self._run.record = self.event
@@ -268,8 +267,8 @@ class Recorder(logging.Handler):
             at = self._times.now() if stamp is None else self._times.of(stamp)
             self._json(f"/{device}/state", at, reading)
             if isinstance(reading, ArmState):
-                self._put("/tf", at, partial(self._sketch.arm_at, state=reading))
-                self._put("/joints", at, partial(self._sketch.arm_joints, state=reading))
+                self._put("/tf", at, lambda draw: draw.arm(at, reading))
+                self._put("/joints", at, lambda draw: draw.arm_joints(at, reading.joint_speeds))
                 self._look_around()
             elif isinstance(reading, RailState):
                 self._rail_at(at, reading.position)
@@ -284,8 +283,8 @@ class Recorder(logging.Handler):
             "lost_before": frame.lost_before,
         }  # fmt: skip
         self._json(f"/{camera}/frame", at, told)
-        self._put(f"/{camera}/calibration", at, partial(self._sketch.lens, camera=camera))
-        self._put(f"/{camera}/image", at, partial(self._sketch.image, camera=camera, picture=picture))
+        self._put(f"/{camera}/calibration", at, lambda draw: draw.lens(at, camera))
+        self._put(f"/{camera}/image", at, lambda draw: draw.image(at, camera, picture))
 
     def _camera_of(self, what: str, frame: Frame) -> str:
         """Which camera took it, by its size; where both have the same, by what it is kept as."""
@@ -297,7 +296,8 @@ class Recorder(logging.Handler):
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler.emit`."""
         at = self._times.of_wall(record.created)
-        self._put("/log", at, partial(self._sketch.log_line, record=record, text=record.getMessage()))
+        text = record.getMessage()
+        self._put("/log", at, lambda draw: draw.log_line(at, record, text))
 
     def _wire(self, device: str) -> Callable[[bool, object], None]:
         topic = {"arm": "/arm/rtde", "vehicle": "/vehicle/can"}.get(device, f"/{device}/serial")
@@ -311,8 +311,8 @@ class Recorder(logging.Handler):
     # --- what is made of it ---
 
     def _rail_at(self, at: int, position: float) -> None:
-        self._put("/tf", at, partial(self._sketch.rail_at, position=position))
-        self._put("/joints", at, self._sketch.rail_joint)
+        self._put("/tf", at, lambda draw: draw.scan_camera(at, position))
+        self._put("/joints", at, lambda draw: draw.rail_joint(at))
 
     def _lines(self, lines: TimedCloud) -> None:
         """Each line of the cloud, and once a second all so far; a place in it that is empty is NaN."""
@@ -321,12 +321,16 @@ class Recorder(logging.Handler):
         due = float(times[order[0]]) + GROWN_S
         for done, k in enumerate(order.tolist(), 1):
             at = self._times.of(float(times[k]))
-            self._put("/cloud/line", at, partial(self._sketch.line, points=points[k][seen[k]]))
+            self._line(at, points[k][seen[k]])
             if times[k] >= due or done == len(order):
                 due = float(times[k]) + GROWN_S
-                so_far = np.sort(order[:done])
-                grown = partial(self._sketch.grown, points=points, seen=seen, lines=so_far)
-                self._put("/cloud/grown", at, grown)
+                self._grown(at, points, seen, np.sort(order[:done]))
+
+    def _line(self, at: int, points: NDArray[np.float32]) -> None:
+        self._put("/cloud/line", at, lambda draw: draw.cloud(at, points))
+
+    def _grown(self, at: int, points: NDArray[np.float32], seen: NDArray[np.bool_], lines: NDArray[np.intp]) -> None:
+        self._put("/cloud/grown", at, lambda draw: draw.thinned(at, points[lines][seen[lines]]))
 
     def _look_around(self) -> None:
         """Draw the bodies again where the part or the station changed."""
@@ -339,7 +343,8 @@ class Recorder(logging.Handler):
         gone = [name for name in self._bodies if name not in bodies]
         new = [body for name, body in bodies.items() if self._bodies.get(name) is not body]
         self._bodies = bodies
-        self._put("/scene", self._times.now(), partial(self._sketch.scene, new=new, gone=gone))
+        at = self._times.now()
+        self._put("/scene", at, lambda draw: draw.scene(at, new, gone))
 
     def _is_due(self, what: str, period: float) -> bool:
         now = self._devices.clock.now()
@@ -351,5 +356,12 @@ class Recorder(logging.Handler):
     def _json(self, topic: str, at: int, told: object) -> None:
         self.file.put(topic, at, partial(as_json, told))
 
-    def _put(self, topic: str, at: int, make: Callable[[int], bytes | None]) -> None:
-        self.file.put(topic, at, partial(make, at))
+    @cached_property
+    def _drawing(self) -> Drawing:
+        """Made by the writer's thread: a job's start does not wait for the packages that it needs."""
+        from cell.run.record.drawing import Drawing
+
+        return Drawing(self._config, self._devices, self._calibration)
+
+    def _put(self, topic: str, at: int, make: Callable[[Drawing], bytes | None]) -> None:
+        self.file.put(topic, at, lambda: make(self._drawing))

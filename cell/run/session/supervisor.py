@@ -271,11 +271,7 @@ class Cell:
         return self._runs.stops
 
     def begin(
-        self,
-        kind: str,
-        work: Callable[[Run[Made]], Made],
-        observer: Observer | None = None,
-        stops: int | None = None,
+        self, kind: str, work: Callable[[Run[Made]], Made], observer: Observer | None = None, stops: int | None = None
     ) -> Run[Made]:
         """Begin a run of a kind; `InterlockError` while another one is going on or the cell is closed.
 

@@ -20,7 +20,7 @@ from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import difference, transform
 from cell.measure.inversion import NominalSurface, PlacePose
 from cell.procedures.part_error import part_points
-from cell.run.report.truth import pose_of
+from cell.run.report.report import pose_of
 from drivers.interfaces import Vector
 from lab.bench.acceptance.campaign import acceptance
 from lab.bench.job.expected import expect

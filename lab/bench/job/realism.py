@@ -18,7 +18,7 @@ from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import NominalSurface, PlacePose
 from cell.procedures.part_error import part_covariance
-from cell.run.report.truth import pose_of
+from cell.run.report.report import pose_of
 from lab.bench.job.accuracy import WANTED, figures, interval
 from lab.bench.job.scan_errors import COVERED
 from lab.bench.job.whole_job import JobRecord, run_whole_job

@@ -25,7 +25,7 @@ from cell.measure.reconstruction import Cloud
 from cell.measure.reconstruction.build import ScanGeometry
 from cell.procedures.part_error import part_points
 from cell.procedures.steps.reconstruct import Reconstruction
-from cell.run.report.truth import SENSOR_POINTS, pose_of
+from cell.run.report.report import SENSOR_POINTS, pose_of
 from drivers.interfaces import Vector
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.models.arm import ArmParams

@@ -93,10 +93,7 @@ def test_the_same_seed_gives_the_same_bytes_through_a_fault_and_its_recovery() -
     report = dict(first.report)
     require_safe(report)
     (fault,) = report["faults"]
-    assert (fault["code"], fault["remedy"]) == (
-        "arm.protective_stop",
-        "confirmed by the simulated person, recovered",
-    )
+    assert (fault["code"], fault["remedy"]) == ("arm.protective_stop", "confirmed by the simulated person, recovered")
     assert (report["clock"], report["wall_s"], report["pid"]) == ("virtual", None, None)
     assert report["truth"]["error_mm"]["d"]["mean"] < 3 * report["truth"]["bound_mm"]
 

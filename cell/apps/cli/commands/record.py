@@ -36,7 +36,7 @@ def _group() -> None:
 def repair(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
     """Close the record of a run that was cut off, so that every reader opens it; a whole one stays as it is."""
     from cell.run.folder import is_going
-    from cell.run.record import repair as work
+    from cell.run.record import reading as work
     from drivers.errors import ConfigError
 
     path, folder = _record(name, config)

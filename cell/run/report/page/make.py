@@ -1,19 +1,23 @@
-"""The page of a run: one HTML file that asks nobody for anything, for a browser and for paper."""
+"""The page of a run: one HTML file that asks nobody for anything, for a browser and for paper.
+
+Its verdict and its tables are text: what was used, what was judged, and nominal beside actual.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import cv2
 
 from cell.run.folder import read_report
-from cell.run.report.figures import noise_rows, simulated_words
-from cell.run.report.page import facts, render
+from cell.run.report.figures import noise_rows, shown_limit, shown_value, simulated_words
+from cell.run.report.page import render
 from cell.run.report.page.course import Timeline, Trend, past_runs, timeline
-from cell.run.report.page.facts import RunVerdict, TableRow
 from cell.run.report.page.surface import SurfaceView, surface_view
 from drivers.errors import CellError
 
@@ -23,6 +27,27 @@ MOST_EDGE = 900
 """Longer edge of a picture in px; a larger one is made smaller."""
 QUALITY = 82
 MOST_LAST = 6
+
+Row = tuple[str, ...]
+K95 = 1.96
+"""Standard deviations within which 95 % of a normal distribution lie."""
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class RunVerdict:
+    """What a run came to in one line, beside the tolerance, and whether its outcome is a good one."""
+
+    words: str
+    good: bool
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """A row of a table; with `kept` False its figure is outside its limit."""
+
+    cells: Row
+    kept: bool = True
 
 
 @dataclass(frozen=True)
@@ -108,16 +133,16 @@ def _run_page(folder: Path, report: Mapping[str, Any]) -> RunPage:
         outcome=str(report["outcome"]),
         simulated=simulated_words(report.get("simulated")),
         world=f"seed {report.get('seed')}, level {report.get('level')}",
-        verdict=facts.verdict(report),
+        verdict=verdict(report),
         reason=str(report.get("reason") or ""),
         refused=refused,
-        judged=facts.judged(report),
-        compared=facts.compared(report),
+        judged=judged(report),
+        compared=compared(report),
         surface=surface,
         unreadable=unreadable,
         course=timeline(folder, report),
         trend=Trend(past_runs(folder, report), tolerance) if kind == "job" else None,
-        used=facts.identities(folder, report),
+        used=identities(folder, report),
         noise=[TableRow(row) for row in noise_rows(noise)],
         noise_level=str(noise.get("level") or ""),
     )
@@ -170,3 +195,116 @@ def photograph(path: Path, caption: str) -> Photograph | None:
         image = cv2.resize(image, None, fx=share, fy=share, interpolation=cv2.INTER_AREA)
     done, data = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, QUALITY))
     return Photograph(f"{path.name}: {caption}", data.tobytes(), drawn) if done else None
+
+
+def verdict(report: Mapping[str, Any]) -> RunVerdict:
+    """The errors beside the tolerance."""
+    bound, truth = report.get("place_bound_95"), report.get("truth")
+    tolerance = (report.get("tolerance") or {}).get("translation_mm")
+    outside = sum(not row.kept for row in judged(report))
+    words = []
+    if truth is not None:
+        words.append(f"true place error at most {truth['error_mm']['d']['max']:.3f} mm (simulated world)")
+    if bound is not None:
+        words.append(f"stated: 95 % within {bound['d']:.3f} mm")
+    if tolerance is not None and (truth is not None or bound is not None):
+        words.append(f"tolerance {tolerance:g} mm")
+    if outside:
+        words.append("one figure outside its limit" if outside == 1 else f"{outside} figures outside their limits")
+    return RunVerdict("; ".join(words), report["outcome"] in ("placed", "done") and not outside)
+
+
+def identities(folder: Path, report: Mapping[str, Any]) -> list[TableRow]:
+    """What the run was: cell, devices, job, calibration with its age, configuration, program."""
+    rows: list[Row] = [("run", str(report.get("run", folder.name))), ("cell", str(report.get("cell", "")))]
+    if words := simulated_words(report.get("simulated")):
+        rows.append(("world", f"{words}, seed {report.get('seed')}, level {report.get('level')}"))
+    rows.append(("begun", str(report.get("started", "")).replace("T", " ")))
+    rows.append(("ended", str(report.get("ended") or "not ended").replace("T", " ")))
+    if report.get("kind", "job") == "job":
+        rows.append(("job", f"{report.get('job')}, hash {report.get('job_hash')}"))
+        if mesh := report.get("mesh"):
+            name, digest = Path(str(mesh.get("file"))).name, str(mesh.get("sha256"))
+            rows.append(("drawn surface", f"{name}, SHA-256 {digest[:16]}"))
+    calibration = _calibration(folder)
+    if report.get("calibration_hash"):
+        rows.append(("calibration", f"hash {report['calibration_hash']}, {_age(calibration, report)}"))
+    for device, serial in (calibration.get("identities") or {}).items():
+        rows.append((f"{device}, serial number", str(serial)))
+    if calibration.get("kinematics"):
+        rows.append(("arm, kinematics", str(calibration["kinematics"])))
+    if report.get("configuration_hash"):
+        rows.append(("configuration", f"hash {report['configuration_hash']}"))
+    rows.append(("program", f"assembly-cell {report.get('version', 'of another version')}"))
+    return [TableRow(row) for row in rows]
+
+
+def _calibration(folder: Path) -> dict[str, Any]:
+    try:
+        told = json.loads((folder / "calibration.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return told if isinstance(told, dict) else {}
+
+
+def _age(calibration: Mapping[str, Any], report: Mapping[str, Any]) -> str:
+    date = f"made {report.get('calibration_date')}"
+    try:
+        seconds = datetime.fromisoformat(str(report["started"])).timestamp() - float(calibration["made"])
+    except (KeyError, ValueError):
+        return date
+    unit, size = next(((u, s) for u, s in (("days", 86400), ("h", 3600), ("min", 60)) if seconds >= 2 * s), ("s", 1))
+    return f"{date}, {seconds / size:.0f} {unit} before the run"
+
+
+def compared(report: Mapping[str, Any]) -> list[TableRow]:
+    """Where the surface was found, where the part ended, and where it was first touched.
+
+    Cells: quantity, nominal, actual, deviation, tolerance, uncertainty (95 %). The surface may lie anywhere: the part
+    goes with it. What has to keep the tolerance is the part on the surface.
+    """
+    return [TableRow(row) for row in (*_surface_rows(report), *_part_rows(report), *_touch_rows(report))]
+
+
+def _surface_rows(report: Mapping[str, Any]) -> Iterator[Row]:
+    found, sigma = _result(report, "invert_pose"), report.get("place_sigma")
+    if found is None or not report.get("place_pose") or not sigma:
+        return
+    for about, unit, sigmas in (("", "mm", "translation_mm"), ("about ", "mrad", "rotation_mrad")):
+        for axis, off, one in zip(AXES, found[f"correction_{unit}"], sigma[sigmas], strict=True):
+            shown, unsure = f"{off:+.3f} {unit}", f"± {K95 * one:.3f} {unit}"
+            yield f"surface {about}{axis}, from the board", f"0 {unit}", shown, shown, "follows it", unsure
+
+
+def _part_rows(report: Mapping[str, Any]) -> Iterator[Row]:
+    bound, truth = report.get("place_bound_95"), report.get("truth")
+    if bound is None:
+        return
+    tolerance = (report.get("tolerance") or {}).get("translation_mm")
+    for name in (*AXES, "d"):
+        off = "not measured" if truth is None else f"{truth['error_mm'][name]['max']:.3f} mm"
+        of = "part's points, largest D" if name == "d" else f"part's points, largest along {name}"
+        allowed = f"at most {tolerance:g} mm" if name == "d" and tolerance is not None else ""
+        yield of, "0 mm", off, "" if truth is None else off, allowed, f"{bound[name]:.3f} mm"
+
+
+def _touch_rows(report: Mapping[str, Any]) -> Iterator[Row]:
+    if (touch := (_result(report, "place") or {}).get("touch")) is None:
+        return
+    limit = next((row.cells[2] for row in judged(report) if row.cells[0].startswith("first touch")), "")
+    expected, felt = (f"{touch[key]:.3f} mm" for key in ("expected_mm", "felt_mm"))
+    unsure = f"± {K95 * touch['sigma_mm']:.3f} mm"
+    yield "first touch above the place", expected, felt, f"{touch['off_mm']:+.3f} mm", limit, unsure
+
+
+def _result(report: Mapping[str, Any], step: str) -> Mapping[str, Any] | None:
+    made = next((row.get("result") for row in report.get("steps") or () if row.get("name") == step), None)
+    return made if isinstance(made, dict) and "summary_missing" not in made else None
+
+
+def judged(report: Mapping[str, Any]) -> list[TableRow]:
+    """Every figure beside its limit, and whether it keeps it."""
+    return [
+        TableRow((str(row["name"]), shown_value(row), shown_limit(row)), bool(row.get("kept", True)))
+        for row in report.get("measured") or ()
+    ]

@@ -3,158 +3,29 @@ states of its own error is what its covariance says."""
 
 from __future__ import annotations
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from scipy.stats import chi2, norm
 
 from cell.config.job import SwathSection
-from cell.measure.reconstruction.ply import read_cloud
-from cell.procedures.frame_store import FrameStore
 from cell.procedures.part_error import stated_bound
-from cell.procedures.steps.reconstruct import Reconstruction
 from cell.run.folder import write_json
-from cell.run.job_run import RunOutcome
-from cell.run.report.pictures import SurfacePanel, draw_surface
 from cell.run.report.report import strict
-from drivers.errors import CellError, Measured, RefusedError
-from drivers.interfaces import Frame
+from drivers.errors import CellError
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.support import ROOT, report_runs
-from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
+from tests.support.report_runs import CONFIG, Ended, Ends, pot, read_strictly
 
 DOCUMENT = ROOT / "docs" / "reference" / "report.md"
-REFUSALS: list[tuple[Make, str, str | None, bool, bool]] = [
-    (report_runs.no_board, "drive_to_target", None, True, False),
-    (report_runs.blurred_board, "drive_to_target", "board's dots off their places, RMS", True, False),
-    (report_runs.few_points, "reconstruct", "points of the cloud", False, True),
-    (report_runs.other_surface, "invert_pose", "points over the surface that fit it", False, False),
-    (report_runs.too_strict, "invert_pose", "3σ in tolerances: translation along the z axis", False, False),
-    (report_runs.no_contact, "place", None, True, False),
-]
-
-
-def read_strictly(path: Path) -> dict[str, Any]:
-    def refuse(word: str) -> None:
-        raise AssertionError(f"{word} is no JSON")
-
-    report: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)
-    return report
 
 
 @pytest.fixture(scope="module")
 def placed(ends: Ends) -> Ended:
     return ends(report_runs.placed)
-
-
-@pytest.mark.parametrize(("make", "step", "number", "frames", "cloud"), REFUSALS)
-def test_a_refusal_leaves_what_it_looked_at(
-    ends: Ends, make: Make, step: str, number: str | None, frames: bool, cloud: bool
-) -> None:
-    run = ends(make)
-    report = read_strictly(run.folder / "report.json")
-    assert report["outcome"] == "refused"
-    refusal = report["refusal"]
-    assert (refusal["step"], refusal["reason"]) == (step, report["reason"])
-    if number is not None:
-        first = refusal["numbers"][0]
-        assert (first["name"], first["kept"]) == (number, False)
-        assert first["value"] < first["limit"] if first["bound"] == "at least" else first["value"] > first["limit"]
-        assert report["measured"][0] == first
-    assert bool(refusal["frames"]) == frames
-    for name in refusal["frames"]:
-        assert cv2.imread(str(run.folder / name), cv2.IMREAD_GRAYSCALE) is not None
-    assert (refusal["cloud"] == "cloud.ply") == cloud
-    if cloud:
-        assert 0 < len(read_cloud(run.folder / "cloud.ply").points) < 500
-    assert "picture_missing" not in report
-    assert cv2.imread(str(run.folder / "picture.png")).shape[1] > 1500
-
-
-def test_a_place_that_was_refused_is_shown_with_all_its_figures(ends: Ends) -> None:
-    run = ends(report_runs.other_surface)
-    names = {row["name"] for row in run.report["refusal"]["numbers"]}
-    assert {"fit, χ²/dof", "surface covered", "points off the surface, RMS"} <= names
-    assert run.report["place_pose"] is None
-
-
-def test_a_part_that_met_nothing_says_how_far_it_was_lowered(ends: Ends) -> None:
-    (number,) = ends(report_runs.no_contact).report["refusal"]["numbers"]
-    assert number["name"] == "reached without contact"
-    assert number["value"] == pytest.approx(-1.0, abs=0.1)
-
-
-def test_a_photograph_is_kept_before_it_is_looked_at(ends: Ends) -> None:
-    run = ends(report_runs.no_board)
-    # One from where the vehicle started, one after it drove on odometry: neither showed the board of the job.
-    assert [Path(name).name[:9] for name in run.report["refusal"]["frames"]] == ["board-01-", "board-02-"]
-
-
-def test_evidence_nearest_to_the_cause_stays() -> None:
-    error = RefusedError("too little", Measured("points", 3, least=5)).showing(
-        Measured("points", 4, least=5), Measured("rms", 0.1, "mm", most=0.3), seen={"frame": 1}
-    )
-    error.showing(seen={"frame": 2, "pose": 3})
-    assert [(number.name, number.value) for number in error.numbers] == [("points", 3), ("rms", 0.1)]
-    assert error.seen == {"frame": 1, "pose": 3}
-    assert str(error) == "too little"
-
-
-def test_a_fault_keeps_the_last_frames_and_every_fault_before_it(ends: Ends) -> None:
-    run = ends(report_runs.faulted)
-    report = read_strictly(run.folder / "report.json")
-    assert report["refusal"] is None
-    assert [(run.folder / name).is_file() for name in report["last_frames"]] == [True]
-    first, last = report["faults"]
-    assert (first["code"], first["step"], first["attempt"]) == ("camera.frames_lost", "laser_sweep", 1)
-    assert (first["remedy"], last["remedy"]) == ("tried again", "ended the run")
-    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4}", first["at"])
-
-
-def test_only_the_frames_of_the_last_step_are_its_evidence(tmp_path: Path) -> None:
-    def frame(number: int) -> Frame:
-        return Frame(np.zeros((4, 4), np.uint8), number, 0.01, 0.0, 0.0, 0.0)
-
-    with FrameStore(tmp_path / "frames") as store:
-        store.keep("board-01", frame(1))
-        store.begin()
-        for number in range(2, 40):
-            store.keep("stripe", frame(number))
-    assert store.recent[-1] == "stripe-000039.png"
-    assert len(store.recent) == 12
-    assert len(list((tmp_path / "frames").iterdir())) == 39
-
-
-def test_a_placed_run_measures_itself_against_its_limits(placed: Ended) -> None:
-    rows = {row["name"]: row for row in placed.report["measured"]}
-    assert all(row["kept"] for row in rows.values())
-    truth = placed.report["truth"]
-    assert rows["place error, largest of 45 points"]["value"] == truth["error_mm"]["d"]["max"]
-    assert rows["place error, largest of 45 points"]["limit"] == 0.6
-    assert rows["place error, stated 95 % bound"]["limit"] == 0.6
-    assert rows["contact depth"]["limit"] == 1.0
-    assert rows["surface covered"]["limit"] == 35.0
-    assert 0.5 < rows["fit, χ²/dof"]["value"] < 2.0
-
-
-def test_a_real_cell_has_its_own_figures(ends: Ends) -> None:
-    report = ends(report_runs.real).report
-    assert report["truth"] is None
-    names = [row["name"] for row in report["measured"]]
-    assert names[:5] == [
-        "place error, stated 95 % bound",
-        "contact depth",
-        "first touch, off what the scan says",
-        "fit, χ²/dof",
-        "surface covered",
-    ]
 
 
 def test_the_stated_bound_is_the_closed_form_for_a_round_error(placed_pot: JobRecord) -> None:
@@ -265,50 +136,3 @@ def test_the_report_keeps_its_contract(placed: Ended) -> None:
     assert {"points", "error_mm", "d_p95", "sensor_mm", "bound_mm"} <= set(report["truth"])
     assert (report["kind"], len(report["mesh"]["sha256"])) == ("job", 64)
     assert report["started"] < report["ended"]
-
-
-# --- the picture ---
-
-
-def surface_axes(panel: SurfacePanel, seams: list[dict[str, Any]]) -> tuple[Any, Any]:
-    figure = Figure()
-    axes = figure.subplots()
-    draw_surface(figure, axes, panel, 0.2, seams)
-    return axes, figure.axes[1]
-
-
-def test_the_map_of_deviations_has_a_fixed_scale_in_mm(placed_pot: JobRecord) -> None:
-    made = placed_pot.results["reconstruct"]
-    assert isinstance(made, Reconstruction)
-    points = np.column_stack([*np.random.default_rng(1).uniform(-0.02, 0.02, (2, 4000)), np.zeros(4000)])
-    for size in (1e-6, 1e-3):
-        axes, colours = surface_axes(SurfacePanel(points, np.full(4000, size), believed=True), [])
-        assert colours.get_ylim() == (-0.2, 0.2)
-        assert colours.get_ylabel() == "deviation from the drawn surface in mm"
-        assert f"{1e3 * size:.3f} mm RMS" in axes.get_title()
-        assert axes.get_xlabel().endswith("in mm")
-
-
-def test_a_surface_that_was_not_found_is_shown_by_its_height() -> None:
-    points = np.array([[0.0, 0.0, 0.001], [0.01, 0.0, 0.002]])
-    axes, colours = surface_axes(SurfacePanel(points, None, believed=False), [])
-    assert colours.get_ylabel() == "height in mm"
-    assert "not found" in axes.get_title()
-    surface_axes(SurfacePanel(points[:0], points[:0, 0], believed=True), [])
-
-
-# --- in a notebook ---
-
-
-def test_a_result_in_a_notebook_is_short_and_escaped(placed: Ended, placed_pot: JobRecord) -> None:
-    result = RunOutcome("refused", "<script>alert('x')</script>" + 500 * "y", placed.folder, placed.report)
-    html = result._repr_html_()
-    assert "<script>" not in html
-    assert "&lt;script&gt;" in html
-    assert len(html) < 3000
-    assert "at most 0.6 mm" in html
-    assert len(repr(result)) < 100
-    assert str(result).startswith("refused: ")
-    assert placed_pot.calibration is not None
-    assert "χ²/dof" in placed_pot.calibration._repr_html_()
-    assert len(repr(placed_pot.calibration)) < 100

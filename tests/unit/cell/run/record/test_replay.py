@@ -1,0 +1,75 @@
+"""Perception fed again with what a run kept gives the same bits, and what was changed is found."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from cell.apps.cli import main
+from cell.run.record.replay import FILE as PERCEPTION
+from cell.run.record.replay import replay
+from drivers.errors import ConfigError
+from lab.bench.job.whole_job import JobRecord
+
+
+@pytest.fixture
+def copied(folder: Path, tmp_path: Path) -> Iterator[Path]:
+    """The run's folder, to be changed."""
+    copy = tmp_path / folder.name
+    shutil.copytree(folder, copy, ignore=lambda where, names: [n for n in names if n == "record.mcap"])
+    yield copy
+
+
+def test_perception_fed_again_gives_the_same_bits(folder: Path, placed_pot: JobRecord) -> None:
+    compared = replay(folder)
+    assert [each.difference for each in compared] == [""] * len(compared)
+    names = [each.what for each in compared]
+    assert names[:4] == ["board's pose", "cloud", "place pose", "its covariance"]
+    assert int(names[4].split()[0]) == len(list((folder / "frames").iterdir()))
+
+
+def test_a_pixel_or_a_reading_that_changed_is_found_and_exits_1(
+    copied: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = json.loads((copied / PERCEPTION).read_text(encoding="utf-8"))
+    kept["photograph"]["flange"][0] += 1e-9
+    (copied / PERCEPTION).write_text(json.dumps(kept), encoding="utf-8")
+    stripes = sorted((copied / "frames").glob("stripe-*.png"))
+    middle = stripes[len(stripes) // 2]
+    image = cv2.imread(str(middle), cv2.IMREAD_GRAYSCALE)
+    cv2.imwrite(str(middle), np.roll(image, 1, axis=1))
+    monkeypatch.setattr("sys.argv", ["cell", "replay", str(copied), "--json"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 1
+    told = json.loads(capsys.readouterr().out)
+    assert not told["same"]
+    by_name = {row["what"]: row["difference"] for row in told["compared"]}
+    assert by_name["board's pose"].startswith("off by 1e-06 mm")
+    assert "points" in by_name["cloud"]
+    assert by_name["place pose"].startswith("off by")
+
+
+def test_a_picture_of_the_record_that_is_not_the_file_is_found(folder: Path, tmp_path: Path) -> None:
+    """Without the rest of perception: the run's folder has no pictures here."""
+    from cell.run.record.replay import _pictures
+
+    (tmp_path / "frames").mkdir()
+    shutil.copy(folder / "record.mcap", tmp_path)
+    for path in (folder / "frames").iterdir():
+        shutil.copy(path, tmp_path / "frames")
+    assert _pictures(tmp_path)[0].same
+    victim = sorted((tmp_path / "frames").iterdir())[5]
+    victim.write_bytes(victim.read_bytes()[:-1] + b"\0")
+    assert _pictures(tmp_path)[0].difference == f"not those in frames/: {victim.name}"
+
+
+def test_a_run_that_came_to_no_cloud_says_that_it_cannot_be_replayed(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"holds no perception\.json"):
+        replay(tmp_path)
