@@ -26,6 +26,8 @@ from drivers.errors import CellError, ConfigError
 from statemachine.journal import JournalError, JournalRecord, read
 
 REPORT = "report.json"
+Report = Mapping[str, Any]
+"""What a run's `report.json` holds, or as much of it as its journal tells; docs/reference/report.md has its keys."""
 _NAME = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
 
 
@@ -210,7 +212,7 @@ def run_row(folder: Path) -> dict[str, object]:
     }
 
 
-def wall_seconds(report: Mapping[str, Any]) -> float | None:
+def wall_seconds(report: Report) -> float | None:
     """How long a run took on the wall, by its dates where the report does not say; None while it is not known."""
     if report.get("wall_s") is not None:
         return float(report["wall_s"])

@@ -56,7 +56,7 @@ MOST_POINTS = 60_000
 """Of a cloud that grows; of more, every so many are left out."""
 
 
-class Drawing:
+class RecordDrawing:
     """Makes the messages of one run; each method gives the bytes of one with its time `at`, ns.
 
     It remembers the joints and the rail as they were told last. Cameras are where the `calibration` has them, without

@@ -40,7 +40,7 @@ from statemachine.step import Event
 from statemachine.waiting import WaitableClock
 
 if TYPE_CHECKING:
-    from cell.run.record.drawing import Drawing
+    from cell.run.record.drawing import RecordDrawing
 
 MOST_NUMBERS = 2000
 """Of an array that goes into a message; of a larger one its shape is told."""
@@ -357,11 +357,11 @@ class Recorder(logging.Handler):
         self.file.put(topic, at, partial(as_json, told))
 
     @cached_property
-    def _drawing(self) -> Drawing:
+    def _drawing(self) -> RecordDrawing:
         """Made by the writer's thread: a job's start does not wait for the packages that it needs."""
-        from cell.run.record.drawing import Drawing
+        from cell.run.record.drawing import RecordDrawing
 
-        return Drawing(self._config, self._devices, self._calibration)
+        return RecordDrawing(self._config, self._devices, self._calibration)
 
-    def _put(self, topic: str, at: int, make: Callable[[Drawing], bytes | None]) -> None:
+    def _put(self, topic: str, at: int, make: Callable[[RecordDrawing], bytes | None]) -> None:
         self.file.put(topic, at, lambda: make(self._drawing))

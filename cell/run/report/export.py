@@ -13,7 +13,7 @@ from cell.measure.geometry.poses import from_ur, transform
 from cell.measure.inversion import NominalSurface
 from cell.measure.reconstruction.cloud import triangles, write_mesh
 from cell.measure.reconstruction.ply import StoredCloud, deviation_colours, read_cloud, write_e57, write_ply
-from cell.run.folder import read_report
+from cell.run.folder import Report, read_report
 from cell.run.report.figures import simulated_words
 from drivers.errors import ConfigError
 
@@ -66,13 +66,13 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
     return written
 
 
-def _comment(deviations: NDArray[np.float64] | None, report: dict[str, object]) -> str:
+def _comment(deviations: NDArray[np.float64] | None, report: Report) -> str:
     lines = ["frame: arm base", simulated_words(report.get("simulated"))]
     lines += [] if deviations is None else ["quality: distance from the nominal surface in metres"]
     return "\n".join(line for line in lines if line)
 
 
-def _deviations(cloud: StoredCloud, report: dict[str, Any], name: str | None) -> NDArray[np.float64] | None:
+def _deviations(cloud: StoredCloud, report: Report, name: str | None) -> NDArray[np.float64] | None:
     """Signed distances (n,) in m from the nominal surface where the run found it; None without a place pose."""
     pose = report.get("place_pose")
     if pose is None:

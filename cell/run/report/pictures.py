@@ -29,6 +29,7 @@ from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.sweep.stored_sweep import SweepRecord
+from cell.run.folder import Report
 from cell.run.report.evidence import RefusalEvidence, ended_in
 from cell.run.report.figures import simulated_words, told
 from drivers.interfaces import Frame, Image, Vector
@@ -200,7 +201,7 @@ def draw_error(
     axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=2)
 
 
-def draw_reason(axes: Axes, report: Mapping[str, Any], step: str | None) -> None:
+def draw_reason(axes: Axes, report: Report, step: str | None) -> None:
     """Why a run ended, and the figures that it was judged by; one that leaves its limit is red."""
     empty(axes, f"{report['outcome']}" + ("" if step is None else f" in {step}"), "")
     lines = textwrap.wrap(str(report["reason"]), REASON_COLUMNS)
@@ -241,7 +242,7 @@ TITLE_LINE = 0.17 / HEIGHT
 
 
 def draw_run(
-    path: Path, job: Job, nominal: NominalSurface, result: RunResult, report: Mapping[str, Any], frames: FrameStore
+    path: Path, job: Job, nominal: NominalSurface, result: RunResult, report: Report, frames: FrameStore
 ) -> None:
     """Draw a run's picture from what its steps made, from what its end shows, and from its report."""
     evidence = RefusalEvidence.of(result)

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from cell.run.folder import list_runs, read_report
+from cell.run.folder import Report, list_runs, read_report
 from drivers.errors import CellError
 from statemachine.journal import JournalError, JournalRecord, read
 
@@ -61,7 +61,7 @@ class Timeline:
         return _ticks(self.length, SECONDS, 10)
 
 
-def timeline(folder: Path, report: Mapping[str, Any]) -> Timeline | None:
+def timeline(folder: Path, report: Report) -> Timeline | None:
     """The course of a run by its journal; None where that tells no step.
 
     On the virtual clock the wall's time says nothing: the attempts' durations in the cell's time are laid end to end,
@@ -76,7 +76,7 @@ def timeline(folder: Path, report: Mapping[str, Any]) -> Timeline | None:
     return _virtual(record, report) if report.get("clock") == "virtual" else _wall(record, report)
 
 
-def _wall(record: JournalRecord, report: Mapping[str, Any]) -> Timeline:
+def _wall(record: JournalRecord, report: Report) -> Timeline:
     start = record.run.started
     last = max(
         [record.run.ended or start, *(step.ended or step.started for step in record.steps)]
@@ -90,7 +90,7 @@ def _wall(record: JournalRecord, report: Mapping[str, Any]) -> Timeline:
     return Timeline(tuple(bars), tuple(marks), max(last - start, 0.1), "on the wall")
 
 
-def _virtual(record: JournalRecord, report: Mapping[str, Any]) -> Timeline:
+def _virtual(record: JournalRecord, report: Report) -> Timeline:
     bars, now = [], 0.0
     for step in record.steps:
         length = step.duration_s or 0.0
@@ -149,7 +149,7 @@ class Trend:
         return _ticks(self.highest, MILLIMETRES, 6)
 
 
-def past_runs(folder: Path, report: Mapping[str, Any]) -> list[Past]:
+def past_runs(folder: Path, report: Report) -> list[Past]:
     """The runs of the same job beside `folder` that began before it, and itself at the end; what cannot be read is left
     out."""
     found = []
@@ -166,7 +166,7 @@ def past_runs(folder: Path, report: Mapping[str, Any]) -> list[Past]:
     return [*reversed(found), _past(folder.name, report)]
 
 
-def _past(name: str, report: Mapping[str, Any]) -> Past:
+def _past(name: str, report: Report) -> Past:
     truth, bound = report.get("truth"), report.get("place_bound_95")
     return Past(
         name,

@@ -14,7 +14,7 @@ from typing import Any
 
 import cv2
 
-from cell.run.folder import read_report
+from cell.run.folder import Report, read_report
 from cell.run.report.figures import noise_rows, shown_limit, shown_value, simulated_words
 from cell.run.report.page import render
 from cell.run.report.page.course import Timeline, Trend, past_runs, timeline
@@ -117,7 +117,7 @@ def _html(page: RunPage) -> str:
     return render(__package__, "run.html.jinja", page=page)
 
 
-def _run_page(folder: Path, report: Mapping[str, Any]) -> RunPage:
+def _run_page(folder: Path, report: Report) -> RunPage:
     """All but the photographs. Raises `KeyError`, `TypeError` or `ValueError` for a report of another form."""
     kind, refusal, noise = str(report.get("kind", "job")), report.get("refusal"), report.get("assumed_noise") or {}
     tolerance = (report.get("tolerance") or {}).get("translation_mm")
@@ -148,7 +148,7 @@ def _run_page(folder: Path, report: Mapping[str, Any]) -> RunPage:
     )
 
 
-def _with_photographs(page: RunPage, folder: Path, report: Mapping[str, Any], room: int) -> RunPage:
+def _with_photographs(page: RunPage, folder: Path, report: Report, room: int) -> RunPage:
     """The page with the photographs that need no more than `room` bytes."""
     shown, left_out = [], 0
     for path, caption in chosen(folder, report):
@@ -164,7 +164,7 @@ def _with_photographs(page: RunPage, folder: Path, report: Mapping[str, Any], ro
     return replace(page, photographs=shown, left_out=left_out)
 
 
-def chosen(folder: Path, report: Mapping[str, Any]) -> list[tuple[Path, str]]:
+def chosen(folder: Path, report: Report) -> list[tuple[Path, str]]:
     """Files and captions, the most telling first: what a run looked at that did not place, or what it measured with."""
     last = [str(name) for name in report.get("last_frames") or ()][-MOST_LAST:]
     if report.get("outcome") not in ("placed", "done"):
@@ -197,7 +197,7 @@ def photograph(path: Path, caption: str) -> Photograph | None:
     return Photograph(f"{path.name}: {caption}", data.tobytes(), drawn) if done else None
 
 
-def verdict(report: Mapping[str, Any]) -> RunVerdict:
+def verdict(report: Report) -> RunVerdict:
     """The errors beside the tolerance."""
     bound, truth = report.get("place_bound_95"), report.get("truth")
     tolerance = (report.get("tolerance") or {}).get("translation_mm")
@@ -214,7 +214,7 @@ def verdict(report: Mapping[str, Any]) -> RunVerdict:
     return RunVerdict("; ".join(words), report["outcome"] in ("placed", "done") and not outside)
 
 
-def identities(folder: Path, report: Mapping[str, Any]) -> list[TableRow]:
+def identities(folder: Path, report: Report) -> list[TableRow]:
     """What the run was: cell, devices, job, calibration with its age, configuration, program."""
     rows: list[Row] = [("run", str(report.get("run", folder.name))), ("cell", str(report.get("cell", "")))]
     if words := simulated_words(report.get("simulated")):
@@ -247,7 +247,7 @@ def _calibration(folder: Path) -> dict[str, Any]:
     return told if isinstance(told, dict) else {}
 
 
-def _age(calibration: Mapping[str, Any], report: Mapping[str, Any]) -> str:
+def _age(calibration: Mapping[str, Any], report: Report) -> str:
     date = f"made {report.get('calibration_date')}"
     try:
         seconds = datetime.fromisoformat(str(report["started"])).timestamp() - float(calibration["made"])
@@ -257,7 +257,7 @@ def _age(calibration: Mapping[str, Any], report: Mapping[str, Any]) -> str:
     return f"{date}, {seconds / size:.0f} {unit} before the run"
 
 
-def compared(report: Mapping[str, Any]) -> list[TableRow]:
+def compared(report: Report) -> list[TableRow]:
     """Where the surface was found, where the part ended, and where it was first touched.
 
     Cells: quantity, nominal, actual, deviation, tolerance, uncertainty (95 %). The surface may lie anywhere: the part
@@ -266,7 +266,7 @@ def compared(report: Mapping[str, Any]) -> list[TableRow]:
     return [TableRow(row) for row in (*_surface_rows(report), *_part_rows(report), *_touch_rows(report))]
 
 
-def _surface_rows(report: Mapping[str, Any]) -> Iterator[Row]:
+def _surface_rows(report: Report) -> Iterator[Row]:
     found, sigma = _result(report, "invert_pose"), report.get("place_sigma")
     if found is None or not report.get("place_pose") or not sigma:
         return
@@ -276,7 +276,7 @@ def _surface_rows(report: Mapping[str, Any]) -> Iterator[Row]:
             yield f"surface {about}{axis}, from the board", f"0 {unit}", shown, shown, "follows it", unsure
 
 
-def _part_rows(report: Mapping[str, Any]) -> Iterator[Row]:
+def _part_rows(report: Report) -> Iterator[Row]:
     bound, truth = report.get("place_bound_95"), report.get("truth")
     if bound is None:
         return
@@ -288,7 +288,7 @@ def _part_rows(report: Mapping[str, Any]) -> Iterator[Row]:
         yield of, "0 mm", off, "" if truth is None else off, allowed, f"{bound[name]:.3f} mm"
 
 
-def _touch_rows(report: Mapping[str, Any]) -> Iterator[Row]:
+def _touch_rows(report: Report) -> Iterator[Row]:
     if (touch := (_result(report, "place") or {}).get("touch")) is None:
         return
     limit = next((row.cells[2] for row in judged(report) if row.cells[0].startswith("first touch")), "")
@@ -297,12 +297,12 @@ def _touch_rows(report: Mapping[str, Any]) -> Iterator[Row]:
     yield "first touch above the place", expected, felt, f"{touch['off_mm']:+.3f} mm", limit, unsure
 
 
-def _result(report: Mapping[str, Any], step: str) -> Mapping[str, Any] | None:
+def _result(report: Report, step: str) -> Mapping[str, Any] | None:
     made = next((row.get("result") for row in report.get("steps") or () if row.get("name") == step), None)
     return made if isinstance(made, dict) and "summary_missing" not in made else None
 
 
-def judged(report: Mapping[str, Any]) -> list[TableRow]:
+def judged(report: Report) -> list[TableRow]:
     """Every figure beside its limit, and whether it keeps it."""
     return [
         TableRow((str(row["name"]), shown_value(row), shown_limit(row)), bool(row.get("kept", True)))

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from cell.measure.geometry.poses import from_ur, transform
 from cell.measure.inversion import NominalSurface
 from cell.measure.reconstruction.ply import read_cloud
+from cell.run.folder import Report
 from cell.run.report.evidence import CLOUD
 from cell.run.report.pictures import SCALE_SHARE, frame_map, square_means
 from drivers.errors import CellError
@@ -67,7 +68,7 @@ class SurfaceView:
     stops: Sequence[str]
 
 
-def surface_view(folder: Path, report: Mapping[str, Any]) -> SurfaceView | None:
+def surface_view(folder: Path, report: Report) -> SurfaceView | None:
     """What is shown of the run's cloud, None where it has none; `CellError` for one that cannot be read."""
     scan = scanned(folder, report)
     if scan is None or not len(scan.points):
@@ -86,7 +87,7 @@ def surface_view(folder: Path, report: Mapping[str, Any]) -> SurfaceView | None:
     )
 
 
-def scanned(folder: Path, report: Mapping[str, Any]) -> Scanned | None:
+def scanned(folder: Path, report: Report) -> Scanned | None:
     """The cloud of a run, None where it has none; `CellError` for one that cannot be read."""
     if not (folder / CLOUD).exists():
         return None
@@ -105,7 +106,7 @@ class _NotKnown(Exception):
     """Why a cloud cannot be compared with the drawn surface."""
 
 
-def _surface(folder: Path, report: Mapping[str, Any]) -> tuple[pin.SE3, NominalSurface]:
+def _surface(folder: Path, report: Report) -> tuple[pin.SE3, NominalSurface]:
     """The surface's pose that the run found, and the surface itself if its file is the one that the run had."""
     if (place := report.get("place_pose")) is None:
         raise _NotKnown("the run did not find the surface's place")
