@@ -12,15 +12,15 @@ import logging
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from drivers.errors import DeviceFault, InterlockError
+from drivers.errors import CellError, DeviceFault, InterlockError
 from drivers.interfaces import ATTENDED_S
 from drivers.last_words_child import ALIVE, BEAT, FROZEN_S, GOODBYE, REST
-from drivers.pulse import Pulse
 
 PAUSE_S = 0.02
 """Between two of the last words."""
@@ -133,3 +133,36 @@ class LastWords:
             except subprocess.TimeoutExpired:
                 self._process.kill()
                 self._process.wait(END_TIMEOUT_S)
+
+
+BEAT_S = 0.05
+"""Wall seconds between two beats; `last_words_child.FROZEN_S` allows four of them to be lost."""
+_NICENESS = -10
+
+
+class Pulse:
+    """Calls `beat` every `BEAT_S` on a thread of its own until `close`, or until `beat` fails because nobody listens.
+
+    The thread runs before others where the system allows it.
+    """
+
+    def __init__(self, name: str, beat: Callable[[], None]) -> None:
+        self._beat = beat
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """No beat comes after this; idempotent."""
+        self._closed.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(2.0)
+
+    def _run(self) -> None:
+        # Linux has a niceness for each thread.
+        with suppress(OSError, AttributeError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+        with suppress(OSError, CellError):
+            while not self._closed.is_set():
+                self._beat()
+                self._closed.wait(BEAT_S)

@@ -22,8 +22,7 @@ from pydantic import BaseModel, ConfigDict, ValidationInfo, field_validator, mod
 from drivers.clock import Clock
 from drivers.common.units import number, quantity, whole
 from drivers.errors import ConfigError
-from drivers.interfaces import Arm, Device, Vector
-from drivers.link_table import LinkTable
+from drivers.interfaces import Arm, Device, LinkTable, Vector
 
 Length = Annotated[float, quantity("mm", -20_000, 20_000)]
 Offset = Annotated[float, quantity("mm", -1_000, 1_000)]

@@ -17,8 +17,7 @@ from cell.measure.geometry.poses import to_ur
 from cell.motion.kinematics import HOME, MODELS, arm_kinematics
 from drivers.clock import Clock
 from drivers.errors import ConfigError
-from drivers.interfaces import Arm, Camera, Claw, Device, Laser, Rail, Vector, Vehicle
-from drivers.link_table import LinkTable
+from drivers.interfaces import Arm, Camera, Claw, Device, Laser, LinkTable, Rail, Vector, Vehicle
 from drivers.make import OnArm, Surroundings
 
 INTERFACES: dict[str, type] = {

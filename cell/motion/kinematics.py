@@ -19,7 +19,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from drivers.errors import ConfigError, RefusedError
-from drivers.link_table import LinkTable
+from drivers.interfaces import LinkTable
 
 Joints = NDArray[np.float64]
 """Joint angles of shape (6,), rad."""

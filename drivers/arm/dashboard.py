@@ -11,7 +11,7 @@ import threading
 import time
 
 from drivers.errors import DeadlineError, NotConnectedError
-from drivers.traffic import Traffic
+from drivers.interfaces import Traffic
 
 PORT = 29999
 

@@ -20,8 +20,7 @@ import numpy as np
 from drivers.arm.faults import fault
 from drivers.arm.feed import Six, Snapshot
 from drivers.arm.motion import pose_difference
-from drivers.interfaces import Vector
-from drivers.link_table import LinkTable
+from drivers.interfaces import LinkTable, Vector
 
 PORT = 30001
 _STATE, _KINEMATICS = 16, 5

@@ -48,8 +48,8 @@ class ChildRequest:
     """Do `name` with `arguments`.
 
     Names: stop, close, output, safe_off, alive, attend, payload, zero_force, move_joints, move_linear, follow. `alive`
-    is the owner's sign of life (`drivers.pulse`). `attend` with wall seconds: from now on what moves is stopped unless
-    this is said again within them; 0 ends that.
+    is the owner's sign of life (`Pulse`). `attend` with wall seconds: from now on what moves is stopped unless this is
+    said again within them; 0 ends that.
     """
 
     number: int
@@ -168,12 +168,7 @@ class StateFeed:
     """Snapshots as they come in; `lost` says whether the link is, and `alive` raises the fault of that."""
 
     def __init__(
-        self,
-        name: str,
-        clock: Clock,
-        lost: Callable[[], bool],
-        alive: Callable[[], None],
-        statistics: LinkStatistics,
+        self, name: str, clock: Clock, lost: Callable[[], bool], alive: Callable[[], None], statistics: LinkStatistics
     ) -> None:
         self._name = name
         self._clock = clock

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.arm.faults import fault
-from drivers.arm.rtde_link import PORT, RATE_HZ, VERSION, RtdeLink
+from drivers.arm.link import PORT, RATE_HZ, VERSION, RtdeLink
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, NotConnectedError
 from drivers.interfaces import Reading, Vector
@@ -44,7 +44,7 @@ class Watched:
 
 
 def examine(name: str, address: str, clock: Clock, seconds: float) -> list[Reading]:
-    """Watch the arm at `address`; errors as of `drivers.arm.rtde_link.latch_clock`."""
+    """Watch the arm at `address`; errors as of `drivers.arm.link.latch_clock`."""
     try:
         with RtdeLink(address, clock, clock.wall(seconds) + _TIMEOUT_S) as link:
             watched = _watch(name, link, clock, seconds)

@@ -14,8 +14,7 @@ from drivers.arm.dashboard import Dashboard
 from drivers.arm.factory import Forward, flange_agrees, require_same_flange, require_same_payload, same_payload
 from drivers.arm.faults import fault, require_named, require_remote, unlock
 from drivers.arm.feed import MODE_RUNNING, PLAYING, ChildSetup, Ended, Snapshot, StateFeed, safety_code
-from drivers.arm.link import ArmLink, see_safe
-from drivers.arm.rtde_link import look
+from drivers.arm.link import ArmLink, look, see_safe
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceError, DeviceFault, InterlockError, NotConnectedError, shown
 from drivers.interfaces import LinkStatistics

@@ -21,13 +21,12 @@ from drivers.arm.dashboard import unknown
 from drivers.arm.factory import Forward, read_factory_kinematics
 from drivers.arm.faults import late_words
 from drivers.arm.feed import MODE_RUNNING, ChildSetup, Ended, Snapshot, safety_code
+from drivers.arm.link import latch_clock
 from drivers.arm.motion import ArmLimits, UrMotion
-from drivers.arm.rtde_link import latch_clock
 from drivers.arm.session import ArmSession
 from drivers.clock import Clock, Latch
 from drivers.errors import UNTOLD, Aborted, DeviceError, InterlockError, LimitError, check_positive, shown
-from drivers.interfaces import ATTENDED_S, ArmSafety, ArmState, Identity, Reading, Vector
-from drivers.link_table import LinkTable
+from drivers.interfaces import ATTENDED_S, ArmSafety, ArmState, Identity, LinkTable, Reading, Vector
 
 _FIRST_POINT = 0.02
 _WATCHDOG_S, _WATCHDOG_FAST_S = 0.15, 0.45

@@ -246,10 +246,9 @@ class RobotiqClaw:
         if found == self._grip.stopped:
             return
         self._require_well()
-        why = {
-            AT_POSITION: "the fingers went all the way and met nothing",
-            MOVING: "the fingers still move",
-        }.get(found, "the fingers were stopped on the wrong side")
+        why = {AT_POSITION: "the fingers went all the way and met nothing", MOVING: "the fingers still move"}.get(
+            found, "the fingers were stopped on the wrong side"
+        )
         raise DeviceFault(
             self.name,
             "claw.no_part",

@@ -15,9 +15,16 @@ from typing import Protocol
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError, InterlockError, check_positive, check_range, shown
 from drivers.interfaces import LONGEST_NUDGE_M, LinkStatistics
-from drivers.rail.motion import SWEEP_MARGIN_M, CarriageWatch, RailMotion, move_duration, run_up_distance
+from drivers.rail.motion import (
+    LONGEST_S,
+    SWEEP_MARGIN_M,
+    CarriageWatch,
+    RailMotion,
+    ZeroCheck,
+    move_duration,
+    run_up_distance,
+)
 from drivers.rail.sweep import RailSweep
-from drivers.rail.zero_check import LONGEST_S, ZeroCheck
 
 _AT_START_M = 20e-6
 

@@ -7,19 +7,10 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from drivers.common.addresses import Port
 from drivers.common.units import whole
-from drivers.make import (
-    AnyMake,
-    ClawConfig,
-    DeviceConfig,
-    LaserConfig,
-    Make,
-    Surroundings,
-    real_path,
-    with_endpoint,
-)
+from drivers.make import AnyMake, ClawConfig, DeviceConfig, LaserConfig, Make, Surroundings, real_path, with_endpoint
 
 if TYPE_CHECKING:
-    from drivers.relay.switched import BoardClaw, BoardLaser
+    from drivers.relay.boards import BoardClaw, BoardLaser
 
 NUMATO_BAUDS = (9600, 19200, 38400, 57600, 115200, 230400, 460800, 921600)
 """Speeds of a board on RS-232 or behind a serial server; over its own USB none of them matters."""
@@ -112,16 +103,14 @@ def line_problems(records: Mapping[str, DeviceConfig]) -> Iterator[str]:
 
 
 def _laser(name: str, config: NumatoLaserConfig | LcusLaserConfig, around: Surroundings) -> BoardLaser:
-    from drivers.relay.boards import open_board
-    from drivers.relay.switched import BoardLaser
+    from drivers.relay.boards import BoardLaser, open_board
 
     board = open_board(name, "laser", config.driver, config.url, baud=config.baud)
     return BoardLaser(board, config.relay, control=not around.look)
 
 
 def _claw(name: str, config: NumatoClawConfig, around: Surroundings) -> BoardClaw:
-    from drivers.relay.boards import open_numato
-    from drivers.relay.switched import BoardClaw
+    from drivers.relay.boards import BoardClaw, open_numato
 
     return BoardClaw(
         open_numato(name, "claw", config.url, baud=config.baud),

@@ -12,8 +12,9 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from drivers.clock import Latch
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError
-from drivers.interfaces import ArmSafety, ArmState, Identity, Latch, LinkStatistics, LinkTable, Vector
+from drivers.interfaces import ArmSafety, ArmState, Identity, LinkStatistics, LinkTable, Vector
 from sim_backends.direct.clock import VirtualClock
 from sim_backends.direct.product import ArmSetup, within
 from sim_backends.models.arm import ArmModel, Power, Safety

@@ -31,6 +31,7 @@ from drivers.interfaces import (
     ArmState,
     ChecksZero,
     Claw,
+    LinkTable,
     Motion,
     Nudged,
     Rail,
@@ -41,7 +42,6 @@ from drivers.interfaces import (
     VehicleState,
     why_untold,
 )
-from drivers.link_table import LinkTable
 
 if TYPE_CHECKING:
     from cell.devices.simulated.mixed import SimulatedTouch

@@ -35,8 +35,7 @@ from cell.motion.collision import (
 from cell.motion.kinematics import Joints, arm_kinematics
 from cell.motion.trajectory import PointSpeed, carried_points
 from drivers.errors import DeadlineError
-from drivers.interfaces import Arm, ArmState, Vector, Vehicle, VehicleState
-from drivers.link_table import LinkTable
+from drivers.interfaces import Arm, ArmState, LinkTable, Vector, Vehicle, VehicleState
 
 PATIENCE_S = 1.0
 """How old a reading may be that a rule rests on: what it asks about does not change by itself."""

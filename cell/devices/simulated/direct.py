@@ -20,9 +20,8 @@ from drivers.arm.motion import ArmLimits
 from drivers.clock import ClockMap, Latch
 from drivers.errors import ConfigError
 from drivers.make import MOST_PAYLOAD
-from drivers.rail.motion import CarriageWatch
+from drivers.rail.motion import CarriageWatch, ZeroCheck
 from drivers.rail.sweep import EvenMotion
-from drivers.rail.zero_check import ZeroCheck
 from drivers.vehicle.faults import system_trouble, vehicle_error
 from drivers.vehicle.feedback import PlanarOdometry
 from sim_backends.direct import cell

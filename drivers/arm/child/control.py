@@ -17,15 +17,7 @@ from typing import TYPE_CHECKING
 
 from drivers.arm.child.program import KICK_S, PERIOD, SETTLE_S, ControlProgram, End, joints_off
 from drivers.arm.child.streaming import Streaming
-from drivers.arm.feed import (
-    UNANSWERED,
-    ChildReply,
-    ChildRequest,
-    ChildSetup,
-    Ended,
-    Snapshot,
-    StreamTiming,
-)
+from drivers.arm.feed import UNANSWERED, ChildReply, ChildRequest, ChildSetup, Ended, Snapshot, StreamTiming
 from drivers.arm.motion import JointTrajectory, pose_difference
 from drivers.clock import Clock
 

@@ -14,7 +14,7 @@ from rtde_receive import RTDEReceiveInterface
 
 from drivers.arm.child.program import PERIOD
 from drivers.arm.feed import STOPPED, Snapshot
-from drivers.arm.rtde_link import VARIABLES
+from drivers.arm.link import VARIABLES
 from drivers.clock import Clock
 
 

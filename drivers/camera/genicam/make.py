@@ -69,8 +69,7 @@ class Usb3CameraConfig(GenicamConfig):
 
 def _genicam(name: str, config: GenicamConfig, place: Place, around: Surroundings) -> GenicamCamera:
     from drivers.camera.genicam.acquisition import Network
-    from drivers.camera.genicam.camera import GenicamCamera
-    from drivers.camera.genicam.connection import ExposureTrigger, GenicamSetup, Region
+    from drivers.camera.genicam.camera import ExposureTrigger, GenicamCamera, GenicamSetup, Region
 
     left, top = config.offset
     network = Network()

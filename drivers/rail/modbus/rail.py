@@ -11,8 +11,7 @@ from drivers.clock import Clock
 from drivers.errors import UNTOLD, Aborted, ConfigError, LimitError, shown
 from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
-from drivers.rail.modbus.arrival import DriveArrival, DriveZero
-from drivers.rail.modbus.drive import ModbusDrive
+from drivers.rail.modbus.drive import DriveArrival, DriveZero, ModbusDrive
 from drivers.rail.modbus.link import ModbusLink, Number, Rate, RegisterMap
 
 ROUNDING = 0.01

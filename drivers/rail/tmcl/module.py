@@ -1,22 +1,29 @@
-"""What a module has to be and how its ramp has to be set, so that every motion is the trapezium that is reckoned with.
+"""What a TMCL module has to be, how it is set up, whether its zero still holds, and whether it has arrived.
 
-The vendor's modules with a six-point ramp name their parameters 15, 16 and 19 in two orders (first acceleration, its
-end speed, start speed; or start speed, first acceleration, its end speed). All three are set to 0, which switches the
-first phase off in either order; then only 5 and 17, acceleration and deceleration, are left. Every value is read back.
+Modules with a six-point ramp name their parameters 15, 16 and 19 in two orders. All three are set to 0, which switches
+the first phase off in either order. Then only 5 and 17 are left, acceleration and deceleration. Every value is read
+back, so that every motion is the trapezium that is reckoned with.
 
-What a rail's module tells of its motor driver's health; it tells no voltage.
+A homed module carries a mark: a user variable that a reset takes away, as variables from 56 on live in RAM only. As
+long as the mark stands, the step counter has not been lost either. Its value names the settings that the counter is
+read with, so that no program takes the zero of another one.
 
-Source: docs/reference/protocols.md, section 2."""
+Source: TMCL firmware manual of the TMCM-1260; docs/reference/protocols.md, section 2.
+"""
 
 from __future__ import annotations
 
+import logging
 import re
+import zlib
 from dataclasses import dataclass
 
-from drivers.errors import ConfigError, DeviceFault
+from drivers.clock import Clock
+from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, InterlockError, shown
 from drivers.interfaces import Reading
-from drivers.rail.tmcl.codec import Axis
-from drivers.rail.tmcl.link import NO_SUCH_TYPE, WRONG_VALUE, CommandRefused, TmclLink
+from drivers.rail.axis import Samples
+from drivers.rail.motion import STANDSTILL_S, patience
+from drivers.rail.tmcl.link import NO_SUCH_TYPE, WRONG_VALUE, Axis, CommandRefused, TmclLink
 
 SUPPORTED = ("1210", "1211", "1240", "1241", "1260", "1270", "1276", "1278", "6212", "6214")
 """Modules of the vendor with a six-point ramp that take speeds in pulses per second."""
@@ -147,3 +154,207 @@ def readings(driver_bits: int) -> list[Reading]:
     Open load is left out: a motor that stands shows it without cause.
     """
     return [Reading(what, float(bool(driver_bits & bits)), "", most=0.0, remedy=why) for what, bits, why in _ALARMS]
+
+
+MARK_VARIABLE = 200
+"""User variable that holds the mark: in RAM only."""
+_NONE, _SEARCHING = 0, 1
+STALL_FLAG = 1
+_HOME_SWITCH_MODES = range(5, 9)
+_MODE_BITS = 0x3F
+"""Without the bits that swap the sides (64) and turn the home switch's polarity round (128)."""
+
+_log = logging.getLogger(__name__)
+
+
+class ZeroMark:
+    """The mark on the module behind `link`.
+
+    `settings` are what a position in counts depends on; a module set up by other ones is not homed for this program.
+    """
+
+    def __init__(self, link: TmclLink, settings: tuple[object, ...]) -> None:
+        self._link = link
+        self._value = zlib.crc32(repr(settings).encode()) % 0x7FFF_FFF0 + 2
+        self._seen = False
+        self._distrusted = False
+        self.found_here = False
+        """Whether this program saw the search end; what an earlier one found may be long ago."""
+
+    def meet(self, microstep_resolution: int, reference_mode: int, *, mark: bool = True) -> None:
+        """On connecting, before anything is set: take the mark away unless it is this program's and nothing speaks
+        against it that happened while nobody watched: another resolution, a stall, a limit switch.
+
+        Without `mark` the module is left as it is; its zero is not trusted here all the same.
+        """
+        link = self._link
+        if link.user_variable(MARK_VARIABLE) == self._value:
+            switches = (
+                (Axis.LEFT_SWITCH, Axis.RIGHT_SWITCH) if reference_mode & _MODE_BITS in _HOME_SWITCH_MODES else ()
+            )
+            self._seen = not (
+                link.get(Axis.MICROSTEP_RESOLUTION) != microstep_resolution
+                or link.get(Axis.EXTENDED_ERRORS) & STALL_FLAG
+                or any(link.get(switch) for switch in switches)
+            )
+            if not self._seen:
+                _log.warning("%s: stalled, at a limit switch or set up anew since its homing; not homed", link.name)
+        if mark and not self._seen:
+            link.set_user_variable(MARK_VARIABLE, _NONE)
+        self._distrusted = not mark and not self._seen
+
+    def searching(self, *, issued: int) -> None:
+        """A reference search begins: no zero until it has been found."""
+        self._seen = self.found_here = False
+        self._link.set_user_variable(MARK_VARIABLE, _SEARCHING, issued=issued)
+        self._distrusted = False
+
+    def found(self, *, issued: int) -> None:
+        """The search has ended. `DeviceFault` (rail.reset) when the module was reset meanwhile: that, too, ends it."""
+        if self._link.user_variable(MARK_VARIABLE) != _SEARCHING:
+            raise self._lost("while it searched the reference switch")
+        self._link.set_user_variable(MARK_VARIABLE, self._value, issued=issued)
+        self._seen = self.found_here = True
+
+    def held(self) -> bool:
+        """Whether the module, asked now, counts from a zero that a homing of this configuration found.
+
+        Raises `DeviceFault` (rail.reset), once, when it did before and does not any more.
+        """
+        if self._distrusted:
+            return False
+        held = self._link.user_variable(MARK_VARIABLE) == self._value
+        if self._seen and not held:
+            raise self._lost("since its last motion")
+        self._seen = held
+        return held
+
+    def require(self) -> None:
+        """Raise unless `held`: `InterlockError` when it was never homed."""
+        if not self.held():
+            raise InterlockError(self._link.name, "is not homed, so positions mean nothing yet. Call home() first")
+
+    def require_still(self) -> None:
+        """Raise `DeviceFault` (rail.reset) unless `held`: for a motion that began when it was."""
+        if not self.held():
+            raise self._lost("in its motion")
+
+    def forget(self) -> None:
+        """The count can no longer be trusted: neither by this program nor by another one."""
+        self._seen, self._distrusted = False, True
+        try:
+            self._link.set_user_variable(MARK_VARIABLE, _NONE)
+        except CellError as error:
+            _log.warning("%s: the module could not be told that its zero is lost: %s", self._link.name, error)
+
+    def _lost(self, when: str) -> DeviceFault:
+        self._seen = False
+        return DeviceFault(
+            self._link.name,
+            "rail.reset",
+            f"the module has lost its zero {when}: it was reset or without power, or another program set it up",
+            recoverable=True,
+            hint="Home the rail again; check the module's supply.",
+        )
+
+
+_NEAR = 1
+"""Counts off its target at which a module may come to rest, without saying that it has reached it."""
+_STALL_FLAG = 1
+_DRIVER_FAULTS = {1: "driver too hot", 3: "short circuit in phase A", 4: "short circuit in phase B"}
+
+
+class ArrivalWatch:
+    """Watches one positioning to `target` (microsteps; `counts` microsteps per m), appending readings to `samples`.
+
+    `issued` is the count of stops it was commanded under. `zero` is asked whether the count still holds, and told when
+    it does not; None for a motion that needs none. Called again and again: True at the target, or at most one count off
+    it at rest; raises `Aborted` after a stop, `DeviceFault` for rail.reset, rail.limit_switch, rail.missed_target and
+    rail.stalled.
+    """
+
+    def __init__(
+        self,
+        link: TmclLink,
+        clock: Clock,
+        *,
+        target: int,
+        counts: float,
+        issued: int,
+        samples: Samples,
+        zero: ZeroMark | None,
+    ) -> None:
+        self._link = link
+        self._target = target
+        self._counts = counts
+        self._issued = issued
+        self._samples = samples
+        self._zero = zero
+        self._standstill = patience(clock, STANDSTILL_S)
+        self._last: int | None = None
+        self._moved = clock.now()
+
+    def __call__(self) -> bool:
+        """Read the position once and judge it."""
+        position, stamp, round_trip = self._link.get_stamped(Axis.POSITION)
+        self._samples.append((stamp, position / self._counts, round_trip))
+        if self._link.stops != self._issued:
+            raise Aborted(f"{self._link.name}: stopped at {shown(position / self._counts, 'm')} before its target")
+        near = abs(position - self._target) <= _NEAR
+        if near and (self._link.get(Axis.POSITION_REACHED) or (position == self._last and not self._moving())):
+            # A module that was reset stands at its target, too, if that is 0.
+            self._require_zero()
+            return True
+        if position != self._last:
+            self._last, self._moved = position, stamp
+        elif stamp - self._moved > self._standstill and not self._moving():
+            raise self._failure(position)
+        return False
+
+    def _moving(self) -> bool:
+        return self._link.get(Axis.VELOCITY) != 0
+
+    def _failure(self, position: int) -> DeviceFault:
+        link = self._link
+        self._require_zero()
+        short = (
+            f"stands at {shown(position / self._counts, 'm')}, its target is {shown(self._target / self._counts, 'm')}"
+        )
+        side, switch = ("right", Axis.RIGHT_SWITCH) if self._target > position else ("left", Axis.LEFT_SWITCH)
+        if link.get(switch):
+            self._forget_zero()
+            return DeviceFault(
+                link.name,
+                "rail.limit_switch",
+                f"{short}: the {side} limit switch is hit",
+                recoverable=True,
+                hint="Home the rail again and check the configured travel.",
+            )
+        if link.get(Axis.TARGET_POSITION) != self._target:
+            return DeviceFault(
+                link.name,
+                "rail.missed_target",
+                f"{short}: somebody else changed the module's target",
+                recoverable=True,
+                hint="See what else commands this module.",
+            )
+        self._forget_zero()
+        flags = link.get(Axis.DRIVER_ERRORS)
+        reasons = [text for bit, text in _DRIVER_FAULTS.items() if flags >> bit & 1]
+        if link.get(Axis.EXTENDED_ERRORS) & _STALL_FLAG:
+            reasons.append("stall detected")
+        return DeviceFault(
+            link.name,
+            "rail.stalled",
+            f"{short}: the motor does not move" + (f" ({', '.join(reasons)})" if reasons else ""),
+            recoverable=True,
+            hint="See whether the carriage is blocked and the motor has current, then home again.",
+        )
+
+    def _require_zero(self) -> None:
+        if self._zero is not None:
+            self._zero.require_still()
+
+    def _forget_zero(self) -> None:
+        if self._zero is not None:
+            self._zero.forget()

@@ -14,10 +14,18 @@ from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.motion import RailMotion
 from drivers.rail.tmcl import module
-from drivers.rail.tmcl.arrival import STALL_FLAG, ArrivalWatch, ZeroMark
-from drivers.rail.tmcl.codec import Axis, ReferenceSearch
-from drivers.rail.tmcl.link import NO_SUCH_TYPE, CommandRefused, TmclLink
-from drivers.rail.tmcl.module import EXACT, SPEED, require_supported, set_checked, set_direction, set_ramp
+from drivers.rail.tmcl.link import NO_SUCH_TYPE, Axis, CommandRefused, ReferenceSearch, TmclLink
+from drivers.rail.tmcl.module import (
+    EXACT,
+    SPEED,
+    STALL_FLAG,
+    ArrivalWatch,
+    ZeroMark,
+    require_supported,
+    set_checked,
+    set_direction,
+    set_ramp,
+)
 
 _HOME_SWITCH_ON_BELOW = (5, 7)
 """Reference modes whose zero is the edge below which the home switch is on."""

@@ -291,11 +291,7 @@ class DriveFeedback:
             return self._travel.disturbance
 
     def wait_for(
-        self,
-        happened: Callable[[], bool],
-        timeout: float,
-        alive: Callable[[], bool],
-        floor: float = WALL_FLOOR_S,
+        self, happened: Callable[[], bool], timeout: float, alive: Callable[[], bool], floor: float = WALL_FLOOR_S
     ) -> bool:
         """Wait until news make `happened` true; False when they do not or `alive` turns false.
 

@@ -21,7 +21,7 @@ from cell.measure.vision.stripe.extract import StripeProfile
 from cell.motion.kinematics import HOME, Joints, arm_kinematics
 from cell.procedures.arm.photograph import CalibrationView, scan_calibration_views, target_calibration_views
 from cell.procedures.calibrate.boards import RAIL_MOVE, RAIL_MOVE_VIEWS
-from drivers.link_table import LinkTable
+from drivers.interfaces import LinkTable
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from sim_backends.optics.camera import CameraOptics
 from sim_backends.world import drawing

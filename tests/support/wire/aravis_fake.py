@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from drivers.camera.genicam.acquisition import Network
 from drivers.camera.genicam.aravis import LIBRARIES
-from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import GenicamSetup, Region
+from drivers.camera.genicam.camera import GenicamCamera, GenicamSetup, Region
 from drivers.camera.genicam.device import GigePlace
 from drivers.clock import Clock
 from tests.support.wire.gige_bench import require_aravis

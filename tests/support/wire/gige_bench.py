@@ -11,8 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.camera.genicam.aravis import AravisMissing, load
-from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import GenicamSetup, Region
+from drivers.camera.genicam.camera import GenicamCamera, GenicamSetup, Region
 from drivers.camera.genicam.device import GigePlace
 from drivers.clock import Clock
 from drivers.interfaces import Frame

@@ -87,10 +87,7 @@ def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, di
     ids=["vehicle", "rail searching its switch", "rail", "arm and laser", "laser alone"],
 )
 def test_half_a_second_after_the_last_sign_of_life_all_is_safe(
-    serving: tuple[Path, dict[str, Any]],
-    script: str,
-    moving: Callable[[dict[str, Any]], bool],
-    how: signal.Signals,
+    serving: tuple[Path, dict[str, Any]], script: str, moving: Callable[[dict[str, Any]], bool], how: signal.Signals
 ) -> None:
     folder, endpoints = serving
     # Someone may have been killed here before: nothing may be on its way already.

@@ -30,9 +30,7 @@ from tests.support.modbus_maps import EDGES, PATHS, RAIL
 PRINTED = [
     tomllib.loads(block)
     for block in re.findall(
-        r"```toml\n(.*?)```",
-        (ROOT / "docs" / "how-to" / "other-makes.md").read_text(encoding="utf-8"),
-        re.DOTALL,
+        r"```toml\n(.*?)```", (ROOT / "docs" / "how-to" / "other-makes.md").read_text(encoding="utf-8"), re.DOTALL
     )
 ]
 MODBUS, NUMATO, LCUS, ROBOTIQ = PRINTED

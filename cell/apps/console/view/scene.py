@@ -30,8 +30,7 @@ from cell.motion.collision import PLACED, Body, arm_bodies, station_bodies, tool
 from cell.motion.kinematics import HOME, arm_kinematics
 from cell.procedures.arm.photograph import base_from_place_at_target
 from drivers.errors import ConfigError
-from drivers.interfaces import Vector
-from drivers.link_table import LinkTable
+from drivers.interfaces import LinkTable, Vector
 from drivers.make import CameraConfig
 
 LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")

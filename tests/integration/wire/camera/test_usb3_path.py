@@ -15,8 +15,7 @@ import pytest
 from cell.devices.contracts import Bench
 from cell.devices.contracts.device import CameraContract
 from drivers.camera.genicam.aravis import LIBRARIES, Aravis
-from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import GenicamSetup, Region
+from drivers.camera.genicam.camera import GenicamCamera, GenicamSetup, Region
 from drivers.clock import Clock
 from drivers.interfaces import Camera
 from tests.support.wire.gige_bench import require_aravis

@@ -36,7 +36,7 @@ from cell.motion.trajectory import (
 )
 from drivers.arm.factory import parse_kinematics_info
 from drivers.errors import ConfigError, RefusedError
-from drivers.link_table import LinkTable
+from drivers.interfaces import LinkTable
 from sim_backends.models.arm_kinematics import TABLES, Kinematics
 
 WORKING = np.array([2.8, -1.25, 2.0, -2.3, -1.57, 2.8])

@@ -15,8 +15,7 @@ from numato_usb_relay.relay import Relay as VendorsClient
 
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
-from drivers.relay.boards import LcusBoard, RelayPort, open_board, open_numato
-from drivers.relay.switched import BoardClaw, BoardLaser
+from drivers.relay.boards import BoardClaw, BoardLaser, LcusBoard, RelayPort, open_board, open_numato
 from sim_backends.peers.switches.relays import LcusPeer, NumatoPeer, RelayBoard
 
 pytestmark = pytest.mark.wire
@@ -172,7 +171,7 @@ def test_who_only_looks_sends_nothing(lcus: LcusPeer, wired: Wired) -> None:
 OWNER = """
 import sys, time
 from drivers.relay.boards import open_board
-from drivers.relay.switched import BoardLaser
+from drivers.relay.boards import BoardLaser
 laser = BoardLaser(open_board("laser", "laser", sys.argv[1], sys.argv[2], baud=9600), 2)
 with laser.lit():
     print("lit", flush=True)

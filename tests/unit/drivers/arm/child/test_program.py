@@ -14,15 +14,7 @@ from cell.run.recorded_work import classify
 from drivers.arm.child import program
 from drivers.arm.child.program import ControlProgram, joints_off
 from drivers.arm.feed import ChildSetup, Snapshot
-from drivers.errors import (
-    Aborted,
-    CalibrationStale,
-    ConfigError,
-    DeadlineError,
-    DeviceFault,
-    LimitError,
-    RefusedError,
-)
+from drivers.errors import Aborted, CalibrationStale, ConfigError, DeadlineError, DeviceFault, LimitError, RefusedError
 from statemachine.step import Outcome
 
 SETUP = ChildSetup("127.255.0.9", 1.0, (), (0.0, (0.0, 0.0, 0.0)), 0.15, 4.0)

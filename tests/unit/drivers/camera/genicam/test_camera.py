@@ -14,8 +14,7 @@ import pytest
 from cell.devices.contracts import Bench as ContractBench
 from cell.devices.contracts.device import CameraContract
 from drivers.camera.genicam.acquisition import FORMATS, BlockCount, Network
-from drivers.camera.genicam.camera import GenicamCamera
-from drivers.camera.genicam.connection import ExposureTrigger, GenicamSetup, Region
+from drivers.camera.genicam.camera import ExposureTrigger, GenicamCamera, GenicamSetup, Region
 from drivers.camera.genicam.device import GigePlace
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError

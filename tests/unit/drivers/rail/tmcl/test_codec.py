@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pytrinamic.tmcl import TMCLReply, TMCLRequest
 
-from drivers.rail.tmcl.codec import Axis, TelegramError, TmclCommand, TmclRequest, decode_firmware, decode_reply
+from drivers.rail.tmcl.link import Axis, TelegramError, TmclCommand, TmclRequest, decode_firmware, decode_reply
 
 BYTE = st.integers(0, 255)
 VALUE = st.integers(-(2**31), 2**31 - 1)

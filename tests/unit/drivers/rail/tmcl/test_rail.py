@@ -29,8 +29,7 @@ from drivers.errors import (
 from drivers.interfaces import LinkStatistics, Rail
 from drivers.rail.motion import move_duration, run_up_distance
 from drivers.rail.sweep import fit_line
-from drivers.rail.tmcl.codec import Axis
-from drivers.rail.tmcl.link import TmclLink
+from drivers.rail.tmcl.link import Axis, TmclLink
 from drivers.rail.tmcl.rail import TmclRail
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams

@@ -14,11 +14,7 @@ from cell.config.cell_config import default_toml, load_config
 from cell.makes import make_of
 from drivers.errors import ConfigError, DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
-from drivers.vehicle.cia402.drive import (
-    HEARTBEAT,
-    MOTION,
-    STATUS,
-)
+from drivers.vehicle.cia402.drive import HEARTBEAT, MOTION, STATUS
 from drivers.vehicle.cia402.feedback import DriveFeedback, UnitCheck, WheelDrives
 from drivers.vehicle.cia402.make import CanopenVehicleConfig
 from tests.support import ROOT
