@@ -27,7 +27,7 @@ from cell.config.cell_config import CellConfig
 from cell.config.job import Job, load_job
 from cell.devices.devices import Devices
 from cell.measure.calibration.archive import Observations
-from cell.measure.calibration.drift.timing_fit import TimesRefused
+from cell.measure.calibration.drift.timing import TimesRefused
 from cell.motion.kinematics import kinematics_name
 from cell.procedures.calibrate.boards import collect_scan, collect_target
 from cell.procedures.calibrate.reference_plate import look_at_witness, with_edge

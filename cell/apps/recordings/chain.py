@@ -18,23 +18,21 @@ from numpy.typing import NDArray
 from cell.apps.recordings import result as form
 from cell.apps.recordings.frames import RecordedFrame
 from cell.measure.calibration.archive import ScanObservation
-from cell.measure.calibration.judge.board_shape import moved_by_bend
-from cell.measure.calibration.judge.checks import QualityCheck
-from cell.measure.calibration.judge.flatness import flatness, leave_one_out
-from cell.measure.calibration.judge.hand_eye_checks import hand_eye_checks
+from cell.measure.calibration.judge.checks import QualityCheck, hand_eye_checks
 from cell.measure.calibration.judge.plane_checks import (
     PlaneKnown,
     crooked,
+    flatness,
+    leave_one_out,
     odd_stripes,
     plane_checks,
     planes_of_cameras,
 )
 from cell.measure.calibration.judge.scale import Scale, metric_scale
 from cell.measure.calibration.solve.adjustment import Adjustment
-from cell.measure.calibration.solve.choice import Choice, choose_solution, with_doubt_of_camera
-from cell.measure.calibration.solve.intrinsics import Intrinsics
+from cell.measure.calibration.solve.choice import Choice, choose_solution, points_on_boards, with_doubt_of_camera
+from cell.measure.calibration.solve.intrinsics import Intrinsics, moved_by_bend
 from cell.measure.calibration.solve.joint import Staged, solve_staged, start_state
-from cell.measure.calibration.solve.left_out import points_on_boards
 from cell.measure.calibration.solve.normal import CAMERA, HAND, OWN, PLANE, SHARED, stripe_block
 from cell.measure.calibration.solve.starts import stripe_means
 from cell.measure.geometry.camera import Array, CameraModel

@@ -10,8 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.apps.recordings.frames import RecordedFrame
-from cell.measure.calibration.judge.flatness import Flatness
-from cell.measure.calibration.judge.plane_checks import PlaneKnown
+from cell.measure.calibration.judge.plane_checks import Flatness, PlaneKnown
 from cell.measure.calibration.solve.intrinsics import Intrinsics
 from cell.measure.calibration.solve.starts import HandEye
 from cell.measure.geometry.camera import PARAMETER_NAMES, Array, CameraModel

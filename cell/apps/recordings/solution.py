@@ -21,8 +21,7 @@ from cell.apps.recordings.chain import (  # fmt: skip
 from cell.apps.recordings.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
 from cell.apps.recordings.frames import RecordedFrame, by_stop, counted, merged, used
 from cell.apps.recordings.result import CAMERAS, intrinsics_dict, plane_dict, seen_depths
-from cell.measure.calibration.judge.camera_checks import against_pictures, camera_checks
-from cell.measure.calibration.judge.checks import QualityCheck, refused_parts
+from cell.measure.calibration.judge.checks import QualityCheck, against_pictures, camera_checks, refused_parts
 from cell.measure.calibration.judge.faults import FOREIGN, foreign_view, parted_at
 from cell.measure.calibration.judge.plane_checks import PlaneKnown, plane_checks, planes_of_cameras, planes_without_one
 from cell.measure.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera

@@ -22,10 +22,10 @@ from cell.config.cell_config import CellConfig
 from cell.measure.calibration import Priors, ScanCalibration, ScanObservation, TargetCalibration, TargetObservation
 from cell.measure.calibration.archive import SUFFIX, Observations, write_archive
 from cell.measure.calibration.drift.reference_plate import PlateLine
+from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.calibration.judge.faults import SCALE_RANGE, refuse_wrong_lead
 from cell.measure.calibration.solve.joint import Joint
 from cell.measure.calibration.solve.results import Quality, adjust_scan, adjust_target, sigmas
-from cell.measure.calibration.timing import StampTiming
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from drivers.errors import CalibrationStale, ConfigError

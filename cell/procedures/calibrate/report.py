@@ -20,9 +20,8 @@ from cell.config.calibrations.store import Solved
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, load_job
 from cell.measure.calibration.archive import Observations
-from cell.measure.calibration.judge.advice import advice
-from cell.measure.calibration.judge.coverage import GRID, Coverage, Places, derivatives, influences, place_rms
-from cell.measure.calibration.judge.hand_eye_checks import joint_checks
+from cell.measure.calibration.judge.checks import joint_checks
+from cell.measure.calibration.judge.coverage import GRID, Coverage, Places, advice, derivatives, influences, place_rms
 from cell.measure.calibration.solve.joint import Joint, paper_plane_of
 from cell.measure.calibration.solve.results import ScanCalibration
 from cell.measure.geometry.poses import transform

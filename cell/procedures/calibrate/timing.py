@@ -11,7 +11,8 @@ import pinocchio as pin
 from cell.config.calibrations.store import CellCalibration, link_of, most_late
 from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
-from cell.measure.calibration.drift.timing_fit import (
+from cell.measure.calibration.drift.timing import (
+    StampTiming,
     TimedFrame,
     TimedSweep,
     find_shutter,
@@ -20,7 +21,6 @@ from cell.measure.calibration.drift.timing_fit import (
     refuse_rolling,
     roughly_late,
 )
-from cell.measure.calibration.timing import StampTiming
 from cell.measure.geometry.poses import from_ur
 from cell.measure.vision import BoardSpec, find_board, parse_board
 from cell.motion.kinematics import HOME

@@ -16,7 +16,7 @@ from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.drift.reference_plate import PlateLine, Pointing
 from cell.measure.calibration.drift.reference_plate import pointing as pointing_since
 from cell.measure.calibration.drift.slip import Slip, slip_since
-from cell.measure.calibration.timing import StampTiming
+from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.reconstruction import ScanGeometry
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import BoardFix, ScanPlan, scan_plans

@@ -18,7 +18,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.config.job import ScanSection
-from cell.measure.calibration.timing import StampTiming
+from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.geometry.poses import from_matrix
 from cell.measure.inversion import NominalSurface
 from cell.measure.reconstruction import ProfileBuilder, ScanGeometry

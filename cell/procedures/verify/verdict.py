@@ -22,8 +22,14 @@ import numpy as np
 from cell.base.storage import table
 from cell.config.calibrations.store import CellCalibration, save_calibration
 from cell.config.job import Job
-from cell.measure.calibration.drift.decision import WORST_FIT, DriftVerdict, Suspect
-from cell.measure.calibration.drift.detectability import DETECTED, scan_effect, target_effect
+from cell.measure.calibration.drift.decision import (
+    DETECTED,
+    WORST_FIT,
+    DriftVerdict,
+    Suspect,
+    scan_effect,
+    target_effect,
+)
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn
 from cell.measure.calibration.drift.slip import WitnessCheck
 from cell.measure.geometry.camera import Array

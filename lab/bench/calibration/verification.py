@@ -18,7 +18,7 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.measure.calibration import ScanObservation, TargetObservation
-from cell.measure.calibration.drift.detectability import Change, Detectable
+from cell.measure.calibration.drift.decision import Change, Detectable
 from cell.measure.calibration.drift.evidence import SCAN_DEPTH, SHIFT, TARGET_DEPTH, TURN
 from cell.measure.calibration.solve.normal import CAMERA, HAND, PLANE, RAIL, tangents
 from cell.measure.geometry.poses import from_matrix

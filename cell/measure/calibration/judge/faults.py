@@ -21,9 +21,8 @@ import pinocchio as pin
 import scipy
 from numpy.typing import NDArray
 
-from cell.measure.calibration.judge.board_shape import surface_shapes
 from cell.measure.calibration.solve.adjustment import Adjusted
-from cell.measure.calibration.solve.intrinsics import Intrinsics, adjustment_of
+from cell.measure.calibration.solve.intrinsics import Intrinsics, adjustment_of, surface_shapes
 from cell.measure.calibration.solve.normal import CAMERA, FLANGE, SHARED, ViewData, dots_block
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.poses import angle_apart, difference, from_parts, perturbed

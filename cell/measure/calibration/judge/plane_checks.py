@@ -9,12 +9,17 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.calibration.judge.checks import QualityCheck
+from cell.measure.calibration.archive import ScanObservation
+from cell.measure.calibration.judge.checks import QualityCheck, plane_fit_check
+from cell.measure.calibration.solve.adjustment import Adjustment
+from cell.measure.calibration.solve.choice import Solution
 from cell.measure.calibration.solve.intrinsics import Intrinsics
+from cell.measure.calibration.solve.joint import Staged
+from cell.measure.calibration.solve.normal import AdjustmentState
 from cell.measure.calibration.solve.starts import robust_plane, stripe_pixels
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.geometry.poses import covariance_root
+from cell.measure.geometry.poses import covariance_root, transform
 from cell.measure.vision.board.board import board_pose
 from cell.measure.vision.board.view import BoardView
 from cell.measure.vision.stripe.extract import StripeProfile
@@ -162,17 +167,6 @@ def planes_without_one(clouds: Sequence[Array]) -> list[LightPlane]:
     return [robust_plane(np.concatenate([clouds[j] for j in lit if j != k]))[0] for k in lit]
 
 
-def plane_fit_check(rms: float, own: float, cloud: Array) -> QualityCheck:
-    """The RMS (m) of a plane's points (n, 3) against their span, beside the stripe's own σ (m)."""
-    size = float(np.linalg.norm(np.ptp(cloud, axis=0)))
-    return QualityCheck(
-        "light_plane", "RMS of the stripe's points", 100 * rms / size, 0.8, refuse=2.0, unit="% of the span they cover",
-        says=f"{1e3 * rms:.2f} mm over {1e3 * size:.0f} mm, where the stripe's own noise makes {1e3 * own:.3f} mm: the "
-        "points are not those of one plane; are there two lines, something else that shines, a stripe that is of "
-        "another frame, or a laser that came on while the rows of a rolling shutter were exposed?",
-    )  # fmt: skip
-
-
 def plane_checks(
     rms: float, own: float, cloud: Array, frames: int, known: PlaneKnown, left_out: int = 0
 ) -> list[QualityCheck]:
@@ -210,3 +204,76 @@ def plane_checks(
         )
     )
     return made
+
+
+@dataclass(frozen=True, eq=False)
+class Flatness:
+    """Distances in m of stripe points from one plane: RMS, 95th percentile, number of points, RMS per frame.
+
+    `extent` (2,) in m along the two main directions of the points in that plane.
+    """
+
+    rms: float
+    p95: float
+    points: int
+    extent: Array
+    per_frame: list[float]
+
+
+def flatness(state: AdjustmentState, observations: Sequence[ScanObservation], staged: Staged) -> Flatness | None:
+    """Flatness of the board in the base over all frames with a stripe; None without any."""
+    clouds = [_in_base(state, o, staged, k) for k, o in enumerate(observations)]
+    if sum(len(c) > 0 for c in clouds) < 1:
+        return None
+    return _flat(clouds, LightPlane.fit(np.concatenate(clouds)))
+
+
+def leave_one_out(observations: Sequence[ScanObservation], staged: Staged, solution: Solution) -> Flatness | None:
+    """Each frame measured with the calibration of the others, against the plane that the others' points make."""
+    lit = [k for k in range(len(observations)) if staged.plane is not None and len(staged.plane.rows[k])]
+    if len(lit) < 4:
+        return None
+    clouds, distances = [], []
+    for k in range(len(observations)):
+        if k not in lit:
+            clouds.append(np.zeros((0, 3)))
+            distances.append(np.zeros(0))
+            continue
+        other = solution.left.states[k]
+        if solution.joint:
+            # The step to it was a linear one: now to the end.
+            views = [view for j, view in enumerate(solution.views) if j != k]
+            other = Adjustment(views, solution.free, solution.adjusted.priors).solve(other, variance_rounds=0).state
+        rest = [_in_base(other, o, staged, j) for j, o in enumerate(observations) if j != k]
+        mine = _in_base(other, observations[k], staged, k)
+        clouds.append(mine)
+        distances.append(LightPlane.fit(np.concatenate(rest)).distances(mine))
+    return _summary(clouds, distances)
+
+
+def _in_base(state: AdjustmentState, observation: ScanObservation, staged: Staged, index: int) -> Array:
+    """Stripe points (n, 3) of one frame in the base, at the reported flange pose."""
+    rows = None if staged.plane is None else staged.plane.rows[index]
+    if state.plane is None or observation.profile is None or rows is None or not len(rows):
+        return np.zeros((0, 3))
+    seen = state.plane.intersect(state.camera.rays(stripe_pixels(observation.profile, rows)))
+    base_from_camera = observation.base_from_flange * state.flange_from_camera
+    return transform(base_from_camera, seen[np.isfinite(seen).all(axis=1)])
+
+
+def _flat(clouds: Sequence[Array], plane: LightPlane) -> Flatness:
+    return _summary(clouds, [plane.distances(c) for c in clouds])
+
+
+def _summary(clouds: Sequence[Array], distances: Sequence[Array]) -> Flatness:
+    cloud, away = np.concatenate(clouds), np.concatenate(distances)
+    centred = cloud - cloud.mean(axis=0)
+    spread = centred @ np.linalg.svd(centred, full_matrices=False)[2][:2].T
+    per_frame = [float(np.sqrt(np.mean(d**2))) if len(d) else float("nan") for d in distances]
+    return Flatness(
+        float(np.sqrt(np.mean(away**2))),
+        float(np.percentile(np.abs(away), 95)),
+        len(away),
+        np.ptp(spread, axis=0),
+        per_frame,
+    )

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.measure.calibration.solve.normal import (
@@ -34,7 +35,7 @@ from cell.measure.calibration.solve.normal import (
     stripe_block,
 )
 from cell.measure.geometry.camera import Array
-from cell.measure.geometry.poses import difference
+from cell.measure.geometry.poses import difference, perturbed, transform
 
 if TYPE_CHECKING:
     from cell.measure.calibration.solve.bow import Bow
@@ -291,3 +292,121 @@ def huber(size: Array) -> tuple[Array, float]:
 
 def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
+
+
+Mask = NDArray[np.bool_]
+BEST_POSE_STEPS = 3
+UNKNOWN = 1e6
+LARGEST_STEP = 1.0
+"""A step of a pose or the plane, in m or rad, beyond which the other views determine nothing."""
+TIE = 1e-9
+"""Share of the information that holds directions which the other views do not determine at all."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Of each view (n,), predicted by the others: RMS per component in px, stripe and board in m; NaN where unseen.
+
+    `dots_px` at the view's own best pose: it judges the camera alone. `stripe_m` is the stripe's distance from the
+    board's plane, `board_m` the distance of the board's points from where the others put them, at the flange pose that
+    the arm reports. `squares` is the sum of the squared px. `covariance` (27, 27) is the jackknife's of the shared
+    parameters. `by_held` (27, 27) says by how much each free parameter follows (rows) where a held one is wrong.
+    """
+
+    states: list[AdjustmentState]
+    dots_px: Array
+    stripe_m: Array
+    board_m: Array
+    squares: Array
+    covariance: Array
+    by_held: Array
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Over all views: `dots_px`, `stripe_mm` and `board_mm`; NaN where nothing was seen."""
+        return {
+            "dots_px": _rms_of_known(self.dots_px),
+            "stripe_mm": 1e3 * _rms_of_known(self.stripe_m),
+            "board_mm": 1e3 * _rms_of_known(self.board_m),
+        }
+
+
+def leave_out(adjustment: Adjustment, adjusted: Adjusted) -> LeftOut:
+    """Each view predicted by the others, at the solution `adjusted` of `adjustment`."""
+    state, free = adjusted.state, np.flatnonzero(adjustment.free)
+    parts = [_reduced(adjustment, k, state) for k in range(len(adjustment.views))]
+    lens, off = adjustment.lens_prior(state)
+    information = np.asarray(lens.T @ lens + np.sum([h for h, _ in parts], axis=0))
+    gradient = np.asarray(lens.T @ off + np.sum([g for _, g in parts], axis=0))
+    scale = 1 / np.sqrt(np.maximum(np.diag(information)[free], 1e-30))
+    steps, states = [], []
+    for h, g in parts:
+        rest = (information - h)[np.ix_(free, free)] * scale[:, None] * scale + TIE * np.eye(len(free))
+        step = np.zeros(SHARED)
+        step[free] = scale * np.linalg.lstsq(rest, scale * (gradient - g)[free], rcond=None)[0]
+        steps.append(step)
+        steps[-1] = step = step if np.abs(step[CAMERA.stop :]).max() < LARGEST_STEP else np.full(SHARED, np.nan)
+        far = not np.isfinite(step).all()
+        states.append(state if far else state.moved(np.concatenate([step, np.zeros(OWN * len(parts))])))
+    figures = np.array(
+        [
+            predicted(v, f, s) if np.isfinite(d).all() else [np.inf] * 4
+            for v, f, s, d in zip(adjustment.views, state.flanges, states, steps, strict=True)
+        ]
+    )
+    count = len(parts)
+    apart = np.nan_to_num(np.array(steps) - np.mean(steps, axis=0), nan=np.sqrt(UNKNOWN))
+    held = np.setdiff1d(np.arange(SHARED), free)
+    by_held = np.zeros((SHARED, SHARED))
+    inner = information[np.ix_(free, free)] * scale[:, None] * scale + TIE * np.eye(len(free))
+    by_held[np.ix_(free, held)] = -scale[:, None] * np.linalg.solve(
+        inner, scale[:, None] * information[np.ix_(free, held)]
+    )
+    dots, stripe, board, squares = figures.T
+    scatter = np.asarray((count - 1) / count * apart.T @ apart)
+    return LeftOut(states, dots, stripe, board_m=board, squares=squares, covariance=scatter, by_held=by_held)
+
+
+def _reduced(adjustment: Adjustment, k: int, state: AdjustmentState) -> tuple[Array, Array]:
+    """Information (27, 27) and gradient (27,) that a view brings for the shared parameters, its own pose eliminated."""
+    rows, right = [np.zeros((0, 34))], [np.zeros(0)]
+    for _, jacobian, residual, _ in adjustment.rows_of(k, state):
+        rows.append(jacobian)
+        right.append(residual)
+    own_rows, own_right = adjustment.arm_prior(k, state)
+    stacked = np.vstack([*rows, own_rows])
+    measured = np.concatenate([*right, own_right])
+    basis = np.linalg.qr(stacked[:, FLANGE])[0]
+    shared = stacked[:, :SHARED] - basis @ (basis.T @ stacked[:, :SHARED])
+    return np.asarray(shared.T @ shared), np.asarray(shared.T @ measured)
+
+
+def predicted(view: ViewData, flange: pin.SE3, other: AdjustmentState) -> list[float]:
+    """RMS px at the best pose, stripe and board in m at the reported pose, and the sum of squares in px².
+
+    By a calibration that has not seen the view; `flange` is about where the view itself puts the flange.
+    """
+    if not np.isfinite(other.camera.parameters).all() or other.camera.fx <= 0 or other.camera.fy <= 0:
+        return [np.inf, np.inf, np.inf, np.inf]
+    dots, stripe, board, squares = np.nan, np.nan, np.nan, 0.0
+    if len(view.points):
+        for _ in range(BEST_POSE_STEPS):
+            residual, jacobian = dots_block(other, view, flange, view.rail)
+            rows = jacobian.reshape(-1, jacobian.shape[2])[:, FLANGE]
+            step = np.linalg.lstsq(rows, residual.ravel(), rcond=None)[0]
+            flange = perturbed(flange, step)
+        left = dots_block(other, view, flange, view.rail)[0].ravel()
+        squares = float(left @ left)
+        dots = float(np.sqrt(squares / len(left)))
+        # The pose at which the camera sees the board is the one that a moved flange would give.
+        seen = other.camera_from_board(flange, view.rail)
+        told = other.camera_from_board(view.base_from_flange, view.rail)
+        board = _rms_of_known(np.linalg.norm(transform(seen, view.points) - transform(told, view.points), axis=1))
+    if len(view.stripe) and other.plane is not None:
+        stripe = _rms_of_known(stripe_block(other, view, view.base_from_flange, view.rail)[0])
+    return [dots, stripe, board, squares]
+
+
+def _rms_of_known(values: Array) -> float:
+    known = np.asarray(values)[~np.isnan(values)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

@@ -14,14 +14,14 @@ import pinocchio as pin
 from cell.measure.calibration.archive import ScanObservation, TargetObservation
 from cell.measure.calibration.drift.evidence import Reference
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, PlateLine, Pointing, rolled, turned
+from cell.measure.calibration.drift.timing import Shutter, StampTiming
+from cell.measure.calibration.judge.checks import joint_checks
 from cell.measure.calibration.judge.faults import refuse_bent, refuse_exchanged, refuse_slipped
-from cell.measure.calibration.judge.hand_eye_checks import joint_checks
 from cell.measure.calibration.judge.scale import board_size
 from cell.measure.calibration.solve.adjustment import Adjustment, Priors
 from cell.measure.calibration.solve.bow import FLAT
 from cell.measure.calibration.solve.joint import Joint, Staged, effective_hand_eye_covariance, solve_joint, solve_staged
 from cell.measure.calibration.solve.normal import HAND, SHARED, AdjustmentState
-from cell.measure.calibration.timing import Shutter, StampTiming
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import covariance_root, from_matrix, from_parts

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -16,15 +15,8 @@ import pytest
 from cell.apps.recordings.frames import RecordedFrame
 from cell.apps.recordings.result import empty_result
 from cell.apps.recordings.solution import agreeing, camera_of, solve_frames
-from cell.measure.calibration.archive import ScanObservation
-from cell.measure.calibration.judge.board_shape import moved_by_bend
-from cell.measure.calibration.judge.camera_checks import camera_checks
 from cell.measure.calibration.judge.faults import foreign_view, own_cameras
-from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
-from cell.measure.calibration.solve.choice import choose_solution, with_doubt_of_camera
 from cell.measure.calibration.solve.intrinsics import choose_lens
-from cell.measure.calibration.solve.joint import solve_staged, start_state, view_data
-from cell.measure.calibration.solve.normal import HAND
 from cell.measure.geometry.camera import CameraModel
 from drivers.errors import RefusedError
 from tests.support.recorded_scenes import DISTANCE, FLANGE_FROM_CAMERA, LENS, MATRIX, NORMAL, SIZE, scene
@@ -243,65 +235,6 @@ def test_a_zoom_that_was_changed_in_the_middle_gives_no_hand_eye():
     words = r"up to frame000[234].png give fx = 1[34]\d\d .* zoom, focus or camera were"
     with pytest.raises(RefusedError, match=words):
         camera_of(frames)
-
-
-def test_what_a_bend_does_to_the_chain_is_what_it_moves():
-    """Against the same scene with a flat board: the camera on the flange goes as far as was foretold."""
-    found = []
-    for bend in (0.0, 3e-4):
-        frames = scene(seed=2, bend=bend, laser=False, arm_mm=0.02, arm_mrad=0.02)
-        pictures, _ = choose_lens([frame.view for frame in frames])
-        observations = [ScanObservation(f.view, None, f.base_from_flange, 0.0, f.name) for f in frames]
-        staged = solve_staged(observations, stripe=False, camera=pictures.camera)
-        views = [view_data(o, np.empty(0, dtype=np.intp)) for o in observations]
-        adjustment = Adjustment(views, shared_mask(plane=False, rail=False), Priors(2e-5, 2e-5))
-        found.append((adjustment, adjustment.solve(start_state(staged), 2).state))
-    (_, flat), (adjustment, bent) = found
-    foretold = moved_by_bend(adjustment, bent)
-    turn = bent.flange_from_camera.rotation.T
-    really = turn @ (flat.flange_from_camera.translation - bent.flange_from_camera.translation)
-    assert np.linalg.norm(really) > 5e-4
-    assert np.linalg.norm(foretold[HAND][:3] - really) < 0.15 * np.linalg.norm(really)
-    assert foretold[0] == pytest.approx(flat.camera.fx - bent.camera.fx, rel=0.15)
-
-
-def test_a_camera_that_the_arm_contradicts_is_stated_with_what_parts_them():
-    """The pictures of a lens that was misjudged: 12 px off in focal length, and said to be known to 2 px."""
-    frames = scene(seed=4, laser=False)
-    honest, _ = choose_lens([frame.view for frame in frames])
-    off = np.r_[12.0, 12.0, np.zeros(7)]
-    wrong = replace(
-        honest,
-        camera=honest.camera.with_parameters(honest.camera.parameters + off),
-        sigma=np.full(9, 2.0),
-        covariance=np.diag([4.0, 4.0, 4.0, 4.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
-    )
-    observations = [ScanObservation(f.view, None, f.base_from_flange, 0.0, f.name) for f in frames]
-    staged = solve_staged(observations, stripe=False, camera=wrong.camera)
-    choice, doubted = with_doubt_of_camera(choose_solution(observations, staged, wrong), wrong)
-    assert not choice.best.camera_free
-    assert abs(doubted.camera.fx - MATRIX[0, 0]) < 2.5 * doubted.sigma[0] < 25.0
-    hand = choice.best.adjusted.state.flange_from_camera.translation - FLANGE_FROM_CAMERA.translation
-    assert np.all(np.abs(FLANGE_FROM_CAMERA.rotation.T @ hand) < Z * choice.best.sigma[HAND][:3])
-
-
-@pytest.mark.parametrize("seed", [6, 8, 11])
-def test_few_views_of_a_bent_board_state_how_little_they_tell(seed):
-    """A bend of 0.2 mm that four views cannot tell moved the focal length by three times what was stated."""
-    found, _ = choose_lens([f.view for f in scene(seed=seed, count=4, bend=2e-4, laser=False)])
-    assert abs(found.camera.fx - MATRIX[0, 0]) < 2 * found.sigma[0] < 0.1 * MATRIX[0, 0]
-
-
-@pytest.mark.parametrize(("tilt", "verdict"), [(0.08, "doubt"), (0.45, "ok")])
-def test_a_board_that_was_hardly_tilted_is_a_doubt_with_its_angle(tilt, verdict):
-    """A bend that nobody sees and the focal length look alike: 8 pictures of a real board were 5 deviations off."""
-    frames = scene(seed=6, count=8, laser=False, tilt=tilt)
-    views = [frame.view for frame in frames]
-    found, _ = choose_lens(views)
-    (check,) = (c for c in camera_checks(found, views, [f.name for f in frames]) if "tilt" in c.name)
-    assert check.verdict == verdict
-    if verdict == "doubt":
-        assert re.search(r"tilted by 1?\d° at most.*tilt it by 45°", check.text)
 
 
 @pytest.mark.parametrize("seed", [4, 5])

@@ -13,7 +13,7 @@ from cell.measure.calibration.solve.joint import Joint
 from cell.measure.calibration.solve.results import adjust_target
 from cell.measure.geometry.poses import from_parts
 from drivers.errors import RefusedError
-from tests.unit.cell.measure.calibration.solve.test_joint import (
+from tests.unit.cell.measure.calibration.solve.test_results import (
     BOARD,
     FLANGE_FROM_CAMERA,
     NOMINAL,

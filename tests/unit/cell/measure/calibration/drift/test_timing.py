@@ -19,7 +19,9 @@ from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.drift.evidence import Reference
-from cell.measure.calibration.drift.timing_fit import (
+from cell.measure.calibration.drift.timing import (
+    Shutter,
+    StampTiming,
     TimedFrame,
     TimedSweep,
     TimesRefused,
@@ -30,7 +32,6 @@ from cell.measure.calibration.drift.timing_fit import (
     roughly_late,
 )
 from cell.measure.calibration.solve.results import KEPT, Quality, TargetCalibration
-from cell.measure.calibration.timing import Shutter, StampTiming
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.inversion import NominalSurface

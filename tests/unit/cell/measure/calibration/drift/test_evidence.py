@@ -1,0 +1,116 @@
+"""Promises of the evidence for a change: of a good calibration it scatters as it says, and its reference is stored."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from cell.config.calibrations.store import CellCalibration, read_calibration, save_calibration
+from cell.config.cell_config import load_config
+from cell.measure.calibration.drift.decision import verdict
+from cell.measure.calibration.drift.evidence import Reference, evidence
+from cell.measure.calibration.solve.normal import BOARD, SHARED, AdjustmentState
+from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
+from cell.measure.geometry.light_plane import LightPlane
+from cell.measure.geometry.poses import covariance_root, from_matrix
+from cell.procedures.verify.views import scan_looks, target_looks, verify
+from drivers.errors import CalibrationStale
+from lab.bench.calibration.observed_cell import ObservedCell
+from lab.bench.calibration.verification import look_again
+from sim_backends.world.scene import draw
+
+CONFIG = load_config(None)
+
+
+SEED = 5
+
+
+@pytest.fixture(scope="module")
+def calibrated():
+    """A harsh world; from the drawn pose its fine board lies half out of the picture."""
+    cell = ObservedCell(draw(SEED, "harsh"), CONFIG, np.random.default_rng([SEED, 7]))
+    return cell, CellCalibration.solve(cell.collect_scan(), cell.collect_target(), {"arm": "1"}, CONFIG)
+
+
+def true_state(cell: ObservedCell, calibration: CellCalibration, chain: str) -> AdjustmentState:
+    t = cell.truth
+    if chain == "target":
+        lens = calibration.target.camera.with_parameters(t.target_lens)
+        return AdjustmentState(
+            lens, None, np.zeros(3), from_matrix(t.flange_from_target), from_matrix(t.base_from_large)
+        )
+    lens, plane = calibration.scan.camera.with_parameters(t.scan_lens), LightPlane.of(t.plane_normal, t.plane_distance)
+    return AdjustmentState(
+        lens, plane, t.rail_direction, from_matrix(t.flange_from_scan), from_matrix(t.base_from_fine)
+    )
+
+
+@pytest.mark.parametrize(("checks", "most_alarms"), [(7, 1), pytest.param(42, 4, marks=pytest.mark.campaign)])
+def test_the_evidence_of_a_good_calibration_scatters_as_it_says(calibrated, checks, most_alarms):
+    """Calibrations drawn from their covariance about the truth, noise as stated: χ² of the boards, and few alarms."""
+    cell, calibration = calibrated
+    sigma = cell.scene.deviations
+    # Without a kinematic error the arm's scatter is all that its poses are wrong by.
+    quiet = ObservedCell(replace(cell.scene, dh_error=np.zeros((6, 4))), CONFIG, np.random.default_rng(3))
+    rail = np.sqrt(sigma.rail_homing**2 + cell.scene.rail_backlash**2 / 4 + cell.scene.rail_periodic_amplitude**2 / 2)
+    squares, alarms = [], 0
+    for _ in range(checks):
+        drawn = {}
+        for name, of in (("scan", calibration.scan), ("target", calibration.target)):
+            step = covariance_root(of.reference.covariance)
+            step = step @ quiet.rng.normal(size=step.shape[1])
+            state = true_state(quiet, calibration, name).moved(step)
+            reference = Reference(
+                state.base_from_board, of.reference.covariance, sigma.arm_repeatability / np.sqrt(3),
+                sigma.arm_repeatability_rotation, float(rail), 1.0, 1.0,
+            )  # fmt: skip
+            drawn[name] = state, reference
+        scan, target = (state for state, _ in drawn.values())
+        made = CellCalibration(
+            ScanCalibration(scan.camera, scan.plane, scan.rail_direction, scan.flange_from_camera,
+                            calibration.scan.covariance, calibration.scan.quality, drawn["scan"][1]),
+            TargetCalibration(target.camera, target.flange_from_camera, calibration.target.hand_eye_covariance,
+                              calibration.target.quality, drawn["target"][1]),
+            {}, "", 0.0,
+        )  # fmt: skip
+        seen = look_again(quiet, made)
+        evidences = {
+            "scan": evidence(scan, drawn["scan"][1], scan_looks(scan, seen)),
+            "target": evidence(target, drawn["target"][1], target_looks(seen.target)),
+        }
+        alarms += not verdict(evidences, {"scan": scan, "target": target}).good
+        for weighed in evidences.values():
+            moved, covariance = weighed.change(np.eye(SHARED)[:, BOARD])
+            squares.append(moved @ np.linalg.solve(covariance, moved))
+    freedom = 6 * len(squares)
+    assert chi2.ppf(0.002, freedom) < np.sum(squares) < chi2.ppf(0.998, freedom)
+    # At 3 % each, more than one of 7 happens once in sixty times, more than four of 42 once in a hundred and fifty.
+    assert alarms <= most_alarms
+
+
+def test_the_reference_is_stored_and_an_old_file_is_refused(calibrated, tmp_path):
+    cell, calibration = calibrated
+    save_calibration(calibration, tmp_path / "new.json")
+    back = read_calibration(tmp_path / "new.json")
+    np.testing.assert_allclose(back.scan.reference.covariance, calibration.scan.reference.covariance)
+    assert back.scan.reference.rail == calibration.scan.reference.rail
+    # Of a format without a digest.
+    old = {**calibration.as_dict(), "format": 1}
+    for part in ("scan", "target"):
+        del old[part]["reference"]
+    (tmp_path / "old.json").write_text(json.dumps(old))
+    older = read_calibration(tmp_path / "old.json")
+    with pytest.raises(CalibrationStale, match="reference"):
+        verify(older.scan, older.target, look_again(cell, calibration))
+
+
+def test_a_scan_calibration_reads_its_own_reference_back(calibrated):
+    scan = calibrated[1].scan
+    back = ScanCalibration.from_dict(json.loads(json.dumps(scan.as_dict())))
+    np.testing.assert_allclose(
+        back.reference.base_from_board.homogeneous, scan.reference.base_from_board.homogeneous, atol=1e-12
+    )
