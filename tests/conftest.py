@@ -76,7 +76,7 @@ GROUPS = (
         "unit/cell/measure/inversion/effects/test_causes.py",
         "unit/cell/measure/inversion/test_disagreement.py",
         "unit/cell/procedures/steps/test_workplace.py",
-        "unit/cell/measure/calibration/drift/test_timing_fit.py",
+        "unit/cell/measure/calibration/drift/test_timing.py",
         "unit/drivers/vehicle/test_fixed.py",
         "unit/cell/run/record",
     ),

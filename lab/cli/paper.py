@@ -1,4 +1,4 @@
-"""`cell paper`: the paper's figure, equations and tables reproduced, each with what was wrong in it."""
+"""`cell paper`: the paper's figure and table reproduced, each with what was wrong in it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ OutOption = Annotated[
 ]
 SeedsOption = Annotated[int, typer.Option("--seeds", min=1, max=1000, help="How many simulated heads.")]
 
-paper = typer.Typer(help="The paper, reproduced: its design study, equations and table.", no_args_is_help=True)
+paper = typer.Typer(help="The paper, reproduced: its design study and table.", no_args_is_help=True)
 
 
 @paper.command()
@@ -35,14 +35,6 @@ def figure2(json: JsonOption = False, out: OutOption = None) -> None:
         draw(path)
         # On standard error, so that JSON on standard output stays alone.
         typer.echo(f"drawn: {path}", err=True)
-
-
-@paper.command()
-def equations(json: JsonOption = False, out: OutOption = None) -> None:
-    """Equations (1) to (6) as printed and as corrected, held against ray-traced truth."""
-    from lab.paper.equations import equation_table
-
-    _show(equation_table(), json, out, "equations")
 
 
 @paper.command()

@@ -295,11 +295,10 @@ def report_chain(chain: CalibrationChain, pictures: Intrinsics, result: dict[str
         result["notes"].append(f"no light plane: {chain.no_plane}")
         return
     depths = form.seen_depths(state.plane, state.camera, [v.stripe for v in best.views if len(v.stripe)])
-    checked = None if staged.paper is None else form.finite(1e3 * staged.paper.cross_ratio_m)
     result["light_plane"] = {
         **form.plane_dict(best.name, state.plane, adjusted.stripe_rms_m, chain.noise, chain.plane_known, depths=depths),
         "sigma_distance_mm": 1e3 * float(sigma[PLANE][2]),
-        "staged": {**form.normal_dict(staged.plane.plane, staged.plane.rms), "cross_ratio_check_mm": checked},
+        "staged": form.normal_dict(staged.plane.plane, staged.plane.rms),
     }
     result["stripe_points"] = {n: len(r) for n, r in zip(names, staged.plane.rows, strict=True)}
     if (whole := form.flatness_dict(flat, names)) is not None:

@@ -73,7 +73,7 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
                 chosen = plain = given_camera(given, views)
         except PictureRefused:
             # One picture whose pose nobody can tell must not take the camera of the others.
-            rough = zhang(apart, lens=False)[0] if given is None else given
+            rough = zhang(apart, lens=False) if given is None else given
             for frame in kept:
                 try:
                     board_pose(_view(frame), rough)
@@ -112,7 +112,7 @@ def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None)
 def rough_camera(frames: Sequence[RecordedFrame], given: CameraModel | None) -> tuple[Intrinsics, Intrinsics]:
     """A camera in closed form, without its lens: enough to tell how poses are to be read. Raises RefusedError."""
     views = _views([merged(stop) for stop in by_stop(used(frames))])
-    return (given_camera(zhang(views, lens=False)[0] if given is None else given, views),) * 2
+    return (given_camera(zhang(views, lens=False) if given is None else given, views),) * 2
 
 
 def _refuse_change(found: Intrinsics, views: Sequence[BoardView], names: Sequence[str]) -> None:

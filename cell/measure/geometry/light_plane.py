@@ -1,7 +1,6 @@
 """The laser's light plane in the camera frame, and triangulation: where a pixel's ray meets it.
 
-The general form holds for any plane; the closed form of the paper (its equation 1, corrected) is the special case of a
-laser on the camera's x axis, kept because a test proves the two equal. A sheet may be bowed across the stripe's length:
+A sheet may be bowed across the stripe's length:
 what lens and laser leave of it, a few hundredths of a millimetre. docs/explanation/theory.md, section 2.
 """
 
@@ -10,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from cell.measure.geometry.camera import Array, CameraModel
 
@@ -56,12 +55,11 @@ class LightPlane:
         return cls.of((1.0, 0.0, -1.0 / np.tan(theta)), -baseline)
 
     @classmethod
-    def fit(cls, points: ArrayLike, weights: ArrayLike | None = None) -> LightPlane:
-        """Least-squares plane of points (n, 3); optional weights (n,). Paper, step 5 of section 4.1."""
+    def fit(cls, points: ArrayLike) -> LightPlane:
+        """Least-squares plane of points (n, 3). Paper, step 5 of section 4.1."""
         p = np.asarray(points, dtype=np.float64)
-        w = np.ones(len(p)) if weights is None else np.asarray(weights, dtype=np.float64)
-        centre = np.average(p, axis=0, weights=w)
-        normal = np.linalg.svd((p - centre) * np.sqrt(w)[:, None], full_matrices=False)[2][2]
+        centre = p.mean(axis=0)
+        normal = np.linalg.svd(p - centre, full_matrices=False)[2][2]
         if normal @ centre < 0:
             normal = -normal
         return cls.of(normal, float(normal @ centre))
@@ -136,17 +134,3 @@ def triangulate(camera: CameraModel, plane: LightPlane, pixels: ArrayLike) -> tu
     rays, ray_by_pixel = camera.rays_with_jacobian(pixels)
     points, by_ray, _, _ = plane.intersect_with_jacobians(rays)
     return points, np.asarray(by_ray @ ray_by_pixel, dtype=np.float64)
-
-
-def closed_form(
-    x: ArrayLike, y: ArrayLike, baseline: float, focal: float, theta: float, least: float = 1e-9
-) -> NDArray[np.float64]:
-    """The paper's equation (1), corrected: points (n, 3) in m from image coordinates x', y' in m on the sensor.
-
-    D = f cotθ − x'; X = l x'/D, Y = l y'/D, Z = l f/D, with baseline l and focal length f in m, θ in rad. Rays with
-    D ≤ `least` (m) lie at or beyond the plane's vanishing line and give NaN.
-    """
-    xs, ys = np.atleast_1d(np.asarray(x, dtype=np.float64)), np.atleast_1d(np.asarray(y, dtype=np.float64))
-    d = focal / np.tan(theta) - xs
-    d = np.where(d > least, d, np.nan)
-    return np.column_stack([baseline * xs / d, baseline * ys / d, baseline * focal / d])

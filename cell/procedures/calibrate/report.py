@@ -22,7 +22,7 @@ from cell.config.job import Job, load_job
 from cell.measure.calibration.archive import Observations
 from cell.measure.calibration.judge.checks import joint_checks
 from cell.measure.calibration.judge.coverage import GRID, Coverage, Places, advice, derivatives, influences, place_rms
-from cell.measure.calibration.solve.joint import Joint, paper_plane_of
+from cell.measure.calibration.solve.joint import Joint
 from cell.measure.calibration.solve.results import ScanCalibration
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion import NominalSurface
@@ -203,7 +203,6 @@ def examine(solved: Solved, observations: Observations, config: CellConfig, job:
         "scan_coverage": scan.summary(),
         "target_coverage": target.summary(),
         "noise_found": noise_found(solved.scan),
-        "paper_steps": paper_check(solved.scan, observations),
         "checks": [
             {"camera": camera, **check.as_dict()}
             for camera, joint, nominal in (
@@ -240,33 +239,4 @@ def noise_found(joint: Joint) -> dict[str, float]:
         "dots": priors.dots_scale,
         "stripe": priors.stripe_scale,
         "chi2_per_dof": joint.adjusted.chi2_per_dof,
-    }
-
-
-def paper_check(joint: Joint, observations: Observations) -> dict[str, object] | None:
-    """The light plane by the paper's six steps, with the adjusted camera and boards, beside the adjusted plane.
-
-    `apart_mrad` between the normals, `apart_mm` between the planes at the middle of the stripe's points; None where the
-    stripe crosses too few rows.
-    """
-    state, staged = joint.adjusted.state, joint.staged
-    if state.plane is None or staged.plane is None:
-        return None
-    poses = [
-        state.camera_from_board(flange, rail) for flange, rail in zip(state.flanges, state.rails.tolist(), strict=True)
-    ]
-    paper = paper_plane_of(state.camera, poses, observations.scan, staged.plane.rows)
-    if paper is None:
-        return None
-    seen = state.plane.intersect(state.camera.rays(np.concatenate([view.stripe for view in joint.views])))
-    middle = seen.mean(axis=0)
-    cosine = abs(float(paper.plane.n @ state.plane.n))
-    return {
-        "views": paper.views,
-        "features": paper.features,
-        "rms_mm": 1e3 * paper.rms,
-        "cross_ratio_check_mm": 1e3 * paper.cross_ratio_m,
-        "measured_mm": 1e3 * paper.measured_m,
-        "apart_mrad": 1e3 * float(np.arccos(min(1.0, cosine))),
-        "apart_mm": 1e3 * abs(float(paper.plane.distances(middle[None])[0])),
     }

@@ -49,12 +49,3 @@ def _coverage(console: Console, figures: Mapping[str, Any]) -> None:
         worst = "" if c["largest_cell_mean_px"] is None else f"{c['largest_cell_mean_px']:.3f}"
         table.add_row(camera, f"{100 * c['field_covered']:.0f} %", *shown, worst)
     console.print(table)
-    paper = figures["paper_steps"]
-    if paper is None:
-        console.print("The paper's six steps: the stripe crosses too few rows of the board.")
-        return
-    console.print(
-        f"The paper's six steps give a light plane {paper['apart_mm']:.4f} mm and {paper['apart_mrad']:.3f} mrad from "
-        f"the adjusted one ({paper['features']} features in {paper['views']} views, {paper['rms_mm']:.4f} mm RMS; "
-        f"cross-ratio check {paper['cross_ratio_check_mm']:.4f} mm)."
-    )

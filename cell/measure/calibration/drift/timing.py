@@ -1,6 +1,6 @@
 """How late the scan camera's stamps come against the rail's positions, and its shutter, as kept with a calibration.
 
-Found by `cell.measure.calibration.drift.timing_fit`, from sweeps of `cell.procedures.calibrate.timing`. Both hold for
+Found by `find_timing`, from sweeps of `cell.procedures.calibrate.timing`. Both hold for
 the settings of camera and rail with which they were found: another driver, packet size or baud rate makes stamps or
 readings come otherwise.
 """

@@ -20,7 +20,6 @@ from cell.measure.calibration.solve.normal import (
     CAMERA,
     COLUMNS,
     FLANGE,
-    HAND,
     OWN,
     PLANE,
     RAIL,
@@ -265,15 +264,13 @@ def _scatter(normal: Normal, inverse: Inverse, name: str) -> float:
     return float(np.clip(np.sqrt(block.squares / expected_cost(name, block, inverse)), 0.1, 10.0))
 
 
-def shared_mask(*, plane: bool, rail: bool, tangential: bool = True, k2: bool = True) -> NDArray[np.bool_]:
+def shared_mask(*, plane: bool, rail: bool, tangential: bool = True) -> NDArray[np.bool_]:
     """Which of the 27 shared parameters move: always fx … k1, hand-eye and board; k3 never (it is not observable)."""
     free = np.ones(SHARED, dtype=np.bool_)
     free[CAMERA.start + 8] = False
-    free[5] = k2
     free[6:8] = tangential
     free[PLANE] = plane
     free[RAIL] = rail
-    free[HAND] = True
     return free
 
 

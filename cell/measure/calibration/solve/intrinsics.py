@@ -117,7 +117,7 @@ class _LensFit:
 
 def choose_lens(views: Sequence[BoardView]) -> tuple[Intrinsics, Intrinsics]:
     """The camera with the lens model that the views support, and the one without distortion. Raises RefusedError."""
-    start, _ = zhang(views, lens=False)
+    start = zhang(views, lens=False)
     plain = _fitted(PLAIN, start, _data(views, start))
     if len(views) < LEAST_LEFT_OUT:
         # Too few to choose a lens: what one with distortion would say is not known better.
@@ -129,7 +129,7 @@ def choose_lens(views: Sequence[BoardView]) -> tuple[Intrinsics, Intrinsics]:
         return found, found
     fits = [plain]
     try:
-        curved, _ = zhang(views)
+        curved = zhang(views)
         data = _data(views, curved)
         fits += [_fitted(model, curved, data) for model in RADIAL]
     except RefusedError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,14 +24,15 @@ from cell.measure.calibration.solve.normal import (
     rests_of,
     stripe_block,
 )
-from cell.measure.calibration.solve.paper_steps import PaperPlane, paper_plane, step_2_one_coordinate_system
 from cell.measure.calibration.solve.starts import (
     HandEye,
     PlaneStart,
+    paper_plane,
     plane_from_board,
     solve_hand_eye,
     stripe_means,
     stripe_pixels,
+    zhang,
 )
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.poses import from_parts
@@ -47,18 +49,16 @@ FOLDS = 4
 
 @dataclass(frozen=True, eq=False)
 class Staged:
-    """The closed-form solution: camera and its RMS per view, hand-eye, light plane (None without a stripe).
+    """The closed-form solution: camera, hand-eye, light plane (None without a stripe).
 
     From the first view of each rest of the arm. `plane` holds the stripe's usable rows of all observations; its plane
-    is that of the paper's steps (`paper`) where they give one.
+    is that of the paper's steps where they give one.
     """
 
     camera: CameraModel
-    view_rms: Array
     camera_from_board: list[pin.SE3]
     hand_eye: HandEye
     plane: PlaneStart | None
-    paper: PaperPlane | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +83,6 @@ def solve_staged(
     nominal: CameraModel | None = None,
     rail_direction: Array | None = None,
     stripe: bool = True,
-    lens: bool = True,
     camera: CameraModel | None = None,
 ) -> Staged:
     """Camera, then hand-eye, then light plane, each from the result before. All observations need a view.
@@ -93,60 +92,42 @@ def solve_staged(
     every, observations = observations, [o for o in observations if not o.same_rest]
     views = [o.view for o in observations if o.view is not None]
     if camera is None:
-        camera, view_rms, poses = step_2_one_coordinate_system(views, nominal, lens)
-    else:
-        found = [board_pose(view, camera) for view in views]
-        view_rms, poses = np.array([f.rms_px for f in found]), [f.camera_from_board for f in found]
+        camera = zhang(views, nominal)
+    poses = [board_pose(view, camera).camera_from_board for view in views]
     with_view = [o for o in observations if o.view is not None]
     hand_eye = solve_hand_eye(
         [o.base_from_flange for o in with_view], poses, [o.rail_position for o in with_view], rail_direction
     )
-    plane, paper = None, None
-    if stripe and any(o.profile is not None for o in observations):
-        plane, paper = _light_plane(camera, hand_eye, poses, every)
-    return Staged(camera, view_rms, poses, hand_eye=hand_eye, plane=plane, paper=paper)
+    lit = stripe and any(o.profile is not None for o in observations)
+    return Staged(camera, poses, hand_eye, _light_plane(camera, hand_eye, poses, every) if lit else None)
 
 
 def _light_plane(
     camera: CameraModel, hand_eye: HandEye, poses: Sequence[pin.SE3], every: Sequence[ScanObservation]
-) -> tuple[PlaneStart, PaperPlane | None]:
-    """From the stripes of `every` observation, and the board's poses at those that see it; with the paper's light."""
+) -> PlaneStart:
+    """From the stripes of `every` observation, and the board's poses at those that see it; with the paper's plane."""
     observations = [o for o in every if not o.same_rest]
-    everywhere = [
-        (
-            o.base_from_flange * hand_eye.flange_from_camera * from_parts(o.rail_position * hand_eye.rail_direction)
-        ).inverse()
-        * hand_eye.base_from_board
-        for o in observations
-    ]
-    for k, pose in zip([k for k, o in enumerate(observations) if o.view is not None], poses, strict=True):
-        everywhere[k] = pose
+    seen = iter(poses)
+    everywhere = [_expected(hand_eye, o) if o.view is None else next(seen) for o in observations]
     first = next(o.view for o in observations if o.view is not None)
-    stand_in = [o.view if o.view is not None else first for o in observations]
-    plane = plane_from_board(camera, everywhere, stand_in, [o.profile for o in observations])
-    paper = paper_plane_of(camera, everywhere, observations, plane.rows)
-    if paper is not None:
-        plane = replace(plane, plane=paper.plane, rms=paper.rms)
-    rows, nothing = iter(plane.rows), np.empty(0, dtype=np.intp)
-    return replace(plane, rows=[nothing if o.same_rest else next(rows) for o in every]), paper
-
-
-def paper_plane_of(
-    camera: CameraModel,
-    camera_from_board: Sequence[pin.SE3],
-    observations: Sequence[ScanObservation],
-    rows: Sequence[NDArray[np.intp]],
-) -> PaperPlane | None:
-    """The paper's plane over the observations that show dots and stripe; None when it crosses too few rows."""
+    views, profiles = [o.view or first for o in observations], [o.profile for o in observations]
+    plane = plane_from_board(camera, everywhere, views, profiles)
     used = [
         (pose, o.view, stripe_pixels(o.profile, r))
-        for o, pose, r in zip(observations, camera_from_board, rows, strict=True)
+        for o, pose, r in zip(observations, everywhere, plane.rows, strict=True)
         if o.view is not None and o.profile is not None and len(r)
     ]
-    try:
-        return paper_plane(camera, [p for p, _, _ in used], [v for _, v, _ in used], [s for _, _, s in used])
-    except RefusedError:
-        return None
+    with suppress(RefusedError):
+        paper, rms = paper_plane(camera, [p for p, _, _ in used], [v for _, v, _ in used], [s for _, _, s in used])
+        plane = replace(plane, plane=paper, rms=rms)
+    rows, nothing = iter(plane.rows), np.empty(0, dtype=np.intp)
+    return replace(plane, rows=[nothing if o.same_rest else next(rows) for o in every])
+
+
+def _expected(hand_eye: HandEye, o: ScanObservation) -> pin.SE3:
+    """camera_from_board of an observation that does not see it."""
+    flange_from_camera = hand_eye.flange_from_camera * from_parts(o.rail_position * hand_eye.rail_direction)
+    return (o.base_from_flange * flange_from_camera).inverse() * hand_eye.base_from_board
 
 
 def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> ViewData:

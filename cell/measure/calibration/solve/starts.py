@@ -1,12 +1,7 @@
-"""Closed-form starts: Zhang's camera, and a light plane through all clean stripe points on the boards.
+"""Closed forms that the adjustment starts from: Zhang's camera, Park and Martin's hand-eye, the paper's light plane.
 
-The stripe points that are chosen here are those that the joint adjustment uses. The paper's own way to the plane is in
-`paper_steps`.
-
-Hand-eye in closed form: where a camera sits on the flange, or where it stands when the board is on the flange.
-
-Park and Martin's rotation, then one linear system for everything that is a translation, the rail's included. A start
-for the joint adjustment, and an answer by itself when only poses are given."""
+The stripe points that are chosen here are those that the joint adjustment uses. The hand-eye's rotation comes first,
+then one linear system for everything that is a translation, the rail's included."""
 
 from __future__ import annotations
 
@@ -21,7 +16,8 @@ from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.geometry.poses import difference, from_parts, mean, perturbed
+from cell.measure.geometry.poses import difference, from_parts, mean, perturbed, transform
+from cell.measure.vision.board.board import predict
 from cell.measure.vision.board.view import BoardView
 from cell.measure.vision.stripe.extract import StripeProfile
 from cell.measure.vision.stripe_on_board import on_plane, points_on_board
@@ -30,19 +26,16 @@ from drivers.errors import RefusedError
 LEAST_VIEWS = 3
 
 
-def zhang(
-    views: Sequence[BoardView], nominal: CameraModel | None = None, lens: bool = True
-) -> tuple[CameraModel, Array]:
-    """Camera of several views of a board, and the RMS in px of each view (n,).
+def zhang(views: Sequence[BoardView], nominal: CameraModel | None = None, lens: bool = True) -> CameraModel:
+    """Camera of several views of a board; `nominal` is a start where it is known. Without `lens` it has no distortion.
 
-    `nominal` is a start where it is known. Without `lens` no distortion is estimated. Raises RefusedError for fewer
-    than three views, or none that tell the focal length.
+    Raises RefusedError for fewer than three views, or none that tell the focal length.
     """
     if len(views) < LEAST_VIEWS:
         raise RefusedError(
             f"{len(views)} views of the board; a camera's calibration needs {LEAST_VIEWS} or more from different sides"
         )
-    size = views[0].size
+    width, height = views[0].size
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     if not lens:
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
@@ -57,25 +50,22 @@ def zhang(
     # On several threads it adds up in whatever order they come, so that the last digits differ from time to time.
     cv2.setNumThreads(1)
     try:
-        result = cv2.calibrateCameraExtended(objects, pixels, size, matrix, dist, flags=flags)
+        found = cv2.calibrateCamera(objects, pixels, (width, height), matrix, dist, flags=flags)
     except cv2.error as error:
         raise RefusedError(
             f"the {len(views)} views do not determine a camera: {error.err}; tilt the board more"
         ) from error
     finally:
         cv2.setNumThreads(threads)
-    matrix = np.asarray(result[1], dtype=np.float64)
-    dist = np.asarray(result[2], dtype=np.float64).ravel()[:5]
-    per_view = np.asarray(result[7], dtype=np.float64).ravel()
-    camera = CameraModel(size[0], size[1], 1.0, fy=1.0, cx=0.0, cy=0.0).with_parameters(
+    matrix, dist = np.asarray(found[1], dtype=np.float64), np.asarray(found[2], dtype=np.float64).ravel()[:5]
+    camera = CameraModel(width, height, 1.0, fy=1.0, cx=0.0, cy=0.0).with_parameters(
         [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *dist]
     )
-    if not 0.1 * max(size) < camera.fx < 100 * max(size):
+    if not 0.1 * max(width, height) < camera.fx < 100 * max(width, height):
         raise RefusedError(
             f"the {len(views)} views do not determine a camera (focal length {camera.fx:.0f} px); tilt the board more"
         )
-    # OpenCV's figure is per point; ours everywhere is per component.
-    return camera, np.asarray(per_view / np.sqrt(2), dtype=np.float64)
+    return camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,7 +103,7 @@ def plane_from_board(
         )
     cloud = np.concatenate(points)
     spread = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False) / np.sqrt(len(cloud))
-    if len(points) < 2 or spread[1] < 0.02 * spread[0]:
+    if len(points) < 2 or spread[1] < LEAST_SPREAD * spread[0]:
         raise RefusedError(
             f"the stripe was seen on the board in {len(points)} frames, all along one line; a light plane needs the "
             "board at different distances or tilts"
@@ -151,6 +141,124 @@ def stripe_means(profile: StripeProfile, rows: NDArray[np.intp], count: int) -> 
     pixels = stripe_pixels(profile, rows)
     means = [np.bincount(member, weight * pixels[:, axis]) / total for axis in (0, 1)]
     return np.column_stack(means), 1 / np.sqrt(total)
+
+
+LEAST_IN_ROW = 3
+BEYOND_PITCHES = 1.0
+"""Crossings further beyond a row's last dot than so many pitches are extrapolated too far."""
+LEAST_SPREAD = 0.02
+"""Share of the first spread of points below which the second makes them one line, and no plane."""
+
+
+@dataclass(frozen=True, eq=False)
+class Crossing:
+    """Where the stripe crosses one row (or column) of the board: `place` (2,) in the ideal picture at unit distance.
+
+    `dots` (k,) are the row's points in the view, `axis` the board axis (0: x, 1: y) along which the row runs.
+    """
+
+    place: Array
+    dots: NDArray[np.intp]
+    axis: int
+
+
+def paper_plane(
+    camera: CameraModel, camera_from_board: Sequence[pin.SE3], views: Sequence[BoardView], stripes: Sequence[Array]
+) -> tuple[LightPlane, float]:
+    """The light plane by section 4.1 of the paper, and the RMS distance of its points in m.
+
+    `stripes` are pixels (n, 2) on the boards. Needs no arm. Step 2, camera and poses, comes first: a row of dots is a
+    straight line only without distortion. Raises RefusedError when the stripe crosses too few rows for a plane.
+    """
+    points, seen = [], 0
+    for pose, view, stripe in zip(camera_from_board, views, stripes, strict=True):
+        ideal = _ideal_centres(camera, pose, view)
+        crossings = _rows_crossed(camera, view, ideal, stripe)
+        if crossings:
+            seen += 1
+            # Step 4: from the board's frame to the camera's.
+            points.append(transform(pose, np.array([at_cross_ratio(c, view, ideal) for c in crossings])))
+    if not points:
+        raise RefusedError("the stripe crosses no row of the board in any view; does it lie across the board?")
+    cloud = np.concatenate(points)
+    spread = np.linalg.svd(cloud - cloud.mean(axis=0), compute_uv=False)
+    if seen < 2 or len(cloud) < 3 or spread[1] < LEAST_SPREAD * spread[0]:
+        raise RefusedError(
+            f"the stripe crosses rows of the board in {seen} views, all along one line; a light plane needs the board "
+            "at different distances or tilts"
+        )
+    return robust_plane(cloud)
+
+
+def _rows_crossed(camera: CameraModel, view: BoardView, ideal: Array, stripe: Array) -> list[Crossing]:
+    """Step 1: a line through the stripe, a line through each row of dots, and where they cross, to sub-pixel.
+
+    `ideal` (n, 2) are the dots in the ideal picture, `stripe` (m, 2) pixels. Columns serve instead of rows where the
+    stripe crosses them more squarely.
+    """
+    if len(stripe) < 2:
+        return []
+    line = _line(camera.normalised(stripe))
+    families = [_family(view, ideal, line, axis) for axis in (0, 1)]
+    slants = [np.median(slant) if len(slant) else 0.0 for _, slant in families]
+    return families[int(np.argmax(slants))][0]
+
+
+def at_cross_ratio(crossing: Crossing, view: BoardView, ideal: Array) -> Array:
+    """Step 3: the crossing's place (3,) in m on the board, from cross ratios, which a projection does not change.
+
+    The projective map of a line that keeps them is fitted to all dots of the row; with three it is the cross ratio
+    with those three.
+    """
+    row, at = ideal[crossing.dots], view.object_points[crossing.dots]
+    middle = row.mean(axis=0)
+    along = np.linalg.svd(row - middle, full_matrices=False)[2][0]
+    t, x = (row - middle) @ along, at[:, crossing.axis]
+    scale = np.abs(t).max()
+    t = t / scale
+    here = float((crossing.place - middle) @ along / scale)
+    # x (1 + c t) = a t + b
+    a, b, c = np.linalg.lstsq(np.column_stack([t, np.ones_like(t), -x * t]), x, rcond=None)[0]
+    local = at[0].copy()
+    local[crossing.axis] = (a * here + b) / (1 + c * here)
+    return np.asarray(local, dtype=np.float64)
+
+
+def _ideal_centres(camera: CameraModel, camera_from_board: pin.SE3, view: BoardView) -> Array:
+    """The view's points (n, 2) at unit distance without distortion, dots moved from ellipse centre to circle centre."""
+    points = view.object_points
+    centre = camera.project(transform(camera_from_board, points))
+    return camera.normalised(view.pixels + centre - predict(camera, camera_from_board, points, view.dot_radius))
+
+
+def _family(view: BoardView, ideal: Array, line: Array, axis: int) -> tuple[list[Crossing], list[float]]:
+    """Crossings with the rows along a board axis, and the sine of the angle of each in the picture."""
+    local = view.object_points
+    crossings, slants = [], []
+    for value in np.unique(local[:, 1 - axis]):
+        dots = np.flatnonzero(local[:, 1 - axis] == value)
+        if len(dots) < LEAST_IN_ROW:
+            continue
+        row = _line(ideal[dots])
+        meeting = np.cross(row, line)
+        if abs(meeting[2]) < 1e-6:
+            continue
+        place = meeting[:2] / meeting[2]
+        ends = ideal[dots[np.argsort(local[dots, axis])]]
+        span = ends[-1] - ends[0]
+        share = float((place - ends[0]) @ span / (span @ span))
+        room = BEYOND_PITCHES * view.spec.pitch / float(np.ptp(local[dots, axis]))
+        if -room < share < 1 + room:
+            crossings.append(Crossing(place, dots, axis))
+            slants.append(float(abs(meeting[2])))
+    return crossings, slants
+
+
+def _line(points: Array) -> Array:
+    """Homogeneous line (3,) with a unit normal that fits points (n, 2) best."""
+    centre = points.mean(axis=0)
+    normal = np.linalg.svd(points - centre, full_matrices=False)[2][1]
+    return np.array([normal[0], normal[1], -float(normal @ centre)])
 
 
 LEAST_TURN = np.deg2rad(2.0)
