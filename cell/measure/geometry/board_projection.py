@@ -159,6 +159,31 @@ def pose_equations(
 
 
 @compiled
+def _lens_columns(lens: Array, axis: int, x: float, y: float, seen: float, row: Array) -> None:  # pragma: no cover
+    """Writes the derivatives of a pixel's coordinate by the nine terms of the lens; `seen` is it at unit distance."""
+    f, along = lens[axis], x if axis == 0 else y
+    xx, yy, twice_xy = x * x, y * y, 2 * x * y
+    r2 = xx + yy
+    row[axis] = seen
+    row[2 + axis] = 1.0
+    row[4] = f * along * r2
+    row[5] = row[4] * r2
+    row[8] = row[5] * r2
+    row[6], row[7] = (f * twice_xy, f * (r2 + 2 * xx)) if axis == 0 else (f * (r2 + 2 * yy), f * twice_xy)
+
+
+@compiled
+def _add_tilt(tilted: Array, normal: tuple[float, float, float], flange: Array, row: Array) -> None:  # pragma: no cover
+    """Adds what turning a circle of that `normal` does to its ellipse's centre, which moves by `tilted` (3,)."""
+    bx, by, bz = normal
+    about = (tilted[1] * bz - tilted[2] * by, tilted[2] * bx - tilted[0] * bz, tilted[0] * by - tilted[1] * bx)
+    for k in range(3):
+        row[18 + k] += about[0] * flange[0, k] + about[1] * flange[1, k] + about[2] * flange[2, k]
+        row[24 + k] -= about[k]
+        row[30 + k] += about[k]
+
+
+@compiled
 def dots_terms(
     lens: Array,
     board: Array,
@@ -205,19 +230,11 @@ def dots_terms(
         x, y = mid[0] / mid[2], mid[1] / mid[2]
         u, v, jxx, jxy, jyy = distorted(lens, x, y)
         pixels[i, 0], pixels[i, 1] = lens[0] * u + lens[2], lens[1] * v + lens[3]
-        xx, yy, twice_xy = x * x, y * y, 2 * x * y
-        r2 = xx + yy
         for axis in range(2):
             row = jacobian[i, axis]
             row[:] = 0.0
             f = lens[axis]
-            along = x if axis == 0 else y
-            row[axis] = u if axis == 0 else v
-            row[2 + axis] = 1.0
-            row[4] = f * along * r2
-            row[5] = row[4] * r2
-            row[8] = row[5] * r2
-            row[6], row[7] = (f * twice_xy, f * (r2 + 2 * xx)) if axis == 0 else (f * (r2 + 2 * yy), f * twice_xy)
+            _lens_columns(lens, axis, x=x, y=y, seen=u if axis == 0 else v, row=row)
             by_x, by_y = (f * jxx / mid[2], f * jxy / mid[2]) if axis == 0 else (f * jxy / mid[2], f * jyy / mid[2])
             by_z = -(by_x * x + by_y * y)
             # Farther away the circle is smaller, and its ellipse's centre nearer to the picture of its own.
@@ -243,12 +260,4 @@ def dots_terms(
                 tx, ty, tz = share * n[2] * by_x, share * n[2] * by_y, share * n[2] * by_z + sideways
                 for k in range(3):
                     tilted[k] = tx * to_camera[0, k] + ty * to_camera[1, k] + tz * to_camera[2, k]
-                about = (
-                    tilted[1] * bz - tilted[2] * by,
-                    tilted[2] * bx - tilted[0] * bz,
-                    tilted[0] * by - tilted[1] * bx,
-                )
-                for k in range(3):
-                    row[18 + k] += about[0] * flange[0, k] + about[1] * flange[1, k] + about[2] * flange[2, k]
-                    row[24 + k] -= about[k]
-                    row[30 + k] += about[k]
+                _add_tilt(tilted, (bx, by, bz), flange, row)

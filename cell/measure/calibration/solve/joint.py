@@ -37,6 +37,7 @@ from cell.measure.calibration.solve.starts import (
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision.board.board import board_pose
+from cell.measure.vision.board.view import BoardView
 from drivers.errors import RefusedError
 
 STRIPE_POINTS = 120
@@ -112,16 +113,22 @@ def _light_plane(
     first = next(o.view for o in observations if o.view is not None)
     views, profiles = [o.view or first for o in observations], [o.profile for o in observations]
     plane = plane_from_board(camera, everywhere, views, profiles)
-    used = [
-        (pose, o.view, stripe_pixels(o.profile, r))
-        for o, pose, r in zip(observations, everywhere, plane.rows, strict=True)
-        if o.view is not None and o.profile is not None and len(r)
-    ]
     with suppress(RefusedError):
-        paper, rms = paper_plane(camera, [p for p, _, _ in used], [v for _, v, _ in used], [s for _, _, s in used])
+        paper, rms = paper_plane(camera, _crossed(observations, everywhere, plane.rows))
         plane = replace(plane, plane=paper, rms=rms)
     rows, nothing = iter(plane.rows), np.empty(0, dtype=np.intp)
     return replace(plane, rows=[nothing if o.same_rest else next(rows) for o in every])
+
+
+def _crossed(
+    observations: Sequence[ScanObservation], poses: Sequence[pin.SE3], rows: Sequence[NDArray[np.intp]]
+) -> list[tuple[pin.SE3, BoardView, Array]]:
+    """Pose and view of the board, and the stripe's pixels, of the observations that show both."""
+    return [
+        (pose, o.view, stripe_pixels(o.profile, r))
+        for o, pose, r in zip(observations, poses, rows, strict=True)
+        if o.view is not None and o.profile is not None and len(r)
+    ]
 
 
 def _expected(hand_eye: HandEye, o: ScanObservation) -> pin.SE3:

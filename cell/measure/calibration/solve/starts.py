@@ -162,16 +162,15 @@ class Crossing:
     axis: int
 
 
-def paper_plane(
-    camera: CameraModel, camera_from_board: Sequence[pin.SE3], views: Sequence[BoardView], stripes: Sequence[Array]
-) -> tuple[LightPlane, float]:
+def paper_plane(camera: CameraModel, crossed: Sequence[tuple[pin.SE3, BoardView, Array]]) -> tuple[LightPlane, float]:
     """The light plane by section 4.1 of the paper, and the RMS distance of its points in m.
 
-    `stripes` are pixels (n, 2) on the boards. Needs no arm. Step 2, camera and poses, comes first: a row of dots is a
-    straight line only without distortion. Raises RefusedError when the stripe crosses too few rows for a plane.
+    `crossed` are camera_from_board, the view, and pixels (n, 2) of the stripe on the board. Step 2, camera and poses,
+    comes before: a row of dots is a straight line only without distortion. Raises RefusedError when the stripe crosses
+    too few rows for a plane.
     """
     points, seen = [], 0
-    for pose, view, stripe in zip(camera_from_board, views, stripes, strict=True):
+    for pose, view, stripe in crossed:
         ideal = _ideal_centres(camera, pose, view)
         crossings = _rows_crossed(camera, view, ideal, stripe)
         if crossings:

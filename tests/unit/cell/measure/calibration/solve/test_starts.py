@@ -52,7 +52,7 @@ def test_the_paper_s_steps_find_the_plane_of_exact_views(world):
     camera = CameraModel(640, 480, 1.0, 1.0, 0.0, 0.0).with_parameters(world.lens)
     poses = [from_matrix(world.camera_from_board(k, np.zeros(7))) for k in range(len(exact))]
     stripes = [o.profile.pixels()[200:300] for o in exact]
-    plane, rms = paper_plane(camera, poses, [o.view for o in exact], stripes)
+    plane, rms = paper_plane(camera, list(zip(poses, [o.view for o in exact], stripes, strict=True)))
     # The stripe's line is fitted without the print's rows left out, and the lens bends it by nothing that is left.
     np.testing.assert_allclose(plane.n / plane.distance, world.plane, rtol=1e-4, atol=2e-3)
     assert rms < 2e-6
