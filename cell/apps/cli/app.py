@@ -1,6 +1,6 @@
 """The table of commands. Their bodies import what they need when they run, so that `cell --help` stays quick.
 
-A wrong command line as one line in our words, and what was meant to be typed instead."""
+A wrong command line is told in one line, with what was meant to be typed instead."""
 
 from __future__ import annotations
 
@@ -13,20 +13,7 @@ import typer
 
 from cell.apps.cli import EXIT_USAGE
 from cell.apps.cli.calibration import calibrate
-from cell.apps.cli.commands import (
-    commission,
-    console,
-    devices,
-    doctor,
-    export,
-    new_job,
-    record,
-    run,
-    runs,
-    setup,
-    sim,
-    watch,
-)
+from cell.apps.cli.commands import commission, console, devices, run, runs, setup
 from drivers.errors import CellError, ConfigError
 
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -53,9 +40,8 @@ class App(typer.Typer):
                 raise ConfigError(text) from error
             code = EXIT_USAGE
         except typer.Abort as error:
-            raise CellError(
-                "a question was not answered, so nothing was done; answer it, or give it as an option"
-            ) from error
+            unanswered = "a question was not answered, so nothing was done; answer it, or give it as an option"
+            raise CellError(unanswered) from error
         sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -107,9 +93,18 @@ def _cell(
     console_log(verbose)
 
 
-for group in (run, runs, record, export, calibrate, devices, doctor, commission, setup, new_job, console, watch):
-    group.register(app)
-app.add_typer(sim.app, name="sim")
+for command in (
+    run.run, run.dry_run, run.resume,
+    runs.abort, runs.pause, runs.go_on, runs.confirm, runs.runs, runs.report, runs.export, runs.replay,
+    devices.jog, devices.home, devices.recover, devices.diag, devices.find, devices.devices, devices.doctor,
+    setup.init, setup.check, setup.new_job, commission.commission, console.console,
+):  # fmt: skip
+    # A distance such as -10mm is no option.
+    settings = {"ignore_unknown_options": True} if command is devices.jog else None
+    app.command(command.__name__.replace("_", "-"), context_settings=settings)(command)
+calibrate.register(app)
+app.add_typer(runs.record, name="record")
+app.add_typer(setup.sim, name="sim")
 
 
 def _add_groups() -> None:

@@ -7,19 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cell.apps.cli.options import (  # fmt: skip
-    CellClock,
-    ConfigOption,
-    Confirm,
-    JobOption,
-    JsonOption,
-    Level,
-    LevelOption,
-    SeedOption,
-    SimOption,
-    print_json,
-    wide_console,
-)
+from cell.apps.cli import options
+from cell.apps.cli.options import CellClock, ConfigOption, Confirm, Level, new_table, print_json, wide_console
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,25 +27,20 @@ ConfirmOption = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
-    app.command()(commission)
-
-
 def commission(
     only: OnlyArgument = None,
     config: ConfigOption = None,
-    job: JobOption = "pot",
+    job: options.JobOption = "pot",
     until: Annotated[str | None, typer.Option(help="Stop after the check of this name.")] = None,
     again: Annotated[bool, typer.Option("--again", help="Do these checks again, also those that are good.")] = False,
     show: Annotated[bool, typer.Option("--list", help="Only say how the checks stand; nothing is connected.")] = False,
-    sim: SimOption = None,
+    sim: options.SimOption = None,
     truth: TruthOption = None,
-    seed: SeedOption = 1,
-    level: LevelOption = Level.nominal,
+    seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal,
     clock: ClockOption = CellClock.wall,
     confirm: ConfirmOption = None,
-    json: JsonOption = False,
+    json: options.JsonOption = False,
 ) -> None:
     """Take a cell into service: checks in a safe order, each confirmed before its axis first moves.
 
@@ -126,7 +110,6 @@ class _Page:
         self._numbers = {check.name: k for k, check in enumerate(checks, 1)}
 
     def __call__(self, check: CommissionCheck, verdict: str, result: Result | None) -> None:
-        from rich.table import Table
         from rich.text import Text
 
         from cell.apps.commission.check import bounds
@@ -138,9 +121,8 @@ class _Page:
         if result is None:
             return
         if result.readings:
-            table = Table(show_header=True, header_style="dim", box=None, pad_edge=False)
-            for name in ("measured", "value", "unit", "allowed", ""):
-                table.add_column(name, justify="right" if name in ("value", "allowed") else "left")
+            columns = ("measured", ">value", "unit", ">allowed", "")
+            table = new_table(None, *columns, header_style="dim", box=None, pad_edge=False)
             for row in result.readings:
                 allowed = bounds(row)
                 mark = Text("") if not allowed else Text("ok", "green") if row.ok else Text("outside", "red")
@@ -165,11 +147,8 @@ def _list(made: Commissioning, checks: list[CommissionCheck], json: bool) -> Non
     if json:
         print_json(rows)
         return
-    from rich.table import Table
-
-    table = Table(show_lines=True)
-    for name in ("name", "standing", "moves", "far", "fast", "limit"):
-        table.add_column(name, overflow="fold")
+    columns = ("name", "standing", "moves", "far", "fast", "limit")
+    table = new_table(None, *columns, show_lines=True)
     for row in rows:
-        table.add_row(*(str(row[name]) for name in ("name", "standing", "moves", "far", "fast", "limit")))
+        table.add_row(*(str(row[name]) for name in columns))
     wide_console().print(table)

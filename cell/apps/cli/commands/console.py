@@ -20,11 +20,6 @@ NoOpenOption = Annotated[bool, typer.Option("--no-open", help="Do not open the p
 PortOption = Annotated[int, typer.Option("--port", min=0, max=65535, help="Where the page is; 0 is any that is free.")]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command of this file."""
-    app.command()(console)
-
-
 def console(
     config: ConfigOption = None,
     sim: SimOption = None,

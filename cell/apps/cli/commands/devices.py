@@ -1,4 +1,4 @@
-"""`cell jog`, `cell home`, `cell diag`: one device at a time; `cell find`: what is there; `cell devices`: makes."""
+"""One device at a time, and the computer: `cell jog`, `home`, `recover`, `diag`, `find`, `devices`, `doctor`."""
 
 from __future__ import annotations
 
@@ -7,58 +7,29 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cell.apps.cli import options as completing
-from cell.apps.cli.options import (
-    ConfigOption,
-    JobOption,
-    JsonOption,
-    Level,
-    LevelOption,
-    SeedOption,
-    SimOption,
-    SpeedOption,
-    new_table,
-    print_json,
-    wide_console,
-)
+from cell.apps.cli import options
+from cell.apps.cli.options import ConfigOption, JsonOption, Level, new_table, print_json, wide_console
 
 if TYPE_CHECKING:
     from cell.devices.diagnosis.diagnosis import Diagnosis
     from cell.devices.diagnosis.local_devices import Found
-    from drivers.interfaces import Reading
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command(context_settings={"ignore_unknown_options": True})(jog)
-    app.command()(home)
-    app.command()(recover)
-    app.command()(diag)
-    app.command()(find)
-    app.command()(devices)
 
 
 def jog(
-    device: Annotated[
-        str | None,
-        typer.Argument(
-            help="rail, arm or vehicle.",
-            autocompletion=completing.jogged,
-        ),
-    ] = None,
+    device: Annotated[str | None, typer.Argument(help="rail, arm or vehicle.", autocompletion=options.jogged)] = None,
     motion: Annotated[
         list[str] | None,
         typer.Argument(help="rail: +5mm · arm: z -10mm, rx +2deg or j3 +5deg · vehicle: +0.1m or +5deg."),
     ] = None,
     config: ConfigOption = None,
-    job: JobOption = "pot",
+    job: options.JobOption = "pot",
     lift: Annotated[
         list[str] | None, typer.Option("--lift", help="An interlock that a person lifts; needs a --reason.")
     ] = None,
     reason: Annotated[str, typer.Option("--reason", help="Why interlocks are lifted; it is recorded.")] = "",
-    sim: SimOption = None,
-    seed: SeedOption = 1,
-    level: LevelOption = Level.nominal,
+    sim: options.SimOption = None,
+    seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal,
     json: JsonOption = False,
 ) -> None:
     """Move one device by a little: refused outside its limits or while a run holds the cell."""
@@ -88,12 +59,12 @@ def jog(
 
 def home(
     device: Annotated[
-        str | None, typer.Argument(help="rail or arm alone; without it both.", autocompletion=completing.homed)
+        str | None, typer.Argument(help="rail or arm alone; without it both.", autocompletion=options.homed)
     ] = None,
     config: ConfigOption = None,
-    sim: SimOption = None,
-    seed: SeedOption = 1,
-    level: LevelOption = Level.nominal,
+    sim: options.SimOption = None,
+    seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal,
 ) -> None:
     """Home the rail and bring the arm to its folded posture above the deck."""
     from cell.apps.cli.progress import tell_question
@@ -112,9 +83,9 @@ def home(
 def recover(
     by: Annotated[str | None, typer.Option(help="Who has looked; without it, a terminal asks.")] = None,
     config: ConfigOption = None,
-    sim: SimOption = None,
-    seed: SeedOption = 1,
-    level: LevelOption = Level.nominal,
+    sim: options.SimOption = None,
+    seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal,
 ) -> None:
     """Clear a fault while nothing runs: unlock the arm's protective stop, clear the vehicle's fault. Nothing moves.
 
@@ -143,14 +114,14 @@ def diag(
     device: Annotated[
         list[str] | None,
         typer.Option(
-            "--device", "-d", help="Only this device; may be given more than once.", autocompletion=completing.devices
+            "--device", "-d", help="Only this device; may be given more than once.", autocompletion=options.devices
         ),
     ] = None,
     config: ConfigOption = None,
-    sim: SimOption = None,
-    seed: SeedOption = 1,
-    level: LevelOption = Level.nominal,
-    speed: SpeedOption = 1.0,
+    sim: options.SimOption = None,
+    seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal,
+    speed: options.SpeedOption = 1.0,
     json: JsonOption = False,
 ) -> None:
     """Ask the devices how they are: identity, state, errors, figures with their limits. Exit code 1 if any is not well.
@@ -223,8 +194,33 @@ def devices(json: JsonOption = False) -> None:
     wide_console().print(table)
 
 
+def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
+    """Look whether this computer is fit for the cell: packages, room, clocks, ports, CAN, libraries, a browser.
+
+    Touches no device. Exit code 1 when something is wrong that the configured cell needs; what mends it is beside it.
+    """
+    from cell.apps.doctor import examine_computer
+
+    rows = examine_computer(config)
+    if json:
+        print_json([row.as_dict() for row in rows])
+    else:
+        from rich.text import Text
+
+        colours = {"ok": "green", "wrong": "red", "not needed": "dim"}
+        table = new_table(None, "what", "state", "found", "what mends it")
+        table.columns[1].no_wrap = True
+        for row in rows:
+            table.add_row(Text(row.what), Text(row.state, style=colours[row.state]), Text(row.found), Text(row.mend))
+        wide_console().print(table)
+    if any(row.state == "wrong" for row in rows):
+        raise typer.Exit(1)
+
+
 def _print_table(rows: list[Diagnosis]) -> None:
     from rich.console import Console
+
+    from cell.apps.commission.check import bounds
 
     console = Console()
     columns = ("device", "identity", "address", ">ms p50\np99", "errors", "state")
@@ -243,7 +239,7 @@ def _print_table(rows: list[Diagnosis]) -> None:
     for row in rows:
         for reading in row.readings:
             mark = "[green]ok[/]" if reading.ok else "[red]outside[/]"
-            told = f"{reading.value:.4g}", reading.unit, _allowed(reading)
+            told = f"{reading.value:.4g}", reading.unit, bounds(reading)
             figures.add_row(row.device, reading.what, *told, mark if told[-1] else "")
             if not reading.ok:
                 outside.append(f"{row.device}, {reading.what} {told[0]} {told[1]}, allowed {told[2]}: {reading.remedy}")
@@ -251,15 +247,3 @@ def _print_table(rows: list[Diagnosis]) -> None:
         console.print(figures)
     for line in outside:
         console.print(line, style="red", markup=False, soft_wrap=True)
-
-
-def _allowed(reading: Reading) -> str:
-    match reading.least, reading.most:
-        case None, None:
-            return ""
-        case None, most:
-            return f"≤ {most:g}"
-        case least, None:
-            return f"≥ {least:g}"
-        case least, most:
-            return f"{least:g} to {most:g}"

@@ -10,20 +10,9 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
-from cell.apps.cli import options as completing
+from cell.apps.cli import options
 from cell.apps.cli.commands.runs import NoiseOption, RunArgument, folder_of_runs
-from cell.apps.cli.options import (  # fmt: skip
-    CellClock,
-    ConfigOption,
-    Confirm,
-    JobOption,
-    JsonOption,
-    Level,
-    LevelOption,
-    SeedOption,
-    SimOption,
-    print_json,
-)
+from cell.apps.cli.options import CellClock, ConfigOption, Confirm, JobOption, JsonOption, Level, print_json
 from sim_backends.faults import FAULT_NAMES
 
 if TYPE_CHECKING:
@@ -32,8 +21,7 @@ if TYPE_CHECKING:
     from cell.run.session.supervisor import Cell
 
 UntilOption = Annotated[
-    str | None,
-    typer.Option(help="End the run, done, after the step of this name.", autocompletion=completing.steps),
+    str | None, typer.Option(help="End the run, done, after the step of this name.", autocompletion=options.steps)
 ]
 AtStartOption = Annotated[
     bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
@@ -54,7 +42,7 @@ InjectOption = Annotated[
         "--inject",
         help='A scheduled fault, such as "arm.protective_stop@laser_sweep:40%"; repeatable. What can be '
         f"injected, not named as the codes that are reported: {', '.join(FAULT_NAMES)}.",
-        autocompletion=completing.faults,
+        autocompletion=options.faults,
     ),
 ]
 ConfirmOption = Annotated[
@@ -62,16 +50,8 @@ ConfirmOption = Annotated[
     typer.Option(help='"simulated": the dry run confirms by itself what a person has to; else `cell confirm`.'),
 ]
 ConsoleOption = Annotated[
-    bool,
-    typer.Option("--console", help="Show it in a browser, until its page is closed; or, with --no-open, ended."),
+    bool, typer.Option("--console", help="Show it in a browser, until its page is closed; or, with --no-open, ended.")
 ]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command()(run)
-    app.command("dry-run")(dry_run)
-    app.command()(resume)
 
 
 def run(
@@ -79,9 +59,9 @@ def run(
     config: ConfigOption = None,
     at_start: AtStartOption = False,
     until: UntilOption = None,
-    sim: SimOption = None,
-    seed: SeedOption = 1,
-    level: LevelOption = Level.nominal,
+    sim: options.SimOption = None,
+    seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal,
     pace: Annotated[
         float, typer.Option("--pace", help="Arm and vehicle at this share of their planned speed, 0.25 to 1.")
     ] = 1.0,
@@ -107,8 +87,8 @@ def run(
 def dry_run(
     job: JobOption = "pot",
     config: ConfigOption = None,
-    seed: SeedOption = 1,
-    level: LevelOption = Level.nominal,
+    seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal,
     speed: SpeedOption = None,
     clock: ClockOption = None,
     inject: InjectOption = None,

@@ -1,33 +1,45 @@
-"""`cell abort`, `pause`, `go-on`, `confirm`, `runs`, `report`: what goes on in another process, and what was run."""
+"""What goes on in another process, and what was run.
+
+`cell abort`, `pause`, `go-on`, `confirm`; `cell runs`, `report`, `export`; `cell record repair`, `info`, `export` and
+`cell replay` for the record of a run.
+"""
 
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from cell.apps.cli import options as completing
+from cell.apps.cli import options
 from cell.apps.cli.options import ConfigOption, JsonOption, print_json
 
 RunArgument = Annotated[
-    str | None,
-    typer.Argument(help="A run's folder, name or id. Without it, the newest.", autocompletion=completing.runs),
+    str | None, typer.Argument(help="A run's folder, name or id. Without it, the newest.", autocompletion=options.runs)
 ]
 NoiseOption = Annotated[
     bool, typer.Option("--noise", help="Also show the noise that is assumed, and how several sweeps agree.")
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands of this file."""
-    app.command()(abort)
-    app.command()(pause)
-    app.command("go-on")(go_on)
-    app.command()(confirm)
-    app.command()(runs)
-    app.command()(report)
+class Format(StrEnum):
+    """What can be written."""
+
+    ply = "ply"
+    e57 = "e57"
+    stl = "stl"
+    mesh = "mesh"
+
+
+class Wires(StrEnum):
+    """How raw traffic can be written."""
+
+    candump = "candump"
+    text = "text"
 
 
 def abort(
@@ -41,12 +53,12 @@ def abort(
 
     going = [run for run in list_runs(_going_folder(config)) if listens(run)] if name is None else []
     if not going:
-        _ask(name, config, "abort", reason, "asked {} to end")
+        _ask(_going(name, config), "abort", reason, "asked {} to end")
     # Whoever says stop does not choose: everything that goes on here ends.
     unasked = []
     for run in going:
         try:
-            _ask(str(run), config, "abort", reason, "asked {} to end")
+            _ask(_going(str(run), config), "abort", reason, "asked {} to end")
         except ConfigError as error:
             if listens(run):
                 unasked.append(str(error))
@@ -58,12 +70,12 @@ def abort(
 
 def pause(name: RunArgument = None, config: ConfigOption = None) -> None:
     """Hold what is going on in another process: at its next safe point, that is before its next free motion or step."""
-    _ask(name, config, "pause", "asked for with `cell pause`", "asked {} to hold before its next motion")
+    _ask(_going(name, config), "pause", "asked for with `cell pause`", "asked {} to hold before its next motion")
 
 
 def go_on(name: RunArgument = None, config: ConfigOption = None) -> None:
     """Let a paused run go on."""
-    _ask(name, config, "go-on", "asked for with `cell go-on`", "asked {} to go on")
+    _ask(_going(name, config), "go-on", "asked for with `cell go-on`", "asked {} to go on")
 
 
 def confirm(
@@ -95,14 +107,13 @@ def confirm(
     if question is None and sys.stdin.isatty() and not typer.confirm("Have you looked, and may the run go on?"):
         raise typer.Exit(EXIT_FAILED)
     answer = f"told {{}} that question {waits.number} is confirmed"
-    _ask(str(folder), config, "confirm", reason=by or getpass.getuser(), answer=answer, number=waits.number)
+    _ask(_going(str(folder), config), "confirm", by or getpass.getuser(), answer, waits.number)
 
 
-def _ask(name: str | None, config: Path | None, kind: str, reason: str, answer: str, number: int | None = None) -> None:
+def _ask(folder: Path, kind: str, reason: str, answer: str, number: int | None = None) -> None:
     from drivers.errors import ConfigError
     from statemachine.journal import JournalError, request
 
-    folder = _going(name, config)
     try:
         request(folder, kind, reason, number)
     except JournalError as error:
@@ -164,6 +175,198 @@ def report(
         print_json(data)
     else:
         print_report(data, str(folder), noise=noise, whole=True)
+
+
+def export(
+    name: RunArgument = None,
+    kind: Annotated[
+        Format, typer.Option("--format", "-f", help="ply, e57: the points; stl, mesh: triangles (mesh: coloured PLY).")
+    ] = Format.ply,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="The file. Without it, in the run's folder.")] = None,
+    job: Annotated[
+        str | None, typer.Option("--job", "-j", help="The job whose nominal surface to compare with; else the run's.")
+    ] = None,
+    limit: Annotated[str, typer.Option(help="Deviation at which the colours end, such as 0.2 mm.")] = "0.2 mm",
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Write a run's cloud as PLY, E57 or mesh, coloured by its deviation from the nominal surface, in metres."""
+    from cell.config.cell_config import beside, find_config, load_config
+    from cell.run.folder import find_run
+    from cell.run.report.export import SUFFIXES, export_run
+    from drivers.common.units import parse_quantity
+    from drivers.errors import ConfigError
+
+    try:
+        end = parse_quantity(limit, "mm", 0.001, 100)
+    except ValueError as error:
+        raise ConfigError(f"--limit: {error}") from error
+    source = find_config(config, simulated=True)
+    folder = find_run(beside(source) / load_config(source).cell.runs, name, "job")
+    path = out or folder / f"export-{kind.value}{SUFFIXES[kind.value]}"
+    if path.suffix.lower() != SUFFIXES[kind.value]:
+        raise ConfigError(f"--out {path}: a file of format {kind.value} ends in {SUFFIXES[kind.value]}")
+    if not path.parent.is_dir():
+        raise ConfigError(f"--out {path}: there is no folder {path.parent}; make it first")
+    written = export_run(folder, kind.value, path, job, end)
+    if json:
+        print_json(written)
+        return
+    deviation = written.get("deviation_mm")
+    typer.echo(
+        f"{written['file']}: {written['points']} points"
+        + (f", {written['triangles']} triangles" if "triangles" in written else "")
+        + ("" if deviation is None else f"; off the nominal surface: rms {deviation['rms']:.4f} mm")
+    )
+
+
+# --- the record of a run ---
+
+record = typer.Typer(help="The record of a run, record.mcap.", no_args_is_help=True)
+
+
+@record.callback()
+def _group() -> None:
+    """The record of a run, record.mcap."""
+
+
+@record.command()
+def repair(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
+    """Close the record of a run that was cut off, so that every reader opens it; a whole one stays as it is."""
+    from cell.run.folder import is_going
+    from cell.run.record import reading as work
+    from drivers.errors import ConfigError
+
+    path, folder = _record(name, config)
+    if folder is not None and is_going(folder):
+        raise ConfigError(f"{folder.name} is still going on and writes its record; end it first")
+    with _bar("repair") as progress:
+        done = work.repair(path, progress)
+    if json:
+        whole = done.whole and done.messages > 0
+        told = {"file": str(path), "whole": whole, "messages": done.messages, "lost_bytes": done.lost}
+        print_json({**told, "damaged": done.damaged})
+    elif done.whole and not done.messages:
+        typer.echo(f"{path} is closed and empty: it holds no message; nothing was changed")
+    elif done.damaged:
+        typer.echo(
+            f"{path} was damaged: {'; '.join(done.damaged)}. {done.messages} messages kept, {done.lost} bytes let go; "
+            f"the old file is {path.name}{work.DAMAGED}"
+        )
+    elif done.whole:
+        typer.echo(f"{path} is whole, {done.messages} messages; nothing was changed")
+    else:
+        typer.echo(f"{path} is closed: {done.messages} messages kept, the last {done.lost} bytes were of no use")
+
+
+@record.command()
+def info(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
+    """Show what a record holds: its channels, their messages and sizes, and what was let go."""
+    from rich.console import Console
+
+    from cell.run.record.reading import information
+
+    path, _ = _record(name, config)
+    data = information(path)
+    if json:
+        print_json(data)
+        return
+    table = options.new_table(None, "channel", "schema", ">messages", ">kB", box=None)
+    for row in data["channels"]:
+        table.add_row(row["topic"], row["schema"], str(row["messages"]), f"{row['bytes'] / 1000:.1f}")
+    Console().print(table)
+    whole = "whole" if data["whole"] else f"cut off, {data['lost_bytes']} bytes at its end are of no use"
+    if data["damaged"]:
+        whole = f"DAMAGED, it does not fit its CRC: {'; '.join(data['damaged'])}; `cell record repair` leaves that out"
+    elif data["closed"] and not data["messages"]:
+        whole = "empty, it holds no message"
+    typer.echo(f"{path}: {data['bytes'] / 1e6:.1f} MB, {data['messages']} messages over {data['span_s']} s, {whole}")
+    if data["cpu_s"] is not None and data["span_s"]:
+        typer.echo(f"writing it took {data['cpu_s']:.2f} s of a core, {100 * data['cpu_s'] / data['span_s']:.1f} %")
+    if data["dropped"] is None:
+        closing = "" if data["closed"] else "; `cell record repair` closes it"
+        typer.echo(f"it does not tell what was let go: its last message is missing{closing}")
+    for topic, count in (data["dropped"] or {}).items():
+        typer.echo(f"let go, because too much came at once: {count} of {topic}")
+
+
+@record.command("export")
+def export_wires(
+    name: RunArgument = None,
+    kind: Annotated[
+        Wires, typer.Option("--format", "-f", help="candump: the CAN frames; text: all wires, a line each.")
+    ] = Wires.candump,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="The file. Without it, beside the record.")] = None,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Write the raw traffic of a run: CAN in candump's log format, or CAN, serial lines and RTDE as text."""
+    from cell.run.record.reading import FORMATS
+    from drivers.errors import ConfigError
+
+    path, _ = _record(name, config)
+    suffix, write = FORMATS[kind.value]
+    target = out or path.with_suffix(suffix)
+    if not target.parent.is_dir():
+        raise ConfigError(f"--out {target}: there is no folder {target.parent}; make it first")
+    count = write(path, target)
+    if json:
+        print_json({"file": str(target), "lines": count})
+        return
+    typer.echo(f"{target}: {count} {'CAN frames' if kind is Wires.candump else 'lines'}")
+    if not count:
+        typer.echo("nothing passed on a wire: on the virtual clock, or with that device in the same process, none does")
+
+
+def replay(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
+    """Feed a run's frames and readings through perception again: exits 1 unless cloud and pose come out bit for bit."""
+    from cell.apps.cli import EXIT_FAILED
+    from cell.run.folder import find_run
+    from cell.run.record import replay as work
+
+    folder = find_run(folder_of_runs(config), name, "job")
+    with _bar("replay") as progress:
+        compared = work.replay(folder, progress)
+    same = all(each.same for each in compared)
+    if json:
+        rows = [{"what": each.what, "same": each.same, "difference": each.difference} for each in compared]
+        print_json({"run": folder.name, "same": same, "compared": rows})
+    else:
+        for each in compared:
+            typer.echo(f"{each.what:<32} {each.difference or 'the same, bit for bit'}")
+        if not same:
+            typer.echo(
+                "not the same: this program or its libraries are other ones than those of the run, or its files were "
+                "changed; report.json names the version"
+            )
+    if not same:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _record(name: str | None, config: Path | None) -> tuple[Path, Path | None]:
+    """The record of a run, and the run's folder; or a file by its path."""
+    from cell.run.folder import find_run
+    from cell.run.record.file import FILE
+
+    if name is not None and Path(name).suffix == ".mcap":
+        return Path(name), None
+    folder = find_run(folder_of_runs(config), name)
+    return folder / FILE, folder
+
+
+@contextmanager
+def _bar(what: str) -> Iterator[Callable[[float, str], None]]:
+    """A bar on standard error while something long goes on; gives what tells it how far that is."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = TextColumn("{task.description}"), BarColumn(bar_width=30), TimeElapsedColumn()
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(what, total=1.0)
+        yield lambda share, text: progress.update(task, completed=share, description=text)
+
+
+# --- where the runs are ---
 
 
 def folder_of_runs(config: Path | None) -> Path:

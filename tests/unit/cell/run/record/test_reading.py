@@ -13,7 +13,7 @@ import pytest
 from can.io.canutils import CanutilsLogReader
 from mcap.reader import make_reader
 
-from cell.apps.cli.commands import record as record_command
+from cell.apps.cli.commands.runs import record
 from cell.run.record import file as record_file
 from cell.run.record.file import RecordFile
 from cell.run.record.reading import as_candump, as_text, information, repair
@@ -31,7 +31,7 @@ def test_a_record_without_a_message_is_not_whole(tmp_path: Path, capsys: pytest.
     told = information(path)
     assert (told["whole"], told["closed"], told["messages"]) == (False, True, 0)
     for command, says in (("info", "empty, it holds no message"), ("repair", "is closed and empty")):
-        record_command.app([command, str(path)], standalone_mode=False)
+        record([command, str(path)], standalone_mode=False)
         assert says in " ".join(capsys.readouterr().out.split())
 
 

@@ -1,0 +1,35 @@
+"""`cell jog`, `recover`, `doctor`: what they ask for first, and how they end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from cell.apps.cli.app import app
+from cell.config.cell_config import default_toml
+
+
+def test_a_jog_without_a_motion_and_a_recovery_by_nobody_say_what_they_lack(monkeypatch: pytest.MonkeyPatch) -> None:
+    refused = CliRunner().invoke(app, ["jog"])
+    assert "say what to move" in str(refused.exception)
+    assert "--sim all" in str(refused.exception)
+    monkeypatch.setattr("cell.run.session.supervisor.Cell.open", lambda *_, **__: pytest.fail("the cell was opened"))
+    refused = CliRunner().invoke(app, ["recover", "--sim", "all"])
+    assert "a person has to look at the cell first" in str(refused.exception)
+
+
+def test_only_what_the_configured_cell_needs_ends_with_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    without = json.loads(CliRunner().invoke(app, ["doctor", "--json"]).stdout)
+    assert {row["what"] for row in without if row["state"] == "wrong"} <= {"packages", "disk"}
+    (tmp_path / "cell.toml").write_text(default_toml())
+    real = CliRunner().invoke(app, ["doctor"])
+    assert real.exit_code == 1
+    assert "rail, port" in real.stdout
+    (tmp_path / "cell.toml").write_text("[cell]\n")
+    broken = CliRunner().invoke(app, ["doctor", "--json"])
+    assert broken.exit_code == 1
+    assert json.loads(broken.stdout)[0]["mend"] == "cell check -c cell.toml"
