@@ -1,4 +1,4 @@
-"""`cell commission`: how the checks stand is told without a device, and what belongs to a simulated cell stays there."""
+"""`cell commission`: how the checks stand is told without a device; what is for a simulated cell stays there."""
 
 from __future__ import annotations
 
