@@ -18,7 +18,9 @@ import typer
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
+from cell.procedures.steps.kinds import PLACE
 from drivers.common.units import parse_quantity
+from statemachine.sequence import JobTrigger
 
 DOCS = Path(__file__).parent
 ROOT = DOCS.parent
@@ -371,7 +373,41 @@ def rooms_svg() -> str:
     return "\n".join((*draw, "</svg>\n"))
 
 
+# --- the sequence ---
+
+
+def sequence_page() -> str:
+    """The page about the sequence, with its diagram drawn anew."""
+    there = (DOCS / "explanation/sequence.md").read_text(encoding="utf-8")
+    return re.sub(r"(?<=```mermaid\n).*?(?=```)", diagram(), there, count=1, flags=re.DOTALL)
+
+
+def diagram() -> str:
+    """The sequence of a job that places, for Mermaid; what all steps or all states share is one arrow."""
+    sequence = PLACE.sequence()
+    steps, states = set(sequence.steps), {str(row.source) for row in sequence.table}
+    inside: dict[str, None] = {}
+    around: dict[str, None] = {}
+    for row in sequence.table:
+        alike = [other for other in sequence.table if other.trigger is row.trigger]
+        sources = {str(other.source) for other in alike if other.target == row.target}
+        targets = {str(other.target) for other in alike if other.source == row.source}
+        source = "any_state" if sources == states else "job" if steps <= sources and row.source in steps else row.source
+        target = "job" if targets == steps else str(row.target)
+        # To any step up to the one where it stands: one arrow says as much as all of them.
+        if row.trigger is JobTrigger.AGAIN:
+            source = target = "job"
+        label = row.trigger.value + (f" [{row.guard.value}]" if row.guard.value else "")
+        (inside if {source, target} <= steps else around)[f"{source} --> {target} : {label}"] = None
+    lines = ["stateDiagram-v2", "    direction LR", "    state job {", "        direction LR"]
+    lines += [*(f"        {edge}" for edge in inside), "    }", '    state "any state" as any_state']
+    lines += ["    [*] --> idle", *(f"    {edge}" for edge in around)]
+    lines += [f"    {end} --> [*]" for end in ("placed", "refused", "faulted", "aborted")]
+    return "\n".join(lines) + "\n"
+
+
 PAGES = {
+    "explanation/sequence.md": sequence_page,
     "reference/cell-toml.md": cell_toml,
     "reference/job-toml.md": job_toml,
     "reference/command-line.md": command_line,

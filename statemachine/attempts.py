@@ -1,8 +1,4 @@
-"""One try at a step, from its row in the journal to its result; and what came of all tries so far.
-
-What a run waits for while the cell stands: that it goes on after a pause, and a person's word after a fault.
-
-Doing a step until it succeeds: repeating it, and clearing faults meanwhile, confirmed by a person where needed."""
+"""Doing a step until it succeeds: one try after the other, recovering from faults, and what a run waits for."""
 
 from __future__ import annotations
 

@@ -1,12 +1,8 @@
 """What a person or a program holds of a run that is going on: end it, hold it, let it go on, confirm.
 
-One object for every way to ask: the run's handle, another process through the journal, a signal, `Cell.stop()`. Whoever
-does the run's work asks here.
-
-The one thing that says that a run is to end: seen by every step, plan, wait and recovery of that run.
-
-A token is cancelled once and for ever, by whoever asks first: the operator, a signal, another process, a deadline, the
-cell's health, `Cell.stop()`. After that nothing of the run begins anything new."""
+There is one object for every way to ask: the run's handle, another process, a signal, `Cell.stop()`. Its token is
+cancelled once and for ever, by whoever asks first. After that nothing of the run begins anything new.
+"""
 
 from __future__ import annotations
 

@@ -1,10 +1,9 @@
 """Drives a sequence of steps to its end, whatever happens, and ends it safe.
 
-The work is done by the steps that are passed in. The runner has them watched (`statemachine.watchman`), repeats what
-the policy lets it repeat, and writes everything to the journal as it happens. It knows neither devices nor the cell:
-exceptions are judged by `classify`, the cell is brought to rest by `safe_stop`.
-
-What a script may do between the steps of a run: look at a result, and decide on a refusal."""
+The runner has the steps watched, repeats what the policy lets it repeat, and writes everything to the journal. It knows
+neither devices nor the cell: `classify` judges exceptions, `safe_stop` brings the cell to rest. A script may look at
+results between the steps, and decide on a refusal.
+"""
 
 from __future__ import annotations
 

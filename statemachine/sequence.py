@@ -1,13 +1,10 @@
 """The sequence of a job as data: its steps, the states around them, triggers, transitions and the guards on them.
 
-Which steps there are, and in which order, a job chooses. `Sequence` walks through the table that follows from them
-with the `transitions` library. Its callbacks only guard and log; no work is done here, and nothing is known of what a
-step does. `fault` and `abort` lead out of every state.
+Callbacks only guard and log; no work is done here. `fault` and `abort` lead out of every state.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum
@@ -43,7 +40,6 @@ class JobTrigger(Enum):
     RECOVER = "recover"
     RECOVERED = "recovered"
     ABORT = "abort"
-    RESET = "reset"
 
 
 class TransitionGuard(Enum):
@@ -90,10 +86,6 @@ def table(steps: tuple[str, ...], success: JobState) -> tuple[Transition, ...]:
     rows += [Transition(JobTrigger.RECOVERED, JobState.RECOVERING, step, TransitionGuard.INTERRUPTED) for step in steps]
     rows += [Transition(JobTrigger.FAULT, state, JobState.FAULTED) for state in states]
     rows += [Transition(JobTrigger.ABORT, state, JobState.ABORTED) for state in states]
-    rows += [
-        Transition(JobTrigger.RESET, end, JobState.IDLE)
-        for end in (success, JobState.REFUSED, JobState.FAULTED, JobState.ABORTED)
-    ]
     return tuple(rows)
 
 
@@ -144,11 +136,8 @@ class Sequence:
         self._machine = Machine(
             model=self._model,
             states=list(dict.fromkeys(str(row.source) for row in self.table)),
-            initial=JobState.IDLE.value,
-            auto_transitions=False,
-            queued=False,
-            send_event=False,
-        )
+            initial=JobState.IDLE.value, auto_transitions=False, queued=False, send_event=False,
+        )  # fmt: skip
         for row in self.table:
             self._machine.add_transition(
                 row.trigger.value, str(row.source), str(row.target), conditions=partial(self._holds, row)
@@ -171,28 +160,12 @@ class Sequence:
         if not moved:
             guards = {row.guard.value for row in self.table if (row.trigger, row.source) == (trigger, source)}
             raise SequenceError(f"'{trigger.value}' is held back in state '{source}': not {', '.join(guards)}")
-        if trigger is JobTrigger.RESET:
-            self.facts = Facts()
         if trigger is JobTrigger.AGAIN:
             self.facts.done -= set(self.steps[self.steps.index(self.state) :])
             self.facts.chosen = None
         if self.on_change is not None:
             self.on_change(trigger, source, self.state)
         return self.state
-
-    def allowed(self) -> tuple[Transition, ...]:
-        """The transitions that could be taken now."""
-        return tuple(row for row in self.table if row.source == self.state and self._holds(row))
-
-    def rows(self) -> tuple[Transition, ...]:
-        """The transitions as the machine itself holds them, for the diagram."""
-        guards = {(row.trigger, str(row.source), str(row.target)): row.guard for row in self.table}
-        found = []
-        for trigger in JobTrigger:
-            for way in self._machine.get_transitions(trigger.value):
-                source, target = str(way.source), str(way.dest)
-                found.append(Transition(trigger, source, target, guards[trigger, source, target]))
-        return tuple(found)
 
     def _holds(self, row: Transition) -> bool:
         facts = self.facts
@@ -210,49 +183,3 @@ class Sequence:
             case TransitionGuard.CHOSEN:
                 return row.target == facts.chosen
         return True
-
-
-def mermaid(sequence: Sequence) -> str:
-    """The diagram as `stateDiagram-v2` text, without a fence, ending in a newline."""
-    ends = (sequence.success, JobState.REFUSED, JobState.FAULTED, JobState.ABORTED)
-    inner: list[str] = []
-    outer: list[str] = []
-    for row in _drawn(sequence):
-        (inner if row[0] in sequence.steps and row[1] in sequence.steps else outer).append(_edge(*row))
-    lines = ["stateDiagram-v2", "    direction LR", "    state job {", "        direction LR"]
-    lines += [f"        {line}" for line in inner]
-    lines += ["    }", '    state "any state" as any_state', f"    [*] --> {JobState.IDLE.value}"]
-    lines += [f"    {line}" for line in outer]
-    lines += [f"    {end.value} --> [*]" for end in ends]
-    return "\n".join(lines) + "\n"
-
-
-def _drawn(sequence: Sequence) -> list[tuple[str, str, str]]:
-    """Edges (source, target, label), with the rows that share all steps or all states folded into one."""
-    rows, steps = sequence.rows(), set(sequence.steps)
-    states = {row.source for row in rows}
-    by_target: dict[tuple[JobTrigger, str], set[str]] = defaultdict(set)
-    by_source: dict[tuple[JobTrigger, str], set[str]] = defaultdict(set)
-    for row in rows:
-        by_target[row.trigger, row.target].add(row.source)
-        by_source[row.trigger, row.source].add(row.target)
-    edges: list[tuple[str, str, str]] = []
-    for row in rows:
-        source, target = str(row.source), str(row.target)
-        if by_target[row.trigger, row.target] == states:
-            source = "any_state"
-        elif row.source in steps and by_target[row.trigger, row.target] >= steps:
-            source = "job"
-        if by_source[row.trigger, row.source] == steps:
-            target = "job"
-        # To any step up to the one where it stands: one arrow says as much as all of them.
-        if row.trigger is JobTrigger.AGAIN:
-            source = target = "job"
-        label = row.trigger.value + (f" [{row.guard.value}]" if row.guard.value else "")
-        if (source, target, label) not in edges:
-            edges.append((source, target, label))
-    return edges
-
-
-def _edge(source: str, target: str, label: str) -> str:
-    return f"{source} --> {target} : {label}"

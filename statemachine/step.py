@@ -1,9 +1,8 @@
-"""What passes between the runner and the steps: the context a step is given, events, and records of how it went.
+"""What passes between the runner and the steps: context, policy, events, and records of how it went.
 
-Deadlines, retries and recovery choices of the steps, as data.
-
-Exceptions are named by their class names, so that a policy can be written without importing what raises them.
-A failure is looked at in this order: an end that was asked for; a retry; a recovery; the end of the run."""
+A policy names exceptions by their class names, so that it imports nothing that raises them. A failure is looked at in
+this order: an end that was asked for; a retry; a recovery; the end of the run.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Two ways to have work done and to look around meanwhile: in threads on the wall's clock, in line on a virtual one.
 
-On the wall's clock the work has a thread of its own, so that whoever watches can always act, even while the work sits
-in a long computation. On a virtual clock time moves when somebody waits: the work is done in the thread that watches,
-which looks around each time it has let time pass. That is one thread, so the same work takes the same course.
+On the wall's clock the work has a thread of its own, so whoever watches can always act. On a virtual clock time moves
+when somebody waits: the work is done in the thread that watches, so the same work takes the same course.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Looks around while a run's work goes on, ends it when it has to end, and brings the cell to rest.
 
-What ends work: a request of a person or a program, a signal, its deadline, the cell's health.
-
-Tells what happens in a run: its journal, its observer, and the list of its faults for the report."""
+What ends work: a request of a person or a program, a signal, its deadline, the cell's health. All is told here.
+"""
 
 from __future__ import annotations
 

@@ -9,10 +9,9 @@ from typing import Any
 from cell.config.cell_config import DEVICES, CellConfig
 from cell.devices.devices import Devices
 from cell.devices.gate.gate import Gate
-from cell.devices.gate.gated import GatedArm, GatedClaw, GatedRail, GatedVehicle
+from cell.devices.gate.gated import GatedArm, GatedCamera, GatedClaw, GatedLaser, GatedRail, GatedVehicle
 from cell.devices.gate.interlocks import Interlocks, Situation
 from cell.devices.gate.rules import RULES, Ways
-from cell.devices.gate.scan_head import GatedCamera, GatedLaser
 from cell.measure.geometry.poses import to_ur
 from cell.motion.kinematics import HOME, MODELS, arm_kinematics
 from drivers.clock import Clock
@@ -79,12 +78,9 @@ def connect_one(config: CellConfig, name: str, clock: Clock, *, arm: Arm | None 
     if DEVICES[name] == "arm":
         # Its own process switches the laser off when this one dies.
         around = Surroundings(
-            clock,
-            look,
-            safe_off_outputs=safe_off_outputs(config),
-            reach=MODELS[config.arm.model].reach,
+            clock, look, safe_off_outputs=safe_off_outputs(config), reach=MODELS[config.arm.model].reach,
             forward_of=lambda table: _forward(config, table),
-        )
+        )  # fmt: skip
     make = config.make(name)
     device = make.connect(name, config.device(name), around)
     if missing := [method for method in methods(INTERFACES[make.kind]) if not hasattr(device, method)]:
@@ -127,27 +123,18 @@ def behind_gate(
     ways = Ways(config, None if arm is None else arm.link_table())
     switched = (config.laser, "laser"), (config.claw, "claw")
     situation = Situation(
-        arm,
-        vehicle,
-        laser,
-        claw=claw,
-        outputs={record.output: owner for record, owner in switched if isinstance(record, OnArm)},
-        clear=ways.clear,
-        forward=ways.forward,
-        postures={"HOME": HOME},
-        configuration=config.calibration_hash(),
-        slowed=ways.slowed,
+        arm, vehicle, laser, claw=claw,
+        outputs={record.output: owner for record, owner in switched if isinstance(record, OnArm)}, clear=ways.clear,
+        forward=ways.forward, postures={"HOME": HOME}, configuration=config.calibration_hash(), slowed=ways.slowed,
         clock=clock,
-    )
+    )  # fmt: skip
     gate = Gate(Interlocks(situation, RULES))
     return Devices(
-        clock,
-        gate,
-        arm=None if arm is None else GatedArm(arm, gate),
+        clock, gate, arm=None if arm is None else GatedArm(arm, gate),
         rail=None if rail is None else GatedRail(rail, gate),
         vehicle=None if vehicle is None else GatedVehicle(vehicle, gate),
         scan_camera=None if scan_camera is None else GatedCamera(scan_camera, gate),
         target_camera=None if target_camera is None else GatedCamera(target_camera, gate),
         laser=None if laser is None else GatedLaser(laser, gate, clock),
         claw=None if claw is None else GatedClaw(claw, gate),
-    )
+    )  # fmt: skip

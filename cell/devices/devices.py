@@ -1,6 +1,4 @@
-"""The devices of one cell together: those that are connected, their clock, their stop and their end.
-
-The safe stop as every run and every ending uses it, and what in the cell's health ends a run."""
+"""The devices of one cell together: those that are connected, their clock, their stop, their health and their end."""
 
 from __future__ import annotations
 
@@ -8,9 +6,8 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, TypeVar
 
 from cell.devices.gate.gate import Gate
-from cell.devices.gate.gated import GatedRail
+from cell.devices.gate.gated import GatedLaser, GatedRail
 from cell.devices.gate.interlocks import Interlocks
-from cell.devices.gate.scan_head import GatedLaser
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceError, DeviceFault, NotConnectedError
 from drivers.interfaces import Arm, ArmSafety, Camera, Claw, Device, Vehicle

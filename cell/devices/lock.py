@@ -25,10 +25,9 @@ OWN = "CELL_LOCKS"
 class CellLock:
     """Held by the process that has devices of the cell open; the kernel drops it when that process ends.
 
-    Each device's address is held by itself, whoever the users are, so that neither two cells nor two configurations
-    share a device: by a lock on a file in a folder of the user, which a stale file is none of, and for other users by a
-    name in the kernel's abstract socket space. Anybody can take such a name. The refusal then tells who has it, and how
-    to go on without it.
+    Each device's address is held by itself, so neither two cells nor two configurations share one: by a lock on a file
+    in a folder of the user, and for other users by a name in the kernel's abstract socket space. Anybody can take such
+    a name. The refusal tells who has it, and how to go on without it.
     """
 
     def __init__(self, config: CellConfig, only: Collection[str] = tuple(DEVICES)) -> None:

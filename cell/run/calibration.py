@@ -32,8 +32,7 @@ from cell.motion.kinematics import kinematics_name
 from cell.procedures.calibrate.boards import collect_scan, collect_target
 from cell.procedures.calibrate.reference_plate import look_at_witness, with_edge
 from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
-from cell.procedures.verify.verdict import Verification, keep_confirmed
-from cell.procedures.verify.views import collect_verification
+from cell.procedures.calibrate.verification import Verification, collect_verification, keep_confirmed
 from cell.run.folder import REPORT, new_run, run_log, when
 from cell.run.recorded_work import Hands
 from cell.run.runs import Run

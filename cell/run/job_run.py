@@ -24,9 +24,8 @@ from cell.config.cell_config import DEVICES, CellConfig
 from cell.config.job import Job, load_job
 from cell.devices.devices import Devices, require_healthy, stop_cell
 from cell.devices.simulated.following import DeviceFollowing
-from cell.devices.simulated.injection import Injector
 from cell.devices.simulated.mixed import beware
-from cell.devices.simulated.process import is_whole
+from cell.devices.simulated.process import Injector, is_whole
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Pace
 from cell.procedures.drive.way import Whereabouts

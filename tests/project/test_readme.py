@@ -12,8 +12,6 @@ import typer
 import cell
 import lab.cli
 from cell.apps.cli.app import app
-from cell.procedures.steps.kinds import PLACE
-from statemachine.sequence import mermaid
 from tests.support import ROOT
 
 PAGES = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").rglob("*.md"))]
@@ -35,10 +33,6 @@ def command_lines() -> list[str]:
     text = "\n".join(part for page in PAGES for part in blocks("sh", page))
     parts = re.split(r"[;\n]|&&", re.sub(r"#.*", "", text))
     return sorted({re.sub(r"[\[\]]", "", part).strip() for part in parts if part.strip().startswith("cell ")})
-
-
-def test_the_diagram_is_current() -> None:
-    assert block("mermaid", "docs/explanation/sequence.md").strip() == mermaid(PLACE.sequence()).strip()
 
 
 def test_the_readme_is_short() -> None:

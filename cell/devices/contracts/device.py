@@ -1,21 +1,80 @@
-"""What every device promises, of whatever kind. Derive from the suite of a kind, not from this.
-
-What the cell relies on in a camera.
-
-What the cell relies on in a laser and in a claw."""
+"""How a device is put to a suite, what every device promises, and what the cell relies on in camera, laser and claw."""
 
 from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import pytest
 
-from cell.devices.contracts import Bench
+from drivers.clock import Clock
 from drivers.errors import InterlockError, LimitError, NotConnectedError
 from drivers.interfaces import Camera, Claw, Device, Laser
 
+Connected = TypeVar("Connected", bound=Device)
+
+
+class Faults(Protocol):
+    """How a simulated device is given a fault, and how what caused it is taken away, as a person would."""
+
+    def cause(self, name: str) -> None:
+        """Cause the fault with this code, such as `arm.protective_stop`, now."""
+
+    def clear(self) -> None:
+        """Take away whatever causes faults: the button is released, the motor is well again, an arm that the device
+        hangs on is ready again."""
+
+
+@dataclass(eq=False)
+class Bench(Generic[Connected]):
+    """How a device is come by: `connect()` gives it anew, on `clock`; `motion` (0 to 1) scales ways and speeds.
+
+    `linked` is false for a device without a connection that could be closed. It is closed by `over()`. `faults` is
+    there for a simulated device alone.
+    """
+
+    connect: Callable[[], Connected]
+    clock: Clock
+    motion: float = 1.0
+    linked: bool = True
+    faults: Faults | None = None
+    _open: list[Connected] = field(default_factory=list)
+
+    @property
+    def device(self) -> Connected:
+        """The device, connected when it is first asked for."""
+        if not self._open:
+            self._open.append(self.connect())
+        return self._open[0]
+
+    @contextmanager
+    def faulty(self) -> Iterator[Faults]:
+        """The faults that can be caused inside this context; at its end all causes are gone. A real device skips."""
+        if self.faults is None:
+            pytest.skip("a fault is caused in a simulated device only")
+        try:
+            yield self.faults
+        finally:
+            self.faults.clear()
+
+    def over(self) -> None:
+        """Close it; the next test connects anew."""
+        while self._open:
+            self._open.pop().close()
+
+    @contextmanager
+    def timed(self, took: list[float]) -> Iterator[None]:
+        """Append to `took` how many seconds of the clock passed inside this context."""
+        begun = self.clock.now()
+        yield
+        took.append(self.clock.now() - begun)
+
 
 class DeviceContract:
-    """Who it is, a round trip, a stop and an end. `bench` is a fixture of the class that derives from this."""
+    """Who it is, a round trip, a stop and an end. A suite of a kind derives from it; its user brings `bench`."""
 
     def test_it_says_who_it_is(self, bench: Bench[Device]) -> None:
         """Model and address are not empty: a calibration and `cell diag` go by them."""

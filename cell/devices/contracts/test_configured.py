@@ -12,11 +12,15 @@ import pytest
 
 from cell.config.cell_config import CellConfig, load_config, require_real_addresses
 from cell.devices.assembly import connect_one
-from cell.devices.contracts import Bench
-from cell.devices.contracts.arm import ArmContract
-from cell.devices.contracts.device import CameraContract, ClawContract, LaserContract
-from cell.devices.contracts.rail import RailContract
-from cell.devices.contracts.vehicle import VehicleContract
+from cell.devices.contracts import (
+    ArmContract,
+    Bench,
+    CameraContract,
+    ClawContract,
+    LaserContract,
+    RailContract,
+    VehicleContract,
+)
 from cell.devices.lock import CellLock
 from cell.devices.simulated.process import cause_fault, clear_faults
 from drivers.clock import Clock
@@ -25,6 +29,10 @@ from drivers.interfaces import Arm, Device
 pytestmark = pytest.mark.skipif(
     "CELL_CONTRACTS" not in os.environ, reason="CELL_CONTRACTS names no configuration: no device is touched"
 )
+SUITES = {
+    "rail": RailContract, "arm": ArmContract, "vehicle": VehicleContract, "scan_camera": CameraContract,
+    "target_camera": CameraContract, "laser": LaserContract, "claw": ClawContract,
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -54,77 +62,29 @@ class ServedFaults:
             self.arm.recover(confirmed=True)
 
 
-def bench_of(config: CellConfig, name: str) -> Iterator[Bench[Device]]:
-    """The bench of one device; what hangs on the arm brings the arm with it."""
-    clock = Clock(config.cell.time_scale)
-    with ExitStack() as over:
-        arm = None
-        if config.make(name).on_arm:
-            arm = connect_one(config, "arm", clock)
-            over.callback(arm.close)
-        motion = float(os.environ.get("CELL_CONTRACTS_MOTION", "0.2"))
-        linked = not config.make(name).on_arm
-        faults = ServedFaults(config.cell.truth, arm) if config.cell.truth else None
-        bench = Bench(lambda: connect_one(config, name, clock, arm=arm), clock, motion, linked, faults)
-        over.callback(bench.over)
-        yield bench
+class Configured:
+    """A suite of the device `NAME`; what hangs on the arm brings the arm with it."""
 
-
-class _Configured:
     NAME = ""
 
     @pytest.fixture(scope="class")
     @classmethod
     def bench(cls, configured: CellConfig) -> Iterator[Bench[Device]]:
-        """The device of this name."""
-        yield from bench_of(configured, cls.NAME)
-
-
-class TestRail(_Configured, RailContract):
-    """The rail."""
-
-    NAME = "rail"
-
-
-class TestArm(_Configured, ArmContract):
-    """The arm."""
-
-    NAME = "arm"
-
-
-class TestVehicle(_Configured, VehicleContract):
-    """The vehicle."""
-
-    NAME = "vehicle"
-
-    @pytest.fixture(scope="class")
-    @classmethod
-    def bench(cls, configured: CellConfig) -> Iterator[Bench[Device]]:
-        """The vehicle, where there is one that drives."""
-        if not configured.vehicle.DRIVES:
+        """Of the device, connected; a frame that stands has no vehicle to put to a suite."""
+        name, make, clock = cls.NAME, configured.make(cls.NAME), Clock(configured.cell.time_scale)
+        if name == "vehicle" and not configured.vehicle.DRIVES:
             pytest.skip("the arm stands on a fixed frame: there is no vehicle")
-        yield from bench_of(configured, cls.NAME)
+        with ExitStack() as over:
+            arm = connect_one(configured, "arm", clock) if make.on_arm else None
+            if arm is not None:
+                over.callback(arm.close)
+            motion = float(os.environ.get("CELL_CONTRACTS_MOTION", "0.2"))
+            faults = ServedFaults(configured.cell.truth, arm) if configured.cell.truth else None
+            bench = Bench(lambda: connect_one(configured, name, clock, arm=arm), clock, motion, not make.on_arm, faults)
+            over.callback(bench.over)
+            yield bench
 
 
-class TestScanCamera(_Configured, CameraContract):
-    """The camera on the rail."""
-
-    NAME = "scan_camera"
-
-
-class TestTargetCamera(_Configured, CameraContract):
-    """The camera on the flange."""
-
-    NAME = "target_camera"
-
-
-class TestLaser(_Configured, LaserContract):
-    """The laser."""
-
-    NAME = "laser"
-
-
-class TestClaw(_Configured, ClawContract):
-    """The claw."""
-
-    NAME = "claw"
+for _name, _suite in SUITES.items():
+    _class = f"Test{_name.title().replace('_', '')}"
+    globals()[_class] = type(_class, (Configured, _suite), {"NAME": _name})

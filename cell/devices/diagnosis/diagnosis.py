@@ -1,6 +1,4 @@
-"""How every device is: connected, who it is, figures with their limits, errors, state. One's failure hides no other.
-
-A device's figures with their limits: round trips, whatever its driver tells of it, and a camera's stream."""
+"""How every device is: connected, who it is, figures with their limits, errors, state. One's failure hides no other."""
 
 from __future__ import annotations
 

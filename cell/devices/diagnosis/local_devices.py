@@ -182,12 +182,9 @@ def _usb3(root: Path) -> Iterator[Found]:
         guid = serial if re.fullmatch(r"[0-9A-Fa-f]{12}", serial) else "GUID"
         hint = "" if guid == serial else "; its GUID is shown by `arv-tool-0.8`, behind the maker's name and a dash"
         yield Found(
-            "camera",
-            f"USB {usb.name}",
-            f"USB3 Vision: {told}{hint}",
-            True,
+            "camera", f"USB {usb.name}", f"USB3 Vision: {told}{hint}", True,
             f'[scan_camera] driver = "usb3", guid = "{guid}"',
-        )
+        )  # fmt: skip
 
 
 def _entries(folder: Path) -> list[Path]:

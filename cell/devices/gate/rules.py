@@ -1,11 +1,7 @@
 """The interlocks as a table: which commands each is asked for, what has to hold, and how that is looked up.
 
-`python -m cell.devices.gate.rules` prints the table of docs/reference/interlocks.md; a test keeps that current.
-
-Which bodies the arm would bring together on the way that a command asks for, whoever asks, planned or not.
-
-Known here are the arm, its tool, the vehicle, the boards on its deck and the obstacles of the configuration. The part
-in the claw or where it was put, and the station with the job's obstacles are among them where a run has told of them.
+`python -m cell.devices.gate.rules` prints the table of docs/reference/interlocks.md; a test keeps it current. A way is
+checked against arm, tool, vehicle, deck and obstacles, and against part and station once a run has told of them.
 """
 
 from __future__ import annotations
@@ -18,9 +14,8 @@ import numpy as np
 import pinocchio as pin
 
 from cell.config.cell_config import CellConfig, deck_plates, mounted, vehicle_obstacles
-from cell.devices.gate.gated import GuardedMotion
+from cell.devices.gate.gated import UNATTENDED_S, GuardedMotion
 from cell.devices.gate.interlocks import PURPOSES, DeviceCommand, Rule, Situation
-from cell.devices.gate.scan_head import UNATTENDED_S
 from cell.measure.geometry.poses import from_ur
 from cell.motion.collision import (
     TOUCHES,

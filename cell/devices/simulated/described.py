@@ -73,17 +73,12 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
     # A real rail that does not say how it counts is followed: how it is driven does not show.
     steps, _ = rail.counted or (STOCK.cell.rail.steps_per_turn, 1)
     return drawn.CellDrawing(
-        arm=arm.model,
-        payload=arm.payload,
-        payload_centre=arm.payload_centre,
+        arm=arm.model, payload=arm.payload, payload_centre=arm.payload_centre,
         vehicle_from_base=_matrix(arm.vehicle_from_base.se3()),
         track=(TURNS_WIDER if config.vehicle.SLIDES else 1.0) * config.vehicle.track,
         rail=drawn.RailDrawing(rail.lead, steps, rail.travel, (low + margin, high - margin), rail.turned_round),
-        scan=_camera(config.scan_camera, SCAN_FOCUS),
-        target=_camera(config.target_camera, TARGET_FOCUS),
-        baseline=laser.baseline,
-        tan_theta=laser.tan_theta,
-        witness=_witness(config),
+        scan=_camera(config.scan_camera, SCAN_FOCUS), target=_camera(config.target_camera, TARGET_FOCUS),
+        baseline=laser.baseline, tan_theta=laser.tan_theta, witness=_witness(config),
         laser_output=laser.output if isinstance(laser, ArmOutputLaserConfig) else None,
         claw_output=claw.output if isinstance(claw, ArmOutputClawConfig) else None,
         grip_input=claw.feedback if isinstance(claw, ArmOutputClawConfig) else None,
@@ -93,7 +88,7 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
         base_from_deck_board=_matrix(config.calibration.large.base_from_board.se3()),
         wires={name: wire for name in ("vehicle", "rail", "laser", "claw") if (wire := config.device(name).wire())},
         obstacles=_boxes({o.name: (o.base_from_centre, o.size) for o in config.obstacle}),
-    )
+    )  # fmt: skip
 
 
 def _station(job: Job, mesh: Path, drives: bool) -> drawn.StationDrawing:

@@ -1,7 +1,6 @@
 """A simulated cell in this process, on a virtual clock: the world's models behind the drivers' interfaces, no wires.
 
-Puts together what `sim_backends.direct` leaves open: the configuration's values, and the product's own logic that is to
-be proven there as well. Everything above the devices' interfaces is the product, unchanged.
+It gives `sim_backends.direct` the configuration's values and the product's own logic.
 """
 
 from __future__ import annotations
@@ -61,16 +60,9 @@ class VirtualCell(DirectCell):
         laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
         vehicle = self.vehicle if config.vehicle.DRIVES else connect_one(config, "vehicle", self.clock)
         self.devices: Devices = behind_gate(
-            config,
-            self.clock,
-            self.arm,
-            rail=self.rail,
-            vehicle=vehicle,
-            scan_camera=self.scan_camera,
-            target_camera=self.target_camera,
-            laser=laser,
-            claw=claw,
-        )
+            config, self.clock, self.arm, rail=self.rail, vehicle=vehicle, scan_camera=self.scan_camera,
+            target_camera=self.target_camera, laser=laser, claw=claw,
+        )  # fmt: skip
 
     def _switch(self, name: str, direct: type[DirectLaser | DirectClaw]) -> Any:
         """What hangs on the arm is the product's own driver; anything else is a switch of the world."""

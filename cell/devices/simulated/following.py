@@ -1,16 +1,7 @@
 """Tells a simulated world what the real devices of the same cell do, as they measure themselves.
 
-One thread a device, each reading only. Readings go with the host time at which they held; the world waits with a
-picture until it has them. So the way of a reading to the world delays pictures and does not spoil them.
-
-What real devices measure of themselves, as rows for a simulated world that follows them; reading only.
-
-A row is the host time at which it held, s, and the device's numbers, as `sim_backends.world.following` has them.
-
-A simulated camera beside real devices: a picture that its world could not make is asked for again.
-
-Readings of a real device leave gaps now and then. A single picture into such a gap is not made; the next one is,
-because whoever takes single pictures waits until everything rests. A stream's lost frames are counted as any others.
+One thread a device, each reading only. A row is the host time at which a reading held, s, and the device's numbers. The
+world waits with a picture until it has them: a late reading delays pictures and does not spoil them.
 """
 
 from __future__ import annotations
@@ -201,16 +192,13 @@ class DeviceFollowing:
         if "arm" in followed:
             self._arm = ArmFeed(devices)
             table = devices.arm.link_table()
-            rows = (
-                None
-                if table is None
-                else [list(row) for row in zip(table.a, table.d, table.alpha, table.theta, strict=True)]
-            )
-            switched = (config.laser, "laser"), (config.claw, "claw")
-            bits = sum(
-                1 << record.output for record, name in switched if isinstance(record, OnArm) and name not in simulated
-            )
-            self._link.ask(op="begin", table=rows, outputs=bits)
+            columns = () if table is None else (table.a, table.d, table.alpha, table.theta)
+            rows = [list(row) for row in zip(*columns, strict=True)] or None
+            real = [
+                record for record, name in ((config.laser, "laser"), (config.claw, "claw")) if name not in simulated
+            ]
+            outputs = sum(1 << record.output for record in real if isinstance(record, OnArm))
+            self._link.ask(op="begin", table=rows, outputs=outputs)
         self._threads = [
             threading.Thread(target=self._feed, args=(name, feeds[name]()), name=f"following {name}", daemon=True)
             for name in followed

@@ -1,13 +1,7 @@
-"""A cell of real devices and simulated ones: the world that has the latter, and follows the former.
+"""A cell of real devices and simulated ones: which mixes make sense, and the world that follows the real ones.
 
-Which devices of one cell are simulated beside real ones, and whether that makes sense.
-
-A simulated camera sees a simulated world, which follows the real devices. A real camera sees the real one, in which
-nothing follows a simulated device: what it would need of those is refused, not made up.
-
-What a real arm feels of a simulated station: the force of the simulated part on the simulated surface.
-
-The arm's own force counts as ever: whatever really is in the way ends a guarded motion as well."""
+A real camera sees the real cell, in which nothing follows a simulated device: what it would need of those is refused.
+"""
 
 from __future__ import annotations
 
@@ -216,15 +210,9 @@ class MixedCell:
         require_possible(config, simulated, needed)
         real = followed(config, simulated, needed)
         self.world = SimulatedCell(
-            config,
-            Described.of(job),
-            seed=seed,
-            level=level,
-            speed=config.cell.time_scale,
-            gige=[name for name in on_gige(config) if name in simulated],
-            simulated=simulated,
-            follow=real,
-        )
+            config, Described.of(job), seed=seed, level=level, speed=config.cell.time_scale,
+            gige=[name for name in on_gige(config) if name in simulated], simulated=simulated, follow=real,
+        )  # fmt: skip
         undo.callback(self.world.close)
         self.config = with_endpoints(config, self.world.endpoints, _addressed(config, simulated))
         self.lock = undo.enter_context(CellLock(self.config, needed))

@@ -1,16 +1,14 @@
-"""Starts a simulated cell in a process of its own and ends it, whatever happens to this one.
+"""A simulated cell in a process of its own: its start and end, the truth that it tells, the faults that it is given.
 
 The process serves the devices' real protocols on free loopback endpoints; the rest of the cell only gets their
 addresses, as if they were hardware. It ends when its standard input closes, so it cannot outlive its owner.
-
-The truth endpoint of a served simulated cell, from this side: ask for the truth, cause a fault.
-
-A line to a simulated world that follows real devices: one request at a time, answered at once."""
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import select
 import socket
 import subprocess
@@ -18,7 +16,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,6 +25,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 from cell.config.cell_config import DEVICES, CellConfig
 from drivers.errors import CellError, ConfigError, DeviceFault
 from drivers.interfaces import Identity
+from sim_backends.faults import FAULT_NAMES
+from statemachine.step import Event
 
 if TYPE_CHECKING:
     from cell.devices.simulated.described import Described
@@ -108,12 +108,9 @@ class WorldLink:
 
     def _lost(self, why: object) -> DeviceFault:
         return DeviceFault(
-            "simulated world",
-            "sim.lost",
-            f"it does not take what the real devices do: {why}",
-            recoverable=False,
+            "simulated world", "sim.lost", f"it does not take what the real devices do: {why}", recoverable=False,
             hint="Its process has ended or hangs; open the cell again.",
-        )
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -282,12 +279,9 @@ class SimulatedCell:
                 if self._process.poll() == 2:
                     raise ConfigError(reason)
                 raise DeviceFault(
-                    "simulated cell",
-                    "sim.start",
-                    reason,
-                    recoverable=False,
+                    "simulated cell", "sim.start", reason, recoverable=False,
                     hint="Run `cell sim serve` to see its output.",
-                )
+                )  # fmt: skip
             line += chunk
         endpoints: dict[str, Any] = json.loads(line)
         return endpoints
@@ -364,3 +358,85 @@ def endpoint_toml(config: dict[str, Any], endpoints: dict[str, Any]) -> str:
     for name in DEVICES:
         tables[name] |= endpoints.get(name, {})
     return "# A simulated cell that is served: the configuration with its addresses.\n\n" + tomlkit.dumps(tables)
+
+
+_FORM = re.compile(r"(?P<fault>[a-z_.]+)@(?P<step>[a-z_]+)(:(?P<percent>\d+(\.\d+)?)\s*%)?")
+
+
+@dataclass(frozen=True)
+class Injection:
+    """A fault by name, and the step and the fraction (0 to 1) of it at which it happens."""
+
+    fault: str
+    step: str
+    fraction: float
+
+    @classmethod
+    def parse(cls, text: str, steps: Sequence[str]) -> Injection:
+        """From `fault@step:percent%`, or `fault@step` for its start; `ConfigError` lists what is known.
+
+        `steps` are the names of the job's steps.
+        """
+        match = _FORM.fullmatch(text.strip())
+        if match is None:
+            raise ConfigError(f'"{text}" is no scheduled fault: write it as "arm.protective_stop@laser_sweep:40%"')
+        fault, step, percent = match["fault"], match["step"], float(match["percent"] or 0.0)
+        if fault not in FAULT_NAMES:
+            raise ConfigError(f'"{text}": the simulated cell has no fault "{fault}"; known: {", ".join(FAULT_NAMES)}')
+        if step not in steps:
+            raise ConfigError(f'"{text}": there is no step "{step}"; the steps are {", ".join(steps)}')
+        if percent > 100.0:
+            raise ConfigError(f'"{text}": {percent:g} % is outside 0 % to 100 %')
+        return cls(fault, step, percent / 100.0)
+
+    def __str__(self) -> str:
+        return f"{self.fault}@{self.step}:{100 * self.fraction:g}%"
+
+
+class Injector:
+    """An observer of a run that causes each fault once, by `cause(name)`.
+
+    `missed` has what was scheduled and did not happen: not reached, or not to be caused, and why.
+    """
+
+    def __init__(self, cause: Callable[[str], None], injections: Sequence[Injection]) -> None:
+        self.injections = tuple(injections)
+        self._cause = cause
+        self._waiting = list(injections)
+        self._failed: dict[Injection, str] = {}
+
+    @classmethod
+    def scheduled(cls, texts: Sequence[str], steps: Sequence[str], simulated: Simulation | None) -> Injector:
+        """For texts that `Injection.parse` takes; `ConfigError` also for a fault that this cell cannot have."""
+        injections = [Injection.parse(text, steps) for text in texts]
+        if simulated is None:
+            raise ConfigError(f"{', '.join(map(str, injections))} can only happen to a simulated cell")
+        for injection in injections:
+            simulated.require_fault(injection.fault)
+        return cls(simulated.fault, injections)
+
+    def __call__(self, event: Event) -> None:
+        """Take an event of the runner."""
+        match event.kind:
+            case "step_started":
+                fraction = 0.0
+            case "progress":
+                fraction = float(str(event.data["fraction"]))
+            case "step_done":
+                fraction = 1.0
+            case _:
+                return
+        for injection in list(self._waiting):
+            if injection.step == event.step and fraction >= injection.fraction:
+                self._waiting.remove(injection)
+                try:
+                    self._cause(injection.fault)
+                # The others are still to happen, and the report tells of this one.
+                except Exception as error:
+                    self._failed[injection] = f"could not be caused: {error}"
+
+    @property
+    def missed(self) -> dict[str, str]:
+        """Why each fault that did not happen did not."""
+        early = {str(injection): "the run did not come that far" for injection in self._waiting}
+        return early | {str(injection): why for injection, why in self._failed.items()}

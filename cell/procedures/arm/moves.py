@@ -1,8 +1,4 @@
-"""Moves of the arm as the steps ask for them: planned free of collisions, jerk-limited, followed and settled.
-
-How fast work moves arm and vehicle, of what is planned: a person who wants to look closely slows them down.
-
-What has become of the part in the claw: held, released, or not known."""
+"""Moves of the arm as the steps ask for them: free of collisions, jerk-limited, at a pace that a person may lower."""
 
 from __future__ import annotations
 

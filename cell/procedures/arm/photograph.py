@@ -1,26 +1,27 @@
-"""A photograph of the station's board, as its pose in the arm's base with its covariance.
+"""A photograph of the station's board as its pose in the arm's base, and where the cameras have to be.
 
-Where the cameras have to be: poses for looking, photographing, scanning and calibrating.
-
-Pure geometry: nominal poses and the present calibration come in, poses of the flange in the arm's base go out. Whether
-the arm can reach them without a collision is `cell.motion`'s business."""
+Poses for looking, photographing, scanning and calibrating are pure geometry. Whether the arm can reach them is
+`cell.motion`'s business.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 
 import numpy as np
 import pinocchio as pin
+import scipy
 
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, PhotoSection
 from cell.measure.calibration import ScanCalibration, TargetCalibration
 from cell.measure.geometry.poses import compose_covariance, from_parts, from_ur, mean, transform
+from cell.measure.inversion.effects.during_sweep import require_firm
 from cell.measure.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board
 from cell.measure.vision.board.view import centre_of
-from cell.procedures.drive.settled import swing
 from drivers.errors import CalibrationStale, Measured, RefusedError
 from drivers.interfaces import Arm, Camera, Frame, Vector
 
@@ -116,6 +117,52 @@ def photograph(
     return BoardFix(*seen, tuple(frames), tuple(views), swung, flange=flange, by_mount=by_mount)
 
 
+# A vehicle that has just stopped, or that somebody leans on, rocks on its tyres by a tenth of a milliradian and more, a
+# few times a second. The arm's base rocks with it, and what was seen a moment ago is not where it was.
+
+APART_S = 0.07
+"""Between two photographs: four of them are spread over the period of the few hertz at which vehicles rock."""
+CHANCE = 1e-5
+"""Of taking a board that stands still for one that does not."""
+LEAST_M = 20e-6
+"""What a board goes to and fro less than this is not worth waiting for."""
+
+
+def swing(views: Sequence[BoardView], metres_per_px: float) -> float:
+    """By how much, m, to either side the board moves between photographs from one place; 0 where nothing shows it.
+
+    The mean place of the points that all of them show tells it: what lens and board are off by is the same in each.
+    """
+    if len(views) < 2:
+        return 0.0
+    shared = reduce(np.intersect1d, [view.ids for view in views])
+    if not len(shared):
+        return 0.0
+    means, variances = [], []
+    for view in views:
+        here = np.isin(view.ids, shared)
+        means.append(view.pixels[here].mean(axis=0))
+        variances.append(float(np.mean(view.sigma[here] ** 2)) / len(shared))
+    squares = float(np.sum((np.array(means) - np.mean(means, axis=0)) ** 2))
+    free = len(views) - 1
+    if squares < float(np.mean(variances)) * scipy.special.chdtri(2 * free, CHANCE):
+        return 0.0
+    # Of a sine along a line the mean square is half that of its height.
+    found = float(np.sqrt(2.0 * squares / free)) * metres_per_px
+    return found if found > LEAST_M else 0.0
+
+
+def swing_covariance(swung: float, base_from_board: pin.SE3, base_from_vehicle: pin.SE3) -> Vector:
+    """Covariance (6, 6), m² and rad², base axes, of a board that goes to and fro by `swung` m as the vehicle rocks.
+
+    Raises `RefusedError` when it rocks too much to put anything down.
+    """
+    away = float(np.linalg.norm(base_from_board.translation - base_from_vehicle.translation))
+    angle = swung / away
+    require_firm(angle, swung, "the board")
+    return np.diag([0.5 * swung**2] * 3 + [0.5 * angle**2] * 3)
+
+
 def _require(pose: BoardPose, limits: PhotoSection) -> None:
     if not pose.obliquity <= limits.max_obliquity:
         seen, allowed = math.degrees(pose.obliquity), math.degrees(limits.max_obliquity)
@@ -185,10 +232,8 @@ def scan_plans(
 ) -> list[ScanPlan]:
     """The job's sweeps, each along the surface's x axis over its own part of the surface.
 
-    The scan camera looks along the surface's −z from the stand-off, image x along the surface's x, then turned about
-    the middle of what it scans; the stripe crosses the optical axis's height where the calibrated light plane does, so
-    the camera runs behind by that much. The rail is in the middle of its travel at half-way, or all along when the arm
-    moves the head.
+    The scan camera looks along the surface's −z from the stand-off, image x along the surface's x, turned about the
+    middle of what it scans. The rail is in the middle of its travel half-way, or all along when the arm moves the head.
     """
     low, high = config.rail.travel
     middle, half = 0.5 * (low + high), 0.5 * job.scan.length
@@ -242,10 +287,8 @@ def verification_views(
 ) -> tuple[CalibrationView, CalibrationView]:
     """One of the scan camera's calibration views and one of the target camera's, aimed with what the calibration found.
 
-    Mounts and boards stand some millimetres from where they are drawn. From the drawn poses a board may lie half out
-    of the picture, which leaves the rail no way to go; from the calibrated ones the pictures are as drawn. The rail
-    stands near its middle, so that it can move both ways, and the boards are tilted. Raises `CalibrationStale` for a
-    calibration that was stored without its reference.
+    From the drawn poses a board may lie half out of the picture. The rail stands near its middle, so that it can move
+    both ways. Raises `CalibrationStale` for a calibration that was stored without its reference.
     """
     if scan.reference is None or target.reference is None:
         raise CalibrationStale(

@@ -1,7 +1,6 @@
 """First touch: where the part met the ground as the arm felt it, against where the scan says that it would.
 
-Nothing else of a job looks at the place again after the scan, so this is the only witness of what went wrong between
-the two: a laser that has turned, an arm that sags under the part, a part that lies otherwise in the claw.
+Nothing else tells what went wrong after the scan: a laser that turned, an arm that sags, a part that slipped.
 """
 
 from __future__ import annotations
@@ -108,9 +107,8 @@ def expected_touch(job: Job, nominal: NominalSurface, pose: PlacePose, placing: 
     """Where the part touches first with all that is stated: of the pose, of the grasp, and (`placing`, (6, 6), base
     axes) of the flange each time the arm comes to rest.
 
-    Tilted by some of it, the part touches with an edge before it is down. Where its force then seems to begin lies
-    between that edge's touch, of stiff bodies, and the mean height of all its points, of soft ones: both are allowed
-    for.
+    A tilted part touches with an edge before it is down. Where its force then seems to begin lies between that touch,
+    of stiff bodies, and the mean height of all its points, of soft ones: both are allowed for.
     """
     values, vectors = np.linalg.eigh(part_covariance(job, pose, placing))
     root = vectors * np.sqrt(np.maximum(values, 0.0))

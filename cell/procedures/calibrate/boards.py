@@ -1,9 +1,7 @@
 """Collecting what a calibration is solved from: the cell moves through its own poses over the boards on its deck.
 
-Where the scan camera has to go when a planned calibration view misses the board.
-
-Mounting and board may lie several mm from the drawing, more than a small board leaves room for. What the views so far
-showed tells where both are; while there is none, the surroundings of the planned view are searched."""
+Where a planned view misses the board, it is aimed anew by what the other views showed, or searched for.
+"""
 
 from __future__ import annotations
 
@@ -110,12 +108,11 @@ Made = TypeVar("Made")
 def collect_scan(
     config: CellConfig, devices: Devices, mover: Mover, check: Check, progress: Progress, keep: Keep
 ) -> list[ScanObservation]:
-    """Dots and stripe on the fine board, at several depths, tilts and rail positions.
+    """Dots and stripe on the fine board, at several depths, tilts and rail positions; every picture goes to `keep`.
 
-    At each view the laser is off for the photograph and on for the stripe; at some of them the rail moves either way
-    for further photographs while the arm rests (`same_rest`), right after their view in the list. A view that does not
-    show the board is aimed anew by what the others showed. Every picture goes to `keep`. Raises `RefusedError` when too
-    few views show it even then.
+    The laser is off for a photograph and on for the stripe. At some views the rail moves either way for further
+    photographs while the arm rests (`same_rest`), right after their view in the list. Raises `RefusedError` when too
+    few views show the board.
     """
     board = parse_board(config.calibration.fine.board)
     views = scan_calibration_views(config, board)

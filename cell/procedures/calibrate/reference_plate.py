@@ -1,6 +1,4 @@
-"""A look at the witness of the laser's pointing: the rail to its end, the laser on, a few pictures of the plate.
-
-A look at the edge of the plate on the claw: the rail takes the laser's line over it, to and fro."""
+"""The plate on the claw: where the laser's line lies on it, and where the rail takes the line over its edge."""
 
 from __future__ import annotations
 
@@ -17,6 +15,7 @@ from cell.devices.devices import Devices
 from cell.measure.calibration.drift.reference_plate import LEAST_ROWS, Edge, PlateLine
 from cell.measure.geometry.camera import Array
 from cell.measure.vision import extract
+from cell.procedures.sweep.swath import frames_of
 from drivers.errors import DeviceFault, LimitError, Measured, RefusedError
 from drivers.interfaces import Frame
 
@@ -208,14 +207,9 @@ def _passed(
     rail.move_to(rail.sweep_start(*ends, speed)).wait(30.0)
     times, light, dark = [], [], []
     with devices.interlocks.purpose("calibration"), camera.stream() as frames, laser.lit():
-        sweep, over = rail.sweep(*ends, speed), np.inf
-        for frame in frames:
+        sweep = rail.sweep(*ends, speed)
+        for frame in frames_of(sweep, frames):
             laser.renew()
-            if sweep.done and over == np.inf:
-                sweep.wait(1.0)
-                over = sweep.window[1]
-            if frame.mid_exposure > over:
-                break
             keep("witness-edge", frame)
             times.append(frame.mid_exposure)
             light.append(_light(frame.image, witness))

@@ -1,9 +1,7 @@
 """How good a calibration is, beyond its χ²: coverage, residuals, what limits it at the job's points, what to add.
 
-Made from the adjustments and the observations, so it serves a calibration just made and an archived one alike. A run
-never asks for it.
-
-Pictures of a calibration: residual maps and coverage of each camera, and what limits the place that is measured."""
+It is made from adjustments and observations: of a calibration just made or of an archived one. A run never asks for it.
+"""
 
 from __future__ import annotations
 
@@ -106,13 +104,9 @@ def _field(figure: Figure, axes: Axes, seen: Coverage) -> None:
             at = ((column + 0.5) * width / GRID[0], (row + 0.5) * height / GRID[1])
             dark = counts[row, column] > 0.6 * counts.max()
             axes.text(
-                *at,
-                f"{counts[row, column]:.0f}",
-                ha="center",
-                va="center",
-                fontsize=8,
+                *at, f"{counts[row, column]:.0f}", ha="center", va="center", fontsize=8,
                 color="white" if dark else "black",
-            )
+            )  # fmt: skip
     covered = seen.summary()["field_covered"]
     _frame(axes, seen, f"dots in each part of the picture: {100 * covered:.0f} % covered")
     figure.colorbar(shown, ax=axes, label="dots", shrink=0.85)
@@ -235,8 +229,4 @@ def places_of_job(config: CellConfig, job: Job, nominal: NominalSurface, scan: S
 def noise_found(joint: Joint) -> dict[str, float]:
     """The noise that the residuals speak of, as multiples of what dots and stripe state, and χ²/dof."""
     priors = joint.adjusted.priors
-    return {
-        "dots": priors.dots_scale,
-        "stripe": priors.stripe_scale,
-        "chi2_per_dof": joint.adjusted.chi2_per_dof,
-    }
+    return {"dots": priors.dots_scale, "stripe": priors.stripe_scale, "chi2_per_dof": joint.adjusted.chi2_per_dof}

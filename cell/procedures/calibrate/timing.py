@@ -27,6 +27,7 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import rail_ends, verification_views
 from cell.procedures.calibrate.boards import Check, Keep, Progress, move_to_view
+from cell.procedures.sweep.swath import frames_of
 from drivers.errors import DeviceFault, LimitError, RefusedError
 
 SLOW_SHARE = 0.25
@@ -76,19 +77,12 @@ def collect_timing(
 
 
 def look_at_shutter(
-    config: CellConfig,
-    devices: Devices,
-    mover: Mover,
-    calibration: CellCalibration,
-    check: Check,
-    keep: Keep,
+    config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, check: Check, keep: Keep
 ) -> CellCalibration:
     """A new `calibration` with what one sweep to and fro over the fine board tells of the scan camera's shutter.
 
-    Where that tells nothing, for instance because pictures from a moving rail do not show the board, or the camera is
-    too slow for them, a note says so.
-    Raises `RefusedError` for a rolling shutter and for stamps that come later than the configuration allows: a sweep's
-    rows would lie askew, or all of it elsewhere, and nothing of a job shows it.
+    Where that tells nothing, a note says so. Raises `RefusedError` for a rolling shutter and for stamps that come later
+    than the configuration allows: nothing of a job would show either.
     """
     exposure = min(EXPOSURES) * config.scan_camera.photo_exposure
     pairs = [(min(config.rail.max_speed, MOST_SMEAR_M / exposure), exposure)]
@@ -145,12 +139,10 @@ def _sweeps(
     moved = float(np.linalg.norm(from_ur(devices.arm.state().flange).translation - base_from_flange.translation))
     if moved > MOST_MOVED_M:
         raise DeviceFault(
-            devices.arm.name,
-            "arm.moved_in_sweep",
+            devices.arm.name, "arm.moved_in_sweep",
             f"the flange moved by {1e3 * moved:.2f} mm during the sweeps, allowed {1e3 * MOST_MOVED_M:.1f} mm",
-            recoverable=True,
-            hint="See what pushed the arm; the sweeps are of no use.",
-        )
+            recoverable=True, hint="See what pushed the arm; the sweeps are of no use.",
+        )  # fmt: skip
     return base_from_flange, sweeps
 
 
@@ -165,13 +157,7 @@ def _swept(
     seen = []
     with camera.stream() as frames:
         sweep = rail.sweep(start, stop, speed)
-        end = np.inf
-        for frame in frames:
-            if sweep.done and end == np.inf:
-                sweep.wait(1.0)
-                end = sweep.window[1]
-            if frame.mid_exposure > end:
-                break
+        for frame in frames_of(sweep, frames):
             keep(what, frame)
             seen.append(frame)
     begin, end = sweep.window

@@ -1,7 +1,6 @@
 """Does the station still stand where it was photographed? The board is looked at once more.
 
-The scan says where the surface is against the arm's base. Table and vehicle have to stand still from the scan until the
-part is down: nothing that the arm feels tells a shift to the side.
+Nothing that the arm feels tells a shift to the side between the scan and the placing.
 """
 
 from __future__ import annotations
@@ -11,8 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from cell.measure.geometry.poses import difference
-from cell.procedures.arm.photograph import BoardFix, photo_pose
-from cell.procedures.drive.settled import swing_covariance
+from cell.procedures.arm.photograph import BoardFix, photo_pose, swing_covariance
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, Workplace
 from drivers.errors import Measured, RefusedError
 

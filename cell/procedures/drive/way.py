@@ -1,17 +1,9 @@
-"""Whether a way of the vehicle may be driven: how far on odometry alone, and how close to the station.
+"""The vehicle's way over the floor: where it stands, whether it may drive there, and driving on odometry.
 
-Everything is seen from above, in the place frame. The way is the one that the line law would drive without errors; the
-room that it needs grows with how far the vehicle has gone, and turned on the spot, since it was last seen.
-
-The vehicle's way over the floor: planar poses, the law that keeps it on a line, and driving on odometry.
-
-Frame: the place frame seen from above, with the line of approach along its x axis. Angles are about z.
-
-What is known about where the vehicle stands: nothing, or its pose by odometry since it was seen or said.
-
-Odometry counts from wherever the driver was opened. It tells a place only from an anchor on: a sighting of the board,
-or a person's word that the vehicle stands at its start. The anchor is lost with the driver, with its link, and when
-somebody else moved or commanded the vehicle meanwhile."""
+Frame: the place frame seen from above, the line of approach along its x axis. Angles are about z. Odometry tells a
+place only from an anchor on: a sighting of the board, or a person's word. The room that a way needs grows with how far
+the vehicle has gone, and turned on the spot, since then.
+"""
 
 from __future__ import annotations
 
@@ -169,12 +161,9 @@ def drive_line(
 def _blocked(what: str) -> DeviceFault:
     """A vehicle that does not come along: driving against what blocks it once more is not for a program to decide."""
     return DeviceFault(
-        "vehicle",
-        "vehicle.blocked",
-        f"it {what}",
-        recoverable=False,
+        "vehicle", "vehicle.blocked", f"it {what}", recoverable=False,
         hint="Look what blocks it or where its wheels slip, and jog it away from there. Then run the job again.",
-    )
+    )  # fmt: skip
 
 
 def turn_to(vehicle: Vehicle, odometry: Located, yaw: float, clock: Clock, check: Callable[[], None]) -> None:

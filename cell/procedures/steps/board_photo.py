@@ -10,9 +10,7 @@ from dataclasses import replace
 
 import pinocchio as pin
 
-from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.photograph import BoardFix, photo_pose
-from cell.procedures.drive.settled import swing_covariance, words
+from cell.procedures.arm.photograph import BoardFix, photo_pose, swing_covariance
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
 from statemachine.runner import StepContext
@@ -22,23 +20,18 @@ WAIT_S, WAITS = 1.0, 4
 """How long a vehicle that rocks is waited for, and how often. One that has stopped is quiet by then."""
 
 
-def board_photo(
-    base_from_flange: pin.SE3,
-    base_from_vehicle: pin.SE3,
-    mover: Mover,
-    photograph: Callable[[], BoardFix],
-    wait: Callable[[float], None],
-    progress: Callable[[float, str], None],
-) -> BoardFix:
-    """Move to the planned photograph pose, settle, and take the board's pose from photographs of a quiet vehicle.
+def photographed(here: Workplace, goal: pin.SE3, progress: Callable[[float, str], None]) -> BoardFix:
+    """Move to the photograph pose `goal`, base_from_flange, settle, and take the board's pose from a quiet vehicle.
 
-    Refusals (not found, too oblique, residual too high, ambiguous) come from `photograph` with their reason, those of
-    `until_quiet` likewise.
+    Refusals (not found, too oblique, residual too high, ambiguous) come from `Workplace.photograph` with their reason,
+    those of `until_quiet` likewise.
     """
+    here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
     progress(0.1, "arm to the photograph pose")
-    mover.to(base_from_flange, "the photograph pose")
+    here.mover.to(goal, "the photograph pose")
     progress(0.7, "photographing the board")
-    return until_quiet(base_from_vehicle, photograph, wait, progress)
+    vehicle, count = here.config.arm.vehicle_from_base.se3().inverse(), here.job.photo.count
+    return until_quiet(vehicle, lambda: here.photograph(count), here.devices.clock.sleep, progress)
 
 
 def until_quiet(
@@ -67,15 +60,16 @@ def settled(fix: BoardFix, base_from_vehicle: pin.SE3) -> BoardFix:
     if not fix.swung:
         return fix
     unknown = swing_covariance(fix.swung, fix.base_from_board, base_from_vehicle)
-    return replace(fix, covariance=fix.covariance + unknown, notes=(words(fix.swung, WAITS * WAIT_S),))
+    return replace(fix, covariance=fix.covariance + unknown, notes=(rocks_on(fix.swung, WAITS * WAIT_S),))
 
 
-def photographed(here: Workplace, goal: pin.SE3, progress: Callable[[float, str], None]) -> BoardFix:
-    """`board_photo` at `goal`, base_from_flange, of where a job is done."""
-    here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
-    vehicle = here.config.arm.vehicle_from_base.se3().inverse()
-    count, wait = here.job.photo.count, here.devices.clock.sleep
-    return board_photo(goal, vehicle, here.mover, lambda: here.photograph(count), wait=wait, progress=progress)
+def rocks_on(swung: float, waited: float) -> str:
+    """For people, where the job goes on nevertheless."""
+    return (
+        f"the vehicle rocks, or the board swings: after {waited:.0f} s of waiting it still goes to and fro by "
+        f"±{1e3 * swung:.2f} mm between photographs; what that leaves open is in the stated uncertainty. See what "
+        "shakes it, or lower the vehicle's supports"
+    )
 
 
 def _at(here: Workplace, context: StepContext) -> BoardFix:

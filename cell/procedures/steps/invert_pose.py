@@ -47,21 +47,13 @@ class LineTimes:
 
 
 def invert_pose(
-    scan: Reconstruction,
-    fix: BoardFix,
-    job: Job,
-    nominal: NominalSurface,
-    kinematic: Vector,
-    taken: LineTimes,
+    scan: Reconstruction, fix: BoardFix, job: Job, nominal: NominalSurface, kinematic: Vector, taken: LineTimes
 ) -> PlacePose:
     """Where the surface is, in the arm base, with the covariance that stripe, rail, calibration and arm leave it with.
 
-    The base is the arm's own, as it realises it where it places; `kinematic` (6, 6) is the covariance of the surface's
-    place from what the arm's geometry leaves between calibration, sweep and placing. The prior is the board's pose
-    carried on to the surface. With the lines' times a vehicle that rocks is seen and told apart from the pose.
-
-    Raises `RefusedError` when scan, surface and board do not fit together or the vehicle rocks too much, and
-    `NotObservable` when a direction is not known to the job's tolerance.
+    `kinematic` (6, 6) is the covariance of the place from what the arm's geometry leaves between calibration, sweep and
+    placing. The prior is the board's pose carried on to the surface. Raises `RefusedError` when scan, surface and board
+    do not fit together or the vehicle rocks too much, `NotObservable` when a direction is not known well enough.
     """
     prior = _prior(fix, job)
     tolerance = Tolerance(job.place.tolerance, job.place.tolerance_angle)

@@ -90,16 +90,8 @@ def _enter(here: Workplace, step: JobStep, context: StepContext) -> object:
 
 
 PLACE = Kind(
-    "place",
-    (
-        drive_to_target.STEP,
-        board_photo.STEP,
-        laser_sweep.STEP,
-        reconstruct.STEP,
-        invert_pose.STEP,
-        place.STEP,
-    ),
-)  # fmt: skip
+    "place", (drive_to_target.STEP, board_photo.STEP, laser_sweep.STEP, reconstruct.STEP, invert_pose.STEP, place.STEP)
+)
 
 
 def find_kind(name: str) -> Kind:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import pinocchio as pin
@@ -17,9 +17,7 @@ from cell.measure.calibration.drift.reference_plate import PlateLine, Pointing
 from cell.measure.calibration.drift.reference_plate import pointing as pointing_since
 from cell.measure.calibration.drift.slip import Slip, slip_since
 from cell.measure.calibration.drift.timing import StampTiming
-from cell.measure.reconstruction import ScanGeometry
-from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.photograph import BoardFix, ScanPlan, scan_plans
+from cell.procedures.arm.photograph import BoardFix, scan_plans
 from cell.procedures.calibrate.reference_plate import require_edge, require_witness
 from cell.procedures.drive.station_check import require_unmoved
 from cell.procedures.steps.workplace import JobStep, Workplace
@@ -43,23 +41,33 @@ UNCHECKED = (
 
 
 def laser_sweep(
-    plans: Sequence[ScanPlan],
+    here: Workplace,
+    fix: BoardFix,
+    head: ScanCalibration,
     scan: ScanSection,
-    geometry: ScanGeometry,
-    errors: SweepErrors,
-    mover: Mover,
-    devices: Devices,
+    *,
     keep_frame: Callable[[Frame], None],
     check: Callable[[], None],
     progress: Callable[[float, str], None],
-    sweeping: Callable[[SweepCollector], None] = lambda collector: None,
+    sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None,
+    most_lost: float = MAX_LOST_FRACTION,
 ) -> SweepRecord:
-    """Sweep the scan head over every planned strip, by the rail or by the arm as `scan.mode` says.
+    """Sweep the scan head over every strip of `scan`, by the rail or by the arm as `scan.mode` says.
 
-    `check` raises when the run is to end; `sweeping` is told who takes the frames of a sweep. Raises what `rail_sweep`
-    and `arm_sweep` raise, and `DeviceFault` (rail.lost_steps).
+    The board tells where the surface is; `sweeping` is told it beside who takes the frames. `check` raises when the run
+    is to end. Raises what `rail_sweep` and `arm_sweep` raise, and `DeviceFault` (rail.lost_steps).
     """
-    sweep = arm_sweep if scan.mode == "arm" else rail_sweep
+    devices, config = here.devices, here.config
+    base_from_place = fix.base_from_board * here.job.place_from_board.inverse()
+    base_from_surface = base_from_place * here.job.surface.place_from_surface.se3()
+    _home(here, progress)
+    plans = scan_plans(config, here.job.model_copy(update={"scan": scan}), base_from_surface, head)
+    errors = SweepErrors(
+        here.repeatability, config.calibration.rail_sigma, SHIFT_SHARE * here.job.place.tolerance,
+        rate=devices.clock.rate, late=math.hypot(config.scan_camera.late, config.rail.late),
+        timing=times_known(here.calibration.scan, config)[0], lost=most_lost,
+    )  # fmt: skip
+    sweep, geometry = arm_sweep if scan.mode == "arm" else rail_sweep, head.geometry()
     progress(0.01, "preparing")
     rehearse(geometry)
     swaths = []
@@ -72,8 +80,8 @@ def laser_sweep(
 
         tell(0.02, "arm to the scan pose")
         collector = SweepCollector(geometry, scan, keep_frame, tell)
-        sweeping(collector)
-        swaths.append(sweep(plan, mover, devices, errors, collector))
+        sweeping(collector, base_from_surface)
+        swaths.append(sweep(plan, here.mover, devices, errors, collector))
     return SweepRecord(tuple(swaths), doubts=() if scan.mode == "arm" else _counted(devices, progress))
 
 
@@ -119,47 +127,6 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
     return sweep
 
 
-def swept(
-    here: Workplace,
-    fix: BoardFix,
-    head: ScanCalibration,
-    scan: ScanSection,
-    keep_frame: Callable[[Frame], None],
-    check: Callable[[], None],
-    progress: Callable[[float, str], None],
-    sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None,
-    most_lost: float = MAX_LOST_FRACTION,
-) -> SweepRecord:
-    """`laser_sweep` where a job is done, over the strips of `scan`; raises what it raises.
-
-    The board tells where the surface is; `sweeping` is told it beside who takes the frames.
-    """
-    base_from_place = fix.base_from_board * here.job.place_from_board.inverse()
-    base_from_surface = base_from_place * here.job.surface.place_from_surface.se3()
-    devices = here.devices
-    _home(here, progress)
-    return laser_sweep(
-        scan_plans(here.config, here.job.model_copy(update={"scan": scan}), base_from_surface, head),
-        scan,
-        head.geometry(),
-        errors=SweepErrors(
-            here.repeatability,
-            here.config.calibration.rail_sigma,
-            SHIFT_SHARE * here.job.place.tolerance,
-            rate=devices.clock.rate,
-            late=math.hypot(here.config.scan_camera.late, here.config.rail.late),
-            timing=times_known(here.calibration.scan, here.config)[0],
-            lost=most_lost,
-        ),
-        mover=here.mover,
-        devices=devices,
-        keep_frame=keep_frame,
-        check=check,
-        progress=progress,
-        sweeping=lambda collector: sweeping(collector, base_from_surface),
-    )
-
-
 def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     head = here.calibration.scan
     _home(here, context.progress)
@@ -167,16 +134,10 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     doubts = times_known(head, here.config)[1]
     if pointing is not None:
         head = head.pointed(pointing, here.config.laser.exit_point)
-    record = swept(
-        here,
-        fix,
-        head,
-        scan=unhurried(here.job.scan, context.attempt),
-        keep_frame=lambda frame: here.frames.keep("stripe", frame),
-        check=context.check,
-        progress=context.progress,
-        sweeping=here.sweeping,
-    )
+    record = laser_sweep(
+        here, fix, head, unhurried(here.job.scan, context.attempt), check=context.check, progress=context.progress,
+        keep_frame=lambda frame: here.frames.keep("stripe", frame), sweeping=here.sweeping,
+    )  # fmt: skip
     rest = here.devices.interlocks.situation.last if here.job.scan.mode == "rail" else None
     doubts = (*record.doubts, *unwatched(head.witness), *doubts, *here.notes)
     record = replace(record, pointing=pointing, slip=slip, doubts=doubts, rest=rest)

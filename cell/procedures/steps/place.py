@@ -38,10 +38,11 @@ FAST_FORCE = 3.0
 
 @dataclass(frozen=True, eq=False)
 class PlaceResult:
-    """Where the flange was when the part was let go, how far that was from where it was expected, in m, pressed on as
-    it was, and where the part had touched first; None from an arm that tells too few states. `look` is what was seen of
-    the surface between its sweep and the descent; None where it was measured without a sweep. `pose` is where it was
-    placed to: the inverted one, carried on where something creeps."""
+    """Where the flange was when the part was let go, how far off in depth, m, and where the part touched first.
+
+    `look` is what was seen of the surface between its sweep and the descent; None where it was measured without a
+    sweep. `pose` is where it was placed to: the inverted one, carried on where something creeps.
+    """
 
     base_from_flange: pin.SE3
     contact: bool
@@ -95,10 +96,9 @@ class Placing:
         """Put the part onto the surface, and fold the arm.
 
         Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes
-        by `contact_force`.
-        Raises `RefusedError` before anything moves when the part is not held any more; with the part still held and
-        lifted when contact comes too early, that is with `contact_force` more than `contact_travel` above where it was
-        expected, does not come at all, or begins where the stated uncertainty of the place does not allow it.
+        by `contact_force`. Raises `RefusedError` before anything moves when the part is not held any more. It does so
+        with the part still held and lifted when contact comes too early, not at all, or where the stated uncertainty of
+        the place does not allow it.
         """
         require_held(self.part)
         self._approach()

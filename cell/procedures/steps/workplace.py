@@ -1,6 +1,4 @@
-"""Where a job is done: one cell's configuration, calibration and devices, the job's surface, and the run's folder.
-
-What one step of a job is: how it is watched, what it needs of earlier steps, what it makes, and what it does."""
+"""Where a job is done: one cell's configuration, calibration and devices, the job's surface, and the run's folder."""
 
 from __future__ import annotations
 
@@ -20,8 +18,7 @@ from cell.devices.devices import Devices
 from cell.measure.inversion import NominalSurface
 from cell.measure.vision import BoardSpec, parse_board
 from cell.procedures.arm.moves import Mover, Pace, PartProgress
-from cell.procedures.arm.photograph import BoardFix, photograph
-from cell.procedures.drive.settled import APART_S
+from cell.procedures.arm.photograph import APART_S, BoardFix, photograph
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.sweep.swath import SweepCollector
@@ -137,16 +134,10 @@ class Workplace:
         self._photographs += 1
         what = f"board-{self._photographs:02d}"
         fix = photograph(
-            self.devices.arm,
-            self.devices.target_camera,
-            self.calibration.target,
-            spec=self.board,
-            limits=self.job.photo,
-            repeatability=self.repeatability,
-            count=count,
-            keep=lambda frame: self.frames.keep(what, frame),
-            pause=lambda: self.devices.clock.sleep(APART_S),
-        )
+            self.devices.arm, self.devices.target_camera, self.calibration.target, spec=self.board,
+            limits=self.job.photo, repeatability=self.repeatability, count=count,
+            keep=lambda frame: self.frames.keep(what, frame), pause=lambda: self.devices.clock.sleep(APART_S),
+        )  # fmt: skip
         self.frames.found = fix.frames[-1], fix.views[-1].pixels
         if self.devices.following is not None:
             self.devices.following.board_seen(fix.base_from_board)

@@ -1,7 +1,6 @@
 """Does the surface still lie where it was swept? A few lines of it are swept once more before the part is put down.
 
-The board may stand firm while the surface slides beside it, pushed by a sleeve or a hose; a run that is resumed rests
-on a sweep of an hour ago. Nothing that the arm feels tells a shift to the side.
+The surface may slide while the board stands firm. Nothing that the arm feels tells a shift to the side.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.calibrate.reference_plate import configure_fast
 from cell.procedures.drive.station_check import require_unmoved as require_board_unmoved
-from cell.procedures.steps.laser_sweep import swept
+from cell.procedures.steps.laser_sweep import laser_sweep
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
@@ -86,8 +85,8 @@ def _swept_again(
     few = sparse(here.job.scan, sweep.swaths[0])
     # A camera of a few frame rates takes all the lines.
     rate = configure_fast(here.devices, few.exposure, (few.frame_rate, here.job.scan.frame_rate))
-    again = swept(
-        here, fix, head, scan=few.model_copy(update={"frame_rate": rate}),
+    again = laser_sweep(
+        here, fix, head, few.model_copy(update={"frame_rate": rate}),
         keep_frame=lambda frame: here.frames.keep("second-look", frame), check=context.check,
         progress=lambda share, text: context.progress(0.04 * share, f"whether the surface lies where it did: {text}"),
         most_lost=MOST_LOST,

@@ -1,9 +1,8 @@
-"""A sweep on the disk: which frames it took and where the scan head was, so that a run can be resumed without it.
+"""What a sweep brought, and that on the disk: so that a run can be resumed without sweeping again.
 
-The frames themselves are the run's PNG files, from which the stripe is extracted again. A stored sweep holds only as
-long as arm base and station have not moved against each other, which a new photograph of the board must confirm.
-
-What the laser sweep brought: one swath after the other."""
+The frames are the run's PNG files, from which the stripe is extracted again. A stored sweep holds only as long as arm
+base and station have not moved against each other, which a new photograph of the board must confirm.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +35,11 @@ from drivers.interfaces import ArmMotion, Frame, Vector
 
 @dataclass(frozen=True, eq=False)
 class SweepRecord:
-    """What the sweeps brought, in their order; at least one. `pointing` of the laser and `slip` of the head, where a
-    witness told them; `doubts` for people: what of calibration and arm is not as one would have it. `earlier` names the
-    run that swept, where it was another one. `rest` is the motion that brought the arm to where it stood meanwhile, if
-    it did: as long as that is the arm's newest, it stands there."""
+    """What the sweeps brought, in their order; at least one.
+
+    `pointing` of the laser and `slip` of the head, where a witness told them; `doubts` for people; `earlier` names the
+    run that swept, where it was another one. `rest` is the motion that brought the arm to where it stood meanwhile.
+    """
 
     swaths: tuple[Swath, ...]
     pointing: Pointing | None = None
@@ -252,12 +252,6 @@ def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeomet
     lines = arrays["lines"]
     middle = collector.require_frames("stored sweep", lines)
     return Swath(
-        builder=collector.builder,
-        **arrays,
-        lost=int(lost),
-        residual=float(residual),
-        shift=float(shift),
-        points=sum(collector.counts[int(line)] for line in lines),
-        middle=middle[0],
-        middle_profile=middle[1],
-    )
+        builder=collector.builder, **arrays, lost=int(lost), residual=float(residual), shift=float(shift),
+        points=sum(collector.counts[int(line)] for line in lines), middle=middle[0], middle_profile=middle[1],
+    )  # fmt: skip

@@ -1,16 +1,13 @@
 """One sweep over a strip of the surface: frames are turned into points while they come, and paired with poses after.
 
-A frame is let go as soon as its profile has been triangulated, so memory does not grow with the sweep's frames.
-
-Did the camera's clock step in the middle of a sweep, as one does that is set anew over the network?
-
-Then the pictures before and after it are paired with places that do not go together. A step shows twice: the stamps
-leave their even pace by the pictures' numbers, and the pictures seem to arrive by as much sooner or later. A camera
-that paces unevenly shows only the first, a network or a machine that is busy only the second."""
+A frame is let go once its profile is triangulated, so memory does not grow with the sweep. A camera's clock may step in
+the middle of a sweep. A step shows twice: the stamps leave their even pace, and the pictures seem to arrive by as much
+sooner or later. A camera that paces unevenly shows only the first, a busy network only the second.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,7 +22,7 @@ from cell.measure.reconstruction import ProfileBuilder, ScanGeometry
 from cell.measure.vision import StripeProfile, StripeStream
 from cell.measure.vision.stripe.extract import drawn
 from drivers.errors import DeviceFault
-from drivers.interfaces import Camera, Frame, FrameStream, Vector
+from drivers.interfaces import Camera, Frame, FrameStream, Sweep, Vector
 
 WINDOW = 7
 """Pictures before and after a moment that are compared."""
@@ -46,12 +43,7 @@ def step_of_clock(numbers: Sequence[int], stamps: Sequence[float], received: Seq
 
 
 def require_one_clock(
-    camera: str,
-    numbers: Sequence[int],
-    stamps: Sequence[float],
-    received: Sequence[float],
-    speed: float,
-    most: float,
+    camera: str, numbers: Sequence[int], stamps: Sequence[float], received: Sequence[float], speed: float, most: float
 ) -> None:
     """Raise `DeviceFault` (camera.clock_stepped) where a step parts the lines of a sweep at `speed`, m/s, by over
     `most`, m."""
@@ -59,13 +51,11 @@ def require_one_clock(
     if speed * abs(step) <= most:
         return
     raise DeviceFault(
-        camera,
-        "camera.clock_stepped",
+        camera, "camera.clock_stepped",
         f"its clock stepped by about {1e3 * step:+.1f} ms during the sweep: the pictures before and after it lie "
-        f"{1e3 * speed * abs(step):.3f} mm apart along the sweep, allowed are {1e3 * most:.3f} mm",
-        recoverable=True,
+        f"{1e3 * speed * abs(step):.3f} mm apart along the sweep, allowed are {1e3 * most:.3f} mm", recoverable=True,
         hint="See whether a network clock (PTP) or another application sets the camera's clock.",
-    )
+    )  # fmt: skip
 
 
 def _steps(values: Vector, window: int, of: Callable[..., Vector]) -> Vector:
@@ -81,12 +71,13 @@ STEP_SHARE = 0.5
 
 @dataclass(frozen=True)
 class SweepErrors:
-    """What a sweep's pose may be off by: `repeatability` (6, 6) of base_from_flange each time the arm comes to rest, m²
-    and rad²; `rail` one standard deviation of a rail position in m; `shift` the farthest, in m, that a sweep may lie
-    off as a whole because its times are not known better; `rate` seconds of the clock per wall second; `late` the most,
-    in s, that a device may hold a reading back before it puts its time on it; `timing` how late the camera's stamps
-    come against the rail's readings, where that was measured: then it stands for `late` in a sweep by the rail; `lost`
-    the share of its frames that may be lost."""
+    """What a sweep's pose may be off by.
+
+    `repeatability` (6, 6) of base_from_flange each time the arm comes to rest, m² and rad²; `rail` one standard
+    deviation of a rail position, m; `shift` the farthest that a sweep may lie off by its times, m; `rate` seconds of
+    the clock per wall second; `late` the most that a device may hold a reading back, s; `timing` how late the camera's
+    stamps come, where that was measured; `lost` the share of its frames that may be lost.
+    """
 
     repeatability: Vector
     rail: float
@@ -128,29 +119,24 @@ def shift_by_times(known: Sequence[TimeBound], speed: float, errors: SweepErrors
         worst = max(known, key=lambda one: one.bound)
         told = " and ".join(f"those of the {one.kind} to ±{1e3 * one.bound / errors.rate:.1f} ms" for one in known)
         raise DeviceFault(
-            worst.name,
-            f"{worst.kind}.late_readings",
+            worst.name, f"{worst.kind}.late_readings",
             f"replies come so late that times are not known well enough, {told} at best: at {1e3 * speed:.2f} mm/s the "
-            f"sweep may lie {1e3 * shift:.3f} mm off, allowed are {1e3 * errors.shift:.3f} mm",
-            recoverable=True,
+            f"sweep may lie {1e3 * shift:.3f} mm off, allowed are {1e3 * errors.shift:.3f} mm", recoverable=True,
             hint=f"Shorten the way to the {worst.kind} (baud rate, adapter, network, load of this machine) or sweep "
             "more slowly.",
-        )
+        )  # fmt: skip
     return shift, speed**2 * (sum(one.bound**2 for one in known) + errors.late**2) / 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Swath:
-    """What one sweep brought. For each of its n lines: the profile's number in `builder`, the frame's id in
-    `frame_ids`, the `times` (n,) in s at the middle of its exposure on the cell's clock; base_from_flange in `flanges`
-    (n, 4, 4) and the rail's position in `rail` (n,) at that time, and `line_spread` (n, 3), m in base axes, one
-    standard deviation of the line's own place along the sweep.
+    """What one sweep brought.
 
-    `seen` are the ids of all its frames, in their order, also of those that made no line: how the stripe is found in a
-    frame rests on those before it.
-    `covariance` (6, 6) of base_from_flange is common to all lines. `lost` counts the frames that the gaps of the frame
-    ids tell of, and those left out because nothing tells where the arm was; `residual` in m is how far the readings
-    scatter about an even motion, `shift` in m the farthest that the sweep may lie off because of its times.
+    For each of its n lines: the profile's number in `builder`, the frame's id in `frame_ids`, the `times` (n,) in s at
+    the middle of its exposure, base_from_flange in `flanges` (n, 4, 4), the `rail`'s position (n,), and `line_spread`
+    (n, 3), m in base axes, one standard deviation of the line's own place. `seen` are the ids of all its frames, also
+    of those that made no line. `covariance` (6, 6) of base_from_flange is common to all lines. `lost` counts frames
+    lost or left out; `residual` in m is how far readings scatter about an even motion; `shift` in m see `SweepErrors`.
     """
 
     builder: ProfileBuilder
@@ -175,6 +161,13 @@ class Swath:
         return from_matrix(self.flanges[len(self.flanges) // 2])
 
 
+@dataclass(frozen=True, eq=False)
+class RailPath:
+    """What the rail told during a sweep: `samples` (n, 2), host time in s and position in m."""
+
+    samples: Vector
+
+
 _REHEARSED: set[tuple[int, int]] = set()
 """Heights and widths of pictures that were rehearsed."""
 
@@ -192,6 +185,18 @@ def rehearse(geometry: ScanGeometry) -> None:
     for picture in drawn(*size):
         builder.see(StripeStream().extract(picture))
     _REHEARSED.add(size)
+
+
+def frames_of(sweep: Sweep, frames: FrameStream) -> Iterator[Frame]:
+    """The frames of a sweep by the rail, to its end: their delivery may lag behind it."""
+    over = np.inf
+    for frame in frames:
+        if sweep.done and over == np.inf:
+            sweep.wait(1.0)
+            over = sweep.window[1]
+        if frame.mid_exposure > over:
+            return
+        yield frame
 
 
 @dataclass(eq=False)
@@ -245,12 +250,10 @@ class SweepCollector:
         """The middle frame and profile; raises `DeviceFault` without a line or with a larger share of frames lost."""
         if not len(lines) or self.middle is None or self.lost > most_lost * self.expected:
             raise DeviceFault(
-                camera,
-                "camera.frames_lost",
+                camera, "camera.frames_lost",
                 f"{len(lines)} frames came from the sweep and {self.lost} were lost, of about {self.expected:.0f}",
-                recoverable=True,
-                hint="Lower scan.frame_rate or look at the camera's link.",
-            )
+                recoverable=True, hint="Lower scan.frame_rate or look at the camera's link.",
+            )  # fmt: skip
         return self.middle
 
     def require_one_clock(self, camera: str, errors: SweepErrors) -> None:

@@ -1,10 +1,9 @@
-"""A sweep by the arm alone: the rail stands still, the flange runs along a straight line under the lit laser.
+"""A sweep by the rail, or by the arm alone: the other stands still, under the lit laser.
 
-Every line has a flange pose of its own, between the states that the arm reported. What is not known of the two clocks
-shifts the whole sweep along its way: it is bounded by round trips before and after the sweep, and stated in the
-covariance. How long the arm held a state back before it put its time on it cannot be known.
-
-A sweep by the rail: the arm stands still, the carriage runs at constant velocity under the lit laser."""
+By the arm every line has a flange pose of its own, between the states that the arm reported. What is not known of the
+two clocks shifts the whole sweep along its way; round trips bound it. How long the arm held a state back before it put
+its time on it cannot be known.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +21,7 @@ from cell.measure.geometry.poses import from_parts, from_ur
 from cell.motion.trajectory import LONGEST_GAP_S, FlangeTrack, Trajectory
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import ScanPlan
-from cell.procedures.observed import RailPath
-from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors, TimeBound, shift_by_times
+from cell.procedures.sweep.swath import RailPath, Swath, SweepCollector, SweepErrors, TimeBound, shift_by_times
 from drivers.clock import ClockMap
 from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import Arm, ArmState, Sweep, Vector
@@ -62,12 +60,10 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     swath = _swath_of(collector, lines, camera.name, errors)
     if len(lines) < 3:
         raise DeviceFault(
-            arm.name,
-            "arm.sweep_too_short",
-            f"only {len(lines)} profiles were taken on the planned {1e3 * length:.1f} mm",
-            recoverable=True,
+            arm.name, "arm.sweep_too_short",
+            f"only {len(lines)} profiles were taken on the planned {1e3 * length:.1f} mm", recoverable=True,
             hint="Lower scan.speed or raise scan.frame_rate.",
-        )
+        )  # fmt: skip
     steady = np.polynomial.Polynomial.fit(times[lines], done, 1)
     known = TimeBound(arm.name, "arm", max(clocks.bound_at(float(times[k])) for k in (lines[0], lines[-1])))
     shift, variance = shift_by_times([known, TimeBound.of(camera)], scan.speed, errors)
@@ -133,13 +129,11 @@ def _on_the_line(
     uneven = int(np.count_nonzero(within & ~even))
     if uneven > errors.lost * np.count_nonzero(within):
         raise DeviceFault(
-            track.name,
-            "arm.uneven_sweep",
+            track.name, "arm.uneven_sweep",
             f"where the arm was is not known at {uneven} of {np.count_nonzero(within)} profiles, allowed are "
-            f"{100 * errors.lost:.0f} %: it did not move evenly between the states that came from it",
-            recoverable=True,
+            f"{100 * errors.lost:.0f} %: it did not move evenly between the states that came from it", recoverable=True,
             hint="Look at the arm's link and at what else this machine is busy with.",
-        )
+        )  # fmt: skip
     within &= even
     return seen[within], flanges[within], done[within], uneven
 
@@ -225,12 +219,10 @@ def _require_unmoved(arm: Arm, base_from_flange: pin.SE3) -> None:
     moved = np.linalg.norm(from_ur(arm.state().flange).translation - base_from_flange.translation)
     if not moved <= MAX_FLANGE_MOTION:
         raise DeviceFault(
-            arm.name,
-            "arm.moved_in_sweep",
+            arm.name, "arm.moved_in_sweep",
             f"the flange moved by {1e3 * moved:.2f} mm during the sweep, allowed {1e3 * MAX_FLANGE_MOTION:.1f} mm",
-            recoverable=True,
-            hint="See what pushed the arm; the sweep is of no use.",
-        )
+            recoverable=True, hint="See what pushed the arm; the sweep is of no use.",
+        )  # fmt: skip
 
 
 def _require_even(rail: str, sweep: Sweep, errors: SweepErrors) -> None:
@@ -238,13 +230,11 @@ def _require_even(rail: str, sweep: Sweep, errors: SweepErrors) -> None:
     allowed = MAX_RESIDUAL * errors.rail * max(1.0, errors.rate)
     if not sweep.unevenness <= allowed:
         raise DeviceFault(
-            rail,
-            "rail.uneven_sweep",
+            rail, "rail.uneven_sweep",
             f"the rail's readings lie {1e3 * sweep.unevenness:.3f} mm (median) off an even motion, more than their "
-            f"round trips explain; allowed {1e3 * allowed:.3f} mm",
-            recoverable=True,
+            f"round trips explain; allowed {1e3 * allowed:.3f} mm", recoverable=True,
             hint="See whether the carriage jams and what else commands this module.",
-        )
+        )  # fmt: skip
 
 
 def _residual(sweep: Sweep, devices: Devices, errors: SweepErrors) -> float:

@@ -31,7 +31,8 @@ from cell.devices.devices import Devices
 from cell.devices.gate.interlocks import DeviceCommand
 from cell.motion.collision import Body, arm_bodies, tool_bodies, vehicle_bodies
 from cell.procedures.frame_store import FrameFile
-from cell.procedures.observed import RailPath, TimedCloud
+from cell.procedures.steps.reconstruct import TimedCloud
+from cell.procedures.sweep.swath import RailPath
 from cell.run.record.file import CAMERAS, COMMANDED, FILE, RecordFile, missing
 from cell.run.runs import Run
 from drivers.clock import Clock

@@ -23,14 +23,13 @@ from cell.config.calibrations.store import CalibrationEdited, CellCalibration
 from cell.config.cell_config import DEVICES, CellConfig, Confirm
 from cell.config.job import Job, load_job
 from cell.devices.devices import Devices, stop_cell
-from cell.devices.simulated.injection import Injector
 from cell.devices.simulated.mixed import Sim
-from cell.devices.simulated.process import Simulation, is_whole
+from cell.devices.simulated.process import Injector, Simulation, is_whole
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
+from cell.procedures.calibrate.verification import Verification
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.steps.kinds import find_kind
-from cell.procedures.verify.verdict import Verification
 from cell.run import calibration as sessions
 from cell.run.calibration import recorded_maintenance
 from cell.run.folder import find_run

@@ -23,8 +23,14 @@ from cell.measure.calibration.drift.evidence import SCAN_DEPTH, SHIFT, TARGET_DE
 from cell.measure.calibration.solve.normal import CAMERA, HAND, PLANE, RAIL, tangents
 from cell.measure.geometry.poses import from_matrix
 from cell.procedures.arm.photograph import rail_ends, verification_views
-from cell.procedures.verify.verdict import Verification, at_place
-from cell.procedures.verify.views import SCAN_APPROACHES, TARGET_APPROACHES, CheckObservations, verify
+from cell.procedures.calibrate.verification import (
+    SCAN_APPROACHES,
+    TARGET_APPROACHES,
+    CheckObservations,
+    Verification,
+    at_place,
+    verify,
+)
 from lab.bench.calibration.observed_cell import ObservedCell, Truth
 from sim_backends.world.scene import draw, rotation
 
@@ -167,7 +173,7 @@ def disturbances() -> list[Disturbance]:
 
 
 def look_again(cell: ObservedCell, calibration: CellCalibration) -> CheckObservations:
-    """What `cell.procedures.verify.views.collect_verification` brings from this world."""
+    """What `cell.procedures.calibrate.verification.collect_verification` brings from this world."""
     config = cell.config
     assert calibration.scan.reference is not None
     scan_view, target_view = verification_views(config, cell.fine, cell.large, calibration.scan, calibration.target)

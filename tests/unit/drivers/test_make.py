@@ -11,9 +11,7 @@ import pytest
 
 from cell.config.cell_config import CellConfig, load_config, tables_of, validate
 from cell.devices.assembly import safe_off_outputs
-from cell.devices.contracts import Bench
-from cell.devices.contracts.device import ClawContract, LaserContract
-from cell.devices.contracts.rail import RailContract
+from cell.devices.contracts import Bench, ClawContract, LaserContract, RailContract
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.makes import BUILT_IN
@@ -23,9 +21,9 @@ from drivers.rail.modbus.make import register_map
 from sim_backends.peers.wired import rail_peer, switch_peers
 from sim_backends.world.drawing import read
 from sim_backends.world.world import World
-from tests.integration.virtual.test_direct_contracts import DirectFaults
 from tests.support import ROOT
 from tests.support.modbus_maps import EDGES, PATHS, RAIL
+from tests.unit.cell.devices.contracts.test_device import DirectFaults
 
 PRINTED = [
     tomllib.loads(block)

@@ -105,7 +105,7 @@ def dry_run(
     from cell.check.fit import require_fit
     from cell.config.cell_config import find_config, load_config
     from cell.config.job import load_job
-    from cell.devices.simulated.injection import Injection
+    from cell.devices.simulated.process import Injection
     from cell.procedures.steps.kinds import find_kind
     from cell.run.session.supervisor import Cell
 

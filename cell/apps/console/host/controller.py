@@ -20,8 +20,8 @@ from cell.apps.console.server.commands import checked_command, checked_message
 from cell.config.job import load_job, require_job_name
 from cell.devices.diagnosis.diagnosis import ask
 from cell.devices.gate.gate import Gated
+from cell.procedures.calibrate.verification import Verification
 from cell.procedures.steps.kinds import find_kind
-from cell.procedures.verify.verdict import Verification
 from cell.run.jogging import Jog
 from cell.run.runs import Run
 from drivers.errors import CellError, InterlockError

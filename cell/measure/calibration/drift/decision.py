@@ -4,7 +4,7 @@ Every part of the chain that may have changed is a hypothesis against none
 (`cell.measure.calibration.drift.evidence`). Their mean Bayes factor is the statistic; what it exceeds by chance is
 found by drawing scores from their own covariance, so that a good calibration is called disturbed in `FALSE_ALARMS` of
 all checks. The most probable part is named. What a good verdict is worth is said by
-`cell.measure.calibration.drift.detectability`.
+`cell.measure.calibration.drift.decision`.
 """
 
 from __future__ import annotations

@@ -12,8 +12,7 @@ from typing import Any
 
 import pytest
 
-from cell.devices.contracts import Bench
-from cell.devices.contracts.device import CameraContract
+from cell.devices.contracts import Bench, CameraContract
 from drivers.camera.genicam.aravis import LIBRARIES, Aravis
 from drivers.camera.genicam.camera import GenicamCamera, GenicamSetup, Region
 from drivers.clock import Clock

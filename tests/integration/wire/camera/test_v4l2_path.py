@@ -17,8 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.devices.contracts import Bench
-from cell.devices.contracts.device import CameraContract
+from cell.devices.contracts import Bench, CameraContract
 from drivers.camera.v4l2 import V4l2Camera
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault, LimitError, NotConnectedError

@@ -19,10 +19,8 @@ from tests.support.wire.cells import cell, served
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
 BLOCKS = re.findall(
-    r"```toml\n(.*?)```",
-    (ROOT / "docs" / "how-to" / "other-makes.md").read_text(encoding="utf-8"),
-    re.DOTALL,
-)
+    r"```toml\n(.*?)```", (ROOT / "docs" / "how-to" / "other-makes.md").read_text(encoding="utf-8"), re.DOTALL,
+)  # fmt: skip
 
 
 @pytest.fixture

@@ -26,12 +26,9 @@ class Served:
 
     def __init__(self, *options: str) -> None:
         self.process = subprocess.Popen(
-            [*SERVE, "--json", "--exit-with-stdin", *options],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+            [*SERVE, "--json", "--exit-with-stdin", *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
         assert self.process.stdout is not None
         self.endpoints: dict[str, Any] = json.loads(self.process.stdout.readline())
         self._ended: tuple[int, str] | None = None

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from cell.devices.contracts import Bench
-from cell.devices.contracts.vehicle import VehicleContract
+from cell.devices.contracts import Bench, VehicleContract
 from drivers.clock import Clock
 from drivers.interfaces import Vehicle
 from drivers.vehicle.cia402.setup import Watchdog

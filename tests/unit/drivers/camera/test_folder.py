@@ -11,8 +11,7 @@ import pytest
 
 from cell.config.cell_config import default_toml, load_config
 from cell.devices.assembly import connect, connect_one
-from cell.devices.contracts import Bench
-from cell.devices.contracts.device import CameraContract
+from cell.devices.contracts import Bench, CameraContract
 from cell.makes import installed, make_of
 from drivers.camera.folder import RecordedCamera
 from drivers.camera.genicam import aravis

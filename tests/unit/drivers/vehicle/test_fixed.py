@@ -17,8 +17,7 @@ from cell.config.calibrations.store import save_calibration
 from cell.config.cell_config import default_toml, load_config
 from cell.config.job import load_job
 from cell.devices.assembly import connect_one
-from cell.devices.contracts import Bench
-from cell.devices.contracts.device import DeviceContract
+from cell.devices.contracts import Bench, DeviceContract
 from cell.devices.diagnosis.diagnosis import _vehicle_state
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell

@@ -17,9 +17,9 @@ import pytest
 from cell.config.cell_config import load_config
 from cell.config.job import job_path
 from cell.devices.devices import Devices
+from cell.devices.gate.gated import UNATTENDED_S
 from cell.devices.gate.interlocks import DeviceCommand
 from cell.devices.gate.rules import LINE_STEP_M, LINE_STEP_RAD, RULES, Ways, markdown
-from cell.devices.gate.scan_head import UNATTENDED_S
 from cell.devices.lock import CellLock
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur, to_ur
@@ -561,10 +561,7 @@ class ReadSlowly(os.PathLike[str]):
 
 def test_a_stop_that_comes_while_work_is_prepared_is_not_lost(cell: Cell) -> None:
     stood = cell.devices.arm.state().joints
-    for begin in (
-        lambda job: cell.calibrate(job=job),
-        lambda job: jog(cell, parse_jog("arm", ["j1", "+5deg"]), job),
-    ):
+    for begin in (lambda job: cell.calibrate(job=job), lambda job: jog(cell, parse_jog("arm", ["j1", "+5deg"]), job)):
         with pytest.raises(Aborted, match=r"was stopped before the .* began"):
             begin(ReadSlowly(cell))
     before = cell.stops

@@ -3,7 +3,6 @@ its declared noise allows."""
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,6 @@ from lab.bench.job.accuracy import LIMITS, figures, summed_up
 from lab.bench.job.expected import mean_distance
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.clock import SteppedClock
-from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from tests.support.report_runs import pot
 
 CONFIG = load_config(None)
@@ -72,20 +70,6 @@ def test_a_sweep_knows_where_the_rail_was_at_any_time_of_it(cell):
         assert sweep.position_at(time) == pytest.approx(cell.world.rail.carriage(time), abs=4e-6)
 
 
-def test_the_arm_arrives_where_it_was_sent(cell):
-    arm = cell.arm
-    start = arm.state().joints
-    end = start + np.array([0.1, -0.05, 0.05, 0.0, 0.1, 0.2])
-    times = np.linspace(0.0, 2.0, 101)
-    smooth = 3 * (times / 2) ** 2 - 2 * (times / 2) ** 3
-    arm.follow(times, start + smooth[:, None] * (end - start)).wait(10.0)
-    state = arm.state()
-    assert not state.moving
-    np.testing.assert_allclose(state.joints, end, atol=2e-3)
-    expected = Kinematics(UR10E_DH).forward(state.joints)
-    np.testing.assert_allclose(state.flange[:3], expected[:3, 3], atol=1e-9)
-
-
 def test_the_vehicle_counts_the_way_that_it_drove(cell):
     vehicle = cell.vehicle
     vehicle.enable()
@@ -102,27 +86,6 @@ def test_the_vehicle_counts_the_way_that_it_drove(cell):
     assert after.speed == 0.0
     with pytest.raises(InterlockError):
         vehicle.drive(0.1, 0.0)
-
-
-def test_frames_follow_each_other_in_world_time(cell):
-    camera = cell.devices.scan_camera
-    camera.configure(0.002, 50.0)
-    with camera.stream() as frames:
-        begun = cell.clock.now()
-        made = [frames.next(1.0) for _ in range(3)]
-    assert [b.frame_id - a.frame_id for a, b in pairwise(made)] == [1, 1]
-    times = [frame.host_time for frame in made]
-    np.testing.assert_allclose(np.diff(times), 0.02, atol=1e-6)
-    # Clocks are compared to half a round trip.
-    assert times[0] == pytest.approx(begun, abs=2.5e-4)
-    assert made[0].image.shape == camera.shape == (480, 640)
-
-
-def test_the_laser_is_seen_only_while_it_is_lit(cell):
-    lit_before = cell.world.laser.at(cell.clock.now())
-    with cell.devices.laser.bare.lit():
-        lit = cell.world.laser.at(cell.clock.now())
-    assert (lit_before, lit, cell.world.laser.at(cell.clock.now())) == (False, True, False)
 
 
 def test_a_stop_of_the_rail_ends_its_motion_and_lasts_until_it_stands(cell):
@@ -147,19 +110,6 @@ def test_a_search_that_was_stopped_has_found_no_zero():
     assert not rail.state().homed
     with pytest.raises(InterlockError, match="is not homed"):
         rail.move_to(0.02)
-
-
-def test_a_rail_that_was_reset_says_so_once_and_is_not_homed():
-    rail = VirtualCell(CONFIG, seed=4, level="ideal").rail
-    rail.home().wait(60.0)
-    rail.reset()
-    with pytest.raises(DeviceFault) as caught:
-        rail.state()
-    assert caught.value.code == "rail.reset"
-    assert not rail.state().homed
-    rail.home().wait(60.0)
-    rail.move_to(0.05).wait(30.0)
-    assert rail.state().position == pytest.approx(0.05, abs=1e-7)
 
 
 def test_a_protective_stop_is_unlocked_on_a_persons_word_after_its_delay_with_the_laser_off():

@@ -47,10 +47,8 @@ def calibration() -> TargetCalibration:
     """As drawn, which an ideal cell is, and known without error: what a photograph states is its own."""
     drawn = made().target
     return replace(
-        drawn,
-        flange_from_camera=CONFIG.target_camera.flange_from_camera.se3(),
-        hand_eye_covariance=np.zeros((6, 6)),
-    )
+        drawn, flange_from_camera=CONFIG.target_camera.flange_from_camera.se3(), hand_eye_covariance=np.zeros((6, 6)),
+    )  # fmt: skip
 
 
 def photographed(cell: VirtualCell, count: int = 1, **limits: float) -> BoardFix:

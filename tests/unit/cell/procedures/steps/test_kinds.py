@@ -1,4 +1,4 @@
-"""A sequence per job: its steps as data, one more of them from outside, and what a script does in between."""
+"""A sequence per job: its steps as data, and one more of them from outside."""
 
 from __future__ import annotations
 
@@ -18,10 +18,8 @@ from cell.procedures.steps.place import PlaceResult
 from cell.procedures.steps.workplace import JobStep, Workplace
 from drivers.clock import Clock
 from drivers.errors import ConfigError
-from statemachine.journal import Journal, read
-from statemachine.runner import NO_SCRIPT, Again, Runner, RunResult, Script, StepContext
-from statemachine.sequence import Sequence
-from statemachine.step import Failure, Outcome, Policy, Step
+from statemachine.runner import StepContext
+from statemachine.step import Step
 
 
 @dataclass(frozen=True)
@@ -121,143 +119,3 @@ def test_a_kind_that_ends_the_program_as_it_is_loaded_is_refused(
     monkeypatch.setattr(kinds, "entry_points", lambda group: installed)
     with pytest.raises(ConfigError, match="ends_the_program:KIND cannot be used: 3"):
         find_kind("ends")
-
-
-class Bench:
-    """Three steps, the second, or another, refuses as often as it is told to."""
-
-    def __init__(self, folder: Path, refusals: int, script: Script = NO_SCRIPT, refuses: str = "sweep") -> None:
-        self.log: list[str] = []
-        self.seen: list[tuple[str, ...]] = []
-        """Whose results each try was given."""
-        self.refuses = refuses
-        self.folder = folder
-        names = ("photo", "sweep", "place")
-        self.runner = Runner(
-            sequence=Sequence(names),
-            steps={name: self._step(name) for name in names},
-            policy=Policy(tuple(Step(name, 5.0) for name in names)),
-            journal=Journal(folder, "r1"),
-            clock=Clock(),
-            classify=lambda error: Failure(Outcome.REFUSED, str(error), "refused"),
-            safe_stop=lambda reason: self.log.append("stop"),
-            script=script,
-        )
-        self.left = refusals
-
-    def _step(self, name: str):  # type: ignore[no-untyped-def]
-        def work(context: StepContext) -> str:
-            self.log.append(name)
-            self.seen.append(tuple(context.results))
-            if name == self.refuses and self.left > 0:
-                self.left -= 1
-                raise ValueError("too few points")
-            return f"made by {name}"
-
-        return work
-
-    def run(self) -> RunResult:
-        return self.runner.run()
-
-
-def test_a_script_lets_a_refused_run_go_on_from_an_earlier_step_and_the_reason_is_kept(tmp_path: Path) -> None:
-    asked: list[tuple[str, str]] = []
-
-    def decide(step: str, failure: Failure) -> Again | None:
-        asked.append((step, failure.reason))
-        return Again("photo", "wiped the lens")
-
-    bench = Bench(tmp_path, 1, Script(on_refusal=decide))
-    result = bench.run()
-    assert result.outcome is Outcome.PLACED
-    assert asked == [("sweep", "too few points")]
-    assert bench.log == ["photo", "sweep", "stop", "stop", "photo", "sweep", "place", "stop"]
-    assert [(fault.step, fault.remedy) for fault in result.faults] == [("sweep", "again from photo")]
-    (decided,) = (event for event in read(tmp_path).events if event.kind == "decided")
-    assert decided.data == {"reason": "too few points", "again": "photo", "why": "wiped the lens"}
-
-
-def test_what_is_to_be_done_again_is_given_nothing_of_what_came_after_it(tmp_path: Path) -> None:
-    script = Script(on_refusal=lambda step, failure: Again("photo", "the table was bumped"))
-    bench = Bench(tmp_path, 1, script, refuses="place")
-    assert bench.run().outcome is Outcome.PLACED
-    once = [(), ("photo",), ("photo", "sweep")]
-    assert bench.seen == [*once, *once]
-
-
-def test_a_script_is_asked_about_refusals_alone(tmp_path: Path) -> None:
-    asked: list[str] = []
-
-    def decide(step: str, failure: Failure) -> Again:
-        asked.append(step)
-        return Again("photo", "whatever it was")
-
-    bench = Bench(tmp_path, 1, Script(on_refusal=decide))
-    bench.runner.classify = lambda error: Failure(Outcome.FAULTED, str(error), "fault")
-    assert bench.run().outcome is Outcome.FAULTED
-    assert asked == []
-
-
-def test_without_a_decision_a_refusal_ends_the_run(tmp_path: Path) -> None:
-    result = Bench(tmp_path, 1, Script(on_refusal=lambda step, failure: None)).run()
-    assert (result.outcome, result.reason) == (Outcome.REFUSED, "too few points")
-    assert [fault.remedy for fault in result.faults] == ["ended the run"]
-
-
-def test_a_decision_for_a_step_that_was_not_reached_ends_the_run(tmp_path: Path) -> None:
-    result = Bench(tmp_path, 1, Script(on_refusal=lambda step, failure: Again("place", "hurry"))).run()
-    assert result.outcome is Outcome.REFUSED
-    assert "chose to go on from 'place', allowed: photo, sweep" in result.reason
-
-
-def test_a_script_that_never_gives_up_is_asked_three_times_about_a_step(tmp_path: Path) -> None:
-    asked: list[str] = []
-
-    def decide(step: str, failure: Failure) -> Again:
-        asked.append(step)
-        return Again("photo", "once more")
-
-    result = Bench(tmp_path, 99, Script(on_refusal=decide)).run()
-    assert asked == ["sweep"] * 3
-    assert result.outcome is Outcome.REFUSED
-    assert "has decided about sweep 3 times, the most allowed" in result.reason
-
-
-def test_retries_before_a_decision_are_counted_with_those_after_it(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, 5, Script(on_refusal=lambda step, failure: Again("sweep", "once more")))
-    bench.runner.policy = bench.runner.policy.with_step(Step("sweep", 5.0, 1, ("ValueError",)))
-    result = bench.run()
-    assert result.outcome is Outcome.PLACED
-    # Failed, retried; again: failed, retried; again: failed, retried, done.
-    assert [record.retries for record in result.steps] == [0, 3, 0]
-    assert [(fault.attempt, fault.remedy) for fault in result.faults] == [
-        (1, "tried again"), (2, "again from sweep"), (1, "tried again"), (2, "again from sweep"), (1, "tried again"),
-    ]  # fmt: skip
-
-
-def test_a_script_sees_each_result_before_the_next_step_and_may_refuse(tmp_path: Path) -> None:
-    seen: list[object] = []
-
-    def look(result: object) -> None:
-        seen.append(result)
-        raise ValueError("the photograph is not of this board")
-
-    bench = Bench(tmp_path, 0, Script(after={"photo": look}))
-    result = bench.run()
-    assert seen == ["made by photo"]
-    assert (result.outcome, result.reason) == (Outcome.REFUSED, "the photograph is not of this board")
-    assert set(bench.log[1:]) == {"stop"}
-
-
-def test_an_abort_ends_a_run_whose_script_still_ponders(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, 0)
-
-    def ponder(result: object) -> None:
-        bench.runner.control.abort("enough")
-        bench.runner.control.token.event.wait(5.0)
-        bench.runner.control.token.check()
-
-    bench.runner.script = Script(after={"photo": ponder})
-    result = bench.run()
-    assert (result.outcome, result.reason) == (Outcome.ABORTED, "enough")
-    assert "sweep" not in bench.log

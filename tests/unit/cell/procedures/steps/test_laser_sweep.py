@@ -1,11 +1,19 @@
-"""A repeated sweep is slower, with its lines as close as before."""
+"""A sweep counts its steps afterwards; a repeated one is slower, with its lines as close as before."""
 
 from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 
 from cell.config.job import load_job
-from cell.procedures.steps.laser_sweep import unhurried
+from cell.procedures.steps.laser_sweep import UNCHECKED, laser_sweep, unhurried
+from cell.procedures.sweep.second_look import sparse
+from drivers.errors import DeviceFault
+from lab.bench.job.whole_job import JobRecord
+from tests.support.report_runs import pot
+from tests.unit.cell.procedures.sweep.test_second_look import Site
 
 
 @pytest.mark.parametrize(("attempt", "share"), [(1, 1.0), (2, 0.5), (3, 0.25)])
@@ -15,3 +23,28 @@ def test_each_repetition_is_half_as_fast_with_the_lines_as_close(attempt: int, s
     assert again.speed == pytest.approx(share * scan.speed)
     assert again.speed / again.frame_rate == pytest.approx(scan.speed / scan.frame_rate)
     assert again.length == scan.length
+
+
+@pytest.mark.parametrize(("fault", "mode"), [("", 5), ("rail.lost_steps", 5), ("", 1)])
+def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
+    placed_pot: JobRecord, tmp_path: Path, fault: str, mode: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lost steps refuse what was swept; a rail that does not show its switch leaves a doubt."""
+    site, told = Site(placed_pot, tmp_path, *pot()), []
+    rail = site.cell.devices.rail
+    rail.home().wait(60.0)
+    if fault:
+        site.cell.fault(fault)
+    if mode == 1:
+        monkeypatch.setattr(rail, "check_zero", lambda: None)
+    few = sparse(site.job.scan, placed_pot.results["laser_sweep"].swaths[0])
+    with pytest.raises(DeviceFault, match="lost steps") if fault else nullcontext() as met:
+        swept = laser_sweep(
+            site.work, site.made["board_photo"], site.work.calibration.scan, few, keep_frame=lambda frame: None,
+            check=lambda: None, progress=lambda share, text: told.append(text),
+        )  # fmt: skip
+        assert swept.doubts == ((UNCHECKED,) if mode == 1 else ())
+    if fault:
+        assert (met.value.code, met.value.recoverable) == ("rail.lost_steps", True)
+        assert not rail.state().homed_here
+    assert "looking whether the rail has lost steps" in told

@@ -60,11 +60,9 @@ class Site:
         self.base_from_surface = from_matrix(inverse(world_from_base) @ world.scene.world_from_surface)
         self.mover = Mover(self.arm, self.cell.clock, CONFIG, JOB)
         self.mover.meet_station(
-            self.base_from_surface * JOB.surface.place_from_surface.se3().inverse(),
-            JOB,
-            parse_board(JOB.board.spec),
+            self.base_from_surface * JOB.surface.place_from_surface.se3().inverse(), JOB, parse_board(JOB.board.spec),
             NOMINAL.extent,
-        )
+        )  # fmt: skip
         self.part = PartProgress()
         self.noted: list[PartState] = []
         self.forces: list[float] = []
@@ -293,29 +291,24 @@ def test_placing_is_tried_once_whatever_becomes_of_it() -> None:
     assert (step.max_retries, step.retry_on, step.on_failure) == (0, (), OnFailure.STOP)
 
 
-def test_a_run_that_has_put_its_part_down_is_not_resumed(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("parts", "ended", "words"),
+    [
+        (("unknown", "released"), False, "had put its part down already, only the retreat failed"),
+        (("released",), True, "what came after that failed"),
+        (("unknown",), False, "Look what has become of the part"),
+    ],
+)
+def test_a_run_whose_part_may_be_down_is_not_resumed(
+    tmp_path: Path, parts: tuple[str, ...], ended: bool, words: str
+) -> None:
     """Whether it was killed or faulted afterwards: the journal had it before the retreat began."""
     journal = Journal(tmp_path, "run", {"job_file": "pot.toml", "job_hash": "0"})
-    journal.event("note", "place", {"part": "unknown", "base_from_part": [0.0] * 6})
-    journal.event("note", "place", {"part": "released", "base_from_part": [0.0] * 6})
-    journal.close()
-    with pytest.raises(ConfigError, match="had put its part down already, only the retreat failed"):
-        UnfinishedRun.find(tmp_path)
-
-
-def test_a_run_that_failed_in_a_later_step_does_not_blame_the_retreat(tmp_path: Path) -> None:
-    journal = Journal(tmp_path, "run", {"job_file": "pot.toml", "job_hash": "0"})
     key = journal.step_started("place", 1)
-    journal.event("note", "place", {"part": "released", "base_from_part": [0.0] * 6})
-    journal.step_ended(key, 1.0, {})
+    for part in parts:
+        journal.event("note", "place", {"part": part, "base_from_part": [0.0] * 6})
+    if ended:
+        journal.step_ended(key, 1.0, {})
     journal.close()
-    with pytest.raises(ConfigError, match="what came after that failed"):
-        UnfinishedRun.find(tmp_path)
-
-
-def test_a_run_that_was_killed_while_the_claw_released_is_not_resumed(tmp_path: Path) -> None:
-    journal = Journal(tmp_path, "run", {"job_file": "pot.toml", "job_hash": "0"})
-    journal.event("note", "place", {"part": "unknown", "base_from_part": [0.0] * 6})
-    journal.close()
-    with pytest.raises(ConfigError, match="Look what has become of the part"):
+    with pytest.raises(ConfigError, match=words):
         UnfinishedRun.find(tmp_path)

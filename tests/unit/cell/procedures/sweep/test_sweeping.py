@@ -1,6 +1,6 @@
 """A sweep that something disturbed is a fault that names it, on the devices without wires: nothing of it is used.
 
-A sweep by the arm alone, on the devices in this process: its place is known as well as the arm's times are."""
+By the rail, and by the arm alone: then its place is known as well as the arm's times are."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import pytest
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import load_config
 from cell.config.job import ScanSection, load_job
-from cell.devices.gate.scan_head import UNATTENDED_S
+from cell.devices.gate.gated import UNATTENDED_S
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts, from_ur
@@ -27,9 +27,8 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import ScanPlan
 from cell.procedures.drive.way import Whereabouts
-from cell.procedures.steps.laser_sweep import UNCHECKED, _home, laser_sweep
+from cell.procedures.steps.laser_sweep import _home
 from cell.procedures.steps.workplace import Workplace
-from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors
 from cell.procedures.sweep.sweeping import JITTER_S, LATENCY_S, arm_sweep, rail_sweep
 from drivers.errors import DeviceFault
@@ -40,17 +39,26 @@ from sim_backends.direct.arm import DirectArm
 CONFIG = load_config(None)
 SCAN = load_job("pot")[0].scan.model_copy(update={"length": 0.02, "speed": 0.02, "frame_rate": 20.0})
 GEOMETRY = ScanGeometry(
-    nominal_camera(CONFIG.scan_camera),
-    LightPlane.of((1.0, 0.0, -1 / 3.5), -0.035),
-    np.array([1.0, 0.0, 0.0]),
+    nominal_camera(CONFIG.scan_camera), LightPlane.of((1.0, 0.0, -1 / 3.5), -0.035), np.array([1.0, 0.0, 0.0]),
     CONFIG.scan_camera.flange_from_camera.se3(),
-)
+)  # fmt: skip
 ERRORS = SweepErrors(np.zeros((6, 6)), 5e-6, 0.15e-3)
 Meddle = Callable[[VirtualCell], None]
 
 
-def nothing(cell: VirtualCell) -> None:
+def nothing(of: object) -> None:
     """Nobody meddles."""
+
+
+def ready(made: VirtualCell | None) -> tuple[VirtualCell, Mover, pin.SE3]:
+    """A cell that may sweep, homed and folded; its arm's moves, and where the flange stands."""
+    cell = made or VirtualCell(CONFIG, seed=4, level="ideal")
+    cell.devices.vehicle.brake()
+    cell.devices.interlocks.work_with(CONFIG.calibration_hash())
+    cell.devices.rail.home().wait(60.0)
+    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None)
+    mover.to_joints(HOME)
+    return cell, mover, from_ur(cell.devices.arm.state().flange)
 
 
 def sweep(
@@ -65,16 +73,8 @@ def sweep(
 
     Replies of rail and camera come so many s late.
     """
-    cell = made or VirtualCell(CONFIG, seed=4, level="ideal")
-    devices = cell.devices
-    devices.vehicle.brake()
-    devices.interlocks.work_with(CONFIG.calibration_hash())
-    devices.rail.home().wait(60.0)
-    cell.rail.late = late
-    cell.scan_camera.late = camera_late
-    mover = Mover(devices.arm, cell.clock, CONFIG, None)
-    mover.to_joints(HOME)
-    pose: pin.SE3 = from_ur(devices.arm.state().flange)
+    cell, mover, pose = ready(made)
+    cell.rail.late, cell.scan_camera.late = late, camera_late
     taken: list[int] = []
 
     def keep(frame: Frame) -> None:
@@ -83,7 +83,7 @@ def sweep(
             meddle(cell)
 
     collector = SweepCollector(GEOMETRY, scan, keep, lambda fraction, text: None)
-    return rail_sweep(ScanPlan(pose, pose, 0.03, 0.05), mover, devices, errors, collector)
+    return rail_sweep(ScanPlan(pose, pose, 0.03, 0.05), mover, cell.devices, errors, collector)
 
 
 def test_the_picture_of_a_sweep_is_from_its_middle() -> None:
@@ -91,42 +91,6 @@ def test_the_picture_of_a_sweep_is_from_its_middle() -> None:
     taken = swath.seen.tolist()
     assert taken.index(swath.middle.frame_id) == pytest.approx(SCAN.length / SCAN.speed * SCAN.frame_rate / 2, abs=1)
     assert len(taken) > SCAN.length / SCAN.speed * SCAN.frame_rate * 0.9
-
-
-@pytest.mark.parametrize(("fault", "mode"), [("", 5), ("rail.lost_steps", 5), ("", 1)])
-def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
-    fault: str, mode: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Lost steps refuse what was swept; a rail that does not show its switch leaves a doubt."""
-    cell = VirtualCell(CONFIG, seed=4, level="ideal")
-    devices = cell.devices
-    devices.vehicle.brake()
-    devices.interlocks.work_with(CONFIG.calibration_hash())
-    devices.rail.home().wait(60.0)
-    mover = Mover(devices.arm, cell.clock, CONFIG, None)
-    mover.to_joints(HOME)
-    pose: pin.SE3 = from_ur(devices.arm.state().flange)
-    told: list[str] = []
-    if fault:
-        cell.fault(fault)
-    if mode == 1:
-        monkeypatch.setattr(devices.rail, "check_zero", lambda: None)
-
-    def swept() -> SweepRecord:
-        plans = [ScanPlan(pose, pose, 0.03, 0.05)]
-        return laser_sweep(
-            plans, SCAN, GEOMETRY, ERRORS, mover, devices, lambda frame: None, lambda: None,
-            lambda fraction, text: told.append(text),
-        )  # fmt: skip
-
-    if fault:
-        with pytest.raises(DeviceFault, match="lost steps") as met:
-            swept()
-        assert (met.value.code, met.value.recoverable) == ("rail.lost_steps", True)
-        assert not devices.rail.state().homed_here
-    else:
-        assert swept().doubts == ((UNCHECKED,) if mode == 1 else ())
-    assert "looking whether the rail has lost steps" in told
 
 
 def refused(code: str, meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0) -> str:
@@ -256,16 +220,9 @@ def test_a_camera_whose_clock_cannot_be_compared_well_is_refused_as_well() -> No
     assert re.search(r"those of the camera to ±100\.\d ms", refused("camera.late_readings", camera_late=0.2))
 
 
-LENGTH = 0.02
-
-
-def nothing_of_arm_sweep(arm: DirectArm) -> None:
-    """Nobody meddles."""
-
-
-def sweep_of_arm_sweep(
+def swept_by_arm(
     late: float = 0.0,
-    meddle: Callable[[DirectArm], None] = nothing_of_arm_sweep,
+    meddle: Callable[[DirectArm], None] = nothing,
     made: VirtualCell | None = None,
     errors: SweepErrors = ERRORS,
 ) -> tuple[Swath, float]:
@@ -273,14 +230,9 @@ def sweep_of_arm_sweep(
 
     `meddle` is called with each of ten frames from the middle.
     """
-    cell = made or VirtualCell(CONFIG, seed=4, level="ideal")
+    cell, mover, start = ready(made)
     devices, arm, camera = cell.devices, cell.arm, cell.scan_camera
-    devices.vehicle.brake()
-    devices.rail.home().wait(60.0)
-    mover = Mover(devices.arm, cell.clock, CONFIG, None)
-    mover.to_joints(HOME)
-    start: pin.SE3 = from_ur(arm.state().flange)
-    end = from_parts(np.array([0.0, LENGTH, 0.0])) * start
+    end = from_parts(np.array([0.0, SCAN.length, 0.0])) * start
     arm.late = late
     taken: list[int] = []
 
@@ -296,16 +248,16 @@ def sweep_of_arm_sweep(
 
 
 def test_a_sweep_that_nothing_disturbed_lies_where_it_says() -> None:
-    swath, off = sweep_of_arm_sweep()
+    swath, off = swept_by_arm()
     assert len(swath.lines) == pytest.approx(20, abs=2)
     assert off < 10e-6
     assert off < swath.shift < 25e-6
 
 
-def test_the_laser_goes_off_before_a_camera_that_is_slow_to_end_its_stream_of_arm_sweep() -> None:
+def test_the_laser_goes_off_before_a_camera_that_is_slow_to_end_its_stream_by_the_arm() -> None:
     cell = VirtualCell(CONFIG, seed=4, level="ideal")
     cell.scan_camera.lingers = 2.0
-    swath, _ = sweep_of_arm_sweep(made=cell)
+    swath, _ = swept_by_arm(made=cell)
     assert cell.world.laser.at(swath.times[-1])
     assert not cell.world.laser.at(cell.clock.now() - 1.9)
 
@@ -315,14 +267,14 @@ def test_an_arm_that_is_pushed_again_and_again_is_a_fault() -> None:
         arm.model.drive.q[0] += 0.001
 
     with pytest.raises(DeviceFault, match="did not move evenly") as caught:
-        sweep_of_arm_sweep(meddle=push)
+        swept_by_arm(meddle=push)
     assert caught.value.code == "arm.uneven_sweep"
 
 
 @pytest.mark.parametrize("late", [0.02, 0.2])
 def test_states_that_are_all_late_are_refused_with_what_they_leave_open(late: float) -> None:
     with pytest.raises(DeviceFault) as caught:
-        sweep_of_arm_sweep(late)
+        swept_by_arm(late)
     assert caught.value.code == "arm.late_readings"
     assert caught.value.recoverable
     told = re.search(r"those of the arm to ±([\d.]+) ms", str(caught.value))
@@ -332,9 +284,9 @@ def test_states_that_are_all_late_are_refused_with_what_they_leave_open(late: fl
 
 
 @pytest.mark.parametrize("rate", [1.0, 3.0])
-def test_lateness_that_is_allowed_is_in_the_budget_of_arm_sweep(rate: float) -> None:
+def test_lateness_that_is_allowed_is_in_the_budget_by_the_arm(rate: float) -> None:
     late = 0.01
-    swath, off = sweep_of_arm_sweep(late, errors=replace(ERRORS, rate=rate))
+    swath, off = swept_by_arm(late, errors=replace(ERRORS, rate=rate))
     # The trap: the states lie on a perfect line, and the sweep is half of the lateness off.
     assert swath.residual < 10e-6
     # From tick to tick the simulated arm's speed differs by a tenth from that of the sweep.

@@ -6,13 +6,10 @@ import re
 from pathlib import Path
 
 import cv2
-import numpy as np
 import pytest
 
 from cell.measure.reconstruction.ply import read_cloud
-from cell.procedures.frame_store import FrameStore
 from drivers.errors import Measured, RefusedError
-from drivers.interfaces import Frame
 from tests.support import report_runs
 from tests.support.report_runs import Ended, Ends, Make, read_strictly
 
@@ -94,20 +91,6 @@ def test_a_fault_keeps_the_last_frames_and_every_fault_before_it(ends: Ends) -> 
     assert (first["code"], first["step"], first["attempt"]) == ("camera.frames_lost", "laser_sweep", 1)
     assert (first["remedy"], last["remedy"]) == ("tried again", "ended the run")
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4}", first["at"])
-
-
-def test_only_the_frames_of_the_last_step_are_its_evidence(tmp_path: Path) -> None:
-    def frame(number: int) -> Frame:
-        return Frame(np.zeros((4, 4), np.uint8), number, 0.01, 0.0, 0.0, 0.0)
-
-    with FrameStore(tmp_path / "frames") as store:
-        store.keep("board-01", frame(1))
-        store.begin()
-        for number in range(2, 40):
-            store.keep("stripe", frame(number))
-    assert store.recent[-1] == "stripe-000039.png"
-    assert len(store.recent) == 12
-    assert len(list((tmp_path / "frames").iterdir())) == 39
 
 
 def test_a_placed_run_measures_itself_against_its_limits(placed: Ended) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cell.devices.contracts import Bench as ContractBench
-from cell.devices.contracts.device import CameraContract
+from cell.devices.contracts import CameraContract
 from drivers.camera.genicam.acquisition import FORMATS, BlockCount, Network
 from drivers.camera.genicam.camera import ExposureTrigger, GenicamCamera, GenicamSetup, Region
 from drivers.camera.genicam.device import GigePlace

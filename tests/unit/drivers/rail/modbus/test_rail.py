@@ -21,8 +21,7 @@ import pytest
 from pymodbus.client import ModbusSerialClient
 from pymodbus.framer import FramerRTU
 
-from cell.devices.contracts import Bench, Faults
-from cell.devices.contracts.rail import RailContract
+from cell.devices.contracts import Bench, Faults, RailContract
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import LinkStatistics, Rail

@@ -23,8 +23,7 @@ from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_matrix
 from cell.procedures.arm.photograph import rail_ends, verification_views
-from cell.procedures.verify.verdict import Verification
-from cell.procedures.verify.views import verify
+from cell.procedures.calibrate.verification import Verification, verify
 from drivers.errors import RefusedError
 from lab.bench.calibration.observed_cell import ObservedCell, shifted
 from lab.bench.calibration.verification import KINDS_OF_CHANGE, changed, disturbances, look_again

@@ -17,7 +17,7 @@ from cell.measure.calibration.solve.normal import BOARD, SHARED, AdjustmentState
 from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import covariance_root, from_matrix
-from cell.procedures.verify.views import scan_looks, target_looks, verify
+from cell.procedures.calibrate.verification import scan_looks, target_looks, verify
 from drivers.errors import CalibrationStale
 from lab.bench.calibration.observed_cell import ObservedCell
 from lab.bench.calibration.verification import look_again

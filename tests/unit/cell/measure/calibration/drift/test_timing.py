@@ -15,8 +15,6 @@ import pytest
 from cell.config.calibrations.finding import find_calibration
 from cell.config.calibrations.store import CellCalibration, changed, link_of, save_calibration
 from cell.config.cell_config import load_config
-from cell.config.job import load_job
-from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.drift.evidence import Reference
 from cell.measure.calibration.drift.timing import (
@@ -34,17 +32,10 @@ from cell.measure.calibration.drift.timing import (
 from cell.measure.calibration.solve.results import KEPT, Quality, TargetCalibration
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.inversion import NominalSurface
 from cell.measure.vision import BoardView, parse_board
-from cell.procedures.arm.moves import Mover
-from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
 from cell.procedures.steps.laser_sweep import times_known
 from cell.run.calibration import kept_if_refused
-from cell.run.recorded_work import Hands, RecordedWork
-from cell.run.runs import Run
 from drivers.errors import CalibrationStale, RefusedError
-from lab.bench.job.whole_job import JobRecord, run_whole_job
-from sim_backends.world import scene
 from tests.unit.cell.procedures.sweep.test_sweeping import ERRORS, sweep
 
 CONFIG = load_config(None)
@@ -173,36 +164,6 @@ def test_one_sweep_to_and_fro_tells_roughly_how_late_stamps_come(late: float) ->
         refuse_late(found, sigma, MOST_LATE_S)
 
 
-def test_a_calibration_has_looked_at_the_shutter(placed_pot: JobRecord) -> None:
-    assert placed_pot.calibration is not None
-    shutter = placed_pot.calibration.scan.shutter
-    assert shutter is not None
-    assert abs(shutter.readout) < 5 * shutter.sigma < 0.25e-3
-    assert times_known(placed_pot.calibration.scan, CONFIG) == (None, ())
-
-
-def test_a_calibration_of_a_cell_with_a_rolling_shutter_is_refused(placed_pot: JobRecord) -> None:
-    made = placed_pot.calibration
-    assert made is not None
-    cell = VirtualCell(CONFIG, 2, "nominal+rolling_shutter")
-    cell.devices.vehicle.brake()
-    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None)
-    with pytest.raises(RefusedError, match=r"rolling shutter: its last row is exposed (9\.9|10\.0|10\.1) ms after"):
-        look_at_shutter(CONFIG, cell.devices, mover, made, lambda: None, lambda what, frame: None)
-
-
-def test_a_shutter_that_could_not_be_looked_at_is_a_note_and_the_calibration_holds(placed_pot: JobRecord) -> None:
-    made = placed_pot.calibration
-    assert made is not None
-    spoilt = replace(made, scan=replace(made.scan, shutter=None))
-    short = CONFIG.model_copy(update={"rail": CONFIG.rail.model_copy(update={"travel": (0.04, 0.055)})})
-    cell = VirtualCell(CONFIG, 2)
-    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None)
-    seen = look_at_shutter(short, cell.devices, mover, spoilt, lambda: None, lambda what, frame: None)
-    assert seen.scan.shutter is None
-    assert "whether the scan camera has a rolling shutter was not seen: the fine board stays" in seen.scan.notes[-1]
-
-
 @pytest.mark.parametrize("readout", [10e-3, 0.1e-3])
 def test_what_is_refused_of_the_times_later_ends_the_stored_calibration_too(readout: float, tmp_path: Path) -> None:
     """Else the job after a refused `cell calibrate` would go on with the calibration before it."""
@@ -283,36 +244,3 @@ def test_a_sweep_puts_late_stamps_back_and_is_surer_of_its_place() -> None:
     shares = [float(np.sqrt(np.linalg.eigvalsh(one.covariance)[-1])) for one in (before, after)]
     assert shares[0] > 0.02 * MOST_LATE_S / np.sqrt(3)
     assert shares[1] < 0.005e-3
-
-
-def measured(made: CellCalibration, seed: int, level: str, folder: Path) -> StampTiming:
-    """What the simulated cell of `seed` finds."""
-    cell = VirtualCell(CONFIG, seed, level)
-    job, _ = load_job("pot")
-
-    def look(hands: Hands) -> StampTiming:
-        cell.devices.interlocks.work_with(made.configuration)
-        cell.devices.vehicle.brake()
-        mover = Mover(cell.devices.arm, cell.clock, CONFIG, job, hands.safe_point)
-        given = CONFIG, cell.devices, mover, made, hands.check, lambda f, t: None, lambda what, frame: None
-        return collect_timing(*given)
-
-    return Run("timing", lambda run: RecordedWork(run, "timing", cell.devices, folder, {}).perform(look)).result()
-
-
-@pytest.mark.campaign
-def test_ten_simulated_cells_know_their_lateness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two milliseconds late each; the eleventh has a rolling shutter."""
-    drawn = scene._clock
-    monkeypatch.setattr(scene, "_clock", lambda *given: replace(drawn(*given), latency=2e-3))
-    job, mesh = load_job("pot")
-    nominal, off = NominalSurface.load(mesh, unit=job.surface.mesh_unit), []
-    for seed in range(1, 11):
-        record = run_whole_job(CONFIG, job, nominal, seed, "nominal")
-        assert record.calibration is not None
-        found = measured(record.calibration, seed, "nominal", tmp_path)
-        assert found.sigma <= 0.2e-3
-        off.append((found.late - 2e-3) / found.sigma)
-    assert np.abs(off).max() < 3.5
-    with pytest.raises(RefusedError, match="rolling shutter"):
-        measured(record.calibration, 10, "nominal+rolling_shutter", tmp_path)

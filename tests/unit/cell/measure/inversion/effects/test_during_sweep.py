@@ -1,30 +1,21 @@
-"""A vehicle that rocks while the laser sweeps: seen in a made-up scan of known motion, and not seen where it stands.
-
-A carriage that sinks along its travel, planted into the cloud of a good sweep, is in the stated covariance."""
+"""A vehicle that rocks while the laser sweeps: seen in a made-up scan of known motion, and not seen where it stands."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from cell.config.job import load_job
-from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
-from cell.measure.inversion.effects.between_sweeps import Creep
 from cell.measure.inversion.effects.during_sweep import (
     LARGEST_RAD,
-    LEAST_SAG,
-    Droop,
-    Head,
     Rocking,
     _Sweep,
-    bow,
     find_rocking,
     rocking_covariance,
     rocking_motions,
@@ -33,12 +24,8 @@ from cell.measure.reconstruction.cloud import Cloud, merge
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.steps.invert_pose import LineTimes
 from cell.procedures.steps.invert_pose import invert_pose as step
-from cell.procedures.steps.place import carried_on
 from cell.procedures.steps.reconstruct import Reconstruction
-from drivers.errors import NotObservable, RefusedError
-from lab.bench.job.scan_errors import own_base, surface_at_middle
-from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
-from tests.support.report_runs import CONFIG, pot, work_of
+from drivers.errors import RefusedError
 
 JOB, MESH = load_job("pot")
 NOMINAL = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
@@ -226,95 +213,3 @@ def inverted(cloud: Cloud) -> PlacePose:
 
     scan = Reconstruction(cloud, (), still, still)
     return step(scan, fix, JOB, NOMINAL, np.zeros((6, 6)), LineTimes(TIMES, VEHICLE))
-
-
-def head_of(record: JobRecord, cloud: Cloud) -> Head:
-    assert record.calibration is not None
-    scan, sweep = record.calibration.scan, record.results["laser_sweep"]
-    travel = CONFIG.rail.travel[1]
-    return Head.of(cloud, sweep.base_from_flange, scan.flange_from_camera, scan.rail_direction, travel)
-
-
-def drooped(record: JobRecord, sag: float) -> Cloud:
-    """The record's cloud, with the carriage sunk by `sag` m at the end of its travel."""
-    cloud = record.results["reconstruct"].cloud
-    lines, rows = np.nonzero(cloud.valid)
-    points = cloud.points.copy()
-    points[lines, rows] -= Droop(sag, 0.0, head_of(record, cloud)).motions(cloud, lines, rows).sum(axis=2)
-    return replace(cloud, points=points)
-
-
-def inverted_of_droop(record: JobRecord, sag: float) -> PlacePose:
-    """By the job's step, with the carriage sunk by `sag` m at the end of its travel."""
-    made, (job, nominal) = record.results, pot()
-    sweep, bent = made["laser_sweep"], drooped(record, sag)
-    vehicle = CONFIG.arm.vehicle_from_base.se3().inverse()
-    taken = LineTimes(sweep.times, vehicle, head_of(record, bent))
-    assert record.kinematic is not None
-    return step(replace(made["reconstruct"], cloud=bent), made["board_photo"], job, nominal, record.kinematic, taken)
-
-
-@pytest.mark.parametrize("sag", [0.1e-3, -0.1e-3, 0.15e-3])
-def test_a_carriage_that_droops_is_told_and_in_the_stated_covariance(placed_pot: JobRecord, sag: float) -> None:
-    good, found = placed_pot.results["invert_pose"], inverted_of_droop(placed_pot, sag)
-    (note,) = found.notes
-    assert "bowed along the rail, as if its carriage had sunk by" in note and "cell calibrate" in note
-    off = difference(good.base_from_surface, found.base_from_surface)
-    assert np.linalg.norm(off[3:]) > 0.5e-3
-    assert off @ np.linalg.solve(good.covariance, off) > 12.6
-    assert off @ np.linalg.solve(found.covariance, off) < 12.6
-
-
-def test_without_a_droop_nothing_is_added_and_too_large_a_one_is_refused(placed_pot: JobRecord) -> None:
-    good, found = placed_pot.results["invert_pose"], inverted_of_droop(placed_pot, 0.0)
-    assert found.notes == good.notes == ()
-    np.testing.assert_array_equal(found.covariance, good.covariance)
-    with pytest.raises(NotObservable, match=r"not determined.*as if its carriage had sunk by 0\.[3-5]"):
-        inverted_of_droop(placed_pot, 0.4e-3)
-
-
-def test_a_place_that_is_carried_on_for_a_creep_keeps_what_the_droop_adds(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
-    made, (job, nominal), cell = placed_pot.results, pot(), VirtualCell(CONFIG, 2, "nominal")
-    good, sweep = made["invert_pose"], made["laser_sweep"]
-    rate, origin = np.array([6e-6, 0, 0, 0, 3e-6, 0]), good.base_from_surface.translation
-    creep = Creep(rate, np.diag(np.full(6, 0.1e-6**2)), origin, float(sweep.times.mean()))
-    creeping = replace(creep, rate=-rate).undone(drooped(placed_pot, 0.1e-3), sweep.times)
-    work = work_of(cell, job, nominal, placed_pot, NoFrames(), tmp_path)
-    scan = replace(made["reconstruct"], cloud=creeping)
-    found = carried_on(work, sweep, scan, made["board_photo"], creep)
-    (note,) = found.notes
-    assert "as if its carriage had sunk by" in note
-    assert (found.sigma > 0.99 * inverted_of_droop(placed_pot, 0.1e-3).sigma).all()
-    assert (found.sigma / good.sigma).max() > 3
-
-
-# --- in the simulator ---
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("name", ["pot", "seat", "panel"])
-def test_a_droop_since_the_calibration_is_in_the_stated_covariance_or_refused(name: str, seed: int) -> None:
-    """Prints the bow without a droop, and with one of .1 mm how far the place is off against its covariance."""
-    job, mesh = load_job(name)
-    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
-    good = run_whole_job(CONFIG, job, nominal, seed, "nominal")
-    assert (good.outcome, good.reason) == ("placed", "")
-    found, cloud = good.results["invert_pose"], good.results["reconstruct"].cloud
-    untouched = bow(cloud, nominal, found.base_from_surface, head_of(good, cloud))
-    assert untouched is not None
-    told = " ".join(found.notes)
-    print(f"{name} {seed}: bow {1e6 * untouched[0]:.1f} ± {1e6 * untouched[1]:.1f} µm {told}")
-    worn = run_whole_job(CONFIG, job, nominal, seed, "nominal+droop", calibrated=good)
-    if worn.outcome == "placed":
-        found = worn.results["invert_pose"]
-        off = difference(found.base_from_surface, own_base(worn) * surface_at_middle(worn))
-        distance = float(off @ np.linalg.solve(found.covariance, off))
-        print(f"{name} {seed}: droop, m² {distance:.1f} {' '.join(found.notes)}")
-        assert distance <= 12.6
-    else:
-        print(f"{name} {seed}: droop, {worn.outcome}: {worn.reason}")
-        assert "as if its carriage had sunk by" in worn.reason
-    assert abs(untouched[0]) < LEAST_SAG and "bowed" not in told

@@ -1,20 +1,48 @@
-"""A vehicle that rocks is seen in photographs that follow each other, waited for, and stated where it does not rest."""
+"""A vehicle that rocks is waited for, and stated where it does not rest."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pinocchio as pin
 import pytest
 
+from cell.config.cell_config import load_config
 from cell.measure.vision import BoardView, parse_board
-from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.drive.settled import APART_S, swing, swing_covariance
-from cell.procedures.steps.board_photo import WAIT_S, WAITS, until_quiet
+from cell.procedures.arm.photograph import APART_S, BoardFix, swing, swing_covariance
+from cell.procedures.drive.station_check import require_unmoved
+from cell.procedures.steps.board_photo import WAIT_S, WAITS, photographed, until_quiet
+from cell.procedures.steps.workplace import PHOTO_RATE_HZ
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord
+from tests.support.report_runs import at_work
+
+CONFIG = load_config(None)
+
+
+def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Taken(Exception):
+        """The camera was asked."""
+
+    def photograph(count: int = 1) -> None:
+        raise Taken
+
+    here, fix, asked = at_work(placed_pot, tmp_path), placed_pot.results["board_photo"], []
+    monkeypatch.setattr(here, "photograph", photograph)
+    monkeypatch.setattr(here, "mover", SimpleNamespace(to=lambda *given: None))
+    monkeypatch.setattr(here.devices.target_camera, "configure", lambda *given: asked.append(given))
+    with pytest.raises(Taken):
+        photographed(here, fix.base_from_board, lambda share, text: None)
+    with pytest.raises(Taken):
+        require_unmoved(here, fix, "before the sweep", lambda share, text: None)
+    assert asked == [(CONFIG.target_camera.photo_exposure, PHOTO_RATE_HZ)] * 2
+
 
 BOARD = parse_board("chessboard:9x7:20mm")
 FOCAL, AWAY, NOISE = 1667.0, 0.9, 0.05

@@ -18,8 +18,7 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
-from cell.procedures.verify.verdict import Verification, keep_confirmed
-from cell.procedures.verify.views import collect_verification
+from cell.procedures.calibrate.verification import Verification, collect_verification, keep_confirmed
 from cell.run.recorded_work import Hands, RecordedWork
 from cell.run.runs import Run
 from lab.bench.job.whole_job import JobRecord, run_whole_job

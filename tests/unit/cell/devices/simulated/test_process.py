@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cell.devices.simulated.injection import Injection, Injector
+from cell.devices.simulated.process import Injection, Injector
 from cell.procedures.steps.kinds import PLACE
 from drivers.errors import ConfigError, DeviceFault
 from sim_backends.direct import cell as direct

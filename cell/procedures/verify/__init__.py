@@ -1,1 +1,0 @@
-"""How good a stored calibration is today."""

@@ -1,0 +1,192 @@
+"""The plate on the claw is looked at by a simulated head: where its edge is, and what has slipped since."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from cell.config.cell_config import load_config
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.calibration.drift.reference_plate import PlateLine
+from cell.measure.calibration.drift.slip import Slip, slip_since
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.light_plane import LightPlane
+from cell.procedures.calibrate.reference_plate import SPEED, look_at_edge, require_edge, require_witness
+from cell.procedures.steps.laser_sweep import unwatched
+from drivers.errors import RefusedError
+from drivers.interfaces import Frame
+
+CONFIG = load_config(None)
+
+
+def let_go(what: str, frame: Frame) -> None:
+    """No picture is kept."""
+
+
+def looked(cell: VirtualCell, before: PlateLine | None = None) -> PlateLine:
+    now = require_witness(CONFIG, cell.devices, let_go)
+    if before is not None:
+        return require_edge(CONFIG, cell.devices, let_go, before, now)
+    return replace(now, edge=look_at_edge(CONFIG, cell.devices, let_go, now, None))
+
+
+@pytest.fixture(scope="module")
+def cell() -> tuple[VirtualCell, PlateLine, Callable[[PlateLine], Slip]]:
+    """A simulated cell, what it shows of the plate, and how a later look is held against that."""
+    cell = VirtualCell(CONFIG, 3, "nominal")
+    cell.devices.vehicle.brake()
+    cell.devices.rail.home().wait(60.0)
+    cell.devices.interlocks.work_with(CONFIG.calibration_hash())
+    before = looked(cell)
+    scene = cell.world.scene
+    lens = scene.scan_lens
+    camera = CameraModel(640, 480, lens.fx, lens.fy, lens.cx, lens.cy, lens.dist)
+    plane = LightPlane.of(scene.light_plane_normal, scene.light_plane_distance)
+    return cell, before, lambda now: slip_since(before, now, camera, plane, scene.rail_direction)
+
+
+def test_the_edge_is_where_the_world_has_it(cell) -> None:
+    world, before = cell[0].world, cell[1]
+    assert before.edge is not None
+    world.rail.carriage(0.0)
+    scene, plate = world.scene, world.scene.drawing.cell.witness
+    edge = np.linalg.inv(scene.flange_from_scan_camera) @ plate @ np.array([0.0065, 0.0, 0.0, 1.0])
+    # The way of the carriage, in the camera's frame, until the edge lies in the light plane.
+    way = (edge[:3] @ scene.light_plane_normal - scene.light_plane_distance) / (
+        scene.rail_direction @ scene.light_plane_normal
+    )
+    assert before.edge.place == pytest.approx(way / (1 + scene.rail_lead_error), abs=2e-5)
+    # What comes later here is the carriage, by the play of its screw.
+    assert before.edge.lag == pytest.approx(scene.rail_backlash / (2 * SPEED), abs=2e-3)
+
+
+@pytest.mark.parametrize("moved", [(0.0, 0.0), (0.12e-3, 0.0), (-0.1e-3, 0.15e-3)])
+def test_a_head_that_has_slipped_is_seen_to_hundredths(cell, moved: tuple[float, float]) -> None:
+    virtual, before, since = cell
+    world, scene = virtual.world, virtual.world.scene
+    off = np.eye(4)
+    off[:2, 3] = moved
+    world.scene = replace(scene, flange_from_scan_camera=scene.flange_from_scan_camera @ off)
+    try:
+        slip = since(looked(virtual, before))
+    finally:
+        world.scene = scene
+    assert slip.shift == pytest.approx(moved, abs=2.5e-5)
+    assert abs(slip.lag) < 3e-3 and not slip.hidden
+
+
+def test_a_head_that_has_slipped_far_is_refused_with_the_next_step(cell) -> None:
+    virtual, before, _ = cell
+    world, scene = virtual.world, virtual.world.scene
+    off = np.eye(4)
+    off[0, 3] = 1e-3
+    world.scene = replace(scene, flange_from_scan_camera=scene.flange_from_scan_camera @ off)
+    try:
+        with pytest.raises(RefusedError, match=r"slipped.*cell calibrate"):
+            looked(virtual, before)
+    finally:
+        world.scene = scene
+
+
+def test_auto_gain_is_no_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    virtual, before, _ = cell
+    render = virtual.world.render
+
+    def up_to_200(camera: str, t_mid: float, exposure: float) -> np.ndarray:
+        image = render(camera, t_mid, exposure).astype(float)
+        return np.clip(image * np.clip(200.0 / np.percentile(image, 99.9), 0.2, 8.0), 0, 255).astype(np.uint8)
+
+    monkeypatch.setattr(virtual.world, "render", up_to_200)
+    with pytest.raises(RefusedError, match=r"times as bright.*auto gain.*off"):
+        looked(virtual, before)
+
+
+def test_a_laser_that_has_turned_is_no_slip(cell) -> None:
+    virtual, before, since = cell
+    world, scene = virtual.world, virtual.world.scene
+    shown = world._cameras._shown
+    drifted = replace(scene, workshop=replace(scene.workshop, pointing=0.4e-3))
+    world._cameras._shown = drifted, *shown[1:]
+    world.stand(1e5)
+    try:
+        slip = since(looked(virtual, before))
+    finally:
+        world._cameras._shown = shown
+    assert slip.size < 2.5e-5
+
+
+def test_pictures_that_are_paired_one_off_are_seen(cell) -> None:
+    virtual, before, since = cell
+    spec = virtual.scan_camera.model.spec
+    virtual.scan_camera.model.spec = replace(spec, latency=spec.latency + 1 / 30)
+    try:
+        slip = since(looked(virtual, before))
+    finally:
+        virtual.scan_camera.model.spec = spec
+    assert slip.lag == pytest.approx(1 / 30, abs=3e-3)
+    assert abs(slip.along) < 2.5e-5
+    with pytest.raises(RefusedError, match=r"pictures come \+3\d\.\d ms later"):
+        slip.require()
+
+
+def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell) -> None:
+    virtual, before, since = cell
+    camera, seen = virtual.scan_camera.model, []
+
+    def lose(after: Callable[[int], bool]) -> PlateLine:
+        def keep(what: str, frame: Frame) -> None:
+            if what == "witness-edge":
+                seen.append(frame)
+                if after(len(seen)):
+                    camera.fault("camera.frame_loss", 1)
+
+        seen.clear()
+        return require_edge(CONFIG, virtual.devices, keep, before, replace(before, edge=None))
+
+    lose(lambda k: False)
+    undisturbed = len(seen)
+    # The line leaves the plate at the middle of each pass.
+    slip = since(lose(lambda k: k in (undisturbed // 4, undisturbed // 4 + 1)))
+    assert len(seen) > 1.3 * undisturbed, "once more"
+    assert abs(slip.lag) < 3e-3 and abs(slip.along) < 2.5e-5
+    with pytest.raises(
+        RefusedError, match=r"pictures were lost each of the 3 times.*open by \d\.\d+ mm.*then try again"
+    ):
+        lose(lambda k: k % 4 == 0)
+
+
+@pytest.mark.parametrize("most_hz", [16.0, 10.0])
+def test_a_slower_camera_sees_the_edge_at_the_same_place(cell, most_hz: float) -> None:
+    virtual, before, _ = cell
+    spec = virtual.scan_camera.model.spec
+    virtual.scan_camera.model.spec = replace(spec, frame_rate_max=most_hz)
+    try:
+        edge = look_at_edge(CONFIG, virtual.devices, let_go, before, None)
+    finally:
+        virtual.scan_camera.model.spec = spec
+    assert edge is not None
+    assert edge.place == pytest.approx(before.edge.place, abs=1e-5)
+
+
+def test_an_end_of_the_line_that_is_covered_is_no_shift(cell) -> None:
+    _, before, since = cell
+    columns = before.columns.copy()
+    columns[before.rows[-25:]] = np.nan
+    slip = since(replace(before, columns=columns))
+    assert slip.hidden and slip.across == 0.0 and "covered" in slip.notes[0]
+
+
+def test_a_job_says_what_its_plate_does_not_show(cell) -> None:
+    whole = cell[1]
+    assert unwatched(whole) == ()
+    assert "no edge" in " ".join(unwatched(replace(whole, edge=None)))
+    assert "laser.witness" in " ".join(unwatched(None))
+
+
+def test_it_is_kept_with_the_calibration(cell) -> None:
+    before = cell[1]
+    again = PlateLine.read(before.as_dict())
+    assert again is not None and again.edge == before.edge

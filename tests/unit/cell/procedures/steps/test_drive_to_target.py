@@ -1,0 +1,150 @@
+"""The drive to the target: only from a known place, until the board says that it stands there."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.drive.way import Planar, Whereabouts
+from drivers.errors import RefusedError
+from tests.unit.cell.procedures.drive.test_way import JOB, VEHICLE_FROM_BASE, LateVehicle, Site, moved
+
+
+def test_a_vehicle_that_nobody_knows_about_is_not_driven_and_told_what_to_do() -> None:
+    site = Site()
+    stood = site.truth()
+    with pytest.raises(RefusedError, match=r"has just connected.*no board found") as refused:
+        site.run()
+    assert "cell jog vehicle" in str(refused.value)
+    assert "--at-start" in str(refused.value)
+    assert moved(stood, site.truth()) == 0.0
+
+
+def test_after_a_jog_in_another_process_three_runs_are_refused_and_nothing_drives() -> None:
+    site = Site()
+    site.turn(math.radians(30))
+    for _ in range(3):
+        stood = site.truth()
+        site.whereabouts = Whereabouts(site.vehicle)  # each run is a new process
+        with pytest.raises(RefusedError, match="not known"):
+            site.run()
+        assert moved(stood, site.truth()) == 0.0
+
+
+@pytest.mark.parametrize("seed", [2, 5])
+def test_from_its_start_it_comes_to_the_target_and_stands_there_in_later_runs(seed: int) -> None:
+    site = Site(seed)
+    site.whereabouts.say_at_start()
+    arrival = site.run()
+    assert max(abs(arrival.error_along), abs(arrival.error_across)) < JOB.approach.tolerance
+    stood = site.truth()
+    assert moved(Planar.of(JOB.approach.target.se3()), stood) < 0.02
+    site.run()
+    assert moved(stood, site.truth()) < 0.002
+    assert site.cell.world.collisions.found == ()
+
+
+@pytest.mark.parametrize("off", [Planar(0.0, 0.04, 0.0), Planar(0.0, 0.0, math.radians(3)), Planar(-0.04, 0.0, 0.0)])
+def test_a_vehicle_that_stands_beside_its_target_or_turned_is_brought_there_and_braked(off: Planar) -> None:
+    site = Site()
+    target = Planar.of(JOB.approach.target.se3())
+    stands, model = target * off, site.cell.world.vehicle
+    model._x, model._y, model._yaw = stands.x, stands.y, stands.yaw
+    site.cell.clock.sleep(0.1)
+    arrival = site.run()
+    left = target.inverse() * site.truth()
+    assert max(abs(left.x), abs(left.y)) < JOB.approach.tolerance
+    assert abs(left.yaw) < JOB.approach.tolerance_angle
+    assert (arrival.error_along, arrival.error_across) == pytest.approx((left.x, left.y), abs=1e-4)
+    assert arrival.error_yaw == pytest.approx(left.yaw, abs=1e-3)
+    assert model.feedback(site.cell.clock.now()).braked
+
+
+@pytest.mark.parametrize("shimmers", [True, False])
+def test_a_target_that_is_not_met_is_refused_with_the_vehicle_braked(shimmers: bool) -> None:
+    """The board is seen turned about the vehicle, by a degree more each time as in shimmering air, or always by three
+    from where it stood at first: however the vehicle turns, it is off."""
+    site, seen, first = Site(), 0.0, []
+    target = Planar.of(JOB.approach.target.se3())
+    model = site.cell.world.vehicle
+    model._x, model._y, model._yaw = target.x, target.y, target.yaw
+    site.cell.clock.sleep(0.1)
+    photograph = site.photograph
+
+    def turned() -> BoardFix:
+        nonlocal seen
+        seen = seen + math.radians(1.0) if shimmers else math.radians(3.0)
+        first.append(photograph())
+        fix = first[-1 if shimmers else 0]
+        about = VEHICLE_FROM_BASE.inverse() * pin.SE3(pin.exp3(np.array([0.0, 0.0, seen])), np.zeros(3))
+        return replace(fix, base_from_board=about * VEHICLE_FROM_BASE * fix.base_from_board)
+
+    site.photograph = turned  # type: ignore[method-assign]
+    cause = "warm air shimmers .* wheels are not" if shimmers else "check the floor and the wheels"
+    with pytest.raises(RefusedError, match=rf"mm across and .* from its target after 9 photographs.*{cause}"):
+        site.run()
+    assert model.feedback(site.cell.clock.now()).braked
+    # One before it drives, nine on the way and two that are compared with each other.
+    assert len(first) == 12
+
+
+def test_a_vehicle_that_late_readings_let_pass_its_goal_is_brought_back_to_see_the_board() -> None:
+    site = Site()
+    way = moved(Planar.of(JOB.approach.start.se3()), Planar.of(JOB.approach.staging.se3()))
+    site.vehicle = LateVehicle(site.cell, way - 0.05, 0.6, looks_new=True)
+    site.whereabouts = Whereabouts(site.vehicle)
+    site.whereabouts.say_at_start()
+    seen = site.photograph
+
+    def narrow() -> BoardFix:
+        if site.truth().x > JOB.approach.staging.translation[0] + 0.04 and not site.notes:
+            raise RefusedError("the board is cut off by the picture's edge")
+        return seen()
+
+    site.photograph = narrow  # type: ignore[method-assign]
+    arrival = site.run()
+    assert max(abs(arrival.error_along), abs(arrival.error_across)) < JOB.approach.tolerance
+    assert ["brought there" in note for note in site.notes] == [True]
+
+
+def test_a_jog_in_the_same_process_is_counted_by_odometry() -> None:
+    site = Site()
+    site.whereabouts.say_at_start()
+    site.turn(math.radians(20))
+    site.turn(math.radians(-40))
+    site.turn(math.radians(40))
+    site.whereabouts.enter(JOB)
+    assert site.whereabouts.turned == pytest.approx(math.radians(100), abs=0.05)
+    assert site.whereabouts.pose().yaw == pytest.approx(site.truth().yaw, abs=0.03)
+    site.run()
+    assert moved(Planar.of(JOB.approach.target.se3()), site.truth()) < 0.02
+
+
+def test_somebody_who_is_wrong_about_the_start_gets_no_further_than_its_way() -> None:
+    """Turned by 30° and said to be at its start: it goes that way once, sees nothing, and is not driven again."""
+    site = Site()
+    site.turn(math.radians(30))
+    stood = site.truth()
+    site.whereabouts.say_at_start()
+    for _ in range(3):
+        with pytest.raises(RefusedError, match="no board found"):
+            site.run()
+    staging = Planar.of(JOB.approach.staging.se3())
+    start = Planar.of(JOB.approach.start.se3())
+    assert moved(stood, site.truth()) < moved(start, staging) + 0.05
+    assert site.cell.world.collisions.found == ()
+
+
+def test_a_target_in_the_table_is_not_driven_to() -> None:
+    site = Site()
+    site.whereabouts.say_at_start()
+    target = JOB.approach.target.model_copy(update={"translation": (-0.8, 0.0, -0.6)})
+    with pytest.raises(RefusedError, match="of the table"):
+        site.run(JOB.model_copy(update={"approach": JOB.approach.model_copy(update={"target": target})}))
+    assert moved(Planar.of(JOB.approach.staging.se3()), site.truth()) < 0.05
+    assert site.cell.world.collisions.found == ()

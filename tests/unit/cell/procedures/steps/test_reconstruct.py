@@ -1,0 +1,66 @@
+"""The cloud of a job: no earlier one is taken for it, and what was refused is shown."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from cell.config.cell_config import load_config
+from cell.measure.calibration import ScanCalibration
+from cell.measure.calibration.drift.reference_plate import Pointing
+from cell.measure.reconstruction import Cloud
+from cell.procedures.steps import reconstruct
+from cell.procedures.sweep.stored_sweep import FILE, SweepRecord
+from drivers.errors import RefusedError
+from lab.bench.job.whole_job import JobRecord
+from tests.support.report_runs import at_work, with_few_lines
+
+CONFIG = load_config(None)
+
+
+def test_the_cloud_of_an_earlier_sweep_is_gone_whatever_becomes_of_this_one(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*given: object) -> None:
+        raise MemoryError("too many points")
+
+    (tmp_path / "cloud.ply").write_text("of the sweep before")
+    monkeypatch.setattr(reconstruct, "build_cloud", fails)
+    with pytest.raises(MemoryError):
+        reconstruct.reconstructed(at_work(placed_pot, tmp_path), placed_pot.results["laser_sweep"])
+    assert not (tmp_path / "cloud.ply").exists()
+
+
+def test_the_cloud_is_built_with_the_laser_where_it_pointed(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, sweep, given = at_work(placed_pot, tmp_path), placed_pot.results["laser_sweep"], []
+    monkeypatch.setattr(ScanCalibration, "variants", lambda head: given.append(head) or ())
+    turned, head = Pointing(1e-3, 1e-5, 0.0), here.calibration.scan
+    for pointing in (None, turned):
+        reconstruct.reconstructed(here, replace(sweep, pointing=pointing))
+    expected = head.pointed(turned, CONFIG.laser.exit_point).geometry().light_plane
+    assert given[0] is head
+    np.testing.assert_array_equal(given[1].geometry().light_plane.normal, expected.normal)
+    assert not np.allclose(expected.normal, head.geometry().light_plane.normal, atol=1e-4)
+
+
+def test_a_sweep_is_kept_and_its_cloud_shown_also_where_it_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
+    assert placed_pot.folder is not None and (placed_pot.folder / FILE).is_file()
+    here, told = at_work(placed_pot, tmp_path), []
+    here.devices.gate.listener = cast(Any, SimpleNamespace(reading=lambda device, reading: told.append(device)))
+    few = with_few_lines(placed_pot, 2).results["laser_sweep"]
+    for sweep in (placed_pot.results["laser_sweep"], few):
+        context = cast(Any, SimpleNamespace(made={SweepRecord: sweep}.get))
+        if sweep is few:
+            with pytest.raises(RefusedError) as caught:
+                reconstruct.STEP.work(here, context)
+            assert isinstance(caught.value.seen["cloud"], Cloud)
+        else:
+            reconstruct.STEP.work(here, context)
+    assert told == ["scan_camera"]
