@@ -18,6 +18,7 @@ import scipy
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, PhotoSection
 from cell.measure.calibration import ScanCalibration, TargetCalibration
+from cell.measure.calibration.drift.evidence import Reference
 from cell.measure.geometry.poses import compose_covariance, from_parts, from_ur, mean, transform
 from cell.measure.inversion.effects.during_sweep import require_firm
 from cell.measure.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board
@@ -282,6 +283,16 @@ def target_calibration_views(config: CellConfig, board: BoardSpec) -> list[Calib
     ]
 
 
+def references(scan: ScanCalibration, target: TargetCalibration) -> tuple[Reference, Reference]:
+    """What both cameras' calibrations are verified against. Raises `CalibrationStale` where that was not stored."""
+    if scan.reference is None or target.reference is None:
+        raise CalibrationStale(
+            "the stored calibration holds no reference to verify against, it was made by an older program; run "
+            "`cell calibrate` once"
+        )
+    return scan.reference, target.reference
+
+
 def verification_views(
     config: CellConfig, fine: BoardSpec, large: BoardSpec, scan: ScanCalibration, target: TargetCalibration
 ) -> tuple[CalibrationView, CalibrationView]:
@@ -290,14 +301,10 @@ def verification_views(
     From the drawn poses a board may lie half out of the picture. The rail stands near its middle, so that it can move
     both ways. Raises `CalibrationStale` for a calibration that was stored without its reference.
     """
-    if scan.reference is None or target.reference is None:
-        raise CalibrationStale(
-            "the stored calibration holds no reference to verify against, it was made by an older program; run "
-            "`cell calibrate` once"
-        )
+    near, far = references(scan, target)
     rail = _scan_rail(config, SCAN_VERIFICATION)
-    base_from_scan = _looking(scan.reference.base_from_board, fine, _SCAN_VIEWS[SCAN_VERIFICATION])
-    base_from_target = _looking(target.reference.base_from_board, large, _TARGET_VIEWS[TARGET_VERIFICATION])
+    base_from_scan = _looking(near.base_from_board, fine, _SCAN_VIEWS[SCAN_VERIFICATION])
+    base_from_target = _looking(far.base_from_board, large, _TARGET_VIEWS[TARGET_VERIFICATION])
     return (
         CalibrationView(base_from_scan * scan.flange_from_camera_at(rail).inverse(), rail),
         CalibrationView(base_from_target * target.flange_from_camera.inverse(), 0.0),

@@ -25,7 +25,7 @@ from cell.measure.geometry.poses import from_ur
 from cell.measure.vision import BoardSpec, find_board, parse_board
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.photograph import rail_ends, verification_views
+from cell.procedures.arm.photograph import rail_ends, references, verification_views
 from cell.procedures.calibrate.boards import Check, Keep, Progress, move_to_view
 from cell.procedures.sweep.swath import frames_of
 from drivers.errors import DeviceFault, LimitError, RefusedError
@@ -117,8 +117,7 @@ def _sweeps(
     """
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
     view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)
-    assert calibration.scan.reference is not None
-    base_from_board = calibration.scan.reference.base_from_board
+    base_from_board = references(calibration.scan, calibration.target)[0].base_from_board
     # Within the travel the rail has to gain its speed, and to lose it.
     room = max(speed for speed, _ in pairs) ** 2 / (2 * config.rail.acceleration) + ROOM_M
     low, high = config.rail.travel

@@ -48,12 +48,12 @@ from cell.measure.vision.board.view import centre_of
 from cell.measure.vision.stripe_on_board import points_on_board
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.photograph import CalibrationView, ScanPlan, rail_ends, verification_views
+from cell.procedures.arm.photograph import CalibrationView, ScanPlan, rail_ends, references, verification_views
 from cell.procedures.calibrate.boards import PHOTO_RATE, Check, Keep, Progress, look_for, move_to_view
 from cell.procedures.calibrate.reference_plate import require_witness
 from cell.procedures.sweep.swath import SweepCollector, SweepErrors, rehearse
 from cell.procedures.sweep.sweeping import rail_sweep
-from drivers.errors import CalibrationStale, RefusedError
+from drivers.errors import RefusedError
 from drivers.interfaces import Camera, Frame
 
 SWEEP_PROFILES = 24
@@ -90,22 +90,14 @@ def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservat
     Raises `CalibrationStale` for a calibration that was stored without its reference, `RefusedError` when the sweep
     does not show the board.
     """
-    if scan.reference is None or target.reference is None:
-        raise CalibrationStale(
-            "the stored calibration holds no reference to verify against, it was made by an older program; run "
-            "`cell calibrate` once"
-        )
-    states = {
-        "scan": _state(scan, scan.reference),
-        "target": AdjustmentState(
-            target.camera, None, np.zeros(3), target.flange_from_camera, target.reference.base_from_board
-        ),
-    }  # fmt: skip
+    near, far = references(scan, target)
+    head = _state(scan, near)
+    eye = AdjustmentState(target.camera, None, np.zeros(3), target.flange_from_camera, far.base_from_board)
     evidences = {
-        "scan": evidence(states["scan"], scan.reference, scan_looks(states["scan"], seen)),
-        "target": evidence(states["target"], target.reference, target_looks(seen.target)),
+        "scan": evidence(head, near, scan_looks(head, seen)),
+        "target": evidence(eye, far, target_looks(seen.target)),
     }
-    return verdict(evidences, states)
+    return verdict(evidences, {"scan": head, "target": eye})
 
 
 def check_witness(scan: ScanCalibration, seen: CheckObservations) -> WitnessCheck | None:
@@ -117,10 +109,10 @@ def check_witness(scan: ScanCalibration, seen: CheckObservations) -> WitnessChec
     return WitnessCheck.of(seen.pointing, seen.exit_point, state, weighed)
 
 
-def _state(scan: ScanCalibration, reference: Reference) -> AdjustmentState:
+def _state(head: ScanCalibration, of: Reference) -> AdjustmentState:
     return AdjustmentState(
-        scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, reference.base_from_board
-    )  # fmt: skip
+        head.camera, head.light_plane, head.rail_direction, head.flange_from_camera, of.base_from_board
+    )
 
 
 def scan_looks(state: AdjustmentState, seen: CheckObservations) -> list[PictureMeasurements]:
@@ -197,9 +189,8 @@ def collect_verification(
     """
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
     scan_view, target_view = verification_views(config, fine, large, calibration.scan, calibration.target)
-    assert calibration.scan.reference is not None
-    base_from_board = calibration.scan.reference.base_from_board
-    ends = rail_ends(calibration.scan, base_from_board, scan_view, fine, config.rail.travel)
+    near, _ = references(calibration.scan, calibration.target)
+    ends = rail_ends(calibration.scan, near.base_from_board, scan_view, fine, config.rail.travel)
     if not devices.rail.state().homed_here:
         progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
@@ -261,15 +252,10 @@ def _sweep(
     keep_frame: Callable[[Frame], None],
 ) -> list[ScanObservation]:
     """To the view and over the board's plate from end to end."""
-    section = ScanSection.model_validate(
-        {
-            "stand_off": "130 mm",
-            "length": f"{1e3 * (ends[1] - ends[0])} mm",
-            "speed": SWEEP_SPEED,
-            "frame_rate": SWEEP_RATE,
-            "exposure": f"{1e3 * config.calibration.stripe_exposure} ms",
-        }
-    )
+    length, exposure = f"{1e3 * (ends[1] - ends[0])} mm", f"{1e3 * config.calibration.stripe_exposure} ms"
+    section = ScanSection.model_validate({
+        "stand_off": "130 mm", "length": length, "speed": SWEEP_SPEED, "frame_rate": SWEEP_RATE, "exposure": exposure,
+    })  # fmt: skip
     profiles: list[StripeProfile] = []
     plan = ScanPlan(view.base_from_flange, view.base_from_flange, *ends)
     errors = SweepErrors(np.zeros((6, 6)), config.calibration.rail_sigma, MAX_SHIFT, devices.clock.rate)

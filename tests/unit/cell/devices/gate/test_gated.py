@@ -10,11 +10,14 @@ import pytest
 
 from cell.config.cell_config import load_config
 from cell.devices.devices import Devices
+from cell.devices.gate.gated import UNATTENDED_S
 from cell.devices.gate.interlocks import DeviceCommand, Rule, Situation
 from cell.devices.simulated.direct import VirtualCell
 from cell.motion.kinematics import HOME
-from drivers.errors import Aborted, InterlockError
+from drivers.errors import Aborted, DeadlineError, InterlockError
+from drivers.interfaces import Laser
 from statemachine.control import CancelToken
+from tests.unit.cell.devices.gate.test_interlocks import at_rest
 
 CONFIG = load_config(None)
 
@@ -92,3 +95,51 @@ def test_a_stop_that_comes_while_a_rule_of_the_claw_waits_leaves_the_part_held()
     with interlocks.lifted(["claw_at_contact"]), pytest.raises(InterlockError, match="after_a_stop"):
         devices.claw.release()
     assert devices.claw.holding
+
+
+def test_the_laser_goes_off_by_itself_when_its_owner_sleeps() -> None:
+    world = at_rest()
+    devices = world.devices
+    with devices.interlocks.purpose("test"):
+        with devices.laser.lit():
+            for _ in range(4):
+                world.clock.sleep(0.6 * UNATTENDED_S)
+                devices.laser.renew()
+            assert world.truth()["laser_on"]
+        with pytest.raises(InterlockError, match=r"nobody renewed it for 20 s .*laser_attended"), devices.laser.lit():
+            world.clock.sleep(UNATTENDED_S + 0.2)
+            assert not world.truth()["laser_on"]
+        with devices.laser.lit():
+            assert world.truth()["laser_on"]
+
+
+class Stubborn:
+    """A laser on its switch, of which the first attempts to switch it off fail."""
+
+    def __init__(self, bare: Laser, failures: list[Exception]) -> None:
+        self.bare, self.failures = bare, failures
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self.bare, name)
+
+    def stop(self) -> None:
+        if self.failures:
+            raise self.failures.pop(0)
+        self.bare.stop()
+
+
+def test_a_laser_that_does_not_go_off_is_switched_off_again() -> None:
+    world = at_rest()
+    devices = world.devices
+    failures = [DeadlineError("arm", "no answer"), RuntimeError("unforeseen")]
+    devices.laser.bare = Stubborn(devices.laser.bare, failures)
+    with devices.interlocks.purpose("test"):
+        with pytest.raises(InterlockError, match="went off because"), devices.laser.lit():
+            world.clock.sleep(UNATTENDED_S + 0.2)
+            assert world.truth()["laser_on"]
+            world.clock.sleep(1.5)
+            assert not world.truth()["laser_on"]
+        devices.laser.bare.failures += [DeadlineError("arm", "no answer")] * 99
+        with pytest.raises(InterlockError, match="was to go off, which is not confirmed"), devices.laser.lit():
+            world.clock.sleep(UNATTENDED_S + 2.0)
+    assert not world.truth()["laser_on"]

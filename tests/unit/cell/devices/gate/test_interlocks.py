@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import logging
-import os
 import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
 from cell.config.cell_config import load_config
-from cell.config.job import job_path
 from cell.devices.devices import Devices
-from cell.devices.gate.gated import UNATTENDED_S
 from cell.devices.gate.interlocks import DeviceCommand
 from cell.devices.gate.rules import LINE_STEP_M, LINE_STEP_RAD, RULES, Ways, markdown
-from cell.devices.lock import CellLock
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur, to_ur
 from cell.motion.collision import BASE, FLANGE, block, tool_bodies
 from cell.motion.kinematics import HOME
-from cell.run.jogging import jog, parse_jog
-from cell.run.session.supervisor import Cell
 from drivers.clock import Clock
-from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
-from drivers.interfaces import Laser
+from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
 from sim_backends.models.arm import Power
 from sim_backends.models.arm_kinematics import Kinematics
 from tests.support import ROOT
@@ -39,14 +29,18 @@ LASER = CONFIG.laser.output
 DOCUMENT = ROOT / "docs" / "reference" / "interlocks.md"
 
 
-@pytest.fixture
-def world() -> VirtualCell:
+def at_rest() -> VirtualCell:
     """A simulated cell: the vehicle braked, the arm folded, the rail homed, a part in the claw."""
     made = VirtualCell(CONFIG, seed=4, level="ideal")
     made.vehicle.brake()
     made.arm.move_joints(HOME, 1.0, 2.0).wait(60.0)
     made.rail.home().wait(60.0)
     return made
+
+
+@pytest.fixture
+def world() -> VirtualCell:
+    return at_rest()
 
 
 @pytest.fixture
@@ -133,50 +127,6 @@ def test_the_laser_is_lit_for_a_declared_purpose_only_and_not_while_driving(devi
         devices.vehicle.bare.enable()
         refused("laser_off_to_drive", lambda: devices.vehicle.drive(0.1, 0.0), "the laser is on")
     assert not devices.laser.is_on
-
-
-def test_the_laser_goes_off_by_itself_when_its_owner_sleeps(world: VirtualCell, devices: Devices) -> None:
-    with devices.interlocks.purpose("test"):
-        with devices.laser.lit():
-            for _ in range(4):
-                world.clock.sleep(0.6 * UNATTENDED_S)
-                devices.laser.renew()
-            assert world.truth()["laser_on"]
-        with pytest.raises(InterlockError, match=r"nobody renewed it for 20 s .*laser_attended"), devices.laser.lit():
-            world.clock.sleep(UNATTENDED_S + 0.2)
-            assert not world.truth()["laser_on"]
-        with devices.laser.lit():
-            assert world.truth()["laser_on"]
-
-
-class Stubborn:
-    """A laser on its switch, of which the first attempts to switch it off fail."""
-
-    def __init__(self, bare: Laser, failures: list[Exception]) -> None:
-        self.bare, self.failures = bare, failures
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self.bare, name)
-
-    def stop(self) -> None:
-        if self.failures:
-            raise self.failures.pop(0)
-        self.bare.stop()
-
-
-def test_a_laser_that_does_not_go_off_is_switched_off_again(world: VirtualCell, devices: Devices) -> None:
-    failures = [DeadlineError("arm", "no answer"), RuntimeError("unforeseen")]
-    devices.laser.bare = Stubborn(devices.laser.bare, failures)
-    with devices.interlocks.purpose("test"):
-        with pytest.raises(InterlockError, match="went off because"), devices.laser.lit():
-            world.clock.sleep(UNATTENDED_S + 0.2)
-            assert world.truth()["laser_on"]
-            world.clock.sleep(1.5)
-            assert not world.truth()["laser_on"]
-        devices.laser.bare.failures += [DeadlineError("arm", "no answer")] * 99
-        with pytest.raises(InterlockError, match="was to go off, which is not confirmed"), devices.laser.lit():
-            world.clock.sleep(UNATTENDED_S + 2.0)
-    assert not world.truth()["laser_on"]
 
 
 def test_an_alarm_on_the_wall_rings_whatever_its_owner_does_and_not_after_its_end() -> None:
@@ -493,148 +443,6 @@ def test_an_output_that_another_device_owns_is_switched_by_that_device(devices: 
     devices.arm.set_digital_output(LASER, False)
     devices.arm.set_digital_output(7, True)
     assert devices.claw.holding
-
-
-# --- a person's word ---
-
-
-@pytest.fixture
-def cell(world: VirtualCell, tmp_path: Path) -> Iterator[Cell]:
-    made = Cell(CONFIG, tmp_path, CellLock(CONFIG), world.devices, None)
-    yield made
-    made.close()
-
-
-def test_after_a_stop_a_script_begins_nothing_until_a_person_says_so(cell: Cell) -> None:
-    rail, arm = cell.devices.rail, cell.devices.arm
-    rail.move_to(0.01).wait(30.0)
-    cell.stop()
-    for begin in (
-        lambda: rail.move_to(0.02), rail.home, lambda: arm.move_joints(HOME + 0.01, 0.5, 1.0), arm.recover,
-        cell.devices.vehicle.enable, cell.devices.claw.grip, arm.zero_force, lambda: arm.set_payload(1.0, np.zeros(3)),
-        lambda: arm.set_digital_output(7, True),
-    ):  # fmt: skip
-        refused("after_a_stop", begin, "clear_stop(by)")
-    arm.set_digital_output(LASER, False)
-    cell.home("rail")
-    refused("after_a_stop", lambda: rail.move_to(0.02))
-    with pytest.raises(ConfigError, match="name of the person"):
-        cell.clear_stop(" ")
-    cell.clear_stop("Anna")
-    rail.move_to(0.02).wait(30.0)
-    assert rail.state().position == pytest.approx(0.02, abs=1e-6)
-
-
-def test_an_output_that_may_be_the_lasers_is_switched_off_after_a_stop_while_it_is_tried(cell: Cell) -> None:
-    """Where the numbers of laser and claw are swapped in the configuration, the claw's output lights the laser."""
-    arm, claw = cell.devices.arm, CONFIG.claw.output
-    with cell.maintenance("what hangs on which output", ["own_switch"]), cell.devices.interlocks.tried(claw):
-        arm.set_digital_output(claw, True)
-        cell.stop()
-        arm.set_digital_output(claw, False)
-        assert not arm.state().digital_outputs >> claw & 1
-    refused("after_a_stop", lambda: arm.set_digital_output(7, False), "clear_stop(by)")
-
-
-def test_an_output_that_is_tried_counts_as_a_lasers_for_the_arm_as_well(cell: Cell) -> None:
-    """A recovery switches off what may be a laser's, and leaves a claw's alone otherwise."""
-    arm, claw = cell.devices.arm, CONFIG.claw.output
-    with cell.maintenance("what hangs on which output", ["own_switch"]):
-        arm.set_digital_output(claw, True)
-        arm.recover()
-        assert arm.state().digital_outputs >> claw & 1
-        with cell.devices.interlocks.tried(claw):
-            arm.recover()
-            assert not arm.state().digital_outputs >> claw & 1
-
-
-class ReadSlowly(os.PathLike[str]):
-    """A job's file that is read so slowly that a stop comes meanwhile."""
-
-    def __init__(self, cell: Cell) -> None:
-        self.cell = cell
-
-    def __fspath__(self) -> str:
-        self.cell.stop()
-        return str(job_path("pot"))
-
-
-def test_a_stop_that_comes_while_work_is_prepared_is_not_lost(cell: Cell) -> None:
-    stood = cell.devices.arm.state().joints
-    for begin in (lambda job: cell.calibrate(job=job), lambda job: jog(cell, parse_jog("arm", ["j1", "+5deg"]), job)):
-        with pytest.raises(Aborted, match=r"was stopped before the .* began"):
-            begin(ReadSlowly(cell))
-    before = cell.stops
-    cell.stop()
-    with pytest.raises(Aborted, match="was stopped before the test began"):
-        cell.perform("test", lambda hands: None, stops=before)
-    assert np.array_equal(cell.devices.arm.state().joints, stood)
-
-
-def test_work_outside_a_job_takes_the_vehicle_in_command_with_its_brake_locked(cell: Cell) -> None:
-    assert not cell.devices.vehicle.state().command_mode
-    cell.home("arm")
-    state = cell.devices.vehicle.state()
-    assert (state.command_mode, state.braked) == (True, True)
-
-
-def test_maintenance_lifts_what_it_names_and_nothing_else_and_is_recorded(
-    cell: Cell, caplog: pytest.LogCaptureFixture
-) -> None:
-    devices, away = cell.devices, HOME + 0.05
-    devices.vehicle.enable()
-    with caplog.at_level(logging.WARNING), cell.maintenance("the brake is being changed", lift=["vehicle_parked"]):
-        devices.arm.move_joints(away, 0.5, 1.0).wait(30.0)
-        refused("claw_at_contact", devices.claw.release)
-    assert "maintenance (the brake is being changed): lifted vehicle_parked" in caplog.text
-    refused("vehicle_parked", lambda: devices.arm.move_joints(HOME, 0.5, 1.0))
-    (report,) = (json.loads(path.read_text()) for path in cell.runs_folder.glob("*/report.json"))
-    assert (report["kind"], report["outcome"]) == ("maintenance", "done")
-    assert (report["maintenance"], report["lifted"]) == ("the brake is being changed", ["vehicle_parked"])
-
-
-def test_a_run_in_maintenance_says_so_in_its_report(cell: Cell) -> None:
-    with cell.maintenance("trial", lift=["own_switch"]):
-        cell.home("rail")
-    reports = [json.loads(path.read_text()) for path in cell.runs_folder.glob("*/report.json")]
-    assert {report["kind"]: report.get("interlocks_lifted") for report in reports}["homing"] == ["own_switch"]
-
-
-@pytest.mark.parametrize(
-    "names", [["no_such_rule"], ["after_a_stop"], ["laser_attended"], ["way_clear", "same_kinematics"], []]
-)
-def test_only_rules_that_a_person_may_lift_are_lifted_and_only_for_a_reason(cell: Cell, names: list[str]) -> None:
-    with pytest.raises(ConfigError), cell.maintenance("why not", lift=names):
-        pass
-    with pytest.raises(ConfigError, match="needs a reason"), cell.maintenance(" ", lift=["own_switch"]):
-        pass
-    assert not list(cell.runs_folder.glob("*/report.json"))
-
-
-def test_jogs_keep_the_interlocks_and_home_makes_the_vehicle_free_to_drive(cell: Cell) -> None:
-    def jogged(device: str, *words: str) -> dict[str, str]:
-        return jog(cell, parse_jog(device, list(words)))
-
-    assert "moved" in jogged("vehicle", "+0.1m")["vehicle"]
-    assert cell.devices.vehicle.state().braked
-    assert "→" in jogged("arm", "j1", "+20deg")["j1"]
-    with pytest.raises(InterlockError, match=r"20\.0 deg from HOME.*cell home arm.*arm_stowed"):
-        jogged("vehicle", "+0.1m")
-    cell.home("arm")
-    jogged("vehicle", "-0.1m")
-    moved = jogged("arm", "z", "+10mm")["flange"].split("moved ")[1]
-    assert float(moved.removesuffix(" mm")) == pytest.approx(10.0, abs=0.1)
-
-
-@pytest.mark.parametrize(("axis", "turn"), [("rx", (0.05, 0.0, 0.0)), ("rz", (0.0, 0.0, -0.05))])
-def test_a_jog_turns_the_flange_about_an_axis_of_the_base_where_it_stands(
-    cell: Cell, axis: str, turn: tuple[float, ...]
-) -> None:
-    before = from_ur(cell.devices.arm.state().flange)
-    jog(cell, parse_jog("arm", [axis, f"{sum(turn)} rad"]))
-    after = from_ur(cell.devices.arm.state().flange)
-    np.testing.assert_allclose(pin.log3(after.rotation @ before.rotation.T), turn, atol=1e-3)
-    np.testing.assert_allclose(after.translation, before.translation, atol=1e-4)
 
 
 @pytest.mark.parametrize(("row", "column", "by"), [(1, 0, 0.06e-3), (4, 3, 0.2e-3)], ids=["length", "zero"])
