@@ -9,9 +9,16 @@ import numpy as np
 import pytest
 
 from drivers.clock import Clock
-from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, NotConnectedError
-from drivers.rail.motion import RailMotion
-from drivers.rail.sweep import RailSweep
+from drivers.errors import (
+    Aborted,
+    CellError,
+    DeadlineError,
+    DeviceFault,
+    InterlockError,
+    NotConnectedError,
+)
+from drivers.rail.motion import RailMotion, move_duration, run_up_distance
+from tests.support.wire.rail_bench import benched, connect
 
 FAST = 100.0
 
@@ -78,72 +85,31 @@ def test_a_motion_that_is_there_too_soon_went_faster_than_it_was_told() -> None:
     motion(lambda: True, [], least=0.2).wait(500.0)  # too short to be judged
 
 
-def sweep(
-    *, start: float = 0.02, stop: float = 0.06, ran: float = 0.02, bend: float = 0.0, count: int = 41,
-    arrived: Callable[[], bool] = lambda: True,
-) -> RailSweep:  # fmt: skip
-    """From 5 mm before `start` to 5 mm behind `stop`, told 20 mm/s; it ran at `ran`, `bend` m off half-way."""
-    way = np.sign(stop - start)
-    places = np.linspace(start - 0.005 * way, stop + 0.005 * way, count)
-    seconds = np.abs(places - places[0]) / ran
-    places = places + bend * np.sin(np.pi * np.arange(count) / (count - 1))
-    record = [(100.0 + float(t), float(x), 1e-4) for t, x in zip(seconds, places, strict=True)]
-    return RailSweep(
-        "rail", Clock(FAST), start=start, stop=stop, speed=0.02, resolution=1e-6, record=record, arrived=arrived,
-        halt=lambda: None, duration=1.0,
-    )  # fmt: skip
+def test_ramps_follow_from_speed_and_acceleration() -> None:
+    assert run_up_distance(0.2, 0.5) == pytest.approx(0.04)
+    assert move_duration(0.2, 0.2, 0.5) == pytest.approx(2 * 0.4 + (0.2 - 0.08) / 0.2)
+    assert move_duration(-0.02, 0.2, 0.5) == pytest.approx(2 * np.sqrt(0.02 / 0.5))
 
 
-@pytest.mark.parametrize(("start", "stop"), [(0.02, 0.06), (0.06, 0.02)])
-def test_a_sweep_tells_its_place_inside_its_window_only(start: float, stop: float) -> None:
-    made = sweep(start=start, stop=stop)
-    made.wait(50.0)
-    begin, end = made.window
-    assert (begin, end) == pytest.approx((100.25, 102.25), abs=1e-6)
-    assert made.position_at(101.25) == pytest.approx(0.04, abs=1e-8)
-    assert made.position_at(begin) == pytest.approx(start, abs=1e-8)
-    for outside in (begin - 1e-3, end + 1e-3):
-        with pytest.raises(ValueError, match="outside the sweep's constant-velocity window"):
-            made.position_at(outside)
-
-
-def test_a_sweep_tells_nothing_before_its_end_nor_after_a_failed_one() -> None:
-    there = threading.Event()
-    made = sweep(arrived=there.is_set)
-    for asked in (lambda: made.window, lambda: made.position_at(101.0), lambda: made.time_bound):
-        with pytest.raises(InterlockError, match="still runs"):
-            asked()
-    there.set()
-    made.wait(50.0)
-    assert made.window
-    failed = sweep(arrived=raising(DeviceFault("rail", "rail.stalled", "stalled", recoverable=True, hint="")))
-    failed.join(2.0)
-    with pytest.raises(DeviceFault, match="stalled"):
-        _ = failed.window
-
-
-@pytest.mark.parametrize(
-    ("made", "code"),
-    [
-        ({"ran": 0.0188}, "rail.velocity"),
-        ({"ran": 0.0212}, "rail.velocity"),
-        ({"count": 4}, "rail.velocity"),
-        ({"bend": 0.5e-3}, "rail.uneven"),
-        ({"bend": -0.5e-3}, "rail.uneven"),
-    ],
-    ids=str,
-)
-def test_a_sweep_that_was_not_as_commanded_has_no_window(made: dict[str, float], code: str) -> None:
-    ended = sweep(**made)  # type: ignore[arg-type]
-    ended.wait(50.0)
-    with pytest.raises(DeviceFault) as caught:
-        _ = ended.window
-    assert caught.value.code == code
-
-
-@pytest.mark.parametrize("ran", [0.0192, 0.0208])
-def test_a_velocity_within_what_is_allowed_is_the_one_that_was_measured(ran: float) -> None:
-    ended = sweep(ran=ran)
-    ended.wait(50.0)
-    begin, end = ended.window
-    assert end - begin == pytest.approx(0.04 / ran, rel=1e-6)
+@pytest.mark.wire
+@pytest.mark.parametrize(("lost", "refused"), [(0.0, False), (0.03e-3, False), (0.09e-3, True), (-0.09e-3, True)])
+def test_a_count_that_is_off_by_more_than_a_twentieth_of_a_millimetre_is_refused(lost: float, refused: bool) -> None:
+    with benched(1.0) as made:
+        rail, model = made.rail, made.model
+        rail.home().wait(20.0)
+        counted = model.position(made.world.now())
+        model.set_position(made.world.now(), counted + round(lost * 200 * 256 / 0.002))
+        check = rail.check_zero()
+        assert check is not None
+        if refused:
+            with pytest.raises(DeviceFault, match=r"lost steps .* between .* by its count \(allowed 0 ± 0.05 mm\)"):
+                check.wait(10.0)
+            with pytest.raises(InterlockError, match="not homed"):
+                rail.sweep(0.01, 0.09, 0.02)
+        else:
+            check.wait(10.0)
+            assert rail.state().homed and abs(rail.state().position) < 1e-5
+        rail.close()
+        limited = connect(made.peer.url, made.clock, reference_mode=1)
+        assert limited.check_zero() is None
+        limited.close()

@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from drivers.clock import Clock
+from drivers.errors import (
+    DeviceFault,
+    InterlockError,
+)
 from drivers.interfaces import Vector
-from drivers.rail.sweep import EvenMotion
+from drivers.rail.motion import run_up_distance
+from drivers.rail.sweep import EvenMotion, RailSweep, fit_line
+from tests.support.wire.rail_bench import ACCELERATION, Bench
 
 SPEED = 0.015
 DURATION = 4.0
@@ -75,3 +86,146 @@ def test_what_no_even_motion_explains_is_found_beside_prompt_and_late_replies(sp
     assert 0.002 / 8 - SPEED * 0.0012 <= bent.residual <= 0.002 / 8
     slight = EvenMotion.of(times, positions + 1e-3 * bend, trips)
     assert slight.residual <= 1e-6
+
+
+def test_one_late_sample_does_not_bend_the_line() -> None:
+    times = np.linspace(10.0, 12.0, 40)
+    positions = 0.01 + 0.02 * (times - 10.0)
+    trips = np.full(40, 0.001)
+    times[30] += 0.25
+    trips[30] = 0.5
+    origin, velocity = fit_line(times, positions, trips)
+    assert velocity == pytest.approx(0.02, rel=1e-4)
+    assert origin + velocity * 11.0 == pytest.approx(0.03, abs=1e-6)
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize(("start", "stop"), [(0.02, 0.06), (0.06, 0.02)])
+def test_a_sweep_knows_its_position_at_any_time_to_some_micrometres(homed: Bench, start: float, stop: float) -> None:
+    speed = 0.04
+    homed.rail.move_to(homed.rail.sweep_start(start, stop, speed)).wait(10.0)
+    sweep = homed.rail.sweep(start, stop, speed)
+    with pytest.raises(InterlockError, match="still runs"):
+        sweep.position_at(homed.clock.now())
+    sweep.wait(10.0)
+    begin, end = sweep.window
+    assert end - begin == pytest.approx(abs(stop - start) / speed, rel=1e-3)
+    times = np.linspace(begin, end, 50)[1:-1]
+    errors = [sweep.position_at(time) - homed.carriage(time) for time in times]
+    assert np.max(np.abs(errors)) < 30e-6
+    assert speed * sweep.time_bound < 300e-6
+    assert len(sweep.samples) > 20
+    assert sweep.samples.shape[1] == 2
+    with pytest.raises(ValueError, match="outside the sweep"):
+        sweep.position_at(end + 0.1)
+    # Outside of start and stop there is room for the ramps, and the rail has come to rest behind them.
+    assert abs(homed.carriage() - stop) > run_up_distance(speed, ACCELERATION)
+
+
+@pytest.mark.wire
+def test_late_replies_shift_a_sweep_within_the_bound_that_it_states(homed: Bench) -> None:
+    start, stop, speed = 0.02, 0.06, 0.005
+    homed.rail.move_to(homed.rail.sweep_start(start, stop, speed)).wait(10.0)
+    homed.peer.fault("rail.late_reply")
+    sweep = homed.rail.sweep(start, stop, speed)
+    sweep.wait(30.0)
+    begin, end = sweep.window
+    times = np.linspace(begin, end, 50)[5:-5]
+    late = np.array([homed.carriage(time) - sweep.position_at(time) for time in times]) / speed
+    # 0.2 s on the wall, half of which the middle of the round trip is off; and nothing but the round trips shows it.
+    assert late.mean() == pytest.approx(0.1 * homed.clock.rate, rel=0.1)
+    assert sweep.time_bound == pytest.approx(0.1 * homed.clock.rate, rel=0.1)
+    # The bench's two clocks are compared to a millisecond only.
+    assert late.max() <= sweep.time_bound + 0.005
+    assert sweep.unevenness == 0.0
+
+
+@pytest.mark.wire
+def test_a_sweep_that_somebody_slowed_down_is_a_fault_with_both_velocities(homed: Bench) -> None:
+    homed.rail.move_to(homed.rail.sweep_start(0.02, 0.06, 0.04)).wait(10.0)
+    sweep = homed.rail.sweep(0.02, 0.06, 0.04)
+    settings = homed.model.settings
+    slower = replace(settings, max_velocity=round(0.9 * settings.max_velocity))
+    homed.model.configure(homed.world.now(), slower)
+    sweep.wait(10.0)
+    with pytest.raises(DeviceFault, match=r"ran at 3[567]\.\d+ mm/s instead of 40\.000 mm/s") as caught:
+        _ = sweep.window
+    assert caught.value.code == "rail.velocity"
+
+
+FAST = 100.0
+
+
+def sweep(
+    *, start: float = 0.02, stop: float = 0.06, ran: float = 0.02, bend: float = 0.0, count: int = 41,
+    arrived: Callable[[], bool] = lambda: True,
+) -> RailSweep:  # fmt: skip
+    """From 5 mm before `start` to 5 mm behind `stop`, told 20 mm/s; it ran at `ran`, `bend` m off half-way."""
+    way = np.sign(stop - start)
+    places = np.linspace(start - 0.005 * way, stop + 0.005 * way, count)
+    seconds = np.abs(places - places[0]) / ran
+    places = places + bend * np.sin(np.pi * np.arange(count) / (count - 1))
+    record = [(100.0 + float(t), float(x), 1e-4) for t, x in zip(seconds, places, strict=True)]
+    return RailSweep(
+        "rail", Clock(FAST), start=start, stop=stop, speed=0.02, resolution=1e-6, record=record, arrived=arrived,
+        halt=lambda: None, duration=1.0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("start", "stop"), [(0.02, 0.06), (0.06, 0.02)])
+def test_a_sweep_tells_its_place_inside_its_window_only(start: float, stop: float) -> None:
+    made = sweep(start=start, stop=stop)
+    made.wait(50.0)
+    begin, end = made.window
+    assert (begin, end) == pytest.approx((100.25, 102.25), abs=1e-6)
+    assert made.position_at(101.25) == pytest.approx(0.04, abs=1e-8)
+    assert made.position_at(begin) == pytest.approx(start, abs=1e-8)
+    for outside in (begin - 1e-3, end + 1e-3):
+        with pytest.raises(ValueError, match="outside the sweep's constant-velocity window"):
+            made.position_at(outside)
+
+
+def test_a_sweep_tells_nothing_before_its_end_nor_after_a_failed_one() -> None:
+    there = threading.Event()
+    made = sweep(arrived=there.is_set)
+    for asked in (lambda: made.window, lambda: made.position_at(101.0), lambda: made.time_bound):
+        with pytest.raises(InterlockError, match="still runs"):
+            asked()
+    there.set()
+    made.wait(50.0)
+    assert made.window
+
+    def stalls() -> bool:
+        raise DeviceFault("rail", "rail.stalled", "stalled", recoverable=True, hint="")
+
+    failed = sweep(arrived=stalls)
+    failed.join(2.0)
+    with pytest.raises(DeviceFault, match="stalled"):
+        _ = failed.window
+
+
+@pytest.mark.parametrize(
+    ("made", "code"),
+    [
+        ({"ran": 0.0188}, "rail.velocity"),
+        ({"ran": 0.0212}, "rail.velocity"),
+        ({"count": 4}, "rail.velocity"),
+        ({"bend": 0.5e-3}, "rail.uneven"),
+        ({"bend": -0.5e-3}, "rail.uneven"),
+    ],
+    ids=str,
+)
+def test_a_sweep_that_was_not_as_commanded_has_no_window(made: dict[str, float], code: str) -> None:
+    ended = sweep(**made)  # type: ignore[arg-type]
+    ended.wait(50.0)
+    with pytest.raises(DeviceFault) as caught:
+        _ = ended.window
+    assert caught.value.code == code
+
+
+@pytest.mark.parametrize("ran", [0.0192, 0.0208])
+def test_a_velocity_within_what_is_allowed_is_the_one_that_was_measured(ran: float) -> None:
+    ended = sweep(ran=ran)
+    ended.wait(50.0)
+    begin, end = ended.window
+    assert end - begin == pytest.approx(0.04 / ran, rel=1e-6)

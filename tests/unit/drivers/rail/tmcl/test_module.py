@@ -1,0 +1,249 @@
+"""Promises of `drivers.rail.tmcl.module`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from drivers.clock import Clock
+from drivers.errors import (
+    DeviceFault,
+    InterlockError,
+)
+from drivers.rail.tmcl.rail import TmclRail
+from tests.support.wire.rail_bench import ACCELERATION, MAX_SPEED, Bench, connect, reply, telegram
+
+pytestmark = pytest.mark.wire
+
+
+def test_a_limit_switch_on_the_way_is_a_fault_that_names_it(bench: Bench) -> None:
+    rail = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
+    rail.home().wait(20.0)
+    with pytest.raises(DeviceFault, match="right limit switch") as caught:
+        rail.move_to(0.11).wait(20.0)
+    assert caught.value.code == "rail.limit_switch"
+    with pytest.raises(InterlockError, match="home"):
+        rail.move_to(0.05)
+    rail.close()
+    # Somebody turns it off the switch by hand: that does not make the count right.
+    bench.model.rotate(bench.world.now(), -51_200)
+    bench.clock.sleep(2.0)
+    again = connect(bench.peer.url, bench.clock)
+    assert not again.state().right_switch
+    assert not again.state().homed
+    again.close()
+
+
+def test_the_next_program_finds_the_rail_homed_and_its_zero_where_it_was(homed: Bench) -> None:
+    homed.rail.move_to(0.005).wait(10.0)
+    homed.rail.close()
+    again = connect(homed.peer.url, homed.clock)
+    state = again.state()
+    assert (state.homed, state.position) == (True, 0.005)
+    again.move_to(0.010).wait(10.0)
+    assert homed.carriage() == pytest.approx(0.010, abs=1e-6)
+    again.close()
+
+
+def test_the_zero_of_another_configuration_is_not_taken_nor_given_back(homed: Bench) -> None:
+    homed.rail.close()
+    other = TmclRail(
+        "rail", homed.peer.url, lead=0.004, steps_per_turn=200, microsteps=256, travel=(0.0, 0.1), max_speed=MAX_SPEED,
+        acceleration=ACCELERATION, clock=homed.clock,
+    )  # fmt: skip
+    assert not other.state().homed
+    with pytest.raises(InterlockError, match="not homed"):
+        other.move_to(0.01)
+    other.close()
+    # The other program has set the module up for itself since.
+    again = connect(homed.peer.url, homed.clock)
+    assert not again.state().homed
+    again.close()
+
+
+def test_a_module_set_to_other_microsteps_is_not_homed_any_more(homed: Bench) -> None:
+    homed.rail.close()
+    homed.peer.module.handle(telegram(5, 140, 7))
+    again = connect(homed.peer.url, homed.clock)
+    assert not again.state().homed
+    again.close()
+
+
+def test_a_stall_that_nobody_watched_ends_the_trust_in_the_zero(homed: Bench) -> None:
+    homed.rail.close()
+    homed.peer.module.handle(telegram(5, 13, 1))  # without its left limit switch
+    homed.model.rotate(homed.world.now(), -5 * 51_200)
+    homed.clock.sleep(3.0)
+    homed.model.rotate(homed.world.now(), 5 * 51_200)
+    homed.clock.sleep(1.0)
+    again = connect(homed.peer.url, homed.clock)
+    assert not again.state().left_switch
+    assert not again.state().homed
+    again.close()
+
+
+def test_a_motor_that_stalls_before_its_target_loses_the_zero(bench: Bench) -> None:
+    bench.model.params = replace(bench.model.params, ends=(-0.004, 0.08))  # something lies in the carriage's way
+    rail = connect(bench.peer.url, bench.clock)
+    rail.home().wait(20.0)
+    with pytest.raises(DeviceFault, match="stall detected") as caught:
+        rail.move_to(0.09).wait(30.0)
+    assert caught.value.code == "rail.stalled"
+    assert not rail.state().homed
+    rail.close()
+    # The flag is gone once it has moved off the end; that does not make the count right.
+    bench.model.rotate(bench.world.now(), -51_200)
+    bench.clock.sleep(2.0)
+    again = connect(bench.peer.url, bench.clock)
+    assert not again.state().homed
+    again.close()
+
+
+def test_a_rail_that_somebody_left_at_a_limit_switch_is_not_homed_any_more(bench: Bench) -> None:
+    rail = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
+    rail.home().wait(20.0)
+    rail.close()
+    bench.model.rotate(bench.world.now(), 10 * 51_200)
+    bench.clock.sleep(7.0)
+    again = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
+    state = again.state()
+    assert state.right_switch
+    assert not state.homed
+    again.close()
+
+
+def test_a_reset_between_two_motions_is_told_before_anything_moves(homed: Bench) -> None:
+    homed.rail.move_to(0.03).wait(10.0)
+    homed.peer.fault("rail.reset")
+    with pytest.raises(DeviceFault, match="lost its zero") as caught:
+        homed.rail.move_to(0.01)
+    assert caught.value.code == "rail.reset"
+    with pytest.raises(InterlockError, match="home"):
+        homed.rail.move_to(0.01)
+    assert homed.carriage() == pytest.approx(0.03, abs=1e-6)
+
+
+def test_a_position_read_after_a_reset_is_a_fault_and_then_that_of_a_rail_not_homed(homed: Bench) -> None:
+    homed.rail.move_to(0.03).wait(10.0)
+    homed.peer.fault("rail.reset")
+    with pytest.raises(DeviceFault) as caught:
+        homed.rail.state()
+    assert caught.value.code == "rail.reset"
+    assert not homed.rail.state().homed
+
+
+@pytest.mark.parametrize("goal", [0.05, 0.0])
+def test_a_reset_on_the_way_is_never_an_arrival(homed: Bench, goal: float) -> None:
+    homed.rail.move_to(0.03).wait(10.0)
+    motion = homed.rail.move_to(goal, speed=0.01)
+    homed.clock.sleep(1.0)
+    homed.peer.fault("rail.reset")
+    with pytest.raises(DeviceFault, match="Home the rail again") as caught:
+        motion.wait(20.0)
+    assert caught.value.code == "rail.reset"
+    assert caught.value.recoverable
+
+
+def test_a_reset_in_a_sweep_leaves_no_window(homed: Bench) -> None:
+    homed.rail.move_to(homed.rail.sweep_start(0.02, 0.06, 0.02)).wait(10.0)
+    sweep = homed.rail.sweep(0.02, 0.06, 0.02)
+    homed.clock.sleep(1.0)
+    homed.peer.fault("rail.reset")
+    with pytest.raises(DeviceFault) as caught:
+        sweep.wait(20.0)
+    assert caught.value.code == "rail.reset"
+    with pytest.raises(DeviceFault):
+        _ = sweep.window
+
+
+def test_a_reset_in_the_search_does_not_end_it_well(bench: Bench) -> None:
+    motion = bench.rail.home()
+    bench.clock.sleep(0.2)
+    bench.peer.fault("rail.reset")
+    with pytest.raises(DeviceFault) as caught:
+        motion.wait(20.0)
+    assert caught.value.code == "rail.reset"
+    assert not bench.rail.state().homed
+
+
+def test_homing_after_a_reset_sets_the_module_up_again(homed: Bench) -> None:
+    homed.peer.fault("rail.reset")
+    homed.rail.home().wait(20.0)
+    homed.rail.move_to(0.02).wait(10.0)
+    assert homed.carriage() == pytest.approx(0.02, abs=1e-6)
+    assert homed.model.settings.search_mode == 5
+    assert homed.model.settings.max_acceleration == round(ACCELERATION * 200 * 256 / 0.002)
+
+
+def test_a_target_changed_by_another_is_not_reported_as_arrival(homed: Bench) -> None:
+    motion = homed.rail.move_to(0.05, speed=0.02)
+    homed.model.move_to(homed.world.now(), 1000)
+    with pytest.raises(DeviceFault, match="changed the module's target"):
+        motion.wait(20.0)
+
+
+def test_a_module_that_lets_neither_first_phase_be_off_gets_no_acceleration_for_a_speed(
+    module: Callable[..., str],
+) -> None:
+    """Of parameters 15 and 16 one is a speed, and modules differ in which."""
+    told: list[int] = []
+
+    def answer(request: bytes) -> bytes:
+        if request[1] != 5 or request[2] not in (15, 16):
+            return reply(request)
+        told.append(request[2])
+        return reply(request, status=100 if any(request[4:8]) else 4)
+
+    with pytest.raises(DeviceFault, match="command 5, type 16, value 0: invalid value"):
+        connect(module(answer), Clock())
+    assert told == [15, 15, 16]
+
+
+def test_a_zero_that_was_lost_is_not_trusted_though_the_module_cannot_be_told(module: Callable[..., str]) -> None:
+    variables: dict[int, int] = {}
+    full = False
+
+    def answer(request: bytes) -> bytes:
+        command, kind, value = request[1], request[2], int.from_bytes(request[4:8], "big", signed=True)
+        if command == 9:
+            if full:
+                return reply(request, status=5)
+            variables[kind] = value
+        # It stands at 0 and at its right limit switch, whatever it is told.
+        known = {(10, kind): variables.get(kind, 0), (6, 10): 1, (6, 0): 1_280_000}
+        return reply(request, known.get((command, kind), 0))
+
+    rail = connect(module(answer), Clock())
+    rail.home().wait(10.0)
+    assert rail.state().homed
+    full = True
+    with pytest.raises(DeviceFault, match="right limit switch"):
+        rail.move_to(0.05).wait(10.0)
+    assert not rail.state().homed
+    rail.close()
+
+
+def test_who_only_looks_trusts_no_doubtful_zero_and_leaves_it_to_who_controls(homed: Bench) -> None:
+    homed.rail.close()
+    homed.peer.module.handle(telegram(5, 140, 7))
+    looking = connect(homed.peer.url, homed.clock, control=False)
+    assert not looking.state().homed
+    looking.close()
+    assert homed.model.settings.microsteps == 7
+
+
+@pytest.mark.parametrize("off", [1, -1, 2])
+def test_a_module_that_stands_one_count_off_its_target_has_arrived(
+    homed: Bench, monkeypatch: pytest.MonkeyPatch, off: int
+) -> None:
+    counted = homed.model.position
+    monkeypatch.setattr(homed.model, "position", lambda t: counted(t) + off)
+    motion = homed.rail.move_to(0.01)
+    if abs(off) == 1:
+        motion.wait(10.0)
+        assert homed.rail.state().position == pytest.approx(0.01, abs=1e-7)
+    else:
+        with pytest.raises(DeviceFault, match=r"its target is|has not ended"):
+            motion.wait(10.0)
