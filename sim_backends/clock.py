@@ -1,11 +1,9 @@
-"""The world's clock: seconds of the simulated world, running N times as fast as the wall.
+"""The world's clock, N times as fast as the wall, and the recent past of moving bodies and of switches.
 
-Devices' protocols keep their wall rates; physics, time stamps and exposures are in world seconds.
-
-The recent past of a moving body: poses by world time, interpolated between samples.
-
-Cameras expose at times that fall between two ticks of the physics, and their pictures are rendered later; both
-read the pose here. Before the first and after the last sample the nearest pose holds."""
+Devices' protocols keep their wall rates; physics, time stamps and exposures are in world seconds. Cameras expose
+between two ticks of the physics and are rendered later: poses are interpolated. Before the first and after the last
+sample the nearest pose holds.
+"""
 
 from __future__ import annotations
 

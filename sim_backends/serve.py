@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,30 +31,31 @@ from sim_backends.faults import (
     VEHICLE_FAULTS,
 )
 from sim_backends.models.arm_kinematics import TABLES
+from sim_backends.models.vehicle import VehicleModel
 from sim_backends.peers.arm.rtde.server import PERIOD, RtdePeer
 from sim_backends.peers.camera.frames import FramePeer
 from sim_backends.peers.camera.gige import GigePeer
-from sim_backends.peers.truth import FollowingPeer, TruthPeer
-from sim_backends.peers.vehicle.agilex import vehicle_peer
-from sim_backends.peers.wired import rail_peer, switch_peers
+from sim_backends.peers.rail.tmcl import TmclPeer
+from sim_backends.peers.server import Peer
+from sim_backends.peers.switches import switch_peers
+from sim_backends.peers.truth import following_peer, truth_peer
+from sim_backends.peers.vehicle.agilex import AgilexPeer
+from sim_backends.peers.vehicle.canopen import CanopenPeer, CanopenSettings
+from sim_backends.peers.vehicle.slcan import CanPeer
 from sim_backends.world.bodies.surfaces import SURFACES
 from sim_backends.world.drawing import STOCK, read
 from sim_backends.world.following import FOLLOWED, WorldFollowing
-from sim_backends.world.hardware import camera_spec
 from sim_backends.world.levels import LEVELS
-from sim_backends.world.world import World, truth
+from sim_backends.world.world import World, camera_spec, truth
+
+if TYPE_CHECKING:
+    from sim_backends.peers.rail.modbus_drive import ModbusPeer
 
 SPEEDS = (0.05, 50.0)
 """World seconds per wall second that can be asked for."""
 
 
-class _Peer(Protocol):
-    def start(self) -> None: ...
-
-    def stop(self) -> None: ...
-
-
-P = TypeVar("P", bound=_Peer)
+P = TypeVar("P", bound=Peer)
 
 ARM_LAG = 0.2
 """Seconds on the wall that a picture waits for the arm's model at most."""
@@ -71,6 +72,57 @@ def picture(world: World, camera: str, t_mid: float, exposure: float) -> NDArray
         clock.sleep(PERIOD * clock.speed)
         waited += PERIOD
     return world.render(camera, t_mid, exposure)
+
+
+def rail_peer(world: World) -> TmclPeer | ModbusPeer:
+    """The peer of the rail. Raises ValueError for one on Modbus where pymodbus is not installed."""
+    wire = world.scene.drawing.cell.wires.get("rail")
+    if wire is None:
+        return TmclPeer(world.rail, world.clock)
+    try:
+        # Only who simulates such a drive needs the library.
+        from sim_backends.peers.rail.modbus_drive import ModbusDriveServer, ModbusPeer
+    except ImportError as error:
+        raise ValueError(
+            f"a rail on Modbus is simulated with pymodbus, which is not installed ({error}): pip install "
+            "'assembly-cell[modbus]'"
+        ) from error
+    return ModbusPeer(ModbusDriveServer(world.rail, world.clock, wire), wire["unit"])
+
+
+class FixedFrame:
+    """No vehicle: nothing to connect to. Its model stands braked where it was set down."""
+
+    endpoint: dict[str, str] = {}  # noqa: RUF012
+
+    def __init__(self, model: VehicleModel) -> None:
+        self._model = model
+
+    def start(self) -> None:
+        """Nothing moves it."""
+
+    def stop(self) -> None:
+        """Nothing to end."""
+
+    def fault(self, name: str) -> None:
+        """It has none: ValueError."""
+        raise ValueError(f"{name}: the arm stands on a fixed frame, there is no vehicle that could have it")
+
+    def clear(self) -> None:
+        """Nothing to clear."""
+
+
+def vehicle_peer(world: World) -> CanPeer | FixedFrame:
+    """The peer; ValueError for a make that none simulates."""
+    wire = dict(world.scene.drawing.cell.wires.get("vehicle", {"make": "agilex"}))
+    make = wire.pop("make")
+    if make == "agilex":
+        return AgilexPeer(world.vehicle, world.clock)
+    if make == "canopen":
+        return CanopenPeer(world.vehicle, world.clock, CanopenSettings(**wire))
+    if make == "fixed":
+        return FixedFrame(world.vehicle)
+    raise ValueError(f"nothing simulates a vehicle of the make {make!r}")
 
 
 CAMERAS = ("scan", "target")
@@ -96,10 +148,7 @@ class ServedCell:
                 name: _bound(
                     bound,
                     (GigePeer if name in gige else FramePeer)(
-                        f"{name}_camera",
-                        clock,
-                        partial(self._picture, name),
-                        camera_spec(world.scene, name),
+                        f"{name}_camera", clock, partial(self._picture, name), camera_spec(world.scene, name)
                     ),
                 )
                 for name in CAMERAS
@@ -108,8 +157,8 @@ class ServedCell:
             self._switches, self._switch_endpoints = switch_peers(world)
             for switch in self._switches:
                 _bound(bound, switch)
-            self._told = _bound(bound, FollowingPeer(world, self.following)) if follow else None
-            self._truth = _bound(bound, TruthPeer(self.truth, self.fault, self.reset, self.make_ready))
+            self._told = _bound(bound, following_peer(world, self.following)) if follow else None
+            self._truth = _bound(bound, truth_peer(self.truth, self.fault, self.reset, self.make_ready))
             self._peers = bound.pop_all()
         self._faults = self._fault_actions()
 
@@ -154,10 +203,7 @@ class ServedCell:
             **({"rail": {"url": rail.url}} if rail else {}),
             **({"vehicle": vehicle.endpoint} if vehicle else {}),
             **{
-                f"{name}_camera": {
-                    "address": camera.address,
-                    "driver": "gige" if name in self._gige else "stream",
-                }
+                f"{name}_camera": {"address": camera.address, "driver": "gige" if name in self._gige else "stream"}
                 for name, camera in self._cameras.items()
             },
             **self._switch_endpoints,
@@ -201,7 +247,7 @@ class ServedCell:
         self.following.require(camera, t_mid)
         return picture(self.world, camera, t_mid, exposure)
 
-    def _all(self) -> tuple[_Peer, ...]:
+    def _all(self) -> tuple[Peer, ...]:
         devices = (self._arm, self._rail, self._vehicle, *self._cameras.values(), *self._switches)
         return tuple(peer for peer in (*devices, self._told, self._truth) if peer is not None)
 

@@ -20,7 +20,7 @@ GROUPS = (
     # One cell at a time, as an engineer runs it; those first that need little of what the job compiles.
     (
         "integration/wire/cell/test_commands.py",
-        "integration/wire/cell/test_serve.py",
+        "unit/sim_backends/test_serve.py",
         "integration/wire/cell/test_one_authority.py",
         "integration/wire/cell/test_whole_job.py",
         "integration/browser/test_screen.py",
@@ -35,15 +35,10 @@ GROUPS = (
         "integration/wire/rail/test_other_module.py",
         "integration/wire/vehicle/test_other_vehicle.py",
         "integration/wire/rail/test_other_drives.py",
-        "integration/wire/vehicle/test_other_master.py",
         "integration/wire/vehicle/test_canopen_contract.py",
-        "integration/wire/rail/test_sim_rail.py",
-        "integration/wire/vehicle/test_sim_vehicle.py",
     ),
     # The arm; last those whose times are compared most closely: at first others still compile.
     (
-        "integration/wire/arm/test_sim_arm.py",
-        "integration/wire/arm/test_sim_arm_ports.py",
         "integration/wire/arm/test_arm_others.py",
         "integration/wire/arm/test_factory_kinematics.py",
         "unit/drivers/test_last_words.py",
@@ -53,7 +48,6 @@ GROUPS = (
         "unit/drivers/camera/test_stream.py",
         "unit/drivers/camera/genicam/test_camera.py",
         "integration/wire/camera/test_aravis_fake_camera.py",
-        "integration/wire/camera/test_sim_frames.py",
         "unit/drivers/relay/test_boards.py",
         "unit/drivers/claw/test_robotiq.py",
     ),

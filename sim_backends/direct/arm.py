@@ -1,9 +1,7 @@
 """The arm in this process: trajectories are streamed into the model as a driver on a wire streams them.
 
-A protective stop waits for a person's word, an emergency stop for the power; what an arm may be asked is checked by the
-limits that it is given.
-
-Motions of the arm in this process: servo lag, arrival and contact as a driver that streams sees them."""
+A protective stop waits for a person's word, an emergency stop for the power.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +10,11 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from drivers.clock import Latch
-from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError
+from drivers.arm.faults import fault
+from drivers.arm.motion import ArmLimits
+from drivers.clock import Clock, Latch
+from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, LimitError, check_range
 from drivers.interfaces import ArmSafety, ArmState, Identity, LinkStatistics, LinkTable, Vector
-from sim_backends.direct.clock import VirtualClock
-from sim_backends.direct.product import ArmSetup, within
 from sim_backends.models.arm import ArmModel, Power, Safety
 from sim_backends.models.arm_kinematics import matrix_from_pose, pose_from_matrix
 from sim_backends.models.arm_motion import JointMove, LinearMove, Servo, SimulatedMotion, StopMotion
@@ -141,14 +139,17 @@ _SAFETY = {
 class DirectArm:
     """The arm `model`; see `drivers.interfaces.Arm` for the promises."""
 
-    def __init__(self, name: str, model: ArmModel, clock: VirtualClock, setup: ArmSetup) -> None:
+    def __init__(
+        self, name: str, model: ArmModel, clock: Clock, *, limits: ArmLimits, safe_off: tuple[int, ...]
+    ) -> None:
+        """Outputs in `safe_off` go off at a recovery and at the end."""
         self.name = name
         self.statistics = LinkStatistics()
         self.model = model
         self.clock = clock
         self.rests: list[Vector] = []
         """Joint angles (6,), rad, at the end of each motion so far."""
-        self._setup = setup
+        self._limits, self._safe_off = limits, safe_off
         self._motion: ArmMove | None = None
         self.late = 0.0
         """By how many seconds each state comes later than the controller measured it."""
@@ -174,19 +175,12 @@ class DirectArm:
         model = self.model
         speeds = model.drive.qd.copy()
         return ArmState(
-            stamp=self.clock.now() + self.late,
-            joints=model.drive.q.copy(),
-            joint_speeds=speeds,
-            flange=pose_from_matrix(model.reported_flange()),
-            wrench=model.felt.copy(),
-            safety=_SAFETY[model.safety],
-            moving=bool(np.abs(speeds).max() >= AT_REST),
-            digital_inputs=model.digital_inputs,
-            digital_outputs=model.digital_outputs,
-            device_time=self.clock.now(),
-            controlled=model.power is Power.RUNNING,
-            reason=model.fault_text,
-        )
+            stamp=self.clock.now() + self.late, joints=model.drive.q.copy(), joint_speeds=speeds,
+            flange=pose_from_matrix(model.reported_flange()), wrench=model.felt.copy(), safety=_SAFETY[model.safety],
+            moving=bool(np.abs(speeds).max() >= AT_REST), digital_inputs=model.digital_inputs,
+            digital_outputs=model.digital_outputs, device_time=self.clock.now(),
+            controlled=model.power is Power.RUNNING, reason=model.fault_text,
+        )  # fmt: skip
 
     @contextmanager
     def record(self) -> Iterator[list[ArmState]]:
@@ -205,23 +199,23 @@ class DirectArm:
 
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMove:
         """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""
-        joints = self._setup.limits.check_joints(self.name, joints)
-        self._setup.limits.check_joint_move(self.name, speed, acceleration)
+        joints = self._limits.check_joints(self.name, joints)
+        self._limits.check_joint_move(self.name, speed, acceleration)
         self._require_free()
         return self._begin(ArmMove(self, JointMove(joints, speed, acceleration)))
 
     def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMove:
         """Straight in space to the flange pose (x, y, z, rx, ry, rz) at `speed` m/s."""
-        target = matrix_from_pose(self._setup.limits.check_pose(self.name, flange))
-        self._setup.limits.check_linear_move(self.name, speed, acceleration)
+        target = matrix_from_pose(self._limits.check_pose(self.name, flange))
+        self._limits.check_linear_move(self.name, speed, acceleration)
         self._require_free()
         return self._begin(ArmMove(self, LinearMove(target, speed, acceleration)))
 
     def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMove:
         """Stream a joint trajectory; see `drivers.interfaces.Arm`."""
-        times, joints = self._setup.limits.check_trajectory(self.name, times, joints)
+        times, joints = self._limits.check_trajectory(self.name, times, joints)
         if force_limit is not None:
-            within(self.name, "force limit", force_limit, low=1e-9, high=_MOST_FORCE, unit="N")
+            check_range(self.name, "force limit", force_limit, low=1e-9, high=_MOST_FORCE, unit="N")
         gap = float(np.abs(joints[0] - self.model.drive.q).max())
         if gap > _FIRST_POINT:
             raise InterlockError(
@@ -239,19 +233,19 @@ class DirectArm:
 
     def set_payload(self, mass: float, centre: Vector) -> None:
         """Tell the model what it carries."""
-        mass, offset = self._setup.limits.check_payload(self.name, mass, centre)
+        mass, offset = self._limits.check_payload(self.name, mass, centre)
         self.model.payload = (mass, np.array(offset))
 
     def set_digital_output(self, index: int, value: bool) -> None:
         """Set an output and let a tick pass, in which the world follows it."""
-        within(self.name, "digital output", index, low=0, high=_OUTPUTS - 1, unit="")
+        self._check_index("output", index)
         self.model.write_digital_outputs(1 << index, int(value) << index)
         self.clock.sleep(TICK_S)
 
     @contextmanager
     def trying(self, index: int) -> Iterator[None]:
         """See `drivers.interfaces.TriesOutputs`."""
-        within(self.name, "digital output", index, low=0, high=_OUTPUTS - 1, unit="")
+        self._check_index("output", index)
         self._tried.append(index)
         try:
             yield
@@ -260,7 +254,7 @@ class DirectArm:
 
     def digital_input(self, index: int) -> bool:
         """What is wired to input `index`."""
-        within(self.name, "digital input", index, low=0, high=_OUTPUTS - 1, unit="")
+        self._check_index("input", index)
         return bool(self.model.digital_inputs >> index & 1)
 
     def recover(self, *, confirmed: bool = False) -> None:
@@ -270,7 +264,7 @@ class DirectArm:
         """
         stops = self._stops
         self._require_remote()
-        for index in (*self._setup.safe_off, *self._tried):
+        for index in (*self._safe_off, *self._tried):
             self.set_digital_output(index, False)
         if self.model.safety is Safety.PROTECTIVE_STOP:
             if not confirmed:
@@ -294,12 +288,12 @@ class DirectArm:
     def close(self) -> None:
         """Stop; the safe outputs go off."""
         self.stop()
-        for index in (*self._setup.safe_off, *self._tried):
+        for index in (*self._safe_off, *self._tried):
             self.set_digital_output(index, False)
 
     def fault(self, code: str, text: str) -> DeviceFault:
         """The fault of a code, in the driver's words."""
-        return self._setup.fault(self.name, code, text)
+        return fault(self.name, code, text)
 
     def trouble(self) -> DeviceFault | None:
         """What keeps a program from moving the arm now, or None."""
@@ -334,6 +328,10 @@ class DirectArm:
             self._recorded.append(self.state())
         if self._motion is not None and not self._motion.done:
             self._motion.after_tick(t)
+
+    def _check_index(self, what: str, index: int) -> None:
+        if not 0 <= index < _OUTPUTS:
+            raise LimitError(self.name, f"digital {what} {index} does not exist, 0 to {_OUTPUTS - 1} do")
 
     def _require_free(self) -> None:
         self._require_remote()

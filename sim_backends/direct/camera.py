@@ -1,7 +1,6 @@
 """A camera in this process: exposures take the world's time, stamps come from the camera's own clock.
 
-The device's clock has its drift and latency; it is mapped to the host's by a map that is given, from latches that were
-answered somewhere within their round trip.
+That clock has drift and latency. It is compared with the host's by latches, answered somewhere within their round trip.
 """
 
 from __future__ import annotations
@@ -14,14 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.clock import Clock, ClockMap, Latch
 from drivers.errors import Aborted, DeadlineError, InterlockError, LimitError
 from drivers.interfaces import Frame, Identity, LinkStatistics
-from sim_backends.direct.clock import VirtualClock
-from sim_backends.direct.product import CameraSetup
 from sim_backends.models.camera import CameraState
 from sim_backends.world.drawing import inverse
-from sim_backends.world.hardware import camera_spec
-from sim_backends.world.world import World
+from sim_backends.world.world import World, camera_spec
 
 ROUND_TRIP_S = 0.0005
 LATCHES = 8
@@ -42,9 +39,7 @@ class Shot:
 class DirectCamera:
     """The camera "scan" or "target" of `world`; see `drivers.interfaces.Camera` for the promises."""
 
-    def __init__(
-        self, name: str, camera: str, world: World, clock: VirtualClock, setup: CameraSetup, wire: np.random.Generator
-    ) -> None:
+    def __init__(self, name: str, camera: str, world: World, clock: Clock, *, wire: np.random.Generator) -> None:
         """`wire` draws when within a round trip the camera answers."""
         self.name = name
         self.statistics = LinkStatistics()
@@ -60,8 +55,7 @@ class DirectCamera:
         self._camera = camera
         self._world = world
         self._wire = wire
-        self._latch = setup.latch
-        self._map = setup.clock_map()
+        self._map = ClockMap()
         self._streams: list[DirectStream] = []
 
     def identity(self) -> Identity:
@@ -158,7 +152,7 @@ class DirectCamera:
             before = now + k * (ROUND_TRIP_S + self.late)
             answered = before + float(self._wire.uniform(0.0, ROUND_TRIP_S))
             device = 1e-9 * self.model.spec.device_ns(answered)
-            latches.append(self._latch(before, device, before + ROUND_TRIP_S + self.late))
+            latches.append(Latch(before, device, before + ROUND_TRIP_S + self.late))
         self._map.add(latches)
         self.clock.sleep(LATCHES * (ROUND_TRIP_S + self.late))
 

@@ -1,21 +1,24 @@
 """A simulated cell in this process: one seeded world, its clock, and its devices behind the drivers' interfaces.
 
 Time moves when somebody waits: a sleep, a motion's `wait`, a picture's exposure. So the product runs on it unchanged,
-as fast as the machine computes, and the same for the same seed.
-
-The faults that devices without wires can be made to have: those of the models. A wire's own need the wire."""
+as fast as the machine computes, and the same for the same seed. Of faults there are those of the models.
+"""
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Protocol
 
+from drivers.arm.motion import ArmLimits
+from drivers.clock import Clock
 from sim_backends.clock import SteppedClock
 from sim_backends.direct.arm import DirectArm
 from sim_backends.direct.camera import DirectCamera
-from sim_backends.direct.clock import VirtualClock
-from sim_backends.direct.product import DirectSetup
-from sim_backends.direct.rail import DirectRail
-from sim_backends.direct.vehicle import DirectVehicle
+from sim_backends.direct.rail import DirectRail, RailSetup
+from sim_backends.direct.vehicle import DirectVehicle, VehicleSetup
 from sim_backends.faults import (
     ARM_FAULTS,
     CAMERA_FAULTS,
@@ -45,28 +48,93 @@ def require(name: str) -> None:
         raise ValueError(f"unknown fault {name!r}; known: {', '.join(NAMES)}")
 
 
-def clear(cell: DirectCell) -> None:
-    """Take away all causes of faults, as a person would: buttons are released, motors are well again."""
-    cell.world.arm.clear()
-    cell.world.vehicle.clear(cell.clock.now())
-    cell.world.rail.clear(cell.clock.now())
+Look = Callable[[], None]
+Ring = Callable[[], float | None]
 
 
-def cause(cell: DirectCell, name: str) -> None:
-    """Cause the fault `name`, of the scan camera where it says only `camera.`."""
-    require(name)
-    if name in ARM_FAULTS:
-        cell.world.arm.fault(name.removeprefix("arm."))
-    elif name in RAIL_MODEL_FAULTS:
-        cell.world.rail.fault(name, cell.clock.now())
-    elif name in RAIL_FAULTS:
-        cell.rail.reset()
-    elif name in VEHICLE_MODEL_FAULTS:
-        cell.world.vehicle.fault(name, cell.clock.now())
-    elif name in CAMERA_FAULTS:
-        cell.scan_camera.model.fault(name, 1)
-    else:
-        cell.target_camera.model.fault(name.removeprefix("target_"), 1)
+class VirtualClock(Clock):
+    """World time as the host's clock, at rate 1: whoever waits on it lets the world's time pass, tick by tick.
+
+    One thread moves the time at a time. A thread that looks around while it waits does so after each tick of its own.
+    """
+
+    def __init__(self, time: SteppedClock, tick: Callable[[float], None]) -> None:
+        """`tick(until)` lets the world go on by one tick, at most to `until` s."""
+        super().__init__()
+        self._time = time
+        self._tick = tick
+        self._moving = threading.Lock()
+        self._looking = threading.local()
+        self._alarms: dict[Ring, float] = {}
+
+    def now(self) -> float:
+        """World time in s."""
+        return self._time.now()
+
+    def sleep(self, seconds: float) -> None:
+        """Let `seconds` of the world pass. Raises what the look-out of this thread raises (see `looking`)."""
+        until = self.now() + seconds
+        while self._step(until):
+            self.look()
+
+    def wait(self, event: threading.Event, timeout: float) -> bool:
+        """Let time pass until `event` is set, at most `timeout` s; True when it was set."""
+        until = self.now() + timeout
+        while not event.is_set() and self._step(until):
+            self.look()
+        return event.is_set()
+
+    @contextmanager
+    def looking(self, look: Look) -> Iterator[None]:
+        """Inside this context `look()` is called after each tick that this thread waits for, in place of an outer one.
+
+        What it raises comes out of the wait.
+        """
+        outer = getattr(self._looking, "look", None)
+        self._looking.look = look
+        try:
+            yield
+        finally:
+            self._looking.look = outer
+
+    def look(self) -> None:
+        """Look around now, if this thread does that at all."""
+        look: Look | None = getattr(self._looking, "look", None)
+        if look is not None:
+            look()
+
+    def _step(self, until: float) -> bool:
+        with self._moving:
+            if self._time.now() >= until:
+                return False
+            self._tick(until)
+        self._ring()
+        return True
+
+    @contextmanager
+    def alarm(self, seconds: float, ring: Ring) -> Iterator[None]:
+        """See `Clock.alarm`; rung by whoever lets the time pass, after the tick that brings it there."""
+        self._alarms[ring] = self.now() + seconds
+        try:
+            yield
+        finally:
+            self._alarms.pop(ring, None)
+
+    def _ring(self) -> None:
+        for ring in [ring for ring, due in self._alarms.items() if due <= self._time.now()]:
+            self._alarms.pop(ring, None)
+            if (again := ring()) is not None:
+                self._alarms[ring] = self.now() + again
+
+
+@dataclass(frozen=True)
+class DirectSetup:
+    """What the devices are given; of the arm its limits, and the outputs that are off after a recovery."""
+
+    limits: ArmLimits
+    safe_off: tuple[int, ...]
+    rail: RailSetup
+    vehicle: VehicleSetup
 
 
 LONGEST_TICK_S = 0.05
@@ -96,11 +164,11 @@ class DirectCell:
         self.world = World(seed, level, drawing=drawing, clock=self._time)
         self.clock = VirtualClock(self._time, self._tick)
         wire = stream(seed, "lockstep.wire")
-        self.arm = DirectArm("arm", self.world.arm, self.clock, setup.arm)
+        self.arm = DirectArm("arm", self.world.arm, self.clock, limits=setup.limits, safe_off=setup.safe_off)
         self.rail = DirectRail("rail", self.world.rail, self.clock, setup.rail, wire)
         self.vehicle = DirectVehicle("vehicle", self.world.vehicle, self.clock, setup.vehicle)
-        self.scan_camera = DirectCamera("scan_camera", "scan", self.world, self.clock, setup=setup.camera, wire=wire)
-        self.target_camera = DirectCamera("target_camera", "target", self.world, self.clock, setup.camera, wire=wire)
+        self.scan_camera = DirectCamera("scan_camera", "scan", self.world, self.clock, wire=wire)
+        self.target_camera = DirectCamera("target_camera", "target", self.world, self.clock, wire=wire)
         self._ticking: tuple[Ticking, ...] = (self.arm, self.vehicle)
 
     def truth(self) -> dict[str, object]:
@@ -108,12 +176,28 @@ class DirectCell:
         return truth(self.world)
 
     def fault(self, name: str) -> None:
-        """Cause the fault `name`, one of `faults.NAMES`; ValueError for one that is not, or needs a wire."""
-        cause(self, name)
+        """Cause a fault, the scan camera's where it says only `camera.`; ValueError for one that is not in `NAMES`."""
+        require(name)
+        now = self.clock.now()
+        if name in ARM_FAULTS:
+            self.world.arm.fault(name.removeprefix("arm."))
+        elif name in RAIL_MODEL_FAULTS:
+            self.world.rail.fault(name, now)
+        elif name in RAIL_FAULTS:
+            self.rail.reset()
+        elif name in VEHICLE_MODEL_FAULTS:
+            self.world.vehicle.fault(name, now)
+        elif name in CAMERA_FAULTS:
+            self.scan_camera.model.fault(name, 1)
+        else:
+            self.target_camera.model.fault(name.removeprefix("target_"), 1)
 
     def clear_faults(self) -> None:
-        """Take away all causes of faults."""
-        clear(self)
+        """Take away all causes of faults, as a person would: buttons are released, motors are well again."""
+        now = self.clock.now()
+        self.world.arm.clear()
+        self.world.vehicle.clear(now)
+        self.world.rail.clear(now)
 
     def _tick(self, until: float) -> None:
         """Let the world's time pass by one tick, as fine as what moves needs, at most up to `until` s."""

@@ -1,24 +1,40 @@
-"""The rail in this process: positions are read as a driver on a wire reads them, somewhere in a round trip.
-
-Motions of the rail in this process: how they arrive, or why they never will, and what a sweep has read."""
+"""The rail in this process: positions are read as a driver on a wire reads them, somewhere in a round trip."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError
+from drivers.clock import Clock
+from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, check_range
 from drivers.interfaces import LONGEST_NUDGE_M, Identity, LinkStatistics, RailState, Vector
-from sim_backends.direct.clock import VirtualClock
-from sim_backends.direct.product import CarriageCheck, RailSetup, SweepLine, within
+from drivers.rail.motion import POLL_S, SWEEP_MARGIN_M, CarriageWatch, ZeroCheck, run_up_distance
+from drivers.rail.sweep import EvenMotion
 from sim_backends.models.rail import RailModel
 
-POLL_S = 0.010
 STANDSTILL_S = 0.5
 """A motor that has not moved for this long before its target has stalled."""
+
+
+@dataclass(frozen=True)
+class RailSetup:
+    """How the rail is driven: m, m/s, m/s²; `reversed` turns its motor round.
+
+    `serial` is the number by which the cell knows it; None where it tells its own.
+    """
+
+    lead: float
+    steps_per_turn: int
+    microsteps: int
+    travel: tuple[float, float]
+    max_speed: float
+    acceleration: float
+    reversed: bool
+    serial: str | None = None
 
 
 class RailMove:
@@ -27,12 +43,9 @@ class RailMove:
     `asked` is what tells that a motion in several legs has ended."""
 
     def __init__(
-        self,
-        rail: DirectRail,
-        target: int | None,
-        watch: CarriageCheck | None = None,
+        self, rail: DirectRail, target: int | None, watch: CarriageWatch | None = None,
         asked: Callable[[], bool] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._rail = rail
         self._asked = asked
         self._watch = watch
@@ -124,12 +137,9 @@ class RailMove:
         for side, hit in (("left", model.left_switch(now)), ("right", model.right_switch(now))):
             if hit:
                 return DeviceFault(
-                    rail.name,
-                    "rail.limit_switch",
-                    f"{short}: the {side} limit switch is hit",
-                    recoverable=True,
+                    rail.name, "rail.limit_switch", f"{short}: the {side} limit switch is hit", recoverable=True,
                     hint="Home the rail again and check the configured travel.",
-                )
+                )  # fmt: skip
         return DeviceFault(
             rail.name,
             "rail.stalled",
@@ -146,7 +156,7 @@ class DirectSweep(RailMove):
         super().__init__(rail, target)
         self._start, self._stop = start, stop
         self._readings: list[tuple[float, float]] = []
-        self._motion: SweepLine | None = None
+        self._motion: EvenMotion | None = None
 
     @property
     def samples(self) -> Vector:
@@ -179,7 +189,7 @@ class DirectSweep(RailMove):
         """Median distance in m of the readings from an even motion; see `drivers.interfaces.Sweep`."""
         return self._even().unevenness
 
-    def _even(self) -> SweepLine:
+    def _even(self) -> EvenMotion:
         if not self.done:
             raise InterlockError(self._rail.name, "the sweep still runs. wait() first")
         if self._error is not None:
@@ -189,14 +199,12 @@ class DirectSweep(RailMove):
             low, high = sorted((self._start, self._stop))
             inside = readings[(readings[:, 1] >= low) & (readings[:, 1] <= high)]
             trips = np.full(len(inside), self._rail.round_trip)
-            self._motion = self._rail.setup.even(inside[:, 0], inside[:, 1], trips)
+            self._motion = EvenMotion.of(inside[:, 0], inside[:, 1], trips)
         return self._motion
 
 
 ROUND_TRIP_S = 0.0005
 """Between a request and its reply; the module answers somewhere in between."""
-SWEEP_MARGIN_M = 0.5e-3
-"""Added to a sweep's ramp: takes up backlash and rounding."""
 _AT_START_M = 20e-6
 _HOME_SWITCH_MODE = 5
 
@@ -204,9 +212,7 @@ _HOME_SWITCH_MODE = 5
 class DirectRail:
     """The rail `model` as a controller in microsteps shows it; see `drivers.interfaces.Rail` for the promises."""
 
-    def __init__(
-        self, name: str, model: RailModel, clock: VirtualClock, setup: RailSetup, wire: np.random.Generator
-    ) -> None:
+    def __init__(self, name: str, model: RailModel, clock: Clock, setup: RailSetup, wire: np.random.Generator) -> None:
         """`wire` draws when within a round trip the module answers."""
         self.name = name
         self.statistics = LinkStatistics()
@@ -256,15 +262,10 @@ class DirectRail:
         stamp, position = self.read(now)
         velocity = self.model.velocity(now) / self._counts
         return RailState(
-            stamp=stamp,
-            position=position,
-            velocity=velocity,
-            homed=self._homed,
-            homed_here=self._homed,
-            moving=velocity != 0.0 or self.model.searching(now),
-            left_switch=self.model.left_switch(now),
+            stamp=stamp, position=position, velocity=velocity, homed=self._homed, homed_here=self._homed,
+            moving=velocity != 0.0 or self.model.searching(now), left_switch=self.model.left_switch(now),
             right_switch=self.model.right_switch(now),
-        )
+        )  # fmt: skip
 
     def home(self) -> RailMove:
         """Search the home switch; position 0 is there afterwards."""
@@ -277,14 +278,14 @@ class DirectRail:
 
     def move_to(self, position: float, speed: float | None = None) -> RailMove:
         """Move to `position` m; refused with `InterlockError` before homing."""
-        within(self.name, "position", position, *self.travel, "m")
+        check_range(self.name, "position", position, *self.travel, "m")
         speed = self._checked(self.setup.max_speed if speed is None else speed)
         self._motion = RailMove(self, self._start(position, speed))
         return self._motion
 
     def nudge(self, distance: float, speed: float) -> RailMove:
         """Move by `distance` m, whether homed or not."""
-        within(self.name, "distance of a nudge", distance, low=-LONGEST_NUDGE_M, high=LONGEST_NUDGE_M, unit="m")
+        check_range(self.name, "distance of a nudge", distance, low=-LONGEST_NUDGE_M, high=LONGEST_NUDGE_M, unit="m")
         self._require_free()
         now = self.clock.now()
         target = self.model.position(now) + round(distance * self._counts)
@@ -303,14 +304,10 @@ class DirectRail:
         self._require_free()
         self._require_zero()
         model, clock = self.model, self.clock
-        check = self.setup.check(
-            self.name,
-            begin,
-            lambda: self.counted(clock.now()),
-            lambda: model.home_switch(clock.now()),
-            forget=self.forget_zero,
-            speed=self.setup.max_speed,
-        )
+        check = ZeroCheck(
+            self.name, begin, lambda: self.counted(clock.now()), lambda: model.home_switch(clock.now()),
+            forget=self.forget_zero, speed=self.setup.max_speed,
+        )  # fmt: skip
         self._motion = RailMove(self, None, asked=check)
         return self._motion
 
@@ -361,12 +358,9 @@ class DirectRail:
         """The fault of a module that was reset; told once."""
         self._lost = False
         return DeviceFault(
-            self.name,
-            "rail.reset",
-            f"the module has lost its zero {when}: it was reset or without power",
-            recoverable=True,
-            hint="Home the rail again; check the module's supply.",
-        )
+            self.name, "rail.reset", f"the module has lost its zero {when}: it was reset or without power",
+            recoverable=True, hint="Home the rail again; check the module's supply.",
+        )  # fmt: skip
 
     def reset(self) -> None:
         """What is to happen to the module: it starts anew, and has forgotten its zero and its settings."""
@@ -375,8 +369,8 @@ class DirectRail:
 
     # --- inside ---
 
-    def _watch(self, length: float | None) -> CarriageCheck:
-        return self.setup.watch(self.name, self.clock, length)
+    def _watch(self, length: float | None) -> CarriageWatch:
+        return CarriageWatch(self.name, self.clock, length)
 
     def _set_up(self) -> None:
         """Tell the module what it forgets when it is reset."""
@@ -398,13 +392,13 @@ class DirectRail:
         speed = self._checked(speed)
         if start == stop:
             raise InterlockError(self.name, f"a sweep from {1e3 * start:.3f} mm to the same place has no direction")
-        run_up = speed * speed / (2.0 * self.setup.acceleration)
+        run_up = run_up_distance(speed, self.setup.acceleration)
         ramp = math.copysign(run_up + SWEEP_MARGIN_M, stop - start)
-        begin = within(self.name, "sweep start less its start-up", start - ramp, *self.travel, "m")
-        return begin, within(self.name, "sweep stop plus its run-out", stop + ramp, *self.travel, "m")
+        begin = check_range(self.name, "sweep start less its start-up", start - ramp, *self.travel, "m")
+        return begin, check_range(self.name, "sweep stop plus its run-out", stop + ramp, *self.travel, "m")
 
     def _checked(self, speed: float) -> float:
-        return within(self.name, "speed", speed, low=1e-9, high=self.setup.max_speed, unit="m/s")
+        return check_range(self.name, "speed", speed, low=1e-9, high=self.setup.max_speed, unit="m/s")
 
     def _start(self, position: float, speed: float) -> int:
         """Send it there; the target in counts."""

@@ -6,9 +6,9 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from drivers.clock import Clock
 from drivers.errors import DeviceFault, InterlockError
 from drivers.interfaces import Identity, LinkStatistics
-from sim_backends.direct.clock import VirtualClock
 from sim_backends.world.world import World
 
 TAKES_S = 0.01
@@ -19,7 +19,7 @@ _POLL_S = 0.01
 class _DirectSwitch:
     """What both share: a switch of the world, "laser" or "claw"."""
 
-    def __init__(self, name: str, world: World, clock: VirtualClock) -> None:
+    def __init__(self, name: str, world: World, clock: Clock) -> None:
         self.name = name
         self.statistics = LinkStatistics()
         self._world = world
@@ -41,7 +41,7 @@ class _DirectSwitch:
 class DirectLaser(_DirectSwitch):
     """The line laser; see `drivers.interfaces.Laser`."""
 
-    def __init__(self, name: str, world: World, clock: VirtualClock) -> None:
+    def __init__(self, name: str, world: World, clock: Clock) -> None:
         super().__init__(name, world, clock)
         self._owner = threading.Lock()
 

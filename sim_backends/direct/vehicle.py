@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
-from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError
+from drivers.clock import Clock
+from drivers.errors import Aborted, DeadlineError, InterlockError, check_range
 from drivers.interfaces import Identity, LinkStatistics, VehicleState
-from sim_backends.direct.clock import VirtualClock
-from sim_backends.direct.product import VehicleSetup, within
+from drivers.vehicle.faults import emergency_stop, system_trouble, vehicle_error
+from drivers.vehicle.feedback import PlanarOdometry
 from sim_backends.models.vehicle import ChassisState, Mode, VehicleModel
 
 KEEP_ALIVE_S = 0.020
@@ -20,15 +22,30 @@ _STILL = 0.002
 _FARTHEST_M = 0.5
 
 
+@dataclass(frozen=True)
+class VehicleSetup:
+    """Limits in m/s and rad/s; its wheels are `track` m apart, `count` is the way, m, that its counters count in.
+
+    `make` is what it calls itself.
+    """
+
+    max_speed: float
+    max_yaw_rate: float
+    track: float
+    make: str
+    count: float
+
+
 class DirectVehicle:
     """The vehicle `model`; see `drivers.interfaces.Vehicle` for the promises."""
 
-    def __init__(self, name: str, model: VehicleModel, clock: VirtualClock, setup: VehicleSetup) -> None:
+    def __init__(self, name: str, model: VehicleModel, clock: Clock, setup: VehicleSetup) -> None:
         self.name = name
         self.statistics = LinkStatistics()
         self.model = model
         self._clock = clock
         self._setup = setup
+        self._odometry = PlanarOdometry(setup.track, setup.count)
         self._velocity = (0.0, 0.0)
         self._renewed = clock.now()
         self._driven = -math.inf
@@ -48,37 +65,23 @@ class DirectVehicle:
     def state(self, max_age: float = 0.2) -> VehicleState:
         """Feedback as the bus carries it, odometry as it is integrated from that."""
         feedback = self.model.feedback(self._clock.now())
-        odometry = self._setup.odometry
         return VehicleState(
-            stamp=self._clock.now(),
-            x=odometry.x,
-            y=odometry.y,
-            yaw=odometry.yaw,
-            speed=round(feedback.speed, 3),
-            yaw_rate=round(feedback.yaw_rate, 3),
-            command_mode=feedback.mode is Mode.CAN,
-            braked=self._braked,
-            emergency_stop=feedback.state is ChassisState.EMERGENCY_STOP,
-            error_bits=feedback.errors,
-            battery_volts=round(feedback.volts, 1),
-            trouble=self._setup.trouble(feedback.errors),
-        )
+            stamp=self._clock.now(), x=self._odometry.x, y=self._odometry.y, yaw=self._odometry.yaw,
+            speed=round(feedback.speed, 3), yaw_rate=round(feedback.yaw_rate, 3),
+            command_mode=feedback.mode is Mode.CAN, braked=self._braked,
+            emergency_stop=feedback.state is ChassisState.EMERGENCY_STOP, error_bits=feedback.errors,
+            battery_volts=round(feedback.volts, 1), trouble=system_trouble(feedback.errors, commanded=True),
+        )  # fmt: skip
 
     def check(self) -> None:
         """Raise the `DeviceFault` that the vehicle shows now. Nobody else commands it here."""
         now = self._clock.now()
         feedback = self.model.feedback(now)
         if feedback.state is ChassisState.EMERGENCY_STOP:
-            raise DeviceFault(
-                self.name,
-                "vehicle.emergency_stop",
-                "the emergency stop is pressed",
-                recoverable=False,
-                hint="Release the button when it is safe, then `cell recover`.",
-            )
+            raise emergency_stop(self.name)
         if feedback.state is not ChassisState.OK:
-            driven = now - self._driven < REST_AFTER_S
-            raise self._setup.error(self.name, feedback.errors, self._setup.trouble(feedback.errors), driven)
+            trouble = system_trouble(feedback.errors, commanded=True)
+            raise vehicle_error(self.name, feedback.errors, trouble, driven=now - self._driven < REST_AFTER_S)
 
     def recover(self) -> None:
         """Clear errors and take command, with the brake locked throughout."""
@@ -94,8 +97,8 @@ class DirectVehicle:
     def drive(self, speed: float, yaw_rate: float) -> None:
         """Set the velocity that is kept alive for 0.5 s; `InterlockError` when braked or not enabled."""
         limit, turn = self._setup.max_speed, self._setup.max_yaw_rate
-        speed = within(self.name, "speed", speed, low=-limit, high=limit, unit="m/s")
-        yaw_rate = within(self.name, "yaw rate", yaw_rate, low=-turn, high=turn, unit="rad/s")
+        speed = check_range(self.name, "speed", speed, low=-limit, high=limit, unit="m/s")
+        yaw_rate = check_range(self.name, "yaw rate", yaw_rate, low=-turn, high=turn, unit="rad/s")
         self.check()
         if self._stopping:
             raise Aborted(f"{self.name}: a stop is under way")
@@ -172,4 +175,4 @@ class DirectVehicle:
     def _count(self) -> None:
         feedback = self.model.feedback(self._clock.now())
         left, right = (round(way / self._setup.count) for way in (feedback.left, feedback.right))
-        self._setup.odometry.update(left, right, _FARTHEST_M)
+        self._odometry.update(left, right, _FARTHEST_M)

@@ -1,20 +1,11 @@
-"""Kinematics of a six-axis arm from its Denavit-Hartenberg table: forward, Jacobian and numerical inverse.
+"""Kinematics of a six-axis arm from its Denavit-Hartenberg table, and where its flange truly is.
 
-Angles are in rad, lengths in m. A pose is a (4, 4) matrix `base_from_flange` or the controller's 6-vector
-(x, y, z, rx, ry, rz) with a rotation vector. Sources: the maker's DH table (docs/reference/protocols.md, section 1);
-damped least squares after Nakamura and Hanafusa 1986.
-
-What an arm's joints are off: angles that its encoders do not see, from uneven gears and from the weight it carries.
+Angles are in rad, lengths in m. A pose is a (4, 4) matrix `base_from_flange` or the controller's 6-vector (x, y, z, rx,
+ry, rz) with a rotation vector. Sources: the maker's DH table (docs/reference/protocols.md, section 1); damped least
+squares after Nakamura and Hanafusa 1986.
 
 A strain wave gear repeats its error once and twice a turn of the motor, which turns some hundred times as often as the
-joint: over the whole workspace it looks like noise, and yet is the same wherever a joint comes back. Under a weight
-each joint gives way by its compliance times the torque about its axis; gravity is along the base's -z.
-
-Where the flange truly is: the true kinematics at the encoders' joint angles, and an error of repeatability.
-
-The error is drawn anew for every rest. While the arm moves, it passes smoothly from the last rest's error to the next
-one's, and its variance stays the same on the way. Or, with a memory, it is another one only after some way of the
-joints: a place approached again in the same manner has the same error. What the joints are off is in `arm_joints`.
+joint: over the whole workspace it looks like noise, and yet is the same wherever a joint comes back.
 """
 
 from __future__ import annotations
@@ -252,14 +243,9 @@ class TruePose:
     """True base_from_flange over time of an arm with `kinematics`; errors per axis `sigma` in m and rad."""
 
     def __init__(
-        self,
-        kinematics: Kinematics,
-        sigma: tuple[float, float],
-        blend_time: float,
-        rng: np.random.Generator,
-        joints: JointErrors | None = None,
-        memory: float = 0.0,
-    ) -> None:
+        self, kinematics: Kinematics, sigma: tuple[float, float], blend_time: float, rng: np.random.Generator,
+        joints: JointErrors | None = None, memory: float = 0.0,
+    ) -> None:  # fmt: skip
         """`blend_time` is how many seconds of motion the error takes to become the next one; with a `memory`, rad, it
         changes with the joints' way instead, and is another one after about that way."""
         self.pose: Matrix = np.eye(4)

@@ -1,13 +1,8 @@
-"""Motions of the simulated arm that end by themselves: each plans from where the arm is and is stepped with time.
+"""Motions of the simulated arm: each plans from where the arm is and is stepped with time. Units: rad, m, s, N.
 
 A motion changes `JointDrives.q` and `JointDrives.qd`; it knows nothing of safety, programs or bytes. Moves follow a
-trapezoidal speed profile. Motions that are streamed are in `arm_streams`. Units: rad, m, s, N.
-
-A move of the simulated arm's tool along a circle through three points. Units: rad, m, s.
-
-Motions of the simulated arm that go on until something else replaces them: servo targets, speeds, compliance.
-
-Units: rad, m, s, N."""
+trapezoidal speed profile and end by themselves; streams go on until something replaces them.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sim_backends.models.arm_kinematics import (
-    Kinematics,
-    Matrix,
-    Vector,
-    invert,
-    rotation_matrix,
-    rotation_vector,
-)
+from sim_backends.models.arm_kinematics import Kinematics, Matrix, Vector, invert, rotation_matrix, rotation_vector
 
 
 class MotionError(Exception):

@@ -186,14 +186,6 @@ class FollowedVehicle(VehicleModel):
         """What the real vehicle has told last."""
         speed, yaw_rate, braked = self._told
         return VehicleReadings(
-            ChassisState.OK,
-            Mode.CAN,
-            0,
-            braked=braked,
-            errors=0,
-            volts=self.params.battery_volts,
-            speed=speed,
-            yaw_rate=yaw_rate,
-            left=0.0,
-            right=0.0,
-        )
+            ChassisState.OK, Mode.CAN, 0, braked=braked, errors=0, volts=self.params.battery_volts, speed=speed,
+            yaw_rate=yaw_rate, left=0.0, right=0.0,
+        )  # fmt: skip

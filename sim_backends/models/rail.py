@@ -2,8 +2,7 @@
 
 Motion is kept as a time line of constant-acceleration pieces in motor turns, so nothing has to be ticked and cameras
 may ask for the recent past. The controller counts microsteps; only `carriage` knows where the carriage really is.
-
-What a rail is made of, and what its controller can be told: the data of the rail's model."""
+"""
 
 from __future__ import annotations
 

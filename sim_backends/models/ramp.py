@@ -1,10 +1,7 @@
-"""Velocity ramps of a stepper controller as pieces of constant acceleration, exact at any time.
+"""Velocity ramps of a stepper controller as pieces of constant acceleration, and the lead screw that they turn.
 
 A ramp is a list of `Piece`s in time order; each is monotone in position, and the last one goes on for ever.
-
-The lead screw of the rail: from motor turns to true carriage travel, with its errors.
-
-Lead error (scale), one periodic error per turn, and backlash as a play that the nut has between the flanks."""
+"""
 
 from __future__ import annotations
 

@@ -150,18 +150,10 @@ class VehicleModel:
         with self._lock:
             self._advance(t)
             return VehicleReadings(
-                self._state(),
-                self._mode,
-                self._motion_mode,
-                braked=self._braked,
-                errors=self._errors,
-                volts=self.params.battery_volts,
-                speed=self._speed,
-                yaw_rate=self._yaw_rate,
-                left=self._left,
-                right=self._right,
-                drivers=tuple(self._drivers),
-            )
+                self._state(), self._mode, self._motion_mode, braked=self._braked, errors=self._errors,
+                volts=self.params.battery_volts, speed=self._speed, yaw_rate=self._yaw_rate, left=self._left,
+                right=self._right, drivers=tuple(self._drivers),
+            )  # fmt: skip
 
     def set_mode(self, t: float, mode: Mode) -> None:
         """Choose who commands; any change stops the vehicle."""

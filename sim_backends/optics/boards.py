@@ -62,17 +62,9 @@ def render_rectangle(
     if window is None:
         return
     edges = draw(
-        image,
-        x,
-        y,
-        inverse=inverse,
-        pattern=pattern,
-        window=np.array(window),
-        offset=offset,
-        focal_px=optics.fx,
-        level=level,
-        gain=gain_parameters(optics, light),
-    )
+        image, x, y, inverse=inverse, pattern=pattern, window=np.array(window), offset=offset, focal_px=optics.fx,
+        level=level, gain=gain_parameters(optics, light),
+    )  # fmt: skip
     if edges:
         blur_window(image, window, float(optics.blur_px(_distance(pose, pattern))))
 
@@ -120,17 +112,9 @@ def _distance(pose: Vector, pattern: Vector) -> float:
 
 @compiled
 def draw(
-    image: Image,
-    ray_x: Image,
-    ray_y: Image,
-    inverse: Vector,
-    pattern: Vector,
-    window: NDArray[np.int64],
-    offset: float,
-    focal_px: float,
-    level: float,
-    gain: Vector,
-) -> int:
+    image: Image, ray_x: Image, ray_y: Image, inverse: Vector, pattern: Vector, window: NDArray[np.int64],
+    offset: float, focal_px: float, level: float, gain: Vector,
+) -> int:  # fmt: skip
     """Draw the rectangle; `inverse` maps a ray to (bx, by, 1)/Z. Returns the number of edge pixels."""
     u0, v0, u1, v1 = window[0], window[1], window[2], window[3]
     board = np.empty((3, u1 - u0), dtype=np.float64)

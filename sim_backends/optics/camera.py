@@ -1,10 +1,7 @@
-"""Pin-hole camera with Brown distortion, thin-lens defocus and mild vignetting, as the simulated cameras see the world.
+"""Pin-hole camera with Brown distortion, thin-lens defocus, mild vignetting, and an 8-bit sensor with its noise.
 
 Camera frame: z along the optical axis, x to the right, y down the image; metres. Pixel centres lie at whole numbers.
-
-Gaussian blur of a window of an image, in place: point spread and defocus.
-
-From light to the picture: shot noise, read noise, saturation and quantisation of an 8-bit sensor."""
+"""
 
 from __future__ import annotations
 
@@ -195,30 +192,19 @@ def separable_blur(image: Image, kernel: Image) -> None:
         for k in range(0, radius, 3):
             far = 2 * radius - k
             add_pairs(
-                out,
-                kernel[k : k + 3],
-                line[k : k + cols],
-                b=line[far : far + cols],
-                c=line[k + 1 : k + 1 + cols],
-                d=line[far - 1 : far - 1 + cols],
-                e=line[k + 2 : k + 2 + cols],
-                f=line[far - 2 : far - 2 + cols],
-            )
+                out, kernel[k : k + 3], line[k : k + cols], b=line[far : far + cols], c=line[k + 1 : k + 1 + cols],
+                d=line[far - 1 : far - 1 + cols], e=line[k + 2 : k + 2 + cols], f=line[far - 2 : far - 2 + cols],
+            )  # fmt: skip
     for v in range(rows):
         out = image[v]
         scale(out, across[v], kernel[radius])
         for k in range(0, radius, 3):
             reach = radius - k
             add_pairs(
-                out,
-                kernel[k : k + 3],
-                across[max(0, v - reach)],
-                b=across[min(rows - 1, v + reach)],
-                c=across[max(0, v - reach + 1)],
-                d=across[min(rows - 1, v + reach - 1)],
-                e=across[max(0, v - reach + 2)],
-                f=across[min(rows - 1, v + reach - 2)],
-            )
+                out, kernel[k : k + 3], across[max(0, v - reach)], b=across[min(rows - 1, v + reach)],
+                c=across[max(0, v - reach + 1)], d=across[min(rows - 1, v + reach - 1)],
+                e=across[max(0, v - reach + 2)], f=across[min(rows - 1, v + reach - 2)],
+            )  # fmt: skip
 
 
 @compiled_fast
@@ -245,12 +231,9 @@ def sensor(image_dn: Image, optics: CameraOptics, rng: np.random.Generator) -> N
     picture = np.empty(image_dn.shape, dtype=np.uint8)
     seed = rng.integers(0, 2**63, dtype=np.uint64)
     quantise(
-        np.ascontiguousarray(image_dn, dtype=np.float32).ravel(),
-        np.float32(1.0 / optics.electrons_per_dn),
-        np.float32(optics.read_noise_dn**2),
-        seed,
-        picture.ravel(),
-    )
+        np.ascontiguousarray(image_dn, dtype=np.float32).ravel(), np.float32(1.0 / optics.electrons_per_dn),
+        np.float32(optics.read_noise_dn**2), seed, picture.ravel(),
+    )  # fmt: skip
     return picture
 
 

@@ -1,10 +1,8 @@
-"""Ambient light: how bright a surface of known albedo and slope appears, and how that varies over the picture.
+"""Ambient light: how bright a surface appears, its variation over the picture, a strip of sunlight, meshes.
 
-Sunlight through a window: a strip on the ground that is brighter than the rest, whatever lies there.
-
-Meshes in ambient light: the leaves of the box tree are splatted into a coarse depth buffer, then smoothed.
-
-Good for the eye and for the stripe's background, not for measuring: silhouettes are true to a few pixels."""
+Meshes are splatted from the leaves of their box tree into a coarse depth buffer and smoothed: good for the eye and for
+the stripe's background, not for measuring. Silhouettes are true to a few pixels.
+"""
 
 from __future__ import annotations
 
@@ -133,18 +131,9 @@ def render_mesh(image: Image, optics: CameraOptics, instance: MeshInstance, ligh
 
 @compiled
 def splat(
-    centres: Vector,
-    normals: Vector,
-    sizes: Vector,
-    pose: Vector,
-    eye: Vector,
-    intrinsics: Vector,
-    cell: int,
-    lamp: Vector,
-    diffuse: float,
-    depth: Vector,
-    shade: Vector,
-) -> None:
+    centres: Vector, normals: Vector, sizes: Vector, pose: Vector, eye: Vector, intrinsics: Vector, cell: int,
+    lamp: Vector, diffuse: float, depth: Vector, shade: Vector,
+) -> None:  # fmt: skip
     """Nearest leaf wins in every cell of `cell` pixels; `shade` is its relative light. Leaves, `eye` and
     `lamp` are in the mesh frame."""
     for i in range(centres.shape[0]):
@@ -174,15 +163,9 @@ def splat(
 
 @compiled_fast
 def spread(
-    image: Image,
-    cover: Image,
-    shade: Image,
-    cell: int,
-    cell_of: NDArray[np.int32],
-    share_of: Image,
-    level: float,
+    image: Image, cover: Image, shade: Image, cell: int, cell_of: NDArray[np.int32], share_of: Image, level: float,
     gain: Vector,
-) -> None:
+) -> None:  # fmt: skip
     """Lay the coarse shade over the image, bilinear between cells; where nothing covers, the image stays."""
     rows, cols = image.shape
     cells = cover.shape[1]

@@ -103,13 +103,7 @@ def _tree(corners: Vector, used: NDArray[np.bool_]) -> tuple[Vector, Vector]:
 
 @compiled
 def cut(
-    corners: Vector,
-    low: Vector,
-    high: Vector,
-    normal: Vector,
-    distance: float,
-    segments: Vector,
-    normals: Vector,
+    corners: Vector, low: Vector, high: Vector, normal: Vector, distance: float, segments: Vector, normals: Vector
 ) -> int:
     """Fill `segments` and `normals`; returns how many cuts there are, also those beyond the capacity."""
     first_leaf = low.shape[0] // 2
@@ -173,13 +167,7 @@ def cut(
 
 @compiled
 def shadow(
-    corners: Vector,
-    low: Vector,
-    high: Vector,
-    points: Vector,
-    eye: Vector,
-    start: float,
-    seen: NDArray[np.bool_],
+    corners: Vector, low: Vector, high: Vector, points: Vector, eye: Vector, start: float, seen: NDArray[np.bool_]
 ) -> None:
     """Clear `seen[i]` where any triangle lies between `points[i]` and `eye` (Möller–Trumbore, any hit)."""
     first_leaf = low.shape[0] // 2

@@ -18,25 +18,17 @@ Image = NDArray[np.float32]
 
 
 def render(
-    optics: CameraOptics,
-    scene: Sequence[SceneObject],
-    laser: LaserOptics | None,
-    exposure: float,
-    rng: np.random.Generator,
-    light: Light | None = None,
-) -> NDArray[np.uint8]:
+    optics: CameraOptics, scene: Sequence[SceneObject], laser: LaserOptics | None, exposure: float,
+    rng: np.random.Generator, light: Light | None = None,
+) -> NDArray[np.uint8]:  # fmt: skip
     """Picture (height, width) uint8 that the camera takes of `scene` with `exposure` seconds; `laser` None is off."""
     return sensor(expected_image(optics, scene, laser, exposure=exposure, rng=rng, light=light), optics, rng)
 
 
 def expected_image(
-    optics: CameraOptics,
-    scene: Sequence[SceneObject],
-    laser: LaserOptics | None,
-    exposure: float,
-    rng: np.random.Generator,
-    light: Light | None = None,
-) -> Image:
+    optics: CameraOptics, scene: Sequence[SceneObject], laser: LaserOptics | None, exposure: float,
+    rng: np.random.Generator, light: Light | None = None,
+) -> Image:  # fmt: skip
     """The light that `render` puts on the sensor, (height, width) float32 in DN, before noise and saturation.
 
     Planes lie behind everything else, then the farther object is drawn first. `rng` draws the speckle only.

@@ -1,22 +1,35 @@
-"""A TCP server on the loopback interface: one thread per client, all of them ended by `stop()`.
+"""What peers serve with on the loopback interface: TCP with a thread per client, a serial line, lines of JSON.
 
 Whatever a client does (vanish, send garbage, stop reading), it costs its own connection only.
-
-A simulated device's end of a serial line: over TCP (as behind a serial server), and on request a pseudo terminal."""
+"""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import select
 import socket
 import threading
 import tty
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any, Protocol
+
+import numpy as np
 
 log = logging.getLogger(__name__)
+
+
+class Peer(Protocol):
+    """What every peer offers."""
+
+    def start(self) -> None:
+        """Begin to serve."""
+
+    def stop(self) -> None:
+        """End all connections and threads; idempotent."""
 
 
 class TcpServer:
@@ -73,7 +86,7 @@ class TcpServer:
                 return
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             thread = threading.Thread(
-                target=self._serve, args=(connection,), name=f"{self.name}-client-{peer[1]}", daemon=True
+                target=self._run, args=(connection,), name=f"{self.name}-client-{peer[1]}", daemon=True
             )
             with self._lock:
                 if self._stopping.is_set():
@@ -82,7 +95,7 @@ class TcpServer:
                 self._connections[connection] = thread
                 thread.start()
 
-    def _serve(self, connection: socket.socket) -> None:
+    def _run(self, connection: socket.socket) -> None:
         try:
             self._handle(connection)
         except OSError as error:
@@ -163,3 +176,44 @@ def _transmit(descriptor: int, data: bytes) -> None:
     """Send as a serial line does: what nobody reads is lost."""
     with contextlib.suppress(BlockingIOError):
         os.write(descriptor, data)
+
+
+Operation = Callable[[Mapping[str, Any]], Mapping[str, object] | None]
+"""Carries out a request and gives what its reply says beside "ok"; ValueError, TypeError or KeyError refuse it."""
+
+
+class JsonLinesPeer(TcpServer):
+    """Serves at `address` one JSON object per line each way: `operations` by the request's "op".
+
+    Replies are {"ok": true, …} or {"ok": false, "error": …}; arrays are told as lists.
+    """
+
+    def __init__(self, name: str, operations: Mapping[str, Operation], longest: int = 64 * 1024) -> None:
+        """A request is at most `longest` bytes."""
+        super().__init__(name, self._talk)
+        self._operations = operations
+        self._longest = longest
+
+    def _talk(self, connection: socket.socket) -> None:
+        with connection.makefile("rb") as lines:
+            while line := lines.readline(self._longest):
+                connection.sendall(json.dumps(self._answer(line), default=_plain).encode() + b"\n")
+
+    def _answer(self, line: bytes) -> dict[str, object]:
+        try:
+            request = json.loads(line)
+            operation = self._operations[request["op"]]
+        except (ValueError, TypeError, KeyError):
+            known = ", ".join(self._operations)
+            return {"ok": False, "error": f'a request is one line with a JSON object whose "op" is one of: {known}'}
+        try:
+            return {"ok": True, **(operation(request) or {})}
+        except (ValueError, TypeError, KeyError) as error:
+            told = str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
+            return {"ok": False, "error": told}
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is not fit for JSON")

@@ -58,14 +58,11 @@ class Cameras:
         x, y, z = (float(v) for v in scene.laser_origin)
         nx, ny, nz = (float(v) for v in scene.light_plane_normal)
         self._laser = LaserOptics(
-            origin=(x, y, z),
-            normal=(nx, ny, nz),
-            distance=scene.light_plane_distance,
+            origin=(x, y, z), normal=(nx, ny, nz), distance=scene.light_plane_distance,
             speckle_contrast=scene.deviations.speckle_contrast,
-            bow=scene.workshop.sheet_bow * BOW_AT[0] / BOW_AT[1] ** 2,
-            end=effects.sheet_ends,
+            bow=scene.workshop.sheet_bow * BOW_AT[0] / BOW_AT[1] ** 2, end=effects.sheet_ends,
             shadows=((-0.06, 0.004, 0.7), (0.035, 0.002, 0.9)) if effects.dust else (),
-        )
+        )  # fmt: skip
         self._grain = Grain(effects.texture, effects.dust, effects.gloss)
         gx, gy = (float(v) for v in scene.light_gradient)
         self._light = Light(level=scene.light_level, gradient=(gx, gy))
@@ -80,16 +77,9 @@ class Cameras:
         self._shown = scene, station, Board.parse(scene.drawing.station.board)
 
     def picture(
-        self,
-        camera: str,
-        world_from_camera: Pose,
-        world_from_base: Pose,
-        laser: bool,
-        exposure: float,
-        warm: float = 0.0,
-        t: float = 0.0,
-        camera_from_flange: Pose | None = None,
-    ) -> Picture:
+        self, camera: str, world_from_camera: Pose, world_from_base: Pose, laser: bool, exposure: float,
+        warm: float = 0.0, t: float = 0.0, camera_from_flange: Pose | None = None,
+    ) -> Picture:  # fmt: skip
         """The picture (height, width) of `camera`, "scan" or "target", exposed for `exposure` s at these poses.
 
         `warm` is how far, of 0 to 1, laser and cameras have warmed up; `t` the world time, s, by which the sun moves.
@@ -152,7 +142,7 @@ class Cameras:
         camera_from_table = camera_from_world @ scene.world_from_table
         table = (2 * drawing.TABLE_HALF, 2 * drawing.TABLE_HALF)
         placed: list[tuple[SceneObject, Pose, float]] = [
-            (PlaneInstance(camera_from_table, table, TABLE_ALBEDO), camera_from_table, drawing.TABLE_HALF * 1.5),
+            (PlaneInstance(camera_from_table, table, TABLE_ALBEDO), camera_from_table, drawing.TABLE_HALF * 1.5)
         ]
         boards = [
             (camera_from_world @ scene.world_from_board, board_there),
@@ -189,17 +179,7 @@ def in_view(optics: CameraOptics, centre: NDArray[np.float64], radius: float, fa
 
 def _optics(scene: Scene, lens: Lens, drawn: CameraDrawing, transmission: float) -> CameraOptics:
     return CameraOptics(
-        width=drawn.size[0],
-        height=drawn.size[1],
-        fx=lens.fx,
-        fy=lens.fy,
-        cx=lens.cx,
-        cy=lens.cy,
-        distortion=lens.dist,
-        pixel=drawn.pixel,
-        f_number=drawing.F_NUMBER,
-        focal=drawn.focal_length,
-        focus_distance=drawn.focus,
-        read_noise_dn=scene.deviations.read_noise,
-        transmission=transmission,
-    )
+        width=drawn.size[0], height=drawn.size[1], fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy,
+        distortion=lens.dist, pixel=drawn.pixel, f_number=drawing.F_NUMBER, focal=drawn.focal_length,
+        focus_distance=drawn.focus, read_noise_dn=scene.deviations.read_noise, transmission=transmission,
+    )  # fmt: skip

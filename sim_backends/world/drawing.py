@@ -1,12 +1,11 @@
 """How one simulated cell is drawn: everything that a configuration and a job describe, before anything deviates.
 
 A world is drawn around a `Drawing`: its true values are those described here and the level's tolerances. `STOCK` is the
-cell of `nominal`. Poses are (4, 4), m, named `a_from_b`; frames as in `nominal`.
-
-The nominal geometry of the simulated cell: where everything would be if nothing deviated.
+cell of the shipped configuration, whose geometry is written out here. Poses are (4, 4), m, named `a_from_b`.
 
 Frames: world W (z up, floor z = 0), vehicle V, arm base B, flange F (z out of the flange), scan camera C, target
-camera T (z along the optical axis), part, surface S, place frame P, boards D (x right, y down, z into the board)."""
+camera T (z along the optical axis), part, surface S, place frame P, boards D (x right, y down, z into the board).
+"""
 
 from __future__ import annotations
 
@@ -81,6 +80,8 @@ SCAN_SIZE = (640, 480)
 SCAN_FOCUS = 0.130
 TARGET_SIZE = (1280, 1024)
 TARGET_FOCUS = 1.0
+CAMERA_RATE = {"scan": 120.0, "target": 30.0}
+"""Most pictures a second."""
 LASER_BASELINE = 0.035
 """From the scan camera to the laser's exit point, against C's x axis, m."""
 LASER_TAN_THETA = 3.5

@@ -138,12 +138,9 @@ class WorldFollowing:
             for name in self._tracks
         }
         return {
-            "devices": devices,
-            "pictures": len(self._waited) - self._lost,
-            "waited_ms": _shares(self._waited),
-            "not_made": self._lost,
-            "why_not": self._why,
-        }
+            "devices": devices, "pictures": len(self._waited) - self._lost, "waited_ms": _shares(self._waited),
+            "not_made": self._lost, "why_not": self._why,
+        }  # fmt: skip
 
     def _behind(self, needed: Sequence[str], t: float) -> str | None:
         """The first of them that is not known up to `t`."""
@@ -189,12 +186,9 @@ class WorldFollowing:
 
 _LENGTHS = {"arm": 8, "rail": 1, "vehicle": 6, "laser": 1, "claw": 1}
 _TAKERS: dict[str, Callable[[WorldFollowing, float, NDArray[np.float64]], list[float]]] = {
-    "arm": WorldFollowing._take_arm,
-    "rail": WorldFollowing._take_rail,
-    "vehicle": WorldFollowing._take_vehicle,
-    "laser": WorldFollowing._take_laser,
-    "claw": WorldFollowing._take_claw,
-}
+    "arm": WorldFollowing._take_arm, "rail": WorldFollowing._take_rail, "vehicle": WorldFollowing._take_vehicle,
+    "laser": WorldFollowing._take_laser, "claw": WorldFollowing._take_claw,
+}  # fmt: skip
 
 
 def _shares(seconds: Sequence[float]) -> dict[str, float] | None:

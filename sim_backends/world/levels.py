@@ -1,13 +1,10 @@
 """How far a world deviates from its nominal geometry: one table of 1σ values for each level.
 
 Every draw is Gaussian and cut at 2.5 σ. `ideal` keeps only what a perfect cell would have too: the sensor's
-quantisation and a little read noise. `workshop` is `nominal` with all effects of `effects.py`; "nominal+rocking+grasp"
-is a level with just those.
-
-What a workshop does to a cell that the drawing's tolerances leave out: one row an effect, with its size and source.
-
-Every effect is off at the other levels, and can be added alone to any of them (`levels.py`: "nominal+sheet_bow"). Sizes
-marked "assumed" are of the usual order; nobody measured them on this cell."""
+quantisation and a little read noise. `workshop` is `nominal` with what a workshop does to a cell that the drawing's
+tolerances leave out. Each such effect is off at the other levels and can be added alone: "nominal+rocking+grasp". Sizes
+marked "assumed" are of the usual order; nobody measured them on this cell.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +12,21 @@ import dataclasses
 from dataclasses import dataclass, field
 
 
-def _row(unit: str, meaning: str, source: str) -> float:
-    """An effect of size 0: off."""
-    made: float = field(default=0.0, metadata={"unit": unit, "meaning": meaning, "source": source})
+def _row(size: float, unit: str, meaning: str, source: str, option: bool = False) -> float:
+    """An effect, off; `size` is its when it is on. An `option` is none of `workshop`."""
+    made: float = field(
+        default=0.0, metadata={"size": size, "unit": unit, "meaning": meaning, "source": source, "option": option}
+    )
     return made
+
+
+def _told(rows: Deviations | Effects) -> dict[str, dict[str, float | str]]:
+    """Every row that is not off, with its size, unit and meaning, for reports that state what was assumed."""
+    return {
+        f.name: {"sigma": getattr(rows, f.name), "unit": f.metadata["unit"], "of": f.metadata["meaning"]}
+        for f in dataclasses.fields(rows)
+        if getattr(rows, f.name) or isinstance(rows, Deviations)
+    }
 
 
 @dataclass(frozen=True)
@@ -26,56 +34,75 @@ class Effects:
     """The size of every effect, SI; 0 is off. What is drawn at random is drawn to this size from the world's seed."""
 
     factory_arm: float = _row(
+        1e-3,
         "m",
         "1 sigma of the link lengths that the controller knows and the maker's table does not; 2 mrad per mm of twists "
         "and zeros, and 50 mm per mm of the offsets that cancel along the parallel axes",
         "factory tables of three arms in the tests of the maker's ur_calibration",
     )
     joint_harmonics: float = _row(
+        0.07e-3,
         "rad",
         "RMS error of each joint's angle, in sines of one and two turns of its motor",
         "strain wave gears repeat with the wave generator: Tuttle, Understanding and modeling the behavior of a "
         "harmonic drive gear transmission, MIT 1992; size assumed",
     )
     path_memory: float = _row(
+        0.5,
         "rad",
         "way of the joints after which the arm's repeatability error is another one; drawn anew at each rest if 0",
         "friction and play keep their state over a short way (Tuttle 1992); length assumed",
     )
     sag: float = _row(
+        3e-6,
         "rad/(N m)",
         "compliance of each joint under the weight that the flange carries",
         "gears of this size have 1e4 to 1e5 N m/rad (makers' catalogues); what a controller leaves of it is assumed",
     )
-    rocking: float = _row("rad", "amplitude of the standing vehicle's rocking at about 4 Hz", "soft tyres; assumed")
+    rocking: float = _row(
+        0.1e-3, "rad", "amplitude of the standing vehicle's rocking at about 4 Hz", "soft tyres; assumed"
+    )
     sheet_bow: float = _row(
+        0.02e-3,
         "m",
         "1 sigma of the light sheet's bow: off its plane 18 mm beside the middle, 130 mm from the laser",
         "line straightness of line lasers, 0.05 to 0.1 % of the line (makers' data sheets)",
     )
     laser_pointing: float = _row(
-        "rad/K", "turn of the light plane as the laser warms", "makers' data sheets of line lasers, 10 to 100 µrad/K"
+        50e-6,
+        "rad/K",
+        "turn of the light plane as the laser warms",
+        "makers' data sheets of line lasers, 10 to 100 µrad/K",
     )
     camera_warm_up: float = _row(
+        0.01,
         "px/K",
         "shift of both cameras' principal points as they warm, per axis; the focal length follows by 1e-5 per K",
         "Elias et al., Sensors 2020, 20, 643, for the kind of effect; size assumed for a metal housing",
     )
-    grasp: float = _row("m", "1 sigma of the part's place in the claw; 10 mrad per mm of turn", "assumed")
-    late_stamps: float = _row("s", "most that a camera's time stamps are late; even from 0", "assumed")
-    rolling_shutter: float = _row("s", "from the first row's exposure to the last one's", "CMOS sensors, 10 to 30 ms")
-    texture: float = _row(
-        "1", "RMS of the surface's albedo, in grains of 0.3 and 1 mm", "cast or ground metal, assumed"
+    grasp: float = _row(0.1e-3, "m", "1 sigma of the part's place in the claw; 10 mrad per mm of turn", "assumed")
+    late_stamps: float = _row(2e-3, "s", "most that a camera's time stamps are late; even from 0", "assumed")
+    rolling_shutter: float = _row(
+        10e-3, "s", "from the first row's exposure to the last one's", "CMOS sensors, 10 to 30 ms", option=True
     )
-    gloss: float = _row("1", "light mirrored towards the camera, of that scattered", "half-matt metal; assumed")
-    dust: float = _row("1", "spots per cm² on the surface, and shadows on the laser's window", "assumed")
-    sheet_ends: float = _row("rad", "angle from the fan's middle at which it fades out", "fan angle of a line laser")
-    sunlight: float = _row("1", "light of the sun's patch, of the room's; it moves over table and board", "assumed")
+    texture: float = _row(
+        0.10, "1", "RMS of the surface's albedo, in grains of 0.3 and 1 mm", "cast or ground metal, assumed"
+    )
+    gloss: float = _row(0.3, "1", "light mirrored towards the camera, of that scattered", "half-matt metal; assumed")
+    dust: float = _row(1.0, "1", "spots per cm² on the surface, and shadows on the laser's window", "assumed")
+    sheet_ends: float = _row(
+        0.17, "rad", "angle from the fan's middle at which it fades out", "fan angle of a line laser"
+    )
+    sunlight: float = _row(
+        0.4, "1", "light of the sun's patch, of the room's; it moves over table and board", "assumed"
+    )
     droop: float = _row(
+        0.1e-3,
         "m",
         "how far the scan head's carriage has sunk, along the camera's axis, at the far end of its travel: as the "
         "square of its way; it rolls about the way by 10 mrad per mm",
         "a carriage on one guide, worn where it works; size assumed",
+        option=True,
     )
 
     @classmethod
@@ -83,40 +110,13 @@ class Effects:
         """Every effect."""
         return tuple(f.name for f in dataclasses.fields(cls))
 
-    def assumed_noise(self) -> dict[str, dict[str, float | str]]:
-        """Every effect that is on, with its size, unit and meaning."""
-        return {
-            f.name: {
-                "sigma": getattr(self, f.name),
-                "unit": f.metadata["unit"],
-                "of": f.metadata["meaning"],
-            }
-            for f in dataclasses.fields(self)
-            if getattr(self, f.name)
-        }
-
 
 NONE = Effects()
-WORKSHOP = Effects(
-    factory_arm=1e-3,
-    joint_harmonics=0.07e-3,
-    path_memory=0.5,
-    sag=3e-6,
-    rocking=0.1e-3,
-    sheet_bow=0.02e-3,
-    laser_pointing=50e-6,
-    camera_warm_up=0.01,
-    grasp=0.1e-3,
-    late_stamps=2e-3,
-    texture=0.10,
-    gloss=0.3,
-    dust=1.0,
-    sheet_ends=0.17,
-    sunlight=0.4,
-)
-"""All of them together; a rolling shutter and a carriage that droops are options that are added by their names."""
-ALONE = dataclasses.replace(WORKSHOP, rolling_shutter=10e-3, droop=0.1e-3)
+_ROWS = dataclasses.fields(Effects)
+ALONE = Effects(**{f.name: f.metadata["size"] for f in _ROWS})
 """The size of each when it is added alone."""
+WORKSHOP = Effects(**{f.name: f.metadata["size"] for f in _ROWS if not f.metadata["option"]})
+"""All of them together, but for the options, which are added by their names."""
 WARMING_K, WARMING_S = 10.0, 1200.0
 """How much warmer laser and cameras become after they are switched on, and in what time (1/e)."""
 
@@ -133,9 +133,9 @@ CUT = 2.5
 """Draws lie within this many σ."""
 
 
-def _of(unit: str, meaning: str) -> float:
-    """A σ of the table with its unit and meaning; every level must state it."""
-    made: float = field(metadata={"unit": unit, "meaning": meaning})
+def _of(nominal: float, unit: str, meaning: str) -> float:
+    """A σ of the table, at `nominal`, with its unit and meaning."""
+    made: float = field(default=nominal, metadata={"unit": unit, "meaning": meaning})
     return made
 
 
@@ -143,93 +143,53 @@ def _of(unit: str, meaning: str) -> float:
 class Deviations:
     """1σ of every deviation and noise, SI. Vectors are drawn component by component with the σ given here."""
 
-    hand_eye_translation: float = _of("m", "scan camera on its carriage against the drawing")
-    hand_eye_rotation: float = _of("rad", "scan camera on its carriage against the drawing")
-    target_mount_translation: float = _of("m", "target camera on the flange against the drawing")
-    target_mount_rotation: float = _of("rad", "target camera on the flange against the drawing")
-    light_plane_offset: float = _of("m", "laser's exit point, per axis")
-    light_plane_tilt: float = _of("rad", "light plane's normal")
-    focal_length: float = _of("1", "relative, both lenses")
-    principal_point: float = _of("px", "per axis, both lenses")
-    distortion_k1: float = _of("1", "first radial coefficient, both lenses")
-    rail_direction: float = _of("rad", "sweep direction in the camera's frame")
-    rail_lead: float = _of("1", "relative error of the rail's lead")
-    rail_periodic: float = _of("m", "amplitude of the error once per turn of the screw")
-    rail_backlash: float = _of("m", "lost motion of the carriage")
-    rail_homing: float = _of("m", "home position, anew at each homing")
-    arm_repeatability: float = _of("m", "radial (1/√3 of it per axis), anew each time the arm settles")
-    arm_repeatability_rotation: float = _of("rad", "per axis, anew each time the arm settles")
-    arm_factory_length: float = _of("m", "each link length and offset that the controller knows and the drawing not")
-    arm_factory_angle: float = _of("rad", "each joint's zero and twist that the controller knows and the drawing not")
-    arm_factory_slide: float = _of("m", "offsets of joints 2 and 3 in the controller's table, taken back by joint 4's")
-    arm_dh_length: float = _of("m", "each link length and offset")
-    arm_dh_angle: float = _of("rad", "each joint's zero")
-    arm_force_noise: float = _of("N", "measured force, per axis")
-    odometry_scale: float = _of("1", "relative error of the way driven")
-    odometry_yaw: float = _of("1", "relative error of the angle turned")
-    suspension: float = _of("rad/m", "body's lean per metre that the arm reaches out")
-    station_translation: float = _of("m", "surface against the place frame that the board defines")
-    station_rotation: float = _of("rad", "surface against the place frame that the board defines")
-    deck_board_translation: float = _of("m", "calibration boards on the deck against the drawing")
-    deck_board_rotation: float = _of("rad", "calibration boards on the deck against the drawing")
-    start_translation: float = _of("m", "vehicle's start")
-    start_rotation: float = _of("rad", "vehicle's start")
-    grasp_translation: float = _of("m", "part in the claw")
-    grasp_rotation: float = _of("rad", "part in the claw")
-    camera_clock_drift: float = _of("1", "relative drift of a camera's time stamps")
-    exposure_latency: float = _of("s", "time stamp after the start of the exposure")
-    read_noise: float = _of("DN", "camera's read noise")
-    speckle_contrast: float = _of("1", "correlated along the stripe")
-    ambient: float = _of("1", "relative deviation of the ambient light's level and its gradient across the image")
+    hand_eye_translation: float = _of(0.002, "m", "scan camera on its carriage against the drawing")
+    hand_eye_rotation: float = _of(0.0105, "rad", "scan camera on its carriage against the drawing")
+    target_mount_translation: float = _of(0.002, "m", "target camera on the flange against the drawing")
+    target_mount_rotation: float = _of(0.0105, "rad", "target camera on the flange against the drawing")
+    light_plane_offset: float = _of(0.0005, "m", "laser's exit point, per axis")
+    light_plane_tilt: float = _of(0.0070, "rad", "light plane's normal")
+    focal_length: float = _of(0.005, "1", "relative, both lenses")
+    principal_point: float = _of(4.0, "px", "per axis, both lenses")
+    distortion_k1: float = _of(0.02, "1", "first radial coefficient, both lenses")
+    rail_direction: float = _of(0.0070, "rad", "sweep direction in the camera's frame")
+    rail_lead: float = _of(0.0015, "1", "relative error of the rail's lead")
+    rail_periodic: float = _of(3e-6, "m", "amplitude of the error once per turn of the screw")
+    rail_backlash: float = _of(10e-6, "m", "lost motion of the carriage")
+    rail_homing: float = _of(5e-6, "m", "home position, anew at each homing")
+    arm_repeatability: float = _of(0.04e-3, "m", "radial (1/√3 of it per axis), anew each time the arm settles")
+    arm_repeatability_rotation: float = _of(0.08e-3, "rad", "per axis, anew each time the arm settles")
+    arm_factory_length: float = _of(
+        0.0, "m", "each link length and offset that the controller knows and the drawing not"
+    )
+    arm_factory_angle: float = _of(
+        0.0, "rad", "each joint's zero and twist that the controller knows and the drawing not"
+    )
+    arm_factory_slide: float = _of(
+        0.0, "m", "offsets of joints 2 and 3 in the controller's table, taken back by joint 4's"
+    )
+    arm_dh_length: float = _of(0.03e-3, "m", "each link length and offset")
+    arm_dh_angle: float = _of(0.02e-3, "rad", "each joint's zero")
+    arm_force_noise: float = _of(0.3, "N", "measured force, per axis")
+    odometry_scale: float = _of(0.01, "1", "relative error of the way driven")
+    odometry_yaw: float = _of(0.015, "1", "relative error of the angle turned")
+    suspension: float = _of(0.0004, "rad/m", "body's lean per metre that the arm reaches out")
+    station_translation: float = _of(0.002, "m", "surface against the place frame that the board defines")
+    station_rotation: float = _of(0.0087, "rad", "surface against the place frame that the board defines")
+    deck_board_translation: float = _of(0.002, "m", "calibration boards on the deck against the drawing")
+    deck_board_rotation: float = _of(0.0087, "rad", "calibration boards on the deck against the drawing")
+    start_translation: float = _of(0.02, "m", "vehicle's start")
+    start_rotation: float = _of(0.014, "rad", "vehicle's start")
+    grasp_translation: float = _of(0.01e-3, "m", "part in the claw")
+    grasp_rotation: float = _of(0.1e-3, "rad", "part in the claw")
+    camera_clock_drift: float = _of(20e-6, "1", "relative drift of a camera's time stamps")
+    exposure_latency: float = _of(20e-6, "s", "time stamp after the start of the exposure")
+    read_noise: float = _of(0.4, "DN", "camera's read noise")
+    speckle_contrast: float = _of(0.15, "1", "correlated along the stripe")
+    ambient: float = _of(0.06, "1", "relative deviation of the ambient light's level and its gradient across the image")
 
-    def assumed_noise(self) -> dict[str, dict[str, float | str]]:
-        """Every σ with its unit and meaning, for reports that state what was assumed."""
-        return {
-            f.name: {"sigma": getattr(self, f.name), "unit": f.metadata["unit"], "of": f.metadata["meaning"]}
-            for f in dataclasses.fields(self)
-        }
 
-
-NOMINAL = Deviations(
-    hand_eye_translation=0.002,
-    hand_eye_rotation=0.0105,
-    target_mount_translation=0.002,
-    target_mount_rotation=0.0105,
-    light_plane_offset=0.0005,
-    light_plane_tilt=0.0070,
-    focal_length=0.005,
-    principal_point=4.0,
-    distortion_k1=0.02,
-    rail_direction=0.0070,
-    rail_lead=0.0015,
-    rail_periodic=3e-6,
-    rail_backlash=10e-6,
-    rail_homing=5e-6,
-    arm_repeatability=0.04e-3,
-    arm_repeatability_rotation=0.08e-3,
-    arm_factory_length=0.0,
-    arm_factory_angle=0.0,
-    arm_factory_slide=0.0,
-    arm_dh_length=0.03e-3,
-    arm_dh_angle=0.02e-3,
-    arm_force_noise=0.3,
-    odometry_scale=0.01,
-    odometry_yaw=0.015,
-    suspension=0.0004,
-    station_translation=0.002,
-    station_rotation=0.0087,
-    deck_board_translation=0.002,
-    deck_board_rotation=0.0087,
-    start_translation=0.02,
-    start_rotation=0.014,
-    grasp_translation=0.01e-3,
-    grasp_rotation=0.1e-3,
-    camera_clock_drift=20e-6,
-    exposure_latency=20e-6,
-    read_noise=0.4,
-    speckle_contrast=0.15,
-    ambient=0.06,
-)
+NOMINAL = Deviations()
 IDEAL = Deviations(**{f.name: 0.0 for f in dataclasses.fields(Deviations)} | {"read_noise": 0.1})
 HARSH = Deviations(**{f.name: 2.5 * getattr(NOMINAL, f.name) for f in dataclasses.fields(Deviations)})
 
@@ -262,7 +222,7 @@ def number_of(level: str) -> str:
 
 def assumed_noise(level: str) -> dict[str, dict[str, float | str]]:
     """Every σ of `level` with its unit and meaning, and the effects that are on."""
-    return deviations(level).assumed_noise() | effects_of(level).assumed_noise()
+    return _told(deviations(level)) | _told(effects_of(level))
 
 
 def _parts(level: str) -> list[str]:

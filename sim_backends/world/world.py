@@ -1,14 +1,13 @@
 """The world: the devices' models in one place, what couples them, and the pictures that the cameras take of it.
 
 The models are advanced by their peers. What they share passes through here: switches on the arm's outputs, contact,
-the vehicle's lean under the arm, and the chain of poses from the floor to the cameras.
-
-The world's truth as one JSON object, for the report's comparison and for nothing that the cell does.
-
-Lengths in m, angles in rad, poses as nested 4×4 lists named `a_from_b`; frames as in `nominal`."""
+the vehicle's lean under the arm, and the chain of poses from the floor to the cameras. Its truth is one JSON object,
+for the report's comparison and for nothing that the cell does; frames are those of `drawing`.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import asdict, replace
 from typing import Any
@@ -17,18 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.clock import SwitchHistory, WorldClock
-from sim_backends.models.arm import ArmModel, Safety
+from sim_backends.models.arm import ArmModel, ArmParams, Safety
+from sim_backends.models.arm_kinematics import TABLES
+from sim_backends.models.camera import CameraSpec
 from sim_backends.models.followed import FollowedArm, FollowedRail, FollowedVehicle
-from sim_backends.models.rail import RailModel
-from sim_backends.models.vehicle import VehicleModel
-from sim_backends.world import hardware
+from sim_backends.models.rail import RailModel, RailParams
+from sim_backends.models.ramp import Screw
+from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.world.bodies.collisions import ArmPoints, Collision, Collisions
 from sim_backends.world.bodies.contact import PartContact
 from sim_backends.world.bodies.station import Station
 from sim_backends.world.cameras import Cameras
-from sim_backends.world.drawing import STOCK, Drawing, StationDrawing, inverse, pose
+from sim_backends.world.drawing import CAMERA_RATE, STOCK, Drawing, StationDrawing, inverse, pose
 from sim_backends.world.levels import WARMING_S, assumed_noise
-from sim_backends.world.scene import CameraClock, Lens, draw, rotation
+from sim_backends.world.scene import CameraClock, Lens, Scene, draw, rotation, stream
 
 Pose = NDArray[np.float64]
 
@@ -43,14 +44,9 @@ class World:
     """One seeded world. `scene` holds what was drawn, `arm`, `rail` and `vehicle` the models that the peers drive."""
 
     def __init__(
-        self,
-        seed: int = 1,
-        level: str = "nominal",
-        speed: float = 1.0,
-        drawing: Drawing = STOCK,
-        clock: WorldClock | None = None,
-        followed: Collection[str] = (),
-    ) -> None:
+        self, seed: int = 1, level: str = "nominal", speed: float = 1.0, drawing: Drawing = STOCK,
+        clock: WorldClock | None = None, followed: Collection[str] = (),
+    ) -> None:  # fmt: skip
         """Draw the world around `drawing` and let its clock run, at `speed` unless it is given one.
 
         Of arm, rail and vehicle those in `followed` are where real ones are measured: see `world.following`.
@@ -59,9 +55,9 @@ class World:
         self.scene = draw(seed, level, drawing)
         self.station = Station.of(drawing.station)
         self.clock = WorldClock(speed) if clock is None else clock
-        self.arm = hardware.make_arm(self.scene, self.clock, FollowedArm if "arm" in followed else ArmModel)
-        self.rail = hardware.make_rail(self.scene, FollowedRail if "rail" in followed else RailModel)
-        self.vehicle = hardware.make_vehicle(self.scene, FollowedVehicle if "vehicle" in followed else VehicleModel)
+        self.arm = make_arm(self.scene, self.clock, FollowedArm if "arm" in followed else ArmModel)
+        self.rail = make_rail(self.scene, FollowedRail if "rail" in followed else RailModel)
+        self.vehicle = make_vehicle(self.scene, FollowedVehicle if "vehicle" in followed else VehicleModel)
         self.laser = SwitchHistory()
         self.switches = {"laser": False, "claw": True}
         """What switches laser and claw where no output of the arm does: set by their peers."""
@@ -78,13 +74,10 @@ class World:
         """Part in the claw, and bodies of cell and station that may meet."""
         scene, station = self.scene, self.scene.drawing.station
         self.part = PartContact(
-            self.station.ground,
-            scene.world_from_surface,
-            scene.flange_from_part,
-            world_from_table=scene.world_from_table,
-            surface_from_part=station.surface_from_part,
+            self.station.ground, scene.world_from_surface, scene.flange_from_part,
+            world_from_table=scene.world_from_table, surface_from_part=station.surface_from_part,
             table_height=station.height,
-        )
+        )  # fmt: skip
         self._solid = ArmPoints(scene.drawing)
         self.collisions = Collisions(scene, self.part, found)
         self._report_grip()
@@ -155,15 +148,9 @@ class World:
         lit = self.laser.at(t)
         camera_from_flange = inverse(self.flange_from_camera(camera, t))
         return self._cameras.picture(
-            camera,
-            world_from_camera,
-            world_from_base,
-            laser=lit,
-            exposure=exposure,
-            warm=self.warmth(t),
-            t=t,
+            camera, world_from_camera, world_from_base, laser=lit, exposure=exposure, warm=self.warmth(t), t=t,
             camera_from_flange=camera_from_flange,
-        )
+        )  # fmt: skip
 
     def warmth(self, t: float) -> float:
         """How far, of 0 to 1, laser and cameras have warmed up since they were switched on, at world time `t`."""
@@ -241,11 +228,76 @@ class World:
     def _sag(self) -> tuple[float, float, float]:
         """Roll, pitch (rad) and height (m) of the body: it leans towards where the arm reaches out."""
         reach = self.arm.base_from_flange(self.clock.now())[:3, 3]
-        return (
-            float(-self.scene.suspension[1] * reach[1]),
-            float(self.scene.suspension[0] * reach[0]),
-            0.0,
-        )
+        return (float(-self.scene.suspension[1] * reach[1]), float(self.scene.suspension[0] * reach[0]), 0.0)
+
+
+_TORQUE_PER_FORCE = 0.05
+"""Noise of the measured torque, Nm, per newton of noise in the force."""
+
+
+def make_arm(scene: Scene, clock: WorldClock, made: type[ArmModel] = ArmModel) -> ArmModel:
+    """The arm at rest, with its claw closed."""
+    sigma, drawn = scene.deviations, scene.drawing.cell
+    model = drawn.arm
+    params = ArmParams.of(
+        model, dh=TABLES[model] + scene.dh_factory, dh_error=scene.dh_error,
+        repeatability=(sigma.arm_repeatability / math.sqrt(3.0), sigma.arm_repeatability_rotation),
+        force_noise=(sigma.arm_force_noise, _TORQUE_PER_FORCE * sigma.arm_force_noise),
+        memory=scene.effects.path_memory, harmonics=scene.workshop.harmonics, compliance=scene.effects.sag,
+        carried=drawn.payload, carried_centre=drawn.payload_centre, serial=f"2023{scene.serial}",
+    )  # fmt: skip
+    arm = made(params, stream(scene.seed, "arm"), clock)
+    if drawn.claw_output is not None:
+        closed = 1 << drawn.claw_output
+        arm.write_digital_outputs(closed, closed)
+    return arm
+
+
+def make_rail(scene: Scene, made: type[RailModel] = RailModel) -> RailModel:
+    """The rail, switched on anywhere on its travel and not yet homed."""
+    drawn = scene.drawing.cell.rail
+    screw = Screw(
+        lead=drawn.lead, scale_error=scene.rail_lead_error, periodic=scene.rail_periodic_amplitude,
+        phase=scene.rail_periodic_phase, backlash=scene.rail_backlash,
+    )  # fmt: skip
+    params = RailParams(
+        screw=screw,
+        steps_per_turn=drawn.steps_per_turn,
+        repeatability=scene.deviations.rail_homing,
+        start=float(stream(scene.seed, "rail.start").uniform(*drawn.start)),
+        serial=int(scene.serial),
+        reversed=drawn.reversed,
+    ).around(drawn.travel)
+    return made(params, stream(scene.seed, "rail"))
+
+
+def make_vehicle(scene: Scene, made: type[VehicleModel] = VehicleModel) -> VehicleModel:
+    """The vehicle standing at its start, braked for good where it is a fixed frame.
+
+    Its drift sideways and in yaw follow the odometry's errors.
+    """
+    start = scene.world_from_vehicle_start
+    yaw = float(np.arctan2(start[1, 0], start[0, 0]))
+    params = VehicleParams(
+        start=(float(start[0, 3]), float(start[1, 3]), yaw), track=scene.drawing.cell.track,
+        distance_scale=1.0 + scene.odometry_scale, yaw_scale=1.0 + scene.odometry_yaw,
+        lateral_walk=0.1 * scene.deviations.odometry_scale, yaw_walk=0.1 * scene.deviations.odometry_yaw,
+    )  # fmt: skip
+    model = made(params, stream(scene.seed, "vehicle"))
+    if scene.drawing.cell.fixed:
+        model.set_brake(0.0, True)
+    return model
+
+
+def camera_spec(scene: Scene, camera: str) -> CameraSpec:
+    """The camera "scan" or "target"; its serial carries the seed, so that another cell's calibration is recognised."""
+    drawn, scan = scene.drawing.cell, camera == "scan"
+    size = drawn.scan.size if scan else drawn.target.size
+    timing = scene.scan_clock if scan else scene.target_clock
+    return CameraSpec(
+        model=f"SIM-{camera.upper()}", serial=f"SIM{scene.serial}-{camera.upper()}", width=size[0], height=size[1],
+        frame_rate_max=CAMERA_RATE[camera], epoch=timing.epoch, drift_ppm=1e6 * timing.drift, latency=timing.latency,
+    )  # fmt: skip
 
 
 def truth(world: World) -> dict[str, object]:
@@ -284,11 +336,7 @@ def truth(world: World) -> dict[str, object]:
             "speed": vehicle.speed,
             "yaw_rate": vehicle.yaw_rate,
         },
-        "arm": {
-            "moving": world.arm.moving,
-            "safety": world.arm.safety.name.lower(),
-            "fault": world.arm.fault_text,
-        },
+        "arm": {"moving": world.arm.moving, "safety": world.arm.safety.name.lower(), "fault": world.arm.fault_text},
         "collisions": [asdict(collision) for collision in world.collisions.found],
         "rail_moving": world.rail.velocity(t) != 0,
     }

@@ -23,8 +23,7 @@ from drivers.make import CameraConfig, OnArm, Pose
 from sim_backends.optics.scene import KINDS, Board
 from sim_backends.world import drawing as drawn
 from sim_backends.world.bodies.surfaces import surface
-from sim_backends.world.drawing import SCAN_FOCUS, STOCK, TABLE_HALF, TARGET_FOCUS, Drawing
-from sim_backends.world.hardware import CAMERA_RATE
+from sim_backends.world.drawing import CAMERA_RATE, SCAN_FOCUS, STOCK, TABLE_HALF, TARGET_FOCUS, Drawing
 
 MOST_BLUR, MOST_STRIPE_BLUR_PX = 0.5, 16.0
 """Diameter of the blur disc at which a board's dots are still found, in diameters of a dot, and a stripe, in px."""

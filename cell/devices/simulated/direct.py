@@ -1,6 +1,6 @@
 """A simulated cell in this process, on a virtual clock: the world's models behind the drivers' interfaces, no wires.
 
-It gives `sim_backends.direct` the configuration's values and the product's own logic.
+It gives `sim_backends.direct` the configuration's values; what is above the devices' interfaces is the product.
 """
 
 from __future__ import annotations
@@ -14,19 +14,14 @@ from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.devices import Devices
 from cell.devices.simulated.described import Described
 from cell.motion.kinematics import MODELS
-from drivers.arm.faults import fault
 from drivers.arm.motion import ArmLimits
-from drivers.clock import ClockMap, Latch
 from drivers.errors import ConfigError
 from drivers.make import MOST_PAYLOAD
-from drivers.rail.motion import CarriageWatch, ZeroCheck
-from drivers.rail.sweep import EvenMotion
-from drivers.vehicle.faults import system_trouble, vehicle_error
-from drivers.vehicle.feedback import PlanarOdometry
 from sim_backends.direct import cell
-from sim_backends.direct.cell import DirectCell
-from sim_backends.direct.product import ArmSetup, CameraSetup, DirectSetup, RailSetup, VehicleSetup
+from sim_backends.direct.cell import DirectCell, DirectSetup
+from sim_backends.direct.rail import RailSetup
 from sim_backends.direct.switches import DirectClaw, DirectLaser
+from sim_backends.direct.vehicle import VehicleSetup
 
 
 class VirtualCell(DirectCell):
@@ -92,23 +87,19 @@ class VirtualCell(DirectCell):
 
 
 def setup_of(config: CellConfig) -> DirectSetup:
-    """What the devices are given: the configuration's values and the drivers' logic."""
+    """What the devices are given: the configuration's values."""
     arm, rail, vehicle = config.arm, config.rail, config.vehicle
-    count = vehicle.count_length
     if rail.counted is None:
         raise ConfigError(f'rail.driver = "{rail.driver}" does not say how it counts; name another make, or use wires')
     return DirectSetup(
-        ArmSetup(
-            ArmLimits(
-                joint_speeds=(arm.max_joint_speed,) * 6,
-                joint_acceleration=arm.max_joint_acceleration,
-                linear_speed=arm.max_tool_speed,
-                reach=MODELS[arm.model].reach,
-                payload=MOST_PAYLOAD[arm.model],
-            ),
-            fault,
-            safe_off_outputs(config),
+        ArmLimits(
+            joint_speeds=(arm.max_joint_speed,) * 6,
+            joint_acceleration=arm.max_joint_acceleration,
+            linear_speed=arm.max_tool_speed,
+            reach=MODELS[arm.model].reach,
+            payload=MOST_PAYLOAD[arm.model],
         ),
+        safe_off_outputs(config),
         RailSetup(
             rail.lead,
             *rail.counted,
@@ -116,19 +107,13 @@ def setup_of(config: CellConfig) -> DirectSetup:
             rail.max_speed,
             rail.acceleration,
             rail.turned_round,
-            EvenMotion.of,
-            CarriageWatch,
-            ZeroCheck,
             rail.untold_serial,
         ),
         VehicleSetup(
             vehicle.max_speed,
             vehicle.max_yaw_rate,
-            PlanarOdometry(vehicle.track, count),
-            trouble=lambda bits: system_trouble(bits, commanded=True),
-            error=lambda name, bits, trouble, driven: vehicle_error(name, bits, trouble, driven=driven),
+            track=vehicle.track,
             make=vehicle.MODEL or vehicle.driver,
-            count=count,
+            count=vehicle.count_length,
         ),
-        CameraSetup(ClockMap, Latch),
     )

@@ -1,12 +1,10 @@
-"""The light of one row crossing of the stripe: how bright, how wide, and spread over which pixels.
+"""The light of one row crossing of the stripe, spread over pixels, and the speckle on it.
 
 Radiometry, docs/explanation/theory.md, section 4: the irradiance of the light sheet falls with the distance from the
-laser and the cosine of incidence; a diffuse surface's image does not depend on the camera's distance.
-
-Laser speckle: a random factor on the stripe's light, correlated over neighbouring pixels, new in every frame.
-
-The factor is log-normal with mean 1 and standard deviation C, the contrast. It moves a stripe's centre by about
-0.6 C √(grain × stripe width) pixels, the error that no extractor can remove."""
+laser and the cosine of incidence; a diffuse surface's image does not depend on the camera's distance. Speckle is a
+log-normal factor of mean 1 and standard deviation C, new in every frame. It moves a stripe's centre by about
+0.6 C √(grain × stripe width) pixels, the error that no extractor can remove.
+"""
 
 from __future__ import annotations
 
@@ -73,23 +71,10 @@ def add_gaussian(line: Image, centre: float, sigma: float, light: float) -> tupl
 
 @compiled
 def expose(
-    image: Image,
-    touched: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    columns: Vector,
-    slopes: Vector,
-    points: Vector,
-    normals: Vector,
-    factors: Vector,
-    intrinsics: Vector,
-    camera: Vector,
-    plane_normal: Vector,
-    origin: Vector,
-    sheet: float,
-    brightness: float,
-    pose: Vector,
-    pattern: Vector,
-) -> None:
+    image: Image, touched: NDArray[np.int64], rows: NDArray[np.int64], columns: Vector, slopes: Vector, points: Vector,
+    normals: Vector, factors: Vector, intrinsics: Vector, camera: Vector, plane_normal: Vector, origin: Vector,
+    sheet: float, brightness: float, pose: Vector, pattern: Vector,
+) -> None:  # fmt: skip
     """Draw crossings of one object, each with a factor on its light.
 
     On a patterned board the sheet is cut into sub-sheets and sub-rows, each with the albedo under it, so that the
@@ -159,12 +144,7 @@ def expose(
 
 
 def add_speckled(
-    image: Image,
-    stripe: Image,
-    touched: NDArray[np.int64],
-    contrast: float,
-    grain_px: float,
-    rng: np.random.Generator,
+    image: Image, stripe: Image, touched: NDArray[np.int64], contrast: float, grain_px: float, rng: np.random.Generator
 ) -> None:
     """Add `stripe` times the speckle to `image`, row v in the columns touched[v, 0] … touched[v, 1] (excluded).
 

@@ -1,8 +1,7 @@
-"""A light sheet that is not perfect: bowed, fading at its ends, with shadows of dust; and surfaces that mirror it.
+"""A light sheet that is not perfect: bowed, fading at its ends, with shadows of dust; and which points it reaches.
 
 The fan's middle is the sheet's direction that is nearest to the camera's axis; y is across it, in the sheet.
-
-Which points of a light plane's cut the laser reaches and the camera, at the origin of its frame, sees."""
+"""
 
 from __future__ import annotations
 

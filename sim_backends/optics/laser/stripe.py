@@ -59,14 +59,9 @@ def crossings(optics: CameraOptics, laser: LaserOptics, instance: SceneObject) -
     rows = np.empty(capacity, dtype=np.int64)
     values = np.empty((capacity, 8))
     count = follow(
-        np.ascontiguousarray(segments),
-        np.ascontiguousarray(normals),
-        optics.intrinsics,
-        width=optics.width,
-        height=optics.height,
-        rows=rows,
-        values=values,
-    )
+        np.ascontiguousarray(segments), np.ascontiguousarray(normals), optics.intrinsics, width=optics.width,
+        height=optics.height, rows=rows, values=values,
+    )  # fmt: skip
     values = values[:count]
     if laser.bow != 0.0 and count:
         columns, points = values[:, 0].copy(), values[:, 2:5].copy()
@@ -117,23 +112,11 @@ def render_stripe(
             pose, pattern = appearance(instance)
         points, normals = np.ascontiguousarray(found.points), np.ascontiguousarray(found.normals)
         expose(
-            image,
-            touched,
-            found.rows,
-            columns=found.columns,
-            slopes=found.slopes,
-            points=points,
-            normals=normals,
+            image, touched, found.rows, columns=found.columns, slopes=found.slopes, points=points, normals=normals,
             factors=light_at(points, normals, laser, grain) * (1.0 if share is None else share),
-            intrinsics=optics.intrinsics,
-            camera=camera,
-            plane_normal=normal,
-            origin=origin,
-            sheet=laser.width,
-            brightness=laser.brightness * exposure,
-            pose=np.ascontiguousarray(pose),
-            pattern=pattern,
-        )
+            intrinsics=optics.intrinsics, camera=camera, plane_normal=normal, origin=origin, sheet=laser.width,
+            brightness=laser.brightness * exposure, pose=np.ascontiguousarray(pose), pattern=pattern,
+        )  # fmt: skip
     return touched
 
 
@@ -163,14 +146,9 @@ def _with_rim(instance: PlaneInstance, laser: LaserOptics) -> PlaneInstance:
 
 @compiled
 def follow(
-    segments: Vector,
-    normals: Vector,
-    intrinsics: Vector,
-    width: int,
-    height: int,
-    rows: NDArray[np.int64],
+    segments: Vector, normals: Vector, intrinsics: Vector, width: int, height: int, rows: NDArray[np.int64],
     values: Vector,
-) -> int:
+) -> int:  # fmt: skip
     """Row crossings of straight segments (k, 2, 3): columns of `values` are u, du/dv, point, normal."""
     count = 0
     for s in range(segments.shape[0]):

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from sim_backends.models.arm import ArmModel, Power, Safety
-from sim_backends.peers.arm.script.script import ProgramMemory, RuntimeState
+from sim_backends.peers.arm.program import ProgramMemory, RuntimeState
 
 VERSION = (5, 15, 2, 1130077)
 """Controller version: major, minor, bug fix, build."""
@@ -23,19 +23,13 @@ _SAFETY = {
     Safety.EMERGENCY_STOP: "ROBOT_EMERGENCY_STOP",
 }
 _STATES = {
-    RuntimeState.STOPPED: "STOPPED",
-    RuntimeState.PLAYING: "PLAYING",
-    RuntimeState.PAUSING: "PAUSED",
-    RuntimeState.PAUSED: "PAUSED",
-    RuntimeState.RESUMING: "PLAYING",
-}
+    RuntimeState.STOPPED: "STOPPED", RuntimeState.PLAYING: "PLAYING", RuntimeState.PAUSING: "PAUSED",
+    RuntimeState.PAUSED: "PAUSED", RuntimeState.RESUMING: "PLAYING",
+}  # fmt: skip
 _FIXED = {
-    "close safety popup": "closing safety popup",
-    "restart safety": "Restarting safety",
-    "quit": "Disconnected",
-    "shutdown": "Shutting down",
-    "savelog": "Log saved to disk",
-}
+    "close safety popup": "closing safety popup", "restart safety": "Restarting safety", "quit": "Disconnected",
+    "shutdown": "Shutting down", "savelog": "Log saved to disk",
+}  # fmt: skip
 _FOR_REMOTE_ONLY = frozenset(["play", "pause", "stop", "shutdown", "load", "power", "brake", "unlock", "restart"])
 """First words of what is refused in local control."""
 _LOCAL = (

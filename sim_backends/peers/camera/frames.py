@@ -1,13 +1,9 @@
-"""A camera on the network: frame stream protocol, version 1 (`docs/reference/frame-stream.md`).
+"""A camera on the network: frame stream protocol, version 1 (`docs/reference/frame-stream.md`), for one client.
 
-Here are the requests and the rule that a camera has one client; the pictures are the session's.
-
-Messages of the frame stream protocol, version 1: magic, two lengths, a JSON header, a payload.
-
-A camera's acquisition: one thread exposes on time, another renders what was exposed and sends it.
-
-Exposures keep the device's rate in world time, whatever rendering takes. A picture is asked for once its exposure is
-over, because only then the state of the world at its middle is known."""
+In an acquisition one thread exposes on time, another renders what was exposed and sends it. Exposures keep the device's
+rate in world time, whatever rendering takes. A picture is asked for once its exposure is over, because only then the
+state of the world at its middle is known.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
-from sim_backends.faults import CAMERA_FAULTS as FAULTS
 from sim_backends.models.camera import CameraSpec, CameraState
 from sim_backends.peers.server import TcpServer
 
@@ -228,38 +223,26 @@ class FrameSession:
                 self._send(exposure, image)
 
 
-__all__ = ["BACKLOG", "FAULTS", "CameraSpec", "FramePeer", "Render"]
-
 _HANDOVER = 0.3
 """Wall seconds that a second client waits for the first one to go."""
 _SLOWEST = 0.01
 """Lowest frame rate in Hz."""
 
 
-class FramePeer:
+class FramePeer(TcpServer):
     """Serves one camera to one client at a time at `address` (`127.0.0.1:port`)."""
 
     def __init__(self, name: str, clock: WorldClock, render: Render, spec: CameraSpec) -> None:
         """`render` is called in the session's thread, once the exposure that it is to show is over."""
-        self.name = name
+        super().__init__(name, self._serve)
         self.camera = CameraState(spec)
         self._clock = clock
         self._render = render
-        self._server = TcpServer(name, self._serve)
-        self.address = self._server.address
         self._free = threading.Condition()
         self._session: FrameSession | None = None
 
-    def start(self) -> None:
-        """Begin to serve."""
-        self._server.start()
-
-    def stop(self) -> None:
-        """End the connection and all threads; idempotent."""
-        self._server.stop()
-
     def fault(self, name: str, count: int = 1) -> None:
-        """Cause a fault of `FAULTS` (see `CameraState.fault`); ValueError for another name."""
+        """Cause a fault (see `CameraState.fault`); ValueError for another name."""
         self.camera.fault(name, count)
 
     def clear(self) -> None:
@@ -312,13 +295,9 @@ class FramePeer:
     def _send_frame(self, connection: socket.socket, exposure: Exposure, image: NDArray[np.uint8]) -> None:
         spec = self.camera.spec
         header = {
-            "op": "frame",
-            "frame_id": exposure.frame_id,
-            "device_ns": spec.device_ns(exposure.begin + spec.latency),
-            "exposure_s": exposure.duration,
-            "width": spec.width,
-            "height": spec.height,
-        }
+            "op": "frame", "frame_id": exposure.frame_id, "device_ns": spec.device_ns(exposure.begin + spec.latency),
+            "exposure_s": exposure.duration, "width": spec.width, "height": spec.height,
+        }  # fmt: skip
         if not self.camera.silent:
             connection.sendall(message(header, image.tobytes()))
 
@@ -326,13 +305,9 @@ class FramePeer:
 
     def _answer(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         operations: dict[str, Callable[[FrameSession, dict[str, object]], dict[str, object]]] = {
-            "identify": self._identify,
-            "configure": self._configure,
-            "start": self._start,
-            "stop": self._stop,
-            "trigger": self._trigger,
-            "latch": self._latch,
-        }
+            "identify": self._identify, "configure": self._configure, "start": self._start, "stop": self._stop,
+            "trigger": self._trigger, "latch": self._latch,
+        }  # fmt: skip
         operation = operations.get(str(request.get("op")))
         try:
             if operation is None:

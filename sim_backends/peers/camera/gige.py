@@ -1,11 +1,9 @@
 """A camera on GigE Vision: answers on UDP port 3956 of a loopback address of its own, sends pictures where it is told.
 
 One client controls it and others may read; a client that stays silent longer than its heartbeat loses control. Packets
-that got lost are sent again when they are asked for. It listens to its own address alone, so no broadcast finds it.
-
-The pictures of a simulated GigE Vision camera on their way: packets to where the client wants them, and again.
-
-Nothing leaves this computer: another destination than a loopback address gets nothing."""
+that got lost are sent again when they are asked for. It listens to its own address alone, so no broadcast finds it, and
+sends nothing to another destination than a loopback address.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +21,12 @@ from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import CameraSpec, CameraState
-from sim_backends.peers.camera import gige_memory as memory
+from sim_backends.peers.camera import gigevision as memory
 from sim_backends.peers.camera.frames import Exposure, FrameSession, Rejected, Render
-from sim_backends.peers.camera.gige_memory import ENCODERS, GigeMemory
-from sim_backends.peers.camera.gvcp import (
+from sim_backends.peers.camera.gigevision import (
+    ENCODERS,
     PORT,
+    GigeMemory,
     GvcpCommand,
     GvcpRefused,
     GvcpRequest,
@@ -113,8 +112,6 @@ class GigeStream:
             with contextlib.suppress(OSError):
                 self._socket.sendto(packet, (host, self._read.word(memory.STREAM_PORT) & 0xFFFF))
 
-
-__all__ = ["GigePeer"]
 
 _FIRE = 1 << 31
 _LATCH = 2

@@ -71,12 +71,9 @@ class ModbusDriveServer:
         self._written = dict.fromkeys(self._writable, 0)
         t = self._clock.now()
         settings = dataclasses.replace(
-            self.rail.settings,
-            microsteps=0,
-            search_mode=5,
-            search_speed=round(SEARCH_RPM / 60.0 * self._turn),
+            self.rail.settings, microsteps=0, search_mode=5, search_speed=round(SEARCH_RPM / 60.0 * self._turn),
             switch_speed=round(CREEP_RPM / 60.0 * self._turn),
-        )
+        )  # fmt: skip
         self.rail.configure(t, settings)
 
     # --- what is read ---

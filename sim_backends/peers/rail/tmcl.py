@@ -1,16 +1,9 @@
-"""The rail's wire: TMCL requests over TCP (as behind a serial server) or over a pseudo terminal.
+"""A TMCM-1260 stepper module on its serial line: axis and global parameters, motion commands, status codes.
 
-Framing as on the serial line: nine bytes make a request, and an incomplete one is forgotten after a pause.
-
-Parameter tables of the simulated stepper module: number → value at power-on and allowed range.
-
-Numbers and meanings are those of the TMCM-1260 with velocities in pps; 15 to 20 as the vendor's library has them.
-
-A stepper module as seen through TMCL: axis and global parameters, motion commands, status codes.
-
-Modelled on the TMCM-1260 (docs/reference/protocols.md, section 2). One request of nine bytes gives one reply; no
-transport here. The module's serial number stands in user variable 0 (bank 2), where it is written when a module is put
-into service."""
+Nine bytes make a request (docs/reference/protocols.md, section 2); an incomplete one is forgotten after a pause.
+Numbers and meanings are the module's, with velocities in pps; 15 to 20 are as the vendor's library has them. The serial
+number stands in user variable 0 (bank 2), where it is written when a module is put into service.
+"""
 
 from __future__ import annotations
 
@@ -27,59 +20,28 @@ from sim_backends.models.rail import RailModel, RailSettings
 from sim_backends.peers.server import SerialServer
 
 SETTINGS: dict[int, tuple[str, int, int]] = {
-    4: ("max_velocity", 0, 7_999_774),
-    5: ("max_acceleration", 0, 7_629_278),
-    12: ("right_stop", 0, 1),
-    13: ("left_stop", 0, 1),
-    15: ("first_acceleration", 0, 7_629_278),
-    16: ("first_speed", 0, 1_000_000),
-    17: ("max_deceleration", 1, 7_629_278),
-    18: ("last_deceleration", 1, 7_629_278),
-    26: ("soft_stop", 0, 1),
-    140: ("microsteps", 0, 8),
-    193: ("search_mode", 1, 8),
-    194: ("search_speed", 1, 7_999_774),
-    195: ("switch_speed", 1, 7_999_774),
-    251: ("reverse_shaft", 0, 1),
-}
+    4: ("max_velocity", 0, 7_999_774), 5: ("max_acceleration", 0, 7_629_278), 12: ("right_stop", 0, 1),
+    13: ("left_stop", 0, 1), 15: ("first_acceleration", 0, 7_629_278), 16: ("first_speed", 0, 1_000_000),
+    17: ("max_deceleration", 1, 7_629_278), 18: ("last_deceleration", 1, 7_629_278), 26: ("soft_stop", 0, 1),
+    140: ("microsteps", 0, 8), 193: ("search_mode", 1, 8), 194: ("search_speed", 1, 7_999_774),
+    195: ("switch_speed", 1, 7_999_774), 251: ("reverse_shaft", 0, 1),
+}  # fmt: skip
 """Axis parameters that set the motion: number → (setting, smallest, largest value)."""
 
 SEARCH_MODES = (1, 2, 3, 4, 5, 6, 7)
 """Values of axis parameter 193 that this module knows."""
 
 PLAIN: dict[int, tuple[int, int, int]] = {
-    6: (128, 0, 255),
-    7: (8, 0, 255),
-    14: (0, 0, 1),
-    19: (0, 0, 7_999_774),
-    20: (10, 1, 7_999_774),
-    21: (0, 0, 65535),
-    24: (0, 0, 1),
-    25: (0, 0, 1),
-    31: (0, 0, 65535),
-    127: (0, 0, 1),
-    153: (0, 0, 13),
-    154: (3, 0, 13),
-    181: (0, 0, 7_999_774),
-    204: (0, 0, 65535),
-    214: (200, 0, 65535),
-    254: (0, 0, 0),
-    255: (1, 1, 1),
-}
+    6: (128, 0, 255), 7: (8, 0, 255), 14: (0, 0, 1), 19: (0, 0, 7_999_774), 20: (10, 1, 7_999_774), 21: (0, 0, 65535),
+    24: (0, 0, 1), 25: (0, 0, 1), 31: (0, 0, 65535), 127: (0, 0, 1), 153: (0, 0, 13), 154: (3, 0, 13),
+    181: (0, 0, 7_999_774), 204: (0, 0, 65535), 214: (200, 0, 65535), 254: (0, 0, 0), 255: (1, 1, 1),
+}  # fmt: skip
 """Axis parameters that are only remembered: number → (value at power-on, smallest, largest value)."""
 
 GLOBALS: dict[int, tuple[int, int, int]] = {
-    65: (0, 0, 11),
-    66: (1, 1, 255),
-    68: (0, 0, 65535),
-    69: (8, 2, 8),
-    70: (2, 0, 2047),
-    71: (1, 0, 2047),
-    73: (0, 0, 2**31 - 1),
-    75: (0, 0, 255),
-    76: (2, 0, 255),
-    77: (0, 0, 1),
-}
+    65: (0, 0, 11), 66: (1, 1, 255), 68: (0, 0, 65535), 69: (8, 2, 8), 70: (2, 0, 2047), 71: (1, 0, 2047),
+    73: (0, 0, 2**31 - 1), 75: (0, 0, 255), 76: (2, 0, 255), 77: (0, 0, 1),
+}  # fmt: skip
 """Global parameters of bank 0: number → (value at power-on, smallest, largest value)."""
 
 EEPROM_LOCK, UNLOCK, LOCK = 73, 4321, 1234
@@ -127,20 +89,11 @@ class TmclModule:
         self._commands: dict[int, Callable[[int, int, int], int]] = {
             1: lambda kind, motor, value: self._rotate(kind, motor, value),
             2: lambda kind, motor, value: self._rotate(kind, motor, -value),
-            3: lambda kind, motor, value: self._rotate(kind, motor, 0),
-            4: self._move,
-            5: self._set_axis,
-            6: self._get_axis,
-            7: self._store_axis,
-            8: self._restore_axis,
-            9: self._set_global,
-            10: self._get_global,
-            11: self._store_global,
-            12: self._restore_global,
-            13: self._search,
-            14: self._set_output,
+            3: lambda kind, motor, value: self._rotate(kind, motor, 0), 4: self._move, 5: self._set_axis,
+            6: self._get_axis, 7: self._store_axis, 8: self._restore_axis, 9: self._set_global, 10: self._get_global,
+            11: self._store_global, 12: self._restore_global, 13: self._search, 14: self._set_output,
             15: self._get_input,
-        }
+        }  # fmt: skip
 
     def _power_on(self) -> None:
         self._axis = {number: value for number, (value, _, _) in PLAIN.items()}
@@ -243,20 +196,12 @@ class TmclModule:
             rail.clear_stall()
             return stalled
         readings: dict[int, Callable[[], int]] = {
-            0: rail.target,
-            1: lambda: rail.position(t),
-            2: rail.target_velocity,
-            3: lambda: rail.velocity(t),
-            8: lambda: int(rail.reached(t)),
-            9: lambda: int(rail.home_switch(t)),
-            10: lambda: int(rail.right_switch(t)),
-            11: lambda: int(rail.left_switch(t)),
-            29: lambda: rail.velocity(t),
-            196: rail.switch_distance,
-            202: lambda: rail.params.steps_per_turn,
-            206: lambda: 0,
+            0: rail.target, 1: lambda: rail.position(t), 2: rail.target_velocity, 3: lambda: rail.velocity(t),
+            8: lambda: int(rail.reached(t)), 9: lambda: int(rail.home_switch(t)),
+            10: lambda: int(rail.right_switch(t)), 11: lambda: int(rail.left_switch(t)), 29: lambda: rail.velocity(t),
+            196: rail.switch_distance, 202: lambda: rail.params.steps_per_turn, 206: lambda: 0,
             208: lambda: int(rail.stalled(t)) | (int(rail.velocity(t) == 0) << 7),
-        }
+        }  # fmt: skip
         if kind not in readings:
             raise TmclRefused(BAD_TYPE)
         return readings[kind]()

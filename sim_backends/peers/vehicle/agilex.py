@@ -3,33 +3,29 @@
 Encoded here from the protocol's description (docs/reference/protocols.md, section 3), independently of any DBC.
 Feedback keeps its cycles in world time; in a fast world a frame is sent at most once per `_FAST` or `_SLOW` of wall
 time, with the newest values.
-
-The peer of the vehicle that a drawing has: AgileX v2 unless its wires name another make, or none at all."""
+"""
 
 from __future__ import annotations
 
 import math
 import struct
-import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
 
 from sim_backends.clock import WorldClock
-from sim_backends.faults import FOREIGN_COMMANDS, SECOND_VEHICLE, VEHICLE_MODEL_FAULTS
-from sim_backends.faults import VEHICLE_FAULTS as FAULTS
+from sim_backends.faults import FOREIGN_COMMANDS, SECOND_VEHICLE, VEHICLE_FAULTS
 from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams, VehicleReadings
-from sim_backends.peers.vehicle.canopen import CanopenPeer, CanopenSettings
-from sim_backends.peers.vehicle.slcan import CanFrame, SlcanBus
-from sim_backends.world.world import World
+from sim_backends.peers.vehicle.slcan import CanFrame, CanPeer
 
 MOTION_COMMAND, BRAKE, MOTION_MODE, VERSION_REQUEST, MODE, CLEAR = 0x111, 0x131, 0x141, 0x411, 0x421, 0x441
 SYSTEM_STATE, MOTION_STATE, MOTION_MODE_STATE, ODOMETRY, BATTERY = 0x211, 0x221, 0x291, 0x311, 0x361
 VERSION_NUMBERS, VERSION_TEXT = 0x41A, 0x4A1
 MOTOR_MOTION, MOTOR_DRIVER = 0x251, 0x261
 
-_TICK = 0.005
 _FAST, _SLOW = 0.005, 0.020
+_SLACK = 0.0025
+"""Half of the time between two looks, s: without it a frame would wait for the next look again and again."""
 _DRIVER_ENABLED = 0x40
 _FOREIGN_FRAME = struct.pack(">hhhh", 200, 0, 0, 0)
 """What somebody else on the bus commands: 0.2 m/s ahead."""
@@ -41,83 +37,47 @@ _SIDES = (1, -1, -1, 1)
 _Encoder = Callable[[VehicleReadings, VehicleParams, int], bytes]
 
 
-class AgilexPeer:
-    """Serves the bus as slcan adapters at `channel` and lets the vehicle's time pass.
+class AgilexPeer(CanPeer):
+    """The vehicle that speaks AgileX v2."""
 
-    Open it with python-can: `Bus(interface=peer.interface, channel=peer.channel, sleep_after_open=0)`.
-    """
-
-    interface = "slcan"
+    FAULTS = VEHICLE_FAULTS
 
     def __init__(self, model: VehicleModel, clock: WorldClock) -> None:
-        self.model = model
-        self._clock = clock
-        self._bus = SlcanBus("vehicle", self._receive)
-        self.channel = self._bus.channel
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
+        super().__init__(model, clock)
         self._count = 0
         self._others: set[str] = set()
         """`FOREIGN_COMMANDS` and `SECOND_VEHICLE`, while they are on the bus."""
         self._schedule = [_Cyclic(identifier, *entry) for identifier, entry in _CYCLES.items()]
 
-    @property
-    def endpoint(self) -> dict[str, str]:
-        """Where python-can finds it."""
-        return {"interface": self.interface, "channel": self.channel}
-
-    def start(self) -> None:
-        """Begin to serve."""
-        self._bus.start()
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End all connections and threads; idempotent."""
-        self._stopping.set()
-        if self._thread.ident is not None:
-            self._thread.join()
-        self._bus.stop()
-
     def fault(self, name: str) -> None:
-        """`can.bus_off`: the adapters drop out and have to be opened again. Until `clear`, `can.refused_frames` is
-        adapters that refuse every frame, `can.foreign_commands` is
-        somebody else who commands 0.2 m/s ahead, `can.second_vehicle` another vehicle that stands and reports under the
-        same identifiers. The others are the vehicle's own.
-
-        Raises ValueError for a name that is not in `FAULTS`.
+        """As `CanPeer`, and until `clear`: `can.refused_frames` is adapters that refuse every frame,
+        `can.foreign_commands` somebody else who commands 0.2 m/s ahead, `can.second_vehicle` another vehicle that
+        stands and reports under the same identifiers.
         """
-        if name == "can.bus_off":
-            self._bus.drop()
-        elif name == "can.refused_frames":
+        if name == "can.refused_frames":
             self._bus.refusing = True
         elif name in (FOREIGN_COMMANDS, SECOND_VEHICLE):
             self._others.add(name)
-        elif name in VEHICLE_MODEL_FAULTS:
-            self.model.fault(name, self._clock.now())
         else:
-            raise ValueError(f"unknown vehicle fault {name!r}; known: {', '.join(FAULTS)}")
+            super().fault(name)
 
     def clear(self) -> None:
         """Take away the vehicle's faults, and others from the bus."""
         self._others.clear()
         self._bus.refusing = False
-        self.model.clear(self._clock.now())
+        super().clear()
 
-    def _run(self) -> None:
-        due = time.monotonic()
-        while not self._stopping.wait(max(0.0, due - time.monotonic())):
-            due = max(due + _TICK, time.monotonic())
-            t = self._clock.now()
-            self.model.tick(t)
-            feedback = self.model.feedback(t)
-            frames = []
-            for cyclic in self._schedule:
-                if cyclic.due(t, time.monotonic()):
-                    self._count = (self._count + 1) & 0xFF
-                    frames.append(CanFrame(cyclic.id, cyclic.encode(feedback, self.model.params, self._count)))
-                    frames += self._of_others(cyclic, feedback)
-            if frames:
-                self._bus.send(frames)
+    def _tick(self, t: float) -> None:
+        self.model.tick(t)
+        feedback = self.model.feedback(t)
+        frames = []
+        for cyclic in self._schedule:
+            if cyclic.due(t, time.monotonic()):
+                self._count = (self._count + 1) & 0xFF
+                frames.append(CanFrame(cyclic.id, cyclic.encode(feedback, self.model.params, self._count)))
+                frames += self._of_others(cyclic, feedback)
+        if frames:
+            self._bus.send(frames)
 
     def _of_others(self, cyclic: _Cyclic, feedback: VehicleReadings) -> list[CanFrame]:
         """What others put on the bus beside this frame of the vehicle's."""
@@ -181,9 +141,8 @@ class _Cyclic:
         """True when it is time to send, which is then counted as done."""
         if t < self._next or wall < self._next_wall:
             return False
-        # Half a tick of slack, or a frame would wait for the next tick again and again.
         self._next = max(self._next + self._cycle, t - 0.5 * self._cycle)
-        self._next_wall = wall + self._interval - 0.5 * _TICK
+        self._next_wall = wall + self._interval - _SLACK
         return True
 
 
@@ -247,41 +206,3 @@ _CYCLES: dict[int, tuple[float, float, _Encoder]] = {
     BATTERY: (0.500, _SLOW, _battery),
 }
 """Feedback frames: id → (cycle in world s, shortest interval in wall s, encoder)."""
-
-
-class FixedFrame:
-    """No vehicle: nothing to connect to. Its model stands braked where it was set down."""
-
-    endpoint: dict[str, str] = {}  # noqa: RUF012
-
-    def __init__(self, model: VehicleModel) -> None:
-        self._model = model
-
-    def start(self) -> None:
-        """Nothing moves it."""
-
-    def stop(self) -> None:
-        """Nothing to end."""
-
-    def fault(self, name: str) -> None:
-        """It has none: ValueError."""
-        raise ValueError(f"{name}: the arm stands on a fixed frame, there is no vehicle that could have it")
-
-    def clear(self) -> None:
-        """Nothing to clear."""
-
-
-VehiclePeer = AgilexPeer | CanopenPeer | FixedFrame
-
-
-def vehicle_peer(world: World) -> VehiclePeer:
-    """The peer; ValueError for a make that none simulates."""
-    wire = dict(world.scene.drawing.cell.wires.get("vehicle", {"make": "agilex"}))
-    make = wire.pop("make")
-    if make == "agilex":
-        return AgilexPeer(world.vehicle, world.clock)
-    if make == "canopen":
-        return CanopenPeer(world.vehicle, world.clock, CanopenSettings(**wire))
-    if make == "fixed":
-        return FixedFrame(world.vehicle)
-    raise ValueError(f"nothing simulates a vehicle of the make {make!r}")

@@ -70,13 +70,9 @@ class CanopenNode:
     """
 
     def __init__(
-        self,
-        number: int,
-        values: dict[tuple[int, int], Value],
-        texts: dict[tuple[int, int], bytes],
-        send: Callable[[CanFrame], None],
-        lost: Callable[[], None],
-    ) -> None:
+        self, number: int, values: dict[tuple[int, int], Value], texts: dict[tuple[int, int], bytes],
+        send: Callable[[CanFrame], None], lost: Callable[[], None],
+    ) -> None:  # fmt: skip
         self.number = number
         self.state = PREPARING
         self.silent = False
@@ -167,16 +163,12 @@ class CanopenNode:
 
     def _communication(self) -> dict[tuple[int, int], Value]:
         found = {
-            (0x1001, 0): Value("<B", read=lambda: self.error_register),
-            (0x1005, 0): Value("<I", 0x080, writable=True),
-            (0x100C, 0): Value("<H", writable=True),
-            (0x100D, 0): Value("<B", writable=True),
-            (0x1016, 0): Value("<B", 1),
-            (0x1016, 1): Value("<I", writable=True),
-            (0x1017, 0): Value("<H", writable=True),
-            (0x1029, 0): Value("<B", 1),
+            (0x1001, 0): Value("<B", read=lambda: self.error_register), (0x1005, 0): Value("<I", 0x080, writable=True),
+            (0x100C, 0): Value("<H", writable=True), (0x100D, 0): Value("<B", writable=True),
+            (0x1016, 0): Value("<B", 1), (0x1016, 1): Value("<I", writable=True),
+            (0x1017, 0): Value("<H", writable=True), (0x1029, 0): Value("<B", 1),
             (0x1029, 1): Value("<B", writable=True),
-        }
+        }  # fmt: skip
         for k in range(_PDOS):
             for base, first in ((0x1400, 0x200), (0x1800, 0x180)):
                 parameter, mapping = base + k, base + 0x200 + k

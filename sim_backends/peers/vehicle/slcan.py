@@ -1,8 +1,7 @@
-"""A CAN bus behind slcan adapters on TCP, every client an adapter on the same bus (docs/reference/protocols.md, section
-4).
+"""A CAN bus behind slcan adapters on TCP, and a vehicle on it (docs/reference/protocols.md, section 4).
 
-What one client sends reaches the owner of the bus and all other clients; an adapter that is not open, is set to
-another bit rate or listens only takes no part in sending.
+Every client is an adapter on the same bus. What one client sends reaches the owner of the bus and all other clients; an
+adapter that is not open, is set to another bit rate or listens only takes no part in sending.
 """
 
 from __future__ import annotations
@@ -10,9 +9,14 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from sim_backends.clock import WorldClock
+from sim_backends.faults import VEHICLE_MODEL_FAULTS
+from sim_backends.models.vehicle import VehicleModel
 from sim_backends.peers.server import TcpServer
 
 _OK, _ERROR = b"\r", b"\a"
@@ -34,35 +38,22 @@ class CanFrame:
     length: int = 0
 
 
-class SlcanBus:
+class SlcanBus(TcpServer):
     """The bus. `receive` is called with each frame that a client sends, in that client's thread."""
 
-    def __init__(self, name: str, receive: Callable[[CanFrame], None], serial: str = "SIM1") -> None:
+    def __init__(self, name: str, receive: Callable[[CanFrame], None]) -> None:
+        super().__init__(name, self._serve)
         self.refusing = False
         """Whether every frame is refused, as by adapters that are bus-off."""
         self._receive = receive
-        self._serial = serial
-        self._lock = threading.Lock()
+        self._adapters_lock = threading.Lock()
         self._adapters: list[_Adapter] = []
-        self._server = TcpServer(name, self._serve)
-        self.channel = f"socket://{self._server.address}"
-
-    def start(self) -> None:
-        """Begin to accept adapters' hosts."""
-        self._server.start()
-
-    def stop(self) -> None:
-        """End all connections and threads; idempotent."""
-        self._server.stop()
-
-    def drop(self) -> None:
-        """End all present connections."""
-        self._server.drop()
+        self.channel = f"socket://{self.address}"
 
     def send(self, frames: list[CanFrame], sender: _Adapter | None = None) -> None:
         """Put frames on the bus: all adapters but `sender` get them."""
         lines = b"".join(_encode(frame) for frame in frames)
-        with self._lock:
+        with self._adapters_lock:
             adapters = list(self._adapters)
         for adapter in adapters:
             if adapter is not sender:
@@ -70,7 +61,7 @@ class SlcanBus:
 
     def _serve(self, connection: socket.socket) -> None:
         adapter = _Adapter(connection)
-        with self._lock:
+        with self._adapters_lock:
             self._adapters.append(adapter)
         try:
             pending = b""
@@ -81,7 +72,7 @@ class SlcanBus:
                 if len(pending) > 256:
                     pending = b""
         finally:
-            with self._lock:
+            with self._adapters_lock:
                 self._adapters.remove(adapter)
 
     def _command(self, adapter: _Adapter, line: bytes) -> None:
@@ -90,22 +81,22 @@ class SlcanBus:
         if kind in ("t", "T", "r", "R"):
             frame = _decode(text)
             if frame is None or not adapter.open or adapter.listening or self.refusing:
-                adapter.answer(_ERROR)
+                adapter.put(_ERROR)
             elif adapter.rate != _BUS_RATE:
                 adapter.bus_error = True
-                adapter.answer(_ERROR)
+                adapter.put(_ERROR)
             else:
-                adapter.answer(b"z\r" if kind in "tr" else b"Z\r")
+                adapter.put(b"z\r" if kind in "tr" else b"Z\r")
                 self.send([frame], sender=adapter)
                 self._receive(frame)
         elif kind == "V":
-            adapter.answer(b"V1013\r")
+            adapter.put(b"V1013\r")
         elif kind == "N":
-            adapter.answer(f"N{self._serial[:4]}\r".encode("ascii"))
+            adapter.put(b"NSIM1\r")
         elif kind == "F":
-            adapter.answer(f"F{adapter.flags():02X}\r".encode("ascii"))
+            adapter.put(f"F{adapter.flags():02X}\r".encode("ascii"))
         else:
-            adapter.answer(_OK if adapter.configure(kind, rest) else _ERROR)
+            adapter.put(_OK if adapter.configure(kind, rest) else _ERROR)
 
 
 class _Adapter:
@@ -142,13 +133,10 @@ class _Adapter:
     def deliver(self, lines: bytes) -> None:
         """Frames from the bus; lost when the channel is closed, wrongly set or its host does not read."""
         if self.open and self.rate == _BUS_RATE:
-            self._put(lines)
+            self.put(lines)
 
-    def answer(self, line: bytes) -> None:
-        """The reply to a command."""
-        self._put(line)
-
-    def _put(self, data: bytes) -> None:
+    def put(self, data: bytes) -> None:
+        """Send to the host what it takes now, and keep the rest."""
         with self._lock:
             if len(self._outgoing) + len(data) > _FIFO:
                 self._overrun = True
@@ -181,3 +169,71 @@ def _decode(text: str) -> CanFrame | None:
     if len(payload) != (0 if remote else count):
         return None
     return CanFrame(number, payload, extended, remote, count)
+
+
+_TICK = 0.005
+
+
+class CanPeer(ABC):
+    """A vehicle on the bus: serves it as slcan adapters at `channel` and lets the vehicle's time pass.
+
+    Open it with python-can: `Bus(interface=peer.interface, channel=peer.channel, sleep_after_open=0)`.
+    """
+
+    interface = "slcan"
+    FAULTS: tuple[str, ...]
+
+    def __init__(self, model: VehicleModel, clock: WorldClock) -> None:
+        self.model = model
+        self._clock = clock
+        self._bus = SlcanBus("vehicle", self._receive)
+        self.channel = self._bus.channel
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="vehicle", daemon=True)
+
+    @property
+    def endpoint(self) -> dict[str, str]:
+        """Where python-can finds it."""
+        return {"interface": self.interface, "channel": self.channel}
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._bus.start()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End all connections and threads; idempotent."""
+        self._stopping.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._bus.stop()
+
+    def fault(self, name: str) -> None:
+        """`can.bus_off`: the adapters drop out and have to be opened again; or one of the vehicle's own.
+
+        Raises ValueError for a name that is not in `FAULTS`.
+        """
+        if name == "can.bus_off":
+            self._bus.drop()
+        elif name in VEHICLE_MODEL_FAULTS:
+            self.model.fault(name, self._clock.now())
+        else:
+            raise ValueError(f"unknown vehicle fault {name!r}; known: {', '.join(self.FAULTS)}")
+
+    def clear(self) -> None:
+        """Take away the causes of faults."""
+        self.model.clear(self._clock.now())
+
+    def _run(self) -> None:
+        due = time.monotonic()
+        while not self._stopping.wait(max(0.0, due - time.monotonic())):
+            due = max(due + _TICK, time.monotonic())
+            self._tick(self._clock.now())
+
+    @abstractmethod
+    def _receive(self, frame: CanFrame) -> None:
+        """A frame from somebody else on the bus, in that client's thread."""
+
+    @abstractmethod
+    def _tick(self, t: float) -> None:
+        """Let time pass up to `t` s of the world, every 5 ms of the wall."""

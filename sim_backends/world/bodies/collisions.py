@@ -1,12 +1,9 @@
-"""What is solid in the world and must not meet: vehicle, arm and tool, table, board and its post, floor.
+"""What is solid in the world and must not meet: vehicle, arm and tool, table, board and its post, floor, obstacles.
 
 Coarse on purpose, and never larger than the real thing: points with a radius along the arm and at the tool's corners,
-boxes for what stands, obstacles of configuration and job among them. The part's and the fingertips' contact with the
-ground is `contact`'s business. The plates on the deck are left out.
-
-The points with a radius that stand for arm, tool and part where the world looks what they meet.
-
-Never larger than the real thing, and coarse on purpose."""
+boxes for what stands. The part's and the fingertips' contact with the ground is `contact`'s business. The plates on the
+deck are left out.
+"""
 
 from __future__ import annotations
 

@@ -39,15 +39,10 @@ class PartContact:
     """
 
     def __init__(
-        self,
-        surface: Surface,
-        world_from_surface: Pose,
-        flange_from_part: Pose,
-        *,
-        world_from_table: Pose | None = None,
-        surface_from_part: Pose | None = None,
+        self, surface: Surface, world_from_surface: Pose, flange_from_part: Pose, *,
+        world_from_table: Pose | None = None, surface_from_part: Pose | None = None,
         table_height: float = drawing.TABLE_HEIGHT,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """The table lies at the surface's origin, and the part's frame is the surface's when it is placed, unless
         `world_from_table` and `surface_from_part` say so. Raises ValueError when there is no surface for the part."""
         self._surface = surface

@@ -1,13 +1,10 @@
-"""The placement surfaces: closed-form height fields z = h(x, y) in the surface frame S, and meshes of them.
+"""The placement surfaces as height fields z = h(x, y) in the surface frame S, and as meshes.
 
 `pot` is a free-form relief without symmetry, `seat` a curved seat with a ledge, a step and a recess whose flanks are
 steep but finite; both cover |x| ≤ 35 mm, |y| ≤ 18 mm. `panel` is a curved sheet with three beads, |y| ≤ 30 mm: wider
-than the scan camera's field. Around them lies the table, z = 0.
-
-A surface from a mesh file, as the world needs it: what the cameras see of it, and the ground that a part meets.
-
-The ground is a height field: the highest that the mesh is above each place, from a raster fine enough that what lies
-between its points is less than what a part can feel."""
+than the scan camera's field. Around them lies the table, z = 0. Of a mesh file the ground is the highest that the mesh
+is above each place, from a raster fine enough that what lies between its points is less than what a part can feel.
+"""
 
 from __future__ import annotations
 

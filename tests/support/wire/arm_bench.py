@@ -29,11 +29,12 @@ class ArmBench:
     """Starts the process; `address` is where the arm answers. To be used as a context."""
 
     def __init__(
-        self, *, speed: float = 1.0, table: float | None = None, model: str = "UR10e", factory: np.ndarray | None = None
-    ) -> None:
+        self, *, speed: float = 1.0, table: float | None = None, model: str = "UR10e",
+        factory: np.ndarray | None = None, unlock_delay: float = 0.3,
+    ) -> None:  # fmt: skip
         """`factory` (6, 4) is what the controller's table is off the maker's: a, d, alpha, joint offset."""
-        arguments = [str(speed), "none" if table is None else str(table), model]
-        arguments.append(json.dumps(None if factory is None else factory.tolist()))
+        given = (speed, table, model, None if factory is None else factory.tolist(), unlock_delay)
+        arguments = [json.dumps(value) for value in given]
         self.process = subprocess.Popen(
             [sys.executable, __file__, *arguments],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -89,10 +90,10 @@ def _table(height: float):
     return contact
 
 
-def _main(speed: float, table: float | None, name: str, factory: list[list[float]] | None) -> None:
+def _main(speed: float, table: float | None, name: str, factory: list[list[float]] | None, unlock_delay: float) -> None:
     clock = WorldClock(speed)
     dh = TABLES[name] + (0.0 if factory is None else np.array(factory))
-    params = ArmParams.of(name, dh=dh, unlock_delay=0.3, force_noise=(0.2, 0.02))
+    params = ArmParams.of(name, dh=dh, unlock_delay=unlock_delay, force_noise=(0.2, 0.02))
     model = ArmModel(params, np.random.default_rng(0), clock)
     if table is not None:
         model.contact = _table(table)
@@ -129,6 +130,4 @@ def _main(speed: float, table: float | None, name: str, factory: list[list[float
 
 
 if __name__ == "__main__":
-    _main(
-        float(sys.argv[1]), None if sys.argv[2] == "none" else float(sys.argv[2]), sys.argv[3], json.loads(sys.argv[4])
-    )
+    _main(*map(json.loads, sys.argv[1:]))

@@ -50,12 +50,7 @@ def started(*arguments: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
     """A `cell` command that is going on; killed at the end if it still is."""
     # In the tests' own session: Linux shares a machine among sessions first, whatever is nice within one.
     process = subprocess.Popen(
-        command(*arguments),
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        preexec_fn=_heard,
+        command(*arguments), cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=_heard
     )
     try:
         yield process

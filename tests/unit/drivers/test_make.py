@@ -18,7 +18,8 @@ from cell.makes import BUILT_IN
 from drivers.errors import ConfigError
 from drivers.rail.modbus.link import Number
 from drivers.rail.modbus.make import register_map
-from sim_backends.peers.wired import rail_peer, switch_peers
+from sim_backends.peers.switches import switch_peers
+from sim_backends.serve import rail_peer
 from sim_backends.world.drawing import read
 from sim_backends.world.world import World
 from tests.support import ROOT

@@ -1,23 +1,17 @@
 """RTDE version 2 over TCP: the simulated arm's controller as a client on the network sees it.
 
 One thread advances the arm and serves RTDE, the dashboard and the script ports every 2 ms on the wall, on absolute
-deadlines. Source: the maker's RTDE guide; docs/reference/protocols.md, section 1. Physics is elsewhere.
-
-One RTDE connection: the handshakes, the recipes and the packets, in version 1 or 2 of the protocol.
-
-A connection speaks version 1 until it asks for 2: one output recipe without a number in front, sent 500 times a second,
-and an input recipe without one as well. Source: the maker's RTDE guide."""
+deadlines. A connection speaks version 1 until it asks for 2: one output recipe without a number in front, sent 500
+times a second, and an input recipe without one as well. Sources: the maker's RTDE guide; docs/reference/protocols.md,
+section 1. Physics is elsewhere.
+"""
 
 from __future__ import annotations
 
 import argparse
-import json
 import logging
-import os
-import select
 import signal
 import struct
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -30,8 +24,9 @@ from sim_backends.clock import WorldClock
 from sim_backends.faults import CONTROLLER_FAULTS as FAULTS
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
-from sim_backends.peers.arm.controller_ports import Client, TcpPorts
 from sim_backends.peers.arm.dashboard import BANNER, VERSION, DashboardServer
+from sim_backends.peers.arm.ports import SCRIPT_PORTS, Client, ScriptClients, TcpPorts
+from sim_backends.peers.arm.program import ProgramMemory
 from sim_backends.peers.arm.rtde.variables import (
     FORMATS,
     INPUTS,
@@ -41,8 +36,6 @@ from sim_backends.peers.arm.rtde.variables import (
     Registers,
     RegisterView,
 )
-from sim_backends.peers.arm.script.port import SCRIPT_PORTS, ScriptClients
-from sim_backends.peers.arm.script.script import ProgramMemory
 
 _HEADER = struct.Struct(">HB")
 _CATCH_UP = 4
@@ -340,52 +333,26 @@ class RtdePeer:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Serve one arm with exact kinematics until SIGINT, SIGTERM or the end of standard input (with --until-eof)."""
+    """Serve one arm with exact kinematics until SIGINT or SIGTERM."""
     parser = argparse.ArgumentParser(prog="python -m sim_backends.peers.arm.rtde.server", description=main.__doc__)
     parser.add_argument("--speed", type=float, default=1.0, help="world seconds per wall second")
     parser.add_argument("--host", default=None, help="loopback address, default: a free one")
     parser.add_argument("--model", choices=sorted(TABLES), default="UR10e", help="which arm")
-    parser.add_argument("--unlock-delay", type=float, default=5.0, help="world seconds before a stop can be unlocked")
     parser.add_argument(
         "--programs", type=Path, help="folder of NAME.script files that the dashboard loads as NAME.urp"
     )
-    parser.add_argument("--json", action="store_true", help="announce the address as one JSON line")
-    parser.add_argument("--until-eof", action="store_true", help="take commands on standard input and end with it")
     options = parser.parse_args(arguments)
     clock = WorldClock(options.speed)
-    params = ArmParams.of(options.model, unlock_delay=options.unlock_delay)
+    params = ArmParams.of(options.model)
     model = ArmModel(params, np.random.default_rng(0), clock)
     peer = RtdePeer(model, clock, options.host, options.programs)
     peer.start()
-    print(json.dumps({"address": peer.address, "pid": os.getpid()}) if options.json else peer.address, flush=True)
+    print(peer.address, flush=True)
     ended = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: ended.set())
-    try:
-        if options.until_eof:
-            _obey(model, ended)
-        else:
-            ended.wait()
-    finally:
-        peer.stop()
-
-
-def _obey(model: ArmModel, ended: threading.Event) -> None:
-    """Carry out lines of standard input: the name of a fault, `clear`, or `input INDEX 0|1`."""
-    while not ended.is_set():
-        if not select.select([sys.stdin], [], [], 0.2)[0]:
-            continue
-        line = sys.stdin.readline()
-        if not line:
-            return
-        words = line.split()
-        if words == ["clear"]:
-            model.clear()
-        elif len(words) == 3 and words[0] == "input":
-            model.set_digital_input(int(words[1]), words[2] == "1")
-        elif words:
-            model.fault(words[0])
-        print(json.dumps({"ok": True}), flush=True)
+    ended.wait()
+    peer.stop()
 
 
 if __name__ == "__main__":

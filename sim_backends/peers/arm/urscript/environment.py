@@ -1,11 +1,8 @@
-"""What the commands of a URScript program share: the arm, who moves it, its messages and its connections.
-
-URScript's values beside numbers, texts and truth values: lists, poses and structs, with their arithmetic.
+"""What a URScript program computes with: its values, the commands that only compute, and what its commands share.
 
 Lists are added and scaled element by element; a pose is a list of six that prints with a `p`. Members that scripts
-can reach begin with `u_`, so that a script reaches nothing else of an object.
-
-URScript's commands that only compute: numbers, texts, lists, poses. Source: the maker's script manual."""
+can reach begin with `u_`, so that a script reaches nothing else of an object. Source: the maker's script manual.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +27,7 @@ from sim_backends.models.arm_kinematics import (
     rotation_vector,
 )
 from sim_backends.models.arm_motion import ForceMode, SimulatedMotion, StopMotion
-from sim_backends.peers.arm.script.context import CYCLE, Context, HeldOutputs, Job, ProgramError
+from sim_backends.peers.arm.commands import CYCLE, Context, HeldOutputs, Job, ProgramError
 
 MOST_ELEMENTS, MOST_CHARACTERS, MOST_INTEGER = 100_000, 1_000_000, 2**63
 """What a variable may hold; a controller's own limits are lower, and a program that exceeds them ends."""

@@ -1,7 +1,4 @@
-"""One URScript program as it runs: its threads, what ends them, and the commands of the controller that it calls.
-
-The threads take turns, each until its cycle ends. What the commands do is in the modules beside this one.
-"""
+"""One URScript program as it runs: its threads, which take turns, each until its cycle ends, and what ends them."""
 
 from __future__ import annotations
 
@@ -10,9 +7,9 @@ from collections.abc import Callable, Generator
 from traceback import walk_tb
 from typing import Any
 
-from sim_backends.peers.arm.script.context import Context, Job, ProgramError
+from sim_backends.peers.arm.commands import Context, Job, ProgramError
+from sim_backends.peers.arm.urscript import commands, sockets
 from sim_backends.peers.arm.urscript import environment as arithmetic
-from sim_backends.peers.arm.urscript import motions, sensing, settings, sockets
 from sim_backends.peers.arm.urscript.environment import Commands, Environment, List, ScriptPose, Value, own
 from sim_backends.peers.arm.urscript.translate import ScriptError, translate
 
@@ -24,13 +21,7 @@ _VALUES_A_TURN = 1000
 _MOST_THREADS = 100
 _MAIN = -1
 """The program's own thread; scripts take 0 for no thread."""
-_LIBRARIES: tuple[Callable[[Environment], Commands], ...] = (
-    arithmetic.commands,
-    motions.commands,
-    sensing.commands,
-    settings.commands,
-    sockets.commands,
-)
+_LIBRARIES: tuple[Callable[[Environment], Commands], ...] = (arithmetic.commands, commands.commands, sockets.commands)
 
 
 class _Halt(Exception):

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Generator
 from contextlib import suppress
 
-from sim_backends.peers.arm.script.context import CYCLE
+from sim_backends.peers.arm.commands import CYCLE
 from sim_backends.peers.arm.urscript.environment import Commands, Environment, List, Value, shown
 
 _NAME = "socket_0"

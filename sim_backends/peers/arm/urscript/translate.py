@@ -3,8 +3,8 @@
 Every function and thread becomes a generator that yields where a control cycle ends; a user's function is called with
 `yield from`, and so is a command that takes time. A script's names get a `u_` in front, so that it reaches nothing of
 Python but what `Machine` gives it. Variables of the program itself, and those declared global, are Python's globals.
-
-URScript's words: a text cut into tokens. Source: the maker's script manual, chapter on the language."""
+Source: the maker's script manual, chapter on the language.
+"""
 
 from __future__ import annotations
 

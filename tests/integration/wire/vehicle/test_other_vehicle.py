@@ -57,11 +57,7 @@ def driver(peer: OtherVehicle) -> Iterator[AgilexVehicle]:
 
 @pytest.mark.parametrize(
     ("versions", "firmware"),
-    [
-        ("sdk", "HW V1.2 SW V3.4 20240105"),
-        ("manual", "hardware 2/1, controller 260, drivers 9"),
-        ("none", "unknown"),
-    ],
+    [("sdk", "HW V1.2 SW V3.4 20240105"), ("manual", "hardware 2/1, controller 260, drivers 9"), ("none", "unknown")],
 )
 def test_its_version_is_told_however_it_answers_and_not_answering_is_no_fault(
     versions: Literal["sdk", "manual", "none"], firmware: str

@@ -12,7 +12,7 @@ from pyrobotiqur import RobotiqGripper
 from drivers.claw.robotiq import Grip, RobotiqClaw
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
-from sim_backends.peers.arm.robotiq import RobotiqPeer
+from sim_backends.peers.switches import RobotiqPeer
 from sim_backends.world.drawing import STOCK
 from sim_backends.world.world import World
 

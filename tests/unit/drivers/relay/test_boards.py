@@ -16,7 +16,7 @@ from numato_usb_relay.relay import Relay as VendorsClient
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.relay.boards import BoardClaw, BoardLaser, LcusBoard, RelayPort, open_board, open_numato
-from sim_backends.peers.switches.relays import LcusPeer, NumatoPeer, RelayBoard
+from sim_backends.peers.switches import LcusPeer, NumatoPeer, RelayBoard
 
 pytestmark = pytest.mark.wire
 

@@ -1,112 +1,18 @@
-"""The simulated arm without its network: kinematics against Pinocchio, motions against closed forms, true poses."""
+"""The simulated arm without its network: true poses, the force that it feels, its safety system."""
 
 import math
 
 import numpy as np
-import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams, Power, Safety
-from sim_backends.models.arm_kinematics import (
-    UR10E_DH,
-    Kinematics,
-    matrix_from_pose,
-    pose_error,
-    pose_from_matrix,
-)
-from sim_backends.models.arm_motion import ForceMode, JointMove, JointSpeed, LinearMove, LinearSpeed, Servo, StopMotion
+from sim_backends.models.arm_kinematics import UR10E_DH, matrix_from_pose, pose_error, pose_from_matrix
+from sim_backends.models.arm_motion import JointMove, JointSpeed, LinearSpeed, Servo
+from tests.support.simulated_arm import TICK, finish, make_arm, pinocchio_flange, run
 
-TICK = 0.002
 Array = NDArray[np.float64]
-
-
-def pinocchio_arm(table: Array) -> pin.Model:
-    """The same arm built from the DH table by another library."""
-    model = pin.Model()
-    parent, placement = 0, pin.SE3.Identity()
-    for i, (a, d, alpha, offset) in enumerate(table):
-        turn = pin.SE3(pin.utils.rotate("z", offset), np.zeros(3))
-        parent = model.addJoint(parent, pin.JointModelRZ(), placement * turn, f"j{i}")
-        placement = pin.SE3(pin.utils.rotate("x", alpha), np.array([a, 0.0, d]))
-    model.addFrame(pin.Frame("flange", parent, 0, placement, pin.FrameType.OP_FRAME))
-    return model
-
-
-def pinocchio_flange(table: Array, q: Array) -> Array:
-    model = pinocchio_arm(table)
-    data = model.createData()
-    pin.framesForwardKinematics(model, data, q)
-    return np.asarray(data.oMf[model.getFrameId("flange")].homogeneous)
-
-
-def make_arm(**params: object) -> ArmModel:
-    return ArmModel(ArmParams(**params), np.random.default_rng(3), WorldClock())  # type: ignore[arg-type]
-
-
-def run(arm: ArmModel, seconds: float, tick: float = TICK) -> None:
-    for _ in range(round(seconds / tick)):
-        arm.tick(arm.time + tick)
-
-
-def finish(arm: ArmModel, limit: float = 30.0) -> float:
-    """Tick until the motion has ended; the seconds it took."""
-    start = arm.time
-    while not arm.idle:
-        assert arm.time - start < limit, "the motion does not end"
-        arm.tick(arm.time + TICK)
-    return arm.time - start
-
-
-def random_table(rng: np.random.Generator) -> Array:
-    return UR10E_DH + rng.normal(scale=1e-3, size=(6, 4))
-
-
-def test_forward_kinematics_and_jacobian_agree_with_pinocchio() -> None:
-    rng = np.random.default_rng(1)
-    for _ in range(20):
-        table = random_table(rng)
-        q = rng.uniform(-2 * math.pi, 2 * math.pi, 6)
-        pose, jacobian = Kinematics(table).forward_with_jacobian(q)
-        np.testing.assert_allclose(pose, pinocchio_flange(table, q), atol=1e-12)
-        np.testing.assert_allclose(Kinematics(table).forward(q), pose, atol=1e-15)
-        model = pinocchio_arm(table)
-        data = model.createData()
-        expected = pin.computeFrameJacobian(
-            model, data, q, model.getFrameId("flange"), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-        )
-        np.testing.assert_allclose(jacobian, expected, atol=1e-12)
-
-
-def test_inverse_kinematics_reaches_the_pose_within_the_joint_limits() -> None:
-    rng = np.random.default_rng(2)
-    for _ in range(50):
-        target = pinocchio_flange(UR10E_DH, rng.uniform(-3, 3, 6))
-        q = Kinematics(UR10E_DH).inverse(target, rng.uniform(-3, 3, 6))
-        assert q is not None
-        assert np.abs(q).max() <= 2 * math.pi
-        np.testing.assert_allclose(pinocchio_flange(UR10E_DH, q), target, atol=1e-8)
-
-
-def test_a_joint_move_takes_the_time_of_its_trapezoid_and_arrives_exactly() -> None:
-    arm = make_arm()
-    target = arm.drive.q + np.array([0.8, -0.2, 0.1, 0.0, 0.3, -0.4])
-    arm.start(JointMove(target, 0.5, 1.0))
-    assert finish(arm) == pytest.approx(0.8 / 0.5 + 0.5 / 1.0, abs=2 * TICK)
-    np.testing.assert_array_equal(arm.drive.q, target)
-    np.testing.assert_array_equal(arm.drive.qd, np.zeros(6))
-
-
-def test_a_joint_move_keeps_every_joint_within_its_speed_limit() -> None:
-    arm = make_arm()
-    arm.start(JointMove(arm.drive.q + np.array([1.5, 0.1, 0, 0, 0, 1.6]), 3.1, 20.0))
-    fastest = np.zeros(6)
-    while not arm.idle:
-        arm.tick(arm.time + TICK)
-        fastest = np.maximum(fastest, np.abs(arm.drive.qd))
-    assert arm.safety is Safety.NORMAL
-    assert fastest[0] == pytest.approx(math.radians(120), rel=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -130,61 +36,6 @@ def test_each_models_joints_turn_as_fast_as_the_maker_says_and_no_faster(name: s
             seen = max(seen, abs(float(model.drive.qd[joint])))
         assert math.degrees(seen) == pytest.approx(limit)
         assert model.safety is Safety.NORMAL and model.idle
-
-
-def test_a_linear_move_keeps_to_the_line_at_its_speed() -> None:
-    arm = make_arm()
-    start = arm.reported_flange()
-    target = start.copy()
-    target[:3, 3] += [0.05, -0.1, 0.08]
-    target[:3, :3] = pin.exp3(np.array([0.05, 0.0, 0.1])) @ target[:3, :3]
-    arm.start(LinearMove(target, 0.1, 0.5))
-    way = target[:3, 3] - start[:3, 3]
-    points = []
-    while not arm.idle:
-        arm.tick(arm.time + TICK)
-        points.append(arm.reported_flange()[:3, 3] - start[:3, 3])
-    line = np.array(points)
-    along = line @ way / np.linalg.norm(way)
-    assert np.linalg.norm(line - np.outer(along, way) / np.linalg.norm(way), axis=1).max() < 1e-8
-    assert np.diff(along).max() == pytest.approx(0.1 * TICK, rel=1e-4)
-    np.testing.assert_allclose(arm.reported_flange(), target, atol=1e-8)
-
-
-def test_a_servo_target_that_moves_evenly_is_followed_with_the_lag() -> None:
-    arm = make_arm()
-    start = arm.drive.q.copy()
-    servo = Servo(start, lag=0.05)
-    arm.start(servo)
-    rate = np.array([0.2, -0.1, 0.1, 0, 0.3, 0])
-    for k in range(1, 501):
-        servo.target = start + rate * (k * TICK)
-        arm.tick(arm.time + TICK)
-    # Each target already holds for the tick that leads to it: half a tick less of lag.
-    np.testing.assert_allclose(servo.target - arm.drive.q, rate * (0.05 - TICK / 2), atol=1e-6)
-    run(arm, 1.0)
-    np.testing.assert_allclose(arm.drive.q, servo.target, atol=1e-8)
-
-
-@pytest.mark.parametrize("tick", [TICK, 0.016])
-def test_speed_commands_ramp_up_hold_and_stop(tick: float) -> None:
-    arm = make_arm()
-    before = arm.drive.q.copy()
-    arm.start(JointSpeed(np.array([0.0, 0, 0, 0, 0, 0.5]), 1.0))
-    run(arm, 1.6, tick)
-    assert arm.drive.qd[5] == pytest.approx(0.5)
-    assert arm.drive.q[5] - before[5] == pytest.approx(0.5 * 1.6 - 0.5 * 0.5 * 0.5, abs=2e-3)
-    arm.start(StopMotion(2.0))
-    finish(arm)
-    assert arm.drive.q[5] - before[5] == pytest.approx(0.5 * 1.6 - 0.125 + 0.5**2 / 4, abs=2e-2)
-
-
-def test_a_tool_speed_moves_the_tool_at_that_speed() -> None:
-    arm = make_arm()
-    before = arm.reported_flange()
-    arm.start(LinearSpeed(np.array([0.0, 0.0, -0.05, 0, 0, 0]), 10.0))
-    run(arm, 1.0)
-    np.testing.assert_allclose(arm.reported_flange()[:3, 3] - before[:3, 3], [0, 0, -0.05], atol=2e-4)
 
 
 def test_the_reported_pose_follows_the_nominal_table_and_the_true_pose_the_true_one() -> None:
@@ -244,17 +95,6 @@ def test_a_force_above_the_limit_stops_the_arm() -> None:
     assert surface - arm.reported_flange()[2, 3] == pytest.approx(150 / 5e4, abs=2e-4)
 
 
-def test_force_mode_settles_at_the_wanted_force() -> None:
-    arm = make_arm()
-    surface = arm.reported_flange()[2, 3] - 0.005
-    arm.contact = lambda pose: np.array([0.0, 0, 1e5 * max(0.0, surface - pose[2, 3]), 0, 0, 0])
-    down = np.array([0.0, 0, 1, 0, 0, 0])
-    arm.start(ForceMode(np.eye(4), down, -20.0 * down, np.full(6, 0.05)))
-    run(arm, 1.5, 0.008)
-    assert arm.wrench[2] == pytest.approx(20.0, abs=0.5)
-    assert np.abs(arm.reported_flange()[:2, 3] - pinocchio_flange(UR10E_DH, arm.params.initial_q)[:2, 3]).max() < 1e-5
-
-
 def test_the_wrench_can_be_taken_as_zero_and_carries_the_stated_noise() -> None:
     arm = make_arm(force_noise=(0.5, 0.05))
     arm.contact = lambda pose: np.array([1.0, 2.0, -30.0, 0.1, 0.2, 0.3])
@@ -286,15 +126,6 @@ def test_a_joint_beyond_its_range_is_a_protective_stop() -> None:
     assert arm.safety is Safety.PROTECTIVE_STOP
     assert "360°" in arm.fault_text
     assert arm.drive.q[0] <= 2 * math.pi
-
-
-def test_a_line_through_the_edge_of_the_reach_is_a_protective_stop() -> None:
-    arm = make_arm()
-    target = arm.reported_flange()
-    target[0, 3] += 1.0
-    arm.start(LinearMove(target, 0.5, 2.0))
-    run(arm, 5.0)
-    assert arm.safety is Safety.PROTECTIVE_STOP
 
 
 def test_a_protective_stop_can_be_unlocked_after_its_delay_and_the_motion_resumed() -> None:

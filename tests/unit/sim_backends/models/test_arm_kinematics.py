@@ -8,13 +8,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from sim_backends.models.arm_kinematics import (
-    UR10E_DH,
-    JointErrors,
-    Kinematics,
-    TruePose,
-    rotation_vector,
-)
+from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics, TruePose, rotation_vector
+from tests.support.simulated_arm import pinocchio_arm, pinocchio_flange
 
 
 def test_inverse_kinematics_says_when_a_pose_is_out_of_reach() -> None:
@@ -60,3 +55,33 @@ def test_with_a_memory_the_error_changes_with_the_way_and_keeps_its_size() -> No
     assert abs(far[0]) < 0.2 * 3e-8
     assert near[1] == pytest.approx(3e-8, rel=0.2)
     assert far[1] == pytest.approx(3e-8, rel=0.2)
+
+
+def random_table(rng: np.random.Generator) -> np.ndarray:
+    return UR10E_DH + rng.normal(scale=1e-3, size=(6, 4))
+
+
+def test_forward_kinematics_and_jacobian_agree_with_pinocchio() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        table = random_table(rng)
+        q = rng.uniform(-2 * math.pi, 2 * math.pi, 6)
+        pose, jacobian = Kinematics(table).forward_with_jacobian(q)
+        np.testing.assert_allclose(pose, pinocchio_flange(table, q), atol=1e-12)
+        np.testing.assert_allclose(Kinematics(table).forward(q), pose, atol=1e-15)
+        model = pinocchio_arm(table)
+        data = model.createData()
+        expected = pin.computeFrameJacobian(
+            model, data, q, model.getFrameId("flange"), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+        )
+        np.testing.assert_allclose(jacobian, expected, atol=1e-12)
+
+
+def test_inverse_kinematics_reaches_the_pose_within_the_joint_limits() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        target = pinocchio_flange(UR10E_DH, rng.uniform(-3, 3, 6))
+        q = Kinematics(UR10E_DH).inverse(target, rng.uniform(-3, 3, 6))
+        assert q is not None
+        assert np.abs(q).max() <= 2 * math.pi
+        np.testing.assert_allclose(pinocchio_flange(UR10E_DH, q), target, atol=1e-8)

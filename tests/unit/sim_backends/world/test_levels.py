@@ -14,7 +14,20 @@ from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics
 from sim_backends.optics.pattern import grain_at, grain_parameters
 from sim_backends.optics.scene import Grain
 from sim_backends.world import drawing
-from sim_backends.world.levels import ALONE, LEVELS, Effects, assumed_noise, deviations, effects_of, number_of, only
+from sim_backends.world.levels import (
+    ALONE,
+    CUT,
+    HARSH,
+    IDEAL,
+    LEVELS,
+    NOMINAL,
+    Effects,
+    assumed_noise,
+    deviations,
+    effects_of,
+    number_of,
+    only,
+)
 from sim_backends.world.scene import draw
 from sim_backends.world.world import World
 
@@ -146,3 +159,48 @@ def test_only_a_refusal_that_names_the_effect_is_excused(effect: str) -> None:
 def test_a_refusal_that_names_rocking_is_one_by_its_name() -> None:
     reason = f"the parts do not agree {likeliest([Cause('sway', 'the vehicle rocks at 4 Hz', 'line', 0.0, 0.9)])}"
     assert verdict({"outcome": "refused", "effect": "rocking", "reason": reason}) == "named"
+
+
+def angle(a: np.ndarray, b: np.ndarray) -> float:
+    return float(np.linalg.norm(a[:3, :3] - b[:3, :3]) / np.sqrt(2.0))
+
+
+def test_ideal_deviates_in_nothing_but_read_noise() -> None:
+    values = dataclasses.asdict(IDEAL)
+    assert 0 < values.pop("read_noise") <= 0.2
+    assert set(values.values()) == {0.0}
+
+
+def test_harsh_is_two_and_a_half_times_nominal() -> None:
+    for name, value in dataclasses.asdict(NOMINAL).items():
+        assert getattr(HARSH, name) == pytest.approx(2.5 * value), name
+
+
+def test_assumed_noise_states_value_unit_and_meaning_of_everything() -> None:
+    table = assumed_noise("nominal")
+    assert set(table) == set(dataclasses.asdict(NOMINAL))
+    assert table["arm_repeatability"] == {
+        "sigma": 0.04e-3,
+        "unit": "m",
+        "of": "radial (1/√3 of it per axis), anew each time the arm settles",
+    }
+    assert all(entry["unit"] and entry["of"] for entry in table.values())
+
+
+def test_unknown_levels_and_seeds_are_refused_with_the_choices() -> None:
+    with pytest.raises(ValueError, match="ideal, nominal, harsh"):
+        deviations("rough")
+    with pytest.raises(ValueError, match="0 or greater"):
+        draw(-1, "nominal")
+
+
+def test_nominal_deviations_scatter_as_the_table_says_and_are_cut() -> None:
+    shifts, turns = [], []
+    for seed in range(200):
+        scene = draw(seed, "nominal")
+        moved = drawing.inverse(drawing.WORLD_FROM_PLACE) @ scene.world_from_surface
+        shifts.append(moved[:3, 3])
+        turns.append(angle(moved, np.eye(4)))
+    assert np.std(shifts) == pytest.approx(NOMINAL.station_translation, rel=0.1)
+    assert np.abs(shifts).max() <= CUT * NOMINAL.station_translation + 1e-12
+    assert np.sqrt(np.mean(np.square(turns)) / 3) == pytest.approx(NOMINAL.station_rotation, rel=0.1)

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError
 from drivers.vehicle.cia402.master import last_words
-from sim_backends.models.wheel_drive import WheelState
+from sim_backends.peers.vehicle.canopen import WheelState
 from sim_backends.peers.vehicle.canopen_node import WRONG_VALUE, Abort
 from tests.support.canopen_bench import RATE, SETTINGS, WATCHDOG_S, WHEELS, Bench, at_bench, frame, with_output_brake
 

@@ -1,12 +1,15 @@
-"""A part with upright walls has room beside them: put down a little to the side it lies on the floor, not on a wall."""
+"""The part on the surface: forces of contact, where it comes to rest, and when the claw grips it."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
-from sim_backends.world.bodies.contact import PartContact
-from sim_backends.world.bodies.surfaces import Surface
+from sim_backends.world import drawing
+from sim_backends.world.bodies.contact import STIFFNESS, PartContact
+from sim_backends.world.bodies.surfaces import HALF_X, HALF_Y, Surface, surface
+from sim_backends.world.scene import rotation
 
 Floats = NDArray[np.float64]
 
@@ -26,3 +29,110 @@ def test_a_part_put_down_a_little_aside_lies_on_the_floor_of_the_steps() -> None
     part.set_claw(False, aside)
     lies = part.part_pose(aside)
     np.testing.assert_allclose(lies[:3, 3], (1.5e-4, 0.0, 0.0), atol=1e-9)
+
+
+def turned(vector: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation(np.array(vector))
+    pose[:3, 3] = at
+    return pose
+
+
+def contact(
+    name: str = "pot", lean: tuple[float, float, float] = (0.004, -0.006, 0.01)
+) -> tuple[PartContact, np.ndarray]:
+    world_from_surface = turned(lean, (0.01, -0.02, 0.6))
+    return PartContact(surface(name), world_from_surface, drawing.FLANGE_FROM_PART), world_from_surface
+
+
+def flange_for(world_from_part: np.ndarray) -> np.ndarray:
+    return world_from_part @ drawing.inverse(drawing.FLANGE_FROM_PART)
+
+
+def raised(pose: np.ndarray, dx: float = 0.0, dz: float = 0.0) -> np.ndarray:
+    made = pose.copy()
+    made[0, 3] += dx
+    made[2, 3] += dz
+    return made
+
+
+@pytest.mark.parametrize("name", ["pot", "seat", "panel"])
+def test_no_force_before_contact_and_stiffness_times_depth_after(name: str) -> None:
+    part, target = contact(name, lean=(0.0, 0.0, 0.0))
+    assert not part.wrench(flange_for(raised(target, dz=1e-4))).any()
+    at_depth = [part.wrench(flange_for(raised(target, dz=-depth)))[2] for depth in (1e-4, 2e-4)]
+    assert at_depth[1] == pytest.approx(2 * at_depth[0], rel=1e-3)
+    # Slopes lower the vertical stiffness by cos² of the slope, averaged over the underside.
+    assert 0.7 * STIFFNESS < at_depth[0] / 1e-4 < STIFFNESS
+
+
+def test_contact_pushes_against_the_side_that_it_runs_into() -> None:
+    part, target = contact(lean=(0.0, 0.0, 0.0))
+    tilted = target @ turned((0.0, 0.02, 0.0))
+    wrench = part.wrench(flange_for(raised(tilted, dz=0.0)))
+    # Turned about +y, the side at +x is low; the force there, at +x of the flange, turns back about −y.
+    assert wrench[2] > 0
+    assert wrench[4] < 0
+
+
+def test_released_on_the_surface_the_part_stays_where_it_was_placed() -> None:
+    part, target = contact()
+    part.set_claw(False, flange_for(target))
+    assert not part.held
+    assert part.part_pose(np.eye(4)) == pytest.approx(target, abs=1e-8)
+
+
+def test_released_above_the_surface_the_part_falls_straight_down_onto_it() -> None:
+    part, target = contact(lean=(0.0, 0.0, 0.0))
+    part.set_claw(False, flange_for(raised(target, dz=0.008)))
+    assert part.part_pose(np.eye(4)) == pytest.approx(target, abs=1e-7)
+
+
+def test_a_part_that_was_pressed_in_springs_back_to_touch_the_surface() -> None:
+    part, target = contact()
+    part.set_claw(False, flange_for(raised(target, dz=-0.0004)))
+    assert part.part_pose(np.eye(4))[2, 3] == pytest.approx(target[2, 3], abs=5e-6)
+
+
+def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact() -> None:
+    part, target = contact()
+    part.set_claw(False, flange_for(raised(target, dx=0.002, dz=0.002)))
+    rest = part.part_pose(np.eye(4))
+    assert rest[:2, 3] == pytest.approx(target[:2, 3] + [0.002, 0.0])
+    x, y = (
+        a.ravel() for a in np.meshgrid(np.linspace(-HALF_X, HALF_X, 21) * 0.9, np.linspace(-HALF_Y, HALF_Y, 11) * 0.9)
+    )
+    underside = np.column_stack([x, y, surface("pot").height(x, y), np.ones_like(x)])
+    seen = (drawing.inverse(target) @ rest @ underside.T).T
+    gap = seen[:, 2] - surface("pot").height(seen[:, 0], seen[:, 1])
+    assert 0 < rest[2, 3] - target[2, 3] < 0.002
+    assert gap.min() > -2e-5
+    assert gap.min() < 2e-4
+
+
+def test_dropped_beside_the_table_the_part_falls_to_the_floor() -> None:
+    part, target = contact(lean=(0.0, 0.0, 0.0))
+    part.set_claw(False, flange_for(raised(target, dx=-0.5)))
+    assert part.part_pose(np.eye(4))[2, 3] < 0.01
+
+
+def test_the_claw_grips_again_only_within_its_reach() -> None:
+    part, target = contact()
+    part.set_claw(False, flange_for(target))
+    part.set_claw(True, flange_for(raised(target, dz=0.02)))
+    assert not part.held
+    part.set_claw(False, flange_for(raised(target, dz=0.02)))
+    part.set_claw(True, flange_for(raised(target, dz=0.003)))
+    assert part.held
+    lifted = part.part_pose(flange_for(raised(target, dz=0.103)))
+    assert lifted == pytest.approx(raised(target, dz=0.1), abs=1e-9)
+
+
+def test_an_empty_claw_feels_the_table_with_its_fingers() -> None:
+    part, target = contact(lean=(0.0, 0.0, 0.0))
+    part.set_claw(False, flange_for(target))
+    beside = raised(target, dx=0.1)
+    tips_on_the_table = flange_for(beside)
+    tips_on_the_table[2, 3] = target[2, 3] + 0.155
+    assert not part.wrench(raised(tips_on_the_table, dz=1e-4)).any()
+    assert part.wrench(raised(tips_on_the_table, dz=-0.01))[2] > 0

@@ -1,1 +1,0 @@
-"""The script ports of the controller, and the commands of the control script."""

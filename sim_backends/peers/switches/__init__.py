@@ -1,1 +1,0 @@
-"""Relay boards on a serial line."""

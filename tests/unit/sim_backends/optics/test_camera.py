@@ -1,0 +1,46 @@
+"""Promises of the simulated lens and sensor."""
+
+import cv2
+import numpy as np
+import pytest
+
+from sim_backends.optics import PlaneInstance, sensor
+from tests.support.optics_scene import SCAN, expose, pose
+
+
+def test_a_board_out_of_focus_is_blurred_by_the_thin_lens_formula():
+    # The scan camera, focused at 130 mm, blurs a point at 1 m over a disc of 24 px (docs/explanation/theory.md, section
+    # 4).
+    disc = 8e-3 / 4 * 8e-3 * 0.87 / (1.0 * 0.122) / 4.8e-6
+    assert disc == pytest.approx(23.8, abs=0.1)
+    assert float(SCAN.blur_px(1.0)) == pytest.approx(np.hypot(0.6, disc / 4))
+    edge = PlaneInstance(pose([0, 0, 0], [0.1, 0.0, 1.0]), (0.2, 2.0), 0.9)
+    profile = expose(SCAN, [edge], 0.020)[240]
+    slope = np.diff(profile)
+    column = np.arange(len(slope)) + 0.5
+    centre = (slope * column).sum() / slope.sum()
+    spread = np.sqrt((slope * (column - centre) ** 2).sum() / slope.sum())
+    assert spread == pytest.approx(np.hypot(0.6, disc / 4), rel=0.03)
+
+
+@pytest.mark.parametrize("level", [2.25, 60.0, 200.0])
+def test_sensor_noise_has_the_stated_mean_and_variance(level):
+    picture = sensor(np.full((480, 640), level, np.float32), SCAN, np.random.default_rng(3)).astype(float)
+    assert picture.mean() == pytest.approx(level, abs=0.01)
+    assert picture.var() == pytest.approx(level / 40 + 0.4**2 + 1 / 12, rel=0.02)
+
+
+def test_sensor_saturates_at_255_and_never_wraps():
+    image = np.full((64, 64), 400, np.float32)
+    image[:32] = 0
+    picture = sensor(image, SCAN, np.random.default_rng(0))
+    assert (picture[32:] == 255).all()
+    assert picture[:32].max() <= 3
+
+
+def test_undistortion_undoes_the_lens_to_a_nanopixel():
+    pixels = np.array([[0.0, 0.0], [639.0, 479.0], [319.5, 239.5], [17.3, 440.2]])
+    rays = np.column_stack([SCAN.undistort(pixels), np.ones(4)])
+    matrix = np.array([[SCAN.fx, 0, SCAN.cx], [0, SCAN.fy, SCAN.cy], [0, 0, 1.0]])
+    back, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(SCAN.distortion))
+    np.testing.assert_allclose(back[:, 0], pixels, atol=1e-9)

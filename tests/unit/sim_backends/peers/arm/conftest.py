@@ -1,0 +1,33 @@
+"""A simulated arm and the real ur_rtde at it, and a controller without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.support.script_controller import Controller
+from tests.support.wire.arm_bench import ArmBench
+from tests.support.wire.ur_client import SPEED, Client
+
+
+@pytest.fixture(scope="module")
+def session() -> Iterator[Client]:
+    with ArmBench(speed=SPEED, unlock_delay=5.0) as simulator:
+        client = Client(simulator)
+        yield client
+        client.control.stopScript()
+        client.control.disconnect()
+        client.io.disconnect()
+        client.receive.disconnect()
+
+
+@pytest.fixture
+def arm(session: Client) -> Client:
+    session.recover()
+    return session
+
+
+@pytest.fixture
+def controller() -> Controller:
+    return Controller()

@@ -1,0 +1,285 @@
+"""The simulated camera, spoken to by a client of a few lines written for this test."""
+
+from __future__ import annotations
+
+import json
+import socket
+import struct
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sim_backends.clock import WorldClock
+from sim_backends.models.camera import CameraSpec
+from sim_backends.peers.camera.frames import BACKLOG, FramePeer
+
+pytestmark = pytest.mark.wire
+
+
+SPEC = CameraSpec(
+    "SimCam", "SIM000007-SCAN", width=64, height=48, frame_rate_max=120.0, epoch=5000.0, drift_ppm=80.0, latency=0.0002
+)
+
+
+class Scene:
+    """A picture whose grey value counts the calls; remembers when it was asked for what."""
+
+    def __init__(self, clock: WorldClock) -> None:
+        self.clock = clock
+        self.open = threading.Event()
+        self.open.set()
+        self.calls: list[tuple[float, float, float]] = []
+
+    def render(self, t_mid: float, exposure: float) -> NDArray[np.uint8]:
+        self.calls.append((self.clock.now(), t_mid, exposure))
+        assert self.open.wait(10.0)
+        return np.full((48, 64), len(self.calls) % 256, np.uint8)
+
+
+class Client:
+    def __init__(self, address: str) -> None:
+        host, port = address.split(":")
+        self.socket = socket.create_connection((host, int(port)), timeout=3.0)
+        self.frames: list[tuple[dict[str, Any], bytes]] = []
+
+    def send(self, **request: Any) -> None:
+        text = json.dumps(request).encode()
+        self.socket.sendall(b"CFS1" + struct.pack(">II", len(text), 0) + text)
+
+    def receive(self) -> tuple[dict[str, Any], bytes]:
+        magic, header, payload = struct.unpack(">4sII", self._read(12))
+        assert magic == b"CFS1"
+        return json.loads(self._read(header)), self._read(payload)
+
+    def ask(self, **request: Any) -> dict[str, Any]:
+        """The reply to a request; frames that come before it are kept."""
+        self.send(id=77, **request)
+        while True:
+            header, payload = self.receive()
+            if header["op"] != "frame":
+                assert (header["op"], header["id"]) == (request["op"], 77)
+                return header
+            self.frames.append((header, payload))
+
+    def frame(self) -> dict[str, Any]:
+        header, payload = self.frames.pop(0) if self.frames else self.receive()
+        assert header["op"] == "frame"
+        assert len(payload) == header["width"] * header["height"] == 64 * 48
+        return header
+
+    def vanish(self) -> None:
+        """Go as a killed process goes, without a farewell."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        self.socket.close()
+
+    def _read(self, count: int) -> bytes:
+        data = b""
+        while len(data) < count:
+            part = self.socket.recv(count - len(data))
+            if not part:
+                raise EOFError
+            data += part
+        return data
+
+
+@pytest.fixture
+def clock() -> WorldClock:
+    return WorldClock(5.0)
+
+
+@pytest.fixture
+def scene(clock: WorldClock) -> Scene:
+    return Scene(clock)
+
+
+@pytest.fixture
+def peer(clock: WorldClock, scene: Scene) -> Iterator[FramePeer]:
+    peer = FramePeer("scan", clock, scene.render, SPEC)
+    peer.start()
+    yield peer
+    scene.open.set()
+    peer.stop()
+
+
+@pytest.fixture
+def client(peer: FramePeer) -> Iterator[Client]:
+    client = Client(peer.address)
+    yield client
+    client.socket.close()
+
+
+def world_time(device_ns: int) -> float:
+    return (device_ns * 1e-9 - 5000.0) / (1.0 + 80e-6)
+
+
+def test_the_camera_says_who_it_is(client: Client) -> None:
+    identity = client.ask(op="identify")
+    assert identity["ok"] is True
+    assert (identity["model"], identity["serial"], identity["firmware"]) == ("SimCam", "SIM000007-SCAN", "1.0")
+    assert (identity["width"], identity["height"], identity["pixel_format"]) == (64, 48, "mono8")
+    assert identity["frame_rate_max_hz"] == 120.0
+    assert 0.0 < identity["exposure_min_s"] < identity["exposure_max_s"]
+
+
+def test_the_latch_reads_the_device_clock(client: Client, clock: WorldClock) -> None:
+    before = clock.now()
+    device_ns = client.ask(op="latch")["device_ns"]
+    assert before <= world_time(device_ns) <= clock.now()
+
+
+def test_a_trigger_gives_one_frame_that_began_after_it(client: Client, clock: WorldClock, scene: Scene) -> None:
+    client.ask(op="configure", exposure_s=0.01, frame_rate_hz=50.0)
+    asked = clock.now()
+    assert client.ask(op="trigger")["ok"]
+    frame = client.frame()
+    began = world_time(frame["device_ns"]) - SPEC.latency
+    assert asked <= began <= clock.now()
+    assert frame["exposure_s"] == 0.01
+    called, t_mid, exposure = scene.calls[0]
+    assert t_mid == pytest.approx(began + 0.005, abs=1e-6)
+    assert (exposure, len(scene.calls)) == (0.01, 1)
+    assert called >= t_mid + 0.005
+
+
+def test_free_running_frames_lie_on_the_grid_of_the_device_clock(client: Client, scene: Scene) -> None:
+    client.ask(op="configure", exposure_s=0.004, frame_rate_hz=10.0)
+    first = client.ask(op="start", frame_rate=100.0)["next_frame_id"]
+    frames = [client.frame() for _ in range(60)]
+    assert [frame["frame_id"] for frame in frames] == list(range(first, first + 60))
+    steps = np.diff([frame["device_ns"] for frame in frames])
+    np.testing.assert_allclose(steps, 10_000_000, atol=2)
+    for frame, (called, t_mid, _) in zip(frames, scene.calls, strict=False):
+        assert t_mid == pytest.approx(world_time(frame["device_ns"]) - SPEC.latency + 0.002, abs=1e-6)
+        assert called >= t_mid + 0.002
+
+
+def test_a_picture_is_rendered_as_soon_as_its_exposure_is_over(client: Client, scene: Scene, clock: WorldClock) -> None:
+    client.ask(op="start", frame_rate=50.0)
+    for _ in range(40):
+        client.frame()
+    late = [(called - t_mid - 0.5 * exposure) / clock.speed for called, t_mid, exposure in scene.calls]
+    assert np.median(late) < 0.01
+
+
+def test_slow_rendering_drops_exposures_beyond_the_backlog_and_says_so(
+    client: Client, scene: Scene, clock: WorldClock
+) -> None:
+    scene.open.clear()
+    client.ask(op="start", frame_rate=120.0)
+    clock.sleep(1.5)
+    scene.open.set()
+    frames = [client.frame() for _ in range(BACKLOG + 20)]
+    ids = [frame["frame_id"] for frame in frames]
+    assert ids[: BACKLOG + 1] == list(range(1, BACKLOG + 2))
+    assert ids[BACKLOG + 1] > BACKLOG + 50
+    # A dropped exposure has taken its time all the same.
+    grid = frames[0]["device_ns"] + (np.array(ids) - 1) * 1e9 / 120.0
+    np.testing.assert_allclose([frame["device_ns"] for frame in frames], grid, atol=10)
+
+
+def test_lost_frames_leave_a_gap_in_the_ids(client: Client, peer: FramePeer) -> None:
+    client.ask(op="start", frame_rate=50.0)
+    ids = [client.frame()["frame_id"]]
+    peer.fault("camera.frame_loss", 3)
+    ids += [client.frame()["frame_id"] for _ in range(11)]
+    assert sorted(np.diff(ids)) == [1] * 10 + [4]
+
+
+def test_after_stop_no_frame_follows(client: Client, scene: Scene, clock: WorldClock) -> None:
+    client.ask(op="start", frame_rate=120.0)
+    client.frame()
+    assert client.ask(op="stop")["ok"]
+    client.frames.clear()
+    clock.sleep(0.5)
+    assert client.ask(op="latch")["ok"]
+    assert client.frames == []
+    assert client.ask(op="configure", exposure_s=0.001, frame_rate_hz=20.0)["ok"]
+
+
+@pytest.mark.parametrize(
+    "request_, words",
+    [
+        ({"op": "configure", "exposure_s": 5.0, "frame_rate_hz": 10.0}, ("exposure_s", "2e-05 to 1 s")),
+        ({"op": "configure", "exposure_s": 0.001, "frame_rate_hz": 500.0}, ("frame_rate_hz", "0.01 to 120 Hz")),
+        ({"op": "configure", "exposure_s": 0.1, "frame_rate_hz": 50.0}, ("0.02 s", "10 Hz")),
+        ({"op": "configure", "exposure_s": "long"}, ("exposure_s", "not a number")),
+        ({"op": "start", "frame_rate": 0.0}, ("frame_rate", "0.01 to 120 Hz")),
+        ({"op": "explode"}, ("unknown op", "identify")),
+        ({"op": None}, ("unknown op",)),
+    ],
+)
+def test_bad_requests_are_refused_with_the_reason(client: Client, request_: dict[str, Any], words: tuple[str]) -> None:
+    reply = client.ask(**request_)
+    assert reply["ok"] is False
+    for word in words:
+        assert word in reply["error"]
+    assert client.ask(op="latch")["ok"]
+
+
+def test_requests_that_clash_with_free_running_are_refused(client: Client) -> None:
+    client.ask(op="start", frame_rate=20.0)
+    for request in ({"op": "start"}, {"op": "trigger"}, {"op": "configure", "exposure_s": 0.001}):
+        reply = client.ask(**request)
+        assert not reply["ok"]
+        assert "stop first" in reply["error"]
+
+
+def test_a_second_client_is_turned_away_and_may_come_once_the_first_is_gone(peer: FramePeer, client: Client) -> None:
+    client.ask(op="start", frame_rate=100.0)
+    second = Client(peer.address)
+    refusal = second.ask(op="identify")
+    assert not refusal["ok"]
+    assert "in use" in refusal["error"]
+    with pytest.raises(EOFError):
+        second.receive()
+    client.vanish()
+    third = Client(peer.address)
+    assert third.ask(op="identify")["ok"]
+    assert third.ask(op="trigger")["ok"]
+    third.frame()
+    third.socket.close()
+
+
+def test_garbage_ends_its_own_connection_only(peer: FramePeer) -> None:
+    first = Client(peer.address)
+    first.socket.sendall(b"GET / HTTP/1.1\r\n\r\n")
+    header, _ = first.receive()
+    assert not header["ok"]
+    assert "CFS1" in header["error"]
+    first.socket.close()
+    half = Client(peer.address)
+    half.socket.sendall(b"CFS1\x00\x00\x00\x20")
+    half.vanish()
+    second = Client(peer.address)
+    second.socket.sendall(b"CFS1" + struct.pack(">II", 3, 0) + b"{a:")
+    assert not second.receive()[0]["ok"]
+    assert second.ask(op="latch")["ok"]
+    second.socket.close()
+
+
+def test_a_silent_camera_says_nothing_until_it_is_cleared(peer: FramePeer, client: Client) -> None:
+    with pytest.raises(ValueError, match=r"camera\.frame_loss"):
+        peer.fault("camera.nonsense")
+    peer.fault("camera.silent")
+    client.socket.settimeout(0.2)
+    with pytest.raises(TimeoutError):
+        client.ask(op="latch")
+    peer.clear()
+    client.socket.settimeout(3.0)
+    assert client.ask(op="latch")["ok"]
+
+
+def test_stopping_leaves_no_thread_even_in_mid_stream(clock: WorldClock, scene: Scene) -> None:
+    before = set(threading.enumerate())
+    peer = FramePeer("scan", clock, scene.render, SPEC)
+    peer.start()
+    client = Client(peer.address)
+    client.ask(op="start", frame_rate=120.0)
+    client.frame()
+    peer.stop()
+    client.socket.close()
+    assert set(threading.enumerate()) == before

@@ -1,0 +1,65 @@
+"""What peers serve with: a client costs its own connection only, and nothing is left once a peer has stopped."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+from collections.abc import Callable
+
+import pytest
+import serial
+
+from sim_backends.peers.server import PAUSE_S, SerialServer, TcpServer
+
+pytestmark = pytest.mark.wire
+
+
+def echo(connection: socket.socket) -> None:
+    while data := connection.recv(100):
+        if data == b"fail":
+            raise RuntimeError("an error of the peer")
+        connection.sendall(data)
+
+
+def test_who_vanishes_or_brings_an_error_about_costs_its_own_connection_only() -> None:
+    server = TcpServer("echo", echo)
+    server.start()
+    place = (server.host, server.port)
+    killed = socket.create_connection(place, timeout=2.0)
+    killed.sendall(b"half")
+    killed.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    killed.close()
+    with socket.create_connection(place, timeout=2.0) as failed:
+        failed.sendall(b"fail")
+        assert failed.recv(100) == b""
+    with socket.create_connection(place, timeout=2.0) as client:
+        client.sendall(b"hello")
+        assert client.recv(100) == b"hello"
+        server.drop()
+        assert client.recv(100) == b""
+    server.stop()
+
+
+def whole(data: bytes, write: Callable[[bytes], object]) -> bytes:
+    """Requests of four bytes, repeated."""
+    while len(data) >= 4:
+        write(data[:4])
+        data = data[4:]
+    return data
+
+
+def test_a_serial_line_serves_a_terminal_and_a_socket_and_forgets_half_a_request() -> None:
+    before = set(threading.enumerate())
+    server = SerialServer("line", whole, pty=True)
+    server.start()
+    for url in (server.url, server.pty):
+        with serial.serial_for_url(url, timeout=2.0) as port:
+            port.write(b"ab")
+            port.flush()
+            threading.Event().wait(4 * PAUSE_S)
+            port.write(b"wxyz")
+            assert port.read(4) == b"wxyz"
+    with socket.create_connection(("127.0.0.1", int(server.url.rsplit(":", 1)[1])), timeout=2.0):
+        server.stop()
+    assert set(threading.enumerate()) == before

@@ -1,0 +1,119 @@
+"""The adapters of the simulated bus, spoken to directly and through python-can."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+from collections.abc import Callable, Iterator
+
+import can
+import numpy as np
+import pytest
+
+from sim_backends.clock import WorldClock
+from sim_backends.models.vehicle import VehicleModel, VehicleParams
+from sim_backends.peers.vehicle.agilex import AgilexPeer
+
+pytestmark = pytest.mark.wire
+
+
+def message(identifier: int, data: list[int]) -> can.Message:
+    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+
+
+def receive(bus: can.BusABC, wanted: Callable[[can.Message], bool], seconds: float = 20.0) -> can.Message:
+    wall = WorldClock()
+    while wall.now() < seconds:
+        frame = bus.recv(0.1)
+        if frame is not None and wanted(frame):
+            return frame
+    raise AssertionError("the frame did not come within the deadline")
+
+
+def open_bus(peer: AgilexPeer) -> can.BusABC:
+    return can.Bus(interface=peer.interface, channel=peer.channel, bitrate=500_000, sleep_after_open=0)
+
+
+@pytest.fixture
+def peer() -> Iterator[AgilexPeer]:
+    peer = AgilexPeer(VehicleModel(VehicleParams(), np.random.default_rng(1)), WorldClock(4.0))
+    peer.start()
+    yield peer
+    peer.stop()
+
+
+@pytest.fixture
+def bus(peer: AgilexPeer) -> Iterator[can.BusABC]:
+    bus = open_bus(peer)
+    yield bus
+    bus.shutdown()
+
+
+@pytest.fixture
+def adapter(peer: AgilexPeer) -> Iterator[socket.socket]:
+    host, port = peer.channel.removeprefix("socket://").split(":")
+    with socket.create_connection((host, int(port)), timeout=2.0) as adapter:
+        yield adapter
+
+
+def ask(adapter: socket.socket, line: bytes) -> bytes:
+    adapter.sendall(line + b"\r")
+    answer = b""
+    while not answer.endswith((b"\r", b"\a")):
+        answer += adapter.recv(1)
+    return answer
+
+
+def test_all_clients_share_the_bus(peer: AgilexPeer, bus: can.BusABC) -> None:
+    other = open_bus(peer)
+    receive(other, lambda f: True)
+    bus.send(message(0x7AB, [1, 2, 3]))
+    assert receive(other, lambda f: f.arbitration_id == 0x7AB).data == b"\x01\x02\x03"
+    other.shutdown()
+
+
+def test_bus_off_ends_the_connection_and_it_can_be_opened_again(peer: AgilexPeer) -> None:
+    bus = open_bus(peer)
+    with pytest.raises(ValueError, match=r"can\.bus_off"):
+        peer.fault("can.nonsense")
+    # An adapter that was not accepted yet would not lose anything.
+    receive(bus, lambda f: f.arbitration_id == 0x211)
+    peer.fault("can.bus_off")
+    with pytest.raises(can.CanError):
+        receive(bus, lambda f: False)
+    # Closing it says goodbye to an adapter that is no longer there.
+    with contextlib.suppress(can.CanError):
+        bus.shutdown()
+    again = open_bus(peer)
+    receive(again, lambda f: f.arbitration_id == 0x211)
+    again.shutdown()
+
+
+def test_an_adapter_answers_as_the_lawicel_protocol_says(adapter: socket.socket, peer: AgilexPeer) -> None:
+    assert ask(adapter, b"V") == b"V1013\r"
+    assert ask(adapter, b"N") == b"NSIM1\r"
+    assert ask(adapter, b"t1110") == b"\a"
+    assert ask(adapter, b"S5") == b"\r"
+    assert ask(adapter, b"O") == b"\r"
+    assert ask(adapter, b"O") == b"\a"
+    assert ask(adapter, b"t1110") == b"\a"
+    assert ask(adapter, b"F") == b"F84\r"
+    assert ask(adapter, b"C") == b"\r"
+    assert ask(adapter, b"S6") == b"\r"
+    for malformed in (b"t11", b"t8000", b"t1119", b"t1112AA", b"tXYZ0", b"S9", b"Q", b"\xff\xfe"):
+        assert ask(adapter, malformed) == b"\a"
+
+
+def test_clients_that_die_or_do_not_read_do_not_disturb_the_others(peer: AgilexPeer, bus: can.BusABC) -> None:
+    host, port = peer.channel.removeprefix("socket://").split(":")
+    deaf = socket.create_connection((host, int(port)), timeout=2.0)
+    deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+    deaf.sendall(b"O\r" + b"\x00garbage" * 100)
+    killed = socket.create_connection((host, int(port)), timeout=2.0)
+    killed.sendall(b"O\rt1118")
+    killed.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    killed.close()
+    for _ in range(200):
+        receive(bus, lambda f: f.arbitration_id == 0x221)
+    deaf.close()

@@ -1,0 +1,58 @@
+"""The world's clock, and the recent past of moving bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim_backends.clock import History, WorldClock, interpolate
+from sim_backends.world.scene import rotation
+
+
+def turned(vector: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = rotation(np.array(vector))
+    pose[:3, 3] = at
+    return pose
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_clock_refuses_a_speed_that_does_not_advance(speed: float) -> None:
+    with pytest.raises(ValueError, match="greater than 0"):
+        WorldClock(speed)
+
+
+def test_a_fast_clock_reaches_a_time_that_many_times_sooner() -> None:
+    slow, fast = WorldClock(1.0), WorldClock(50.0)
+    fast.sleep_until(1.0)
+    assert fast.now() >= 1.0
+    assert slow.now() == pytest.approx(fast.now() / 50.0, rel=0.2)
+
+
+def test_history_interpolates_a_screw_motion_and_holds_its_ends() -> None:
+    history = History()
+    for t in np.arange(0.0, 2.0, 0.1):
+        history.append(t, turned((0.0, 0.0, 0.5 * t), (t, 0.0, 0.0)))
+    expected = turned((0.0, 0.0, 0.5 * 1.234), (1.234, 0.0, 0.0))
+    assert history.at(1.234) == pytest.approx(expected, abs=1e-12)
+    assert history.at(-1.0) == pytest.approx(history.at(0.0))
+    assert history.at(99.0) == pytest.approx(history.at(1.9))
+
+
+def test_history_forgets_what_is_older_than_it_keeps() -> None:
+    history = History(keep=1.0)
+    for t in np.arange(0.0, 5.0, 0.01):
+        history.append(t, turned((0, 0, 0), (t, 0, 0)))
+    assert history.at(0.0)[0, 3] == pytest.approx(4.0, abs=0.02)
+    assert history.at(4.005)[0, 3] == pytest.approx(4.005)
+    assert history.at(4.985)[0, 3] == pytest.approx(4.985)
+
+
+def test_an_empty_history_says_so() -> None:
+    with pytest.raises(LookupError, match="empty"):
+        History().at(0.0)
+
+
+def test_interpolation_stays_a_rotation_for_large_turns() -> None:
+    halfway = interpolate(turned((0, 0, 0)), turned((1.0, -1.2, 0.3)), 0.5)
+    assert halfway == pytest.approx(turned((0.5, -0.6, 0.15)), abs=1e-12)

@@ -1,0 +1,252 @@
+"""The served simulated cell: one command, every endpoint, clean ends, and several at once."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import can
+import pytest
+
+from sim_backends import serve
+from sim_backends.clock import SteppedClock
+from sim_backends.serve import main
+from sim_backends.world.world import World
+
+pytestmark = pytest.mark.wire
+
+
+SERVE = [sys.executable, "-m", "sim_backends.serve"]
+
+
+class Served:
+    """A simulated cell in a process of its own."""
+
+    def __init__(self, *options: str) -> None:
+        self.process = subprocess.Popen(
+            [*SERVE, "--json", "--exit-with-stdin", *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        assert self.process.stdout is not None
+        self.endpoints: dict[str, Any] = json.loads(self.process.stdout.readline())
+        self._ended: tuple[int, str] | None = None
+
+    def ask_truth(self, **request: Any) -> dict[str, Any]:
+        host, port = self.endpoints["truth"]["address"].split(":")
+        with socket.create_connection((host, int(port)), 5.0) as connection:
+            connection.sendall(json.dumps(request).encode() + b"\n")
+            reply: dict[str, Any] = json.loads(connection.makefile().readline())
+        return reply
+
+    def end(self, number: signal.Signals | None = None) -> tuple[int, str]:
+        """Send it a signal, or close its input; exit code and what it wrote to stderr."""
+        if self._ended is None:
+            if number is not None:
+                self.process.send_signal(number)
+                self.process.wait(15)
+            _, error = self.process.communicate(timeout=15)
+            self._ended = self.process.returncode, error
+        return self._ended
+
+    def close(self) -> None:
+        if self.process.poll() is None:
+            self.process.kill()
+            self.process.communicate(timeout=15)
+
+
+@pytest.fixture(scope="module")
+def pair() -> Iterator[tuple[Served, Served]]:
+    a = Served("--seed", "3")
+    b = Served("--seed", "4", "--surface", "seat", "--level", "ideal", "--speed", "2")
+    yield a, b
+    for served in (a, b):
+        served.close()
+
+
+@pytest.fixture
+def served(pair: tuple[Served, Served]) -> Served:
+    return pair[0]
+
+
+def camera_request(address: str, operation: str) -> dict[str, Any]:
+    host, port = address.split(":")
+    with socket.create_connection((host, int(port)), 5.0) as connection:
+        text = json.dumps({"op": operation, "id": 1}).encode()
+        connection.sendall(b"CFS1" + struct.pack(">II", len(text), 0) + text)
+        stream = connection.makefile("rb")
+        magic, length, _ = struct.unpack(">4sII", stream.read(12))
+        assert magic == b"CFS1"
+        reply: dict[str, Any] = json.loads(stream.read(length))
+    return reply
+
+
+class Rtde:
+    """Just enough of the protocol's second version to write digital outputs (docs/reference/protocols.md, section
+    1)."""
+
+    def __init__(self, address: str) -> None:
+        self._socket = socket.create_connection((address, 30004), 5.0)
+        self._stream = self._socket.makefile("rb")
+        assert self.request("V", b"\0\2") == b"\1"
+        reply = self.request("I", b"standard_digital_output_mask,standard_digital_output")
+        self._recipe = reply[0]
+        assert reply[1:] == b"UINT8,UINT8"
+
+    def request(self, kind: str, payload: bytes) -> bytes:
+        self._send(kind, payload)
+        size, answered = struct.unpack(">HB", self._stream.read(3))
+        assert chr(answered) == kind
+        return self._stream.read(size - 3)
+
+    def write_output(self, index: int, on: bool) -> None:
+        self._send("U", bytes([self._recipe, 1 << index, int(on) << index]))
+
+    def _send(self, kind: str, payload: bytes) -> None:
+        self._socket.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
+
+    def close(self) -> None:
+        self._stream.close()
+        self._socket.close()
+
+
+def test_every_device_answers_at_its_endpoint_in_its_own_protocol(served: Served) -> None:
+    endpoints = served.endpoints
+    scan = camera_request(endpoints["scan_camera"]["address"], "identify")
+    target = camera_request(endpoints["target_camera"]["address"], "identify")
+    assert (scan["width"], scan["height"], scan["serial"]) == (640, 480, "SIM0000031-SCAN")
+    assert (target["width"], target["height"], target["serial"]) == (1280, 1024, "SIM0000031-TARGET")
+
+    host, port = endpoints["rail"]["url"].removeprefix("socket://").split(":")
+    with socket.create_connection((host, int(port)), 5.0) as rail:
+        request = bytes([1, 6, 1, 0, 0, 0, 0, 0])
+        rail.sendall(request + bytes([sum(request) & 0xFF]))
+        reply = rail.makefile("rb").read(9)
+    assert reply[2:4] == bytes([100, 6])
+
+    with socket.create_connection((endpoints["arm"]["address"], 29999), 5.0) as dashboard:
+        lines = dashboard.makefile("rw", newline="\n")
+        assert "Dashboard Server" in lines.readline()
+        lines.write("robotmode\n")
+        lines.flush()
+        assert lines.readline().strip() == "Robotmode: RUNNING"
+
+    vehicle = endpoints["vehicle"]
+    with can.Bus(interface=vehicle["interface"], channel=vehicle["channel"], sleep_after_open=0) as bus:
+        seen = set()
+        while 0x211 not in seen:
+            message = bus.recv(2.0)
+            assert message is not None, f"no system state among {seen}"
+            seen.add(message.arbitration_id)
+
+
+def test_two_cells_share_no_endpoint_and_no_world(pair: tuple[Served, Served]) -> None:
+    a, b = (served.endpoints for served in pair)
+    for device in ("arm", "rail", "vehicle", "scan_camera", "target_camera", "truth"):
+        assert set(a[device].values()) - {"slcan"} != set(b[device].values()) - {"slcan"}, device
+    truths = [served.ask_truth(op="truth")["truth"] for served in pair]
+    assert [t["seed"] for t in truths] == [3, 4]
+    assert [t["surface"]["name"] for t in truths] == ["pot", "seat"]
+    assert truths[0]["poses"]["world_from_surface"] != truths[1]["poses"]["world_from_surface"]
+
+
+def test_switching_outputs_turns_the_laser_on_and_drops_the_part(served: Served) -> None:
+    before = served.ask_truth(op="truth")["truth"]
+    assert before["part"]["held"]
+    assert before["digital_outputs"][:2] == [False, True]
+    rtde = Rtde(served.endpoints["arm"]["address"])
+    try:
+        for index, on in ((0, True), (1, False)):
+            rtde.write_output(index, on)
+        # A request is answered in the period after its writes took effect.
+        rtde.request("v", b"")
+        rtde.request("v", b"")
+        after = served.ask_truth(op="truth")["truth"]
+        rtde.write_output(0, False)
+    finally:
+        rtde.close()
+    assert after["laser_on"]
+    assert not after["part"]["held"]
+
+
+def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served) -> None:
+    assert served.ask_truth(op="fault", name="arm.protective_stop")["ok"]
+    assert served.ask_truth(op="truth")["truth"]["arm"]["safety"] == "protective_stop"
+    assert served.ask_truth(op="reset")["ok"]
+    assert served.ask_truth(op="truth")["truth"]["arm"]["safety"] == "normal"
+    refused = served.ask_truth(op="fault", name="arm.coffee")
+    assert not refused["ok"]
+    assert "arm.protective_stop" in refused["error"]
+    assert "can.bus_off" in refused["error"]
+
+
+def test_it_ends_with_its_input_so_that_it_cannot_outlive_its_owner() -> None:
+    served = Served()
+    try:
+        assert served.end() == (0, "")
+    finally:
+        served.close()
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--level", "rough"], "ideal"),
+        (["--surface", "vase"], "pot"),
+        (["--arm", "UR11"], "UR10e"),
+        (["--speed", "0"], "within 0.05 and 50"),
+        (["--speed", "nan"], "within 0.05 and 50"),
+        (["--speed", "fast"], "--speed"),
+        (["--seed", "-3"], "0 or greater"),
+    ],
+)
+def test_wrong_options_end_with_code_2_and_say_what_is_allowed(
+    options: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(options)
+    assert ended.value.code == 2
+    assert says in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize(("which", "number"), [(0, signal.SIGINT), (1, signal.SIGTERM)])
+def test_a_signal_ends_it_cleanly(pair: tuple[Served, Served], which: int, number: signal.Signals) -> None:
+    """The last of this file: it ends those that the others ask."""
+    assert pair[which].end(number) == (0, "")
+
+
+class LaggingClock(SteppedClock):
+    """World time that passes while somebody sleeps; the arm's model of `world` follows it by `lag` s."""
+
+    world: World | None = None
+    lag = 0.0
+
+    def sleep(self, seconds: float) -> None:
+        super().sleep(seconds)
+        assert self.world is not None
+        self.world.arm.tick(self.now() - self.lag)
+
+
+def lagging(lag: float) -> World:
+    clock = LaggingClock()
+    world = World(seed=1, level="nominal", clock=clock)
+    clock.world, clock.lag = world, lag
+    clock.step_to(1.0)
+    return world
+
+
+def test_a_picture_waits_for_the_arm_to_come_to_its_exposure() -> None:
+    world = lagging(0.015)
+    assert serve.picture(world, "scan", 1.0, 0.002).shape == (480, 640)
+    assert 1.0 <= world.arm.time < 1.0 + 2 * serve.PERIOD
+
+
+def test_a_picture_does_not_wait_for_ever() -> None:
+    world = lagging(5.0)
+    assert serve.picture(world, "scan", 1.0, 0.002).shape == (480, 640)
+    assert world.clock.now() == pytest.approx(1.0 + serve.ARM_LAG, abs=2 * serve.PERIOD)

@@ -1,0 +1,86 @@
+"""What the cameras of an ideal world see is where closed forms put it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim_backends.world import drawing
+from sim_backends.world.bodies.surfaces import HALF_Y, surface
+from sim_backends.world.drawing import STOCK
+from sim_backends.world.world import World
+
+
+class StandingWorld(World):
+    """An ideal or nominal world whose vehicle stands at the station and whose arm is put wherever a test wants it."""
+
+    def __init__(self, level: str = "ideal", seed: int = 5, surface: str = "pot") -> None:
+        super().__init__(seed=seed, level=level, drawing=STOCK.with_surface(surface))
+        self.base = drawing.pose((-0.75, 0.0, 0.55), (1, 0, 0), (0, 0, 1))
+
+    def world_from_base(self, t: float) -> np.ndarray:
+        return self.base
+
+    def look(
+        self, camera: str, world_from_camera: np.ndarray, exposure: float = 0.002, laser: bool = False
+    ) -> np.ndarray:
+        return self._cameras.picture(camera, world_from_camera, self.base, laser, exposure)
+
+
+@pytest.fixture(scope="module")
+def ideal() -> StandingWorld:
+    return StandingWorld()
+
+
+def above(point: tuple[float, float, float]) -> np.ndarray:
+    """A camera that looks straight down from `point`, its x axis along world x."""
+    return drawing.pose(point, (1, 0, 0), (0, 0, -1))
+
+
+def test_the_stripe_on_the_table_is_where_the_closed_form_puts_it(ideal: StandingWorld) -> None:
+    """x' = f (cot θ − l/Z), docs/explanation/theory.md, section 2, on the bare table beside the surface at Z = 130
+    mm."""
+    picture = ideal.look("scan", above((0.12, 0.0, 0.60 + 0.130)), laser=True).astype(float)
+    dark = ideal.look("scan", above((0.12, 0.0, 0.60 + 0.130))).astype(float)
+    light = (picture - dark)[40:440]
+    light[light < 4] = 0.0
+    centres = (light * np.arange(640)).sum(axis=1) / light.sum(axis=1)
+    expected = 319.5 + 0.008 / 4.8e-6 * (1 / 3.5 - 0.035 / 0.130)
+    assert centres.mean() == pytest.approx(expected, abs=0.01)
+    assert centres.std() < 0.05
+
+
+def test_the_stripe_follows_the_relief(ideal: StandingWorld) -> None:
+    """Each lit pixel's ray, cut with the light plane, ends on the closed form of the surface."""
+    world_from_camera = above((0.0, 0.0, 0.60 + 0.130))
+    light = ideal.look("scan", world_from_camera, laser=True).astype(float) - ideal.look("scan", world_from_camera)
+    light[light < 4] = 0.0
+    rows = np.arange(30, 450)
+    u = (light[rows] * np.arange(640)).sum(axis=1) / light[rows].sum(axis=1)
+    ray = np.column_stack([(u - 319.5), (rows - 239.5), np.full(len(rows), 0.008 / 4.8e-6)]) / (0.008 / 4.8e-6)
+    depth = 0.035 / (1 / 3.5 - ray[:, 0])
+    points = ray * depth[:, None]
+    x, y, z = points[:, 0], -points[:, 1], 0.130 - points[:, 2]
+    on_it = np.abs(y) < HALF_Y - 0.001
+    assert on_it.sum() > 300
+    assert np.sqrt(np.mean((z - surface("pot").height(x, y))[on_it] ** 2)) < 1e-4
+
+
+def test_the_target_camera_sees_the_boards_dots_where_a_pinhole_puts_them(ideal: StandingWorld) -> None:
+    world_from_board = drawing.WORLD_FROM_PLACE @ drawing.PLACE_FROM_BOARD
+    world_from_camera = world_from_board @ drawing.pose((0.08, 0.06, -0.9), (1, 0, 0), (0, 0, 1))
+    picture = ideal.look("target", world_from_camera, exposure=0.008).astype(float)
+    for i, j in [(0, 0), (8, 0), (0, 6), (8, 6)]:
+        u, v = (
+            (np.array([i * 0.02 - 0.08, j * 0.02 - 0.06]) / 0.9 * 0.008 / 4.8e-6 + [639.5, 511.5]).round().astype(int)
+        )
+        patch = 190.0 - picture[v - 14 : v + 15, u - 14 : u + 15]
+        patch[patch < 60] = 0.0
+        at = [(patch.sum(axis=axis) * np.arange(-14, 15)).sum() / patch.sum() for axis in (0, 1)]
+        exact = np.array([i * 0.02 - 0.08, j * 0.02 - 0.06]) / 0.9 * 0.008 / 4.8e-6 + [639.5, 511.5]
+        assert [u + at[0], v + at[1]] == pytest.approx(exact, abs=0.05)
+
+
+def test_a_camera_that_looks_away_sees_only_the_room(ideal: StandingWorld) -> None:
+    picture = ideal.look("target", drawing.pose((-0.75, 0.0, 1.5), (1, 0, 0), (0, 0, 1)), exposure=0.008)
+    assert np.ptp(picture) < 30
