@@ -122,21 +122,6 @@ class Diagnosis:
     simulated: bool = False
     readings: list[Reading] = field(default_factory=list)
 
-    @property
-    def p50_text(self) -> str:
-        """Median round trip for people."""
-        return "" if self.p50_ms is None else f"{self.p50_ms:.2f}"
-
-    @property
-    def p99_text(self) -> str:
-        """99th percentile for people."""
-        return "" if self.p99_ms is None else f"{self.p99_ms:.2f}"
-
-    @property
-    def errors_text(self) -> str:
-        """Counters for people."""
-        return ", ".join(f"{name} {count}" for name, count in sorted(self.errors.items())) or "none"
-
     def as_dict(self) -> dict[str, object]:
         """For JSON."""
         told = asdict(self)

@@ -26,6 +26,9 @@ from cell.measure.vision.board.view import centre_of
 from drivers.errors import CalibrationStale, Measured, RefusedError
 from drivers.interfaces import Arm, Camera, Frame, Vector
 
+MOVED = 22.46
+"""Squared Mahalanobis distance of two board poses above which the station has moved: χ² of 6 at 0.999."""
+
 
 @dataclass(frozen=True, eq=False)
 class BoardFix:

@@ -1,1 +1,1 @@
-"""Driving the vehicle: its way, its control law, and whether it stands where it should."""
+"""Driving the vehicle: its way, its control law, and where it stands."""

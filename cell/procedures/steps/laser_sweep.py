@@ -19,7 +19,7 @@ from cell.measure.calibration.drift.slip import Slip, slip_since
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.procedures.arm.photograph import BoardFix, scan_plans
 from cell.procedures.calibrate.reference_plate import require_edge, require_witness
-from cell.procedures.drive.station_check import require_unmoved
+from cell.procedures.steps.board_photo import require_unmoved
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord, save_sweep
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION, SweepCollector, SweepErrors, rehearse

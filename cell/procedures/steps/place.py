@@ -19,7 +19,7 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover, PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.arm.touch import TouchCheck, TouchHeight, expected_touch, felt_touch
-from cell.procedures.drive.station_check import require_unmoved
+from cell.procedures.steps.board_photo import require_unmoved
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace

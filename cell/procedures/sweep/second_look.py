@@ -17,7 +17,7 @@ from cell.measure.inversion.observability import Tolerance
 from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.calibrate.reference_plate import configure_fast
-from cell.procedures.drive.station_check import require_unmoved as require_board_unmoved
+from cell.procedures.steps.board_photo import require_unmoved as require_board_unmoved
 from cell.procedures.steps.laser_sweep import laser_sweep
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
 from cell.procedures.steps.workplace import Workplace

@@ -26,7 +26,7 @@ from cell.measure.calibration.drift.slip import Slip
 from cell.measure.geometry.poses import difference, from_matrix
 from cell.measure.reconstruction import ScanGeometry
 from cell.measure.vision import StripeProfile
-from cell.procedures.arm.photograph import BoardFix
+from cell.procedures.arm.photograph import MOVED, BoardFix
 from cell.procedures.sweep.swath import Swath, SweepCollector
 from drivers.camera.folder import read_image
 from drivers.errors import CalibrationStale, CellError, RefusedError
@@ -93,8 +93,6 @@ class SweepRecord:
 FILE = "sweep.npz"
 FORMAT, UNSEALED = 5, 4
 """Of the sweeps written now, and of those that had no digest, which a replay reads, and no run goes on with."""
-MOVED = 22.46
-"""Squared Mahalanobis distance of two board poses above which the station has moved: χ² of 6 at 0.999."""
 
 _ARRAYS = ("lines", "frame_ids", "times", "flanges", "rail", "line_spread", "covariance", "seen")
 

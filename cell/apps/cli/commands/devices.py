@@ -229,8 +229,9 @@ def _print_table(rows: list[Diagnosis]) -> None:
         mark = "[green]ok[/]" if row.ok else "[red]fails[/]"
         mark += "\n[yellow]simulated[/]" if row.simulated else ""
         identity = "\n".join(part for part in (row.model, row.serial, row.firmware) if part)
-        times = f"{row.p50_text}\n{row.p99_text}"
-        cells = f"{row.device}\n{mark}", identity, row.address, times, row.errors_text, row.state
+        times = "\n".join("" if ms is None else f"{ms:.2f}" for ms in (row.p50_ms, row.p99_ms))
+        errors = ", ".join(f"{name} {count}" for name, count in sorted(row.errors.items())) or "none"
+        cells = f"{row.device}\n{mark}", identity, row.address, times, errors, row.state
         table.add_row(*cells)
     console.print(table)
     columns = ("device", "figure", ">value", "unit", ">allowed", "")

@@ -50,20 +50,6 @@ def test_a_first_run_over_the_wires_calibrates_and_places_within_the_same_bounds
     assert kinds == ["calibration", "job"]
 
 
-def test_the_report_keeps_its_contract(placed: dict[str, Any]) -> None:
-    assert {"outcome", "seed", "level", "steps", "place_pose", "place_sigma", "assumed_noise", "truth"} <= set(placed)
-    assert placed["seed"] == 3
-    assert placed["level"] == "nominal"
-    for step in placed["steps"]:
-        assert {"name", "state", "duration_s", "retries"} <= set(step)
-    truth = placed["truth"]
-    assert truth["points"] == 45
-    assert {"x", "y", "z", "d"} == set(truth["error_mm"])
-    assert {"mean", "p85"} <= set(truth["sensor_mm"])
-    assert 0 < truth["bound_mm"] < 0.5
-    assert truth["d_p95"] <= truth["error_mm"]["d"]["max"] + 1e-9
-
-
 def test_the_placed_part_ends_a_safe_cell(placed: dict[str, Any]) -> None:
     end = placed["end_state"]
     assert not end["laser_on"]

@@ -27,17 +27,6 @@ def devices() -> Devices:
     return VirtualCell(CONFIG, seed=4, level="ideal").devices
 
 
-def test_before_the_stop_the_devices_do_what_they_are_asked(devices: Devices) -> None:
-    devices.gate.enter(CancelToken())
-    devices.rail.home().wait(60.0)
-    devices.rail.move_to(0.02).wait(30.0)
-    assert devices.rail.state().position == pytest.approx(0.02, abs=1e-6)
-    devices.vehicle.brake()
-    with devices.interlocks.purpose("test"), devices.laser.lit():
-        assert devices.laser.is_on
-    assert not devices.laser.is_on
-
-
 def test_who_listens_hears_what_a_camera_is_asked_for() -> None:
     devices, heard = VirtualCell(CONFIG, seed=4, level="ideal").devices, []
     devices.gate.listener = cast(Any, SimpleNamespace(command=lambda command, refused: heard.append(str(command))))
