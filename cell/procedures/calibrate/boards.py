@@ -24,6 +24,7 @@ from cell.measure.vision import BoardSpec, BoardView, board_pose, extract, find_
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import CalibrationView, scan_calibration_views, target_calibration_views
+from cell.procedures.sweep.sweeping import home_rail
 from drivers.errors import DeviceFault, RefusedError
 from drivers.interfaces import Camera, Frame
 
@@ -117,9 +118,7 @@ def collect_scan(
     board = parse_board(config.calibration.fine.board)
     views = scan_calibration_views(config, board)
     camera, rail = devices.scan_camera, devices.rail
-    if not rail.state().homed_here:
-        progress(0.0, "homing the rail")
-        rail.home().wait(60.0)
+    home_rail(devices, progress)
     mover.to_joints(HOME)
     aim = Aim(config, nominal_camera(config.scan_camera))
     made: list[ScanObservation] = []

@@ -28,6 +28,7 @@ from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import rail_ends, references, verification_views
 from cell.procedures.calibrate.boards import Check, Keep, Progress, move_to_view
 from cell.procedures.sweep.swath import frames_of
+from cell.procedures.sweep.sweeping import home_rail
 from drivers.errors import DeviceFault, LimitError, RefusedError
 
 SLOW_SHARE = 0.25
@@ -122,8 +123,7 @@ def _sweeps(
     room = max(speed for speed, _ in pairs) ** 2 / (2 * config.rail.acceleration) + ROOM_M
     low, high = config.rail.travel
     ends = rail_ends(calibration.scan, base_from_board, view, fine, (low + room, high - room))
-    if not devices.rail.state().homed_here:
-        devices.rail.home().wait(60.0)
+    home_rail(devices)
     mover.to_joints(HOME)
     move_to_view(devices, mover, view, 0)
     base_from_flange = from_ur(devices.arm.state().flange)

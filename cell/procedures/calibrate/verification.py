@@ -52,7 +52,7 @@ from cell.procedures.arm.photograph import CalibrationView, ScanPlan, rail_ends,
 from cell.procedures.calibrate.boards import PHOTO_RATE, Check, Keep, Progress, look_for, move_to_view
 from cell.procedures.calibrate.reference_plate import require_witness
 from cell.procedures.sweep.swath import SweepCollector, SweepErrors, rehearse
-from cell.procedures.sweep.sweeping import rail_sweep
+from cell.procedures.sweep.sweeping import home_rail, rail_sweep
 from drivers.errors import RefusedError
 from drivers.interfaces import Camera, Frame
 
@@ -191,9 +191,7 @@ def collect_verification(
     scan_view, target_view = verification_views(config, fine, large, calibration.scan, calibration.target)
     near, _ = references(calibration.scan, calibration.target)
     ends = rail_ends(calibration.scan, near.base_from_board, scan_view, fine, config.rail.travel)
-    if not devices.rail.state().homed_here:
-        progress(0.0, "homing the rail")
-        devices.rail.home().wait(60.0)
+    home_rail(devices, progress)
     mover.to_joints(HOME)
     pointing = None
     if calibration.scan.witness is not None:

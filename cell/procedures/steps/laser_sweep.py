@@ -23,7 +23,7 @@ from cell.procedures.steps.board_photo import require_unmoved
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord, save_sweep
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION, SweepCollector, SweepErrors, rehearse
-from cell.procedures.sweep.sweeping import arm_sweep, rail_sweep
+from cell.procedures.sweep.sweeping import arm_sweep, home_rail, rail_sweep
 from drivers.errors import CalibrationStale
 from drivers.interfaces import Frame
 from statemachine.runner import StepContext
@@ -60,7 +60,7 @@ def laser_sweep(
     devices, config = here.devices, here.config
     base_from_place = fix.base_from_board * here.job.place_from_board.inverse()
     base_from_surface = base_from_place * here.job.surface.place_from_surface.se3()
-    _home(here, progress)
+    home_rail(devices, progress)
     plans = scan_plans(config, here.job.model_copy(update={"scan": scan}), base_from_surface, head)
     errors = SweepErrors(
         here.repeatability, config.calibration.rail_sigma, SHIFT_SHARE * here.job.place.tolerance,
@@ -129,7 +129,7 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
 
 def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     head = here.calibration.scan
-    _home(here, context.progress)
+    home_rail(here.devices, context.progress)
     pointing, slip = _seen_on_plate(here, context)
     doubts = times_known(head, here.config)[1]
     if pointing is not None:
@@ -144,12 +144,6 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     for note in record.notes:
         context.note(text=note)
     return record
-
-
-def _home(here: Workplace, progress: Callable[[float, str], None]) -> None:
-    if not here.devices.rail.state().homed_here:
-        progress(0.0, "homing the rail")
-        here.devices.rail.home().wait(60.0)
 
 
 def times_known(head: ScanCalibration, config: CellConfig) -> tuple[StampTiming | None, tuple[str, ...]]:

@@ -7,7 +7,7 @@ its time on it cannot be known.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 
@@ -33,6 +33,13 @@ LATENCY_S = 0.002
 since nothing tells where in it the joints were read."""
 JITTER_S = 0.0003
 """The same from one line to the next."""
+
+
+def home_rail(devices: Devices, progress: Callable[[float, str], None] = lambda share, text: None) -> None:
+    """Home the rail where this program has not: a zero that another one found is not trusted."""
+    if not devices.rail.state().homed_here:
+        progress(0.0, "homing the rail")
+        devices.rail.home().wait(60.0)
 
 
 def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: SweepCollector) -> Swath:

@@ -8,8 +8,6 @@ import dataclasses
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pinocchio as pin
@@ -26,14 +24,10 @@ from cell.measure.reconstruction import ScanGeometry
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import ScanPlan
-from cell.procedures.drive.way import Whereabouts
-from cell.procedures.steps.laser_sweep import _home
-from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors
-from cell.procedures.sweep.sweeping import JITTER_S, LATENCY_S, arm_sweep, rail_sweep
+from cell.procedures.sweep.sweeping import JITTER_S, LATENCY_S, arm_sweep, home_rail, rail_sweep
 from drivers.errors import DeviceFault
 from drivers.interfaces import Frame, Motion, Rail, RailState
-from lab.bench.job.whole_job import NoFrames
 from sim_backends.direct.arm import DirectArm
 
 CONFIG = load_config(None)
@@ -160,12 +154,7 @@ def test_a_zero_that_another_program_found_is_searched_again_before_a_sweep() ->
     rail = HomedEarlier(cell.rail)
     cell.devices.rail.bare = rail  # type: ignore[assignment]
     assert cell.devices.rail.state().homed
-    nothing_known = cast(Any, None)
-    job = load_job("pot")[0]
-    here = Workplace(
-        CONFIG, job, nothing_known, nothing_known, cell.devices, NoFrames(), Path(), Whereabouts(cell.devices.vehicle)
-    )
-    _home(here, lambda share, text: None)
+    home_rail(cell.devices)
     assert rail.searched
 
 
