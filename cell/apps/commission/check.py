@@ -1,27 +1,27 @@
-"""What a check of the commissioning is, and what it leaves: figures with limits, a verdict, and findings by name.
+"""What a check of the commissioning is, what it leaves, and the record of all that were done, with its protocol page.
 
 A check measures. It never compares two files: what it says of the configuration, the devices and the pictures told it.
-
-Where a commissioning stands, in a file: each check's result with what it rested on, so that one can go on later.
-
 A result counts as long as nothing that it rests on has changed: the keys of the configuration that its check names, the
-results that it needs, and which cell it is. Findings are kept for the protocol when they have been mended, too."""
+results that it needs, and which cell it is.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from cell.base.version import release
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.run.folder import write_json
-from drivers.errors import ConfigError
+from cell.run.report.page import render
+from drivers.errors import CellError, ConfigError
 from drivers.interfaces import Reading
 
 if TYPE_CHECKING:
@@ -54,8 +54,8 @@ class Finding:
     told: str
     found: str
     remedy: str
-    write: dict[str, str] = field(default_factory=dict)
-    write_job: dict[str, str] = field(default_factory=dict)
+    write: dict[str, str]
+    write_job: dict[str, str]
 
     def __str__(self) -> str:
         return f"{self.name}: {self.what}; configured {self.told}, measured {self.found}. {self.remedy}"
@@ -72,15 +72,9 @@ class Result:
     pictures: list[str] = field(default_factory=list)
 
     def measure(
-        self,
-        what: str,
-        value: float,
-        unit: str,
-        *,
-        least: float | None = None,
-        most: float | None = None,
+        self, what: str, value: float, unit: str, *, least: float | None = None, most: float | None = None,
         remedy: str = "",
-    ) -> Reading:
+    ) -> None:  # fmt: skip
         """Note a figure with its limits; one outside makes the check wrong."""
         reading = Reading(what, float(value), unit, least=least, most=most, remedy=remedy)
         self.readings.append(reading)
@@ -88,11 +82,17 @@ class Result:
             self.verdict = CheckVerdict.WRONG
             shown = f"{what}: {value:.4g} {unit}".strip() + f", allowed {bounds(reading)} {unit}".rstrip()
             self.notes.append(f"{shown}. {remedy}".strip())
-        return reading
 
-    def find(self, finding: Finding) -> None:
-        """Note a finding; the check is wrong then."""
-        self.findings.append(finding)
+    def require(self, what: str, so: bool, remedy: str = "") -> None:
+        """Note whether something is as it has to be."""
+        self.measure(what, float(so), "", least=1.0, remedy=remedy)
+
+    def find(
+        self, name: str, what: str, told: str, found: str, remedy: str, *, write: dict[str, str] | None = None,
+        write_job: dict[str, str] | None = None,
+    ) -> None:  # fmt: skip
+        """Note a `Finding`; the check is wrong then."""
+        self.findings.append(Finding(name, what, told, found, remedy, write=write or {}, write_job=write_job or {}))
         self.verdict = CheckVerdict.WRONG
 
     def as_dict(self) -> dict[str, object]:
@@ -139,7 +139,16 @@ def bounds(reading: Reading) -> str:
             return f"{least:g} to {most:g}"
 
 
-FILE = "progress.json"
+def refused(act: Callable[[], object], kind: type[CellError] = CellError) -> bool:
+    """Whether what `act` commands is refused by an error of this kind."""
+    try:
+        act()
+    except kind:
+        return True
+    return False
+
+
+FILE, PROTOCOL = "progress.json", "protocol.html"
 VERSION = 1
 
 
@@ -220,13 +229,50 @@ class Progress:
         write_json(self._file, self._data)
 
 
-def done_well(standing: str) -> bool:
-    """Whether a check that stands so needs not be done again."""
-    return standing == CheckVerdict.GOOD
-
-
 def _at(tables: dict[str, object], key: str) -> Any:
     value: Any = tables
     for part in key.split("."):
         value = value.get(part) if isinstance(value, dict) else None
     return value
+
+
+# --- the protocol ---
+
+
+@dataclass(frozen=True)
+class ProtocolRow:
+    """A check and how it stands, with its stored `result` (None: not done); `readings` beside what is allowed."""
+
+    check: CommissionCheck
+    standing: str
+    result: Mapping[str, Any] | None
+    readings: Sequence[tuple[Reading, str]]
+    pictures: Sequence[Path]
+
+
+def write_protocol(progress: Progress, checks: Sequence[CommissionCheck], config: CellConfig) -> Path:
+    """Write the page beside the record of the progress; returns its path."""
+    cell = progress.cell
+    world = (f"{name} {value}" for name, value in cell.items() if name != "simulated" and value is not None)
+    text = render(
+        __package__,
+        "protocol.html.jinja",
+        cell=config.cell.name,
+        simulated=bool(cell.get("simulated")),
+        world=", ".join(world),
+        written=time.strftime("%Y-%m-%d %H:%M:%S"),
+        release=release(),
+        rows=[_row(progress, check, progress.standing(check, config)) for check in checks],
+        mended=progress.mended,
+    )
+    path = progress.folder / PROTOCOL
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def _row(progress: Progress, check: CommissionCheck, standing: str) -> ProtocolRow:
+    result = progress.result(check.name)
+    kept = result or {"readings": [], "pictures": []}
+    readings = [Reading(row["what"], row["value"], row["unit"], row["least"], row["most"]) for row in kept["readings"]]
+    pictures = [path for name in kept["pictures"] if (path := progress.folder / name).is_file()]
+    return ProtocolRow(check, standing, result, [(reading, bounds(reading)) for reading in readings], pictures)

@@ -1,8 +1,7 @@
-"""The moves by which a camera's mounting and its board's size are measured: shifts first, then turns about the board.
+"""How a camera sits on the flange and how large its board on the deck is, from a few views.
 
-Every way is a few millimetres or degrees, reckoned from what the view before has shown.
-
-How a camera sits on the flange, and how large the board before it is, from a few views: pure geometry.
+First the camera is brought over its board, though nobody knows for sure how it is mounted. Then the flange is shifted,
+and turned about the board, by a few millimetres and degrees.
 
 The arm is the measure of length. Shifts of the flange by known ways show how the camera's axes lie on it, and how long
 the board's picture takes these ways to be: a wrong pitch makes all ways wrong alike, a wrong focal length only those
@@ -12,18 +11,251 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import pinocchio as pin
 
 from cell.apps.commission.check import Result
-from cell.apps.commission.workplace import CommissionWorkplace, Eye, SeenBoard, find_view, see
-from cell.measure.geometry.camera import Array
-from cell.measure.geometry.poses import from_parts, mean
+from cell.apps.commission.workplace import CommissionWorkplace
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import CameraConfig, PlateConfig
+from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.geometry.poses import from_parts, from_ur, mean
+from cell.measure.vision import BoardSpec, BoardView, board_pose, find_board, parse_board
 from cell.measure.vision.board.view import centre_of
 from drivers.errors import CellError, DeviceFault, RefusedError
+from drivers.interfaces import Camera, Frame, Image
+
+TILT = math.radians(15.0)
+"""Of the board against the picture: a board that is seen square tells its own tilt badly."""
+RAIL_STEP = 0.015
+"""How far apart the places are, m, at which a rail that is not homed is thought to stand."""
+PHOTO_RATE = 10.0
+CENTRED_SHARE = 0.03
+"""How far off its middle, in shares of the picture's width, the board may be."""
+CENTRINGS = 3
+"""How often the camera goes on towards what is bright in its picture."""
+LEAST_CONTRAST, LEAST_WAY_SHARE = 25.0, 0.03
+"""By how many DN something has to stand out, and by which share of the picture's width off its middle, to go there."""
+
+
+@dataclass(frozen=True, eq=False)
+class Eye:
+    """A camera with the board on the deck that it calibrates by; `depth` (m) is how far off it looks, `step` (m) how
+    far the flange is shifted at first."""
+
+    name: str
+    config: CameraConfig
+    plate: PlateConfig
+    key: str
+    depth: float
+    step: float
+
+    @property
+    def board(self) -> BoardSpec:
+        """The board as its name in the configuration says it is."""
+        return parse_board(self.plate.board)
+
+    @property
+    def model(self) -> CameraModel:
+        """The camera as the configuration draws it."""
+        return nominal_camera(self.config)
+
+
+@dataclass(frozen=True, eq=False)
+class SeenBoard:
+    """A picture of the board: `base_from_flange` as the arm told it, `camera_from_board` with the board as named."""
+
+    base_from_flange: pin.SE3
+    camera_from_board: pin.SE3
+    view: BoardView
+    frame: Frame
+
+
+def eye_of(desk: CommissionWorkplace, name: str) -> Eye:
+    """The eye "scan_camera" or "target_camera" of the cell."""
+    config = desk.config
+    if name == "scan_camera":
+        return Eye(name, config.scan_camera, config.calibration.fine, key="calibration.fine", depth=0.130, step=0.005)
+    return Eye(name, config.target_camera, config.calibration.large, key="calibration.large", depth=0.650, step=0.030)
+
+
+def camera_of(desk: CommissionWorkplace, eye: Eye) -> Camera:
+    """Its device."""
+    devices = desk.devices
+    return devices.scan_camera if eye.name == "scan_camera" else devices.target_camera
+
+
+def take(desk: CommissionWorkplace, eye: Eye) -> Frame:
+    """A photograph at the configured exposure."""
+    camera = camera_of(desk, eye)
+    camera.configure(eye.config.photo_exposure, PHOTO_RATE)
+    return camera.grab()
+
+
+def see(desk: CommissionWorkplace, eye: Eye) -> SeenBoard:
+    """The board from where the arm stands; `RefusedError` when it is not seen."""
+    frame = take(desk, eye)
+    try:
+        view = find_board(frame.image, eye.board)
+        pose = board_pose(view, eye.model)
+    except RefusedError as refused:
+        raise refused.showing(seen={"frame": frame}) from refused
+    return SeenBoard(from_ur(desk.devices.arm.state().flange), pose.camera_from_board, view, frame)
+
+
+def find_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
+    """Go where the camera sees its board: where it did last, where it is drawn to, or as if its bracket were turned.
+
+    Where a part of something bright is in the picture, the camera goes on towards it. Raises `RefusedError` when the
+    board is seen from nowhere.
+    """
+    mover = desk.mover()
+    reason, tried = "", 0
+    for what, goal, hand in _candidates(desk, eye):
+        for _ in range(1 + CENTRINGS):
+            desk.look_around()
+            try:
+                mover.to(goal, what)
+            except DeviceFault:
+                raise
+            except CellError as error:
+                reason = str(error)
+                break
+            tried += 1
+            try:
+                seen = see(desk, eye)
+            except RefusedError as error:
+                reason = str(error)
+                frame = error.seen["frame"]
+                assert isinstance(frame, Frame)
+                if tried == 1:
+                    desk.keep(result, f"{eye.name}-sees-no-board", frame)
+                way = towards_bright(frame.image)
+                if way is None:
+                    break
+                metres = np.array([*way, 0.0]) * eye.depth / eye.model.fx
+                goal = goal * from_parts(hand.rotation @ metres)
+                continue
+            if tried > 1:
+                result.notes.append(f"the board was seen from the {tried}. place that was tried: {what}")
+            seen, goal = _nearer_the_middle(desk, eye, seen, goal, hand)
+            desk.last_views[eye.name] = goal
+            return seen
+    raise RefusedError(
+        f"{eye.name} saw the board {eye.plate.board} from none of {tried} places. See that the lens cap is off, the "
+        f"light on, the lens in focus at {1e3 * eye.depth:.0f} mm, that the board on the deck is the one of "
+        f"{eye.key}.board, and that {eye.key}.base_from_board is where it is. Last: {reason}"
+    )
+
+
+def _nearer_the_middle(
+    desk: CommissionWorkplace, eye: Eye, seen: SeenBoard, goal: pin.SE3, hand: pin.SE3
+) -> tuple[SeenBoard, pin.SE3]:
+    """The view with the board nearer to the picture's middle, if the camera sits as `hand` has it; else as it is."""
+    way = _off_middle(seen)
+    if np.linalg.norm(way) < CENTRED_SHARE * eye.config.width:
+        return seen, goal
+    nearer = goal * from_parts(hand.rotation @ (np.array([*way, 0.0]) * eye.depth / eye.model.fx))
+    try:
+        desk.mover().to(nearer, f"{eye.name} with its board nearer to the middle")
+        moved = see(desk, eye)
+    except DeviceFault:
+        raise
+    except CellError:
+        moved = None
+    if moved is not None and np.linalg.norm(_off_middle(moved)) < np.linalg.norm(way):
+        return moved, nearer
+    desk.mover().to(goal, "back to where the board was seen")
+    return see(desk, eye), goal
+
+
+def _off_middle(seen: SeenBoard) -> Array:
+    """From the picture's middle to that of the board's points, (2,) px."""
+    width, height = seen.view.size
+    low, high = seen.view.pixels.min(axis=0), seen.view.pixels.max(axis=0)
+    return np.asarray(0.5 * (low + high) - 0.5 * np.array([width - 1, height - 1]))
+
+
+def towards_bright(image: Image) -> Array | None:
+    """From the picture's middle to that of what is bright in it, (2,) px; None when nothing stands out, or all does."""
+    level, _ = cv2.threshold(cv2.GaussianBlur(image, (9, 9), 0), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    bright = image > level
+    share = float(bright.mean())
+    if not 0.02 < share < 0.95 or float(image[bright].mean() - image[~bright].mean()) < LEAST_CONTRAST:
+        return None
+    # Dark dots belong to their bright board: the middle of its outline, not of its pixels.
+    rows, columns = np.flatnonzero(bright.mean(axis=1) > 0.05), np.flatnonzero(bright.mean(axis=0) > 0.05)
+    if not len(rows) or not len(columns):
+        return None
+    middle = 0.5 * np.array([columns[0] + columns[-1], rows[0] + rows[-1]])
+    way = middle - 0.5 * np.array([image.shape[1] - 1, image.shape[0] - 1])
+    return way if np.linalg.norm(way) > LEAST_WAY_SHARE * image.shape[1] else None
+
+
+def _candidates(desk: CommissionWorkplace, eye: Eye) -> Iterator[tuple[str, pin.SE3, pin.SE3]]:
+    """Places of the flange to try, with words for each, and flange_from_camera as it would be then."""
+    drawn = eye.config.flange_from_camera.se3()
+    if eye.name in desk.last_views:
+        yield "where it was seen last", desk.last_views[eye.name], drawn
+    tilted = from_parts(np.zeros(3), pin.exp3(np.array([TILT, 0.0, 0.0])))
+    centre = eye.plate.base_from_board.se3() * from_parts(centre_of(eye.board))
+    looking = centre * tilted * from_parts((0.0, 0.0, -eye.depth))
+    rails = _rail_places(desk, eye)
+    # A head that is turned in its place is carried another way; a camera without a rail looks the same way for it.
+    for quarters in (0, 2, 1, 3) if eye.name == "scan_camera" else (0,):
+        turn = _about_z(quarters)
+        for rail in rails:
+            hand = drawn * turn * from_parts((rail, 0.0, 0.0))
+            yield _words("head", quarters, eye, rail), looking * turn * hand.inverse(), hand
+    for quarters in (2, 1, 3):
+        for rail in rails:
+            hand = _about_z(quarters) * drawn * from_parts((rail, 0.0, 0.0))
+            yield _words("bracket", quarters, eye, rail), looking * hand.inverse(), hand
+
+
+def _about_z(quarters: int) -> pin.SE3:
+    return from_parts(np.zeros(3), pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi * quarters])))
+
+
+def _words(what: str, quarters: int, eye: Eye, rail: float) -> str:
+    words = "as drawn" if quarters == 0 else f"{what} turned by {90 * quarters} deg"
+    return f"{words}, rail near {1e3 * rail:.0f} mm" if eye.name == "scan_camera" else words
+
+
+def _rail_places(desk: CommissionWorkplace, eye: Eye) -> list[float]:
+    """Where the carriage may stand, m, the middle first."""
+    if eye.name != "scan_camera":
+        return [0.0]
+    state = desk.devices.rail.state()
+    if state.homed_here:
+        return [state.position]
+    low, high = desk.config.rail.travel
+    count = max(1, math.ceil((high - low) / RAIL_STEP))
+    places = [low + (k + 0.5) * (high - low) / count for k in range(count)]
+    return sorted(places, key=lambda place: abs(place - 0.5 * (low + high)))
+
+
+def centred_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
+    """As `find_view`, with the middle of the board in the middle of the picture, at the eye's depth.
+
+    For a camera whose axes lie as they are drawn.
+    """
+    seen = find_view(desk, result, eye)
+    at = seen.camera_from_board
+    middle = at.rotation @ centre_of(eye.board) + at.translation
+    hand = eye.config.flange_from_camera.se3()
+    shift = from_parts(hand.rotation @ (middle - np.array([0.0, 0.0, eye.depth])))
+    goal = seen.base_from_flange * shift
+    desk.mover().to(goal, f"{eye.name} above the middle of its board")
+    desk.last_views[eye.name] = goal
+    return see(desk, eye)
+
+
+# --- mounting and scale, by geometry ---
 
 LEAST_SHIFT_SHARE = 0.2
 """The shortest of three directions in which the flange was shifted, in shares of the longest."""
@@ -179,6 +411,8 @@ def _in_words(turn: Array) -> str:
 def _signed(quarters: int) -> int:
     return {1: 90, 2: 180, 3: -90}[quarters]
 
+
+# --- shifts, then turns ---
 
 SMALL_TURN, TURN = math.radians(5.0), math.radians(12.0)
 LEAST_TURNED = 4

@@ -2,11 +2,8 @@
 
 First what does not move, then each axis by itself and slowly, then what a wrong axis would make dangerous.
 
-Changing values in a TOML file without touching the rest of it: comments, order and spaces stay as they are.
-
-The new text is parsed again and has to say what was meant; else nothing is written. The old file is always kept.
-
-Everything that a commissioning begins with: which cell, which person, where its record is."""
+What was found is written into the TOML file; comments, order and spaces of the rest stay. The new text is parsed again
+and has to say what was meant; else nothing is written. The old file is always kept."""
 
 from __future__ import annotations
 
@@ -24,17 +21,9 @@ from typing import Any
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
-from cell.apps.commission.check import CheckVerdict, CommissionCheck, Progress, Result, done_well
-from cell.apps.commission.checks import arm as arm_checks
-from cell.apps.commission.checks import cameras as camera_checks
-from cell.apps.commission.checks import closing as closing_checks
-from cell.apps.commission.checks import links as link_checks
-from cell.apps.commission.checks import outputs as output_checks
-from cell.apps.commission.checks import rail as rail_checks
-from cell.apps.commission.checks import stops as stop_checks
-from cell.apps.commission.checks import vehicle as vehicle_checks
-from cell.apps.commission.person import Person
-from cell.apps.commission.workplace import CommissionWorkplace, Declined, told
+from cell.apps.commission.check import CheckVerdict, CommissionCheck, Progress, Result
+from cell.apps.commission.checks import arm, cameras, outputs, rail, stops, vehicle, whole_cell
+from cell.apps.commission.workplace import CommissionWorkplace, Declined, Person, told
 from cell.config.cell_config import CONFIGURATION, load_config, require_confirm
 from cell.config.job import job_path
 from cell.run.recorded_work import Hands
@@ -93,16 +82,9 @@ def _table(tables: Any, dotted: str) -> Any:
 
 
 CHECKS: tuple[CommissionCheck, ...] = (
-    *link_checks.CHECKS,
-    *arm_checks.CHECKS,
-    *camera_checks.CHECKS,
-    *rail_checks.CHECKS,
-    *output_checks.CHECKS,
-    *vehicle_checks.CHECKS,
-    *stop_checks.CHECKS,
-    *vehicle_checks.STATION_CHECKS,
-    *closing_checks.CHECKS,
-)
+    *whole_cell.LINK_CHECKS, *arm.CHECKS, *cameras.CHECKS, *rail.CHECKS, *outputs.CHECKS, *vehicle.CHECKS,
+    *stops.CHECKS, *vehicle.STATION_CHECKS, *whole_cell.CLOSING_CHECKS,
+)  # fmt: skip
 MENDS = 3
 """How often at most what a check found is written, and the check done again."""
 
@@ -120,19 +102,18 @@ class Commissioning:
         """Do these checks in their order; True when all of them are good."""
         good = True
         for check in checks:
-            if done_well(self.progress.standing(check, self.desk.config)):
+            if self._good(check):
                 self.show(check, "good already", None)
                 continue
-            missing = [name for name in check.needs if not self._good(name)]
-            if missing:
+            if missing := [name for name in check.needs if not self._good(by_name(name))]:
                 self.show(check, f"waits for {', '.join(missing)}", None)
                 good = False
                 continue
             good = self._until_good(check) and good
         return good
 
-    def _good(self, name: str) -> bool:
-        return done_well(self.progress.standing(by_name(name), self.desk.config))
+    def _good(self, check: CommissionCheck) -> bool:
+        return self.progress.standing(check, self.desk.config) == CheckVerdict.GOOD
 
     def _until_good(self, check: CommissionCheck) -> bool:
         """Do a check, mend what it found, and do it again, as often as that helps."""

@@ -2,16 +2,15 @@
 
 The cell is opened anew when its configuration was changed. Nothing of one check is needed by the next but what stands
 in the configuration, and where a camera was seen to see its board last.
-
-Bringing a camera over its board on the deck when nobody knows for sure how it is mounted, and seeing it there."""
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
@@ -19,33 +18,93 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from cell.apps.commission.check import Result
-from cell.apps.commission.person import Person
-from cell.config.calibrations.store import nominal_camera
-from cell.config.cell_config import CameraConfig, PlateConfig, load_config
+from cell.config.cell_config import load_config
 from cell.config.job import Job, load_job
 from cell.devices.devices import Devices
 from cell.devices.simulated.process import cause_fault, make_ready
-from cell.measure.geometry.camera import Array, CameraModel
-from cell.measure.geometry.poses import from_parts, from_ur
-from cell.measure.vision import BoardSpec, BoardView, board_pose, find_board, parse_board
-from cell.measure.vision.board.view import centre_of
 from cell.motion.kinematics import HOME, Joints
 from cell.procedures.arm.moves import Mover
 from cell.run.recorded_work import Hands
-from drivers.errors import CellError, DeviceFault, RefusedError
-from drivers.interfaces import Camera, Frame, Image
+from drivers.errors import CellError, DeviceFault
+from drivers.interfaces import Frame, Image
 from statemachine.step import Observer
 
 if TYPE_CHECKING:
     from cell.config.cell_config import CellConfig
     from cell.run.session.supervisor import Cell
 
-
 SLOW_JOINT = math.radians(15.0)
 """Of the leading joint in free moves, rad/s."""
 SLOW_TOOL = 0.15
 """Of any point of tool and part in free moves, m/s."""
 WIDEST_PICTURE = 640
+
+
+class Person(Protocol):
+    """Whoever stands beside the cell: confirms what is to move, says what sensors cannot see, lends a hand."""
+
+    def go_ahead(self, text: str) -> bool:
+        """Whether what `text` announces may begin."""
+
+    def sees(self, question: str) -> bool:
+        """Yes or no to a question about what there is to be seen."""
+
+    def again(self, question: str) -> bool:
+        """Whether something was changed meanwhile and is to be measured again."""
+
+    def does(self, task: str, by_itself: Callable[[], None] | None = None) -> bool:
+        """Have a person do something; False if they would not. A simulated person does it as `by_itself` says."""
+
+
+class PersonAtTheConsole:
+    """Asks on the console; `ask` shows a text and gives yes or no."""
+
+    def __init__(self, ask: Callable[[str], bool]) -> None:
+        self._ask = ask
+
+    def go_ahead(self, text: str) -> bool:
+        """See `Person.go_ahead`."""
+        return self._ask(f"{text}\n  A hand on the emergency stop. Go ahead?")
+
+    def sees(self, question: str) -> bool:
+        """See `Person.sees`."""
+        return self._ask(question)
+
+    def again(self, question: str) -> bool:
+        """See `Person.again`."""
+        return self._ask(question)
+
+    def does(self, task: str, by_itself: Callable[[], None] | None = None) -> bool:
+        """See `Person.does`."""
+        return self._ask(f"{task} Done?")
+
+
+class SimulatedPerson:
+    """Of a simulated cell: agrees to everything, and says so through `tell`."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+
+    def go_ahead(self, text: str) -> bool:
+        """See `Person.go_ahead`."""
+        self._tell(f"{text} (simulated person: go ahead)")
+        return True
+
+    def sees(self, question: str) -> bool:
+        """See `Person.sees`."""
+        self._tell(f"{question} (simulated person: yes)")
+        return True
+
+    def again(self, question: str) -> bool:
+        """See `Person.again`: nobody has changed anything."""
+        return False
+
+    def does(self, task: str, by_itself: Callable[[], None] | None = None) -> bool:
+        """See `Person.does`."""
+        self._tell(f"{task} (simulated person: done)")
+        if by_itself is not None:
+            by_itself()
+        return True
 
 
 class SlowMover(Mover):
@@ -176,21 +235,19 @@ class CommissionWorkplace:
             "the arm as a whole", "planned ways above the deck", "up to its whole reach",
             f"at most {math.degrees(SLOW_JOINT):.0f} deg/s and {1e3 * SLOW_TOOL:.0f} mm/s",
         )  # fmt: skip
-        return self._mover()
-
-    def _mover(self) -> Mover:
-        config, devices = self.config, self.devices
-        if not devices.vehicle.state().braked:
-            devices.vehicle.recover()
-        arm = config.arm
-        slow = arm.model_copy(
-            update={
-                "max_joint_speed": min(arm.max_joint_speed, SLOW_JOINT),
-                "max_tool_speed": min(arm.max_tool_speed, SLOW_TOOL),
-            }
-        )
-        config = config.model_copy(update={"arm": slow})
+        self.brake()
+        arm, devices = self.config.arm, self.devices
+        slow = {
+            "max_joint_speed": min(arm.max_joint_speed, SLOW_JOINT),
+            "max_tool_speed": min(arm.max_tool_speed, SLOW_TOOL),
+        }
+        config = self.config.model_copy(update={"arm": arm.model_copy(update=slow)})
         return SlowMover(devices.arm, devices.clock, config, self.job, self.look_around, interlocks=devices.interlocks)
+
+    def brake(self) -> None:
+        """The vehicle braked, as the arm needs it."""
+        if not self.devices.vehicle.state().braked:
+            self.devices.vehicle.recover()
 
     def fold(self) -> None:
         """The arm to its folded posture above the deck, unless it is there."""
@@ -231,229 +288,3 @@ def _shown(image: Image, marks: ArrayLike | None) -> cv2.typing.MatLike:
 def told(error: CellError) -> str:
     """An error in one line."""
     return " ".join(str(error).split())
-
-
-TILT = math.radians(15.0)
-"""Of the board against the picture: a board that is seen square tells its own tilt badly."""
-RAIL_STEP = 0.015
-"""How far apart the places are, m, at which a rail that is not homed is thought to stand."""
-PHOTO_RATE = 10.0
-CENTRED_SHARE = 0.03
-"""How far off its middle, in shares of the picture's width, the board may be."""
-CENTRINGS = 3
-"""How often the camera goes on towards what is bright in its picture."""
-LEAST_CONTRAST, LEAST_WAY_SHARE = 25.0, 0.03
-"""By how many DN something has to stand out, and by which share of the picture's width off its middle, to go there."""
-
-
-@dataclass(frozen=True, eq=False)
-class Eye:
-    """A camera with the board on the deck that it calibrates by; `depth` (m) is how far off it looks, `step` (m) how
-    far the flange is shifted at first."""
-
-    name: str
-    config: CameraConfig
-    plate: PlateConfig
-    key: str
-    depth: float
-    step: float
-
-    @property
-    def board(self) -> BoardSpec:
-        """The board as its name in the configuration says it is."""
-        return parse_board(self.plate.board)
-
-    @property
-    def model(self) -> CameraModel:
-        """The camera as the configuration draws it."""
-        return nominal_camera(self.config)
-
-
-@dataclass(frozen=True, eq=False)
-class SeenBoard:
-    """A picture of the board: `base_from_flange` as the arm told it, `camera_from_board` with the board as named."""
-
-    base_from_flange: pin.SE3
-    camera_from_board: pin.SE3
-    view: BoardView
-    frame: Frame
-
-
-def eye_of(desk: CommissionWorkplace, name: str) -> Eye:
-    """The eye "scan_camera" or "target_camera" of the cell."""
-    config = desk.config
-    if name == "scan_camera":
-        return Eye(name, config.scan_camera, config.calibration.fine, key="calibration.fine", depth=0.130, step=0.005)
-    return Eye(name, config.target_camera, config.calibration.large, key="calibration.large", depth=0.650, step=0.030)
-
-
-def camera_of(desk: CommissionWorkplace, eye: Eye) -> Camera:
-    """Its device."""
-    devices = desk.devices
-    return devices.scan_camera if eye.name == "scan_camera" else devices.target_camera
-
-
-def take(desk: CommissionWorkplace, eye: Eye) -> Frame:
-    """A photograph at the configured exposure."""
-    camera = camera_of(desk, eye)
-    camera.configure(eye.config.photo_exposure, PHOTO_RATE)
-    return camera.grab()
-
-
-def see(desk: CommissionWorkplace, eye: Eye) -> SeenBoard:
-    """The board from where the arm stands; `RefusedError` when it is not seen."""
-    frame = take(desk, eye)
-    try:
-        view = find_board(frame.image, eye.board)
-        pose = board_pose(view, eye.model)
-    except RefusedError as refused:
-        raise refused.showing(seen={"frame": frame}) from refused
-    return SeenBoard(from_ur(desk.devices.arm.state().flange), pose.camera_from_board, view, frame)
-
-
-def find_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
-    """Go where the camera sees its board: where it did last, where it is drawn to, or as if its bracket were turned.
-
-    Where a part of something bright is in the picture, the camera goes on towards it. Raises `RefusedError` when the
-    board is seen from nowhere.
-    """
-    mover = desk.mover()
-    reason, tried = "", 0
-    for what, goal, hand in _candidates(desk, eye):
-        for _ in range(1 + CENTRINGS):
-            desk.look_around()
-            try:
-                mover.to(goal, what)
-            except DeviceFault:
-                raise
-            except CellError as error:
-                reason = str(error)
-                break
-            tried += 1
-            try:
-                seen = see(desk, eye)
-            except RefusedError as error:
-                reason = str(error)
-                frame = error.seen["frame"]
-                assert isinstance(frame, Frame)
-                if tried == 1:
-                    desk.keep(result, f"{eye.name}-sees-no-board", frame)
-                way = towards_bright(frame.image)
-                if way is None:
-                    break
-                metres = np.array([*way, 0.0]) * eye.depth / eye.model.fx
-                goal = goal * from_parts(hand.rotation @ metres)
-                continue
-            if tried > 1:
-                result.notes.append(f"the board was seen from the {tried}. place that was tried: {what}")
-            seen, goal = _nearer_the_middle(desk, eye, seen, goal, hand)
-            desk.last_views[eye.name] = goal
-            return seen
-    raise RefusedError(
-        f"{eye.name} saw the board {eye.plate.board} from none of {tried} places. See that the lens cap is off, the "
-        f"light on, the lens in focus at {1e3 * eye.depth:.0f} mm, that the board on the deck is the one of "
-        f"{eye.key}.board, and that {eye.key}.base_from_board is where it is. Last: {reason}"
-    )
-
-
-def _nearer_the_middle(
-    desk: CommissionWorkplace, eye: Eye, seen: SeenBoard, goal: pin.SE3, hand: pin.SE3
-) -> tuple[SeenBoard, pin.SE3]:
-    """The view with the board nearer to the picture's middle, if the camera sits as `hand` has it; else as it is."""
-    way = _off_middle(seen)
-    if np.linalg.norm(way) < CENTRED_SHARE * eye.config.width:
-        return seen, goal
-    nearer = goal * from_parts(hand.rotation @ (np.array([*way, 0.0]) * eye.depth / eye.model.fx))
-    try:
-        desk.mover().to(nearer, f"{eye.name} with its board nearer to the middle")
-        moved = see(desk, eye)
-    except DeviceFault:
-        raise
-    except CellError:
-        moved = None
-    if moved is not None and np.linalg.norm(_off_middle(moved)) < np.linalg.norm(way):
-        return moved, nearer
-    desk.mover().to(goal, "back to where the board was seen")
-    return see(desk, eye), goal
-
-
-def _off_middle(seen: SeenBoard) -> Array:
-    """From the picture's middle to that of the board's points, (2,) px."""
-    width, height = seen.view.size
-    low, high = seen.view.pixels.min(axis=0), seen.view.pixels.max(axis=0)
-    return np.asarray(0.5 * (low + high) - 0.5 * np.array([width - 1, height - 1]))
-
-
-def towards_bright(image: Image) -> Array | None:
-    """From the picture's middle to that of what is bright in it, (2,) px; None when nothing stands out, or all does."""
-    level, _ = cv2.threshold(cv2.GaussianBlur(image, (9, 9), 0), 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    bright = image > level
-    share = float(bright.mean())
-    if not 0.02 < share < 0.95 or float(image[bright].mean() - image[~bright].mean()) < LEAST_CONTRAST:
-        return None
-    # Dark dots belong to their bright board: the middle of its outline, not of its pixels.
-    rows, columns = np.flatnonzero(bright.mean(axis=1) > 0.05), np.flatnonzero(bright.mean(axis=0) > 0.05)
-    if not len(rows) or not len(columns):
-        return None
-    middle = 0.5 * np.array([columns[0] + columns[-1], rows[0] + rows[-1]])
-    way = middle - 0.5 * np.array([image.shape[1] - 1, image.shape[0] - 1])
-    return way if np.linalg.norm(way) > LEAST_WAY_SHARE * image.shape[1] else None
-
-
-def _candidates(desk: CommissionWorkplace, eye: Eye) -> Iterator[tuple[str, pin.SE3, pin.SE3]]:
-    """Places of the flange to try, with words for each, and flange_from_camera as it would be then."""
-    drawn = eye.config.flange_from_camera.se3()
-    if eye.name in desk.last_views:
-        yield "where it was seen last", desk.last_views[eye.name], drawn
-    tilted = from_parts(np.zeros(3), pin.exp3(np.array([TILT, 0.0, 0.0])))
-    centre = eye.plate.base_from_board.se3() * from_parts(centre_of(eye.board))
-    looking = centre * tilted * from_parts((0.0, 0.0, -eye.depth))
-    rails = _rail_places(desk, eye)
-    # A head that is turned in its place is carried another way; a camera without a rail looks the same way for it.
-    for quarters in (0, 2, 1, 3) if eye.name == "scan_camera" else (0,):
-        turn = _about_z(quarters)
-        for rail in rails:
-            hand = drawn * turn * from_parts((rail, 0.0, 0.0))
-            yield _words("head", quarters, eye, rail), looking * turn * hand.inverse(), hand
-    for quarters in (2, 1, 3):
-        for rail in rails:
-            hand = _about_z(quarters) * drawn * from_parts((rail, 0.0, 0.0))
-            yield _words("bracket", quarters, eye, rail), looking * hand.inverse(), hand
-
-
-def _about_z(quarters: int) -> pin.SE3:
-    return from_parts(np.zeros(3), pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi * quarters])))
-
-
-def _words(what: str, quarters: int, eye: Eye, rail: float) -> str:
-    words = "as drawn" if quarters == 0 else f"{what} turned by {90 * quarters} deg"
-    return f"{words}, rail near {1e3 * rail:.0f} mm" if eye.name == "scan_camera" else words
-
-
-def _rail_places(desk: CommissionWorkplace, eye: Eye) -> list[float]:
-    """Where the carriage may stand, m, the middle first."""
-    if eye.name != "scan_camera":
-        return [0.0]
-    state = desk.devices.rail.state()
-    if state.homed_here:
-        return [state.position]
-    low, high = desk.config.rail.travel
-    count = max(1, math.ceil((high - low) / RAIL_STEP))
-    places = [low + (k + 0.5) * (high - low) / count for k in range(count)]
-    return sorted(places, key=lambda place: abs(place - 0.5 * (low + high)))
-
-
-def centred_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
-    """As `find_view`, with the middle of the board in the middle of the picture, at the eye's depth.
-
-    For a camera whose axes lie as they are drawn.
-    """
-    seen = find_view(desk, result, eye)
-    at = seen.camera_from_board
-    middle = at.rotation @ centre_of(eye.board) + at.translation
-    hand = eye.config.flange_from_camera.se3()
-    shift = from_parts(hand.rotation @ (middle - np.array([0.0, 0.0, eye.depth])))
-    goal = seen.base_from_flange * shift
-    desk.mover().to(goal, f"{eye.name} above the middle of its board")
-    desk.last_views[eye.name] = goal
-    return see(desk, eye)

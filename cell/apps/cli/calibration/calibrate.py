@@ -45,8 +45,7 @@ PoseFieldOption = Annotated[
     str | None, typer.Option("--pose-field", help="Which of several recorded poses is the flange's.")
 ]
 SetupOption = Annotated[
-    str | None,
-    typer.Option("--setup", help="Where the camera was: eye-in-hand or eye-to-hand; else the poses tell."),
+    str | None, typer.Option("--setup", help="Where the camera was: eye-in-hand or eye-to-hand; else the poses tell.")
 ]
 CameraOption = Annotated[
     str | None,

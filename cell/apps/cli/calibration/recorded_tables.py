@@ -38,13 +38,7 @@ def _print_details(console: Console, say: Callable[[str], None], result: Result)
     """Every picture, value, check and note."""
     if result["board"] is not None:
         rows = [
-            (
-                f["name"],
-                f["points"],
-                f["pose_from"],
-                f["stripe_from"] or ("here" if f["stripe"] else ""),
-                f["rms_px"],
-            )
+            (f["name"], f["points"], f["pose_from"], f["stripe_from"] or ("here" if f["stripe"] else ""), f["rms_px"])
             for f in result["frames"]
         ]
         console.print(_table("recorded frames", ("picture", "points", "pose", "stripe", "RMS in px"), rows))

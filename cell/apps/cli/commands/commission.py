@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
     from cell.apps.commission.check import CommissionCheck, Result
     from cell.apps.commission.sequence import Commissioning
+    from cell.apps.commission.workplace import Person
 
 
 OnlyArgument = Annotated[list[str] | None, typer.Argument(help="Only these checks; without any, all of them.")]
@@ -50,7 +52,7 @@ def commission(
     from rich.console import Console
 
     from cell.apps.cli.progress import tell_question
-    from cell.apps.commission.protocol import write_protocol
+    from cell.apps.commission.check import write_protocol
     from cell.apps.commission.sequence import CHECKS, begin, chosen, confirms_itself
     from drivers.errors import ConfigError
 
@@ -60,7 +62,7 @@ def commission(
     console = Console(stderr=json, highlight=False)
     by_itself = confirm is not Confirm.person and (sim == "all" or (sim is None and confirms_itself(config)))
     made = begin(
-        config, _person(by_itself, console), _Page(console, CHECKS),
+        config, _person(by_itself, console), partial(_show, console),
         job=job, sim=sim, seed=seed, level=level.value, clock=clock.value, truth=truth,
     )  # fmt: skip
     made.desk.heard = tell_question
@@ -94,56 +96,49 @@ def _print_mended(made: Commissioning, console: Console) -> None:
         console.print(f"found and mended: {text}", style="yellow", markup=False)
 
 
-def _person(simulated: bool, console: Console) -> Any:
-    from cell.apps.commission.person import PersonAtTheConsole, SimulatedPerson
+def _person(simulated: bool, console: Console) -> Person:
+    from cell.apps.commission.workplace import PersonAtTheConsole, SimulatedPerson
 
     if simulated:
         return SimulatedPerson(lambda text: console.print(text, style="dim", markup=False))
     return PersonAtTheConsole(lambda text: typer.confirm(text, err=True))
 
 
-class _Page:
-    """Shows a check on the console once it has ended."""
+def _show(console: Console, check: CommissionCheck, verdict: str, result: Result | None) -> None:
+    """Show a check on the console once it has ended."""
+    from rich.text import Text
 
-    def __init__(self, console: Console, checks: tuple[CommissionCheck, ...]) -> None:
-        self._console = console
-        self._numbers = {check.name: k for k, check in enumerate(checks, 1)}
+    from cell.apps.commission.check import bounds
+    from cell.apps.commission.sequence import CHECKS
 
-    def __call__(self, check: CommissionCheck, verdict: str, result: Result | None) -> None:
-        from rich.text import Text
-
-        from cell.apps.commission.check import bounds
-
-        style = "green" if verdict.startswith("good") else "yellow" if verdict.startswith("waits") else "red"
-        self._console.print(
-            Text(f"{self._numbers[check.name]:2d}  {check.name}: {check.title}: ").append(verdict, style)
-        )
-        if result is None:
-            return
-        if result.readings:
-            columns = ("measured", ">value", "unit", ">allowed", "")
-            table = new_table(None, *columns, header_style="dim", box=None, pad_edge=False)
-            for row in result.readings:
-                allowed = bounds(row)
-                mark = Text("") if not allowed else Text("ok", "green") if row.ok else Text("outside", "red")
-                table.add_row(Text(row.what), f"{row.value:.4g}", Text(row.unit), allowed, mark)
-            self._console.print(table)
-        for finding in result.findings:
-            self._console.print(f"FOUND {finding}", style="bold red", markup=False)
-        for note in result.notes:
-            self._console.print(f"  {note}", style="dim" if verdict == "good" else "", markup=False)
+    number = 1 + CHECKS.index(check)
+    style = "green" if verdict.startswith("good") else "yellow" if verdict.startswith("waits") else "red"
+    console.print(Text(f"{number:2d}  {check.name}: {check.title}: ").append(verdict, style))
+    if result is None:
+        return
+    if result.readings:
+        columns = ("measured", ">value", "unit", ">allowed", "")
+        table = new_table(None, *columns, header_style="dim", box=None, pad_edge=False)
+        for row in result.readings:
+            allowed = bounds(row)
+            mark = Text("") if not allowed else Text("ok", "green") if row.ok else Text("outside", "red")
+            table.add_row(Text(row.what), f"{row.value:.4g}", Text(row.unit), allowed, mark)
+        console.print(table)
+    for finding in result.findings:
+        console.print(f"FOUND {finding}", style="bold red", markup=False)
+    for note in result.notes:
+        console.print(f"  {note}", style="dim" if verdict == "good" else "", markup=False)
 
 
 def _list(made: Commissioning, checks: list[CommissionCheck], json: bool) -> None:
     from cell.config.cell_config import load_config
 
     config = load_config(made.path)
+    keys = ("name", "title", "moves", "far", "fast", "limit", "needs")
     rows = [
-        {"name": check.name, "title": check.title, "standing": made.progress.standing(check, config),
-         "moves": check.moves,
-         "far": check.far, "fast": check.fast, "limit": check.limit, "needs": list(check.needs)}
+        {"standing": made.progress.standing(check, config), **{key: getattr(check, key) for key in keys}}
         for check in checks
-    ]  # fmt: skip
+    ]
     if json:
         print_json(rows)
         return

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.commission.check import CommissionCheck, Finding, Result
+from cell.apps.commission.check import CommissionCheck, Result, refused
 from cell.apps.commission.workplace import CommissionWorkplace
 from cell.measure.geometry.poses import from_ur
 from cell.motion.kinematics import HOME
@@ -27,8 +27,7 @@ MASS_OFF, CENTRE_OFF = 0.25, 0.025
 
 def _axes(desk: CommissionWorkplace, result: Result) -> None:
     arm = desk.devices.arm
-    if not desk.devices.vehicle.state().braked:
-        desk.devices.vehicle.recover()
+    desk.brake()
     kinematics = desk.cell.mover(None).kinematics
     for joint in range(6):
         desk.look_around()
@@ -40,32 +39,22 @@ def _axes(desk: CommissionWorkplace, result: Result) -> None:
         desk.devices.clock.sleep(desk.config.arm.settle_time)
         then = arm.state()
         turned = np.degrees(then.joints - start.joints)
-        step = math.degrees(STEP)
-        result.measure(
-            f"joint {joint + 1} turned", turned[joint], "deg", least=step - MOST_OFF_DEG, most=step + MOST_OFF_DEG
-        )
+        low, high = math.degrees(STEP) - MOST_OFF_DEG, math.degrees(STEP) + MOST_OFF_DEG
+        result.measure(f"joint {joint + 1} turned", turned[joint], "deg", least=low, most=high)
         others = np.delete(np.abs(turned), joint).max()
         result.measure(f"any other joint turned, with joint {joint + 1}", others, "deg", most=MOST_OFF_DEG)
         way = from_ur(start.flange).inverse() * from_ur(then.flange)
         meant = kinematics.fk(start.joints).inverse() * kinematics.fk(then.joints)
-        result.measure(
-            f"flange off the model's way, joint {joint + 1}",
-            1e3 * float(np.linalg.norm(way.translation - meant.translation)),
-            "mm",
-            most=0.1,
-        )
+        off = 1e3 * float(np.linalg.norm(way.translation - meant.translation))
+        result.measure(f"flange off the model's way, joint {joint + 1}", off, "mm", most=0.1)
         arm.move_joints(start.joints, SPEED, ACCELERATION).wait(20.0)
     if not desk.person.sees("Did each joint turn alone, a little way there and back, without touching anything?"):
         result.notes.append("a person saw a joint move otherwise: see that the arm is the one at arm.address")
-        result.measure("a person saw every joint move as announced", 0.0, "", least=1.0)
-    refused = 0.0
+        result.require("a person saw every joint move as announced", False)
     beyond = arm.state().joints.copy()
     beyond[5] = math.radians(400.0)
-    try:
-        arm.move_joints(beyond, SPEED, ACCELERATION).wait(1.0)
-    except LimitError:
-        refused = 1.0
-    result.measure("a joint beyond its limit refused", refused, "", least=1.0)
+    stayed = refused(lambda: arm.move_joints(beyond, SPEED, ACCELERATION).wait(1.0), LimitError)
+    result.require("a joint beyond its limit refused", stayed)
 
 
 def _payload(desk: CommissionWorkplace, result: Result) -> None:
@@ -93,23 +82,20 @@ def _payload(desk: CommissionWorkplace, result: Result) -> None:
     centre = (told * np.array(config.payload_centre) + moment) / max(carried, 1e-3)
     off = float(np.linalg.norm(centre - np.array(config.payload_centre)))
     result.measure("weight that the arm was not told of", mass, "kg")
-    result.measure(
-        "its standard deviation", sigma, "kg", most=0.1, remedy="See that nothing touches the tool and no cable pulls."
-    )
+    remedy = "See that nothing touches the tool and no cable pulls."
+    result.measure("its standard deviation", sigma, "kg", most=0.1, remedy=remedy)
     result.measure("centre of gravity away from what was told", 1e3 * off, "mm")
     if abs(mass) > MASS_OFF + 3.0 * sigma or (off > CENTRE_OFF and carried > 0.5):
         shown = ", ".join(f"{1e3 * v:.0f}" for v in centre)
         result.find(
-            Finding(
-                "arm.payload", "the arm carries another weight than it was told, by its force sensor at rest",
-                f"{told:g} kg", f"{carried:.2f} kg with its centre at ({shown}) mm",
-                "Weigh tool and part, and write both; with a wrong one the arm stops for no reason, or feels contact "
-                "late.",
-                write={
-                    "arm.payload": f'"{carried:.1f} kg"',
-                    "arm.payload_centre": "[" + ", ".join(f'"{round(1e3 * float(v)):d} mm"' for v in centre) + "]",
-                },
-            )
+            "arm.payload", "the arm carries another weight than it was told, by its force sensor at rest",
+            f"{told:g} kg", f"{carried:.2f} kg with its centre at ({shown}) mm",
+            "Weigh tool and part, and write both; with a wrong one the arm stops for no reason, or feels contact "
+            "late.",
+            write={
+                "arm.payload": f'"{carried:.1f} kg"',
+                "arm.payload_centre": "[" + ", ".join(f'"{round(1e3 * float(v)):d} mm"' for v in centre) + "]",
+            },
         )  # fmt: skip
 
 

@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.commission.check import CommissionCheck, Finding, Result
-from cell.apps.commission.measuring import RoughMounting, against_drawing, measure
-from cell.apps.commission.workplace import CommissionWorkplace, Eye, eye_of, find_view
+from cell.apps.commission.check import CommissionCheck, Result
+from cell.apps.commission.measuring import Eye, RoughMounting, against_drawing, eye_of, find_view, measure
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.measure.vision import BoardSpec
 from drivers.interfaces import Image
 
@@ -42,16 +42,10 @@ def picture_figures(result: Result, image: Image, points: object, eye: Eye) -> N
     board = image[y0 : y1 + 1, x0 : x1 + 1].astype(float)
     dark, bright = np.percentile(board, [3, 97])
     exposure = f"{eye.name}.photo_exposure"
-    result.measure(
-        "brightness of the board", bright, "DN", least=60.0, most=250.0, remedy=f"Change {exposure} or the light."
-    )
-    result.measure(
-        "contrast of the board",
-        bright - dark,
-        "DN",
-        least=LEAST_CONTRAST,
-        remedy=f"Raise {exposure}, or light the board evenly.",
-    )
+    remedy = f"Change {exposure} or the light."
+    result.measure("brightness of the board", bright, "DN", least=60.0, most=250.0, remedy=remedy)
+    remedy = f"Raise {exposure}, or light the board evenly."
+    result.measure("contrast of the board", bright - dark, "DN", least=LEAST_CONTRAST, remedy=remedy)
     saturated = 100.0 * float((board >= 255).mean())
     result.measure("saturated pixels", saturated, "%", most=MOST_SATURATED, remedy=f"Lower {exposure}.")
     across = np.abs(board[:, 2:] - board[:, :-2]) / 2.0
@@ -81,11 +75,9 @@ def _mounting(name: str, desk: CommissionWorkplace, result: Result) -> None:
     )  # fmt: skip
     if turned.words:
         result.find(
-            Finding(
-                f"{name}.flange_from_camera", turned.words, pose_words(drawn), pose_words(found.flange_from_camera),
-                remedy="Have the configuration say so, or turn the camera as it is drawn.",
-                write={f"{name}.flange_from_camera": pose_toml(turned.pose)},
-            )
+            f"{name}.flange_from_camera", turned.words, pose_words(drawn), pose_words(found.flange_from_camera),
+            remedy="Have the configuration say so, or turn the camera as it is drawn.",
+            write={f"{name}.flange_from_camera": pose_toml(turned.pose)},
         )  # fmt: skip
     _board(eye, result, axes.across, axes.along, found)
 
@@ -104,24 +96,20 @@ def _board(eye: Eye, result: Result, across: float, along: float, found: RoughMo
     if abs(along / across - 1.0) > FOCAL_OFF:
         focal = eye.config.focal_length * across / along
         result.find(
-            Finding(
-                f"{eye.name}.focal_length",
-                "ways along the optical axis are seen longer or shorter than ways across it",
-                f"{1e3 * eye.config.focal_length:.2f} mm", found=f"{1e3 * focal:.2f} mm",
-                remedy="Read the focal length on the lens and the pixel's size in the camera's data sheet.",
-                write={f"{eye.name}.focal_length": f'"{1e3 * focal:.1f} mm"'},
-            )
+            f"{eye.name}.focal_length",
+            "ways along the optical axis are seen longer or shorter than ways across it",
+            f"{1e3 * eye.config.focal_length:.2f} mm", found=f"{1e3 * focal:.2f} mm",
+            remedy="Read the focal length on the lens and the pixel's size in the camera's data sheet.",
+            write={f"{eye.name}.focal_length": f'"{1e3 * focal:.1f} mm"'},
         )  # fmt: skip
         return
     if abs(across - 1.0) > PITCH_OFF:
         key, named = f"{eye.key}.board", renamed(eye.board, across)
         result.find(
-            Finding(
-                key, "the board has another pitch than its name says, by the ways of the arm",
-                f"{1e3 * eye.board.pitch:g} mm", found=f"{1e3 * eye.board.pitch * across:.2f} mm",
-                remedy="Measure from the first to the last point with a ruler, and name the board so.",
-                write={key: f'"{named}"'} if named != eye.board.name else {},
-            )
+            key, "the board has another pitch than its name says, by the ways of the arm",
+            f"{1e3 * eye.board.pitch:g} mm", found=f"{1e3 * eye.board.pitch * across:.2f} mm",
+            remedy="Measure from the first to the last point with a ruler, and name the board so.",
+            write={key: f'"{named}"'} if named != eye.board.name else {},
         )  # fmt: skip
         return
     drawn = eye.plate.base_from_board.se3()
@@ -130,11 +118,9 @@ def _board(eye: Eye, result: Result, across: float, along: float, found: RoughMo
     if np.linalg.norm(off) > MOST_MOVED:
         key = f"{eye.key}.base_from_board"
         result.find(
-            Finding(
-                key, "the board lies elsewhere on the deck", pose_words(drawn), found=pose_words(found.base_from_board),
-                remedy="Put it where it is drawn, or have the configuration say where it is.",
-                write={key: pose_toml(found.base_from_board)},
-            )
+            key, "the board lies elsewhere on the deck", pose_words(drawn), found=pose_words(found.base_from_board),
+            remedy="Put it where it is drawn, or have the configuration say where it is.",
+            write={key: pose_toml(found.base_from_board)},
         )  # fmt: skip
 
 

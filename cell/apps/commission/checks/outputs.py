@@ -9,8 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.apps.commission.check import CommissionCheck, Finding, Result
-from cell.apps.commission.workplace import CommissionWorkplace, camera_of, centred_view, eye_of
+from cell.apps.commission.check import CommissionCheck, Result
+from cell.apps.commission.measuring import camera_of, centred_view, eye_of
+from cell.apps.commission.workplace import CommissionWorkplace
 from cell.measure.vision import extract
 from drivers.errors import RefusedError
 from drivers.interfaces import Frame, Image
@@ -57,12 +58,8 @@ def _outputs(desk: CommissionWorkplace, result: Result) -> None:
         return
     laser, claw = config.laser.output, config.claw.output
     centred_view(desk, result, eye_of(desk, "scan_camera"))
-    desk.confirm(
-        "laser",
-        f"output {laser}: laser goggles on, nobody looks into the beam",
-        "half a second each time",
-        "on and off",
-    )
+    goggles = f"output {laser}: laser goggles on, nobody looks into the beam"
+    desk.confirm("laser", goggles, "half a second each time", "on and off")
     desk.confirm("claw", f"output {claw}: the claw opens and closes, hands out of it", "its whole stroke", "its own")
     if not desk.person.does("Take whatever is in the claw out of it: it will open."):
         raise RefusedError("the claw was not emptied, so its output was not switched. Take out what is in it")
@@ -84,13 +81,11 @@ def _outputs(desk: CommissionWorkplace, result: Result) -> None:
         _claw(desk, result)
     elif by_claw.stripe_rows >= enough and by_laser.stripe_rows < enough:
         result.find(
-            Finding(
-                "laser.output, claw.output",
-                "the outputs of laser and claw are swapped: the claw's output lights the laser",
-                f"laser {laser}, claw {claw}", found=f"laser {claw}, claw {laser}",
-                remedy="Swap the two numbers, or the two wires.",
-                write={"laser.output": str(claw), "claw.output": str(laser)},
-            )
+            "laser.output, claw.output",
+            "the outputs of laser and claw are swapped: the claw's output lights the laser",
+            f"laser {laser}, claw {claw}", found=f"laser {claw}, claw {laser}",
+            remedy="Swap the two numbers, or the two wires.",
+            write={"laser.output": str(claw), "claw.output": str(laser)},
         )  # fmt: skip
     else:
         _no_light(desk, result, laser, claw, enough)
@@ -109,13 +104,11 @@ def _no_light(desk: CommissionWorkplace, result: Result, laser: int, claw: int, 
                 if _switch(desk, output).stripe_rows >= enough:
                     lit.append(output)
     result.find(
-        Finding(
-            "laser.output", "no stripe comes when the laser's output is switched on",
-            str(laser), f"the laser is lit by output {lit[0]}" if lit else "no output lights it",
-            "See that laser.output is the connector that the laser hangs on, that the laser has power and its shutter "
-            "is open, and that calibration.stripe_exposure is long enough.",
-            write={"laser.output": str(lit[0])} if lit else {},
-        )
+        "laser.output", "no stripe comes when the laser's output is switched on",
+        str(laser), f"the laser is lit by output {lit[0]}" if lit else "no output lights it",
+        "See that laser.output is the connector that the laser hangs on, that the laser has power and its shutter "
+        "is open, and that calibration.stripe_exposure is long enough.",
+        write={"laser.output": str(lit[0])} if lit else {},
     )  # fmt: skip
 
 
@@ -168,19 +161,14 @@ def _stripe(desk: CommissionWorkplace, result: Result, lit: Frame) -> None:
         remedy=f"Raise {exposure}, or see that the line lies across the board.",
     )  # fmt: skip
     if len(rows):
-        width = float(np.median(profile.width[rows]))
-        result.measure(
-            "width of the stripe, one sigma", width, "px", most=WIDEST_STRIPE, remedy="Focus the laser on the board."
-        )
+        width, remedy = float(np.median(profile.width[rows])), "Focus the laser on the board."
+        result.measure("width of the stripe, one sigma", width, "px", most=WIDEST_STRIPE, remedy=remedy)
         across = np.clip(np.round(profile.pixels()[:, 0]).astype(int), 0, lit.image.shape[1] - 1)
         peak = lit.image[rows, across]
-        result.measure(
-            "brightness of the stripe, median", float(np.median(peak)), "DN", least=40.0, remedy=f"Raise {exposure}."
-        )
-        result.measure(
-            "stripe rows that are saturated", 100.0 * float((peak >= 255).mean()), "%", most=MOST_SATURATED,
-            remedy=f"Lower {exposure}.",
-        )  # fmt: skip
+        bright, saturated = float(np.median(peak)), 100.0 * float((peak >= 255).mean())
+        result.measure("brightness of the stripe, median", bright, "DN", least=40.0, remedy=f"Raise {exposure}.")
+        remedy = f"Lower {exposure}."
+        result.measure("stripe rows that are saturated", saturated, "%", most=MOST_SATURATED, remedy=remedy)
 
 
 def _claw(desk: CommissionWorkplace, result: Result) -> None:
@@ -192,7 +180,7 @@ def _claw(desk: CommissionWorkplace, result: Result) -> None:
     if not claw.holding:
         claw.grip(5.0)
     held = desk.devices.arm.state().digital_inputs
-    result.measure("claw.feedback shows the part when closed", float(claw.holding), "", least=1.0)
+    result.require("claw.feedback shows the part when closed", claw.holding)
     if not desk.person.does("Keep a hand below the part: the claw opens."):
         return
     with desk.cell.maintenance("commissioning: the claw opens in the open", ["claw_at_contact"]):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 
-from cell.apps.commission.check import CommissionCheck, Finding, Result
-from cell.apps.commission.workplace import CommissionWorkplace, centred_view, eye_of, see
+from cell.apps.commission.check import CommissionCheck, Result, refused
+from cell.apps.commission.measuring import centred_view, eye_of, see
+from cell.apps.commission.workplace import CommissionWorkplace
 from drivers.errors import DeviceFault, LimitError, RefusedError
 from drivers.interfaces import Nudged, Vector
 from drivers.make import RailConfig
@@ -80,13 +82,11 @@ def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
     if not ahead and aslant < MOST_SIDEWAYS:
         now = bool(getattr(rail, "reversed", False))
         result.find(
-            Finding(
-                "rail.reversed", "the carriage goes the other way than it is told: the rail's direction is reversed",
-                f"+{1e3 * abs(told):.1f} mm", f"{1e3 * moved[0] * np.sign(told):+.1f} mm along the camera's x axis",
-                "Have the module turn the motor the other way, or swap the two wires of one of its coils. If it was "
-                "seen by eye to go away from its home switch, the camera sits upside down on the carriage instead.",
-                write={"rail.reversed": str(not now).lower()} if hasattr(rail, "reversed") else {},
-            )
+            "rail.reversed", "the carriage goes the other way than it is told: the rail's direction is reversed",
+            f"+{1e3 * abs(told):.1f} mm", f"{1e3 * moved[0] * np.sign(told):+.1f} mm along the camera's x axis",
+            "Have the module turn the motor the other way, or swap the two wires of one of its coils. If it was "
+            "seen by eye to go away from its home switch, the camera sits upside down on the carriage instead.",
+            write={"rail.reversed": str(not now).lower()} if hasattr(rail, "reversed") else {},
         )  # fmt: skip
     ratio = way / abs(told)
     if abs(ratio - 1.0) > LEAD_OFF:
@@ -94,12 +94,10 @@ def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
         sold = min(SCREWS, key=lambda mm: abs(math.log(1e-3 * mm / lead)))
         value = 1e-3 * sold if abs(1e-3 * sold / lead - 1.0) < 0.04 else lead
         result.find(
-            Finding(
-                "rail.lead", f"the carriage goes {ratio:.2f} times as far as it is told",
-                f"{1e3 * rail.lead:g} mm a turn", found=f"{1e3 * lead:.2f} mm a turn",
-                remedy="Read the lead on the screw; steps per turn (motor) and microsteps (module) count as well.",
-                write={"rail.lead": f'"{1e3 * value:.4g} mm"'},
-            )
+            "rail.lead", f"the carriage goes {ratio:.2f} times as far as it is told",
+            f"{1e3 * rail.lead:g} mm a turn", found=f"{1e3 * lead:.2f} mm a turn",
+            remedy="Read the lead on the screw; steps per turn (motor) and microsteps (module) count as well.",
+            write={"rail.lead": f'"{1e3 * value:.4g} mm"'},
         )  # fmt: skip
 
 
@@ -146,25 +144,17 @@ def _limits(desk: CommissionWorkplace, result: Result) -> None:
     for name, end in (("low", low), ("high", high)):
         rail.move_to(end, speed).wait(3.0 * (high - low) / speed + 20.0)
         state = rail.state()
-        result.measure(
-            f"{name} end of the travel reached at",
-            1e3 * state.position,
-            "mm",
-            least=1e3 * end - 0.05,
-            most=1e3 * end + 0.05,
-        )
+        here, mm = 1e3 * state.position, 1e3 * end
+        result.measure(f"{name} end of the travel reached at", here, "mm", least=mm - 0.05, most=mm + 0.05)
         hit = state.left_switch or state.right_switch
-        result.measure(
-            f"limit switches active at the {name} end", float(hit), "", most=0.0,
-            remedy="Shorten rail.travel, so that its ends keep off the switches.",
-        )  # fmt: skip
-    refused = 0
-    for beyond in (low - 0.001, high + 0.001):
-        try:
-            rail.move_to(beyond, speed).wait(10.0)
-        except LimitError:
-            refused += 1
-    result.measure("commands 1 mm beyond an end refused", float(refused), "of 2", least=2.0)
+        remedy = "Shorten rail.travel, so that its ends keep off the switches."
+        result.measure(f"limit switches active at the {name} end", float(hit), "", most=0.0, remedy=remedy)
+
+    def go(place: float) -> None:
+        rail.move_to(place, speed).wait(10.0)
+
+    kept = sum(refused(partial(go, beyond), LimitError) for beyond in (low - 0.001, high + 0.001))
+    result.measure("commands 1 mm beyond an end refused", kept, "of 2", least=2.0)
     _switches(desk, result, speed)
     rail.move_to(0.5 * (low + high), speed).wait(60.0)
 
@@ -194,19 +184,17 @@ def _switches(desk: CommissionWorkplace, result: Result, speed: float) -> None:
             code = fault.code
             if code == "rail.switches":
                 result.find(
-                    Finding(
-                        code, fault.message, f"the {name} limit switch at the {name} end", "that of the other end",
-                        "Swap the wires of the two limit switches at the module: as they are, neither stops the "
-                        "carriage before the end of the rail.",
-                    )
+                    code, fault.message, f"the {name} limit switch at the {name} end", "that of the other end",
+                    "Swap the wires of the two limit switches at the module: as they are, neither stops the "
+                    "carriage before the end of the rail.",
                 )  # fmt: skip
                 _nudge(desk, -way)
                 return
         state = rail.state()
         hit = state.left_switch if name == "left" else state.right_switch
-        result.measure(
-            f"{name} limit switch stops the carriage", float(hit and code == "rail.limit_switch"), "", least=1.0,
-            remedy=f"No switch stopped it within {1e3 * BEYOND:.0f} mm: see the switch, its wire, and that it is on.",
+        result.require(
+            f"{name} limit switch stops the carriage", hit and code == "rail.limit_switch",
+            f"No switch stopped it within {1e3 * BEYOND:.0f} mm: see the switch, its wire, and that it is on.",
         )  # fmt: skip
         _nudge(desk, -way)
     rail.home().wait(120.0)

@@ -9,11 +9,11 @@ from functools import partial
 
 import numpy as np
 
-from cell.apps.commission.check import CommissionCheck, Result
+from cell.apps.commission.check import CommissionCheck, Result, refused
 from cell.apps.commission.workplace import CommissionWorkplace
 from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line
 from cell.run.recorded_work import Hands
-from drivers.errors import Aborted, CellError, InterlockError
+from drivers.errors import Aborted, InterlockError
 from drivers.interfaces import ArmSafety, Motion
 
 RAIL_SPEED = 0.020
@@ -46,13 +46,9 @@ def _stops(desk: CommissionWorkplace, result: Result) -> None:
 
 
 def _measured(
-    desk: CommissionWorkplace,
-    result: Result,
-    name: str,
-    cause: str,
-    start: Callable[[CommissionWorkplace], object],
+    desk: CommissionWorkplace, result: Result, name: str, cause: str, start: Callable[[CommissionWorkplace], object],
     stop: Callable[[CommissionWorkplace, Callable[[], None]], None],
-) -> None:
+) -> None:  # fmt: skip
     """Set the device in motion, stop it, and watch it until it rests."""
     _prepare(desk, name)
     marks: dict[str, float] = {}
@@ -74,15 +70,10 @@ def _measured(
         here = _place(desk, name)
         if abs(here - last) > AT_REST[name]:
             last, rested = here, desk.devices.clock.now()
-    factor = math.degrees(1.0) if name == "arm" else 1e3
+    way = abs(_place(desk, name) - marks["from"]) * (math.degrees(1.0) if name == "arm" else 1e3)
     hurry = max(1.0, desk.devices.clock.rate)
     result.measure(f"{name}, {cause}: time to rest, at most", rested - marks["at"], "s", most=MOST_S * hurry)
-    result.measure(
-        f"{name}, {cause}: way",
-        factor * abs(_place(desk, name) - marks["from"]),
-        UNITS[name],
-        most=MOST_WAY[name] * hurry,
-    )
+    result.measure(f"{name}, {cause}: way", way, UNITS[name], most=MOST_WAY[name] * hurry)
 
 
 def _prepare(desk: CommissionWorkplace, name: str) -> None:
@@ -92,12 +83,8 @@ def _prepare(desk: CommissionWorkplace, name: str) -> None:
         desk.confirm("rail", "the carriage", "a part of its travel", f"{1e3 * RAIL_SPEED:.0f} mm/s")
         desk.devices.rail.move_to(0.5 * (low + high), min(RAIL_SPEED, desk.config.rail.max_speed)).wait(60.0)
     elif name == "arm":
-        desk.confirm(
-            "joint 1",
-            "this joint alone",
-            f"up to {math.degrees(ARM_STEP):.0f} deg",
-            f"{math.degrees(ARM_SPEED):.0f} deg/s",
-        )
+        far, fast = f"up to {math.degrees(ARM_STEP):.0f} deg", f"{math.degrees(ARM_SPEED):.0f} deg/s"
+        desk.confirm("joint 1", "this joint alone", far, fast)
         desk.fold()
     else:
         desk.fold()
@@ -113,8 +100,7 @@ def _rail_moves(sign: float, desk: CommissionWorkplace) -> Motion:
 
 def _arm_moves(sign: float, desk: CommissionWorkplace) -> Motion:
     arm = desk.devices.arm
-    if not desk.devices.vehicle.state().braked:
-        desk.devices.vehicle.recover()
+    desk.brake()
     goal = arm.state().joints.copy()
     goal[0] += sign * ARM_STEP
     return arm.move_joints(goal, ARM_SPEED, math.radians(40.0))
@@ -197,27 +183,23 @@ def _vehicle_unrenewed(desk: CommissionWorkplace, result: Result) -> None:
 def _laser(desk: CommissionWorkplace, result: Result) -> None:
     """The laser goes off with a stop, whoever holds it."""
     desk.confirm("laser", "laser goggles on, nobody looks into the beam", "half a second", "on and off")
-    if not desk.devices.vehicle.state().braked:
-        desk.devices.vehicle.recover()
+    desk.brake()
     laser, clock = desk.devices.laser, desk.devices.clock
     with desk.devices.interlocks.purpose("test"), laser.lit():
         clock.sleep(0.2)
         begun = clock.now()
         desk.cell.stop()
-        result.measure(
-            "laser, Cell.stop(): off after, at most", clock.now() - begun, "s", most=MOST_S * max(1.0, clock.rate)
-        )
+        most = MOST_S * max(1.0, clock.rate)
+        result.measure("laser, Cell.stop(): off after, at most", clock.now() - begun, "s", most=most)
         result.measure("laser on after a stop", float(laser.is_on), "", most=0.0)
     desk.cell.clear_stop(BY)
 
 
 def _emergency(desk: CommissionWorkplace, result: Result) -> None:
     """A person stops the arm with the button while it turns; afterwards nothing goes on by itself."""
-    arm, clock = desk.devices.arm, desk.devices.clock
-    simulated = desk.simulated
+    arm, clock, simulated = desk.devices.arm, desk.devices.clock, desk.simulated
     desk.fold()
-    if not desk.devices.vehicle.state().braked:
-        desk.devices.vehicle.recover()
+    desk.brake()
     _arm_moves(1.0, desk)
     clock.sleep(BEFORE_S)
     begun, before = clock.now(), _place(desk, "arm")
@@ -237,20 +219,12 @@ def _emergency(desk: CommissionWorkplace, result: Result) -> None:
     while float(np.abs(arm.state().joint_speeds).max()) > 1e-3 and time.monotonic() < deadline:
         clock.sleep(PERIOD_S)
     result.notes.append(f"after the {cause} the arm told: {stopped.value}")
-    result.measure(f"arm, {cause}: it told so", float(stopped is not ArmSafety.NORMAL), "", least=1.0)
+    result.require(f"arm, {cause}: it told so", stopped is not ArmSafety.NORMAL)
     if simulated:
-        result.measure(
-            f"arm, {cause}: time to rest, at most", clock.now() - begun, "s", most=MOST_S * max(1.0, clock.rate)
-        )
-        result.measure(
-            f"arm, {cause}: way", math.degrees(abs(_place(desk, "arm") - before)), "deg", most=MOST_WAY["arm"]
-        )
-    refused = 0.0
-    try:
-        _arm_moves(1.0, desk).wait(1.0)
-    except CellError:
-        refused = 1.0
-    result.measure("a motion while it is stopped refused", refused, "", least=1.0)
+        most, way = MOST_S * max(1.0, clock.rate), math.degrees(abs(_place(desk, "arm") - before))
+        result.measure(f"arm, {cause}: time to rest, at most", clock.now() - begun, "s", most=most)
+        result.measure(f"arm, {cause}: way", way, "deg", most=MOST_WAY["arm"])
+    result.require("a motion while it is stopped refused", refused(lambda: _arm_moves(1.0, desk).wait(1.0)))
     if desk.person.does("Release the button, look that all is well, and switch the arm on again at its pendant."):
         arm.recover(confirmed=True)
     desk.fold()

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.commission.check import CommissionCheck, Finding, Result
+from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.checks.cameras import PITCH_OFF, renamed
 from cell.apps.commission.measuring import axes_from_shifts
 from cell.apps.commission.workplace import CommissionWorkplace
@@ -55,7 +55,7 @@ def _wheels(desk: CommissionWorkplace, result: Result) -> None:
     result.measure("aside, by the wheels' counters", 1e3 * there.y, "mm", least=-MOST_OFF_MM, most=MOST_OFF_MM)
     result.measure("turned, by the wheels' counters", math.degrees(there.yaw), "deg", least=-1.5, most=1.5)
     result.measure("after the way back", 1e3 * back.x, "mm", least=-MOST_OFF_MM, most=MOST_OFF_MM)
-    result.measure("a person saw it go ahead", float(seen), "", least=1.0)
+    result.require("a person saw it go ahead", seen)
 
 
 def _station(desk: CommissionWorkplace, result: Result) -> None:
@@ -122,11 +122,9 @@ def _by_board(desk: CommissionWorkplace, result: Result, odometry: RelativeOdome
         )
     if way[0] < 0.0:
         result.find(
-            Finding(
-                "arm.vehicle_from_base", "the vehicle goes the other way than the arm has it: away from the board",
-                f"{1e3 * counted:+.0f} mm", f"{1e3 * way[0]:+.0f} mm",
-                "Turn arm.vehicle_from_base by 180 deg about z, or have the vehicle's maker reverse its drives.",
-            )
+            "arm.vehicle_from_base", "the vehicle goes the other way than the arm has it: away from the board",
+            f"{1e3 * counted:+.0f} mm", f"{1e3 * way[0]:+.0f} mm",
+            "Turn arm.vehicle_from_base by 180 deg about z, or have the vehicle's maker reverse its drives.",
         )  # fmt: skip
         return
     result.measure(
@@ -186,11 +184,9 @@ def judge_board(job: str, board: BoardSpec, across: float, result: Result) -> No
     else:
         remedy += f'Below [board] in {path} it has to read spec = "{right}".'
     result.find(
-        Finding(
-            "board.spec of the job", "the station's board has another pitch than its name says, by the ways of the arm",
-            f"{1e3 * board.pitch:g} mm", f"{1e3 * board.pitch * across:.1f} mm", remedy,
-            write_job={} if ships(path) else {"board.spec": f'"{right}"'},
-        )
+        "board.spec of the job", "the station's board has another pitch than its name says, by the ways of the arm",
+        f"{1e3 * board.pitch:g} mm", f"{1e3 * board.pitch * across:.1f} mm", remedy,
+        write_job={} if ships(path) else {"board.spec": f'"{right}"'},
     )  # fmt: skip
 
 

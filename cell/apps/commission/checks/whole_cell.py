@@ -1,4 +1,6 @@
-"""The last four: calibration, its verification, the first job without a part up to the place, and the first part."""
+"""The cell as a whole. First, before anything moves: every device answers, is who it should be, and is well.
+
+The last four: calibration, its verification, the first job without a part up to the place, and the first part."""
 
 from __future__ import annotations
 
@@ -7,7 +9,33 @@ from functools import partial
 
 from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.workplace import CommissionWorkplace
+from cell.config.cell_config import DEVICES
+from cell.devices.diagnosis.diagnosis import STATES, ask
 from drivers.errors import CalibrationStale, RefusedError
+
+WHERE = tuple(
+    f"{name}.{key}" for name in DEVICES for key in ("driver", "address", "url", "channel", "interface", "model", "baud")
+)
+"""What tells who is connected, and where, whatever the make."""
+
+
+def _links(desk: CommissionWorkplace, result: Result) -> None:
+    devices, config = desk.devices, desk.cell.config
+    for name in STATES:
+        device = getattr(devices, name)
+        row = ask(name, config.device(name).place, getattr(device, "bare", device), devices.clock)
+        who = " ".join(part for part in (row.model, row.serial, row.firmware) if part)
+        result.notes.append(f"{name} ({DEVICES[name]}): {who or 'no identity'}, {row.state}")
+        result.require(f"{name} answers and is well", row.ok, f"See `cell diag --device {name}`.")
+        for reading in row.readings:
+            if not reading.ok:
+                result.measure(
+                    f"{name}: {reading.what}", reading.value, reading.unit, least=reading.least, most=reading.most,
+                    remedy=reading.remedy,
+                )  # fmt: skip
+    question = "Is the emergency stop within reach, the cell's surroundings clear, and nothing in the claw's way?"
+    result.require("a person has looked round", desk.person.sees(question))
+
 
 BEFORE_PLACING = "invert_pose"
 ALL = ("rail", "arm", "vehicle", "scan_camera", "target_camera", "laser", "claw", "calibration")
@@ -42,7 +70,7 @@ def _verify(desk: CommissionWorkplace, result: Result) -> None:
     for row in summary["figures"]:
         result.measure(f"{row['name']} (1 sigma {row['sigma']:.4f})", row["value"], row["unit"])
     result.notes.append(summary["reason"])
-    result.measure("calibration is good today", float(verification.good), "", least=1.0, remedy=str(summary["reason"]))
+    result.require("calibration is good today", verification.good, str(summary["reason"]))
 
 
 def _job(part: bool, desk: CommissionWorkplace, result: Result) -> None:
@@ -65,10 +93,10 @@ def _job(part: bool, desk: CommissionWorkplace, result: Result) -> None:
         if isinstance(row.get("value"), int | float):
             result.measure(str(row["name"]), row["value"], str(row.get("unit", "")))
     good = outcome.outcome == ("placed" if part else "done")
-    result.measure("placed" if part else "done up to the place pose", float(good), "", least=1.0, remedy=outcome.reason)
+    result.require("placed" if part else "done up to the place pose", good, outcome.reason)
 
 
-CHECKS = [
+CLOSING_CHECKS = [
     CommissionCheck(
         "calibration", "Calibration", "arm, rail and laser, over the two boards on the deck", "their whole reach there",
         fast="as configured", limit="solved, and its own checks good",
@@ -88,5 +116,12 @@ CHECKS = [
         "job_part", "First job with the part", "everything: vehicle, arm, rail, laser, claw", far="the whole job",
         fast="as configured", limit="placed",
         keys=(*ALL, "job"), needs=("job_empty",), work=partial(_job, True), recorded=False,
+    ),
+]  # fmt: skip
+LINK_CHECKS = [
+    CommissionCheck(
+        "links", "Links and identities: every device answers and is well",
+        "nothing", far="", fast="", limit="identity, round trips and figures as in `cell diag`",
+        keys=WHERE, needs=(), work=_links,
     ),
 ]  # fmt: skip
