@@ -77,7 +77,11 @@ GROUPS = (
     # Each worker gets two groups at first: a short one for the first, the screens for that of the arm.
     ("unit/cell/measure/calibration/test_archive.py",),
     ("unit/lab/bench/board/test_campaign.py",),
-    ("integration/console", "integration/browser"),
+    (
+        *(f"unit/cell/apps/console/{folder}" for folder in ("host", "server", "view")),
+        "integration/console",
+        "integration/browser",
+    ),
     # Long ones begin early, so that no worker is left with one of them at the end.
     ("integration/recorded/test_recorded_calibration.py", "integration/recorded/test_recorded_command.py"),
     ("unit/cell/measure/inversion/test_registration.py",),
@@ -96,7 +100,7 @@ VIRTUAL_JOB = 3
 HERE = Path(__file__).parent
 PLACES = {HERE / name: (number, k) for number, group in enumerate(GROUPS) for k, name in enumerate(group)}
 WIRES = HERE / "integration" / "wire"
-SCREENS = (HERE / "integration" / "browser", HERE / "integration" / "console")
+SCREENS = tuple(HERE / name for name in ("integration/browser", "integration/console", "unit/cell/apps/console"))
 ON_THE_WALL = (*SCREENS, HERE / "unit" / "drivers" / "vehicle" / "test_agilex.py")
 WHOLE_CELL, COMPUTES = 5, 19
 """How much nicer than a single device, whose times are compared to milliseconds, the others are: a whole cell keeps

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.apps.console.messages import CloudPart, Show, ShownPicture
+from cell.apps.console.host.link import CloudPart, Show, ShownPicture
 from tests.support.console.server import Served, serving
 
 pytestmark = pytest.mark.campaign

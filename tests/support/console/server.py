@@ -13,10 +13,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import pytest
 from websockets.sync.client import ClientConnection, connect
 
-from cell.apps.console.host.link import ServerProcess
-from cell.apps.console.messages import Answer, AskCell, Do, Ready, ServerSetup
+from cell.apps.console.host.controller import ConsoleController
+from cell.apps.console.host.link import Answer, AskCell, Do, Ready, ServerProcess, ServerSetup
+from drivers.errors import CellError
 
 HOSTS = ("127.0.0.1", "localhost")
 
@@ -64,6 +66,11 @@ class Served:
         self.stops += 1
         time.sleep(self.stop_s)
         return self.trouble
+
+    def forget(self) -> None:
+        """Hear nothing of what was said until now."""
+        while not self.heard.empty():
+            self.heard.get()
 
     # --- clients ---
 
@@ -161,6 +168,13 @@ class Reply:
         return json.loads(self.text)
 
 
+def refusal(desk: ConsoleController, client: str, **words: Any) -> CellError:
+    """What a desk answers to a command that it refuses."""
+    with pytest.raises(CellError) as refused:
+        desk.do(client, words)
+    return refused.value
+
+
 @contextmanager
 def serving(runs: Path, lasting: str | None = None) -> Iterator[Served]:
     """A server; ended afterwards."""
@@ -179,3 +193,11 @@ def until(true: Any, seconds: float = 10.0) -> bool:
             return True
         time.sleep(0.01)
     return False
+
+
+def running(pid: int) -> bool:
+    """Whether a process lives, and is no corpse that nobody has looked at."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False

@@ -18,9 +18,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from cell.apps.console.host.controller import ConsoleController
-from cell.apps.console.host.link import ServerProcess
+from cell.apps.console.host.link import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, ServerProcess, ServerSetup
 from cell.apps.console.host.observer import CellObserver
-from cell.apps.console.messages import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, ServerSetup
 from cell.apps.console.view.readings import cell_facts
 from cell.config.job import load_job
 from cell.procedures.steps.kinds import find_kind

@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from cell.apps.console.host.controller import ConsoleController
-from cell.apps.console.messages import CloudPart, Happened, Show, ShownPicture
+from cell.apps.console.host.link import CloudPart, Happened, Show, ShownPicture
 from cell.apps.console.view.archive import true_error_mm
 from cell.apps.console.view.readings import Readings
 from cell.apps.console.view.run_view import GrowingCloud, Pictures, RunView

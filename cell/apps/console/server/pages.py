@@ -6,14 +6,15 @@ import asyncio
 import itertools
 import json
 import secrets
+from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from cell.apps.console.messages import Beat, Joined, Left
+from cell.apps.console.host.link import Beat, Joined, Left
 from cell.apps.console.server.access import Bucket
-from cell.apps.console.server.commands import Mailbox, checked_message
+from cell.apps.console.server.commands import checked_message
 from drivers.errors import ConfigError
 
 VERSION = 1
@@ -27,8 +28,68 @@ PATIENCE_S = 10.0
 """Wall seconds after which a page that takes nothing is given up."""
 MOST_CLOUD_BYTES = 8_000_000
 """Of the cloud so far, which a page that comes later is given."""
+MOST_EVENTS, MOST_CLOUDS, MOST_WORDS = 100, 64, 100
+"""That wait for one page."""
 MALFORMED, TOO_MANY, FULL = 1007, 1008, 1013
 """Codes with which a page's link is closed."""
+
+
+class Mailbox:
+    """What waits to be sent to one page: of what is shown only the newest, of the cloud every increment up to a bound.
+
+    A page that reads slowly sees less often, and holds nobody up. In the event loop's thread.
+    """
+
+    def __init__(self) -> None:
+        self._words: deque[str | bytes] = deque(maxlen=MOST_WORDS)
+        self._events: deque[str | bytes] = deque(maxlen=MOST_EVENTS)
+        self._newest: dict[str, str | bytes] = {}
+        self._clouds: deque[str | bytes] = deque(maxlen=MOST_CLOUDS)
+        self._news = asyncio.Event()
+
+    def say(self, item: str | bytes) -> None:
+        """Something to this page alone, in its order."""
+        self._put(self._words, item)
+
+    def event(self, item: str | bytes) -> None:
+        """Something for the list; who is slow misses the oldest."""
+        self._put(self._events, item)
+
+    def cloud(self, item: str | bytes) -> None:
+        """An increment of the cloud."""
+        self._put(self._clouds, item)
+
+    def show(self, what: str, item: str | bytes) -> None:
+        """The newest of its kind, in place of one that was not sent yet."""
+        self._newest[what] = item
+        self._news.set()
+
+    def clear_cloud(self) -> None:
+        """What waits of the cloud is not wanted any more."""
+        self._clouds.clear()
+
+    async def take(self) -> str | bytes:
+        """The next to send; waits for it."""
+        while True:
+            for queue in (self._words, self._events):
+                if queue:
+                    return queue.popleft()
+            if self._newest:
+                what = next(iter(self._newest))
+                return self._newest.pop(what)
+            if self._clouds:
+                return self._clouds.popleft()
+            self._news.clear()
+            await self._news.wait()
+
+    @property
+    def waiting(self) -> int:
+        """How much waits."""
+        return len(self._words) + len(self._events) + len(self._newest) + len(self._clouds)
+
+    def _put(self, queue: deque[str | bytes], item: str | bytes) -> None:
+        queue.append(item)
+        self._news.set()
 
 
 class Page:

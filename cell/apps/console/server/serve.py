@@ -29,7 +29,7 @@ import uvicorn
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from cell.apps.console.messages import (
+from cell.apps.console.host.link import (
     MOST_STOPS,
     Answer,
     AskCell,

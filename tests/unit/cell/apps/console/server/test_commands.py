@@ -16,7 +16,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection
 
 from cell.apps.console.host.console import Console
-from cell.apps.console.messages import Answer, Beat, Do, Joined, Left
+from cell.apps.console.host.link import Answer, Beat, Do, Joined, Left
 from cell.apps.console.server.commands import COMMANDS, MESSAGES
 from cell.run.session.supervisor import Cell
 from tests.support.console.server import Served, serving

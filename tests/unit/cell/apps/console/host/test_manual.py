@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import threading
 import time
+from contextlib import nullcontext
+from typing import Any
 
+import numpy as np
+import pytest
+
+from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.host.manual import LATE_S, Presses
+from cell.run.session.supervisor import Cell
 from drivers.errors import InterlockError
 from drivers.interfaces import ATTENDED_S
+from tests.support.console.server import until
 
 Z_UP = ("arm", "z", 1)
 
@@ -93,3 +101,44 @@ def test_who_waits_for_the_end_hears_it_at_once() -> None:
     press.wait(5.0)
     assert time.monotonic() - begun < 1.0
     assert press.over() == "stopped"
+
+
+@pytest.mark.parametrize(("device", "axis"), [("arm", "z"), ("arm", "j1"), ("rail", "")])
+@pytest.mark.parametrize("end", ["release", "page gone", "another button", "manual off", "silence"])
+def test_what_ends_a_held_button_stops_the_motion(
+    cell: Cell, desk: ConsoleController, monkeypatch: pytest.MonkeyPatch, device: str, axis: str, end: str
+) -> None:
+    """Virtual time passes here alone: what moves on after the end would be seen to."""
+    cell.home("rail")
+    told: list[str] = []
+    moved: Any = getattr(cell.devices, device)
+    monkeypatch.setattr(moved.bare, "attended", lambda: nullcontext(lambda: None), raising=False)
+    monkeypatch.setattr("cell.apps.console.host.manual.ATTENDED_S", 60.0)
+    monkeypatch.setattr(desk, "_say", lambda client, words: told.append(words["state"]))
+    desk.do("c1", {"do": "hold", "name": "Ann"})
+    desk.do("c1", {"do": "manual", "on": True})
+
+    def beat(number: int) -> None:
+        desk.beat("c1", {"type": "jog", "press": number, "device": device, "axis": axis, "sign": 1, "at": None})
+
+    def place() -> Any:
+        return moved.state().position if device == "rail" else moved.state().joints
+
+    begun = place()
+    beat(1)
+    assert until(lambda: told == ["moving"])
+    cell.devices.clock.sleep(0.3)
+    assert np.abs(place() - begun).max() > 1e-4
+    ends: dict[str, Any] = {
+        "release": lambda: desk.jog_end("c1"), "page gone": lambda: desk.left("c1"), "another button": lambda: beat(2),
+        "manual off": lambda: desk.do("c1", {"do": "manual", "on": False}),
+        "silence": lambda: monkeypatch.setattr("cell.apps.console.host.manual.ATTENDED_S", 0.0),
+    }  # fmt: skip
+    ends[end]()
+    assert until(lambda: told == ["moving", "ended"])
+    stood = place()
+    cell.devices.clock.sleep(0.5)
+    assert np.abs(place() - stood).max() < 1e-5
+    beat(1)
+    cell.devices.clock.sleep(0.5)
+    assert np.abs(place() - stood).max() < 1e-5
