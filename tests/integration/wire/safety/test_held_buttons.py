@@ -12,13 +12,12 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from tests.integration.console.test_console import Browser
 from websockets.sync.client import ClientConnection
 
 from cell.apps.console.host.console import Console
 from cell.run.session.supervisor import Cell
 from drivers.clock import Clock
-from tests.support.console.server import until
+from tests.support.console.server import Browser, until
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
