@@ -44,7 +44,7 @@ GROUPS = (
         "unit/drivers/test_last_words.py",
         "integration/wire/safety/test_safe_stop_over_wires.py",
         "unit/drivers/arm/test_session.py",
-        "integration/wire/arm/test_arm_driver.py",
+        "unit/drivers/arm/test_ur.py",
         "unit/drivers/camera/test_stream.py",
         "unit/drivers/camera/genicam/test_camera.py",
         "integration/wire/camera/test_aravis_fake_camera.py",

@@ -10,11 +10,14 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 
+from drivers.arm.feed import Snapshot
 from drivers.clock import Clock
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
@@ -127,6 +130,44 @@ def _main(speed: float, table: float | None, name: str, factory: list[list[float
                 model.fault(fault)
         print(json.dumps(answer), flush=True)
     peer.stop()
+
+
+def joints_away(arm, radians):
+    return arm.state().joints + np.array([radians, 0, 0, 0, 0, 0])
+
+
+def swing(arm, radians, seconds):
+    """Times and joints of a smooth turn of the first joint from where the arm stands."""
+    times = np.linspace(0.0, seconds, int(seconds / 0.008) + 2)
+    part = 0.5 * (1.0 - np.cos(np.pi * times / seconds))
+    return times, arm.state().joints + part[:, None] * np.array([radians, 0, 0, 0, 0, 0])
+
+
+def gone(pid):
+    """True once the process is no more (or only waits to be reaped)."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
+    except FileNotFoundError:
+        return True
+
+
+def snapshot(stamp, **shown):
+    """A state packet of an arm that stands, at `stamp`, but for what is `shown`."""
+    still = (0.0,) * 6
+    usual = {"safety_bits": 1, "mode": 7, "runtime": 2, "inputs": 0, "outputs": 0}
+    return Snapshot(stamp, still, still, still, still, **usual | shown)
+
+
+def keep_outputs(bench):
+    """Have the controller keep the laser's output when no program runs, so that only the driver can switch it off."""
+    with socket.create_connection((bench.address, 30002), timeout=5.0) as connection:
+        connection.sendall(
+            b"sec keep():\n"
+            + b"".join(b"  set_runstate_standard_digital_output_to_value(%d, 0)\n" % k for k in (0, 2))
+            + b"end\n"
+        )
+        connection.recv(4096)
+        Clock().sleep(0.05)
 
 
 if __name__ == "__main__":
