@@ -30,17 +30,6 @@ class Bound:
     covariance: Array
     error: Array = field(default_factory=lambda: np.zeros(SHARED))
 
-    def with_known(self, parameters: Sequence[int]) -> Bound:
-        """The bound when some parameters are known beforehand; their errors are zero."""
-        known = np.array(parameters)
-        free = np.setdiff1d(np.arange(SHARED), known)
-        fixed = self.covariance[np.ix_(known, known)]
-        gain = np.linalg.solve(fixed, self.covariance[np.ix_(known, free)]).T
-        made, error = np.zeros_like(self.covariance), np.zeros(SHARED)
-        made[np.ix_(free, free)] = self.covariance[np.ix_(free, free)] - gain @ self.covariance[np.ix_(known, free)]
-        error[free] = self.error[free] - gain @ self.error[known]
-        return Bound(made, error)
-
     def draws(self, rng: np.random.Generator) -> Array:
         """Errors (200, 26) of the shared parameters as the best calibration would make them."""
         scale = np.sqrt(np.maximum(np.diag(self.covariance), 1e-30))

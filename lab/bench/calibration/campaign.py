@@ -1,7 +1,7 @@
 """The campaign behind `cell bench calibration`: many heads calibrated from drawn observations, errors beside the bound.
 
 Each seed draws a head and its noise. The product's own calibration solves it, and points are measured with both.
-Frames are kept apart: the camera's alone is partly gauge, the arm's base is what placing feels.
+Frames are kept apart: where the scan frame lies is partly gauge, the arm's base is what placing feels.
 """
 
 from __future__ import annotations
@@ -27,17 +27,11 @@ from lab.bench.calibration.world import (
 )
 from lab.bench.over_cores import run_all
 
-FRAMES = ("camera", "scan", "scan_radial_lens", "scan_aligned", "base")
+FRAMES = ("scan", "scan_aligned", "base")
 SCAN_POINTS, BASE_POINTS = 1000, 45
 STAND_OFF, RELIEF = 0.130, 0.015
-TANGENTIAL = (6, 7)
 LENS_TO_MOUNT = 20
 """So many of the generator's parameters describe the head itself; the rest is the board."""
-THEORY_MM = {
-    "scan_radial_lens": {"mean": 0.047, "max": 0.112, "p85": 0.063},
-    "base": {"mean": 0.067, "max": 0.108, "p85": 0.082},
-}
-"""What a prototype reached for the same noise: docs/explanation/theory.md, section 12."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,18 +75,13 @@ def one_trial(seed: int, noise: Noise) -> Trial:
     found = joint.adjusted
     exact = Adjustment(joint.views, shared_mask(plane=True, rail=True), Priors(*_as_drawn(priors)))
     fixed = exact.solve(start_state(joint.staged), variance_rounds=0)
-    radial = solve_joint(observations, joint.staged, priors, tangential=False, held_out=False).adjusted
-    estimates = {frame: _as_world(world, found.state) for frame in FRAMES}
-    estimates["scan_radial_lens"] = _as_world(world, radial.state)
+    estimate = _as_world(world, found.state)
     error = _parameter_errors(found.state, world)
     covariance = found.covariance[: len(error), : len(error)]
     sigma = np.sqrt(np.diag(covariance))
     free = sigma > 0
     best = cramer_rao(world, noise, observations)
-    errors = {}
-    for frame in FRAMES:
-        known = best.with_known(TANGENTIAL) if frame == "scan_radial_lens" else best
-        errors[frame] = measured_errors(world, estimates[frame], known, frame, noise, rng)
+    errors = {frame: measured_errors(world, estimate, best, frame=frame, noise=noise, rng=rng) for frame in FRAMES}
     head = slice(0, LENS_TO_MOUNT)
     return Trial(
         seed,
@@ -196,7 +185,7 @@ def summed_up(trials: Sequence[Trial], noise: Noise) -> dict[str, Any]:
     for frame in FRAMES:
         mean = {key: float(np.mean([t.errors[frame][key] for t in trials])) for key in trials[0].errors[frame]}
         ratios = {"ratio": mean["mean"] / mean["bound_mean"], "ratio_same_noise": mean["mean"] / mean["best_mean"]}
-        frames[frame] = {**mean, **ratios, "theory": THEORY_MM.get(frame)}
+        frames[frame] = {**mean, **ratios}
     chi2 = [t.chi2_per_dof for t in trials]
     drawn = [t.chi2_drawn_noise for t in trials]
     return {
@@ -229,13 +218,10 @@ def measured_errors(
     Stripe and rail (and the arm, in its base) have fresh noise, as when a surface is scanned.
     """
     count = BASE_POINTS if frame == "base" else SCAN_POINTS
-    rail_noise = 0.0 if frame == "camera" else noise.rail
     pixels, rails = sweep_points(world, count, rng)
-    if frame == "camera":
-        rails = np.zeros(count)
     truth = _in_frame(world, pixels, rails, frame)
     noisy = pixels + np.column_stack([noise.stripe * rng.normal(size=count), np.zeros(count)])
-    readings = rails + rail_noise * rng.normal(size=count)
+    readings = rails + noise.rail * rng.normal(size=count)
     both = (estimate, world.moved(best.error))
     off = np.array([_in_frame(head, noisy, readings, frame) - truth for head in both])
     draws = best.draws(rng)
@@ -245,7 +231,7 @@ def measured_errors(
     by_rail = (_in_frame(world, pixels, rails + 1e-6, frame) - truth) / 1e-6
     bound = (draws @ jacobian.T).reshape(len(draws), count, 3)
     bound += by_pixel * noise.stripe * rng.normal(size=(len(draws), count, 1))
-    bound += by_rail * rail_noise * rng.normal(size=(len(draws), count, 1))
+    bound += by_rail * noise.rail * rng.normal(size=(len(draws), count, 1))
     if frame == "base":
         # The arm stands at one pose for the sweep, where it does not quite stand as it says.
         arm = noise.own[:6] * rng.normal(size=(len(draws) + 1, 6))

@@ -127,12 +127,7 @@ def _range(values: Array) -> list[float]:
     return [float(values.min()), float(values.max())]
 
 
-GROUPS = {
-    "camera": range(9),
-    "light plane": range(9, 12),
-    "rail": range(12, 15),
-    "hand-eye": range(15, 21),
-}
+GROUPS = {"camera": range(9), "light plane": range(9, 12), "rail": range(12, 15), "hand-eye": range(15, 21)}
 UNITS = ("px",) * 4 + ("",) * 5 + ("mrad",) * 2 + ("mm",) + ("",) * 3 + ("mm",) * 3 + ("mrad",) * 3
 STEP_SIGMAS = 0.1
 

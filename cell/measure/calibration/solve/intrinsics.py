@@ -65,10 +65,7 @@ class LensModel:
 PLAIN = LensModel("no distortion")
 GIVEN = LensModel("given", given=True)
 RADIAL = (LensModel("k1", k1=True), LensModel("k1, k2", k1=True, k2=True))
-FURTHER = (
-    ("k3", {"k1": True, "k2": True, "k3": True}),
-    ("tangential", {"tangential": True}),
-)
+FURTHER = (("k3", {"k1": True, "k2": True, "k3": True}), ("tangential", {"tangential": True}))
 
 
 @dataclass(frozen=True, eq=False)

@@ -393,9 +393,5 @@ def _scatter(
     apart = np.array([difference(b, middle) for b in boards])
     squares = np.mean(apart**2, axis=0)
     return HandEye(
-        flange_from_camera,
-        direction,
-        middle,
-        float(np.sqrt(squares[:3].sum())),
-        float(np.sqrt(squares[3:].sum())),
+        flange_from_camera, direction, middle, float(np.sqrt(squares[:3].sum())), float(np.sqrt(squares[3:].sum()))
     )

@@ -38,12 +38,7 @@ def rolled_laser(angle: float) -> LaserOptics:
 
 
 def seen(
-    angle: float,
-    seed: int,
-    shift: float = 0.0,
-    rows: int = 480,
-    off: float = 0.0,
-    laser: LaserOptics | None = None,
+    angle: float, seed: int, shift: float = 0.0, rows: int = 480, off: float = 0.0, laser: LaserOptics | None = None
 ) -> PlateLine:
     """The line on a plate 85 mm away and `off` m more, tilted by 3°, with noise, the whole picture `shift` px aside."""
     plate = np.eye(4)

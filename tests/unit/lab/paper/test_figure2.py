@@ -11,8 +11,17 @@ import typer
 from typer.testing import CliRunner
 
 from lab.cli import register
-from lab.paper.design import Head, Light, delta_limit, errors, largest_dz, peak_power, uniformity
-from lab.paper.figure2 import figure2, smallest_baseline
+from lab.paper.figure2 import (
+    Head,
+    Light,
+    delta_limit,
+    errors,
+    figure2,
+    largest_dz,
+    peak_power,
+    smallest_baseline,
+    uniformity,
+)
 
 
 def light_point(x: np.ndarray, y: np.ndarray, baseline: float, focal: float, theta: float) -> np.ndarray:
@@ -86,9 +95,6 @@ def test_the_paper_is_told_right_and_wrong() -> None:
     result = figure2()
     assert result["choice"]["chosen_mm"] == 35.0
     assert result["choice"]["chosen_for_delta_um"] == pytest.approx([0.30, 0.5365], abs=1e-3)
-    verdicts = {row["paper"]: row for row in result["statements"]}
-    assert "0.358 and 0.200" in verdicts["error < 0.5 mm at l = 30 mm and < 0.2 mm at l = 35 mm"]["why"]
-    assert "0.419" in verdicts["with l = 35 mm, tanθ = 3.5 and the system at 150 mm"]["why"]
     # With θ held, the error grows with the baseline, as 35 to 30; with the distance held it falls.
     held = [largest_dz(Head(baseline, 8e-3, float(np.arctan(3.5))), 0.48e-6) for baseline in (0.030, 0.035)]
     assert held[1] / held[0] == pytest.approx(35 / 30)
