@@ -6,13 +6,13 @@ with noise. Frames: the camera's at rail position 0 for scans, the arm's base fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.measure.calibration import Priors, ScanCalibration, ScanObservation
+from cell.measure.calibration import ScanCalibration, ScanObservation
 from cell.measure.calibration.solve.joint import solve_joint, solve_staged
 from cell.measure.calibration.solve.results import KEPT, Quality
 from cell.measure.geometry.camera import CameraModel
@@ -21,6 +21,7 @@ from cell.measure.geometry.poses import from_axes, from_parts, perturbed
 from cell.measure.reconstruction import ScanGeometry
 from cell.measure.vision import BoardView, parse_board
 from cell.measure.vision.stripe.extract import StripeProfile
+from lab.bench.calibration.world import Noise, centroids, circle
 from sim_backends.optics import Board, BoardInstance, CameraOptics, LaserOptics, Mesh, MeshInstance
 from sim_backends.optics.laser.sheet import lit
 from sim_backends.optics.laser.stripe import crossings
@@ -35,37 +36,6 @@ Indices = NDArray[np.intp]
 
 DIRECTIONS = 300
 """Directions, evenly over the sphere, over which the mean length of a Gaussian error is taken."""
-
-
-@dataclass(frozen=True)
-class Noise:
-    """One standard deviation of each: dots, stripe in px, rail reading in m, arm in m (radial) and rad (per axis)."""
-
-    dots: float = 0.05
-    stripe: float = 0.07
-    rail: float = 0.02e-3
-    arm: float = 0.05e-3
-    arm_turn: float = 0.1e-3
-
-    def times(self, factor: float) -> Noise:
-        """The same noise, all of it `factor` times as large."""
-        values = {name: factor * value for name, value in vars(self).items()}
-        return replace(self, **values)
-
-    @property
-    def priors(self) -> Priors:
-        """The same for the adjustment."""
-        return Priors(arm_translation=self.arm / np.sqrt(3), arm_rotation=self.arm_turn, rail=self.rail)
-
-    def as_dict(self) -> dict[str, float]:
-        """For reports."""
-        return {
-            "dots_px": self.dots,
-            "stripe_px": self.stripe,
-            "rail_mm": 1e3 * self.rail,
-            "arm_mm_radial": 1e3 * self.arm,
-            "arm_mrad_per_axis": 1e3 * self.arm_turn,
-        }
 
 
 @dataclass(frozen=True)
@@ -160,19 +130,14 @@ def draw_head(spec: RigSpec, rng: np.random.Generator, level: str = "nominal") -
 
 def arm_error(noise: Noise, rng: np.random.Generator) -> Array:
     """(6,) m and rad: how far the flange stands off what the arm reports, anew at each pose."""
-    return np.concatenate([noise.arm / np.sqrt(3) * rng.standard_normal(3), noise.arm_turn * rng.standard_normal(3)])
+    return np.concatenate([noise.arm / np.sqrt(3) * rng.standard_normal(3), noise.arm_angle * rng.standard_normal(3)])
 
 
 def dot_centres(optics: CameraOptics, camera_from_board: pin.SE3, board: Board) -> Array:
     """Centres (n, 2) px of the dots' images: centroids of their projected rims."""
-    angle = np.linspace(0, 2 * np.pi, RIM, endpoint=False)
-    ring = board.dot_radius * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(RIM)])
+    ring = board.dot_radius * circle(RIM)
     rims = (board.points[:, None] + ring).reshape(-1, 3) @ camera_from_board.rotation.T + camera_from_board.translation
-    pixels = optics.project(rims).reshape(-1, RIM, 2)
-    middle = pixels.mean(axis=1, keepdims=True)
-    a, b = pixels - middle, np.roll(pixels, -1, axis=1) - middle
-    area = a[:, :, 0] * b[:, :, 1] - a[:, :, 1] * b[:, :, 0]
-    return np.asarray(middle[:, 0] + ((a + b) * area[:, :, None]).sum(axis=1) / (3 * area.sum(axis=1))[:, None])
+    return centroids(optics.project(rims).reshape(-1, RIM, 2))
 
 
 def profile_of(columns: Array, sigma: float) -> StripeProfile:

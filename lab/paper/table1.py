@@ -183,7 +183,7 @@ def _forty_five(solved: Solved, flange_from_camera: pin.SE3, swept: Sweep, rng: 
     errors: dict[str, list[Array]] = {name: [] for name in solved.ways()}
     covariances = []
     noise = SPEC.noise
-    arm = np.diag([noise.arm**2 / 3] * 3 + [noise.arm_turn**2] * 3)
+    arm = np.diag([noise.arm**2 / 3] * 3 + [noise.arm_angle**2] * 3)
     variants = solved.calibration.variants()
     lines, rows = np.nonzero(np.isfinite(swept.centres))
     parts = np.array_split(np.arange(len(lines)), SEGMENTS)

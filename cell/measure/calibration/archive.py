@@ -90,8 +90,8 @@ def write_archive(path: Path, observations: Observations) -> None:
     about = {
         "format": FORMAT, "made": o.made, "identities": o.identities, "configuration": o.configuration,
         "kinematics": o.kinematics, "rail_lead": o.rail_lead,
-        "priors": {name: getattr(o.priors, name) for name in PRIORS}, "scan_camera": _camera_dict(o.scan_camera),
-        "target_camera": _camera_dict(o.target_camera),
+        "priors": {name: getattr(o.priors, name) for name in PRIORS}, "scan_camera": o.scan_camera.as_dict(),
+        "target_camera": o.target_camera.as_dict(),
     }  # fmt: skip
     arrays = _views("scan", [(s.view, s.base_from_flange, s.name) for s in o.scan])
     arrays |= _views("target", [(t.view, t.base_from_flange, t.name) for t in o.target])
@@ -279,13 +279,8 @@ def _pose(matrix: Array, name: str) -> pin.SE3:
     return pin.SE3(rotation, matrix[:3, 3].copy())
 
 
-def _camera_dict(camera: CameraModel) -> dict[str, object]:
-    return {"width": camera.width, "height": camera.height, "parameters": camera.parameters.tolist()}
-
-
 def _camera(data: Mapping[str, Any]) -> CameraModel:
-    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, fy=1.0, cx=0.0, cy=0.0)
-    made = model.with_parameters(data["parameters"])
+    made = CameraModel.read(data)
     if not np.isfinite(made.parameters).all() or made.fx <= 0 or made.fy <= 0:
         raise ValueError("a nominal camera needs finite parameters and focal lengths above 0 px")
     return made

@@ -10,7 +10,9 @@ section 6)."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -46,6 +48,16 @@ class CameraModel:
         """The same sensor with other parameters, in the order of `PARAMETER_NAMES`."""
         fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(v) for v in np.asarray(values, dtype=np.float64))
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, dist=(k1, k2, p1, p2, k3))
+
+    def as_dict(self) -> dict[str, object]:
+        """For storage."""
+        return {"width": self.width, "height": self.height, "parameters": self.parameters.tolist()}
+
+    @classmethod
+    def read(cls, data: Mapping[str, Any]) -> CameraModel:
+        """From storage; KeyError, TypeError or ValueError when it is none."""
+        sensor = cls(int(data["width"]), int(data["height"]), 1.0, fy=1.0, cx=0.0, cy=0.0)
+        return sensor.with_parameters(data["parameters"])
 
     def project(self, points: ArrayLike) -> Array:
         """Pixels (n, 2) of points (n, 3) in the camera frame, in m; NaN for points that are not in front."""

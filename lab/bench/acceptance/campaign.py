@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from cell.measure.reconstruction import Cloud
 from drivers.errors import RefusedError
 from lab.bench.acceptance import artefacts
-from lab.paper.rig import Noise, RigSpec, draw_head, in_scan_frame, observe, solve
+from lab.bench.calibration.world import Noise
+from lab.paper.rig import RigSpec, draw_head, in_scan_frame, observe, solve
 from sim_backends.world.levels import deviations
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ Frames are kept apart: where the scan frame lies is partly gauge, the arm's base
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -63,17 +63,17 @@ def one_trial(seed: int, noise: Noise) -> Trial:
     """Draw, calibrate, measure."""
     from cell.config.calibrations.store import nominal_camera
     from cell.config.cell_config import load_config
-    from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
+    from cell.measure.calibration.solve.adjustment import Adjustment, shared_mask
     from cell.measure.calibration.solve.joint import solve_joint, solve_staged, start_state
 
     rng = np.random.default_rng(seed)
     world = draw_head(rng)
     observations = observe(world, noise, rng)
     nominal = nominal_camera(load_config(None).scan_camera)
-    priors = Priors(noise.arm / np.sqrt(3), noise.arm_angle, noise.rail)
+    priors = noise.priors
     joint = solve_joint(observations, solve_staged(observations, nominal), priors, held_out=False)
     found = joint.adjusted
-    exact = Adjustment(joint.views, shared_mask(plane=True, rail=True), Priors(*_as_drawn(priors)))
+    exact = Adjustment(joint.views, shared_mask(plane=True, rail=True), replace(priors, dots_scale=1.0))
     fixed = exact.solve(start_state(joint.staged), variance_rounds=0)
     estimate = _as_world(world, found.state)
     error = _parameter_errors(found.state, world)
@@ -126,11 +126,6 @@ def observe(world: HeadWorld, noise: Noise, rng: np.random.Generator) -> list[An
         reading = float(world.rails[view] + noise.rail * rng.normal())
         made.append(ScanObservation(board, stripe, from_matrix(world.flanges[view]), reading, f"view {view + 1}"))
     return made
-
-
-def _as_drawn(priors: Any) -> tuple[Any, ...]:
-    """The priors with the noise of dots and stripe taken as stated."""
-    return priors.arm_translation, priors.arm_rotation, priors.rail, False, 1.0, 1.0
 
 
 def _as_world(world: HeadWorld, state: Any) -> HeadWorld:
@@ -190,10 +185,7 @@ def summed_up(trials: Sequence[Trial], noise: Noise) -> dict[str, Any]:
     drawn = [t.chi2_drawn_noise for t in trials]
     return {
         "seeds": len(trials),
-        "assumed_noise": {
-            "dots_px": noise.dots, "stripe_px": noise.stripe, "rail_mm": 1e3 * noise.rail,
-            "arm_radial_mm": 1e3 * noise.arm, "arm_rotation_mrad": 1e3 * noise.arm_angle,
-        },
+        "assumed_noise": noise.as_dict(),
         "chi2_per_dof": {"mean": float(np.mean(chi2)), "least": min(chi2), "most": max(chi2)},
         "chi2_per_dof_drawn_noise": {"mean": float(np.mean(drawn)), "least": min(drawn), "most": max(drawn)},
         "noise_found": {key: float(np.mean([t.noise_found[key] for t in trials])) for key in ("dots", "stripe")},

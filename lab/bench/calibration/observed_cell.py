@@ -22,6 +22,7 @@ from cell.motion.kinematics import HOME, Joints, arm_kinematics
 from cell.procedures.arm.photograph import CalibrationView, scan_calibration_views, target_calibration_views
 from cell.procedures.calibrate.boards import RAIL_MOVE, RAIL_MOVE_VIEWS
 from drivers.interfaces import LinkTable
+from lab.bench.calibration.world import circle
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from sim_backends.optics.camera import CameraOptics
 from sim_backends.world import drawing
@@ -185,9 +186,7 @@ class ObservedCell:
 
     def _photo(self, pose: Array, lens: Array, size: tuple[int, int], spec: BoardSpec, bend: float) -> BoardView:
         points = spec.points()
-        angles = np.linspace(0, 2 * np.pi, RIM, endpoint=False)
-        rim = spec.dot_radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(RIM)])
-        rims = (points[:, None] + rim).reshape(-1, 3)
+        rims = (points[:, None] + spec.dot_radius * circle(RIM)).reshape(-1, 3)
         if bend:
             rims[:, 2] += bend_of(spec, bend, rims)
         pixels = _optics(lens, size).project(rims @ pose[:3, :3].T + pose[:3, 3]).reshape(len(points), RIM, 2)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from cell.config.cell_config import load_config
+from cell.measure.calibration import Priors
 from cell.measure.vision.board.view import BoardSpec, parse_board
 from cell.procedures.arm.photograph import scan_calibration_views
 from sim_backends.optics.camera import project_points, undistort_pixels
@@ -47,6 +48,22 @@ class Noise:
     def own(self) -> Array:
         """Deviations (7,) of a view's own parameters."""
         return np.array([self.arm / np.sqrt(3)] * 3 + [self.arm_angle] * 3 + [self.rail])
+
+    @property
+    def priors(self) -> Priors:
+        """The same for the adjustment."""
+        return Priors(self.arm / np.sqrt(3), self.arm_angle, self.rail)
+
+    def times(self, factor: float) -> Noise:
+        """The same noise, all of it `factor` times as large."""
+        return Noise(**{name: factor * value for name, value in vars(self).items()})
+
+    def as_dict(self) -> dict[str, float]:
+        """For reports."""
+        return {
+            "dots_px": self.dots, "stripe_px": self.stripe, "rail_mm": 1e3 * self.rail,
+            "arm_radial_mm": 1e3 * self.arm, "arm_rotation_mrad": 1e3 * self.arm_angle,
+        }  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,15 +116,9 @@ class HeadWorld:
     def dots(self, view: int, own: Array) -> Array:
         """Pixels (n, 2) of the dots: centroids of their distorted images, from polygons on their rims."""
         pose = self.camera_from_board(view, own)
-        angles = np.linspace(0, 2 * np.pi, RIM, endpoint=False)
-        rim = self.spec.dot_radius * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(RIM)])
+        rim = self.spec.dot_radius * circle(RIM)
         points = (self.spec.points()[:, None] + rim).reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3]
-        ring = project_points(np.ascontiguousarray(points), self.lens).reshape(-1, RIM, 2)
-        middle = ring.mean(axis=1, keepdims=True)
-        here, after = ring - middle, np.roll(ring, -1, axis=1) - middle
-        twice = here[..., 0] * after[..., 1] - here[..., 1] * after[..., 0]
-        moment = ((here + after) * twice[..., None]).sum(axis=1)
-        return np.asarray(middle[:, 0] + moment / (3 * twice.sum(axis=1))[:, None])
+        return centroids(project_points(np.ascontiguousarray(points), self.lens).reshape(-1, RIM, 2))
 
     def stripe(self, view: int, own: Array, rows: Array) -> tuple[Array, Array]:
         """Columns (n,) at which the stripe on the board crosses image rows (n,), and where on the board (n, 2) in m."""
@@ -149,6 +160,21 @@ class HeadWorld:
         xy = undistort_pixels(np.ascontiguousarray(pixels), self.lens)
         rays = np.column_stack([xy, np.ones(len(xy))])
         return np.asarray(rays / (rays @ self.plane)[:, None] + rails[:, None] * self.rail)
+
+
+def circle(count: int) -> Array:
+    """Points (n, 3) around a unit circle in the plane z = 0."""
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    return np.column_stack([np.cos(angles), np.sin(angles), np.zeros(count)])
+
+
+def centroids(rings: Array) -> Array:
+    """Centroids (n, 2) of polygons (n, m, 2)."""
+    middle = rings.mean(axis=1, keepdims=True)
+    here, after = rings - middle, np.roll(rings, -1, axis=1) - middle
+    twice = here[..., 0] * after[..., 1] - here[..., 1] * after[..., 0]
+    moment = ((here + after) * twice[..., None]).sum(axis=1)
+    return np.asarray(middle[:, 0] + moment / (3 * twice.sum(axis=1))[:, None])
 
 
 def turned(pose: Array, step: Array) -> Array:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from cell.measure.calibration.archive import ScanObservation
 from cell.measure.calibration.solve.adjustment import Adjusted
+from cell.measure.calibration.solve.joint import view_data
 from cell.measure.calibration.solve.normal import (
     BOARD,
     CAMERA,
@@ -192,17 +193,7 @@ def evidence(state: AdjustmentState, reference: Reference, looks: Sequence[Pictu
 
 def dots_of(photo: ScanObservation) -> ViewData:
     """The dots of an observation, without its stripe."""
-    assert photo.view is not None
-    return ViewData(
-        points=photo.view.object_points,
-        pixels=photo.view.pixels,
-        sigma=photo.view.sigma,
-        dot_radius=photo.view.dot_radius,
-        stripe=np.zeros((0, 2)),
-        stripe_sigma=np.zeros(0),
-        base_from_flange=photo.base_from_flange,
-        rail=photo.rail_position,
-    )
+    return view_data(photo, np.empty(0, dtype=np.intp))
 
 
 def _misfit(rows: list[tuple[Array, Array]], columns: NDArray[np.intp], noise: Array | None = None) -> float:

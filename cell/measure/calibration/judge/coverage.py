@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from cell.measure.calibration.solve.adjustment import Adjustment, Priors, shared_mask
 from cell.measure.calibration.solve.joint import Joint
@@ -261,47 +261,35 @@ def _more_views(joint: Joint, board: BoardSpec, travel: tuple[float, float]) -> 
     near, far, middle = float(seen.depth.min()), float(seen.depth.max()), float(seen.depth.mean())
     low, high = travel
     between = np.linspace(low, high, 6)[1:5]
-    field = 0.2 * middle * np.array(seen.size) / state.camera.fx
+    aside, up = 0.2 * middle * np.array(seen.size) / state.camera.fx
+    diagonal = np.array([(SLIGHT, SLIGHT), (-SLIGHT, SLIGHT), (SLIGHT, -SLIGHT), (-SLIGHT, -SLIGHT)])
+    steep = np.array([STEEP, -STEEP, STEEP, -STEEP])
+    closer, farther = near - FURTHER, far + FURTHER
 
-    def made(poses: list[tuple[Array, Array]], rails: Array) -> list[ViewData]:
-        return [_view(joint, board, at, turn, float(s)) for (at, turn), s in zip(poses, rails, strict=True)]
+    def made(rails: Array = between, **at: ArrayLike) -> list[ViewData]:
+        """Four views with the board square at `middle` but for what is given: x, y, z in m, rx, ry, rz in rad."""
+        poses = np.zeros((4, 6))
+        poses[:, 2] = middle
+        for name, values in at.items():
+            poses[:, ("x", "y", "z", "rx", "ry", "rz").index(name)] = values
+        return [_view(joint, board, pose[:3], pose[3:], float(s)) for pose, s in zip(poses, rails, strict=True)]
 
-    def square(x: float, y: float, z: float, rx: float = 0.0, ry: float = 0.0, rz: float = 0.0) -> tuple[Array, Array]:
-        return np.array([x, y, z]), np.array([rx, ry, rz])
-
-    diagonal = [(SLIGHT, SLIGHT), (-SLIGHT, SLIGHT), (SLIGHT, -SLIGHT), (-SLIGHT, -SLIGHT)]
-    corners = [(-field[0], -field[1]), (field[0], -field[1]), (-field[0], field[1]), (field[0], field[1])]
+    slight = {"rx": diagonal[:, 0], "ry": diagonal[:, 1]}
     alone = [replace(view, same_rest=False) for view in joint.views]
-    several = np.linspace(0, len(alone) - 1, 4).astype(int)
-    ends = f"{1e3 * low:.0f} and {1e3 * high:.0f} mm"
     return {
-        "four more views, tilted steeply about the picture's x": made(
-            [square(0, 0, middle, rx=side) for side in (STEEP, -STEEP, STEEP, -STEEP)], between
+        "four more views, tilted steeply about the picture's x": made(rx=steep),
+        "four more views, tilted steeply about the picture's y": made(ry=steep),
+        f"four more views at the ends of the rail's travel, {1e3 * low:.0f} and {1e3 * high:.0f} mm": made(
+            np.array([low, low, high, high]), **slight
         ),
-        "four more views, tilted steeply about the picture's y": made(
-            [square(0, 0, middle, ry=side) for side in (STEEP, -STEEP, STEEP, -STEEP)], between
-        ),
-        f"four more views at the ends of the rail's travel, {ends}": made(
-            [square(0, 0, middle, rx, ry) for rx, ry in diagonal], np.array([low, low, high, high])
-        ),
-        f"four more views from {1e3 * (near - FURTHER):.0f} and {1e3 * (far + FURTHER):.0f} mm": made(
-            [
-                square(0, 0, z, rx, ry)
-                for z, (rx, ry) in zip((near - FURTHER, far + FURTHER) * 2, diagonal, strict=True)
-            ],
-            between,
-        ),
+        f"four more views from {1e3 * closer:.0f} and {1e3 * farther:.0f} mm": made(z=[closer, farther] * 2, **slight),
         "four more views with the board in the picture's corners": made(
-            [square(x, y, middle, rx, ry) for (x, y), (rx, ry) in zip(corners, diagonal, strict=True)], between
+            x=[-aside, aside, -aside, aside], y=[-up, -up, up, up], **slight
         ),
         "four more views, turned about the optical axis by 90 and 180 deg": made(
-            [
-                square(0, 0, middle, rx=rx, ry=ry, rz=rz)
-                for rz, (rx, ry) in zip((np.pi / 2, -np.pi / 2, np.pi, np.pi), diagonal, strict=True)
-            ],
-            between,
+            rz=[np.pi / 2, -np.pi / 2, np.pi, np.pi], **slight
         ),
-        "four of the present views once more": [alone[k] for k in several],
+        "four of the present views once more": [alone[k] for k in np.linspace(0, len(alone) - 1, 4).astype(int)],
         "all present views once more": list(joint.views),
     }
 

@@ -235,14 +235,11 @@ def _pull(camera: CameraModel, left: LeftOut, covariance: Array) -> Array:
 
 
 def _data(views: Sequence[BoardView], camera: CameraModel) -> list[ViewData]:
-    nothing = np.zeros(0)
+    poses = [board_pose(view, camera).camera_from_board.inverse() for view in views]
     return [
-        ViewData(
-            v.object_points, v.pixels, v.sigma, dot_radius=v.dot_radius, stripe=np.zeros((0, 2)), stripe_sigma=nothing,
-            base_from_flange=board_pose(v, camera).camera_from_board.inverse(), rail=0.0,
-        )
-        for v in views
-    ]  # fmt: skip
+        ViewData(v.object_points, v.pixels, v.sigma, dot_radius=v.dot_radius, base_from_flange=pose)
+        for v, pose in zip(views, poses, strict=True)
+    ]
 
 
 def _mean(rms: Array, views: Sequence[BoardView]) -> float:
@@ -338,27 +335,11 @@ def untold_by_bend(adjustment: Adjustment, state: AdjustmentState) -> Array:
 def _normal(
     adjustment: Adjustment, state: AdjustmentState
 ) -> tuple[NDArray[np.intp], Array, Array, list[tuple[Array, Array]], list[Array]]:
-    """The free terms of the lens, normal equations of these and the three shapes, those of each view, and its rows.
-
-    Poses are eliminated.
-    """
-    _, middle, half = _whole(adjustment)
+    """The free terms of the lens, normal equations of these and the three shapes, those of each view, and its rows."""
     lens = np.flatnonzero(adjustment.free[CAMERA])
-    lens_rows, lens_right = adjustment.lens_prior(state)
-    size = len(lens) + SHAPES
-    prior, pull = np.zeros((size, size)), np.zeros(size)
-    prior[: len(lens), : len(lens)] = (lens_rows.T @ lens_rows)[np.ix_(lens, lens)]
-    pull[: len(lens)] = (lens_rows.T @ lens_right)[lens]
-    parts, wide = [], []
-    for k, view in enumerate(adjustment.views):
-        for _, rows, residual, _ in adjustment.rows_of(k, state):
-            height = rows[:, 21:24] @ state.base_from_board.rotation[:, 2]
-            shapes = np.repeat(surface_shapes((view.points - middle) / half), 2, axis=0)
-            wanted = np.column_stack([rows[:, lens], height[:, None] * shapes, residual])
-            pose = np.linalg.qr(rows[:, FLANGE])[0]
-            wanted -= pose @ (pose.T @ wanted)
-            parts.append((wanted[:, :-1].T @ wanted[:, :-1], wanted[:, :-1].T @ wanted[:, -1]))
-            wide.append(wanted)
+    prior, pull = _lens_prior(adjustment, state, lens)
+    wide = [_bent_rows(adjustment, k, state, lens, arm=False) for k in range(len(adjustment.views))]
+    parts = [(rows[:, :-1].T @ rows[:, :-1], rows[:, :-1].T @ rows[:, -1]) for rows in wide]
     information = prior + np.sum([h for h, _ in parts], axis=0)
     gradient = pull + np.sum([g for _, g in parts], axis=0)
     return lens, information, gradient, parts, wide
@@ -369,36 +350,48 @@ def moved_by_bend(adjustment: Adjustment, state: AdjustmentState) -> Array:
 
     One step from there, with what is free in the adjustment and the three shapes; what is held does not move.
     """
-    _, middle, half = _whole(adjustment)
     free = np.flatnonzero(adjustment.free)
-    lens_rows, lens_right = adjustment.lens_prior(state)
-    size = len(free) + SHAPES
-    information, gradient = np.zeros((size, size)), np.zeros(size)
-    information[: len(free), : len(free)] = (lens_rows.T @ lens_rows)[np.ix_(free, free)]
-    gradient[: len(free)] = (lens_rows.T @ lens_right)[free]
-    for k, view in enumerate(adjustment.views):
-        own_rows, own_right = adjustment.arm_prior(k, state)
-        parts = [
-            ("arm", own_rows, own_right),
-            *((n, rows, right) for n, rows, right, _ in adjustment.rows_of(k, state)),
-        ]
-        stacked = []
-        for name, rows, right in parts:
-            bent = np.zeros((len(rows), SHAPES))
-            if name == "dots":
-                height = rows[:, 21:24] @ state.base_from_board.rotation[:, 2]
-                bent = height[:, None] * np.repeat(surface_shapes((view.points - middle) / half), 2, axis=0)
-            stacked.append(np.column_stack([rows[:, free], bent, right, rows[:, FLANGE]]))
-        every = np.vstack(stacked)
-        pose = np.linalg.qr(every[:, -6:])[0]
-        wanted = every[:, :-6] - pose @ (pose.T @ every[:, :-6])
-        information += wanted[:, :-1].T @ wanted[:, :-1]
-        gradient += wanted[:, :-1].T @ wanted[:, -1]
+    information, gradient = _lens_prior(adjustment, state, free)
+    for k in range(len(adjustment.views)):
+        rows = _bent_rows(adjustment, k, state, free, arm=True)
+        information += rows[:, :-1].T @ rows[:, :-1]
+        gradient += rows[:, :-1].T @ rows[:, -1]
     unit = 1 / np.sqrt(np.maximum(np.diag(information), 1e-30))
     found = unit * np.linalg.lstsq(information * unit[:, None] * unit, unit * gradient, rcond=1e-12)[0]
     moved = np.zeros(len(adjustment.free))
     moved[free] = found[: len(free)]
     return moved
+
+
+def _lens_prior(adjustment: Adjustment, state: AdjustmentState, free: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Information and gradient of what is known of any lens, for the `free` parameters and the three shapes."""
+    rows, right = adjustment.lens_prior(state)
+    size = len(free) + SHAPES
+    information, gradient = np.zeros((size, size)), np.zeros(size)
+    information[: len(free), : len(free)] = (rows.T @ rows)[np.ix_(free, free)]
+    gradient[: len(free)] = (rows.T @ right)[free]
+    return information, gradient
+
+
+def _bent_rows(adjustment: Adjustment, k: int, state: AdjustmentState, free: NDArray[np.intp], *, arm: bool) -> Array:
+    """Rows of view `k`: the `free` parameters, the three shapes, the residual; its own pose is eliminated.
+
+    With `arm` the reported flange pose counts.
+    """
+    _, middle, half = _whole(adjustment)
+    parts = [(name, rows, right) for name, rows, right, _ in adjustment.rows_of(k, state)]
+    if arm:
+        parts.insert(0, ("arm", *adjustment.arm_prior(k, state)))
+    stacked = []
+    for name, rows, right in parts:
+        bent = np.zeros((len(rows), SHAPES))
+        if name == "dots":
+            height = rows[:, 21:24] @ state.base_from_board.rotation[:, 2]
+            bent = height[:, None] * np.repeat(surface_shapes((adjustment.views[k].points - middle) / half), 2, axis=0)
+        stacked.append(np.column_stack([rows[:, free], bent, right, rows[:, FLANGE]]))
+    every = np.vstack(stacked)
+    pose = np.linalg.qr(every[:, -6:])[0]
+    return np.asarray(every[:, :-6] - pose @ (pose.T @ every[:, :-6]))
 
 
 def _whole(adjustment: Adjustment) -> tuple[Array, Array, float]:

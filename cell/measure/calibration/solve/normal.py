@@ -44,10 +44,10 @@ class ViewData:
     pixels: Array
     sigma: Array
     dot_radius: float
-    stripe: Array
-    stripe_sigma: Array
     base_from_flange: pin.SE3
-    rail: float
+    rail: float = 0.0
+    stripe: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    stripe_sigma: Array = field(default_factory=lambda: np.zeros(0))
     stripe_axis: int = 0
     same_rest: bool = False
 

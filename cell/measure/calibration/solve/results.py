@@ -129,13 +129,7 @@ class ScanCalibration:
     def variants(self) -> list[ScanGeometry]:
         """The geometry moved by one standard deviation along each independent direction of the covariance."""
         state = AdjustmentState(
-            self.camera,
-            self.light_plane,
-            self.rail_direction,
-            flange_from_camera=self.flange_from_camera,
-            base_from_board=pin.SE3.Identity(),
-            flanges=[],
-            rails=np.zeros(0),
+            self.camera, self.light_plane, self.rail_direction, self.flange_from_camera, pin.SE3.Identity()
         )
         made = []
         by_bow = self.bow_sigma * self.bow_gain
@@ -166,7 +160,7 @@ class ScanCalibration:
             {name: one.as_dict() for name, one in found.items() if one is not None}
             | refused
             | {
-                "camera": _camera_dict(self.camera),
+                "camera": self.camera.as_dict(),
                 "light_plane": {
                     "normal": list(self.light_plane.normal),
                     "distance": self.light_plane.distance,
@@ -203,7 +197,7 @@ class ScanCalibration:
         alone = "jobs go by the plate on the claw alone until `cell calibrate verify` has seen the laser again"
         confirmed = found("confirmed", ConfirmedTurn.read, alone)
         return cls(
-            _camera(data["camera"]),
+            CameraModel.read(data["camera"]),
             LightPlane.of(plane["normal"], float(plane["distance"])).bowed(float(plane.get("bow", 0.0))),
             np.array(data["rail_direction"], dtype=np.float64),
             flange_from_camera=from_matrix(data["flange_from_camera"]),
@@ -247,7 +241,7 @@ class TargetCalibration:
     def as_dict(self) -> dict[str, object]:
         """For storage."""
         return {
-            "camera": _camera_dict(self.camera),
+            "camera": self.camera.as_dict(),
             "flange_from_camera": self.flange_from_camera.homogeneous.tolist(),
             "hand_eye_covariance": self.hand_eye_covariance.tolist(),
             "quality": vars(self.quality),
@@ -258,7 +252,7 @@ class TargetCalibration:
     def from_dict(cls, data: dict[str, Any]) -> TargetCalibration:
         """From storage; KeyError, TypeError or ValueError when it is not one."""
         return cls(
-            _camera(data["camera"]),
+            CameraModel.read(data["camera"]),
             from_matrix(data["flange_from_camera"]),
             np.array(data["hand_eye_covariance"], dtype=np.float64).reshape(6, 6),
             Quality(**data["quality"]),
@@ -269,15 +263,6 @@ class TargetCalibration:
 def sigmas(covariance: Array) -> dict[str, float]:
     """Standard deviations of the scan head's parameters by name."""
     return dict(zip(PARAMETERS, np.sqrt(np.maximum(0.0, np.diag(covariance))).tolist(), strict=True))
-
-
-def _camera_dict(camera: CameraModel) -> dict[str, object]:
-    return {"width": camera.width, "height": camera.height, "parameters": camera.parameters.tolist()}
-
-
-def _camera(data: dict[str, Any]) -> CameraModel:
-    model = CameraModel(int(data["width"]), int(data["height"]), 1.0, fy=1.0, cx=0.0, cy=0.0)
-    return model.with_parameters(data["parameters"])
 
 
 def calibrate_scan(

@@ -7,7 +7,7 @@ import pytest
 
 from cell.config.calibrations.store import nominal_camera, solve_observations
 from cell.config.cell_config import load_config
-from cell.measure.calibration import Priors, TargetObservation, calibrate_scan
+from cell.measure.calibration import TargetObservation, calibrate_scan
 from cell.measure.calibration.archive import Observations
 from cell.measure.geometry.poses import from_parts
 from lab.bench.calibration.campaign import observe
@@ -26,7 +26,7 @@ def archived(world) -> Observations:
     scan = observe(world, NOISE, np.random.default_rng(2))
     config = load_config(None)
     camera = nominal_camera(config.scan_camera)
-    priors = Priors(NOISE.arm / np.sqrt(3), NOISE.arm_angle, NOISE.rail)
+    priors = NOISE.priors
     # The same views serve a camera without a rail, on a flange that went where the carriage had gone.
     head = calibrate_scan(scan, camera, np.array([1.0, 0.0, 0.0]), priors)
     along = head.flange_from_camera.rotation @ head.rail_direction

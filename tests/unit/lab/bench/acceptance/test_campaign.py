@@ -20,7 +20,8 @@ from lab.bench.acceptance.campaign import (
     form_all,
     plane_deviations,
 )
-from lab.paper.rig import Noise, RigSpec, draw_head
+from lab.bench.calibration.world import Noise
+from lab.paper.rig import RigSpec, draw_head
 from sim_backends.world.levels import LEVELS
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import load_config
-from cell.measure.calibration.solve.adjustment import Adjustment, Priors
+from cell.measure.calibration.solve.adjustment import Adjustment
 from cell.measure.calibration.solve.bow import one_more
 from cell.measure.calibration.solve.joint import Joint, solve_joint, solve_staged
 from cell.measure.calibration.solve.normal import PLANE
@@ -33,7 +33,7 @@ def solved(off: float, seed: int) -> tuple[HeadWorld, Joint]:
     world = replace(draw_head(rng), bow=off * DEPTH / BESIDE**2)
     observations = observe(world, NOISE, rng)
     staged = solve_staged(observations, nominal_camera(load_config(None).scan_camera))
-    priors = Priors(NOISE.arm / np.sqrt(3), NOISE.arm_angle, NOISE.rail)
+    priors = NOISE.priors
     return world, solve_joint(observations, staged, priors, held_out=False)
 
 

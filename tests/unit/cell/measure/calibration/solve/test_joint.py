@@ -10,7 +10,6 @@ import pytest
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import load_config
 from cell.measure.calibration.archive import ScanObservation
-from cell.measure.calibration.solve.adjustment import Priors
 from cell.measure.calibration.solve.joint import Joint, solve_joint, solve_staged
 from cell.measure.calibration.solve.normal import rests_of
 from cell.measure.geometry.poses import from_matrix
@@ -18,7 +17,7 @@ from lab.bench.calibration.campaign import observe
 from lab.bench.calibration.world import HeadWorld, Noise, draw_head, turned
 
 NOISE = Noise(arm=2e-4, arm_angle=4e-4)
-PRIORS = Priors(NOISE.arm / np.sqrt(3), NOISE.arm_angle, NOISE.rail)
+PRIORS = NOISE.priors
 
 
 def moved_at(world: HeadWorld, view: int, rng: np.random.Generator) -> list[ScanObservation]:
