@@ -3,8 +3,8 @@
 Every part of the chain that may have changed is a hypothesis against none
 (`cell.measure.calibration.drift.evidence`). Their mean Bayes factor is the statistic; what it exceeds by chance is
 found by drawing scores from their own covariance, so that a good calibration is called disturbed in `FALSE_ALARMS` of
-all checks. The most probable part is named. What a good verdict is worth is said by
-`cell.measure.calibration.drift.decision`.
+all checks. The most probable part is named. `detectable` says what a good verdict is worth: noise, the arm's scatter
+and the calibration's own covariance hide small changes.
 """
 
 from __future__ import annotations
@@ -308,33 +308,28 @@ def changes(chain: str, state: AdjustmentState) -> list[Change]:
     mount, lens, *others = dict.fromkeys(h.part for h in hypotheses(chain, state.camera.fx))
     depth = SCAN_DEPTH if chain == "scan" else TARGET_DEPTH
     focal = unit[:, CAMERA][:, :4] * state.camera.fx
-    made = [
-        Change(chain, mount, "shift", wanted=SHIFT, unit="m", directions=unit[:, HAND][:, :3]),
-        Change(chain, mount, "turn", wanted=TURN, unit="rad", directions=unit[:, HAND][:, 3:]),
-        Change(chain, lens, "principal point", wanted=TURN, unit="rad", directions=focal[:, 2:]),
-        Change(
-            chain,
-            lens,
-            "focal length",
-            wanted=SHIFT,
-            unit="m",
-            directions=(focal[:, :1] + focal[:, 1:2]) / depth,
-            where=f" at {1e3 * depth:.0f} mm",
-        ),
+    kinds = [
+        (mount, "shift", unit[:, HAND][:, :3], ""),
+        (mount, "turn", unit[:, HAND][:, 3:], ""),
+        (lens, "principal point", focal[:, 2:], ""),
+        (lens, "focal length", (focal[:, :1] + focal[:, 1:2]) / depth, f" at {1e3 * depth:.0f} mm"),
     ]
     if others:
         plane, rail = others
         length = float(np.linalg.norm(state.rail_direction))
         along = state.rail_direction / length
         across = np.column_stack(tangents(along))
-        lead = unit[:, RAIL] @ along[:, None] / LEAD_WAY
-        made += [
-            Change(chain, plane, "turn", wanted=TURN, unit="rad", directions=unit[:, PLANE][:, :2]),
-            Change(chain, plane, "shift", wanted=SHIFT, unit="m", directions=unit[:, PLANE][:, 2:]),
-            Change(chain, rail, "turn", wanted=TURN, unit="rad", directions=unit[:, RAIL] @ across * length),
-            Change(chain, rail, "lead", wanted=SHIFT, unit="m", directions=lead, where=f" in {1e3 * LEAD_WAY:.0f} mm"),
+        kinds += [
+            (plane, "turn", unit[:, PLANE][:, :2], ""),
+            (plane, "shift", unit[:, PLANE][:, 2:], ""),
+            (rail, "turn", unit[:, RAIL] @ across * length, ""),
+            (rail, "lead", unit[:, RAIL] @ along[:, None] / LEAD_WAY, f" in {1e3 * LEAD_WAY:.0f} mm"),
         ]
-    return made
+    sizes = {"turn": (TURN, "rad"), "principal point": (TURN, "rad")}
+    return [
+        Change(chain, part, kind, *sizes.get(kind, (SHIFT, "m")), directions, where)
+        for part, kind, directions, where in kinds
+    ]
 
 
 def detectable(

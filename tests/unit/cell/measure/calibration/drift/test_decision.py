@@ -23,9 +23,9 @@ from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_matrix
 from cell.procedures.arm.photograph import rail_ends, verification_views
-from cell.procedures.calibrate.verification import Verification, verify
+from cell.procedures.calibrate.verification import CheckObservations, Verification, verify
 from drivers.errors import RefusedError
-from lab.bench.calibration.observed_cell import ObservedCell, shifted
+from lab.bench.calibration.observed_cell import ObservedCell, Truth, shifted
 from lab.bench.calibration.verification import KINDS_OF_CHANGE, changed, disturbances, look_again
 from sim_backends.world.scene import draw
 
@@ -64,6 +64,15 @@ def calibrated():
     return cell, CellCalibration.solve(cell.collect_scan(), cell.collect_target(), {"arm": "1"}, CONFIG)
 
 
+def looked_again(cell: ObservedCell, calibration: CellCalibration, truth: Truth) -> CheckObservations:
+    """What a verification sees where this is the truth, for the time of the look."""
+    before, cell.truth = cell.truth, truth
+    try:
+        return look_again(cell, calibration)
+    finally:
+        cell.truth = before
+
+
 def test_the_rail_is_known_to_a_tenth_of_a_milliradian(calibrated):
     cell, calibration = calibrated
     sigma = np.sqrt(np.diag(calibration.scan.covariance))[12:15]
@@ -85,12 +94,8 @@ def test_a_good_calibration_is_called_good(calibrated, checks, most_alarms):
 @pytest.mark.parametrize("disturbance", disturbances(), ids=lambda d: d.name)
 def test_a_disturbance_is_found_and_its_part_suspected(calibrated, disturbance):
     cell, calibration = calibrated
-    before = cell.truth
-    cell.truth = disturbance.moved(before)
-    try:
-        verdict = verify(calibration.scan, calibration.target, look_again(cell, calibration))
-    finally:
-        cell.truth = before
+    seen = looked_again(cell, calibration, disturbance.moved(cell.truth))
+    verdict = verify(calibration.scan, calibration.target, seen)
     assert not verdict.good
     camera = disturbance.part.split()[0]
     # A mount and the lens on it can look the same from one view; never one camera like the other.
@@ -99,12 +104,8 @@ def test_a_disturbance_is_found_and_its_part_suspected(calibrated, disturbance):
 
 def test_the_verdict_reckons_the_place_error(calibrated):
     cell, calibration = calibrated
-    before = cell.truth
-    cell.truth = replace(before, flange_from_scan=before.flange_from_scan @ shifted(np.array([0.0, 0.6e-3, 0.0])))
-    try:
-        seen = look_again(cell, calibration)
-    finally:
-        cell.truth = before
+    moved = cell.truth.flange_from_scan @ shifted(np.array([0.0, 0.6e-3, 0.0]))
+    seen = looked_again(cell, calibration, replace(cell.truth, flange_from_scan=moved))
     verification = Verification.of(calibration, load_job("pot")[0], seen)
     assert "not good any more" in repr(verification)
     assert "<td>scan camera&#39;s mount on the flange" in verification._repr_html_()
@@ -119,13 +120,8 @@ def test_the_verdict_reckons_the_place_error(calibrated):
 
 def test_a_change_that_does_little_to_the_place_is_told_and_not_called_bad(calibrated):
     cell, calibration = calibrated
-    before = cell.truth
     (focus,) = (d for d in disturbances() if d.name == "scan lens, 0.2 mm of focus")
-    cell.truth = focus.moved(before)
-    try:
-        seen = look_again(cell, calibration)
-    finally:
-        cell.truth = before
+    seen = looked_again(cell, calibration, focus.moved(cell.truth))
     verification = Verification.of(calibration, load_job("pot")[0], seen)
     assert verification.verdict.changed
     assert verification.good
@@ -139,15 +135,11 @@ def test_a_change_that_does_little_to_the_place_is_told_and_not_called_bad(calib
 
 def test_a_camera_bumped_by_a_third_of_the_tolerance_is_called_bad_with_the_mm_at_the_place(calibrated):
     cell, calibration = calibrated
-    before, found = cell.truth, []
+    found = []
     for pose, part in (("flange_from_scan", "scan"), ("flange_from_target", "target")):
         for axis in range(3):
-            moved = getattr(before, pose) @ shifted(0.2e-3 * np.eye(3)[axis])
-            cell.truth = replace(before, **{pose: moved})
-            try:
-                seen = look_again(cell, calibration)
-            finally:
-                cell.truth = before
+            moved = getattr(cell.truth, pose) @ shifted(0.2e-3 * np.eye(3)[axis])
+            seen = looked_again(cell, calibration, replace(cell.truth, **{pose: moved}))
             verification = Verification.of(calibration, load_job("pot")[0], seen)
             found.append(not verification.good)
             assert verification.verdict.suspects[0].chain == part
@@ -202,11 +194,7 @@ def test_a_laser_that_turned_as_its_witness_says_is_no_alarm(calibrated, angle):
     # A plane and its reverse turn opposite ways.
     side = np.sign(before.plane_normal @ calibration.scan.light_plane.n)
     there = turned(LightPlane.of(side * before.plane_normal, side * before.plane_distance), EXIT, angle)
-    cell.truth = replace(before, plane_normal=there.n, plane_distance=there.distance)
-    try:
-        seen = look_again(cell, calibration)
-    finally:
-        cell.truth = before
+    seen = looked_again(cell, calibration, replace(before, plane_normal=there.n, plane_distance=there.distance))
     verification = Verification.of(calibration, JOB, replace(seen, pointing=Pointing(angle, 1e-4), exit_point=EXIT))
     assert verification.good, verification.reason
     assert "The laser has turned" in verification.reason
@@ -274,16 +262,12 @@ def test_the_least_shift_is_that_of_the_noncentral_chi_square():
 @pytest.mark.campaign
 def test_what_is_called_detectable_is_found_and_what_is_far_below_is_not(harsh):
     cell, calibration = harsh
-    before = cell.truth
     seen = verify(calibration.scan, calibration.target, look_again(cell, calibration)).detectable
     assert len(seen) == KINDS_OF_CHANGE
     found = {1.0: 0, 0.25: 0}
-    try:
-        for share, d in [(1.0, d) for d in seen] + [(0.25, d) for d in seen[::2]]:
-            cell.truth = changed(before, replace(d, step=share * d.step))
-            found[share] += not verify(calibration.scan, calibration.target, look_again(cell, calibration)).good
-    finally:
-        cell.truth = before
+    for share, d in [(1.0, d) for d in seen] + [(0.25, d) for d in seen[::2]]:
+        there = looked_again(cell, calibration, changed(cell.truth, replace(d, step=share * d.step)))
+        found[share] += not verify(calibration.scan, calibration.target, there).good
     # Of 12 at 95 %, fewer than 10 are found once in fifty times; a quarter of the size is found little above chance.
     assert found[1.0] >= 10
     assert found[0.25] <= 2
