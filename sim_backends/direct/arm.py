@@ -14,7 +14,8 @@ from drivers.arm.faults import fault
 from drivers.arm.motion import ArmLimits
 from drivers.clock import Clock, Latch
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, LimitError, check_range
-from drivers.interfaces import ArmSafety, ArmState, Identity, LinkStatistics, LinkTable, Vector
+from drivers.interfaces import ArmSafety, ArmState, Identity, LinkTable, Vector
+from sim_backends.direct.switches import DirectDevice
 from sim_backends.models.arm import ArmModel, Power, Safety
 from sim_backends.models.arm_kinematics import matrix_from_pose, pose_from_matrix
 from sim_backends.models.arm_motion import JointMove, LinearMove, Servo, SimulatedMotion, StopMotion
@@ -136,15 +137,14 @@ _SAFETY = {
 }
 
 
-class DirectArm:
+class DirectArm(DirectDevice):
     """The arm `model`; see `drivers.interfaces.Arm` for the promises."""
 
     def __init__(
         self, name: str, model: ArmModel, clock: Clock, *, limits: ArmLimits, safe_off: tuple[int, ...]
     ) -> None:
         """Outputs in `safe_off` go off at a recovery and at the end."""
-        self.name = name
-        self.statistics = LinkStatistics()
+        super().__init__(name)
         self.model = model
         self.clock = clock
         self.rests: list[Vector] = []
@@ -165,10 +165,6 @@ class DirectArm:
         """What the model's controller computes with."""
         a, d, alpha, theta = self.model.params.dh.T.tolist()
         return LinkTable(tuple(theta), tuple(a), tuple(d), tuple(alpha))
-
-    def ping(self) -> float:
-        """No wire: 0 s."""
-        return 0.0
 
     def state(self, max_age: float = 0.1) -> ArmState:
         """What the encoders, the force sensor and the inputs show now."""

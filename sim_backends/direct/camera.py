@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from drivers.clock import Clock, ClockMap, Latch
 from drivers.errors import Aborted, DeadlineError, InterlockError, LimitError
-from drivers.interfaces import Frame, Identity, LinkStatistics
+from drivers.interfaces import Frame, Identity
+from sim_backends.direct.switches import DirectDevice
 from sim_backends.models.camera import CameraState
 from sim_backends.world.drawing import inverse
 from sim_backends.world.world import World, camera_spec
@@ -36,13 +37,12 @@ class Shot:
     carriage: float
 
 
-class DirectCamera:
+class DirectCamera(DirectDevice):
     """The camera "scan" or "target" of `world`; see `drivers.interfaces.Camera` for the promises."""
 
     def __init__(self, name: str, camera: str, world: World, clock: Clock, *, wire: np.random.Generator) -> None:
         """`wire` draws when within a round trip the camera answers."""
-        self.name = name
-        self.statistics = LinkStatistics()
+        super().__init__(name)
         self.model = CameraState(camera_spec(world.scene, camera))
         self.clock = clock
         self.late = 0.0
@@ -67,10 +67,6 @@ class DirectCamera:
     def time_bound(self) -> float:
         """Largest error in s of a frame's host time."""
         return self._map.uncertainty
-
-    def ping(self) -> float:
-        """No wire: 0 s."""
-        return 0.0
 
     def configure(self, exposure: float, frame_rate: float) -> None:
         """Set exposure in s and frame rate in Hz; `LimitError` when they clash or the camera cannot."""

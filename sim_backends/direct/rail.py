@@ -11,9 +11,10 @@ import numpy as np
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, check_range
-from drivers.interfaces import LONGEST_NUDGE_M, Identity, LinkStatistics, RailState, Vector
+from drivers.interfaces import LONGEST_NUDGE_M, Identity, RailState, Vector
 from drivers.rail.motion import POLL_S, SWEEP_MARGIN_M, CarriageWatch, ZeroCheck, run_up_distance
 from drivers.rail.sweep import EvenMotion
+from sim_backends.direct.switches import DirectDevice
 from sim_backends.models.rail import RailModel
 
 STANDSTILL_S = 0.5
@@ -209,13 +210,12 @@ _AT_START_M = 20e-6
 _HOME_SWITCH_MODE = 5
 
 
-class DirectRail:
+class DirectRail(DirectDevice):
     """The rail `model` as a controller in microsteps shows it; see `drivers.interfaces.Rail` for the promises."""
 
     def __init__(self, name: str, model: RailModel, clock: Clock, setup: RailSetup, wire: np.random.Generator) -> None:
         """`wire` draws when within a round trip the module answers."""
-        self.name = name
-        self.statistics = LinkStatistics()
+        super().__init__(name)
         self.travel = setup.travel
         self.model = model
         self.clock = clock
@@ -235,10 +235,6 @@ class DirectRail:
         """The model's own plate, or the number by which the cell knows it."""
         serial = self.setup.serial or str(self.model.params.serial)
         return Identity("simulated rail", serial, "virtual", "in this process")
-
-    def ping(self) -> float:
-        """No wire: 0 s."""
-        return 0.0
 
     @property
     def round_trip(self) -> float:

@@ -16,22 +16,29 @@ TAKES_S = 0.01
 _POLL_S = 0.01
 
 
-class _DirectSwitch:
-    """What both share: a switch of the world, "laser" or "claw"."""
+class DirectDevice:
+    """What all devices in this process share: a name, and no wire."""
 
-    def __init__(self, name: str, world: World, clock: Clock) -> None:
+    def __init__(self, name: str) -> None:
         self.name = name
         self.statistics = LinkStatistics()
+
+    def ping(self) -> float:
+        """No wire: 0 s."""
+        return 0.0
+
+
+class _DirectSwitch(DirectDevice):
+    """A switch of the world, "laser" or "claw"."""
+
+    def __init__(self, name: str, world: World, clock: Clock) -> None:
+        super().__init__(name)
         self._world = world
         self._clock = clock
 
     def identity(self) -> Identity:
         """A switch has no plate."""
         return Identity("simulated switch", "virtual", "virtual", "in this process")
-
-    def ping(self) -> float:
-        """No wire: 0 s."""
-        return 0.0
 
     def _set(self, on: bool) -> None:
         self._world.switches[self.name] = on

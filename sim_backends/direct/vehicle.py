@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, InterlockError, check_range
-from drivers.interfaces import Identity, LinkStatistics, VehicleState
+from drivers.interfaces import Identity, VehicleState
 from drivers.vehicle.faults import emergency_stop, system_trouble, vehicle_error
 from drivers.vehicle.feedback import PlanarOdometry
+from sim_backends.direct.switches import DirectDevice
 from sim_backends.models.vehicle import ChassisState, Mode, VehicleModel
 
 KEEP_ALIVE_S = 0.020
@@ -36,12 +37,11 @@ class VehicleSetup:
     count: float
 
 
-class DirectVehicle:
+class DirectVehicle(DirectDevice):
     """The vehicle `model`; see `drivers.interfaces.Vehicle` for the promises."""
 
     def __init__(self, name: str, model: VehicleModel, clock: Clock, setup: VehicleSetup) -> None:
-        self.name = name
-        self.statistics = LinkStatistics()
+        super().__init__(name)
         self.model = model
         self._clock = clock
         self._setup = setup
@@ -57,10 +57,6 @@ class DirectVehicle:
     def identity(self) -> Identity:
         """The protocol has no serial number."""
         return Identity(self._setup.make, "", "virtual", "in this process")
-
-    def ping(self) -> float:
-        """No wire: 0 s."""
-        return 0.0
 
     def state(self, max_age: float = 0.2) -> VehicleState:
         """Feedback as the bus carries it, odometry as it is integrated from that."""

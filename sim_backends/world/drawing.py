@@ -73,7 +73,6 @@ FLANGE_FROM_PART = pose((0.0, 0.0, 0.17), (0, 1, 0), (0, 0, -1))
 RAIL_DIRECTION = np.array([1.0, 0.0, 0.0])
 """The way the carriage moves, in C."""
 
-FOCAL_LENGTH = 0.008
 F_NUMBER = 4.0
 PIXEL = 4.8e-6
 SCAN_SIZE = (640, 480)
@@ -82,15 +81,6 @@ TARGET_SIZE = (1280, 1024)
 TARGET_FOCUS = 1.0
 CAMERA_RATE = {"scan": 120.0, "target": 30.0}
 """Most pictures a second."""
-LASER_BASELINE = 0.035
-"""From the scan camera to the laser's exit point, against C's x axis, m."""
-LASER_TAN_THETA = 3.5
-"""Tangent of the angle at the laser between baseline and light plane."""
-
-LASER_OUTPUT = 0
-CLAW_OUTPUT = 1
-GRIP_INPUT = 0
-"""Standard digital outputs and input of the arm that switch the laser, close the claw and report its grip."""
 
 
 TEXT_M, TEXT_RAD = 5e-6, 1e-9
@@ -218,18 +208,18 @@ STOCK = Drawing(
         track=0.583,
         rail=RailDrawing(0.002, 200, (0.0, 0.100), (0.01, 0.09)),
         scan=CameraDrawing(
-            SCAN_SIZE, PIXEL, FOCAL_LENGTH, SCAN_FOCUS, FLANGE_FROM_SCAN_CAMERA
+            SCAN_SIZE, PIXEL, 0.008, SCAN_FOCUS, FLANGE_FROM_SCAN_CAMERA
         ),
         target=CameraDrawing(
-            TARGET_SIZE, PIXEL, FOCAL_LENGTH, TARGET_FOCUS,
+            TARGET_SIZE, PIXEL, 0.008, TARGET_FOCUS,
             FLANGE_FROM_TARGET_CAMERA,
         ),
-        baseline=LASER_BASELINE,
-        tan_theta=LASER_TAN_THETA,
+        baseline=0.035,
+        tan_theta=3.5,
         witness=FLANGE_FROM_WITNESS,
-        laser_output=LASER_OUTPUT,
-        claw_output=CLAW_OUTPUT,
-        grip_input=GRIP_INPUT,
+        laser_output=0,
+        claw_output=1,
+        grip_input=0,
         fine_board="marked_dots:11x9:3mm",
         base_from_fine_board=BASE_FROM_FINE_BOARD,
         deck_board="marked_dots:9x7:20mm",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,14 +71,13 @@ class WorldFollowing:
         """
         if device not in self._tracks:
             raise ValueError(f"{device} is not followed here; followed: {', '.join(self._tracks) or 'nothing'}")
-        take = _TAKERS[device]
         clock, track, wrenches = self._world.clock, self._tracks[device], []
         for row in rows:
             t, values = float(row[0]), np.array(row[1:], dtype=np.float64)
             if len(values) != _LENGTHS[device] or not np.isfinite(row).all():
                 raise ValueError(f"a reading of {device} is a time and {_LENGTHS[device]} numbers, not {list(row)}")
             before = track.until
-            wrenches.append(take(self, t, values))
+            wrenches.append(self._take(device, t, values))
             # The arm's bits are not on a line between two readings, and its track is of joints alone.
             if track.append(t, values[:6] if device == "arm" else values):
                 self._late[device].append(clock.wall(clock.now() - t))
@@ -154,41 +153,28 @@ class WorldFollowing:
         self._lost, self._why = self._lost + 1, why
         return NotFollowed(why)
 
-    def _take_arm(self, t: float, values: NDArray[np.float64]) -> list[float]:
-        arm = self._world.arm
-        assert isinstance(arm, FollowedArm)
-        arm.write_digital_outputs(self._arm_outputs, int(values[7]))
-        return [float(v) for v in arm.follow(t, values[:6], bool(values[6]))]
-
-    def _take_rail(self, t: float, values: NDArray[np.float64]) -> list[float]:
-        rail = self._world.rail
-        assert isinstance(rail, FollowedRail)
-        rail.follow(t, float(values[0]))
-        return []
-
-    def _take_vehicle(self, t: float, values: NDArray[np.float64]) -> list[float]:
-        vehicle = self._world.vehicle
-        assert isinstance(vehicle, FollowedVehicle)
-        x, y, yaw, speed, yaw_rate, braked = (float(v) for v in values)
-        vehicle.follow(t, x, y, yaw=yaw, speed=speed, yaw_rate=yaw_rate, braked=bool(braked))
-        return []
-
-    def _take_laser(self, t: float, values: NDArray[np.float64]) -> list[float]:
-        # Whoever switched it waited until it was seen: the new state holds since the reading before.
-        since = self._tracks["laser"].until
-        self._world.switch("laser", bool(values[0]), since if np.isfinite(since) else t)
-        return []
-
-    def _take_claw(self, t: float, values: NDArray[np.float64]) -> list[float]:
-        self._world.switch("claw", bool(values[0]))
+    def _take(self, device: str, t: float, values: NDArray[np.float64]) -> list[float]:
+        """Put the device where it was measured; gives the wrench on the arm."""
+        world = self._world
+        match device, getattr(world, device, None):
+            case "arm", FollowedArm() as arm:
+                arm.write_digital_outputs(self._arm_outputs, int(values[7]))
+                return [float(v) for v in arm.follow(t, values[:6], bool(values[6]))]
+            case "rail", FollowedRail() as rail:
+                rail.follow(t, float(values[0]))
+            case "vehicle", FollowedVehicle() as vehicle:
+                x, y, yaw, speed, yaw_rate, braked = (float(v) for v in values)
+                vehicle.follow(t, x, y, yaw=yaw, speed=speed, yaw_rate=yaw_rate, braked=bool(braked))
+            case "laser", _:
+                # Whoever switched it waited until it was seen: the new state holds since the reading before.
+                since = self._tracks["laser"].until
+                world.switch("laser", bool(values[0]), since if np.isfinite(since) else t)
+            case "claw", _:
+                world.switch("claw", bool(values[0]))
         return []
 
 
 _LENGTHS = {"arm": 8, "rail": 1, "vehicle": 6, "laser": 1, "claw": 1}
-_TAKERS: dict[str, Callable[[WorldFollowing, float, NDArray[np.float64]], list[float]]] = {
-    "arm": WorldFollowing._take_arm, "rail": WorldFollowing._take_rail, "vehicle": WorldFollowing._take_vehicle,
-    "laser": WorldFollowing._take_laser, "claw": WorldFollowing._take_claw,
-}  # fmt: skip
 
 
 def _shares(seconds: Sequence[float]) -> dict[str, float] | None:

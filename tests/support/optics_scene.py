@@ -6,23 +6,11 @@ from scipy.spatial.transform import Rotation
 from sim_backends.optics import Board, CameraOptics, Light, expected_image
 
 FOCAL_PX = 8e-3 / 4.8e-6
-
-
 LENS = (-0.08, 0.03, 4e-4, -3e-4, 0.01)
-
-
 SCAN = CameraOptics(640, 480, FOCAL_PX, FOCAL_PX, 319.5, 239.5, LENS, transmission=0.4, vignetting=0.0)
-
-
 TARGET = CameraOptics(1280, 1024, FOCAL_PX, FOCAL_PX, 639.5, 511.5, LENS, focus_distance=1.0, vignetting=0.0)
-
-
 EVEN = Light(gradient=(0.0, 0.0), diffuse=1.0, surroundings=0.35)
-
-
 FINE = Board.parse("marked_dots:11x9:3mm")
-
-
 LARGE = Board.parse("marked_dots:9x7:20mm")
 
 

@@ -8,8 +8,6 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 
 TICK = 0.002
-
-
 Array = NDArray[np.float64]
 
 

@@ -20,11 +20,7 @@ from drivers.clock import Clock
 from tests.support.wire.arm_bench import ArmBench
 
 SPEED = 5.0
-
-
 CLOCK = Clock()
-
-
 DH = [
     (0.0, 0.1807, math.pi / 2), (-0.6127, 0.0, 0.0), (-0.57155, 0.0, 0.0), (0.0, 0.17415, math.pi / 2),
     (0.0, 0.11985, -math.pi / 2), (0.0, 0.11655, 0.0),

@@ -20,8 +20,6 @@ from sim_backends.serve import main
 from sim_backends.world.world import World
 
 pytestmark = pytest.mark.wire
-
-
 SERVE = [sys.executable, "-m", "sim_backends.serve"]
 
 

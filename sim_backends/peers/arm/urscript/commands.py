@@ -8,12 +8,12 @@ effect.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from sim_backends.models.arm import Safety
+from sim_backends.models.arm import ArmModel, Safety
 from sim_backends.models.arm_kinematics import Matrix, Vector, invert
 from sim_backends.models.arm_motion import (
     ArcMove,
@@ -43,16 +43,23 @@ from sim_backends.peers.arm.urscript.environment import (
 
 def commands(environment: Environment) -> Commands:
     """By name; those that take time are generator functions. Actual and target are one: the arm follows exactly."""
-    parts = (
-        (_moves, _optimized_moves, _stops, _streams, _compliance, _waits),
-        (_of_joints, _of_tool, _of_load, _kinematics),
-        (_terminals, _registers, _screen, _settings),
-    )
-    return {name: command for group in parts for part in group for name, command in part(environment).items()}
+    arm = _Arm(environment)
+    plain = {name: getattr(arm, name) for name in vars(_Arm) if not name.startswith("_")}
+    others = {other: plain[name] for name, names in _OTHER_NAMES.items() for other in names.split()}
+    parts = (_terminals, _registers, _screen, _settings)
+    return {**plain, **others, **{name: act for part in parts for name, act in part(environment).items()}}
 
 
-# --- moves ---
-
+_OTHER_NAMES = {
+    "get_actual_joint_positions": "get_joint_positions get_target_joint_positions",
+    "get_actual_joint_speeds": "get_target_joint_speeds get_joint_speeds",
+    "get_actual_tcp_pose": "get_target_tcp_pose get_tcp_pose get_target_waypoint",
+    "get_actual_tool_flange_pose": "get_target_tool_flange_pose",
+    "get_actual_tcp_speed": "get_target_tcp_speed",
+    "get_target_payload": "get_target_payload_mass",
+    "get_joint_temp": "get_controller_temp",
+    "get_target_joint_accelerations": "get_target_payload_inertia",
+}
 _MOST_ACCELERATION = 8.0
 """rad/s², of which the moves that plan for themselves take a share."""
 _RAMPS = 0.25
@@ -67,135 +74,195 @@ def _timed(length: float, t: float, speed: float, acceleration: float) -> tuple[
     return cruise, cruise / (_RAMPS * t)
 
 
-def _moves(e: Environment) -> Mapping[str, Callable[..., Job]]:
-    """Moves to a target at a speed."""
+class _Arm:
+    """Commands that move the arm or ask it: its public methods and their parameters have the names of scripts."""
 
-    def movej(q: List, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Job:
-        goal = _joints(e, q)
-        limit = e.context.model.params.joint_limit
+    def __init__(self, environment: Environment) -> None:
+        self._e = environment
+
+    @property
+    def _model(self) -> ArmModel:
+        return self._e.context.model
+
+    # --- moves ---
+
+    def movej(self, q: List, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Job:
+        goal = self._joints(q)
+        limit = self._model.params.joint_limit
         farthest = int(np.abs(goal).argmax())
         if abs(goal[farthest]) > limit:
             raise ProgramError(f"movej: joint {farthest} to {goal[farthest]:.6g} rad, its limit is {limit:.6g} rad")
-        length = float(np.abs(goal - e.context.model.drive.q).max())
-        yield from e.move(JointMove(goal, *_timed(length, t, v, a)))
+        length = float(np.abs(goal - self._model.drive.q).max())
+        yield from self._e.move(JointMove(goal, *_timed(length, t, v, a)))
 
-    def movel(pose: List, a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Job:
-        goal, here = _tool(e, pose), e.context.model.drive.base_from_tcp()
+    def movel(self, pose: List, a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Job:
+        goal, here = self._tool(pose), self._model.drive.base_from_tcp()
         length = math.dist(goal[:3, 3], here[:3, 3])
-        yield from e.move(LinearMove(goal, *_timed(length, t, v, a), slows=True))
+        yield from self._e.move(LinearMove(goal, *_timed(length, t, v, a), slows=True))
 
-    def movep(pose: List, a: float = 1.2, v: float = 0.25, r: float = 0) -> Job:
-        yield from movel(pose, a, v)
+    def movep(self, pose: List, a: float = 1.2, v: float = 0.25, r: float = 0) -> Job:
+        yield from self.movel(pose, a, v)
 
-    def movec(pose_via: List, pose_to: List, a: float = 1.2, v: float = 0.25, r: float = 0, mode: float = 0) -> Job:
-        yield from e.move(ArcMove(_tool(e, pose_via)[:3, 3], _tool(e, pose_to), v, a, fixed=mode == 1))
+    def movec(
+        self, pose_via: List, pose_to: List, a: float = 1.2, v: float = 0.25, r: float = 0, mode: float = 0
+    ) -> Job:
+        yield from self._e.move(ArcMove(self._tool(pose_via)[:3, 3], self._tool(pose_to), v, a, fixed=mode == 1))
 
-    return {"movej": movej, "movel": movel, "movep": movep, "movec": movec}
+    def optimovej(self, q: List, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
+        """`a` and `v` are shares of the most."""
+        yield from self.movej(q, a * _MOST_ACCELERATION, v * float(self._model.params.speed_limits.min()))
 
+    def optimovel(self, pose: List, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
+        yield from self.movel(pose, 2.5 * a, v)
 
-def _optimized_moves(e: Environment) -> Commands:
-    """Moves that plan for themselves: `a` and `v` are shares of the most."""
-    moves = _moves(e)
+    def stopj(self, a: float = 2.0) -> Job:
+        yield from self._e.move(StopMotion(a))
 
-    def optimovej(q: List, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
-        yield from moves["movej"](q, a * _MOST_ACCELERATION, v * _leading(e))
-
-    def optimovel(pose: List, a: float = 0.3, v: float = 0.3, r: float = 0) -> Job:
-        yield from moves["movel"](pose, 2.5 * a, v)
-
-    return {"optimovej": optimovej, "optimovel": optimovel}
-
-
-def _stops(e: Environment) -> Commands:
-    """Stops of what moves."""
-
-    def stopj(a: float = 2.0) -> Job:
-        yield from e.move(StopMotion(a))
-
-    def stopl(a: float = 1.2, aRot: float = 0) -> Job:
-        yield from e.move(StopMotion(a, linear=True))
-
-    return {"stopj": stopj, "stopl": stopl}
-
-
-def _streams(e: Environment) -> Commands:
-    """Targets and speeds that are sent anew in each cycle."""
+    def stopl(self, a: float = 1.2, aRot: float = 0) -> Job:
+        yield from self._e.move(StopMotion(a, linear=True))
 
     def servoj(
-        q: List, a: float = 0, v: float = 0, t: float = CYCLE, lookahead_time: float = 0.1, gain: float = 300
+        self, q: List, a: float = 0, v: float = 0, t: float = CYCLE, lookahead_time: float = 0.1, gain: float = 300
     ) -> Job:
-        lag = max(e.context.model.params.tracking_lag, lookahead_time * 300.0 / max(gain, 1.0))
-        motion, target = e.context.model.motion, _joints(e, q)
+        lag = max(self._model.params.tracking_lag, lookahead_time * 300.0 / max(gain, 1.0))
+        motion, target = self._model.motion, self._joints(q)
         if isinstance(motion, Servo):
             motion.target, motion.lag = target, lag
         else:
             motion = Servo(target, lag)
-        yield from e.stream(motion, t, lasting=True)
+        yield from self._e.stream(motion, t, lasting=True)
 
-    def speedj(qd: List, a: float = 1.4, t: float = 0) -> Job:
-        yield from _speed(e, JointSpeed(_six(qd), a), t)
+    def speedj(self, qd: List, a: float = 1.4, t: float = 0) -> Job:
+        yield from self._speed(JointSpeed(_six(qd), a), t)
 
-    def speedl(xd: List, a: float = 1.2, t: float = 0, aRot: float = 0) -> Job:
-        yield from _speed(e, LinearSpeed(_six(xd), a), t)
+    def speedl(self, xd: List, a: float = 1.2, t: float = 0, aRot: float = 0) -> Job:
+        yield from self._speed(LinearSpeed(_six(xd), a), t)
 
-    return {"servoj": servoj, "speedj": speedj, "speedl": speedl}
+    def force_mode(self, task_frame: List, selection_vector: List, wrench: List, type: float, limits: List) -> None:
+        self._e.force = ForceMode(matrix(task_frame), _six(selection_vector), _six(wrench), _six(limits))
 
+    def end_force_mode(self) -> Job:
+        if self._e.force is not None:
+            self._e.force = None
+            yield from self._e.move(StopMotion(10.0, linear=True))
 
-def _compliance(e: Environment) -> Commands:
-    """Force mode, and what touches the tool."""
+    def tool_contact(self, direction: Sequence[Value] = (0.0,) * 6) -> int:
+        return tool_contact(self._e.context, _six(direction))
 
-    def force_mode(task_frame: List, selection_vector: List, wrench: List, type: float, limits: List) -> None:
-        e.force = ForceMode(matrix(task_frame), _six(selection_vector), _six(wrench), _six(limits))
-
-    def end_force_mode() -> Job:
-        if e.force is not None:
-            e.force = None
-            yield from e.move(StopMotion(10.0, linear=True))
-
-    def contact(direction: Sequence[Value] = (0.0,) * 6) -> int:
-        return tool_contact(e.context, _six(direction))
-
-    return {"force_mode": force_mode, "end_force_mode": end_force_mode, "tool_contact": contact}
-
-
-def _waits(_: Environment) -> Commands:
-    """Cycles that pass."""
-
-    def sleep(t: float) -> Job:
+    def sleep(self, t: float) -> Job:
         for _ in range(round(t / CYCLE)):
             yield
 
-    def sync() -> Job:
+    def sync(self) -> Job:
         yield
 
-    return {"sleep": sleep, "sync": sync}
+    # --- questions ---
 
+    def get_actual_joint_positions(self) -> List:
+        return numbers(self._model.drive.q)
 
-def _joints(e: Environment, target: List) -> Vector:
-    return e.context.solve(matrix(target)) if isinstance(target, ScriptPose) else _six(target)
+    def get_actual_joint_speeds(self) -> List:
+        return numbers(self._model.drive.qd)
 
+    def get_target_joint_accelerations(self) -> List:
+        return List([0.0] * 6)
 
-def _tool(e: Environment, target: List) -> Matrix:
-    return matrix(target) if isinstance(target, ScriptPose) else e.context.forward(_six(target))
+    def get_actual_joint_positions_history(self, steps: int = 0) -> List:
+        return numbers(self._e.context.joints_before(int(steps)))
 
+    def get_joint_temp(self, joint: float = 0) -> float:
+        return 30.0
 
-def _speed(e: Environment, wanted: JointSpeed | LinearSpeed, t: float) -> Job:
-    motion = e.context.model.motion
-    if isinstance(motion, JointSpeed | LinearSpeed) and type(motion) is type(wanted):
-        motion.target, motion.acceleration = wanted.target, wanted.acceleration
-    else:
-        motion = wanted
-    if not wanted.acceleration > 0:
-        raise ProgramError(f"an acceleration of {wanted.acceleration:g} must be greater than 0")
-    if t <= 0:
-        # Until the speed is reached.
-        gap = wanted.target - e.context.model.drive.qd if isinstance(wanted, JointSpeed) else wanted.target
-        t = float(np.abs(gap).max()) / wanted.acceleration
-    yield from e.stream(motion, t)
+    def get_tool_current(self) -> float:
+        return 0.0
 
+    def get_steptime(self) -> float:
+        return CYCLE
 
-def _leading(e: Environment) -> float:
-    return float(e.context.model.params.speed_limits.min())
+    def is_steady(self) -> bool:
+        return self._model.steady
+
+    def is_within_safety_limits(self, q: List) -> bool:
+        target = np.array(q if len(q) == 6 else [], float)
+        return bool((np.abs(target) <= self._model.params.joint_limit).all())
+
+    def is_robot_stopped(self) -> bool:
+        return not self._model.moving
+
+    def is_in_protective_stop(self) -> bool:
+        return self._model.safety is Safety.PROTECTIVE_STOP
+
+    def get_actual_tcp_pose(self) -> List:
+        return as_pose(self._model.drive.base_from_tcp())
+
+    def get_actual_tool_flange_pose(self) -> List:
+        return as_pose(self._model.reported_flange())
+
+    def get_actual_tcp_speed(self) -> List:
+        return numbers(self._model.drive.tcp_jacobian().dot(self._model.drive.qd))
+
+    def get_tcp_offset(self) -> List:
+        return as_pose(self._model.drive.flange_from_tcp)
+
+    def get_tcp_force(self) -> List:
+        return numbers(self._model.felt)
+
+    def force(self) -> float:
+        return math.hypot(*self._model.felt[:3])
+
+    def get_joint_torques(self) -> List:
+        return numbers(self._model.drive.tcp_jacobian().T.dot(self._model.felt))
+
+    def get_target_payload(self) -> float:
+        return self._model.payload[0]
+
+    def get_target_payload_cog(self) -> List:
+        return numbers(self._model.payload[1])
+
+    def get_inverse_kin(
+        self, x: List, qnear: List | None = None, maxPositionError: float = 1e-10, maxOrientationError: float = 1e-10,
+        tcp: List | None = None,
+    ) -> List:  # fmt: skip
+        target = matrix(x)
+        if tcp is not None:
+            target = target.dot(invert(matrix(tcp))).dot(self._model.drive.flange_from_tcp)
+        return numbers(self._e.context.solve(target, None if qnear is None else np.array(qnear, float)))
+
+    def get_inverse_kin_has_solution(
+        self, x: List, qnear: List | None = None, *others: object, tcp: List | None = None
+    ) -> bool:
+        try:
+            self.get_inverse_kin(x, qnear, tcp=tcp)
+        except ProgramError:
+            return False
+        return True
+
+    def get_forward_kin(self, q: List | None = None, tcp: List | None = None) -> List:
+        drive = self._model.drive
+        place: Matrix = self._model.kinematics.forward(drive.q if q is None else np.array(q, float))
+        return as_pose(place.dot(drive.flange_from_tcp if tcp is None else matrix(tcp)))
+
+    # --- what they share ---
+
+    def _joints(self, target: List) -> Vector:
+        return self._e.context.solve(matrix(target)) if isinstance(target, ScriptPose) else _six(target)
+
+    def _tool(self, target: List) -> Matrix:
+        return matrix(target) if isinstance(target, ScriptPose) else self._e.context.forward(_six(target))
+
+    def _speed(self, wanted: JointSpeed | LinearSpeed, t: float) -> Job:
+        motion = self._model.motion
+        if isinstance(motion, JointSpeed | LinearSpeed) and type(motion) is type(wanted):
+            motion.target, motion.acceleration = wanted.target, wanted.acceleration
+        else:
+            motion = wanted
+        if not wanted.acceleration > 0:
+            raise ProgramError(f"an acceleration of {wanted.acceleration:g} must be greater than 0")
+        if t <= 0:
+            # Until the speed is reached.
+            gap = wanted.target - self._model.drive.qd if isinstance(wanted, JointSpeed) else wanted.target
+            t = float(np.abs(gap).max()) / wanted.acceleration
+        yield from self._e.stream(motion, t)
 
 
 def _six(values: Sequence[Value]) -> Vector:
@@ -204,119 +271,6 @@ def _six(values: Sequence[Value]) -> Vector:
         raise ProgramError(f"{list(values)} are not six finite numbers")
     return array
 
-
-# --- questions ---
-
-_ZEROS = [0.0] * 6
-
-
-def _of_joints(e: Environment) -> Commands:
-    """Where the joints are, and whether they may be there."""
-
-    def joints() -> List:
-        return numbers(e.context.model.drive.q)
-
-    def speeds() -> List:
-        return numbers(e.context.model.drive.qd)
-
-    def within_limits(q: List) -> bool:
-        target = np.array(q if len(q) == 6 else [], float)
-        return bool((np.abs(target) <= e.context.model.params.joint_limit).all())
-
-    def history(steps: int = 0) -> List:
-        return numbers(e.context.joints_before(int(steps)))
-
-    return {
-        "get_actual_joint_positions": joints, "get_joint_positions": joints, "get_target_joint_positions": joints,
-        "get_actual_joint_speeds": speeds, "get_target_joint_speeds": speeds, "get_joint_speeds": speeds,
-        "get_target_joint_accelerations": lambda: List(_ZEROS),
-        "get_actual_joint_positions_history": history,
-        "get_joint_temp": lambda joint: 30.0,
-        "get_controller_temp": lambda: 30.0,
-        "get_steptime": lambda: CYCLE,
-        "is_steady": lambda: e.context.model.steady,
-        "is_within_safety_limits": within_limits,
-        "is_robot_stopped": lambda: not e.context.model.moving,
-        "is_in_protective_stop": lambda: e.context.model.safety is Safety.PROTECTIVE_STOP,
-    }  # fmt: skip
-
-
-def _of_tool(e: Environment) -> Commands:
-    """Where tool and flange are, and how fast."""
-
-    def tool() -> List:
-        return as_pose(e.context.model.drive.base_from_tcp())
-
-    def flange() -> List:
-        return as_pose(e.context.model.reported_flange())
-
-    def tool_speed() -> List:
-        drive = e.context.model.drive
-        return numbers(drive.tcp_jacobian().dot(drive.qd))
-
-    return {
-        "get_actual_tcp_pose": tool, "get_target_tcp_pose": tool, "get_tcp_pose": tool,
-        "get_actual_tool_flange_pose": flange, "get_target_tool_flange_pose": flange,
-        "get_actual_tcp_speed": tool_speed, "get_target_tcp_speed": tool_speed,
-        "get_tcp_offset": lambda: as_pose(e.context.model.drive.flange_from_tcp),
-        "get_tool_current": lambda: 0.0,
-        "get_target_waypoint": tool,
-    }  # fmt: skip
-
-
-def _of_load(e: Environment) -> Commands:
-    """What the tool weighs, and what it feels."""
-
-    def torques() -> List:
-        model = e.context.model
-        return numbers(model.drive.tcp_jacobian().T.dot(model.felt))
-
-    return {
-        "get_tcp_force": lambda: numbers(e.context.model.felt),
-        "force": lambda: math.hypot(*e.context.model.felt[:3]),
-        "get_joint_torques": torques,
-        "get_target_payload": lambda: e.context.model.payload[0],
-        "get_target_payload_mass": lambda: e.context.model.payload[0],
-        "get_target_payload_cog": lambda: numbers(e.context.model.payload[1]),
-        "get_target_payload_inertia": lambda: List(_ZEROS),
-    }
-
-
-def _kinematics(e: Environment) -> Commands:
-    """From joints to poses and back."""
-
-    def inverse(x: List, qnear: List | None, tcp: List | None) -> Vector:
-        near = None if qnear is None else np.array(qnear, float)
-        target = matrix(x)
-        if tcp is not None:
-            target = target.dot(invert(matrix(tcp))).dot(e.context.model.drive.flange_from_tcp)
-        return e.context.solve(target, near)
-
-    def get_inverse_kin(
-        x: List, qnear: List | None = None, maxPositionError: float = 1e-10, maxOrientationError: float = 1e-10,
-        tcp: List | None = None,
-    ) -> List:  # fmt: skip
-        return numbers(inverse(x, qnear, tcp))
-
-    def has_solution(x: List, qnear: List | None = None, *others: object, tcp: List | None = None) -> bool:
-        try:
-            inverse(x, qnear, tcp)
-        except ProgramError:
-            return False
-        return True
-
-    def get_forward_kin(q: List | None = None, tcp: List | None = None) -> List:
-        drive = e.context.model.drive
-        place: Matrix = e.context.model.kinematics.forward(drive.q if q is None else np.array(q, float))
-        return as_pose(place.dot(drive.flange_from_tcp if tcp is None else matrix(tcp)))
-
-    return {
-        "get_inverse_kin": get_inverse_kin, "get_inverse_kin_has_solution": has_solution,
-        "get_forward_kin": get_forward_kin,
-    }  # fmt: skip
-
-
-# --- terminals, registers, screen, settings ---
 
 _KINDS = {"standard": (0, 8), "configurable": (8, 8), "tool": (16, 2)}
 """First bit and number of the digital inputs and outputs of each kind."""

@@ -11,6 +11,7 @@ import socket
 import struct
 from collections.abc import Callable, Generator
 from contextlib import suppress
+from typing import TypeAlias, TypeVar
 
 from sim_backends.peers.arm.commands import CYCLE
 from sim_backends.peers.arm.urscript.environment import Commands, Environment, List, Value, shown
@@ -19,6 +20,8 @@ _NAME = "socket_0"
 _CONNECTING_S = 2.0
 _MOST_NUMBERS = 30
 """What the controller reads at once."""
+Result = TypeVar("Result")
+_Reading: TypeAlias = Generator[None, None, Result]
 
 
 class _Connections:
@@ -29,7 +32,7 @@ class _Connections:
         self._open: dict[str, socket.socket] = {}
         self._received: dict[str, bytes] = {}
 
-    def open(self, address: str, port: int, name: str) -> Generator[None, None, bool]:
+    def open(self, address: str, port: int, name: str) -> _Reading[bool]:
         self.close(name)
         if not _is_loopback(address):
             return False
@@ -67,7 +70,7 @@ class _Connections:
             return False
         return True
 
-    def take(self, name: str, enough: Callable[[bytes], int], timeout: float) -> Generator[None, None, bytes]:
+    def take(self, name: str, enough: Callable[[bytes], int], timeout: float) -> _Reading[bytes]:
         """The first `enough(received)` bytes as soon as that is not 0; none after `timeout` s (0: for ever)."""
         cycles = math.inf if timeout <= 0 else max(1, round(timeout / CYCLE))
         while True:
@@ -104,85 +107,78 @@ def commands(environment: Environment) -> Commands:
     """By name; those that take time are generator functions."""
     links = _Connections(environment)
     environment.on_close(links.close_all)
-    return {**_sending(links), **_reading_numbers(links), **_reading_text(links)}
+    sockets = _Sockets(links)
+    return {name: getattr(sockets, name) for name in vars(_Sockets) if name.startswith("socket_")}
 
 
-def _sending(links: _Connections) -> Commands:
-    """To open, to close and to send."""
+class _Sockets:
+    """Its public methods and their parameters have the names of scripts."""
 
-    def socket_open(address: str, port: int, socket_name: str = _NAME) -> Generator[None, None, bool]:
-        return (yield from links.open(address, port, socket_name))
+    def __init__(self, links: _Connections) -> None:
+        self._links = links
 
-    def send(text: Value, socket_name: str = _NAME) -> bool:
-        return links.send(socket_name, shown(text).encode())
+    def socket_open(self, address: str, port: int, socket_name: str = _NAME) -> _Reading[bool]:
+        return (yield from self._links.open(address, port, socket_name))
 
-    return {
-        "socket_open": socket_open,
-        "socket_close": lambda socket_name=_NAME: links.close(socket_name),
-        "socket_set_var": lambda name, value, socket_name=_NAME: send(f"SET {name} {shown(value)}\n", socket_name),
-        "socket_send_string": send,
-        "socket_send_line": lambda text, socket_name=_NAME: send(shown(text) + "\n", socket_name),
-        "socket_send_int": lambda value, socket_name=_NAME: links.send(socket_name, struct.pack(">i", int(value))),
-        "socket_send_byte": lambda value, socket_name=_NAME: links.send(socket_name, bytes([int(value) & 255])),
-    }
+    def socket_close(self, socket_name: str = _NAME) -> None:
+        self._links.close(socket_name)
 
+    def socket_send_string(self, text: Value, socket_name: str = _NAME) -> bool:
+        return self._links.send(socket_name, shown(text).encode())
 
-def _reading_numbers(links: _Connections) -> Commands:
-    """To read numbers."""
+    def socket_send_line(self, text: Value, socket_name: str = _NAME) -> bool:
+        return self.socket_send_string(shown(text) + "\n", socket_name)
 
-    def read_integers(number: int, socket_name: str = _NAME, timeout: float = 2) -> Generator[None, None, List]:
-        return (yield from _numbers(links, socket_name, int(number), timeout, ">i"))
+    def socket_set_var(self, name: str, value: Value, socket_name: str = _NAME) -> bool:
+        return self.socket_send_string(f"SET {name} {shown(value)}\n", socket_name)
 
-    def read_bytes(number: int, socket_name: str = _NAME, timeout: float = 2) -> Generator[None, None, List]:
-        return (yield from _numbers(links, socket_name, int(number), timeout, ">B"))
+    def socket_send_int(self, value: float, socket_name: str = _NAME) -> bool:
+        return self._links.send(socket_name, struct.pack(">i", int(value)))
 
-    def read_floats(number: int, socket_name: str = _NAME, timeout: float = 2) -> Generator[None, None, List]:
+    def socket_send_byte(self, value: float, socket_name: str = _NAME) -> bool:
+        return self._links.send(socket_name, bytes([int(value) & 255]))
+
+    def socket_read_binary_integer(self, number: int, socket_name: str = _NAME, timeout: float = 2) -> _Reading[List]:
+        return (yield from _numbers(self._links, socket_name, int(number), timeout, ">i"))
+
+    def socket_read_byte_list(self, number: int, socket_name: str = _NAME, timeout: float = 2) -> _Reading[List]:
+        return (yield from _numbers(self._links, socket_name, int(number), timeout, ">B"))
+
+    def socket_read_ascii_float(self, number: int, socket_name: str = _NAME, timeout: float = 2) -> _Reading[List]:
         """Numbers in brackets: (1.0, 2.0)."""
-        text = (yield from links.take(socket_name, lambda data: data.find(b")") + 1, timeout)).decode(
-            "ascii", "replace"
-        )
+        data = yield from self._links.take(socket_name, lambda data: data.find(b")") + 1, timeout)
         values = []
         with suppress(ValueError):
-            values = [float(part) for part in text.strip().strip("()").split(",")][: int(number)]
+            values = [float(part) for part in data.decode("ascii", "replace").strip().strip("()").split(",")]
+        values = values[: int(number)]
         return List([len(values), *values, *[math.nan] * (int(number) - len(values))])
 
-    return {
-        "socket_read_binary_integer": read_integers,
-        "socket_read_byte_list": read_bytes,
-        "socket_read_ascii_float": read_floats,
-    }
-
-
-def _reading_text(links: _Connections) -> Commands:
-    """To read text, and to ask a server for one of its variables."""
-
-    def read_line(socket_name: str = _NAME, timeout: float = 2) -> Generator[None, None, str]:
-        line = yield from links.take(socket_name, lambda data: data.find(b"\n") + 1, timeout)
+    def socket_read_line(self, socket_name: str = _NAME, timeout: float = 2) -> _Reading[str]:
+        line = yield from self._links.take(socket_name, lambda data: data.find(b"\n") + 1, timeout)
         return line.decode("utf-8", "replace").rstrip("\r\n")
 
-    def read_string(
-        socket_name: str = _NAME, prefix: str = "", suffix: str = "", interpret_escape: bool = False, timeout: float = 2
-    ) -> Generator[None, None, str]:
+    def socket_read_string(
+        self, socket_name: str = _NAME, prefix: str = "", suffix: str = "", interpret_escape: bool = False,
+        timeout: float = 2,
+    ) -> _Reading[str]:  # fmt: skip
         def enough(data: bytes) -> int:
             if not suffix:
                 return len(data)
             found = data.find(suffix.encode())
             return 0 if found < 0 else found + len(suffix)
 
-        text = (yield from links.take(socket_name, enough, timeout)).decode("utf-8", "replace")
+        text = (yield from self._links.take(socket_name, enough, timeout)).decode("utf-8", "replace")
         after = text.partition(prefix)[2] if prefix else text
         return after.removesuffix(suffix) if suffix else after
 
-    def get_var(name: str, socket_name: str = _NAME) -> Generator[None, None, int]:
+    def socket_get_var(self, name: str, socket_name: str = _NAME) -> _Reading[int]:
         """The server answers a question for one of its variables with its name and a number."""
-        links.send(socket_name, f"GET {name}\n".encode())
-        words = (yield from read_line(socket_name)).split()
+        self._links.send(socket_name, f"GET {name}\n".encode())
+        words = (yield from self.socket_read_line(socket_name)).split()
         return int(words[-1]) if words else 0
 
-    return {"socket_read_line": read_line, "socket_read_string": read_string, "socket_get_var": get_var}
 
-
-def _numbers(links: _Connections, name: str, count: int, timeout: float, code: str) -> Generator[None, None, List]:
+def _numbers(links: _Connections, name: str, count: int, timeout: float, code: str) -> _Reading[List]:
     """The count of what came, then the numbers; zeros and a count of 0 when they did not all come in time."""
     count = min(count, _MOST_NUMBERS)
     size = struct.calcsize(code) * count

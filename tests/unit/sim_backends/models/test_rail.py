@@ -9,8 +9,6 @@ from sim_backends.models.rail import RailModel, RailParams, RailSettings
 from sim_backends.models.ramp import Screw
 
 STEPS = 200 * 256
-
-
 LEAD = 0.002
 
 

@@ -9,14 +9,8 @@ from sim_backends.peers.arm.program import RuntimeState
 from tests.support.script_controller import Controller
 
 GOAL = [1.0, -1.57, -1.57, -1.57, 1.57, 0.0]
-
-
 MOVE = f"def program():\n  movej({GOAL}, a=2.0, v=0.5)\nend\n"
-
-
 SERVING = "def rtde_control():\n  global reg_offset_int = # int register offset\n 0\nend\n"
-
-
 WATCHDOG = 35
 
 

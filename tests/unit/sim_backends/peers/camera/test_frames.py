@@ -18,8 +18,6 @@ from sim_backends.models.camera import CameraSpec
 from sim_backends.peers.camera.frames import BACKLOG, FramePeer
 
 pytestmark = pytest.mark.wire
-
-
 SPEC = CameraSpec(
     "SimCam", "SIM000007-SCAN", width=64, height=48, frame_rate_max=120.0, epoch=5000.0, drift_ppm=80.0, latency=0.0002
 )

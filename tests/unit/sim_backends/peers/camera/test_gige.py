@@ -16,7 +16,6 @@ from sim_backends.peers.camera import gigevision as g
 from sim_backends.peers.camera.gige import GigePeer
 
 pytestmark = pytest.mark.wire
-
 SPEC = CameraSpec("SimCam", "SIM000007-SCAN", 64, 48, frame_rate_max=120.0)
 
 

@@ -18,8 +18,6 @@ from sim_backends.peers.rail.tmcl import TmclPeer
 from tests.support.wire.clocks import until
 
 pytestmark = pytest.mark.wire
-
-
 STEPS = 200 * 256
 
 

@@ -19,8 +19,6 @@ from tests.support import ROOT
 from tests.support.wire.clocks import until
 
 pytestmark = pytest.mark.wire
-
-
 DBC = ROOT / "drivers" / "vehicle" / "agilex_v2.dbc"
 
 

@@ -66,8 +66,6 @@ def address(running: ArmBench) -> str:
 
 
 NUMBERED = ("int_register", "double_register")
-
-
 NAMES = [
     "timestamp", "target_q", "target_qd", "target_qdd", "target_current", "target_moment", "actual_q", "actual_qd",
     "actual_current", "joint_control_output", "actual_TCP_pose", "actual_TCP_speed", "actual_TCP_force",
@@ -88,8 +86,6 @@ NAMES = [
     *(f"{way}_{kind}_{i}" for way in ("input", "output") for kind in NUMBERED for i in range(48)),
 ]  # fmt: skip
 """The 393 outputs that the maker's own recording example can ask for."""
-
-
 SIZES = {
     "BOOL": 1, "UINT8": 1, "UINT32": 4, "UINT64": 8, "INT32": 4, "DOUBLE": 8, "VECTOR3D": 24, "VECTOR6D": 48,
     "VECTOR6INT32": 24,

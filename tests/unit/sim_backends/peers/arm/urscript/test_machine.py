@@ -76,11 +76,7 @@ def test_a_script_reaches_nothing_of_the_host(controller: Controller) -> None:
 
 
 FIBONACCI = "def program():\n def f(n):\n  if n < 2:\n   return n\n  end\n  return f(n-1)+f(n-2)\n end\n f(60)\nend\n"
-
-
 FORKING = "def program():\n thread t():\n  run t()\n  run t()\n  sync()\n end\n run t()\n sleep(1)\nend\n"
-
-
 SQUARES = "def program():\n def f(n):\n  return f(n*n)\n end\n f(9)\nend\n"
 
 

@@ -91,8 +91,6 @@ def test_texts_are_taken_whole_however_they_arrive() -> None:
 
 
 NESTED = "def program():\n" + "while True:\n" * 25 + "end\n" * 26
-
-
 SAME_NAME_TWICE = "def program():\n  def f(a, a):\n  end\nend\n"
 
 
