@@ -98,7 +98,6 @@ class RailModel:
         self._losing = False
         self._lock = threading.RLock()
         self._edge = 0.0
-        self._switch_distance = 0
         self._stalled_at: float | None = None
         motor = params.screw.nut(params.start)
         self._zero = motor
@@ -170,11 +169,6 @@ class RailModel:
         """True while a reference search is running."""
         with self._lock:
             return self._leg(t).searching
-
-    def switch_distance(self) -> int:
-        """Microsteps between the switches as found by the last search of mode 2, else 0."""
-        with self._lock:
-            return self._switch_distance
 
     def fault(self, name: str, t: float) -> None:
         """Until `clear`: the wires of the limit switches are exchanged, or the motor loses a tenth of its steps on its
@@ -265,7 +259,6 @@ class RailModel:
                 legs = self._run(legs, zero, self.settings.search_speed)
             legs = self._run(legs, self._motor(edge + _BACK_OFF, +1), self.settings.search_speed)
             legs = self._run(legs, zero, self.settings.switch_speed)
-            self._switch_distance = round((right - zero) * self._steps()) if mode in (2, 3) else 0
             self._append(legs[:-1], searching=True)
             self._zero = zero
             self._append(legs[-1:], searching=False)

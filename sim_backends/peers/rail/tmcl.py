@@ -199,7 +199,7 @@ class TmclModule:
             0: rail.target, 1: lambda: rail.position(t), 2: rail.target_velocity, 3: lambda: rail.velocity(t),
             8: lambda: int(rail.reached(t)), 9: lambda: int(rail.home_switch(t)),
             10: lambda: int(rail.right_switch(t)), 11: lambda: int(rail.left_switch(t)), 29: lambda: rail.velocity(t),
-            196: rail.switch_distance, 202: lambda: rail.params.steps_per_turn, 206: lambda: 0,
+            202: lambda: rail.params.steps_per_turn, 206: lambda: 0,
             208: lambda: int(rail.stalled(t)) | (int(rail.velocity(t) == 0) << 7),
         }  # fmt: skip
         if kind not in readings:

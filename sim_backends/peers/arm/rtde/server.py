@@ -227,8 +227,6 @@ class RtdePeer:
         self._late = 0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="arm controller", daemon=True)
-        self.lateness: list[float] = []
-        """How late the newest ticks began, in seconds on the wall."""
 
     @property
     def address(self) -> str:
@@ -274,18 +272,12 @@ class RtdePeer:
             while not self._stopping.is_set():
                 self._clock.sleep_until(due)
                 late = self._clock.now() - due
-                self._note(late)
                 self._tick(due, held_up=self._clock.wall(late) > _HELD_UP_S)
                 due += period
                 if self._clock.now() - due > _GIVEN_UP * period:
                     due = self._clock.now()
         finally:
             self._ports.close()
-
-    def _note(self, late: float) -> None:
-        self.lateness.append(self._clock.wall(late))
-        if len(self.lateness) > 20000:
-            del self.lateness[:10000]
 
     def _tick(self, t: float, held_up: bool) -> None:
         self._tick_count += 1
