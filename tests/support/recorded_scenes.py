@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import warnings
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +13,10 @@ import pinocchio as pin
 import pytest
 
 from cell.apps.recordings.frames import RecordedFrame
+from cell.apps.recordings.result import RecordedResult
+from cell.apps.recordings.solution import camera_of, solve_frames
+from cell.measure.geometry.camera import CameraModel
+from cell.measure.vision.board.board import board_pose
 from cell.measure.vision.board.view import BoardView, parse_board
 from cell.measure.vision.stripe.extract import StripeProfile
 from tests.support import ROOT
@@ -22,6 +28,7 @@ NORMAL = np.array([0.80, 0.05, -0.6]) / np.linalg.norm([0.80, 0.05, -0.6])
 DISTANCE = float(NORMAL @ [0.0, 0.0, 0.40])
 SECOND_NORMAL, SECOND_FURTHER = cv2.Rodrigues(np.array([0.0, 0.15, 0.0]))[0] @ NORMAL, 0.012
 BOARD = parse_board("chessboard:7x6:18mm")
+TRUTH = CameraModel(*SIZE, MATRIX[0, 0], MATRIX[1, 1], MATRIX[0, 2], MATRIX[1, 2], tuple(LENS))
 EDGE = 5
 DOTS_PX, STRIPE_PX = 0.08, 0.15
 
@@ -132,3 +139,44 @@ def _profile(
     return StripeProfile(
         "rows", centres, sigma, np.where(known, 50.0, np.nan), np.where(known, 1.5, np.nan), nowhere, nowhere.copy()
     )
+
+
+Z = 3.5
+PLACE = 0.40
+"""Where on the optical axis the light plane is looked at, m."""
+
+
+def solved(frames: list[RecordedFrame], given: CameraModel | None = None) -> dict[str, Any]:
+    result = RecordedResult()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        solve_frames(frames, camera_of(frames, given), result, given=given)
+    return result.as_dict()
+
+
+def right(result: dict[str, Any]) -> bool:
+    """All that is not refused lies within what is stated about it."""
+    camera, hand, plane = result["intrinsics"], result["hand_eye"], result["light_plane"]
+    if camera is not None:
+        truth = {"fx": MATRIX[0, 0], "fy": MATRIX[1, 1], "cx": MATRIX[0, 2], "cy": MATRIX[1, 2]}
+        if any(abs(camera[name] - value) > Z * camera["sigma_px"][name] for name, value in truth.items()):
+            return False
+    if hand is not None:
+        off = np.array(hand["translation_mm"]) - 1e3 * FLANGE_FROM_CAMERA.translation
+        turn = np.degrees(pin.log3(np.array(hand["rotation"]) @ FLANGE_FROM_CAMERA.rotation.T))
+        if np.any(np.abs(off) > Z * np.array(hand["sigma_mm"])) or np.any(
+            np.abs(turn) > Z * np.array(hand["sigma_deg"])
+        ):
+            return False
+    if plane is not None:
+        at = np.array([(DISTANCE - NORMAL[2] * PLACE) / NORMAL[0], 0.0, PLACE])
+        off_mm = abs(1e3 * at @ np.array(plane["normal"]) - plane["distance_mm"])
+        tilt = np.degrees(np.arccos(min(1.0, abs(np.array(plane["normal"]) @ NORMAL))))
+        if off_mm > Z * plane["sigma_place_mm"] or tilt > Z * plane["sigma_normal_deg"]:
+            return False
+    return True
+
+
+def given_pairs(frames: list[RecordedFrame]) -> list[tuple[pin.SE3, pin.SE3]]:
+    """The frames' flange poses, and their boards as the true camera sees them."""
+    return [(f.base_from_flange, board_pose(f.view, TRUTH).camera_from_board) for f in frames]

@@ -124,51 +124,78 @@ def decide(
     `pitch` of the board in m, as it was named. Raises RefusedError when none does, or when two do that mean different
     things; its text names the option to give.
     """
-    fits: list[Fit] = []
-    problems: list[str] = []
-    for one in series:
-        first = one.records[0]
-        for reading in readings_of(len(first.numbers), first.named, wanted):
-            try:
-                fits += _fits_of(one, reading, boards, setup)
-            except RefusedError as error:
-                problems.append(str(error))
-    fits.sort(key=lambda f: f.score)
+    fits, problems = _fits(series, boards, wanted, setup)
     own = {f.series.name: f for f in fits if f.boards_own and f.score_scaled < AGREES}
+    if 0 < len(own) == len(series):
+        raise RefusedError(_boards_own(next(iter(own.values()))))
     fits = [f for f in fits if f.series.name not in own]
-    if own and all(one.name in own for one in series):
-        fit = next(iter(own.values()))
-        turned = "" if fit.setup == "eye_to_hand" else ", or of the camera as the board sees it"
-        raise RefusedError(
-            f"the poses of {fit.series.name} are those of the board as the camera sees it{turned}, not of the flange: "
-            f"read as {fit.text} they put the camera {1e3 * float(np.linalg.norm(fit.hand.translation)):.1f} mm from "
-            "the origin and along its axes; give the poses that the arm's controller told"
-        )
     if not fits:
         first = series[0].records[0]
         reason = (problems or [why_not(first.numbers, first.named, wanted)])[0]
         raise RefusedError(f"the poses of {series[0].name} cannot be read: {reason}; {NAME_IT}")
     best = fits[0]
     if not best.score < AGREES:
-        sized = [f for f in fits if f.scale > 2 * SCALE_SIGMAS * f.scale_sigma]
-        other = min(sized or fits, key=lambda f: f.score_scaled)
-        if sized and other.score_scaled < 0.5 * AGREES:
-            raise RefusedError(f"read as {other.text}, {scale_problem(other, pitch)[0]}")
-        raise RefusedError(
-            f"no reading of the poses agrees with the pictures: the nearest, {best.text}, leaves {best.left} of "
-            "scatter; are they the poses of these pictures in this order, of the flange (and not joint angles), and is "
-            f"the board's pitch right? Tried were {', '.join(TRIED)}; {NAME_IT}"
-        )
+        raise RefusedError(_none_agrees(fits, pitch))
     rival = next((f for f in fits[1:] if not _same(f, best, boards)), None)
     if rival is not None:
         # The same poses in another file are no other meaning.
         rival = next((f for f in fits if f.series is best.series and _same(f, rival, boards)), rival)
-        # A rival leaves clearly more in all, or turns alike and leaves more in where it puts the board.
-        shift = CLEAR_SHIFT * max(best.shift, LEAST_SHIFT * best.reach)
-        worse = rival.score >= CLEAR * best.score or (rival.turn >= AS_MUCH * best.turn and rival.shift >= shift)
-        if not worse:
+        if not _clearly_worse(rival, best):
             raise RefusedError(_question(best, rival))
     return Decision(best, rival, sorted(own))
+
+
+def _clearly_worse(rival: Fit, best: Fit) -> bool:
+    """Whether a rival leaves clearly more in all, or turns alike and leaves more in where it puts the board."""
+    shift = CLEAR_SHIFT * max(best.shift, LEAST_SHIFT * best.reach)
+    return rival.score >= CLEAR * best.score or (rival.turn >= AS_MUCH * best.turn and rival.shift >= shift)
+
+
+def _fits(
+    series: Sequence[Series], boards: dict[int, list[pin.SE3]], wanted: str | None, setup: str | None
+) -> tuple[list[Fit], list[str]]:
+    """The fits of every reading of the series, the best first, and why some give none."""
+    fits: list[Fit] = []
+    problems: list[str] = []
+    for one in series:
+        first = one.records[0]
+        for reading in readings_of(len(first.numbers), first.named, wanted):
+            poses = {k: pose for k, pose in one.poses(reading).items() if k in boards}
+            if len(poses) < 3 or len(poses) < 0.5 * sum(k in boards for k in one.of):
+                continue
+            keys = sorted(poses)
+            if len(keys) > MOST_FRAMES:
+                keys = [keys[k] for k in np.linspace(0, len(keys) - 1, MOST_FRAMES).round().astype(int)]
+            for side in ("eye_in_hand", "eye_to_hand") if setup is None else (setup,):
+                flanges = [poses[k] if side == "eye_in_hand" else poses[k].inverse() for k in keys]
+                try:
+                    fits.append(_fit(one, reading, side, flanges, [boards[k] for k in keys]))
+                except RefusedError as error:
+                    problems.append(str(error))
+                    break
+    return sorted(fits, key=lambda fit: fit.score), problems
+
+
+def _boards_own(fit: Fit) -> str:
+    turned = "" if fit.setup == "eye_to_hand" else ", or of the camera as the board sees it"
+    return (
+        f"the poses of {fit.series.name} are those of the board as the camera sees it{turned}, not of the flange: "
+        f"read as {fit.text} they put the camera {1e3 * float(np.linalg.norm(fit.hand.translation)):.1f} mm from "
+        "the origin and along its axes; give the poses that the arm's controller told"
+    )
+
+
+def _none_agrees(fits: Sequence[Fit], pitch: float) -> str:
+    best = fits[0]
+    sized = [f for f in fits if f.scale > 2 * SCALE_SIGMAS * f.scale_sigma]
+    other = min(sized or fits, key=lambda f: f.score_scaled)
+    if sized and other.score_scaled < 0.5 * AGREES:
+        return f"read as {other.text}, {scale_problem(other, pitch)[0]}"
+    return (
+        f"no reading of the poses agrees with the pictures: the nearest, {best.text}, leaves {best.left} of "
+        "scatter; are they the poses of these pictures in this order, of the flange (and not joint angles), and is "
+        f"the board's pitch right? Tried were {', '.join(TRIED)}; {NAME_IT}"
+    )
 
 
 def _question(best: Fit, rival: Fit) -> str:
@@ -209,43 +236,34 @@ def _same(a: Fit, b: Fit, boards: dict[int, list[pin.SE3]]) -> bool:
     return a.setup == b.setup and len(both) >= 3 and all(alike)
 
 
-def _fits_of(one: Series, reading: PoseReading, boards: dict[int, list[pin.SE3]], setup: str | None) -> list[Fit]:
-    """The fits of a reading, one for each set-up; none where too few frames have a pose in it.
+def _fit(
+    one: Series, reading: PoseReading, setup: str, flanges: Sequence[pin.SE3], options: Sequence[list[pin.SE3]]
+) -> Fit:
+    """How well flange poses go with the boards, of each the poses that it may have.
 
     Raises RefusedError where the turns tell nothing.
     """
-    poses = {k: p for k, p in one.poses(reading).items() if k in boards}
-    if len(poses) < 3 or len(poses) < 0.5 * sum(k in boards for k in one.of):
-        return []
-    keys = sorted(poses)
-    if len(keys) > MOST_FRAMES:
-        keys = [keys[k] for k in np.linspace(0, len(keys) - 1, MOST_FRAMES).round().astype(int)]
-    found = []
-    for side in ("eye_in_hand", "eye_to_hand") if setup is None else (setup,):
-        flanges = [poses[k] if side == "eye_in_hand" else poses[k].inverse() for k in keys]
-        options = [boards[k] for k in keys]
-        seen = [views[turn] for views, turn in zip(options, orders(flanges, options), strict=True)]
-        rotation, turn, kept = _rotation(flanges, seen)
-        reach = float(np.median([np.linalg.norm(b.translation) for b in seen]))
-        flanges, seen = [flanges[k] for k in kept], [seen[k] for k in kept]
-        offs = {unit: board_shifts(flanges, seen, rotation, size)[0] for unit, size in UNITS.items()}
-        unit = min(offs, key=lambda u: float(np.median(offs[u])))
-        # A pose that is far from all others, in another unit for example, tells nothing of the unit of these.
-        off = offs[unit]
-        close = np.flatnonzero(off <= max(FAR_RATIO * float(np.median(off)), FAR_SHARE * reach))
-        off, scale, sigma, place = board_shifts([flanges[k] for k in close], [seen[k] for k in close], rotation, None)
-        # The unit nearest to what fits best, where that is a size at all; else that which leaves least.
-        if scale > 4 * sigma > 0:
-            unit = min(offs, key=lambda u: abs(math.log(scale / UNITS[u])))
-        shift, size = float(np.median(offs[unit])), UNITS[unit]
-        # A unit so small that the flange seems at rest fits boards that hardly move in the picture, in any reading.
-        small = abs(scale / size - 1) > SCALE_WRONG or scale < SCALE_SIGMAS * sigma
-        score = turn + shift / reach + (1.0 if small else 0.0)
-        hand = from_parts(place, rotation)
-        stands = from_parts(scale * flanges[close[0]].translation, flanges[close[0]].rotation) * hand * seen[close[0]]
-        scaled = scale / size, sigma / size, float(np.median(off))
-        found.append(Fit(one, reading, side, unit, turn, shift, score, *scaled, reach, hand, stands))
-    return found
+    seen = [views[turn] for views, turn in zip(options, orders(flanges, options), strict=True)]
+    rotation, turn, kept = _rotation(flanges, seen)
+    reach = float(np.median([np.linalg.norm(b.translation) for b in seen]))
+    flanges, seen = [flanges[k] for k in kept], [seen[k] for k in kept]
+    offs = {unit: board_shifts(flanges, seen, rotation, size)[0] for unit, size in UNITS.items()}
+    unit = min(offs, key=lambda u: float(np.median(offs[u])))
+    # A pose that is far from all others, in another unit for example, tells nothing of the unit of these.
+    off = offs[unit]
+    close = np.flatnonzero(off <= max(FAR_RATIO * float(np.median(off)), FAR_SHARE * reach))
+    off, scale, sigma, place = board_shifts([flanges[k] for k in close], [seen[k] for k in close], rotation, None)
+    # The unit nearest to what fits best, where that is a size at all; else that which leaves least.
+    if scale > 4 * sigma > 0:
+        unit = min(offs, key=lambda u: abs(math.log(scale / UNITS[u])))
+    shift, size = float(np.median(offs[unit])), UNITS[unit]
+    # A unit so small that the flange seems at rest fits boards that hardly move in the picture, in any reading.
+    small = abs(scale / size - 1) > SCALE_WRONG or scale < SCALE_SIGMAS * sigma
+    score = turn + shift / reach + (1.0 if small else 0.0)
+    hand = from_parts(place, rotation)
+    stands = from_parts(scale * flanges[close[0]].translation, flanges[close[0]].rotation) * hand * seen[close[0]]
+    scaled = scale / size, sigma / size, float(np.median(off))
+    return Fit(one, reading, setup, unit, turn, shift, score, *scaled, reach, hand, stands)
 
 
 def _rotation(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> tuple[Array, float, list[int]]:

@@ -10,16 +10,16 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from cell.apps.recordings.agreement import UNITS, Decision, decide, scale_problem
 from cell.apps.recordings.conventions import check_reading, why_not
 from cell.apps.recordings.frames import RecordedFrame, near, read_frames
 from cell.apps.recordings.pairs import calibrate_pairs, read_pose_pairs
-from cell.apps.recordings.result import empty_result, frame_dict
-from cell.apps.recordings.series import Series, in_order_of_views, list_folder, match_series, read_series
+from cell.apps.recordings.result import Figures, RecordedResult
+from cell.apps.recordings.series import Listing, Series, in_order_of_views, list_folder, match_series, read_series
 from cell.apps.recordings.solution import (
     CameraChanged,
     agreeing,
@@ -46,8 +46,8 @@ class Options:
     """What a person said instead of leaving it to the data; None where nothing was said.
 
     `poses` is a reading's name (`conventions.TRIED`), `pose_field` a series of poses, `setup` eye_in_hand or
-    eye_to_hand; `plan`: only say what was understood. `camera` is known already; with
-    `hold_camera` the arm has no say in it. `laser`: the channel in which its stripe is read, None for none.
+    eye_to_hand; `plan`: only say what was understood. `camera` is known already; with `hold_camera` the arm has no say
+    in it. `laser`: the channel in which its stripe is read, None for none.
     """
 
     poses: str | None = None
@@ -59,108 +59,89 @@ class Options:
     laser: LaserChannel | None = LaserChannel.AUTO
 
 
-def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | None = None) -> dict[str, Any]:
+def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | None = None) -> RecordedResult:
     """Calibrate from the pictures of a folder, or from its pairs of poses when `spec` is None or there are no pictures.
-
-    Keys, all lengths in mm and angles in deg unless the key says otherwise, None for what the folder does not tell:
-
-    - `board`; `frames`: `name`, `used`, `reason`, `text`, `rms_px`, `points`, `pose`, `pose_from`, `stripe`,
-      `stripe_from`;
-    - `laser`: `asked`, the `channel` in which the stripe was read, and `votes`: of the pictures `looked` at, how many
-      show it best in which mix of colours; of a frame `stripe_off`, the picture without the laser, `stripe_text`, why
-      its line is not taken, and `stripe_left_out`, points with a `second_line` or a `reflection`, which are not used;
-    - `poses`: how the flange poses were read: `source`, `reading`, `unit`, `setup`, `matched_by`, `evidence`;
-    - `unread`: `name` and `reason` of each file that was not understood;
-    - `intrinsics`: `fx`, `fy`, `cx`, `cy`, `k1` … `k3`, `width`, `height`, `rms_px` (distance per point, as OpenCV has
-      it), `held_out_rms_px`, `sigma_px`; `intrinsics_without_distortion`, `intrinsics_from_pictures` likewise;
-    - `hand_eye`: `method`, `setup` (eye_in_hand, eye_to_hand), `translation_mm`, `rotation` (3×3),
-      `rotation_vector_rad`, `euler_xyz_rad` (rotations about x, then the new y, then the new z; the
-      first in 0 … π), `scatter_mm`, `scatter_deg`, of the closed form under `closed_form`;
-    - `light_plane`: `normal`, `distance_mm` (normal · point = distance in the camera frame), `rms_mm`,
-      `depth_range_mm`;
-    - `flatness`: `rms_mm`, `p95_mm`, `points`, `extent_mm`, `per_frame`, `leave_one_out`, `staged`;
-    - `noise`: what the adjustment assumed and found; `notes`: what could not be had, and why;
-    - `checks`: `part`, `name`, `value`, `doubt_from`, `refused_from`, `unit`, `verdict` (ok, doubt, refused), `text`;
-      `refused`: why, by part; a part that is refused is None, and what was found of it is in `refused_values`.
 
     Raises ConfigError when there is nothing to read.
     """
     options = options or Options()
     check_reading(options.poses)
-    pairs = read_pose_pairs(folder) if folder.is_dir() else []
     listing = list_folder(folder)
-    if pairs and (spec is None or (listing.texts and not listing.pictures)):
+    pairs = read_pose_pairs(folder)
+    if pairs and (spec is None or not listing.pictures):
         result = calibrate_pairs(pairs)
-        return (
-            result | {"hand_eye": None, "checks": [], "refused": {}, "refused_values": {}} if options.plan else result
-        )
-    if not listing.pictures and listing.texts:
-        raise ConfigError(
-            f"{folder} holds no pictures, and no JSON file with pairs of poses: for a hand-eye without pictures give "
-            "a list of [base_from_flange, camera_from_board], each a 4×4 matrix in m"
-        )
-    if spec is None:
-        count = Counter(path.parent for path in listing.pictures)
-        held = ", ".join(f"{listing.name(f)} ({n})" for f, n in count.items() if f != folder)
-        raise ConfigError(
-            f"{folder}: name the board in the {len(listing.pictures)} pictures with --board, such as "
-            "chessboard:7x6:10mm" + (f"; pictures are in {held}: --from can name one of these, too" if held else "")
-        )
+        return RecordedResult(frames=result.frames, notes=result.notes) if options.plan else result
+    if spec is None or (listing.texts and not listing.pictures):
+        raise ConfigError(_what_is_missing(listing))
     series, links, unread = read_series(listing)
     belonging, strange = match_series(series, listing, links)
     # A plan tells of boards and poses; to read stripes takes seconds for each picture.
     frames, channel = read_frames(listing, spec, links, None if options.plan else options.laser, options.plan)
-    late = [one for one in series if not one.of and in_order_of_views(one, frames)]
-    strange = [(name, reason) for name, reason in strange if name not in [one.name for one in late]]
-    result = empty_result(spec)
-    asked, chosen = (str(one or "none") for one in (channel.asked, channel.chosen))
-    result["laser"] = {"asked": asked, "channel": chosen, "looked": channel.looked, "votes": channel.votes}
-    # Why lines on the board are not taken for the laser's: in one sentence where there may be no laser at all.
-    doubtful = [f"{f.name}: no stripe: {f.stripe_text}" for f in frames if f.stripe_text]
-    if len(doubtful) > 1 and not any(f.profile is not None for f in frames):
-        perhaps = f"no picture shows a stripe for certain, {len(doubtful)} show a line that may be one"
-        doubtful = [f"{perhaps}; {doubtful[0]}"]
-    result["notes"] += doubtful
-    result["unread"] = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread, *strange]]
-    _from_frames(frames, belonging + late, options, result)
-    result["frames"] = [frame_dict(frame) for frame in frames]
+    late = {one.name: one for one in series if not one.of and in_order_of_views(one, frames)}
+    unread += [(name, reason) for name, reason in strange if name not in late]
+    result = RecordedResult(spec.name, laser=channel.figures())
+    result.notes += _doubtful_lines(frames)
+    result.unread = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread]]
+    _from_frames(frames, [*belonging, *late.values()], options, result)
+    result.frames = [frame.figures() for frame in frames]
     return result
 
 
+def _what_is_missing(listing: Listing) -> str:
+    """Why a folder without a board's name, or without pictures, is not read."""
+    if listing.texts and not listing.pictures:
+        return (
+            f"{listing.folder} holds no pictures, and no JSON file with pairs of poses: for a hand-eye without "
+            "pictures give a list of [base_from_flange, camera_from_board], each a 4×4 matrix in m"
+        )
+    count = Counter(path.parent for path in listing.pictures)
+    held = ", ".join(f"{listing.name(f)} ({n})" for f, n in count.items() if f != listing.folder)
+    return (
+        f"{listing.folder}: name the board in the {len(listing.pictures)} pictures with --board, such as "
+        "chessboard:7x6:10mm" + (f"; pictures are in {held}: --from can name one of these, too" if held else "")
+    )
+
+
+def _doubtful_lines(frames: Sequence[RecordedFrame]) -> list[str]:
+    """Why lines on the board are not taken for the laser's: one sentence where there may be no laser at all."""
+    doubtful = [f"{f.name}: no stripe: {f.stripe_text}" for f in frames if f.stripe_text]
+    if len(doubtful) > 1 and not any(f.profile is not None for f in frames):
+        perhaps = f"no picture shows a stripe for certain, {len(doubtful)} show a line that may be one"
+        return [f"{perhaps}; {doubtful[0]}"]
+    return doubtful
+
+
 def _from_frames(
-    frames: list[RecordedFrame], series: Sequence[Series], options: Options, result: dict[str, Any]
+    frames: Sequence[RecordedFrame], series: Sequence[Series], options: Options, result: RecordedResult
 ) -> None:
-    notes: list[str] = result["notes"]
-    found = None
+    cameras = None
     try:
-        found = (rough_camera if options.plan else camera_of)(frames, options.camera)
+        cameras = (rough_camera if options.plan else camera_of)(frames, options.camera)
     except CameraChanged as error:
-        result["refused"]["intrinsics"] = f"no intrinsics: {error}"
+        result.refused["intrinsics"] = f"no intrinsics: {error}"
     except RefusedError as error:
-        notes.append(f"no intrinsics: {error}")
-    understood = attach_poses(frames, series, None if found is None else found[0].camera, options)
-    result["poses"] = understood.about
-    notes += understood.notes
+        result.notes.append(f"no intrinsics: {error}")
+    understood = attach_poses(frames, series, None if cameras is None else cameras[0].camera, options)
+    result.poses = understood.about
+    result.notes += understood.notes
     if understood.refused:
-        result["refused"]["hand_eye"] = understood.refused
-    for one in series:
-        if one.alone and one.name in (understood.about["source"] or []):
-            several = Counter(r.path for r in one.records)
-            names = [r.path.name + (f" {r.label}" if several[r.path] > 1 else "") for r in one.alone]
-            notes.append(f"{', '.join(names)} not used: no picture belongs to it")
-    if found is not None and options.plan:
-        agreeing(frames, found[0].camera)
-    elif found is not None:
-        solve_frames(frames, found, result, understood.setup, given=options.camera, hold_camera=options.hold_camera)
-        note_perhaps_no_laser(frames, result)
+        result.refused["hand_eye"] = understood.refused
+    if cameras is not None and options.plan:
+        agreeing(frames, cameras[0].camera)
+    elif cameras is not None:
+        hold, setup = options.hold_camera, understood.setup
+        solve_frames(frames, cameras, result, setup=setup, given=options.camera, hold_camera=hold)
+        if options.laser is LaserChannel.AUTO:
+            note_perhaps_no_laser(frames, result)
 
 
 @dataclass
 class Understood:
-    """How the poses of a folder were read; `refused`: why there are poses, and none can be used."""
+    """How the poses of a folder were read, and in which series; `refused`: why there are some, and none can be used."""
 
-    setup: str | None = None
-    about: dict[str, Any] = field(default_factory=dict)
+    series: Sequence[Series]
+    setup: str = "eye_in_hand"
+    about: Figures = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     refused: str = ""
 
@@ -179,15 +160,25 @@ def attach_poses(
             text = f"--pose-field {options.pose_field}: no such poses belong to the pictures; there are {names}"
             raise ConfigError(text)
     if not series:
-        return Understood(about={"source": None}, notes=["no flange poses were found that belong to the pictures"])
+        return Understood([], about={"source": None}, notes=["no flange poses were found that belong to the pictures"])
     for one in series:
         _settle(one, frames, len(series) == 1)
-    understood = Understood(about={"source": [s.name for s in series]})
-    if camera is None:
-        return understood
+    undecided = Understood(series, about={"source": [s.name for s in series]})
+    understood = undecided if camera is None else _understand(frames, undecided, camera, options)
+    for one in understood.series:
+        if one.alone:
+            names = ", ".join(one.named(record) for record in one.alone)
+            understood.notes.append(f"{names} not used: no picture belongs to it")
+    return understood
+
+
+def _understand(
+    frames: Sequence[RecordedFrame], understood: Understood, camera: CameraModel, options: Options
+) -> Understood:
+    """The reading of the poses by the boards in the pictures; as it was where nothing can be decided."""
     boards = {}
     for k, frame in enumerate(frames):
-        if frame.view is None or frame.reason is not None or not any(k in s.of for s in series):
+        if frame.view is None or frame.reason is not None or not any(k in s.of for s in understood.series):
             continue
         try:
             boards[k] = [board_pose(view, camera).camera_from_board for view in frame.view.turns()]
@@ -199,7 +190,7 @@ def attach_poses(
         return understood
     try:
         pitch = next(f.view.spec.pitch for f in frames if f.view is not None)
-        decision = decide(series, boards, pitch, options.poses, options.setup)
+        decision = decide(understood.series, boards, pitch, options.poses, options.setup)
     except RefusedError as error:
         understood.refused = f"no hand-eye: {error}"
         return understood
@@ -221,7 +212,7 @@ def _settle(one: Series, frames: Sequence[RecordedFrame], only: bool) -> None:
 def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, options: Options) -> Understood:
     best = decision.best
     one, poses = best.series, best.series.poses(best.reading)
-    about = {
+    about: Figures = {
         "source": [one.name],
         "reading": best.reading.name,
         "text": best.reading.text,
@@ -234,32 +225,34 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
         "shift_mm": 1e3 * best.shift,
     }
     own = "not used: its poses are those of the board as the camera sees it, not of the flange"
-    understood = Understood(best.setup, about, [f"{name} {own}" for name in decision.boards_own])
+    understood = Understood([one], best.setup, about, [f"{name} {own}" for name in decision.boards_own])
     problem, refused = scale_problem(best, pitch)
     if refused:
         understood.refused = f"no hand-eye: {problem}"
     elif problem:
         understood.notes.append(f"doubt: {problem}")
     for k, record in one.of.items():
-        frame, pose = frames[k], poses.get(k)
-        several = sum(r.path == record.path for r in one.records) > 1
-        frame.pose_from = record.path.name + (f" {record.label}" if several and record.label else "")
-        if pose is None:
-            if frame.reason in (None, Reason.DUPLICATE):
-                why = why_not(record.numbers, record.named, best.reading.name)
-                frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: {why}")
-            continue
-        place = UNITS[best.unit] * pose.translation
-        far = float(np.linalg.norm(place))
-        if far > FARTHEST_M:
-            if frame.reason is None:
-                text = f"the flange is {far:.0f} m from the base, read in {best.unit} like the others (allowed"
-                text += f" {FARTHEST_M:.0f} m): is its position in another unit? Correct it"
-                frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: {text}")
-        elif not refused:
-            frame.base_from_flange = from_parts(place, pose.rotation)
+        frames[k].pose_from = one.named(record)
+        if k in poses:
+            _take_pose(frames[k], from_parts(UNITS[best.unit] * poses[k].translation, poses[k].rotation), best.unit)
+        elif frames[k].reason in (None, Reason.DUPLICATE):
+            why = why_not(record.numbers, record.named, best.reading.name)
+            frames[k].refuse(Reason.NO_POSE, f"{frames[k].pose_from}: {why}")
+        if refused:
+            frames[k].base_from_flange = None
     _compare_copies(frames)
     return understood
+
+
+def _take_pose(frame: RecordedFrame, pose: pin.SE3, unit: str) -> None:
+    """Keep a flange pose, or refuse the frame where it is out of every arm's reach."""
+    far = float(np.linalg.norm(pose.translation))
+    if far <= FARTHEST_M:
+        frame.base_from_flange = pose
+    elif frame.reason is None:
+        text = f"the flange is {far:.0f} m from the base, read in {unit} like the others (allowed"
+        text += f" {FARTHEST_M:.0f} m): is its position in another unit? Correct it"
+        frame.refuse(Reason.NO_POSE, f"{frame.pose_from}: {text}")
 
 
 def _compare_copies(frames: Sequence[RecordedFrame]) -> None:

@@ -1,6 +1,6 @@
 """What the numbers of a pose may mean: the table of conventions that are tried, and the names that --poses knows.
 
-Nothing is chosen here: `decide.py` asks the pictures which reading they agree with.
+Nothing is chosen here: `agreement.py` asks the pictures which reading they agree with.
 """
 
 from __future__ import annotations

@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,9 +19,12 @@ import cv2
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
+from cell.apps.recordings.result import Figures
 from cell.apps.recordings.series import Listing, frame_key
-from cell.apps.recordings.stripes import ChosenChannel, ReadStripe, Source, calmest, choose_channel, read_on_board
+from cell.apps.recordings.stripes import ChosenChannel, ReadStripe, Source, choose_channel, read_on_board
 from cell.apps.recordings.texts import PICTURES
 from cell.measure.geometry.poses import difference, mean
 from cell.measure.vision.board.board import find_board
@@ -33,17 +37,13 @@ from drivers.errors import ConfigError
 Small = NDArray[np.float32]
 SMALL, ALIKE_DN = (40, 30), 12.0
 """Small copies of one view differ by less on average; which views are worth a closer look."""
-SAME_DN, CHANGED_DN = 6.0, 40
-"""Half of the pixels differ by less than the first; what differs by more than the second was drawn."""
-LARGEST_SHARE = 0.2
+SAME_DN, CHANGED_DN, LARGEST_SHARE = 6.0, 40, 0.2
+"""Half of the pixels differ by less than the first; what differs by more than the second was drawn: a small share."""
 COLOURED_DN, COLOURED_SHARE = 60, 0.6
 """Drawn pixels are by so much more coloured than before; most of them are."""
-THICK = 80
-"""Lines are thinner than the picture's width over this."""
 HUES, HUE_SHARE = 6, 0.15
 """A laser's line has one hue; axes, markers and corners have several, or are at most of the board's points."""
 AT_POINTS, NEAR_PX = 0.6, 6
-STRAIGHTENED = re.compile(r"undist|rectif|remap|straight", re.IGNORECASE)
 # Pictures that are named alike show the board at one place when its points differ by no more than the first. Those of
 # other numbers are one view when they differ by the second, which is what noise and another file format make. Views
 # whose middles differ by more than the third are not compared.
@@ -88,6 +88,25 @@ class RecordedFrame:
         """Keep what was read of the stripe."""
         self.profile, self.stripe_text, self.stripe_left_out = read.profile, read.text, read.left_out
 
+    def figures(self) -> Figures:
+        """What became of it, for the JSON."""
+        return {
+            "name": self.name,
+            "used": self.reason is None,
+            "reason": None if self.reason is None else str(self.reason),
+            "text": self.text,
+            "rms_px": self.rms_px,
+            "points": 0 if self.view is None else len(self.view.ids),
+            "pose": self.base_from_flange is not None,
+            "pose_from": self.pose_from or None,
+            "stripe": self.profile is not None,
+            "stripe_from": self.stripe_from or None,
+            "stripe_off": self.stripe_off or None,
+            "stripe_text": self.stripe_text,
+            "stripe_left_out": self.stripe_left_out,
+            "order_assumed": self.view is not None and self.view.order_assumed,
+        }
+
     @property
     def dark(self) -> bool:
         """True where the name says that the laser is off."""
@@ -119,28 +138,9 @@ def read_frames(
     if not listing.pictures:
         raise ConfigError(f"{listing.folder} holds no pictures ({', '.join(PICTURES)})")
     frames = [RecordedFrame(path, listing.name(path)) for path in listing.pictures]
-    seen: dict[str, RecordedFrame] = {}
-    small: list[Small | None] = []
-    for frame in frames:
-        small.append(None)
-        try:
-            image = read_picture(frame.path)
-            small[-1] = cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
-            frame.view = find_board(image, spec, quick=quick)
-        except PictureRefused as refused:
-            frame.refuse(refused.reason, str(refused))
-        except (ArithmeticError, LookupError, ValueError, cv2.error) as error:
-            # One picture that upsets the search must not end the reading of the others.
-            frame.refuse(Reason.UNREADABLE, f"the search for the board failed: {type(error).__name__}: {error}")
-        if frame.reason not in (Reason.UNREADABLE, Reason.CUT):
-            # Of pictures without a board, all dark for example, those of other frames may well be the same.
-            digest = "" if frame.view is not None else frame_key(frame.name)
-            digest += hashlib.sha1(frame.path.read_bytes(), usedforsecurity=False).hexdigest()
-            first = seen.setdefault(digest, frame)
-            if first is not frame:
-                frame.shows = first
-                frame.refuse(Reason.DUPLICATE, f"the same file as {first.name}")
-    _set_copies_aside(frames, small)
+    small = [_find_board(frame, spec, quick) for frame in frames]
+    _refuse_same_files(frames)
+    _refuse_drawn(frames, small)
     # One camera's pictures have one size: that of most with a board. Of two that are as frequent the larger: pictures
     # whose lens somebody took out are cropped.
     sizes = Counter(f.view.size for f in frames if f.view is not None)
@@ -157,38 +157,54 @@ def read_frames(
     return frames, channel
 
 
-def _set_copies_aside(frames: Sequence[RecordedFrame], small: Sequence[Small | None]) -> None:
-    """Refuse frames that are others with something drawn in, or straightened; `small` copies (n,) by frame.
+def _find_board(frame: RecordedFrame, spec: BoardSpec, quick: bool) -> Small | None:
+    """Find the board in a frame's picture, or refuse it; a small copy (n,) of the picture that was read."""
+    small = None
+    try:
+        image = read_picture(frame.path)
+        small = cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
+        frame.view = find_board(image, spec, quick=quick)
+    except PictureRefused as refused:
+        frame.refuse(refused.reason, str(refused))
+    except (ArithmeticError, LookupError, ValueError, cv2.error) as error:
+        # One picture that upsets the search must not end the reading of the others.
+        frame.refuse(Reason.UNREADABLE, f"the search for the board failed: {type(error).__name__}: {error}")
+    return small
 
-    Corners, axes and markers are found by their pixels. What a straightened copy shows differs everywhere a little:
-    there its name has to say it, too.
-    """
-    coloured: dict[str, bool] = {}
+
+def _refuse_same_files(frames: Sequence[RecordedFrame]) -> None:
+    """Refuse copies of a file; of pictures without a board, all dark for example, those of other frames may be same."""
+    seen: dict[str, RecordedFrame] = {}
+    for frame in frames:
+        if frame.reason not in (Reason.UNREADABLE, Reason.CUT):
+            digest = "" if frame.view is not None else frame_key(frame.name)
+            digest += hashlib.sha1(frame.path.read_bytes(), usedforsecurity=False).hexdigest()
+            first = seen.setdefault(digest, frame)
+            if first is not frame:
+                frame.shows = first
+                frame.refuse(Reason.DUPLICATE, f"the same file as {first.name}")
+
+
+def _refuse_drawn(frames: Sequence[RecordedFrame], small: Sequence[Small | None]) -> None:
+    """Refuse frames that are others with corners, axes or markers drawn in; `small` copies (n,) by frame."""
+    coloured = cache(_has_colour)
     for frame, mine in zip(frames, small, strict=True):
         for other, its in zip(frames, small, strict=True):
             if other is frame or mine is None or its is None or frame.reason is Reason.DUPLICATE or other.shows:
                 continue
-            if np.abs(mine - its).mean() > ALIKE_DN:
-                continue
-            if STRAIGHTENED.search(frame.name) and not STRAIGHTENED.search(other.name):
-                text = f"by its name it is {other.name}, straightened"
-            elif not frame.lit and _has_colour(frame, coloured) and _drawn_into(frame, other):
-                text = f"it is {other.name} with lines drawn into it"
-            else:
-                continue
-            frame.shows = other
-            frame.refuse(Reason.DUPLICATE, text)
+            alike = np.abs(mine - its).mean() <= ALIKE_DN and not frame.lit
+            if alike and coloured(frame.path) and _drawn_into(frame, other):
+                frame.shows = other
+                frame.refuse(Reason.DUPLICATE, f"it is {other.name} with lines drawn into it")
 
 
-def _has_colour(frame: RecordedFrame, known: dict[str, bool]) -> bool:
-    """True where lines in pure colours may be in the picture; each is read once."""
-    if frame.name not in known:
-        try:
-            image = read_colours(frame.path)
-            known[frame.name] = image.ndim == 3 and bool((_spread(_coloured(image)) > COLOURED_DN).any())
-        except PictureRefused:
-            known[frame.name] = False
-    return known[frame.name]
+def _has_colour(path: Path) -> bool:
+    """True where lines in pure colours may be in the picture."""
+    try:
+        image = read_colours(path)
+    except PictureRefused:
+        return False
+    return image.ndim == 3 and bool((_spread(_coloured(image)) > COLOURED_DN).any())
 
 
 def _spread(image: NDArray[np.uint8]) -> NDArray[np.int16]:
@@ -199,21 +215,18 @@ def _spread(image: NDArray[np.uint8]) -> NDArray[np.int16]:
 
 
 def _drawn_into(frame: RecordedFrame, other: RecordedFrame) -> bool:
-    """True where a frame's picture is the other's with thin coloured lines over it."""
+    """True where a frame's picture is the other's with coloured lines over it."""
     try:
         drawn, plain = (_coloured(read_colours(f.path)) for f in (frame, other))
     except PictureRefused:
         return False
     if drawn.shape != plain.shape:
         return False
-    off = cv2.split(cv2.absdiff(drawn, plain))
-    apart = np.asarray(cv2.max(cv2.max(off[0], off[1]), off[2]), dtype=np.uint8)
+    apart = np.asarray(cv2.absdiff(drawn, plain)).max(axis=2)
     changed = apart > CHANGED_DN
-    if not 0 < changed.mean() < LARGEST_SHARE or np.median(apart) > SAME_DN:
-        return False
     lines = changed & (_spread(drawn) - _spread(plain) > COLOURED_DN)
-    thick = cv2.erode(changed.astype(np.uint8), np.ones((max(5, drawn.shape[1] // THICK),) * 2, np.uint8))
-    if lines.sum() < COLOURED_SHARE * changed.sum() or thick.sum() > 0.1 * changed.sum():
+    few = 0 < changed.mean() < LARGEST_SHARE and np.median(apart) <= SAME_DN
+    if not few or lines.sum() < COLOURED_SHARE * changed.sum():
         return False
     hue = cv2.cvtColor(drawn, cv2.COLOR_RGB2HSV)[:, :, 0][lines]
     # Hues count to 180; each primary in the middle of its part.
@@ -241,15 +254,14 @@ class _Place:
     others: list[RecordedFrame]
 
     @property
-    def dark(self) -> list[Path]:
-        """Pictures without the laser, by their names."""
-        return [f.path for f in self.others if f.dark]
+    def off(self) -> Path | None:
+        """The picture without the laser, by its name."""
+        return next((f.path for f in self.others if f.dark), None)
 
     def sources(self) -> list[tuple[RecordedFrame, Source]]:
-        """Where the stripe may be, each with the picture without the laser that takes most of the board away."""
+        """Where the stripe may be, each with the picture without the laser."""
         lit = [f for f in self.others if f.lit] or [f for f in self.others if not f.dark]
-        offs = [*self.dark, self.board.path]
-        return [(f, Source(f.path, self.view, calmest(f.path, offs, self.view))) for f in lit]
+        return [(f, Source(f.path, self.view, self.off or self.board.path)) for f in lit]
 
 
 def _find_places(frames: Sequence[RecordedFrame], links: Sequence[dict[str, str]]) -> list[_Place]:
@@ -285,29 +297,32 @@ def _find_places(frames: Sequence[RecordedFrame], links: Sequence[dict[str, str]
 
 def _together(frames: Sequence[RecordedFrame], links: Sequence[dict[str, str]]) -> list[list[RecordedFrame]]:
     """Frames by what joins them, names, links or views; those that nothing joins to another are left out."""
-    group = list(range(len(frames)))
+    pairs = np.array([*_joined_by_name(frames, links), *_joined_by_view(frames)], dtype=int).reshape(-1, 2)
+    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(frames),) * 2)
+    labels = connected_components(graph, directed=False)[1].tolist() if frames else []
+    groups = [[f for f, own in zip(frames, labels, strict=True) if own == label] for label in dict.fromkeys(labels)]
+    return [group for group in groups if len(group) > 1]
 
-    def join(a: int, b: int) -> None:
-        old, new = group[b], group[a]
-        group[:] = [new if g == old else g for g in group]
 
+def _joined_by_name(frames: Sequence[RecordedFrame], links: Sequence[dict[str, str]]) -> Iterator[tuple[int, int]]:
+    """Pairs of indices of frames that are named alike, or that a table names together."""
     first: dict[str, int] = {}
     for k, frame in enumerate(frames):
         if key := frame_key(frame.name):
-            join(first.setdefault(key, k), k)
+            yield first.setdefault(key, k), k
     index = {f.name: k for k, f in enumerate(frames)}
     for link in links:
         linked = [index[v] for v in link.values() if v in index]
-        for k in linked[1:]:
-            join(linked[0], k)
+        yield from ((linked[0], k) for k in linked[1:])
+
+
+def _joined_by_view(frames: Sequence[RecordedFrame]) -> Iterator[tuple[int, int]]:
+    """Pairs of indices of frames that show the board at the same pixels."""
     seen = [(k, v, np.median(v.pixels, axis=0)) for k, f in enumerate(frames) if (v := f.view) is not None]
     for i, (k, view, middle) in enumerate(seen):
         for j, other, its in seen[:i]:
-            near = np.abs(middle - its).max() < FAR_PX
-            if near and group[j] != group[k] and _apart(other, view) < SAME_VIEW_PX:
-                join(j, k)
-    groups = [[f for f, g in zip(frames, group, strict=True) if g == one] for one in dict.fromkeys(group)]
-    return [some for some in groups if len(some) > 1]
+            if np.abs(middle - its).max() < FAR_PX and _apart(other, view) < SAME_VIEW_PX:
+                yield j, k
 
 
 def _apart(a: BoardView, b: BoardView) -> float:
@@ -349,7 +364,7 @@ def _read_place(place: _Place, sources: Sequence[tuple[RecordedFrame, Source]], 
     reads = [(frame, source, read_on_board(source, channel)) for frame, source in sources]
     lit = max((r for r in reads if r[2].profile is not None), key=lambda r: r[2].points, default=None)
     if lit is None or not lit[0].lit:
-        mine = read_on_board(Source(board.path, place.view, next(iter(place.dark), None)), channel)
+        mine = read_on_board(Source(board.path, place.view, place.off), channel)
         if mine.profile is not None:
             board.take(mine)
             lit = None

@@ -81,32 +81,43 @@ def _camera(data: Mapping[str, Any]) -> CameraModel:
         values = [float(data.get(name, 0.0)) if name[0] in "kp" else float(data[name]) for name in PARAMETER_NAMES]
         further = {name: float(data[name]) for name in FURTHER_TERMS if name in data}
     else:
-        of, lenses = _key(data, MATRICES), _key(data, LENSES)
-        matrix, lens = _numbers(data[of]).reshape(3, 3), _numbers(data[lenses])
-        if matrix[0, 1] or matrix[1, 0] or not np.array_equal(matrix[2], (0, 0, 1)):
-            raise ConfigError(f"{of} is {matrix.tolist()}, it must be fx 0 cx, 0 fy cy, 0 0 1; {NEXT}")
-        if len(lens) < LEAST_TERMS and lens.any():
-            raise ConfigError(f"{lenses} has {len(lens)} numbers, k1, k2, p1, p2 and perhaps k3 are needed; {NEXT}")
-        values = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *lens[:5], *np.zeros(max(0, 5 - len(lens)))]
-        further = {f"{lenses}[{k + 5}]": float(value) for k, value in enumerate(lens[5:])}
+        values, further = _of_matrices(data)
     for name, value in further.items():
         if value != 0.0:
             raise ConfigError(f"{name} is {value:g}: the lens here has k1, k2, p1, p2 and k3 only; {NEXT}")
     camera = CameraModel(width, height, 1.0, fy=1.0, cx=0.0, cy=0.0).with_parameters(values)
-    longer, inf = max(width, height), math.inf
-    focal = tuple(limit * longer for limit in FOCAL_RANGE)
-    allowed = {"fx": focal, "fy": focal, "cx": (-OUTSIDE * width, (1 + OUTSIDE) * width)}
-    allowed |= {"cy": (-OUTSIDE * height, (1 + OUTSIDE) * height)}
-    if width <= 0 or height <= 0:
-        raise ConfigError(f"the picture is {width}×{height} px, both must be positive; {NEXT}")
+    _require_possible(camera)
+    return camera
+
+
+def _of_matrices(data: Mapping[str, Any]) -> tuple[list[float], dict[str, float]]:
+    """Parameters (9) of a camera matrix and a lens's coefficients, and by name the coefficients that follow these."""
+    of, lenses = _key(data, MATRICES), _key(data, LENSES)
+    matrix, lens = _numbers(data[of]).reshape(3, 3), _numbers(data[lenses])
+    if matrix[0, 1] or matrix[1, 0] or not np.array_equal(matrix[2], (0, 0, 1)):
+        raise ConfigError(f"{of} is {matrix.tolist()}, it must be fx 0 cx, 0 fy cy, 0 0 1; {NEXT}")
+    if len(lens) < LEAST_TERMS and lens.any():
+        raise ConfigError(f"{lenses} has {len(lens)} numbers, k1, k2, p1, p2 and perhaps k3 are needed; {NEXT}")
+    values = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *lens[:5], *np.zeros(max(0, 5 - len(lens)))]
+    return values, {f"{lenses}[{k + 5}]": float(value) for k, value in enumerate(lens[5:])}
+
+
+def _require_possible(camera: CameraModel) -> None:
+    """ConfigError for a camera with a parameter that is not finite, or out of every camera's range."""
+    size, longer = f"{camera.width}×{camera.height} px", max(camera.width, camera.height)
+    if camera.width <= 0 or camera.height <= 0:
+        raise ConfigError(f"the picture is {size}, both must be positive; {NEXT}")
+    focal = FOCAL_RANGE[0] * longer, FOCAL_RANGE[1] * longer
+    allowed = {"fx": focal, "fy": focal}
+    allowed |= {n: (-OUTSIDE * px, (1 + OUTSIDE) * px) for n, px in (("cx", camera.width), ("cy", camera.height))}
     for name, value in zip(PARAMETER_NAMES, camera.parameters, strict=True):
         if not np.isfinite(value):
             raise ConfigError(f"{name} is {value}, it must be a finite number; {NEXT}")
-        low, high = allowed.get(name, (-inf, inf))
+        low, high = allowed.get(name, (-math.inf, math.inf))
         if not low <= value <= high:
-            size = f"in a picture of {width}×{height} px"
-            raise ConfigError(f"{name} is {value:g} px, allowed are {low:g} to {high:g} px {size}; {NEXT}")
-    return camera
+            raise ConfigError(
+                f"{name} is {value:g} px, allowed are {low:g} to {high:g} px in a picture of {size}; {NEXT}"
+            )
 
 
 def _key(data: Mapping[str, Any], names: tuple[str, ...]) -> str:

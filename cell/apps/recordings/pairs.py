@@ -6,15 +6,13 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from cell.apps.recordings.consistency import misplacements, odd_turns
 from cell.apps.recordings.frames import SAME_M, SAME_RAD, counted, grouped, near
-from cell.apps.recordings.result import closed_form_dict, empty_result, hand_eye_dict, setup_note
-from cell.apps.recordings.solution import apply_checks
+from cell.apps.recordings.result import RecordedResult, closed_form_figures, hand_eye_figures, setup_note
 from cell.measure.calibration.judge.checks import QualityCheck
 from cell.measure.calibration.judge.scale import metric_scale
 from cell.measure.calibration.solve.starts import HandEye, refine_hand_eye, solve_hand_eye
@@ -54,13 +52,13 @@ def read_pose_pairs(folder: Path) -> list[Pair]:
     return []
 
 
-def calibrate_pairs(pairs: Sequence[Pair]) -> dict[str, Any]:
+def calibrate_pairs(pairs: Sequence[Pair]) -> RecordedResult:
     """Hand-eye from pairs, camera on the flange or standing before the board.
 
     Pairs that do not agree with most are left out and named. Raises ConfigError when they give none.
     """
     _check_unit(pairs)
-    result = empty_result(None)
+    result = RecordedResult()
     stops = grouped(range(len(pairs)), lambda a, b: _one_stop(pairs[a], pairs[b]))
     means = [(mean([pairs[k][0] for k in stop]), mean([pairs[k][1] for k in stop])) for stop in stops]
     odd = _wrong(means)
@@ -68,48 +66,59 @@ def calibrate_pairs(pairs: Sequence[Pair]) -> dict[str, Any]:
     for k in range(len(pairs)):
         reason = str(Reason.NO_POSE) if k in wrong else None
         frame = {"name": f"pair {k}", "used": k not in wrong, "reason": reason}
-        result["frames"].append({**frame, "text": wrong.get(k, ""), "rms_px": None})
+        result.frames.append({**frame, "text": wrong.get(k, ""), "rms_px": None})
     kept = [pair for k, pair in enumerate(means) if k not in odd]
     if len(stops) < len(pairs):
         same = "pairs of one stop share its error and count as one"
-        result["notes"].append(f"{counted(len(pairs), len(stops), 'pairs')}: {same}")
+        result.notes.append(f"{counted(len(pairs), len(stops), 'pairs')}: {same}")
     if len(kept) < LEAST_PAIRS:
         raise ConfigError(
             f"pairs of poses of {len(kept)} stops agree with each other; a hand-eye that can be checked needs "
             f"{LEAST_PAIRS}"
         )
     boards = [board for _, board in kept]
-    solutions: list[tuple[str, HandEye, list[pin.SE3]]] = []
-    for setup in ("eye_in_hand", "eye_to_hand"):
-        flanges = [f if setup == "eye_in_hand" else f.inverse() for f, _ in kept]
-        try:
-            solutions.append((setup, solve_hand_eye(flanges, boards), flanges))
-        except RefusedError as error:
-            raise ConfigError(f"the {len(pairs)} pairs of poses give no hand-eye: {error}") from error
-    setup, closed, flanges = min(solutions, key=lambda s: s[1].scatter_m)
+    setup, closed, flanges = _closed_form(kept)
     refined, sigma, off = refine_hand_eye(flanges, boards, closed)
     left_out, found = float(np.sqrt(np.mean(off**2))), refined.flange_from_camera
     method, scatter = "Park-Martin, then robust least squares on the poses", (refined.scatter_m, refined.scatter_rad)
-    result["hand_eye"] = {
-        **hand_eye_dict(setup, method, found, scatter, sigma),
+    result.hand_eye = {
+        **hand_eye_figures(setup, method, found, scatter, sigma),
         "left_out": {"board_mm": 1e3 * left_out},
         "frames": len(kept),
-        "closed_form": closed_form_dict(setup, closed),
+        "closed_form": closed_form_figures(setup, closed),
     }
-    result["notes"] += [
-        *setup_note(setup, found), "pairs of poses only: no intrinsics, no light plane, no flatness"
-    ]  # fmt: skip
+    result.notes += setup_note(setup, found)
+    result.notes.append("pairs of poses only: no intrinsics, no light plane, no flatness")
     reach = float(np.median([np.linalg.norm(b.translation) for b in boards]))
-    apart = difference(found, closed.flange_from_camera)
+    checks = _checks(difference(found, closed.flange_from_camera), sigma, left_out, reach=reach, count=len(kept))
+    scale = metric_scale(flanges, boards)
+    result.apply(checks + ([] if scale is None else [scale.check(checks)]))
+    return result
+
+
+def _closed_form(pairs: Sequence[Pair]) -> tuple[str, HandEye, list[pin.SE3]]:
+    """Set-up, hand-eye and flange poses, the camera on the flange or before it, whichever scatters the board less."""
+    solutions: list[tuple[str, HandEye, list[pin.SE3]]] = []
+    for setup in ("eye_in_hand", "eye_to_hand"):
+        flanges = [f if setup == "eye_in_hand" else f.inverse() for f, _ in pairs]
+        try:
+            solutions.append((setup, solve_hand_eye(flanges, [board for _, board in pairs]), flanges))
+        except RefusedError as error:
+            raise ConfigError(f"the {len(pairs)} pairs of poses give no hand-eye: {error}") from error
+    return min(solutions, key=lambda solution: solution[1].scatter_m)
+
+
+def _checks(apart: Array, sigma: Array, left_out: float, *, reach: float, count: int) -> list[QualityCheck]:
+    """Of a hand-eye (6,) `apart` from its closed form, with its σ (6,), in m and rad; `left_out` and `reach` in m."""
     far, place = 1e3 * float(np.linalg.norm(apart[:3])), 1e3 * float(sigma[:3].max())
-    advice = f"from {len(boards)} pairs; turn the flange about two axes by 20° or more, to several sides"
+    advice = f"from {count} pairs; turn the flange about two axes by 20° or more, to several sides"
     strange = (
         f"{1e3 * left_out:.1f} mm from where the others put it: the arm scatters, or the poses are not of one set-up "
         "(another convention, a unit other than m, a board that moved)"
     )
     share, sigmas = 0.1 / reach, float(np.max(np.abs(apart) / np.maximum(sigma, 1e-9)))
     most = 6.0 if share * far > 3.0 else math.inf
-    checks = [
+    return [
         QualityCheck("hand_eye", name, value, doubt=doubt, refuse=refused, unit=unit, says=text)
         for name, value, doubt, refused, unit, text in (
             ("σ of its place", share * place, 1.0, 5.0, "% of the board's distance", f"{place:.1f} mm {advice}"),
@@ -118,9 +127,6 @@ def calibrate_pairs(pairs: Sequence[Pair]) -> dict[str, Any]:
             ("closed form against least squares", sigmas, 3.0, most, "σ", f"{far:.1f} mm apart"),
         )
     ]
-    scale = metric_scale(flanges, boards)
-    apply_checks(checks + ([] if scale is None else [scale.check(checks)]), result)
-    return result
 
 
 def _one_stop(a: Pair, b: Pair) -> bool:

@@ -1,77 +1,103 @@
-"""The parts of what `cell calibrate --from` prints as JSON; lengths in mm, angles in rad unless the name says else."""
+"""What `cell calibrate --from` found, with one serialiser; lengths in mm, angles in deg unless the name says else."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import pinocchio as pin
 
-from cell.apps.recordings.frames import RecordedFrame
-from cell.measure.calibration.judge.plane_checks import Flatness, PlaneKnown
-from cell.measure.calibration.solve.intrinsics import Intrinsics
+from cell.measure.calibration.judge.checks import QualityCheck, refused_parts
+from cell.measure.calibration.judge.plane_checks import Flatness
 from cell.measure.calibration.solve.starts import HandEye
 from cell.measure.geometry.camera import PARAMETER_NAMES, Array, CameraModel
-from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.vision.board.view import BoardSpec
 
 FAR_CAMERA_M = 0.8
-CAMERAS = ("intrinsics", "intrinsics_without_distortion", "intrinsics_from_pictures")
+Figures = dict[str, object]
 
 
-def empty_result(spec: BoardSpec | None) -> dict[str, Any]:
-    """The keys of every result, nothing known yet."""
-    result: dict[str, Any] = {"board": None if spec is None else spec.name, "frames": [], "laser": None, "poses": None}
-    result |= {"unread": [], **dict.fromkeys((*CAMERAS, "hand_eye", "light_plane", "flatness", "noise"))}
-    return result | {"notes": [], "checks": [], "refused": {}, "refused_values": {}}
+@dataclass
+class RecordedResult:
+    """All that was found in a folder; None for what it does not tell, or what is `refused`, by part, with the reason.
+
+    - `frames`: of each `name`, `used`, `reason`, `text`, `rms_px`, `points`, `pose`, `pose_from`, `stripe` and more;
+    - `laser`: what was `asked`, and in which `channel` it was read, by the `votes` of the pictures;
+    - `poses`: `source`, `reading`, `unit`, `setup`, `matched_by`, `evidence`;
+    - `unread`: `name` and `reason` of each file that was not understood;
+    - `notes`: what could not be had, and why; `refused_values`: what was found of a refused part.
+    """
+
+    board: str | None = None
+    frames: list[Figures] = field(default_factory=list)
+    laser: Figures | None = None
+    poses: Figures | None = None
+    unread: list[dict[str, str]] = field(default_factory=list)
+    intrinsics: Figures | None = None
+    intrinsics_without_distortion: Figures | None = None
+    intrinsics_from_pictures: Figures | None = None
+    hand_eye: Figures | None = None
+    light_plane: Figures | None = None
+    flatness: Figures | None = None
+    noise: Figures | None = None
+    notes: list[str] = field(default_factory=list)
+    checks: list[QualityCheck] = field(default_factory=list)
+    refused: dict[str, str] = field(default_factory=dict)
+    refused_values: Figures = field(default_factory=dict)
+
+    def as_dict(self) -> Figures:
+        """For the JSON: arrays as lists, None for numbers that are not finite."""
+        return {each.name: _plain(getattr(self, each.name)) for each in fields(self)}
+
+    def apply(self, checks: Sequence[QualityCheck]) -> None:
+        """Keep the checks, say what is doubtful, and take out what is refused.
+
+        A light plane and a hand-eye rest on the camera: they are refused with it.
+        """
+        self.checks = list(checks)
+        self.notes += [f"doubtful: {check.text}" for check in checks if check.verdict == "doubt"]
+        failed = {part: "; ".join(check.text for check in found) for part, found in refused_parts(checks).items()}
+        gone = list(failed)
+        if "intrinsics" in failed:
+            for part in ("hand_eye", "light_plane"):
+                if getattr(self, part) is not None:
+                    rests = f"{part.replace('_', '-')}: it rests on the camera, which is refused"
+                    failed.setdefault(part, rests)
+            gone = ["intrinsics_without_distortion", "intrinsics_from_pictures", *failed]
+        self.refused |= failed
+        for part in gone:
+            self.refused_values[part] = getattr(self, part)
+            setattr(self, part, None)
+        if "hand_eye" in failed or "light_plane" in failed:
+            self.flatness = None
 
 
-def frame_dict(frame: RecordedFrame) -> dict[str, Any]:
-    """What became of one frame."""
-    return {
-        "name": frame.name,
-        "used": frame.reason is None,
-        "reason": None if frame.reason is None else str(frame.reason),
-        "text": frame.text,
-        "rms_px": frame.rms_px,
-        "points": 0 if frame.view is None else len(frame.view.ids),
-        "pose": frame.base_from_flange is not None,
-        "pose_from": frame.pose_from or None,
-        "stripe": frame.profile is not None,
-        "stripe_from": frame.stripe_from or None,
-        "stripe_off": frame.stripe_off or None,
-        "stripe_text": frame.stripe_text,
-        "stripe_left_out": frame.stripe_left_out,
-        "order_assumed": frame.view is not None and frame.view.order_assumed,
-    }
+def _plain(value: object) -> object:
+    if isinstance(value, QualityCheck):
+        return value.as_dict()
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(each) for each in value]
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    return value if not isinstance(value, float) or math.isfinite(value) else None
 
 
-def intrinsics_dict(found: Intrinsics) -> dict[str, Any]:
-    """A camera from pictures alone, px."""
-    tried = {name: value for name, value in found.tried.items() if math.isfinite(value)}
-    return {
-        **camera_dict(found.camera, found.sigma),
-        "rms_px": found.point_rms_px,
-        "held_out_rms_px": finite(math.sqrt(2) * found.held_out_px),
-        "formal_sigma_px": dict(zip(PARAMETER_NAMES[:4], found.formal[:4].tolist(), strict=True)),
-        "lens": found.model.name,
-        "lens_tried_rms_px": tried,
-        "method": "pictures alone",
-    }
-
-
-def camera_dict(camera: CameraModel, sigma: Array) -> dict[str, Any]:
-    """A camera's parameters by name, and the σ (4 or more,) of the first four."""
+def camera_figures(camera: CameraModel, sigma: Array, rms_px: float, held_out: float, lens: str) -> Figures:
+    """A camera in px with its σ (4 or more,); `rms_px` per point, as OpenCV has it, `held_out` that of left-out views
+    per component."""
     values = dict(zip(PARAMETER_NAMES, camera.parameters.tolist(), strict=True))
     about = dict(zip(PARAMETER_NAMES[:4], sigma[:4].tolist(), strict=True))
-    return {**values, "width": camera.width, "height": camera.height, "sigma_px": about}
+    held_out_px = math.sqrt(2) * held_out
+    size = {"width": camera.width, "height": camera.height}
+    return {**values, **size, "sigma_px": about, "rms_px": rms_px, "held_out_rms_px": held_out_px, "lens": lens}
 
 
-def hand_eye_dict(
+def hand_eye_figures(
     setup: str, method: str, pose: pin.SE3, scatter: tuple[float, float], sigma: Array | None = None
-) -> dict[str, Any]:
+) -> Figures:
     """A hand-eye pose, its angles as matrix, rotation vector and XYZ Euler angles in rad.
 
     `scatter` of the board in the base in m and rad; `sigma` (6,) in m and rad.
@@ -83,25 +109,34 @@ def hand_eye_dict(
         # Of the two triples for one rotation, that with the first angle in 0 … π.
         first, middle, last = first + math.pi, math.pi - middle, last + math.pi
         middle, last = (math.remainder(angle, 2 * math.pi) for angle in (middle, last))
-    found = {
+    found: Figures = {
         "method": method,
         "setup": setup,
         "pose": "flange_from_camera" if setup == "eye_in_hand" else "base_from_camera",
-        "translation_mm": (1e3 * pose.translation).tolist(),
-        "rotation": r.tolist(),
-        "rotation_vector_rad": pin.log3(r).tolist(),
+        "translation_mm": 1e3 * pose.translation,
+        "rotation": r,
+        "rotation_vector_rad": pin.log3(r),
         "euler_xyz_rad": [first, middle, last],
         "scatter_mm": 1e3 * scatter[0],
         "scatter_deg": math.degrees(scatter[1]),
     }
     if sigma is not None:
-        found |= {"sigma_mm": (1e3 * sigma[:3]).tolist(), "sigma_deg": np.degrees(sigma[3:]).tolist()}
+        found |= {"sigma_mm": 1e3 * sigma[:3], "sigma_deg": np.degrees(sigma[3:])}
     return found
 
 
-def closed_form_dict(setup: str, found: HandEye) -> dict[str, Any]:
+def closed_form_figures(setup: str, found: HandEye) -> Figures:
     """A hand-eye by Park and Martin with the scatter of the board in the base."""
-    return hand_eye_dict(setup, "Park-Martin", found.flange_from_camera, (found.scatter_m, found.scatter_rad))
+    return hand_eye_figures(setup, "Park-Martin", found.flange_from_camera, (found.scatter_m, found.scatter_rad))
+
+
+def flatness_figures(flat: Flatness | None, names: Sequence[str]) -> Figures | None:
+    """How flat the board is in the base, end to end, and frame by frame."""
+    if flat is None:
+        return None
+    per_frame = [{"name": name, "rms_mm": 1e3 * rms} for name, rms in zip(names, flat.per_frame, strict=True)]
+    whole = {"rms_mm": 1e3 * flat.rms, "p95_mm": 1e3 * flat.p95, "points": flat.points}
+    return {**whole, "extent_mm": 1e3 * flat.extent, "per_frame": per_frame}
 
 
 def setup_note(setup: str, pose: pin.SE3) -> list[str]:
@@ -119,49 +154,3 @@ def setup_note(setup: str, pose: pin.SE3) -> list[str]:
         "does it stand still, and the board move with the flange? Then the poses are those of the base in the flange: "
         "invert them"
     ]
-
-
-def plane_dict(
-    method: str, plane: LightPlane, rms: float, noise: float, known: PlaneKnown | None, depths: Array
-) -> dict[str, Any]:
-    """A light plane n·P = d in the camera frame. `rms`, the stripe's own `noise` and `depths` (n,) in m."""
-    return {
-        **normal_dict(plane, rms),
-        "depth_range_mm": [1e3 * float(np.nanmin(depths)), 1e3 * float(np.nanmax(depths))],
-        "sigma_place_mm": None if known is None else 1e3 * known.place,
-        "sigma_normal_deg": None if known is None else math.degrees(known.tilt),
-        "stripe_noise_mm": 1e3 * noise,
-        "method": method,
-    }
-
-
-def normal_dict(plane: LightPlane, rms: float) -> dict[str, Any]:
-    """A light plane and the RMS in m of its points."""
-    return {"normal": list(plane.normal), "distance_mm": 1e3 * plane.distance, "rms_mm": 1e3 * rms}
-
-
-def seen_depths(plane: LightPlane, camera: CameraModel, stripes: Sequence[Array]) -> Array:
-    """Depths (n,) in m before the camera at which the stripe was seen on the board."""
-    depths: Array = plane.intersect(camera.rays(np.concatenate(stripes)))[:, 2]
-    return depths
-
-
-def flatness_dict(flat: Flatness | None, names: Sequence[str]) -> dict[str, Any] | None:
-    """How flat the board is in the base, end to end, and frame by frame."""
-    return None if flat is None else {
-        "rms_mm": 1e3 * flat.rms,
-        "p95_mm": 1e3 * flat.p95,
-        "points": flat.points,
-        "extent_mm": (1e3 * flat.extent).tolist(),
-        "per_frame": [{"name": n, "rms_mm": finite(1e3 * v)} for n, v in zip(names, flat.per_frame, strict=True)],
-    }  # fmt: skip
-
-
-def finite(value: float) -> float | None:
-    """None for what is not known."""
-    return value if math.isfinite(value) else None
-
-
-def all_finite(values: Mapping[str, float]) -> dict[str, float | None]:
-    """The values by name, None for what is not known."""
-    return {key: finite(value) for key, value in values.items()}

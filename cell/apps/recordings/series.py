@@ -1,15 +1,14 @@
-"""Series of recorded poses, and the picture of each: by a table, by name, folder, number or time, or in order.
+"""Series of recorded poses, and the picture of each: by a table, by name, folder or number, or in order.
 
 Also what lies in a recording's folder and its sub-folders: pictures, texts, and what is neither, by name.
 """
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,7 +43,6 @@ ROLES = (
     "laser|stripe|line|image|img|frame|picture|pic|photo|pose|poses|tcp|robot|flange|board|chess|chessboard|charuco|"
     "color|colour|rgb|gray|grey|cam|camera|on|off|light|dark|copy|kopie|copie"
 )
-CLOCK = re.compile(r"\d{9,}(?:[._]\d+)?")
 
 
 @dataclass
@@ -119,6 +117,11 @@ class Series:
     alone: list[PoseRecord] = field(default_factory=list)
     doubled: dict[int, list[PoseRecord]] = field(default_factory=dict)
 
+    def named(self, record: PoseRecord) -> str:
+        """A record's file, with its label where the file holds several."""
+        several = sum(other.path == record.path for other in self.records) > 1
+        return record.path.name + (f" {record.label}" if several and record.label else "")
+
     def poses(self, reading: PoseReading) -> dict[int, pin.SE3]:
         """Poses by picture in the unit of the file, without those that the reading makes no pose of."""
         found = {}
@@ -133,46 +136,59 @@ class Series:
 
 def read_series(listing: Listing) -> tuple[list[Series], list[dict[str, str]], list[tuple[str, str]]]:
     """All series of a folder, the links between its files, and the texts that could not be read, with the reason."""
-    contents: dict[str, Content] = {}
+    contents, unread = _read_texts(listing)
+    joined, paired = join_halves([half for content in contents for half in content.halves])
+    for content in contents:
+        name = listing.name(content.path)
+        if content.halves and not content.records and content.path not in paired:
+            what = "positions or rotations only: name both files alike, such as R_gripper2base.txt and"
+            unread.append((name, f"it holds {what} t_gripper2base.txt"))
+        elif not (content.records or content.links or content.halves):
+            unread.append((name, f"no pose is in it ({NEEDED} numbers)"))
+    found = _grouped(listing, contents, joined)
+    few = "one pose, of a kind that no other file has"
+    unread += [(listing.name(one.records[0].path), few) for one in found if len(one.records) < LEAST]
+    links = [link for content in contents for link in content.links]
+    return [one for one in found if len(one.records) >= LEAST], links, unread
+
+
+def _read_texts(listing: Listing) -> tuple[list[Content], list[tuple[str, str]]]:
+    """What the texts of a folder hold, and those that cannot be read, with the reason."""
+    contents: list[Content] = []
     unread: list[tuple[str, str]] = []
     for path in listing.texts:
         try:
-            contents[listing.name(path)] = read_content(path)
+            contents.append(read_content(path))
         except ValueError as error:
             unread.append((listing.name(path), str(error)))
         except Exception as error:
             # Whatever a stray file holds, and whichever reader it upsets: the others are read all the same.
             unread.append((listing.name(path), f"it cannot be read ({type(error).__name__}): {error}"))
-    joined, paired = join_halves([half for content in contents.values() for half in content.halves])
-    for name, content in contents.items():
-        if content.halves and not content.records and not any(path in paired for path, _, _ in content.halves):
-            what = "positions or rotations only: name both files alike, such as R_gripper2base.txt and"
-            unread.append((name, f"it holds {what} t_gripper2base.txt"))
-        elif not (content.records or content.links or content.halves):
-            unread.append((name, f"no pose is in it ({NEEDED} numbers)"))
+    return contents, unread
+
+
+def _grouped(listing: Listing, contents: Iterable[Content], joined: Sequence[PoseRecord]) -> list[Series]:
+    """Records of one place in one file, or of one place in files that are named alike."""
     groups: dict[tuple[str, str, int], list[PoseRecord]] = {}
     for record in joined:
         groups.setdefault((listing.name(record.path), record.field, len(record.numbers)), []).append(record)
     alike = Counter((path.parent, _series_name(path.name)) for path in listing.texts)
-    for content in contents.values():
+    for content in contents:
         fields = Counter(record.field for record in content.records)
+        kind = _series_name(content.path.name)
         for record in content.records:
-            source, place, kind = listing.name(record.path), record.field, _series_name(record.path.name)
+            source, place = listing.name(record.path), record.field
             if fields[place] == 1:
                 # A folder for each pose: files that are the only one of their kind in theirs are of one series.
                 own = alike[record.path.parent, kind] == 1
                 source = _series_name(source) if own else (Path(source).parent / kind).as_posix()
                 place = "" if place == "row" else place
             groups.setdefault((source, place, len(record.numbers)), []).append(record)
-    found = [
+    return [
         Series(f"{source}:{place}" if place not in ("", "row") else source, records)
         for (source, whole, count), some in groups.items()
         for place, records in _kinds(whole, count, some)
     ]
-    few = [(listing.name(s.records[0].path), "one pose, of a kind that no other file has") for s in found]
-    unread += [said for s, said in zip(found, few, strict=True) if len(s.records) < LEAST]
-    links = [link for content in contents.values() for link in content.links]
-    return [s for s in found if len(s.records) >= LEAST], links, unread
 
 
 def _kinds(place: str, count: int, records: list[PoseRecord]) -> list[tuple[str, list[PoseRecord]]]:
@@ -210,19 +226,7 @@ def match_series(
         if len(shown) == len(others) == 1:
             linked[others[0]] = shown[0]
     for one in series:
-        single = len({r.path for r in one.records}) == len(one.records)
-        own = {r.path.parent for r in one.records}
-        which = [k for k, p in enumerate(listing.pictures) if p.parent in own] if single else []
-        which = which or list(range(len(names)))
-        labels = [listing.name(r.path) if single else r.label or "" for r in one.records]
-        if single and sum(label in linked for label in labels) >= LEAST:
-            which, of = list(range(len(names))), {linked[x]: k for k, x in enumerate(labels) if x in linked}
-            found = _Match("table", of, [k for k, x in enumerate(labels) if x not in linked])
-        else:
-            found = _match([names[k] for k in which], labels, [r.time for r in one.records])
-        one.by, one.of = found.by, {which[k]: one.records[i] for k, i in found.of.items()}
-        one.alone = [one.records[i] for i in found.alone]
-        one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
+        _match_pictures(one, listing, linked)
     belonging = [s for s in series if s.of]
     if below := _others(belonging, listing):
         # The folder's own recording is meant; those in its sub-folders have boards and bases of their own.
@@ -231,6 +235,21 @@ def match_series(
         return match_series([s for s in series if not any(r.path.parent in below for r in s.records)], listing, links)
     why = f"poses for {len(names)} pictures, and none says which picture it belongs to"
     return belonging, [(s.name, f"{len(s.records)} {why}") for s in series if not s.of and names]
+
+
+def _match_pictures(one: Series, listing: Listing, linked: dict[str, int]) -> None:
+    """Find the picture of each record: as a table `linked` files and pictures, or by what both are called."""
+    single = len({r.path for r in one.records}) == len(one.records)
+    labels = [listing.name(r.path) if single else r.label or "" for r in one.records]
+    which = list(range(len(listing.pictures)))
+    found = _by_table(labels, linked)
+    if not single or len(found.of) < LEAST:
+        beside = {r.path.parent for r in one.records if single}
+        which = [k for k in which if listing.pictures[k].parent in beside] or which
+        found = _match([listing.name(listing.pictures[k]) for k in which], labels)
+    one.by, one.of = found.by, {which[k]: one.records[i] for k, i in found.of.items()}
+    one.alone = [one.records[i] for i in found.alone]
+    one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
 
 
 def in_order_of_views(one: Series, frames: Sequence[RecordedFrame]) -> bool:
@@ -270,21 +289,24 @@ class _Match:
     doubled: dict[int, list[int]] = field(default_factory=dict)
 
 
-def _match(pictures: Sequence[str], labels: Sequence[str], times: Sequence[float | None]) -> _Match:
+def _by_table(labels: Sequence[str], linked: dict[str, int]) -> _Match:
+    """The label of each picture that a table names with it."""
+    of = {linked[label]: k for k, label in enumerate(labels) if label in linked}
+    return _Match("table", of, [k for k, label in enumerate(labels) if label not in linked])
+
+
+def _match(pictures: Sequence[str], labels: Sequence[str]) -> _Match:
     """The label that belongs to each picture (names below the folder); the first way that serves most of them."""
-    both = (list(pictures), [label.replace("\\", "/") for label in labels])
-    ways = [
-        ("name", [[of(x) for x in side] for side in both]) for of in (str, lambda x: Path(x).name, _stem, frame_key)
-    ]
+    both = pictures, [label.replace("\\", "/") for label in labels]
+    ways = [("name", [list(map(way, side)) for side in both]) for way in (str, frame_key)]
     # A folder for each pose.
-    ways.append(("folder", [[str(Path(x).parent) for x in side] for side in both]))
-    if not any(x.startswith("[") for x in labels):
+    ways.append(("folder", [[str(Path(name).parent) for name in side] for side in both]))
+    if not any(label.startswith("[") for label in labels):
         ways.append(("number", [_numbers(side) for side in both]))
     best = max((_equal(left, right, by) for by, (left, right) in ways), key=lambda found: len(found.of))
-    by_time = _nearest(pictures, labels, times) if len(best.of) < len(pictures) / 2 else None
-    if by_time is None and len(labels) == len(pictures) and len(best.of) < 2:
+    if len(labels) == len(pictures) and len(best.of) < 2:
         return _Match("order", {k: k for k in range(len(labels))}, [])
-    return by_time or best
+    return best
 
 
 def _equal(left: list[str], right: list[str], by: str) -> _Match:
@@ -300,45 +322,17 @@ def _equal(left: list[str], right: list[str], by: str) -> _Match:
     return _Match(by, of, [k for k in range(len(right)) if k not in used], doubled)
 
 
-def _numbers(names: list[str]) -> list[str]:
+def _numbers(names: Sequence[str]) -> list[str]:
     """The numbers in each name that differ from name to name, as one word; empty where there is none."""
     found = [[int(d) for d in re.findall(r"\d+", str(Path(n).with_suffix("")) if "." in n else n)] for n in names]
     length = Counter(map(len, found)).most_common(1)[0][0] if found else 0
     usual = [f for f in found if len(f) == length]
-    varying = [k for k in range(length) if len({f[k] for f in usual}) > 1] or list(range(length))[-1:]
+    varying = [k for k, column in enumerate(zip(*usual, strict=True)) if len(set(column)) > 1]
+    varying = varying or list(range(length))[-1:]
     # A folder's number that goes with the file's adds nothing.
-    if len({tuple(f[k] for k in varying[-1:]) for f in usual}) == len(usual):
+    if varying and len({f[varying[-1]] for f in usual}) == len(usual):
         varying = varying[-1:]
-    return ["-".join(str(f[k]) for k in varying) if len(f) == length and varying else "" for f in found]
-
-
-def _nearest(pictures: Sequence[str], labels: Sequence[str], times: Sequence[float | None]) -> _Match | None:
-    """The pose of the nearest time, where names and table have times of the same clock."""
-    shown = [_clock(Path(p).name) for p in pictures]
-    told = [t if t is not None and math.isfinite(t) else _clock(x) for t, x in zip(times, labels, strict=True)]
-    timed = [k for k, t in enumerate(told) if t is not None]
-    if len(timed) < 2 or 2 * len(timed) < len(told) or None in shown:
-        return None
-    table = np.array([t for t in told if t is not None])
-    for scale in (1.0, 1e-3, 1e-6, 1e-9):
-        clock = np.array([s for s in shown if s is not None]) * scale
-        apart = np.abs(clock[:, None] - table[None, :])
-        near, reach = apart.argmin(axis=1), 0.5 * float(np.median(np.diff(np.sort(clock)))) if len(clock) > 1 else 0.1
-        good = apart.min(axis=1) <= max(reach, 1e-3)
-        if good.mean() > 0.5 and len(set(near[good].tolist())) == int(good.sum()):
-            of = {k: timed[near[k]] for k in np.flatnonzero(good).tolist()}
-            return _Match("time", of, [k for k in range(len(labels)) if k not in of.values()])
-    return None
-
-
-def _clock(name: str) -> float | None:
-    found = CLOCK.search(name)
-    return None if found is None else float(found[0].replace("_", "."))
-
-
-def _stem(name: str) -> str:
-    path = Path(name)
-    return path.stem if path.suffix.lower() in (*PICTURES, *TEXTS) else path.name
+    return ["-".join(str(f[k]) for k in varying) if len(f) == length else "" for f in found]
 
 
 def _series_name(name: str) -> str:
@@ -348,5 +342,7 @@ def _series_name(name: str) -> str:
 
 def frame_key(name: str) -> str:
     """What two pictures of one frame have in common: their name without folders and the words for what is in them."""
-    words = re.split(r"[\s_\-.()]+|(?<=[a-z])(?=\d)", _stem(name).lower())
+    path = Path(name)
+    stem = path.stem if path.suffix.lower() in (*PICTURES, *TEXTS) else path.name
+    words = re.split(r"[\s_\-.()]+|(?<=[a-z])(?=\d)", stem.lower())
     return "-".join(str(int(w)) if w.isdecimal() else w for w in words if w and not re.fullmatch(ROLES, w))

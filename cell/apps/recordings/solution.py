@@ -5,32 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
-from cell.apps.recordings.chain import (  # fmt: skip
-    STRIPE_MEANS,
-    Profiles,
-    Rows,
-    check_chain,
-    of_one_plane,
-    report_chain,
-    solve_chain,
-)
+from cell.apps.recordings.chain import check_chain, pictures_figures, plane_of_pictures, report_chain, solve_chain
 from cell.apps.recordings.consistency import refuse_misplaced, refuse_odd_ones, settle_orders
 from cell.apps.recordings.frames import RecordedFrame, by_stop, counted, merged, used
-from cell.apps.recordings.result import CAMERAS, intrinsics_dict, plane_dict, seen_depths
-from cell.measure.calibration.judge.checks import QualityCheck, against_pictures, camera_checks, refused_parts
+from cell.apps.recordings.result import RecordedResult
+from cell.measure.calibration.judge.checks import QualityCheck, against_pictures, camera_checks
 from cell.measure.calibration.judge.faults import FOREIGN, foreign_view, parted_at
-from cell.measure.calibration.judge.plane_checks import PlaneKnown, plane_checks, planes_of_cameras, planes_without_one
 from cell.measure.calibration.solve.intrinsics import Intrinsics, choose_lens, given_camera
-from cell.measure.calibration.solve.starts import PlaneStart, plane_from_board, stripe_means, stripe_pixels, zhang
-from cell.measure.geometry.camera import Array, CameraModel
+from cell.measure.calibration.solve.starts import zhang
+from cell.measure.geometry.camera import CameraModel
 from cell.measure.vision.board.board import board_pose
 from cell.measure.vision.board.view import BoardView
 from cell.measure.vision.pictures import PictureRefused, Reason
-from cell.measure.vision.stripe_on_board import on_plane
 from drivers.errors import RefusedError
 
 # A frame whose points miss their places by this many times the others' RMS, and by this many px, is not of this board.
@@ -45,71 +34,86 @@ FITS_BETTER = 1.06
 LIKELY_LASER = 0.5
 """Share of the pictures that shows a stripe where there was a laser."""
 OBLIQUE = math.radians(75.0)
+Cameras = tuple[Intrinsics, Intrinsics]
+"""The camera of the pictures, and that without distortion."""
 
 
 class CameraChanged(RefusedError):
     """The pictures are of two cameras, or of one whose zoom or focus was changed."""
 
 
-def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None) -> tuple[Intrinsics, Intrinsics]:
+def camera_of(frames: Sequence[RecordedFrame], given: CameraModel | None = None) -> Cameras:
     """Camera of all used frames, and that without distortion; frames refused whose points miss by far more than others.
 
     A `given` camera is taken as it is. Raises RefusedError where the frames give none.
     """
     while True:
         kept = used(frames)
-        views, stops = _views(kept), by_stop(kept)
-        apart = _views([merged(s) for s in stops])
         try:
-            if given is None:
-                # The camera of the stops with the residuals of each picture.
-                found, plain = choose_lens(apart)
-                chosen, plain = (
-                    replace(c, view_rms=np.array([board_pose(view, c.camera).rms_px for view in views]))
-                    for c in (found, plain)
-                )
-                _refuse_change(chosen, apart, [s[0].name for s in stops])
-            else:
-                chosen = plain = given_camera(given, views)
+            cameras = _camera(kept, given)
         except PictureRefused:
             # One picture whose pose nobody can tell must not take the camera of the others.
-            rough = zhang(apart, lens=False) if given is None else given
-            for frame in kept:
-                try:
-                    board_pose(_view(frame), rough)
-                except PictureRefused as refused:
-                    frame.refuse(refused.reason, str(refused))
-            if len(used(kept)) == len(kept):
+            if not _refuse_poseless(kept, given):
                 raise
             continue
-        worst, typical = int(np.argmax(chosen.view_rms)), float(np.median(chosen.view_rms))
-        if chosen.view_rms[worst] > max(ODD_RATIO * typical, ODD_PX) and len(kept) > LEAST_FRAMES:
-            kept[worst].refuse(
+        if not _refuse_strange(kept, cameras[0], given):
+            return cameras
+
+
+def _camera(kept: Sequence[RecordedFrame], given: CameraModel | None) -> Cameras:
+    """The camera of the stops with the residuals of each picture."""
+    views, stops = _views(kept), by_stop(kept)
+    if given is not None:
+        return (given_camera(given, views),) * 2
+    apart = _views([merged(stop) for stop in stops])
+    chosen, plain = (
+        replace(c, view_rms=np.array([board_pose(view, c.camera).rms_px for view in views])) for c in choose_lens(apart)
+    )
+    _refuse_change(chosen, apart, [stop[0].name for stop in stops])
+    return chosen, plain
+
+
+def _refuse_poseless(kept: Sequence[RecordedFrame], given: CameraModel | None) -> bool:
+    """Refuse frames whose board's pose cannot be told; whether there are any."""
+    rough = zhang(_views([merged(stop) for stop in by_stop(kept)]), lens=False) if given is None else given
+    for frame, view in zip(kept, _views(kept), strict=True):
+        try:
+            board_pose(view, rough)
+        except PictureRefused as refused:
+            frame.refuse(refused.reason, str(refused))
+    return len(used(kept)) < len(kept)
+
+
+def _refuse_strange(kept: Sequence[RecordedFrame], chosen: Intrinsics, given: CameraModel | None) -> bool:
+    """Refuse frames of another board or camera, or seen from too far aside; whether there are any."""
+    worst, typical = int(np.argmax(chosen.view_rms)), float(np.median(chosen.view_rms))
+    if chosen.view_rms[worst] > max(ODD_RATIO * typical, ODD_PX) and len(kept) > LEAST_FRAMES:
+        kept[worst].refuse(
+            Reason.RESIDUAL,
+            f"the board's points miss their places by {math.sqrt(2) * chosen.view_rms[worst]:.2f} px, in the other "
+            f"frames by {math.sqrt(2) * typical:.2f} px: is it another board, bent, or moved in the exposure?",
+        )
+        return True
+    stops = by_stop(kept)
+    foreign = foreign_view(chosen, _views([merged(stop) for stop in stops])) if given is None else None
+    if foreign is not None:
+        for frame in stops[foreign[0]]:
+            frame.refuse(
                 Reason.RESIDUAL,
-                f"the board's points miss their places by {math.sqrt(2) * chosen.view_rms[worst]:.2f} px, in the other "
-                f"frames by {math.sqrt(2) * typical:.2f} px: is it another board, bent, or moved in the exposure?",
+                f"with a camera of its own its points fit {foreign[1]:.0f} times better than chance would have it "
+                f"(usual below {FOREIGN:.0f}), and those of no other picture do: was it taken by another camera, "
+                "or with another zoom, focus or crop?",
             )
-            continue
-        foreign = foreign_view(chosen, apart) if given is None else None
-        if foreign is not None:
-            for frame in stops[foreign[0]]:
-                frame.refuse(
-                    Reason.RESIDUAL,
-                    f"with a camera of its own its points fit {foreign[1]:.0f} times better than chance would have it "
-                    f"(usual below {FOREIGN:.0f}), and those of no other picture do: was it taken by another camera, "
-                    "or with another zoom, focus or crop?",
-                )
-            continue
-        for frame in kept:
-            angle = board_pose(_view(frame), chosen.camera).obliquity
-            if angle > OBLIQUE:
-                text = f"the board is seen {math.degrees(angle):.0f}° from square, allowed are 75°"
-                frame.refuse(Reason.OBLIQUE, text)
-        if len(used(kept)) == len(kept):
-            return chosen, plain
+        return True
+    for frame, view in zip(kept, _views(kept), strict=True):
+        angle = board_pose(view, chosen.camera).obliquity
+        if angle > OBLIQUE:
+            text = f"the board is seen {math.degrees(angle):.0f}° from square, allowed are 75°"
+            frame.refuse(Reason.OBLIQUE, text)
+    return len(used(kept)) < len(kept)
 
 
-def rough_camera(frames: Sequence[RecordedFrame], given: CameraModel | None) -> tuple[Intrinsics, Intrinsics]:
+def rough_camera(frames: Sequence[RecordedFrame], given: CameraModel | None) -> Cameras:
     """A camera in closed form, without its lens: enough to tell how poses are to be read. Raises RefusedError."""
     views = _views([merged(stop) for stop in by_stop(used(frames))])
     return (given_camera(zhang(views, lens=False) if given is None else given, views),) * 2
@@ -137,11 +141,6 @@ def _refuse_change(found: Intrinsics, views: Sequence[BoardView], names: Sequenc
             )
 
 
-def _view(frame: RecordedFrame) -> BoardView:
-    assert frame.view is not None
-    return frame.view
-
-
 def _views(frames: Sequence[RecordedFrame]) -> list[BoardView]:
     return [f.view for f in frames if f.view is not None]
 
@@ -155,140 +154,100 @@ def agreeing(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[Recor
 
 def solve_frames(
     frames: Sequence[RecordedFrame],
-    found: tuple[Intrinsics, Intrinsics],
-    result: dict[str, Any],
-    setup: str | None = None,
+    cameras: Cameras,
+    result: RecordedResult,
+    *,
+    setup: str = "eye_in_hand",
     given: CameraModel | None = None,
     hold_camera: bool = False,
 ) -> None:
     """Put camera, hand-eye, light plane and their checks into the result; a part that fails a check is refused.
 
-    `found` is the camera of the frames as `camera_of` gave it; `setup` says where the camera is if that is known. With
-    `hold_camera` the arm has no say in the camera.
+    `cameras` are those of `camera_of`; `setup` says where the camera is. With `hold_camera` the arm has no say in
+    the camera.
     """
-    chosen, plain = found
-    notes: list[str] = result["notes"]
     told = sum(f.base_from_flange is not None for f in used(frames))
-    posed = agreeing(frames, chosen.camera)
-    left_out, checks = told - len(posed), []
-    if posed and left_out:
-        # A few are slips.
-        name, text = "frames whose pose disagrees with the others", (
-            f"{left_out} of {told} are left out for it, too many for slips: was the camera's zoom, focus or mount, or "
-            "the place of the board or of the arm's base, changed in between? Then calibrate each part by itself"
-        )  # fmt: skip
-        share = 100 * left_out / told
-        checks = [QualityCheck("hand_eye", name, share, doubt=25.0, refuse=40.0, unit="%", says=text)]
-        checks.append(QualityCheck("intrinsics", name, share, doubt=25.0, refuse=math.inf, unit="%", says=text))
-    if len(used(frames)) < len(chosen.view_rms):
+    posed = agreeing(frames, cameras[0].camera)
+    checks = _slips(told - len(posed), told) if posed else []
+    if len(used(frames)) < len(cameras[0].view_rms):
         try:
-            chosen, plain = camera_of(frames, given)
+            cameras = camera_of(frames, given)
         except RefusedError as error:
-            notes.append(f"no intrinsics: {error}")
+            result.notes.append(f"no intrinsics: {error}")
             return
         posed = [f for f in posed if f.reason is None]
-    rest = used(frames)
-    for frame, rms in zip(rest, chosen.view_rms, strict=True):
+    chosen, plain = cameras
+    for frame, rms in zip(used(frames), chosen.view_rms, strict=True):
         frame.rms_px = math.sqrt(2) * float(rms)
-    stops = [merged(stop) for stop in by_stop(rest)]
-    if len(stops) < len(rest):
-        same = "pictures of one stop share its error and count as one frame, their mean"
-        notes.append(f"{counted(len(rest), len(stops))}: {same}")
-    views = _views(stops)
+    stops, views = _stops(frames, posed, result)
     if given is not None:
         chosen, beside = against_pictures(chosen, views)
         plain, checks = chosen, beside + checks
-    result["intrinsics"] = result["intrinsics_from_pictures"] = intrinsics_dict(chosen)
-    result["intrinsics_without_distortion"] = intrinsics_dict(plain)
+    result.intrinsics = result.intrinsics_from_pictures = pictures_figures(chosen)
+    result.intrinsics_without_distortion = pictures_figures(plain)
     checks += camera_checks(chosen, views, [f.name for f in stops], given=given is not None)
     if posed:
-        if len(rest) > len(posed):
-            more = len(rest) - len(posed)
-            notes.append(f"{more} used frames have no flange pose: they count for the intrinsics only")
-        hold = hold_camera or given is not None
-        try:
-            chain = solve_chain([merged(stop) for stop in by_stop(posed)], chosen, setup, hold)
-            checks += check_chain(chain, chosen)
-            report_chain(chain, chosen, result)
-        except (RefusedError, np.linalg.LinAlgError) as error:
-            result["refused"]["hand_eye"] = f"no hand-eye: {error}"
+        checks += _with_poses(posed, chosen, result, setup, hold_camera or given is not None)
     else:
-        notes.append("no used frame has a flange pose: no hand-eye, no flatness")
-    if result["light_plane"] is None and result["hand_eye"] is None:
-        checks += _report_plane(stops, chosen, result)
-    apply_checks(checks, result)
+        result.notes.append("no used frame has a flange pose: no hand-eye, no flatness")
+    if result.light_plane is None and result.hand_eye is None:
+        checks += plane_of_pictures(stops, chosen, result)
+    result.apply(checks)
 
 
-def note_perhaps_no_laser(frames: Sequence[RecordedFrame], result: dict[str, Any]) -> None:
+def _stops(
+    frames: Sequence[RecordedFrame], posed: Sequence[RecordedFrame], result: RecordedResult
+) -> tuple[list[RecordedFrame], list[BoardView]]:
+    """The used frames, those of one stop as one, and their views; what people should know of these is noted."""
+    rest = used(frames)
+    stops = [merged(stop) for stop in by_stop(rest)]
+    if len(stops) < len(rest):
+        same = "pictures of one stop share its error and count as one frame, their mean"
+        result.notes.append(f"{counted(len(rest), len(stops))}: {same}")
+    if len(rest) > len(posed) > 0:
+        more = len(rest) - len(posed)
+        result.notes.append(f"{more} used frames have no flange pose: they count for the intrinsics only")
+    return stops, _views(stops)
+
+
+def _with_poses(
+    posed: Sequence[RecordedFrame], camera: Intrinsics, result: RecordedResult, setup: str, hold_camera: bool
+) -> list[QualityCheck]:
+    """Put what frames with poses give into the result; its checks."""
+    try:
+        chain = solve_chain([merged(stop) for stop in by_stop(posed)], camera, setup, hold_camera)
+        checks = check_chain(chain, camera)
+        report_chain(chain, camera, result)
+    except (RefusedError, np.linalg.LinAlgError) as error:
+        result.refused["hand_eye"] = f"no hand-eye: {error}"
+        return []
+    return checks
+
+
+def _slips(left_out: int, told: int) -> list[QualityCheck]:
+    """Checks of frames that were left out for their pose: a few are slips."""
+    if not left_out:
+        return []
+    name, text = "frames whose pose disagrees with the others", (
+        f"{left_out} of {told} are left out for it, too many for slips: was the camera's zoom, focus or mount, or "
+        "the place of the board or of the arm's base, changed in between? Then calibrate each part by itself"
+    )  # fmt: skip
+    share = 100 * left_out / told
+    return [
+        QualityCheck("hand_eye", name, share, doubt=25.0, refuse=40.0, unit="%", says=text),
+        QualityCheck("intrinsics", name, share, doubt=25.0, refuse=math.inf, unit="%", says=text),
+    ]
+
+
+def note_perhaps_no_laser(frames: Sequence[RecordedFrame], result: RecordedResult) -> None:
     """Where few pictures show a line, and these are of no plane, there may be no laser: that is noted, not refused."""
     frames = used(frames)
-    why, lit = result["refused"].get("light_plane"), [f for f in frames if f.profile is not None]
-    asked = result["laser"]["asked"] != "auto" or any(f.stripe_from for f in lit)
-    if why is None or asked or "intrinsics" in result["refused"] or len(lit) >= LIKELY_LASER * len(frames):
+    why, lit = result.refused.get("light_plane"), [f for f in frames if f.profile is not None]
+    asked = any(f.stripe_from for f in lit)
+    if why is None or asked or "intrinsics" in result.refused or len(lit) >= LIKELY_LASER * len(frames):
         return
-    del result["refused"]["light_plane"]
-    result["notes"].append(
+    del result.refused["light_plane"]
+    result.notes.append(
         f"no light plane: {len(lit)} of {len(frames)} pictures show a line that might be a laser's, and these lines "
         f"are of no light plane: {why}. Where there was a laser, name its colour with --laser"
     )
-
-
-def apply_checks(checks: Sequence[QualityCheck], result: dict[str, Any]) -> None:
-    """Write the checks into the result, say what is doubtful, and take out what is refused.
-
-    What was found of a refused part stays beside the reason, under `refused_values`, where nobody takes it unawares.
-    A light plane and a hand-eye rest on the camera: they are refused with it.
-    """
-    result["checks"] = [check.as_dict() for check in checks]
-    result["notes"] += [f"doubtful: {check.text}" for check in checks if check.verdict == "doubt"]
-    failed = {part: "; ".join(check.text for check in found) for part, found in refused_parts(checks).items()}
-    gone = dict(failed)
-    if "intrinsics" in failed:
-        for part in ("hand_eye", "light_plane"):
-            if result[part] is not None:
-                rests = f"{part.replace('_', '-')}: it rests on the camera, which is refused"
-                failed.setdefault(part, rests)
-        gone = dict.fromkeys(CAMERAS[1:], "") | failed
-    result["refused"] |= failed
-    for part in gone:
-        result["refused_values"][part] = result[part]
-        result[part] = None
-    if "hand_eye" in failed or "light_plane" in failed:
-        result["flatness"] = None
-
-
-def _report_plane(frames: Sequence[RecordedFrame], pictures: Intrinsics, result: dict[str, Any]) -> list[QualityCheck]:
-    """The light plane from pictures alone, when the stripe is in them, and its checks."""
-    camera, views, wrong = pictures.camera, _views(frames), dict[int, str]()
-    profiles = [f.profile for f in frames]
-    if sum(p is not None for p in profiles) < 2:
-        result["notes"].append("no light plane: fewer than two frames show a laser stripe")
-        return []
-    poses = [board_pose(v, camera).camera_from_board for v in views]
-
-    def fit(lit: Profiles) -> tuple[PlaneStart, Rows, Sequence[Array]]:
-        plane = plane_from_board(camera, poses, views, lit)
-        on_boards = [
-            np.zeros((0, 3)) if p is None or not len(r) else on_plane(camera, pose, stripe_pixels(p, r))
-            for p, r, pose in zip(lit, plane.rows, poses, strict=True)
-        ]
-        return plane, plane.rows, on_boards
-
-    try:
-        plane, clouds = of_one_plane(profiles, camera, fit, wrong)
-    except RefusedError as error:
-        result["refused"]["light_plane"] = f"no light plane: {error}"
-        return []
-    finally:
-        result["notes"] += [f"{frames[k].name}: {text} Its stripe is not used." for k, text in wrong.items()]
-    profiles = [None if k in wrong else p for k, p in enumerate(profiles)]
-    both = [(p, r) for p, r in zip(profiles, plane.rows, strict=True) if p is not None and len(r)]
-    noise = [float(np.mean(stripe_means(p, r, STRIPE_MEANS)[1] ** 2)) for p, r in both]
-    cloud: Array = np.concatenate(clouds)
-    moved = planes_of_cameras(pictures, views, profiles, plane.rows)
-    known = PlaneKnown.of(plane.plane, planes_without_one(clouds), cloud, moved)
-    own = float(np.sqrt(np.mean(noise))) * float(np.median(cloud[:, 2])) / camera.fx
-    depths = seen_depths(plane.plane, camera, [stripe_pixels(p, r) for p, r in both])
-    result["light_plane"] = plane_dict("fit on the board's poses", plane.plane, plane.rms, own, known, depths=depths)
-    result["stripe_points"] = {f.name: len(r) for f, r in zip(frames, plane.rows, strict=True)}
-    return plane_checks(plane.rms, own, cloud, frames=len(both), known=known, left_out=len(wrong))

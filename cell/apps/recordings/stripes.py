@@ -86,15 +86,17 @@ class ReadStripe:
 
 @dataclass(frozen=True)
 class ChosenChannel:
-    """In what the laser is read: what was `asked`, what was `chosen`, and how many of the pictures that were
-    `looked` at stood out in each mix of colours."""
+    """In what the laser is read: what was `asked`, what was `chosen`, and the votes of pictures for each mix."""
 
     asked: LaserChannel | None
     chosen: LaserChannel | None
-    looked: int = 0
     votes: dict[str, int] = field(default_factory=dict)
     reads: dict[Path, ReadStripe] = field(default_factory=dict)
     """What was read in it already, by the picture."""
+
+    def figures(self) -> dict[str, object]:
+        """For the JSON."""
+        return {"asked": str(self.asked or "none"), "channel": str(self.chosen or "none"), "votes": self.votes}
 
 
 def choose_channel(sources: Sequence[Source], laser: LaserChannel | None) -> ChosenChannel:
@@ -110,10 +112,10 @@ def choose_channel(sources: Sequence[Source], laser: LaserChannel | None) -> Cho
     reads = {source.path: read_on_board(source, ChosenChannel(laser, laser)) for source in lit}
     votes = Counter(_mix(read.profile) for read in reads.values() if read.profile is not None)
     if not votes:
-        return ChosenChannel(laser, None, len(some), {}, reads)
+        return ChosenChannel(laser, None, {}, reads)
     chosen = votes.most_common(1)[0][0]
     again = {path: read for path, read in reads.items() if read.profile is not None and _mix(read.profile) == chosen}
-    return ChosenChannel(laser, LaserChannel(chosen), len(some), dict(votes.most_common()), again)
+    return ChosenChannel(laser, LaserChannel(chosen), dict(votes.most_common()), again)
 
 
 def _may_show_line(source: Source) -> bool:
@@ -228,16 +230,6 @@ def _white(plane: NDArray[np.float32], view: BoardView) -> float:
 def _needed(white: float) -> float:
     """How bright in DN a line has to be on such a board."""
     return min(LASER_OVER_WHITE * max(white, 0.0) + OVER_DN, SATURATED_DN)
-
-
-def calmest(path: Path, offs: Sequence[Path], view: BoardView) -> Path:
-    """Of pictures without the laser, one or more, the one that takes most of the board away from the picture `path`."""
-    source = Source(path, view)
-    image = source.picture() if len(offs) > 1 else None
-    if image is None:
-        return offs[0]
-    sheet = source.sheet()
-    return min(offs, key=lambda off: _without(image, off, sheet)[1])
 
 
 def _without(image: Shot, path: Path, sheet: NDArray[np.bool_]) -> tuple[Shot | None, float]:

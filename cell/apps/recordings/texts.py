@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -39,6 +39,13 @@ MOVE = re.compile(r"\bmove[a-z]+\s*\(\s*p\s*\[([^\]]*)\]")
 # What a column of a position may begin with, and what those of a rotation are called.
 PREFIXES = ("", "t", "p", "pos", "trans", "translation", "position", "tcp", "flange", "robot", "pose")
 TURNS = (("qx", "qy", "qz", "qw"), ("x", "y", "z", "w"), ("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("a", "b", "c"))
+NAMED_COLUMNS = [
+    ([prefix + axis for axis in "xyz"] + [before + name for name in turn], len(turn))
+    for prefix in PREFIXES
+    for turn in TURNS
+    for before in ("", prefix)
+    if prefix + before or turn != TURNS[1]
+]
 POSITIONS = ("position", "translation", "t", "trans", "tvec", "pos", "xyz")
 ROTATIONS = ("orientation", "rotation", "quaternion", "quat", "q", "r", "rot", "rvec", "rpy")
 NUMBERING = re.compile(r"id|index|frame|image|file|name|no\b|num|^n$|pic")
@@ -61,7 +68,6 @@ class PoseRecord:
     label: str | None
     numbers: Array
     named: str = ""
-    time: float | None = None
     exact: str = ""
 
 
@@ -72,18 +78,58 @@ class Content:
     Halves are rotations (n, 9), (n, 4) or (n, 3), or positions (n, 3), with their place in the file.
     """
 
+    path: Path
     records: list[PoseRecord] = field(default_factory=list)
     links: list[dict[str, str]] = field(default_factory=list)
     halves: list[tuple[Path, str, Array]] = field(default_factory=list)
 
+    def walk(self, data: Any, place: Sequence[str] = (), label: str | None = None) -> None:
+        """Find the poses and the links in nested maps and lists."""
+        if isinstance(data, dict):
+            strings = {str(k): v for k, v in data.items() if isinstance(v, str)}
+            if sum(map(_file_like, strings.values())) > 1:
+                self.links.append(strings)
+            label = next((v for v in strings.values() if _is_picture(v)), label)
+            array, (found, named) = stored_matrix(data), _by_names(data)
+            if array is not None:
+                self._take(array, place, label)
+            elif found is not None:
+                self._add(found, place, label, named)
+            else:
+                for key, value in data.items():
+                    self.walk(value, [*place, str(key)], label)
+        elif isinstance(data, (list, tuple)) and len(data):
+            array = _array(data)
+            if array is not None:
+                self._take(array, place, label)
+            else:
+                for k, value in enumerate(data):
+                    self.walk(value, [*place, f"[{k}]"], label)
+
+    def _take(self, array: Array, place: Sequence[str], label: str | None) -> None:
+        """Add the pose, the poses or the halves of poses that an array holds."""
+        if _is_pose(array):
+            self._add(array.ravel(), place, label)
+        elif array.ndim >= 2 and _is_pose(array[0]):
+            for k, part in enumerate(array):
+                self._add(part.ravel(), [*place, f"[{k}]"], f"[{k}]")
+        elif (rows := _half_of(array)) is not None:
+            self.halves.append((self.path, "/".join(place), rows))
+
+    def _add(self, numbers: Array, place: Sequence[str], label: str | None, named: str = "") -> None:
+        label = label or next((part for part in reversed(place) if re.search(r"\d", part)), None)
+        pattern = "/".join(re.sub(r"\d+", "N", part) for part in place)
+        exact = "/".join(re.sub(r"\[\d+\]", "[N]", part) for part in place)
+        pose = _squared(numbers[len(numbers) not in COUNTS :])
+        self.records.append(PoseRecord(self.path, pattern, label, pose, named=named, exact=exact))
+
 
 def read_content(path: Path) -> Content:
     """Records and links of a file. Raises ValueError that says what is wrong with it."""
-    content, suffix = Content(), path.suffix.lower()
+    content, suffix = Content(path), path.suffix.lower()
     if suffix in (".npy", ".npz"):
         loaded = np.load(path, allow_pickle=False)
-        data = loaded.tolist() if isinstance(loaded, np.ndarray) else {k: v.tolist() for k, v in loaded.items()}
-        _walk(path, data, [], None, content)
+        content.walk(loaded.tolist() if isinstance(loaded, np.ndarray) else {k: v.tolist() for k, v in loaded.items()})
         return content
     # As numpy prints its numbers and arrays.
     text = re.sub(r"(?:np\.|numpy\.)?(?:float\d+|array)\(([^()]*)\)", r"\1", decoded(path.read_bytes()))
@@ -91,16 +137,14 @@ def read_content(path: Path) -> Content:
         raise ValueError("it is empty")
     if text.startswith("version https://git-lfs"):
         raise ValueError("it only points to a file that was not fetched (Git LFS)")
-    data = structured(suffix, text)
-    if data is not None:
-        _walk(path, data, [], None, content)
+    content.walk(structured(suffix, text))
     if suffix not in STRUCTURED and not (content.records or content.links or content.halves):
-        moves = [[float(v) for v in found.split(",")] for found in MOVE.findall(text)]
+        moves = [[float(value) for value in found.split(",")] for found in MOVE.findall(text)]
         content.records += [
             PoseRecord(path, "row", f"[{k}]", np.array(m), "rotation") for k, m in enumerate(moves) if len(m) == 6
         ]
         if not content.records:
-            _read_table(path, text, content)
+            _read_table(text, content)
     return content
 
 
@@ -141,100 +185,52 @@ def structured(suffix: str, text: str) -> Any:
     return None
 
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
-    """Plain maps, lists, numbers and words, whatever their tags say; 1e-3 is a number."""
-
-
-def _plain(loader: _Loader, _: str, node: yaml.Node) -> Any:
-    if isinstance(node, yaml.MappingNode):
-        return loader.construct_mapping(node, deep=True)
-    return loader.construct_sequence(node, deep=True) if isinstance(node, yaml.SequenceNode) else node.value
-
-
-_Loader.add_multi_constructor("", _plain)
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)[eE][-+]?\d+|[-+]?\.Nan"), list("-+.0123456789")
-)
-
-
 def _yaml(text: str) -> Any:
-    """The object of a YAML text, a list of those of its documents. Raises ValueError."""
+    """The object of a YAML text whatever its tags say, a list of those of its documents. Raises ValueError."""
     if re.search(r"(?m)(?:^|[\s\[,])\*\w+\s*(?:[\],]|$)", text):
         raise ValueError("it is YAML with aliases: write the values out")
+    loader = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
     try:
         # OpenCV's first line is none of YAML's, and its values may follow their tag on the next line.
-        found = list(yaml.load_all(re.sub(r"\A%YAML.*\n(?:---)?", "", text).expandtabs(4), _Loader))
+        found = list(yaml.load_all(re.sub(r"\A%YAML.*\n(?:---)?", "", text).expandtabs(4), loader))
     except yaml.YAMLError as error:
         raise ValueError(f"it is no YAML: {' '.join(str(error).split())[:160]}") from error
-    found = [document for document in found if document is not None]
+    found = [_numbered(document) for document in found if document]
     return found if len(found) > 1 else found[0] if found else None
+
+
+def _numbered(data: Any) -> Any:
+    """Maps, lists and words, those that are numbers as such."""
+    if isinstance(data, dict):
+        return {key: _numbered(value) for key, value in data.items()}
+    return list(map(_numbered, data)) if isinstance(data, list) else _scalar(data)
+
+
+def _scalar(word: str) -> float | str:
+    """The number of a word, or the word."""
+    try:
+        return float(word.replace(".nan", "nan").replace(".NaN", "nan").replace(".inf", "inf"))
+    except ValueError:
+        return word.strip()
 
 
 def _element(element: ElementTree.Element) -> Any:
     """An XML element as a map, list, number or word; elements of one name are a list."""
-
-    def scalar(text: str) -> Any:
-        try:
-            numbers = [float(word) for word in text.split()]
-        except ValueError:
-            return text.strip()
-        return numbers[0] if len(numbers) == 1 else numbers or text.strip()
-
-    parts: dict[str, list[Any]] = {key: [scalar(value)] for key, value in element.attrib.items()}
+    text = element.text or ""
+    words = [_scalar(word) for word in text.split()]
+    numbers = words if len(words) > 1 and not any(isinstance(word, str) for word in words) else _scalar(text)
+    parts: dict[str, list[Any]] = {key: [_scalar(value)] for key, value in element.attrib.items()}
     for child in element:
         parts.setdefault(child.tag, []).append(_element(child))
     # An attribute beside a text says what the text is (type_id); beside none it is what the element holds.
-    if parts and (len(element) or not (element.text or "").strip()):
+    if parts and (len(element) or not text.strip()):
         return {key: values[0] if len(values) == 1 else values for key, values in parts.items()}
-    return scalar(element.text or "")
-
-
-def _walk(path: Path, data: Any, place: list[str], label: str | None, content: Content) -> None:
-    """Find the poses and the links in nested maps and lists."""
-    if isinstance(data, dict):
-        strings = {str(k): v for k, v in data.items() if isinstance(v, str)}
-        if sum(map(_file_like, strings.values())) > 1:
-            content.links.append(strings)
-        label = next((v for v in strings.values() if Path(v).suffix.lower() in PICTURES), label)
-        array, (found, named) = stored_matrix(data), _by_names(data)
-        if array is not None:
-            _take(path, array, place, label, content)
-        elif found is not None:
-            content.records.append(_record(path, place, label, found, named))
-        else:
-            for key, value in data.items():
-                _walk(path, value, [*place, str(key)], label, content)
-    elif isinstance(data, (list, tuple)) and len(data):
-        array = _array(data)
-        if array is not None:
-            _take(path, array, place, label, content)
-        else:
-            for k, value in enumerate(data):
-                _walk(path, value, [*place, f"[{k}]"], label, content)
-
-
-def _take(path: Path, array: Array, place: list[str], label: str | None, content: Content) -> None:
-    """Add the pose, the poses or the halves of poses that an array holds."""
-    if _is_pose(array):
-        content.records.append(_record(path, place, label, array.ravel()))
-    elif array.ndim >= 2 and _is_pose(array[0]):
-        content.records += [_record(path, [*place, f"[{k}]"], f"[{k}]", part.ravel()) for k, part in enumerate(array)]
-    elif (rows := _half_of(array)) is not None:
-        content.halves.append((path, "/".join(place), rows))
+    return numbers
 
 
 def _is_pose(array: Array) -> bool:
     counts = (*COUNTS, *(n + 1 for n in COUNTS))
     return array.shape in ((4, 4), (3, 4)) or (array.size in counts and max(array.shape, default=0) == array.size)
-
-
-def _record(path: Path, place: list[str], label: str | None, numbers: Array, named: str = "") -> PoseRecord:
-    label = label or next((p for p in reversed(place) if re.search(r"\d", p)), None)
-    pattern, exact = ("/".join(re.sub(old, new, p) for p in place) for old, new in ((r"\d+", "N"), (r"\[\d+\]", "[N]")))
-    time = float(numbers[0]) if len(numbers) not in COUNTS else None
-    return PoseRecord(
-        path, pattern, label, _squared(numbers if time is None else numbers[1:]), named=named, time=time, exact=exact
-    )
 
 
 def _array(data: Any) -> Array | None:
@@ -293,17 +289,14 @@ def stored_matrix(data: dict[Any, Any]) -> Array | None:
     return array.reshape((rows, columns) if array.size == rows * columns else (rows, columns, -1))
 
 
-def _named_numbers(names: list[str], values: list[Any]) -> tuple[Array | None, str]:
+def _named_numbers(names: Sequence[str], values: Sequence[Any]) -> tuple[Array | None, str]:
     """A pose of columns or keys such as x y z qx qy qz qw, x y z rx ry rz, in any order, others beside."""
     clean = [re.sub(r"\(.*?\)|\[.*?\]|_?(?:mm|deg|rad|m)$|[^a-z]", "", n.lower()) for n in names]
+    for wanted, turns in NAMED_COLUMNS:
+        if set(wanted) <= set(clean):
+            found = np.array([values[clean.index(n)] for n in wanted], dtype=np.float64)
+            return found, "quaternion" if turns == 4 else "rotation"
     numbered = [re.sub(r"[^a-z0-9]", "", n.lower()) for n in names]
-    for prefix in PREFIXES:
-        for turn in TURNS:
-            for before in ("", prefix):
-                wanted = [prefix + a for a in "xyz"] + [before + t for t in turn]
-                if set(wanted) <= set(clean) and len(set(wanted)) == len(wanted):
-                    found = np.array([values[clean.index(n)] for n in wanted], dtype=np.float64)
-                    return found, "quaternion" if len(turn) == 4 else "rotation"
     for name, first in (("pose", 0), ("pose", 1), ("actualtcppose", 0), ("actualtcppose", 1)):
         six = [f"{name}{k + first}" for k in range(6)]
         if set(six) <= set(numbered) and f"{name}{6 + first}" not in numbered:
@@ -315,76 +308,118 @@ def _file_like(word: str) -> bool:
     return re.search(r"\.[A-Za-z]{2,5}$", word) is not None
 
 
-def _read_table(path: Path, text: str, content: Content) -> None:
+def _is_picture(word: str) -> bool:
+    return Path(word).suffix.lower() in PICTURES
+
+
+class _Line(NamedTuple):
+    """A line of a table: its cells, its numbers, and the words beside these."""
+
+    cells: list[str]
+    numbers: list[float]
+    words: list[str]
+
+    @classmethod
+    def of(cls, text: str) -> _Line:
+        separator = r"[;\t]" if re.search(r"[;\t]", text) else "," if "," in text else r"\s+"
+        cells = [cell.strip().strip("\"'") for cell in re.split(separator, text)]
+        words = [word for word in re.split(r"[\s,;=()\[\]{}\"']+", NUMBER.sub(" ", text)) if word]
+        return cls(cells, [float(number) for number in NUMBER.findall(text)], words)
+
+
+def _read_table(text: str, content: Content) -> None:
     """Add the records of a table: a pose in each line, over several lines, or rotations and positions by themselves."""
-    lines = [line.strip() for line in text.splitlines() if line.strip() and line.strip()[0] not in "#%"]
-    # Commas between digits are decimal commas where something else separates.
-    lines = [re.sub(r"(?<=\d),(?=\d)", ".", ln) if ";" in ln or "\t" in ln else ln for ln in lines]
-    numbers = [[float(n) for n in NUMBER.findall(line)] for line in lines]
-    words = [[w for w in re.split(r"[\s,;=()\[\]{}\"']+", NUMBER.sub(" ", line)) if w] for line in lines]
-    header: list[str] = []
-    if len(lines) > 1 and not numbers[0] and max(map(len, numbers[1:])) >= min(COUNTS):
-        header, lines, numbers, words = _cells(lines[0]), lines[1:], numbers[1:], words[1:]
-    for row in words:
-        if sum(map(_file_like, row)) > 1:
-            content.links.append({str(k): w for k, w in enumerate(filter(_file_like, row))})
-    if max(map(len, numbers), default=0) >= min(COUNTS):
-        length = 1
-    elif len({len(n) for n in numbers}) == 1 and not any(words) and (rows := _half_of(np.array(numbers))) is not None:
-        content.halves.append((path, "", rows))
+    header, lines = _table_lines(text)
+    for line in lines:
+        files = [word for word in line.words if _file_like(word)]
+        if len(files) > 1:
+            content.links.append({str(k): file for k, file in enumerate(files)})
+    if (half := _half_of_table(lines)) is not None:
+        content.halves.append((content.path, "", half))
         return
-    else:
-        # A pose over several lines: the shortest pattern of lines that repeats; mostly there are four.
-        patterns = [(len(n), bool(w)) for n, w in zip(numbers, words, strict=True)]
-        lengths = sorted({*range(1, min(LONGEST, len(lines)) + 1), len(lines)} - {0}, key=lambda n: n != 4)
-        repeating = (n for n in lengths if patterns == patterns[:n] * (len(patterns) // n))
-        length = next((n for n in repeating if len(_of_block(words[:n], numbers[:n])) in COUNTS), 0)
-        if not length and not content.links:
-            raise ValueError(f"it holds {sum(map(len, numbers))} numbers; {NEEDED}")
-    blocks = [slice(k, k + length) for k in range(0, len(lines), length)] if length else []
-    poses = [_of_block(words[block], numbers[block]) for block in blocks]
-    seven = np.array([p for p in poses if len(p) == 7]).reshape(-1, 7)
-    quaternions = (seven[:, 3:], seven[:, :4])
-    unit = not len(seven) or any(np.abs(np.linalg.norm(q, axis=1) - 1).max() < UNIT_OFF for q in quaternions)
-    numbering = next((k for k, name in enumerate(header) if NUMBERING.search(name.lower())), None)
-    timing = next((k for k, name in enumerate(header) if re.match(r"time|stamp|t$|sec", name.lower())), None)
-    for k, (block, found) in enumerate(zip(blocks, poses, strict=True)):
-        if not found:
-            continue
-        said, cells = [w for row in words[block] for w in row], _cells(lines[block][0])
-        named, time, pose = "", None, None
-        label = next((w for w in said if Path(w).suffix.lower() in PICTURES), "")
-        label = label or ("" if header else next((w.strip(":=") for w in said if re.search(r"\d", w)), ""))
-        if len(cells) == len(header):
-            values = [float(c) if NUMBER.fullmatch(c) else np.nan for c in cells]
-            pose, named = _named_numbers(header, values)
-            time = None if timing is None else values[timing]
-            label = label or (cells[numbering] if numbering is not None and pose is not None else "")
-        if pose is None:
-            if len(found) - 1 in COUNTS and (len(found) != 7 or not unit):
-                time, found = found[0], found[1:]
-                label = label or (f"{time:.0f}" if abs(time) < LARGEST_NUMBER and time == int(time) else "")
-            pose = np.array(found)
-            if len(pose) not in COUNTS:
-                raise ValueError(f"line {k + 1} of its table holds {len(found)} numbers; {NEEDED}")
-        content.records.append(PoseRecord(path, "row", label or f"[{k}]", _squared(pose), named=named, time=time))
+    length = _lines_of_a_pose(lines)
+    if not length and not content.links:
+        raise ValueError(f"it holds {sum(len(line.numbers) for line in lines)} numbers; {NEEDED}")
+    blocks = [lines[k : k + length] for k in range(0, len(lines), length)] if length else []
+    timed = _timed([numbers for block in blocks if len(numbers := _numbers_of(block)) == 7])
+    for k, block in enumerate(blocks):
+        if _numbers_of(block):
+            content.records.append(_table_record(content.path, k, block, header, timed))
 
 
-def _cells(line: str) -> list[str]:
-    separator = r"[;\t]" if re.search(r"[;\t]", line) else "," if "," in line else r"\s+"
-    return [c.strip().strip("\"'") for c in re.split(separator, line)]
+def _table_lines(text: str) -> tuple[list[str], list[_Line]]:
+    """The cells of a table's header, if it has one, and its other lines without comments."""
+    kept = [line.strip() for line in text.splitlines() if line.strip() and line.strip()[0] not in "#%"]
+    # Commas between digits are decimal commas where something else separates.
+    lines = [_Line.of(re.sub(r"(?<=\d),(?=\d)", ".", line) if re.search(r"[;\t]", line) else line) for line in kept]
+    if len(lines) > 1 and not lines[0].numbers and max(len(line.numbers) for line in lines[1:]) >= min(COUNTS):
+        return lines[0].cells, lines[1:]
+    return [], lines
 
 
-def _of_block(words: Sequence[list[str]], numbers: Sequence[list[float]]) -> list[float]:
+def _half_of_table(lines: Sequence[_Line]) -> Array | None:
+    """The rows of a table that holds nothing but rotations or positions; else None."""
+    rows = [line.numbers for line in lines]
+    even = len(set(map(len, rows))) == 1 and not any(line.words for line in lines)
+    return _half_of(np.array(rows)) if even and len(rows[0]) < min(COUNTS) else None
+
+
+def _timed(seven: Sequence[list[float]]) -> bool:
+    """Whether of seven numbers the first is a time, because no four of them are a quaternion."""
+    rows = np.array(seven).reshape(-1, 7)
+    quaternions = (rows[:, 3:], rows[:, :4])
+    return len(rows) > 0 and all(np.abs(np.linalg.norm(q, axis=1) - 1).max() >= UNIT_OFF for q in quaternions)
+
+
+def _lines_of_a_pose(lines: Sequence[_Line]) -> int:
+    """How many lines hold a pose: the shortest pattern of lines that repeats, mostly four; 0 where none does."""
+    if max((len(line.numbers) for line in lines), default=0) >= min(COUNTS):
+        return 1
+    patterns = [(len(line.numbers), bool(line.words)) for line in lines]
+    lengths = sorted({*range(1, min(LONGEST, len(lines)) + 1), len(lines)} - {0}, key=lambda n: n != 4)
+    repeating = (n for n in lengths if patterns == patterns[:n] * (len(patterns) // n))
+    return next((n for n in repeating if len(_numbers_of(lines[:n])) in COUNTS), 0)
+
+
+def _table_record(path: Path, k: int, block: Sequence[_Line], header: Sequence[str], timed: bool) -> PoseRecord:
+    """The record of the lines of one pose; `timed`: of seven numbers the first is a time. Raises ValueError."""
+    words, cells = [word.strip(":=") for line in block for word in line.words], block[0].cells
+    label = [*filter(_is_picture, words), *filter(re.compile(r"\d").search, [] if header else words), ""][0]
+    pose, named, number = _by_header(header, cells)
+    if pose is not None:
+        return PoseRecord(path, "row", label or number or f"[{k}]", pose, named)
+    found = _numbers_of(block)
+    if len(found) - 1 in COUNTS and (len(found) != 7 or timed):
+        label, found = label or _number_word(found[0]), found[1:]
+    if len(found) not in COUNTS:
+        raise ValueError(f"line {k + 1} of its table holds {len(found)} numbers; {NEEDED}")
+    return PoseRecord(path, "row", label or f"[{k}]", _squared(np.array(found)))
+
+
+def _by_header(header: Sequence[str], cells: Sequence[str]) -> tuple[Array | None, str, str]:
+    """The pose that a row's columns name, how they name its rotation, and the number of the row."""
+    if len(cells) != len(header):
+        return None, "", ""
+    values = [float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells]
+    numbers = (cell for name, cell in zip(header, cells, strict=True) if NUMBERING.search(name.lower()))
+    return *_named_numbers(header, values), next(numbers, "")
+
+
+def _number_word(number: float) -> str:
+    """A picture's number; empty for a time."""
+    return f"{number:.0f}" if abs(number) < LARGEST_NUMBER and number == int(number) else ""
+
+
+def _numbers_of(block: Sequence[_Line]) -> list[float]:
     """The numbers of a pose: no number or time in its title, no angles that only say again what a quaternion says."""
-    several = any(len(n) > 1 for n in numbers)
-    parts = [(" ".join(w).lower(), n) for w, n in zip(words, numbers, strict=True) if len(n) > 1 or not several]
-    if any(len(n) == 4 for _, n in parts) and len(parts) > 2:
-        parts = [(w, n) for w, n in parts if not re.search(r"\brpy\b|euler", w)]
-    said = " ".join(map(" ".join, words)).lower()
+    several = any(len(line.numbers) > 1 for line in block)
+    parts = [line for line in block if len(line.numbers) > 1 or not several]
+    if any(len(line.numbers) == 4 for line in parts) and len(parts) > 2:
+        parts = [line for line in parts if not re.search(r"\brpy\b|euler", " ".join(line.words).lower())]
+    said = " ".join(word for line in block for word in line.words).lower()
     if len(parts) == 2 and re.search(r"(rotation|orientation|quat).*(translation|position)", said):
         parts.reverse()
-    return [value for _, part in parts for value in part]
+    return [value for line in parts for value in line.numbers]
 
 
 def _half_of(array: Array) -> Array | None:
@@ -400,25 +435,44 @@ def _half_of(array: Array) -> Array | None:
     return rows if len(rows) >= LEAST_HALVES and (matrices or unit or rows.shape[1] == 3) else None
 
 
-def join_halves(halves: Sequence[tuple[Path, str, Array]]) -> tuple[list[PoseRecord], set[Path]]:
-    """The poses of halves that belong together by their names or are the only two, and the files they were in."""
-    kinds: tuple[list[Any], list[Any]] = ([], [])
-    for path, where, rows in halves:
+class _Half(NamedTuple):
+    """One half of poses: where its rows (n, …) are, and the words of its name that do not say which half it is."""
+
+    path: Path
+    where: str
+    rows: Array
+    rest: list[str]
+    turns: bool
+
+    @classmethod
+    def of(cls, path: Path, where: str, rows: Array) -> _Half:
         words = re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", f"{path.stem} {where}").lower())
         roles = [found for word in words if (found := HALVES.fullmatch(word))]
         turns = rows.shape[1] != 3 or (bool(roles) and not any(found[1] for found in roles))
-        kinds[not turns].append((path, where, rows, [word for word in words if not HALVES.fullmatch(word)]))
+        return cls(path, where, rows, [word for word in words if not HALVES.fullmatch(word)], turns)
+
+
+def join_halves(found: Sequence[tuple[Path, str, Array]]) -> tuple[list[PoseRecord], set[Path]]:
+    """The poses of halves that belong together by their names or are the only two, and the files they were in."""
+    halves = [_Half.of(*one) for one in found]
     records: list[PoseRecord] = []
     used: set[Path] = set()
-    for path, where, turns, rest in kinds[0]:
-        near = [place for place in kinds[1] if len(place[2]) == len(turns) and place[0].parent == path.parent]
-        named = [place for place in near if place[3] == rest]
-        if len(named) != 1 and sum(len(other[2]) == len(turns) for other in kinds[0]) == 1:
-            named = near
-        if len(named) == 1:
-            matrices, field_name = turns.shape[1] == 9, f"{where}+{named[0][1]}" if where else "row"
-            both = np.hstack([turns, named[0][2]] if matrices else [named[0][2], turns])
-            said = "rotation" if turns.shape[1] == 3 else ""
-            records += [PoseRecord(path, field_name, f"[{k}]", _squared(row), said) for k, row in enumerate(both)]
-            used |= {path, named[0][0]}
+    for turn in (half for half in halves if half.turns):
+        place = _other_half(turn, [half for half in halves if len(half.rows) == len(turn.rows)])
+        if place is None:
+            continue
+        width = turn.rows.shape[1]
+        both = np.hstack([turn.rows, place.rows] if width == 9 else [place.rows, turn.rows])
+        where, said = f"{turn.where}+{place.where}" if turn.where else "row", "rotation" if width == 3 else ""
+        records += [PoseRecord(turn.path, where, f"[{k}]", _squared(row), said) for k, row in enumerate(both)]
+        used |= {turn.path, place.path}
     return records, used
+
+
+def _other_half(turn: _Half, alike: Sequence[_Half]) -> _Half | None:
+    """The positions of rotations, of halves with as many rows: those with the same name, or the only ones."""
+    near = [half for half in alike if not half.turns and half.path.parent == turn.path.parent]
+    named = [half for half in near if half.rest == turn.rest]
+    if len(named) != 1 and sum(half.turns for half in alike) == 1:
+        named = near
+    return named[0] if len(named) == 1 else None

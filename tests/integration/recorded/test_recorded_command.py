@@ -103,7 +103,7 @@ def test_too_few_pictures_are_an_error_that_says_how_many_are_needed(tmp_path):
 def test_a_pose_without_a_picture_is_named(tmp_path):
     for name in ("frame0002.png", "pose0002.txt", "pose0003.txt"):
         shutil.copy(recording("robot_line_laser") / name, tmp_path)
-    notes = calibrate_folder(tmp_path, parse_board("chessboard:7x6:10mm"))["notes"]
+    notes = calibrate_folder(tmp_path, parse_board("chessboard:7x6:10mm")).notes
     assert any("pose0003.txt" in note for note in notes)
 
 
@@ -115,7 +115,7 @@ def test_two_frames_with_poses_of_elsewhere_do_not_hide_each_other(tmp_path):
         path = tmp_path / f"pose{number:04d}.txt"
         (x, *rest), turn = ast.literal_eval(path.read_text())
         path.write_text(str(((x + shift, *rest), turn)))
-    frames = calibrate_folder(tmp_path, parse_board("chessboard:7x6:10mm"))["frames"]
+    frames = calibrate_folder(tmp_path, parse_board("chessboard:7x6:10mm")).frames
     assert [f["name"] for f in frames if not f["used"]] == ["frame0005.png", "frame0008.png"]
 
 
@@ -123,12 +123,14 @@ def test_inverted_pairs_are_recognised_as_a_camera_on_the_flange(tmp_path):
     pairs = json.loads((recording("hand_eye") / "pose_samples.json").read_text())
     inverted = [[np.linalg.inv(flange).tolist(), board] for flange, board in pairs]
     (tmp_path / "pose_samples.json").write_text(json.dumps(inverted))
-    hand_eye = calibrate_folder(tmp_path, None)["hand_eye"]
+    hand_eye = calibrate_folder(tmp_path, None).hand_eye
     assert hand_eye["setup"] == "eye_in_hand"
     np.testing.assert_allclose(hand_eye["translation_mm"], (659, -249, 830), rtol=0.01)
 
 
-def test_the_angles_are_those_of_the_published_hand_eye():
-    hand_eye = calibrate_folder(recording("hand_eye"), None)["hand_eye"]
+def test_the_recorded_pairs_give_the_published_hand_eye():
+    hand_eye = calibrate_folder(recording("hand_eye"), None).hand_eye
+    assert hand_eye["setup"] == "eye_to_hand"
+    np.testing.assert_allclose(hand_eye["translation_mm"], (659, -249, 830), rtol=0.01)
     published = np.array([0.230, -2.540, 1.950])
     assert np.linalg.norm(hand_eye["euler_xyz_rad"] - published) < 0.01 * np.linalg.norm(published)

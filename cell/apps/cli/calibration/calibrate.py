@@ -176,14 +176,14 @@ def _from_folder(folder: Path, board: str | None, options: Options, json: bool, 
     result = calibrate_folder(folder, None if board is None else parse_board(board, single_tag=True), options)
     if json:
         # Kept in a file, it may come back with --camera.
-        print_json(sealed(result))
+        print_json(sealed(result.as_dict()))
     else:
-        print_recorded(result, details)
-    if not any(frame["used"] for frame in result["frames"]):
+        print_recorded(result.as_dict(), details)
+    if not any(frame["used"] for frame in result.frames):
         raise ConfigError(
             f"no picture in {folder} could be used: is {board} the board in the pictures? The reasons are listed above"
         )
-    if result["refused"]:
-        raise RefusedError("; ".join(result["refused"].values()))
-    if not options.plan and result["intrinsics"] is None and result["hand_eye"] is None:
-        raise ConfigError(f"nothing could be calibrated from {folder}: {'; '.join(result['notes'])}")
+    if result.refused:
+        raise RefusedError("; ".join(result.refused.values()))
+    if not options.plan and result.intrinsics is None and result.hand_eye is None:
+        raise ConfigError(f"nothing could be calibrated from {folder}: {'; '.join(result.notes)}")

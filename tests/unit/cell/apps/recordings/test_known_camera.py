@@ -13,8 +13,7 @@ from cell.measure.calibration.solve.intrinsics import choose_lens
 from cell.measure.geometry.camera import CameraModel
 from drivers.errors import ConfigError, RefusedError
 from tests.support import recorded_scenes
-from tests.support.recorded_scenes import LENS, MATRIX, SIZE, scene
-from tests.unit.cell.apps.recordings.test_solution import right, solved
+from tests.support.recorded_scenes import LENS, MATRIX, SIZE, right, scene, solved
 
 SENSIBLE = CameraModel(1280, 960, 1400, 1400, 650, 470)
 
