@@ -83,7 +83,7 @@ GROUPS = (
         "integration/browser",
     ),
     # Long ones begin early, so that no worker is left with one of them at the end.
-    ("integration/recorded/test_recorded_calibration.py", "integration/recorded/test_recorded_command.py"),
+    ("integration/recorded/test_recorded_calibration.py", "unit/cell/apps/cli/calibration/test_calibrate.py"),
     ("unit/cell/measure/inversion/test_registration.py",),
     ("unit/cell/devices/gate/test_interlocks.py",),
     ("unit/cell/measure/calibration/solve/test_joint.py", "unit/cell/measure/calibration/judge/test_scale.py"),

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cell.apps.cli.calibration import solve as calibrate_solve
-from cell.apps.cli.calibration import stored as calibration_list
-from cell.apps.cli.calibration import timing as calibrate_timing
-from cell.apps.cli.calibration import verify
+from cell.apps.cli.calibration import stored
 from cell.apps.cli.options import (  # fmt: skip
     ConfigOption,
     JobOption,
@@ -24,7 +21,6 @@ from cell.apps.cli.options import (  # fmt: skip
 
 if TYPE_CHECKING:
     from cell.apps.recordings.command import Options
-    from cell.measure.vision import LaserChannel
 
 SourceOption = Annotated[
     Path | None, typer.Option("--from", help="A folder of recorded frames, with flange poses or without.")
@@ -71,10 +67,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands of this file, and those below `cell calibrate`."""
     group = typer.Typer(invoke_without_command=True)
     group.callback()(calibrate)
-    calibrate_solve.register(group)
-    verify.register(group)
-    calibrate_timing.register(group)
-    calibration_list.register(group)
+    stored.register(group)
     app.add_typer(group, name="calibrate")
 
 
@@ -110,12 +103,10 @@ def calibrate(
         for name in (name for name, value in given.items() if value):
             raise ConfigError(f"{name} belongs to --from; the boards on the deck are named in the configuration")
     else:
-        from cell.apps.recordings.command import Options
-
-        options = Options(poses, pose_field, _setup(setup), plan, laser=_laser(laser), **_camera(camera))
+        options = _options(plan, poses, pose_field, setup, camera=camera, laser=laser)
         _from_folder(source, board, options, json, details)
         return
-    from cell.apps.cli.calibration.tables import print_examination
+    from cell.apps.cli.calibration.stored import print_examination
     from cell.apps.cli.display import print_calibration
     from cell.apps.cli.progress import ProgressDisplay
     from cell.config.calibrations.store import archive_of, solve_observations
@@ -140,30 +131,29 @@ def calibrate(
         print_examination(examination.summary, pictures)
 
 
-def _camera(text: str | None) -> dict[str, Any]:
-    """What of the options tells of a camera that is known."""
+def _options(
+    plan: bool, poses: str | None, pose_field: str | None, setup: str | None, camera: str | None, laser: str | None
+) -> Options:
+    """What was said of a recording. Raises ConfigError for a word that is none of those allowed."""
+    from cell.apps.recordings.command import Options
     from cell.apps.recordings.known_camera import read_camera
-
-    known = None if text in (None, "pictures") else read_camera(Path(str(text)))
-    return {"camera": known, "hold_camera": text == "pictures"}
-
-
-def _setup(text: str | None) -> str | None:
-    from drivers.errors import ConfigError
-
-    if text not in (None, "eye-in-hand", "eye-to-hand"):
-        raise ConfigError(f"--setup {text}: allowed are eye-in-hand and eye-to-hand")
-    return None if text is None else text.replace("-", "_")
-
-
-def _laser(text: str | None) -> LaserChannel | None:
     from cell.measure.vision import LaserChannel
     from drivers.errors import ConfigError
 
-    allowed = ("none", "red", "green", "blue", "grey", "auto")
-    if text not in (None, *allowed):
-        raise ConfigError(f"--laser {text}: allowed are {', '.join(allowed)}")
-    return None if text == "none" else LaserChannel(text or "auto")
+    lasers = ("none", "red", "green", "blue", "grey", "auto")
+    if setup not in (None, "eye-in-hand", "eye-to-hand"):
+        raise ConfigError(f"--setup {setup}: allowed are eye-in-hand and eye-to-hand")
+    if laser not in (None, *lasers):
+        raise ConfigError(f"--laser {laser}: allowed are {', '.join(lasers)}")
+    return Options(
+        poses,
+        pose_field,
+        setup=None if setup is None else setup.replace("-", "_"),
+        plan=plan,
+        camera=None if camera in (None, "pictures") else read_camera(Path(str(camera))),
+        hold_camera=camera == "pictures",
+        laser=None if laser == "none" else LaserChannel(laser or "auto"),
+    )
 
 
 def _from_folder(folder: Path, board: str | None, options: Options, json: bool, details: bool) -> None:

@@ -1,20 +1,209 @@
-"""`cell calibrate list`, `show` and `accept`: the stored calibrations, what was found out since, and edits of them."""
+"""`cell calibrate list`, `show`, `accept`, `solve`, `verify` and `timing`: what is stored, and how good it is today."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cell.apps.cli.options import ConfigOption, JsonOption, new_table, print_json
+from cell.apps.cli.options import (  # fmt: skip
+    ConfigOption,
+    JobOption,
+    JsonOption,
+    Level,
+    LevelOption,
+    SeedOption,
+    SimOption,
+    new_table,
+    print_json,
+)
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+Summary = Mapping[str, Any]
 
 
 def register(group: typer.Typer) -> None:
     """Add the commands of this file to `cell calibrate`."""
+    for command in (solve, verify, timing):
+        group.command()(command)
     group.command(name="list")(list_calibrations)
     group.command()(show)
     group.command()(accept)
+
+
+def solve(
+    archive: Annotated[Path, typer.Argument(help="The .observations.npz beside a stored calibration.")],
+    config: ConfigOption = None,
+    job: JobOption = "pot",
+    json: JsonOption = False,
+) -> None:
+    """Solve archived observations again, and examine the result; nothing moves and nothing stored is changed.
+
+    Without --config the cameras as drawn and the assumed noise are those of the archive, and the result is the same as
+    when it was made.
+    """
+    from dataclasses import replace
+
+    from cell.apps.cli.display import print_calibration
+    from cell.config.calibrations.store import gathered, solve_observations
+    from cell.config.cell_config import find_config, load_config
+    from cell.measure.calibration.archive import SUFFIX, read_archive
+    from cell.procedures.calibrate.report import examine
+
+    observations = read_archive(archive)
+    loaded = load_config(find_config(config, simulated=True))
+    if config is not None:
+        o = observations
+        again = gathered(o.scan, o.target, o.identities, config=loaded, kinematics=o.kinematics, witness=o.witness)
+        observations = replace(again, made=o.made)
+    solved = solve_observations(observations)
+    summary = solved.calibration.summary()
+    examination = examine(solved, observations, loaded, job)
+    pictures = examination.draw(archive.with_name(archive.name.removesuffix(SUFFIX)))
+    if json:
+        print_json({**summary, **examination.summary, "pictures": [str(path) for path in pictures]})
+        return
+    print_calibration(summary, None)
+    print_examination(examination.summary, pictures)
+
+
+def print_examination(figures: Summary, pictures: Sequence[Path]) -> None:
+    """For people: coverage, the parameters' influence, advice, and where pictures are."""
+    from rich.console import Console
+
+    console = Console()
+    _coverage(console, figures)
+    influence = figures["influence"]
+    title = f"place error left by the calibration: {influence['total_mm']:.4f} mm RMS at the job's points"
+    columns = ("of", ">sigma", "unit", ">alone mm", ">total if known mm")
+    table = new_table(title, *columns)
+    for row in influence["groups"]:
+        table.add_row(f"[bold]{row['name']}[/]", "", "", f"{row['alone_mm']:.4f}", f"{row['if_known_mm']:.4f}")
+    table.add_section()
+    for row in influence["parameters"]:
+        table.add_row(
+            row["name"], f"{row['sigma']:.3g}", row["unit"], f"{row['alone_mm']:.4f}", f"{row['if_known_mm']:.4f}"
+        )
+    console.print(table)
+    console.print("Parameters are known together better than apart: what they do alone does not add up to the total.")
+    table = new_table("what to add, by the predicted covariance", "what", "kind", ">then mm", ">less")
+    for row in figures["advice"]:
+        table.add_row(row["what"], row["kind"], f"{row['then_mm']:.4f}", f"{100 * row['gain']:.1f} %")
+    console.print(table)
+    for check in figures["checks"]:
+        if check["text"]:
+            console.print(f"doubtful ({check['camera']} camera): {check['text']}", markup=False, soft_wrap=True)
+    for path in pictures:
+        console.print(f"picture: {path}", markup=False, soft_wrap=True)
+
+
+def _coverage(console: Console, figures: Summary) -> None:
+    names = (">field", ">depth mm", ">tilt x deg", ">tilt y deg", ">rail mm", ">stripe depth mm", ">worst cell px")
+    table = new_table("what the views cover", "camera", *names)
+    for camera in ("scan", "target"):
+        c = figures[f"{camera}_coverage"]
+        ranges = ("depth_mm", "tilt_about_x_deg", "tilt_about_y_deg", "rail_mm", "stripe_depth_mm")
+        shown = ["" if c[key] is None else f"{c[key][0]:.0f} to {c[key][1]:.0f}" for key in ranges]
+        worst = "" if c["largest_cell_mean_px"] is None else f"{c['largest_cell_mean_px']:.3f}"
+        table.add_row(camera, f"{100 * c['field_covered']:.0f} %", *shown, worst)
+    console.print(table)
+
+
+def verify(
+    config: ConfigOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
+    job: JobOption = "pot",
+    json: JsonOption = False,
+) -> None:
+    """Say how good the stored calibration is today, from a view of each deck board and a sweep over the fine one.
+
+    Exit code 0: good, or changed by less than matters at the job's place. 1: the place may be off by a third of its
+    tolerance or more, with the suspected part, or the pictures fit worse than they did.
+    """
+    from cell.apps.cli.progress import ProgressDisplay
+    from cell.run.session.supervisor import Cell
+
+    with Cell.open(config, sim=sim, seed=seed, level=level.value, job=job) as cell, ProgressDisplay() as display:
+        verification = cell.verify(display, job)
+    if json:
+        print_json(verification.summary())
+    else:
+        print_verification(verification.summary())
+    if not verification.good:
+        raise typer.Exit(1)
+
+
+def print_verification(summary: Summary) -> None:
+    """The comparison for people: each figure with what a good calibration scatters by, then the decision."""
+    from rich.console import Console
+
+    console = Console()
+    title = f"observed today against the calibration of {summary['calibration_date']}"
+    table = new_table(title, "quantity", ">difference", ">sigma if good", "unit")
+    for row in summary["figures"]:
+        table.add_row(row["name"], f"{row['value']:+.4f}", f"{row['sigma']:.4f}", row["unit"])
+    for kind, value in summary["residuals_over_calibration"].items():
+        table.add_row(
+            f"{kind}: residual over the calibration's", f"{value:.2f}", "1", f"≤ {summary['residuals_allowed']}"
+        )
+    console.print(table)
+    title = f"changes that show in {summary['detectable_share']:.0%} of checks like this one"
+    columns = ("part", "change", ">from", ">wanted", "unit")
+    seen = new_table(title, *columns)
+    for row in summary["detectable"]:
+        size = "none" if row["size"] is None else f"{row['size']:.3f}"
+        enough = row["size"] is not None and row["size"] <= row["wanted"]
+        seen.add_row(
+            row["part"], row["change"], size, f"{row['wanted']:g}", row["unit"], style=None if enough else "yellow"
+        )
+    console.print(seen)
+    if summary["suspects"]:
+        allowed = summary["place"]["allowed_mm"]
+        off = (">probability", ">place off by, mm", ">at most", f">of {allowed:g} mm allowed")
+        suspects = new_table("suspected parts", "part", *off, "most probable change")
+        for row in summary["suspects"]:
+            change = ", ".join(f"{name} {value:+.3f}" for name, value in row["change"].items())
+            most = row["place_error_at_most_mm"]
+            error = f"{row['place_error_mm']:.3f}", f"{most:.3f}", f"{most / allowed:.0%}"
+            suspects.add_row(row["part"], f"{row['probability']:.0%}", *error, change)
+        console.print(suspects)
+    console.print(summary["reason"], style="green" if summary["good"] else "red", markup=False, soft_wrap=True)
+
+
+def timing(
+    config: ConfigOption = None,
+    sim: SimOption = None,
+    seed: SeedOption = 1,
+    level: LevelOption = Level.nominal,
+    job: JobOption = "pot",
+    json: JsonOption = False,
+) -> None:
+    """Sweep to and fro over the fine board on the deck and measure how late the scan camera's time stamps come.
+
+    What is found is kept with the stored calibration and taken out of every sweep by the rail. A rolling shutter, and
+    stamps that are not those of an exposure's beginning, are refused by name. Exit code 1 when it is refused.
+    """
+    from cell.apps.cli.progress import ProgressDisplay
+    from cell.run.session.supervisor import Cell
+
+    with Cell.open(config, sim=sim, seed=seed, level=level.value) as cell, ProgressDisplay() as display:
+        found = cell.time_stamps(display, job).scan.timing
+    assert found is not None
+    told = found.summary()
+    if json:
+        print_json(told)
+        return
+    typer.echo(
+        f"the scan camera's time stamps come {told['late_ms']:+.2f} ± {told['sigma_ms']:.2f} ms late; the carriage's "
+        f"play is {told['play_um']:.0f} ± {told['play_sigma_um']:.0f} µm; rows are exposed "
+        f"{told['readout_ms']:.2f} ± {told['readout_sigma_ms']:.2f} ms one after the other. Kept with the calibration"
+    )
 
 
 def list_calibrations(config: ConfigOption = None, json: JsonOption = False) -> None:
@@ -24,7 +213,7 @@ def list_calibrations(config: ConfigOption = None, json: JsonOption = False) -> 
     from cell.config.calibrations.store import read_calibration
     from drivers.errors import CalibrationStale
 
-    rows: list[dict[str, Any]] = []
+    rows: list[Summary] = []
     for path in sorted(_folder(config).glob("*.json")):
         try:
             calibration = read_calibration(path)
@@ -105,7 +294,7 @@ def accept(
         typer.echo(f"{path} is accepted as it is by {edit['who']}: {', '.join(edit['changed'])}")
 
 
-def _since(row: dict[str, Any]) -> str:
+def _since(row: Summary) -> str:
     told = []
     if (turn := row["laser_since"]) is not None:
         told.append(f"laser turned {turn['turned_mrad']:+.3f} ± {turn['sigma_mrad']:.3f} mrad, verified {turn['date']}")

@@ -1,4 +1,4 @@
-"""STEP files, which say their unit: bodies of flat faces, written here from the standard."""
+"""Promises of `cell.apps.new_job.mesh_file`; the STEP files are written here from the standard."""
 
 from __future__ import annotations
 
@@ -62,3 +62,30 @@ def test_a_step_file_tells_its_unit_and_which_way_is_up(tmp_path: Path, unit: st
     drawn = read_drawing(path)
     assert drawn.unit == "m" and len(drawn.bodies) == 1 and drawn.bodies[0].closed
     np.testing.assert_allclose(drawn.bodies[0].size, metres * np.array([6.0, 4.0, 1.0]), rtol=1e-5)
+
+
+def test_what_is_wrong_with_a_mesh_is_named_and_put_right(tmp_path: Path) -> None:
+    inside_out, turned, lone = (trimesh.creation.box((20.0, 10.0, 5.0)) for _ in range(3))
+    inside_out.invert()
+    faces = turned.faces.copy()
+    faces[3] = faces[3][::-1]
+    turned = trimesh.Trimesh(turned.vertices + np.array([40.0, 0.0, 0.0]), faces, process=False)
+    lone = trimesh.Trimesh(lone.vertices + np.array([80.0, 0.0, 0.0]), lone.faces[1:], process=False)
+    flat = trimesh.Trimesh(np.array([[0, 0, 9], [1, 0, 9], [2, 0, 9]], dtype=float), [[0, 1, 2]], process=False)
+    path = tmp_path / "parts.stl"
+    trimesh.util.concatenate([inside_out, turned, lone, flat]).export(path)
+    drawn = read_drawing(path)
+    assert len(drawn.bodies) == 3 and drawn.unit is None
+    assert sorted(body.closed for body in drawn.bodies) == [False, True, True]
+    told = "\n".join(drawn.notes)
+    for words in (
+        "1 triangles without an area",
+        "12 triangles turned round",
+        "\n1 triangles turned round",
+        "open: 3 edges",
+    ):
+        assert words in told, told
+    for body in drawn.bodies:
+        if body.closed:
+            made = trimesh.Trimesh(body.vertices, body.triangles, process=False)
+            assert made.volume == pytest.approx(1000.0)

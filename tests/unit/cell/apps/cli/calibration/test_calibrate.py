@@ -13,7 +13,6 @@ import pytest
 from typer.testing import CliRunner
 
 from cell.apps.cli.app import app
-from cell.apps.cli.calibration.recorded_tables import verdicts
 from cell.apps.recordings.command import calibrate_folder
 from cell.measure.vision import parse_board
 from drivers.errors import ConfigError
@@ -63,18 +62,6 @@ def test_people_get_tables_with_units(tmp_path):
     assert [line.split(":")[0] for line in lines[1:4]] == ["camera", "hand-eye", "light plane"]
     assert re.search(r"fx [\d.]+ ± [\d.]+, .* px; used; ", lines[1])
     assert "circles-03.jpg" in calibrate(tmp_path, "--board", "dots:6x6:34mm", "--laser", "none", "--details").stdout
-
-
-def test_refused_values_are_shown_and_marked():
-    check = {"part": "hand_eye", "verdict": "refused", "text": "hand-eye: too far off"}
-    value = {"setup": "eye_in_hand", "translation_mm": [1, 2, 3], "sigma_mm": [4, 5, 6], "sigma_deg": [0.1, 0.2, 0.3]}
-    none = dict.fromkeys(("intrinsics", "hand_eye", "light_plane"))
-    result = {**none, "checks": [check], "notes": ["no light plane: dark"], "refused_values": {"hand_eye": value}}
-    camera, hand, plane = verdicts({**result, "refused": {"hand_eye": check["text"]}})
-    assert hand.startswith("hand-eye: REFUSED (do not use: eye in hand, x 1.00 ± 4.00, y 2.00 ± 5.00")
-    assert hand.endswith("too far off")
-    assert plane == "light plane: none: no light plane: dark"
-    assert camera == "camera: none: not asked for"
 
 
 def test_pairs_of_poses_need_no_board():

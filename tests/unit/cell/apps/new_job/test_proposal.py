@@ -1,0 +1,24 @@
+"""Promises of `cell.apps.new_job.proposal`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cell.apps.new_job.make import make_job
+from cell.apps.new_job.questions import Asker
+from cell.config.cell_config import load_config
+from drivers.errors import NotObservable
+from tests.support.new_jobs import relief
+
+
+def test_what_takes_long_is_told_while_it_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cell.apps.new_job.questions.PROGRESS_S", 0.0)
+    told: list[str] = []
+    mesh = str(relief(tmp_path / "wave.stl", lambda x, y: 6 + 2 * np.sin(x / 6)))
+    with pytest.raises(NotObservable):
+        make_job(Asker({"mesh": mesh}, None, told.append), load_config(None), tmp_path, False)
+    for words in ("triangles to look at …", "straight sweeps see …", "tilted sweep 8 of 8", "tells most", "other side"):
+        assert any(words in text for text in told), told
