@@ -312,7 +312,7 @@ def _is_picture(word: str) -> bool:
     return Path(word).suffix.lower() in PICTURES
 
 
-class _Line(NamedTuple):
+class _TableLine(NamedTuple):
     """A line of a table: its cells, its numbers, and the words beside these."""
 
     cells: list[str]
@@ -320,7 +320,7 @@ class _Line(NamedTuple):
     words: list[str]
 
     @classmethod
-    def of(cls, text: str) -> _Line:
+    def of(cls, text: str) -> _TableLine:
         separator = r"[;\t]" if re.search(r"[;\t]", text) else "," if "," in text else r"\s+"
         cells = [cell.strip().strip("\"'") for cell in re.split(separator, text)]
         words = [word for word in re.split(r"[\s,;=()\[\]{}\"']+", NUMBER.sub(" ", text)) if word]
@@ -347,17 +347,19 @@ def _read_table(text: str, content: Content) -> None:
             content.records.append(_table_record(content.path, k, block, header, timed))
 
 
-def _table_lines(text: str) -> tuple[list[str], list[_Line]]:
+def _table_lines(text: str) -> tuple[list[str], list[_TableLine]]:
     """The cells of a table's header, if it has one, and its other lines without comments."""
     kept = [line.strip() for line in text.splitlines() if line.strip() and line.strip()[0] not in "#%"]
     # Commas between digits are decimal commas where something else separates.
-    lines = [_Line.of(re.sub(r"(?<=\d),(?=\d)", ".", line) if re.search(r"[;\t]", line) else line) for line in kept]
+    lines = [
+        _TableLine.of(re.sub(r"(?<=\d),(?=\d)", ".", line) if re.search(r"[;\t]", line) else line) for line in kept
+    ]
     if len(lines) > 1 and not lines[0].numbers and max(len(line.numbers) for line in lines[1:]) >= min(COUNTS):
         return lines[0].cells, lines[1:]
     return [], lines
 
 
-def _half_of_table(lines: Sequence[_Line]) -> Array | None:
+def _half_of_table(lines: Sequence[_TableLine]) -> Array | None:
     """The rows of a table that holds nothing but rotations or positions; else None."""
     rows = [line.numbers for line in lines]
     even = len(set(map(len, rows))) == 1 and not any(line.words for line in lines)
@@ -371,7 +373,7 @@ def _timed(seven: Sequence[list[float]]) -> bool:
     return len(rows) > 0 and all(np.abs(np.linalg.norm(q, axis=1) - 1).max() >= UNIT_OFF for q in quaternions)
 
 
-def _lines_of_a_pose(lines: Sequence[_Line]) -> int:
+def _lines_of_a_pose(lines: Sequence[_TableLine]) -> int:
     """How many lines hold a pose: the shortest pattern of lines that repeats, mostly four; 0 where none does."""
     if max((len(line.numbers) for line in lines), default=0) >= min(COUNTS):
         return 1
@@ -381,7 +383,7 @@ def _lines_of_a_pose(lines: Sequence[_Line]) -> int:
     return next((n for n in repeating if len(_numbers_of(lines[:n])) in COUNTS), 0)
 
 
-def _table_record(path: Path, k: int, block: Sequence[_Line], header: Sequence[str], timed: bool) -> PoseRecord:
+def _table_record(path: Path, k: int, block: Sequence[_TableLine], header: Sequence[str], timed: bool) -> PoseRecord:
     """The record of the lines of one pose; `timed`: of seven numbers the first is a time. Raises ValueError."""
     words, cells = [word.strip(":=") for line in block for word in line.words], block[0].cells
     label = [*filter(_is_picture, words), *filter(re.compile(r"\d").search, [] if header else words), ""][0]
@@ -410,7 +412,7 @@ def _number_word(number: float) -> str:
     return f"{number:.0f}" if abs(number) < LARGEST_NUMBER and number == int(number) else ""
 
 
-def _numbers_of(block: Sequence[_Line]) -> list[float]:
+def _numbers_of(block: Sequence[_TableLine]) -> list[float]:
     """The numbers of a pose: no number or time in its title, no angles that only say again what a quaternion says."""
     several = any(len(line.numbers) > 1 for line in block)
     parts = [line for line in block if len(line.numbers) > 1 or not several]
