@@ -12,7 +12,7 @@ from cell.check.fit import require_fit
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from drivers.errors import ConfigError
-from tests.support.new_jobs import from_options, relief
+from tests.unit.cell.apps.new_job.meshes import from_options, relief
 
 
 def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path: Path) -> None:

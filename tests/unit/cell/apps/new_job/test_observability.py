@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import NotObservable
-from tests.support.new_jobs import dish, from_options
+from tests.unit.cell.apps.new_job.meshes import dish, from_options
 
 
 def test_a_disc_is_refused_by_its_free_turn_however_coarsely_it_is_drawn(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from cell.apps.new_job.make import make_job
 from cell.apps.new_job.questions import Asker
 from cell.config.cell_config import load_config
 from drivers.errors import NotObservable
-from tests.support.new_jobs import relief
+from tests.unit.cell.apps.new_job.meshes import relief
 
 
 def test_what_takes_long_is_told_while_it_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

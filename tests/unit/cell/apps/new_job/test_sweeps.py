@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import RefusedError
-from tests.support.new_jobs import from_options, relief
+from tests.unit.cell.apps.new_job.meshes import from_options, relief
 
 
 def test_a_surface_that_repeats_itself_is_refused_by_its_pitch(tmp_path: Path) -> None:
