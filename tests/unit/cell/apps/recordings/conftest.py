@@ -9,7 +9,7 @@ import pytest
 
 from cell.apps.recordings.frames import RecordedFrame, read_frames
 from cell.apps.recordings.series import list_folder
-from tests.support.recorded_pictures import (
+from tests.unit.cell.apps.recordings.pictures import (
     BOARD,
     POSES,
     photograph,

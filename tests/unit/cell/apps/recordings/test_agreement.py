@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import ConfigError
-from tests.support.recorded_pictures import (
+from tests.unit.cell.apps.recordings.pictures import (
     BASE_FROM_BOARD,
     FLANGE_FROM_CAMERA,
     POSES,

@@ -10,7 +10,7 @@ from cell.apps.recordings.command import Options, attach_poses, calibrate_folder
 from cell.apps.recordings.frames import read_frames
 from cell.measure.vision.board.board import find_board
 from drivers.errors import ConfigError
-from tests.support.recorded_pictures import (
+from tests.unit.cell.apps.recordings.pictures import (
     BOARD,
     CAMERA,
     POSES,

@@ -15,13 +15,13 @@ from cell.apps.recordings.pairs import calibrate_pairs
 from cell.apps.recordings.series import Series
 from cell.apps.recordings.solution import agreeing
 from cell.apps.recordings.texts import PoseRecord
-from tests.support.recorded_pictures import (
+from tests.support.recorded_scenes import FLANGE_FROM_CAMERA, TRUTH, given_pairs, right, scene, solved
+from tests.unit.cell.apps.recordings.pictures import (
     CAMERA,
     POSES,
     row,
     understand,
 )
-from tests.support.recorded_scenes import FLANGE_FROM_CAMERA, TRUTH, given_pairs, right, scene, solved
 
 
 @pytest.mark.parametrize(("a", "b"), [(0, 3), (2, 6)])

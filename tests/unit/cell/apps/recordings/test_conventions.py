@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from cell.apps.recordings.conventions import TRIED, check_reading
 from drivers.errors import ConfigError
-from tests.support.recorded_pictures import (
+from tests.unit.cell.apps.recordings.pictures import (
     POSES,
     row,
     understand,

@@ -11,7 +11,7 @@ from cell.apps.recordings.frames import read_frames
 from cell.apps.recordings.series import list_folder
 from cell.measure.vision import read_colours
 from cell.measure.vision.pictures import read_picture
-from tests.support.recorded_pictures import (
+from tests.unit.cell.apps.recordings.pictures import (
     BASE_FROM_BOARD,
     BOARD,
     CAMERA,

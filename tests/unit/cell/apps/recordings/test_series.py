@@ -12,7 +12,7 @@ from cell.apps.recordings.command import Options, attach_poses
 from cell.apps.recordings.frames import RecordedFrame, read_frames
 from cell.apps.recordings.series import in_order_of_views, list_folder, read_series
 from drivers.errors import ConfigError
-from tests.support.recorded_pictures import (
+from tests.unit.cell.apps.recordings.pictures import (
     BOARD,
     CAMERA,
     POSES,

@@ -8,7 +8,7 @@ import numpy as np
 from cell.apps.recordings.frames import read_frames
 from cell.apps.recordings.series import list_folder
 from cell.measure.vision import LaserChannel
-from tests.support.recorded_pictures import (
+from tests.unit.cell.apps.recordings.pictures import (
     BOARD,
     lit,
 )

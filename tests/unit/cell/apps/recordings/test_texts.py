@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cell.apps.recordings.series import list_folder, read_series
-from tests.support.recorded_pictures import (
+from tests.unit.cell.apps.recordings.pictures import (
     CAMERA,
     POSES,
     angles,
