@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -102,10 +102,6 @@ class Policy:
     def of(self, name: str) -> Step:
         """The policy of the step of this name."""
         return next(step for step in self.steps if step.name == name)
-
-    def with_step(self, step: Step) -> Policy:
-        """A copy in which the policy of `step.name` is `step`."""
-        return replace(self, steps=tuple(step if old.name == step.name else old for old in self.steps))
 
 
 Made = TypeVar("Made")

@@ -69,8 +69,8 @@ class Bench:
 
     def policy(self, *args, **values):
         """Another policy of a step."""
-        self.runner.policy = self.runner.policy.with_step(Step(*args, **values))
-        return self
+        step = Step(*args, **values)
+        return self.times(steps=tuple(step if old.name == step.name else old for old in self.runner.policy.steps))
 
     def times(self, **values):
         """Other times of the whole policy."""
