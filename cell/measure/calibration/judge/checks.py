@@ -15,7 +15,14 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.calibration.solve.adjustment import DISTORTION_PRIOR
-from cell.measure.calibration.solve.intrinsics import CENTRED_LENS, LEAST_LEFT_OUT, USUAL, Intrinsics, beside_given
+from cell.measure.calibration.solve.intrinsics import (
+    CENTRED_LENS,
+    LEAST_LEFT_OUT,
+    USUAL,
+    Bend,
+    Intrinsics,
+    beside_given,
+)
 from cell.measure.calibration.solve.normal import HAND, stripe_block
 from cell.measure.geometry.camera import PARAMETER_NAMES, Array, CameraModel, seen_centres
 from cell.measure.geometry.poses import difference, transform
@@ -118,32 +125,32 @@ def camera_checks(
     focal = 100 * float(np.max(found.sigma[:2] / camera.parameters[:2]))
     centre = 100 * float(np.max(found.sigma[2:4])) / width
     advice = "tilt the board more, to several sides and up to 45°, and cover the whole picture"
-    made.append(
+    made += [
         QualityCheck(
             "intrinsics", "σ of the focal length", focal, doubt=2.0, refuse=10.0, unit="%",
             says=f"{len(views)} views give fx = {camera.fx:.0f} ± {found.sigma[0]:.0f} px; {advice}",
-        )
-    )  # fmt: skip
-    made.append(
+        ),
         QualityCheck(
             "intrinsics", "σ of the principal point", centre, doubt=3.0, refuse=10.0, unit="% of the picture",
             says=f"({camera.cx:.0f} ± {found.sigma[2]:.0f}, {camera.cy:.0f} ± {found.sigma[3]:.0f}) px; {advice}",
-        )
-    )  # fmt: skip
-    made.append(_tilt(views, camera))
-    made.append(_terms(found))
+        ),
+        _tilt(views, camera),
+        _terms(found),
+    ]  # fmt: skip
     if len(found.pull):
         made.append(_pulls(found, names))
     if found.bend is not None and found.bend.believed:
-        made.append(
-            QualityCheck(
-                "intrinsics", "bend of the board", 100 * found.bend.share, 100 * USUAL, 3.0, unit="% of its diagonal",
-                says=f"{1e3 * found.bend.height:.2f} ± {1e3 * found.bend.sigma:.2f} mm out of a plane, which moves fx "
-                f"by {abs(found.bend.camera[0]):.1f} px and the principal point by "
-                f"{float(np.hypot(*found.bend.camera[2:4])):.1f} px; glue it to something flat",
-            )
-        )  # fmt: skip
+        made.append(_bend(found.bend))
     return made
+
+
+def _bend(bend: Bend) -> QualityCheck:
+    return QualityCheck(
+        "intrinsics", "bend of the board", 100 * bend.share, 100 * USUAL, 3.0, unit="% of its diagonal",
+        says=f"{1e3 * bend.height:.2f} ± {1e3 * bend.sigma:.2f} mm out of a plane, which moves fx by "
+        f"{abs(bend.camera[0]):.1f} px and the principal point by {float(np.hypot(*bend.camera[2:4])):.1f} px; glue it "
+        "to something flat",
+    )  # fmt: skip
 
 
 def _pulls(found: Intrinsics, names: Sequence[str]) -> QualityCheck:

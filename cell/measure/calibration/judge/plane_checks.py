@@ -137,26 +137,18 @@ def planes_of_cameras(
     rows: Sequence[NDArray[np.intp]],
 ) -> list[LightPlane]:
     """The plane with the camera off by one deviation along each direction of its covariance, one after the other."""
-    made = [_plane_with(pictures.camera, views, profiles, rows)]
-    for column in covariance_root(pictures.covariance).T:
-        if np.any(np.abs(column) > 0):
-            camera = pictures.camera.with_parameters(pictures.camera.parameters + column)
-            made.append(_plane_with(camera, views, profiles, rows))
-    return made
+    lit = [
+        (view, stripe_pixels(profile, chosen[:: max(1, len(chosen) // 100)]))
+        for view, profile, chosen in zip(views, profiles, rows, strict=True)
+        if profile is not None and len(chosen)
+    ]
 
+    def plane(off: Array | float) -> LightPlane:
+        camera = pictures.camera.with_parameters(pictures.camera.parameters + off)
+        clouds = [on_plane(camera, board_pose(view, camera).camera_from_board, pixels) for view, pixels in lit]
+        return robust_plane(np.concatenate(clouds))[0]
 
-def _plane_with(
-    camera: CameraModel,
-    views: Sequence[BoardView],
-    profiles: Sequence[StripeProfile | None],
-    rows: Sequence[NDArray[np.intp]],
-) -> LightPlane:
-    clouds = []
-    for view, profile, chosen in zip(views, profiles, rows, strict=True):
-        if profile is not None and len(chosen):
-            pose = board_pose(view, camera).camera_from_board
-            clouds.append(on_plane(camera, pose, stripe_pixels(profile, chosen[:: max(1, len(chosen) // 100)])))
-    return robust_plane(np.concatenate(clouds))[0]
+    return [plane(0.0), *(plane(column) for column in covariance_root(pictures.covariance).T if np.any(column))]
 
 
 def planes_without_one(clouds: Sequence[Array]) -> list[LightPlane]:
@@ -175,35 +167,26 @@ def plane_checks(
     `left_out` stripes, beside those of the `frames`, are of no line in it.
     """
     reach = float(np.median(cloud[:, 2]))
-    made = [plane_fit_check(rms, own, cloud)]
-    if left_out:
-        made.append(
-            QualityCheck(
-                "light_plane", "stripes that are left out", 100 * left_out / (frames + left_out), 25.0, 40.0, unit="%",
-                says=f"{left_out} of {frames + left_out} lie in no plane with the others, too many for slips: was the "
-                "laser or the camera moved in between, or are there several lines? Calibrate each part by itself",
-            )
-        )  # fmt: skip
-    if frames < LEAST_CHECKED:
-        made.append(
-            QualityCheck(
-                "light_plane", "frames that are missing", LEAST_CHECKED - frames, doubt=0.5, refuse=np.inf, unit="",
-                says=f"{frames} frames show the stripe and check each other little; take {LEAST_CHECKED} or more",
-            )
-        )  # fmt: skip
     words = f"from {frames} frames, each left out in turn; take further frames at other distances and tilts"
-    made.append(
+    left_out_check = QualityCheck(
+        "light_plane", "stripes that are left out", 100 * left_out / (frames + left_out), 25.0, refuse=40.0, unit="%",
+        says=f"{left_out} of {frames + left_out} lie in no plane with the others, too many for slips: was the "
+        "laser or the camera moved in between, or are there several lines? Calibrate each part by itself",
+    )  # fmt: skip
+    missing = QualityCheck(
+        "light_plane", "frames that are missing", LEAST_CHECKED - frames, doubt=0.5, refuse=np.inf, unit="",
+        says=f"{frames} frames show the stripe and check each other little; take {LEAST_CHECKED} or more",
+    )  # fmt: skip
+    return [
+        plane_fit_check(rms, own, cloud),
+        *([left_out_check] if left_out else []),
+        *([missing] if frames < LEAST_CHECKED else []),
         QualityCheck(
             "light_plane", "σ of its place where it was seen", 100 * known.place / reach, doubt=0.5, refuse=4.0,
             unit="% of the distance", says=f"{1e3 * known.place:.2f} mm at {1e3 * reach:.0f} mm, {words}",
-        )
-    )  # fmt: skip
-    made.append(
-        QualityCheck(
-            "light_plane", "σ of its normal", float(np.degrees(known.tilt)), 1.0, 4.0, unit="deg", says=f"{words}"
-        )
-    )
-    return made
+        ),
+        QualityCheck("light_plane", "σ of its normal", float(np.degrees(known.tilt)), 1.0, 4.0, unit="deg", says=words),
+    ]  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,9 +206,10 @@ class Flatness:
 def flatness(state: AdjustmentState, observations: Sequence[ScanObservation], staged: Staged) -> Flatness | None:
     """Flatness of the board in the base over all frames with a stripe; None without any."""
     clouds = [_in_base(state, o, staged, k) for k, o in enumerate(observations)]
-    if sum(len(c) > 0 for c in clouds) < 1:
+    if not any(len(cloud) for cloud in clouds):
         return None
-    return _flat(clouds, LightPlane.fit(np.concatenate(clouds)))
+    plane = LightPlane.fit(np.concatenate(clouds))
+    return _summary(clouds, [plane.distances(cloud) for cloud in clouds])
 
 
 def leave_one_out(observations: Sequence[ScanObservation], staged: Staged, solution: Solution) -> Flatness | None:
@@ -233,21 +217,16 @@ def leave_one_out(observations: Sequence[ScanObservation], staged: Staged, solut
     lit = [k for k in range(len(observations)) if staged.plane is not None and len(staged.plane.rows[k])]
     if len(lit) < 4:
         return None
-    clouds, distances = [], []
-    for k in range(len(observations)):
-        if k not in lit:
-            clouds.append(np.zeros((0, 3)))
-            distances.append(np.zeros(0))
-            continue
+    clouds, distances = [np.zeros((0, 3))] * len(observations), [np.zeros(0)] * len(observations)
+    for k in lit:
         other = solution.left.states[k]
         if solution.joint:
             # The step to it was a linear one: now to the end.
             views = [view for j, view in enumerate(solution.views) if j != k]
             other = Adjustment(views, solution.free, solution.adjusted.priors).solve(other, variance_rounds=0).state
         rest = [_in_base(other, o, staged, j) for j, o in enumerate(observations) if j != k]
-        mine = _in_base(other, observations[k], staged, k)
-        clouds.append(mine)
-        distances.append(LightPlane.fit(np.concatenate(rest)).distances(mine))
+        clouds[k] = _in_base(other, observations[k], staged, k)
+        distances[k] = LightPlane.fit(np.concatenate(rest)).distances(clouds[k])
     return _summary(clouds, distances)
 
 
@@ -259,10 +238,6 @@ def _in_base(state: AdjustmentState, observation: ScanObservation, staged: Stage
     seen = state.plane.intersect(state.camera.rays(stripe_pixels(observation.profile, rows)))
     base_from_camera = observation.base_from_flange * state.flange_from_camera
     return transform(base_from_camera, seen[np.isfinite(seen).all(axis=1)])
-
-
-def _flat(clouds: Sequence[Array], plane: LightPlane) -> Flatness:
-    return _summary(clouds, [plane.distances(c) for c in clouds])
 
 
 def _summary(clouds: Sequence[Array], distances: Sequence[Array]) -> Flatness:
