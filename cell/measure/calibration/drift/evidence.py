@@ -1,14 +1,9 @@
-"""What new observations say about a stored calibration: the score and information of every parameter.
+"""What new observations say about a stored calibration: score and information of every parameter, and hypotheses.
 
-The observations are predicted from the calibration. What the arm's repeatability, the rail's reading, the noise and the
-calibration's own covariance explain of the misfit is taken out; what is left speaks for a change since.
-
-What a calibration leaves behind so that it can be verified later: where its board was, and how sure all of it is.
-
-What may have changed in a calibrated chain, and how strongly a score speaks for each of these changes.
-
-A hypothesis is a Gaussian change of about `SHIFT` or `TURN` of some parameters of one camera's chain; against it stands
-that nothing changed. Scores and information are those of `cell.measure.calibration.drift.evidence`."""
+What the arm's repeatability, the rail's reading, the noise and the calibration's own covariance explain of the misfit
+is taken out; what is left speaks for a change. A hypothesis is a Gaussian change of about `SHIFT` or `TURN` of some
+parameters of one camera's chain, against none. A calibration leaves a `Reference` behind to be verified by.
+"""
 
 from __future__ import annotations
 

@@ -1,14 +1,10 @@
-"""The laser's pointing since the calibration, by a witness: the line on a plate that is fixed to the claw.
+"""The laser's pointing and roll since the calibration, by the line on a plate that is fixed to the claw.
 
-At one end of its travel the rail shows the scan camera that plate, always at the same place. Where the line lies on it
-is looked at with each calibration and before each job. What it has moved is taken for a turn of the light plane about
-the laser's exit and the stripe's direction; a shift of the camera's picture looks the same there and does the same to
-depths, so the turn is right for both. docs/explanation/theory.md, section 7.
-
-Has the light sheet rolled about its own beam since the calibration? The slope of the line on the claw's plate tells.
-
-A roll leaves the middle of the line where it was, so that nothing of the laser's pointing shows it, and tilts a scan by
-as many times its angle as the sheet is steep: three and a half times as the paper draws it."""
+At one end of its travel the rail shows the scan camera that plate, with each calibration and before each job. What the
+line has moved is taken for a turn of the light plane about the laser's exit; a shift of the camera's picture looks the
+same there and does the same to depths. A roll about the beam leaves the line's middle where it was and turns the line;
+it tilts a scan by as many times its angle as the sheet is steep. docs/explanation/theory.md, section 7.
+"""
 
 from __future__ import annotations
 

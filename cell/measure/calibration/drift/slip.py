@@ -1,13 +1,9 @@
-"""Has the scan head slipped since the calibration, and do its pictures still go with the rail's readings?
+"""Has the scan head slipped since the calibration, do its pictures still go with the rail, and was the plate knocked?
 
-The plate on the claw that shows where the laser points (`witness`) has edges. The rail takes the line over one of them,
-to and fro: where the line leaves the plate tells the head's place along the rail, and the difference between the two
-ways how late the pictures come. Where the line on the plate ends, above and below, tells the head's place across.
-
-The laser's witness against the board: did the laser turn since the calibration, or was the witness's plate knocked?
-
-A job has nothing but the plate to go by. A verification sees the stripe on the board as well, which was photographed
-from the same pose, and needs no plate."""
+The plate on the claw has edges. The rail takes the line over one of them, to and fro: where the line leaves the plate
+tells the head's place along the rail, and the difference between the two ways how late the pictures come. The line's
+ends tell the head's place across. A verification sees the stripe on the board as well, which tells laser from plate.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""How late the scan camera's stamps come against the rail's positions, and its shutter, as kept with a calibration.
+"""How late the scan camera's stamps come against the rail's positions, and its shutter, from sweeps over a board.
 
-Found by `find_timing`, from sweeps of `cell.procedures.calibrate.timing`. Both hold for
-the settings of camera and rail with which they were found: another driver, packet size or baud rate makes stamps or
-readings come otherwise.
+What a camera holds back before it stamps a frame looks, in one sweep, like a shift of the whole scan. Swept the other
+way it is a shift to the other side, and it grows with the speed, which the play of a screw does not. Both figures hold
+for the settings of camera and rail with which they were found. docs/explanation/theory.md, section 10.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Absolute checks of a calibration: figures beside limits that do not come from the same fit.
 
-A check that fails refuses the part that it is about; one that is doubtful is said beside the result. Each names its
-part and its numbers.
+A check that fails refuses the part that it is about; one that is doubtful is said beside the result. Here are those of
+a camera, given or from pictures, of a hand-eye, and of the cell's own joint adjustment.
 """
 
 from __future__ import annotations
