@@ -1,9 +1,8 @@
-"""The observations of a calibration in one file, so that it can be solved again later without any device.
+"""The observations of a calibration, in one file, so that it can be solved again later without any device.
 
 A NumPy archive of plain arrays (nothing in it is executed when it is read) and one JSON text with everything else that
 the solution depends on. What is read is checked as if a stranger had written it.
-
-What a calibration is made of: a picture of a board, a stripe on it, where the flange was and where the rail."""
+"""
 
 from __future__ import annotations
 

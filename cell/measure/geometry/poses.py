@@ -1,9 +1,8 @@
-"""Poses as `pin.SE3`, their other spellings, and how their covariances travel.
+"""Poses as `pin.SE3`, their other spellings, how their covariances travel, and square roots of covariances.
 
 A pose named `a_from_b` maps b-coordinates into a. Its 6×6 covariance is of (δt, δφ) in the axes of a: t → t + δt for
 b's origin in m, R → exp(δφ) R in rad. Translation first, then rotation, everywhere in the cell.
-
-Square roots of covariances whose parameters have different units, for variants, draws and propagation."""
+"""
 
 from __future__ import annotations
 

@@ -1,9 +1,9 @@
-"""What a calibration's views cover, and what is left over in the pictures: the figures behind its residual maps.
-
-What each parameter's uncertainty does to a place that is measured: in mm, at the points where it counts.
+"""What a calibration's views cover, what its uncertainty does to a place, and what would make it better.
 
 Parameters are known together better than apart (a shift of the principal point looks like a turn of the camera), so
-each has two figures: what its own deviation would do alone, and what is left when it is known exactly."""
+each has two figures: what its own deviation does alone, and what is left when it is known exactly. Advice is reckoned
+from the adjustment's own information; whether the arm reaches a view is not asked.
+"""
 
 from __future__ import annotations
 

@@ -1,14 +1,9 @@
-"""Faults of a calibration's set-up that it can name itself: exchanged pictures, a bent board, a slipped mount, a lead.
+"""Faults of a calibration's set-up: exchanged pictures, a bent board, a slipped mount, a wrong lead, another zoom.
 
-Each check looks at what only its own fault disturbs, so that one fault is not taken for another: pictures against the
-flange's turns; the dots of each view by themselves; where the views put the board, before and after.
-
-Does one picture, or do all from one on, want another camera: another zoom, focus or crop, of the same size?
-
-Its own pose takes up most of what a wrong focal length does to a board, so that its points miss their places by
-little, and it pulls the camera of all. What tells is by how much less the points miss when that picture alone has
-focal lengths and a principal point of its own, over what the points scatter by: an F-test for each picture, and for
-those from each on."""
+Each check looks at what only its own fault disturbs: pictures against the flange's turns; the dots of each view by
+themselves; where the views put the board, before and after. A picture of another zoom or focus is told by an F-test:
+by how much less the points miss when it alone has focal lengths and a principal point of its own.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Is the light plane a plane, and is it known? Straightness of each stripe, stripes of another line, scatter, size."""
+"""Is the light plane a plane, and is it known? Straight stripes, stripes of another line, scatter, flatness."""
 
 from __future__ import annotations
 

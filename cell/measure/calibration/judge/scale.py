@@ -1,11 +1,8 @@
-"""The arm's travel against the board's size: a board with another pitch, or poses in another unit, show here.
-
-Whatever the hand-eye, the flange's travel in its own unit and the board as the camera sees it fix one scale.
-
-The board's size against the arm's ways: a board that is printed larger or smaller than its name says shows here.
+"""The board's size against the arm's travel: a board of another pitch, or poses in another unit, show here.
 
 Camera, rail and laser take their metres from the board, the flange's poses theirs from the arm. How much larger the
-board would have to be is one more parameter of the adjustment."""
+board would have to be is one more parameter of the adjustment, or of the poses alone.
+"""
 
 from __future__ import annotations
 

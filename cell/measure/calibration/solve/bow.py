@@ -1,9 +1,7 @@
-"""The bow of the light sheet: found beside everything else of the joint adjustment, and only where the stripes show it.
+"""The bow of the light sheet: one more parameter of the adjustment, kept only where the stripes ask for it.
 
-A flat sheet is the rule. A bow is one more parameter of the adjustment, and kept only where the stripes' residuals ask
-for it. docs/explanation/theory.md, section 6.
-
-A parameter that the joint adjustment does not have: what it would be, beside all that it has."""
+docs/explanation/theory.md, section 6.
+"""
 
 from __future__ import annotations
 

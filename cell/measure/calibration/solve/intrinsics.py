@@ -1,7 +1,7 @@
-"""A camera from pictures of a board alone, without flange poses: adjusted with dots as circles, the lens as needed.
+"""A camera from pictures of a board alone: dots as circles, the lens as needed, and whether the board is bent.
 
-Which terms of the lens are free is decided on views that were left out: a few pictures of a small board fit any lens,
-and a lens that is held wrongly moves focal length and principal point by many times their stated deviation.
+Which terms of the lens are free is decided on views that were left out: a few pictures of a small board fit any lens.
+A bent board moves focal length and principal point by many times their formal deviation, and leaves small residuals.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
-"""Normal equations of the joint adjustment in the shape that it has: shared parameters, and a few of each view's own.
-
-Rests of the arm touch each other only through the shared parameters, so their own (one flange pose, and a rail position
-for each view) are eliminated rest by rest (Schur complement): the work grows with the number of views, not its cube.
-
-Residuals of one view of a calibration, with their analytic derivatives: the dots in px, the stripe in m.
+"""Residuals of one view with their derivatives, and normal equations in the shape of the joint adjustment.
 
 Columns of every Jacobian: camera (9), light plane (3: two turns of the normal, distance), rail (3), hand-eye (6),
 board (6), then the view's own flange pose (6) and rail position (1). Poses move as in `cell.measure.geometry.poses`.
+Rests of the arm touch each other only through the shared parameters, so their own are eliminated rest by rest (Schur
+complement): the work grows with the number of views, not its cube.
 """
 
 from __future__ import annotations

@@ -1,6 +1,4 @@
-"""What a calibration gives: the scan head's and the target camera's, with their covariance and residuals.
-
-A camera's calibration from its observations: closed form, joint adjustment, and what refuses the result."""
+"""A camera's calibration from its observations, and what it gives, for scan head and target camera."""
 
 from __future__ import annotations
 
