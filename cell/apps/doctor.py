@@ -26,10 +26,9 @@ from typing import Literal
 
 from packaging.requirements import Requirement
 
-from cell.base.version import DISTRIBUTION
 from cell.config.cell_config import DEVICES, CellConfig, beside, find_config, load_config, runs_folder
 from cell.devices.diagnosis.local_devices import ROOT, barred, opened_by
-from cell.run.folder import list_runs
+from cell.run.folder import DISTRIBUTION, list_runs
 from drivers.errors import ConfigError
 from drivers.make import DeviceConfig
 from drivers.vehicle.health import CanInterface, can_interface

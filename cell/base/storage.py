@@ -2,8 +2,7 @@
 
 The digest is a SHA-256. It shows accidents and edits by hand; it protects from no attacker. Names and dates of runs
 (`UNDATED`) do not count: the same seed gives the same digest.
-
-Results in a notebook: a short table, every word escaped."""
+"""
 
 from __future__ import annotations
 

@@ -43,14 +43,9 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
     one is, with the part in its claw. All problems are told at once, a line each.
     """
     problems = [
-        *_kind(job),
-        *_speeds(job, config),
-        *_boards(job, config),
-        *_plates(config),
-        *_cameras(config),
-        *way_problems(job, config),
-        *place_problems(job),
-    ]
+        *_kind(job), *_speeds(job, config), *_boards(job, config), *_plates(config), *_cameras(config),
+        *way_problems(job, config), *place_problems(job),
+    ]  # fmt: skip
     problems = problems or list(_sight(job, config))
     extent = mesh_box(mesh, job.surface.mesh_unit)
     problems += [*surface_problems(job, extent), *_stripe(job, config, extent[0][2], extent[1][2])]

@@ -1,6 +1,4 @@
-"""Whether the way to the table and what stands on it make sense: the vehicle's poses, the place, the surface's mesh.
-
-Whether putting the part down makes sense: force, speed, accuracy and height, by the job's own mesh, claw and arm."""
+"""Whether the vehicle's way to the table makes sense, the place and its mesh, and how the part is put down there."""
 
 from __future__ import annotations
 

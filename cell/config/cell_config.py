@@ -1,13 +1,9 @@
-"""`cell.toml`: which devices the cell has, where they are and what they may do.
+"""`cell.toml`: which devices the cell has, where they are and what they may do, and what it draws as bodies.
 
 Every value carries its unit and is checked against its range here, once. Unknown keys are refused. The hash of what a
-calibration depends on ties stored calibrations to the configuration that they were made under.
-
-What else is in the way: boxes that a configuration (on the vehicle) or a job (at the station) names.
-
-The planner keeps the arm away from them, the gate every other command, and the way of the vehicle leaves room for them.
-
-What the configuration draws on flange and deck, as bodies: the scan head, the target camera, the boards."""
+calibration depends on ties stored calibrations to the configuration that they were made under. Obstacles are boxes that
+a configuration (on the vehicle) or a job (at the station) names: arm and vehicle keep away from them.
+"""
 
 from __future__ import annotations
 
@@ -118,20 +114,9 @@ def station_obstacles(obstacles: Iterable[StationObstacle], base_from_place: pin
 
 
 __all__ = [
-    "CONFIGURATION",
-    "DEVICES",
-    "ArmConfig",
-    "CameraConfig",
-    "CellConfig",
-    "RailConfig",
-    "VehicleConfig",
-    "beside",
-    "default_toml",
-    "find_config",
-    "load_config",
-    "runs_folder",
-    "validate",
-]
+    "CONFIGURATION", "DEVICES", "ArmConfig", "CameraConfig", "CellConfig", "RailConfig", "VehicleConfig", "beside",
+    "default_toml", "find_config", "load_config", "runs_folder", "validate",
+]  # fmt: skip
 
 Confirm = Literal["person", "simulated"]
 """Who confirms what a person has to: a person, or the simulated cell itself."""

@@ -16,14 +16,9 @@ RUNS = "runs"
 """The folder of runs unless `cell.runs` names another."""
 
 DEVICES = {
-    "arm": "arm",
-    "rail": "rail",
-    "vehicle": "vehicle",
-    "scan_camera": "camera",
-    "target_camera": "camera",
-    "laser": "laser",
-    "claw": "claw",
-}
+    "arm": "arm", "rail": "rail", "vehicle": "vehicle", "scan_camera": "camera", "target_camera": "camera",
+    "laser": "laser", "claw": "claw",
+}  # fmt: skip
 """The cell's devices by the name of their table, and what kind each is."""
 
 

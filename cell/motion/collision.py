@@ -1,18 +1,12 @@
-"""Which bodies of the cell touch at given joint angles.
+"""Which bodies of the cell touch at given joint angles, and whether they stay apart all along a way.
 
-Checks the moving bodies against what stands still and against each other; bodies that are joined to each other are
-left out, and a caller may allow named pairs, such as the part and the surface in the guarded descent.
+Bodies are capsules of the arm, boxes of the tool, the part, the vehicle and the station, generous on purpose. Each
+hangs on the arm's base (fixed), on one of the six joints or on the flange. Bodies that are joined to each other are not
+checked, and a caller may allow named pairs, such as the part and the surface in the guarded descent.
 
-The solids that must not touch: capsules of the arm, boxes of the tool, the part, the vehicle and the station.
-
-Each body hangs on the arm's base (fixed), on one of the six joints or on the flange. Sizes are generous on purpose;
-poses come from the configuration, the job and the measured pose of the board.
-
-Whether bodies stay apart all along a way, between its samples as well.
-
-At each look every pair has a distance, and no joint can bring a pair nearer faster than the farther body reaches from
-its axis. So the next look may be as far along as no pair can have met before: a few looks in free space, many where
-bodies pass each other closely."""
+Between the samples of a way: no joint can bring a pair nearer faster than the farther body reaches from its axis. So
+the next look may be as far along as no pair can have met before.
+"""
 
 from __future__ import annotations
 

@@ -1,13 +1,9 @@
-"""Forward and inverse kinematics of the six-axis arm.
+"""Forward and inverse kinematics of the six-axis arm, and the models that the cell knows by name.
 
-The model is built in code from a Denavit–Hartenberg table, the maker's or the one that the factory calibrated; the
-closed form of the maker's arm, with three parallel axes, lists the branches, and Gauss–Newton on Pinocchio's model
-makes each of them exact. Collisions and time are not known here.
-
-The arms that the cell knows by name: the maker's table, and how thick their links are.
-
-A controller's own table, calibrated in the factory, belongs to one of them: it is told apart here from that of another
-model. Sources: docs/reference/protocols.md, section 1."""
+The model is built in code from a Denavit–Hartenberg table, the maker's or the one that the factory calibrated. The
+closed form of the maker's arm, with three parallel axes, lists the branches; Gauss–Newton on Pinocchio's model makes
+each of them exact. Sources: docs/reference/protocols.md, section 1.
+"""
 
 from __future__ import annotations
 

@@ -1,14 +1,10 @@
-"""Collision-free motions: a direct joint move, else one over corners that a search finds.
+"""Collision-free motions: a direct joint move, else one over corners that OMPL's RRT-Connect finds and shortens.
 
-Everything is deterministic: the same question gives the same path. Every motion is checked all along, between its
-samples as well, before it is returned. Moves are joined at rest.
-
-A way through joint space, found by OMPL's RRT-Connect (Kuffner and LaValle, 2000) and shortened by it.
-
-It is looked at in steps: whoever uses it checks the way in between as well. The same question gives the same way: the
-generator is seeded anew for each search, and a search ends after so many looks, never by the clock.
-
-Where OMPL has no wheel, ways over one corner are tried instead: `limits` says so. Narrow passages need OMPL."""
+Source: Kuffner and LaValle, 2000. Every motion is checked all along, between its samples as well, before it is
+returned. Moves are joined at rest. The same question gives the same path: the generator is seeded anew for each search,
+which ends after so many looks, never by the clock. Where OMPL has no wheel, ways over one corner are tried instead, and
+`limits` says so.
+"""
 
 from __future__ import annotations
 

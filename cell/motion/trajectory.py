@@ -1,17 +1,12 @@
-"""Jerk-limited motions in time: joint moves and straight lines, from rest to rest.
+"""Jerk-limited motions in time, from rest to rest, no point too fast; and where the flange was at a given time.
 
-Ruckig computes them without waypoints (those would call a cloud service); several moves are joined at rest. What is in
-the way is the planner's business, not known here.
+Ruckig computes joint moves and straight lines without waypoints (those would call a cloud service). What is in the way
+is the planner's business. A point's speed is a convex function of where it is on a rigid body, so the fastest is a
+corner: the flange's origin and the corners of all boxes on the flange are enough.
 
-How fast the flange and what it carries may be: the arm's tool speed as a bound on every point of them.
-
-Of a rigid body the fastest point is always one of its corners, since a point's speed is a convex function of where the
-point is: the flange's origin and the corners of all boxes that hang on the flange are enough.
-
-Where the flange was at a given time: between the states that the arm reported while it moved.
-
-A packet's arrival tells its time only roughly, always late, and all of them may be late alike. The arm's own clock
-runs evenly; round trips tie it to the host's, and then every state has its time."""
+A packet's arrival tells the time of a state only roughly, and late. The arm's own clock runs evenly; round trips tie it
+to the host's.
+"""
 
 from __future__ import annotations
 

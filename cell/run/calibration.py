@@ -1,6 +1,4 @@
-"""The cell's work on its own calibration: find it, make one over the boards on the deck, see how good it is today.
-
-A time in which a person has lifted interlocks, as a recorded run: which, for what reason, and how it ended."""
+"""The cell's work on its own calibration: find it, make one over the boards on the deck, see how good it is today."""
 
 from __future__ import annotations
 
@@ -9,10 +7,10 @@ import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from cell.base.storage import sealed, write_json
-from cell.base.version import release
 from cell.config.calibrations.finding import find_calibration
 from cell.config.calibrations.store import (
     CellCalibration,
@@ -29,11 +27,12 @@ from cell.devices.devices import Devices
 from cell.measure.calibration.archive import Observations
 from cell.measure.calibration.drift.timing import TimesRefused
 from cell.motion.kinematics import kinematics_name
+from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.boards import collect_scan, collect_target
 from cell.procedures.calibrate.reference_plate import look_at_witness, with_edge
 from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
 from cell.procedures.calibrate.verification import Verification, collect_verification, keep_confirmed
-from cell.run.folder import REPORT, new_run, run_log, when
+from cell.run.folder import REPORT, new_run, release, run_log, when
 from cell.run.recorded_work import Hands
 from cell.run.runs import Run
 from cell.run.session import warm_up as ahead
@@ -73,13 +72,10 @@ def arm_table(config: CellConfig, devices: Devices) -> str:
 def stored(cell: Opened) -> CellCalibration:
     """The stored calibration of this very cell as configured; see `find_calibration`, also for what it raises."""
     found = find_calibration(
-        cell.calibrations_folder,
-        serial_numbers(cell.devices),
-        cell.config.calibration_hash(),
-        max_age=cell.config.calibration.max_age,
-        kinematics=arm_table(cell.config, cell.devices),
+        cell.calibrations_folder, serial_numbers(cell.devices), cell.config.calibration_hash(),
+        max_age=cell.config.calibration.max_age, kinematics=arm_table(cell.config, cell.devices),
         untold=why_untold(cell.devices.arm),
-    )
+    )  # fmt: skip
     require_as_configured(found, cell.config)
     return found
 
@@ -93,8 +89,7 @@ def calibrate(cell: Opened, run: Run[object], job: str | Path) -> CellCalibratio
     part_of, _ = load_job(job)
     config, devices = cell.config, cell.devices
 
-    def tell(fraction: float, text: str) -> None:
-        run.tell(Event("progress", "calibrate", {"fraction": fraction, "text": text}))
+    tell = partial(_tell, run, "calibrate")
 
     def work(hands: Hands) -> tuple[Observations, CellCalibration]:
         mover = cell.mover(part_of, hands.safe_point)
@@ -139,19 +134,27 @@ def kept_if_refused(folder: Path, name: str) -> Iterator[None]:
         raise
 
 
+def _tell(run: Run[object], step: str, fraction: float, text: str) -> None:
+    run.tell(Event("progress", step, {"fraction": fraction, "text": text}))
+
+
+def _ready(cell: Opened, hands: Hands, calibration: CellCalibration, job: Job) -> Mover:
+    """The arm's moves for work on this calibration, with the vehicle in command: one that is released is noticed."""
+    mover = cell.mover(job, hands.safe_point)
+    cell.devices.interlocks.work_with(calibration.configuration)
+    cell.devices.vehicle.recover()
+    return mover
+
+
 def verify(cell: Opened, run: Run[object], calibration: CellCalibration, job: Job) -> Verification:
     """Look at the deck boards again, recorded in `run`: how good `calibration` is, and what place error of `job`.
 
     What it finds out about the laser is kept with the stored calibration.
     """
-
-    def tell(fraction: float, text: str) -> None:
-        run.tell(Event("progress", "verify", {"fraction": fraction, "text": text}))
+    tell = partial(_tell, run, "verify")
 
     def work(hands: Hands) -> Verification:
-        mover = cell.mover(job, hands.safe_point)
-        cell.devices.interlocks.work_with(calibration.configuration)
-        cell.devices.vehicle.recover()
+        mover = _ready(cell, hands, calibration, job)
         seen = collect_verification(
             cell.config, cell.devices, mover, calibration=calibration, check=hands.check, progress=tell, keep=hands.keep
         )
@@ -167,14 +170,10 @@ def time_stamps(cell: Opened, run: Run[object], calibration: CellCalibration, jo
     """Sweep to and fro over the fine board, recorded in `run`: `calibration`, stored with how late the scan camera's
     time stamps come. `job` names the part that may be in the claw.
     """
-
-    def tell(fraction: float, text: str) -> None:
-        run.tell(Event("progress", "timing", {"fraction": fraction, "text": text}))
+    tell = partial(_tell, run, "timing")
 
     def work(hands: Hands) -> CellCalibration:
-        mover = cell.mover(job, hands.safe_point)
-        cell.devices.interlocks.work_with(calibration.configuration)
-        cell.devices.vehicle.recover()
+        mover = _ready(cell, hands, calibration, job)
         with kept_if_refused(cell.calibrations_folder, calibration.name):
             timing = collect_timing(
                 cell.config, cell.devices, mover, calibration, check=hands.check, progress=tell, keep=hands.keep

@@ -1,10 +1,8 @@
-"""Run folders `runs/<time>-<id>/`: make one, write into it, find one by name or the one that is going on.
+"""Run folders `runs/<time>-<id>/`: make one, find one, and read its report or what its journal knows so far.
 
-What a run's folder tells afterwards, or while it is going on: its report, or what the journal knows so far.
-
-Where the modules' loggers write: `run.log` in a run's folder, and the console.
-
-Every module has a logger of its own, `logging.getLogger(__name__)`; nothing but the command line prints."""
+Every module has a logger of its own, `logging.getLogger(__name__)`; they write to `run.log` in the folder and to the
+console. Nothing but the command line prints.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from cell.base.storage import write_json as write_json
 from drivers.errors import CellError, ConfigError
 from statemachine.journal import JournalError, JournalRecord, read
 
-REPORT = "report.json"
+DISTRIBUTION, REPORT = "assembly-cell", "report.json"
 Report = Mapping[str, Any]
 """What a run's `report.json` holds, or as much of it as its journal tells; docs/reference/report.md has its keys."""
 _NAME = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
@@ -118,6 +117,14 @@ def _info(folder: Path) -> dict[str, object]:
         return {}
 
 
+def release() -> str:
+    """The version of the installed distribution; "not installed" when it runs from a checkout alone."""
+    try:
+        return version(DISTRIBUTION)
+    except PackageNotFoundError:
+        return "not installed"
+
+
 def when(seconds: float) -> str:
     """A time since the epoch as ISO 8601, local, with its offset."""
     return time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(seconds))
@@ -182,18 +189,11 @@ def _from_journal(folder: Path) -> dict[str, Any]:
             "retries": before["retries"] + 1,
         }
     return {
-        "run": folder.name,
-        "kind": "job",
-        "outcome": run.outcome or "not ended",
-        "reason": run.reason or going,
-        "started": when(run.started),
-        "ended": None if run.ended is None else when(run.ended),
-        "wall_s": None if run.ended is None else round(run.ended - run.started, 2),
-        "pid": run.pid,
-        "steps": list(steps.values()),
-        **({"part": part[-1]} if part else {}),
-        **run.info,
-    }
+        "run": folder.name, "kind": "job", "outcome": run.outcome or "not ended", "reason": run.reason or going,
+        "started": when(run.started), "ended": None if run.ended is None else when(run.ended),
+        "wall_s": None if run.ended is None else round(run.ended - run.started, 2), "pid": run.pid,
+        "steps": list(steps.values()), **({"part": part[-1]} if part else {}), **run.info,
+    }  # fmt: skip
 
 
 def run_row(folder: Path) -> dict[str, object]:
@@ -205,11 +205,8 @@ def run_row(folder: Path) -> dict[str, object]:
     keys = ("outcome", "job", "simulated", "seed", "level", "reason", "started")
     kind = report.get("kind", "job") if report["outcome"] != "unreadable" else None
     return {
-        "run": folder.name,
-        **{key: report.get(key) for key in keys},
-        "kind": kind,
-        "duration_s": wall_seconds(report),
-    }
+        "run": folder.name, **{key: report.get(key) for key in keys}, "kind": kind, "duration_s": wall_seconds(report),
+    }  # fmt: skip
 
 
 def wall_seconds(report: Report) -> float | None:

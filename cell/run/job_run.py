@@ -1,8 +1,4 @@
-"""One job as a recorded run: its folder and journal, what watches the cell meanwhile, what an error means for it.
-
-A job that was read and fits the cell; nothing of it has begun.
-
-What a job's run does around the steps: a calibration first where there is none, and the sweep of a run before."""
+"""One job as a recorded run: read and checked, calibrated for if need be, run, and reported."""
 
 from __future__ import annotations
 

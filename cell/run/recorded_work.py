@@ -1,9 +1,8 @@
-"""Work outside a job as a recorded run: calibration, verification, homing, jogs.
+"""Work outside a job as a recorded run (calibration, homing, jogs), and what an error means for any run.
 
-It has a folder, a journal and a report like a job's run, listens to the same requests, asks the same question after a
-protective stop, and whatever ends it early stops the cell first.
-
-What an error means for a run, of a job or of other work, and how the fault behind it is cleared."""
+It has a folder, a journal and a report like a job's run, and listens to the same requests. It asks the same question
+after a protective stop, and whatever ends it early stops the cell first.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +18,11 @@ from typing import TypeVar
 
 from cell.base.lateness import LATENESS, MOST_S
 from cell.base.storage import sealed, write_json
-from cell.base.version import release
 from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices, require_healthy, stop_not_confirmed
 from cell.devices.simulated.following import DeviceFollowing
 from cell.procedures.frame_store import FrameStore
-from cell.run.folder import REPORT, new_run, run_log, timeless, when
+from cell.run.folder import REPORT, new_run, release, run_log, timeless, when
 from cell.run.record.recorder import begin_record
 from cell.run.runs import Run
 from drivers.errors import (
@@ -134,7 +132,6 @@ class RecordedWork:
     """Work of one kind on the cell's devices, recorded below `root`; `info` goes into the journal and the report.
 
     Without the `config` of the cell the devices' own doings are not recorded.
-
     `health(devices)` is called about ten times a second, and raises what must end the work whatever it does.
     """
 

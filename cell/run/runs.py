@@ -1,8 +1,7 @@
-"""The runs of one cell: one goes on at a time, and a stop counts for what was asked for before it.
+"""A run as its starter holds it, and the runs of one cell: one goes on at a time.
 
-A run as its starter holds it: pause it, let it go on, confirm, abort, listen, wait for its result.
-
-Jobs, calibrations, verifications, homing and jogs are all runs. There is one at a time in a cell."""
+Jobs, calibrations, verifications, homing and jogs are all runs. A stop counts for what was asked for before it.
+"""
 
 from __future__ import annotations
 

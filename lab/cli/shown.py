@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import count
-from typing import Protocol
-
-from rich.console import Console
+from typing import TYPE_CHECKING, Protocol
 
 from cell.apps.cli.options import new_table, print_json, wide_console
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 class Told(Protocol):
@@ -25,6 +26,7 @@ class Told(Protocol):
 @contextmanager
 def bar() -> Iterator[Told]:
     """A bar on standard error; gives what to call for it to grow."""
+    from rich.console import Console
     from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
     columns = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))

@@ -72,7 +72,7 @@ app = App(
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        from cell.base.version import release
+        from cell.run.folder import release
 
         typer.echo(f"cell {release()}")
         raise typer.Exit

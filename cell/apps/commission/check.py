@@ -16,10 +16,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cell.base.version import release
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
-from cell.run.folder import write_json
+from cell.run.folder import release, write_json
 from cell.run.report.page import render
 from drivers.errors import CellError, ConfigError
 from drivers.interfaces import Reading

@@ -1,10 +1,8 @@
-"""The cell's calibration as a whole: solved, tied to its devices and configuration, written and read.
+"""The cell's calibration as a whole: solved, tied to its devices and configuration, written, read and checked.
 
-Whether a stored calibration can be one: figures, covariances and dates by themselves, and beside the configuration.
-
-The digest of its file shows an edit; this shows what no calibration says, whoever wrote it.
-
-Whether a timing still holds for the camera and the rail as they are configured now."""
+The digest of its file shows an edit. Its figures are checked besides, by themselves and beside the configuration: that
+shows what no calibration says, whoever wrote it.
+"""
 
 from __future__ import annotations
 
@@ -199,16 +197,11 @@ class CellCalibration:
     def as_dict(self) -> dict[str, object]:
         """For storage."""
         return {
-            "format": FORMAT if self.sealed else UNSEALED,
-            "made": self.made,
-            "date": self.date,
-            "identities": self.identities,
-            "configuration": self.configuration,
-            "kinematics": self.kinematics,
-            "scan": self.scan.as_dict(),
-            "target": self.target.as_dict(),
+            "format": FORMAT if self.sealed else UNSEALED, "made": self.made, "date": self.date,
+            "identities": self.identities, "configuration": self.configuration, "kinematics": self.kinematics,
+            "scan": self.scan.as_dict(), "target": self.target.as_dict(),
             **({"edits": list(self.edits)} if self.edits else {}),
-        }
+        }  # fmt: skip
 
     def hash(self) -> str:
         """Hash of its content, for reports: of what it says, not of when it was made."""
@@ -286,17 +279,9 @@ def gathered(
     )
     cameras = nominal_camera(config.scan_camera), nominal_camera(config.target_camera)
     return Observations(
-        scan,
-        target,
-        *cameras,
-        priors,
-        config.rail.lead,
-        identities,
-        config.calibration_hash(),
-        time.time(),
-        kinematics,
-        witness,
-    )
+        scan, target, *cameras, priors, config.rail.lead, identities, config.calibration_hash(), time.time(),
+        kinematics, witness,
+    )  # fmt: skip
 
 
 def solve_observations(observations: Observations) -> Solved:

@@ -1,11 +1,9 @@
 """Records a run: listens at the gate, on the wires, to the frames, the log and the run's events, for `record.mcap`.
 
 Whoever is listened to only puts what it has into a queue. On the wall's clock times are nanoseconds since the epoch; on
-the virtual clock they are the cell's own, so that the same seed gives the same record.
-
-Readings, commands and what passed on a wire as JSON: numbers keep every digit, what is no number becomes null.
-
-The times of a record: nanoseconds since the epoch on the wall's clock, the cell's own on the virtual one."""
+the virtual clock they are the cell's own, so that the same seed gives the same record. In JSON numbers keep every
+digit, and what is no number becomes null.
+"""
 
 from __future__ import annotations
 

@@ -1,12 +1,9 @@
 """Perception once more, from what a run kept: the same pictures and readings have to give the same cloud and pose.
 
-The run's folder is the truth: its PNG files, `sweep.npz` (where the scan head was at each line, from the rail's or the
-arm's readings), the flange at the photograph, job, configuration and calibration. The pictures in `record.mcap` have to
-be the same bytes. Everything is compared bit for bit: a difference means other code, other libraries, or changed files.
-
-What a run's perception was given and what it made of it, to the last digit: `perception.json` in the run's folder.
-
-With the frames, `sweep.npz`, job, configuration and calibration beside it, `cell.run.record.replay` does it all again.
+The run's folder is the truth: its PNG files, `sweep.npz` (where the scan head was at each line), job, configuration and
+calibration, and `perception.json` with the flange at the photograph and what came of it, to the last digit. The
+pictures in `record.mcap` have to be the same bytes. Everything is compared bit for bit: a difference means other code,
+other libraries, or changed files.
 """
 
 from __future__ import annotations
@@ -180,16 +177,9 @@ class _Kept:
         """Where the flange was at the photograph."""
         nothing = np.zeros(6)
         return ArmState(
-            0.0,
-            nothing,
-            nothing,
-            flange=self._flange,
-            wrench=nothing,
-            safety=ArmSafety.NORMAL,
-            moving=False,
-            digital_inputs=0,
-            digital_outputs=0,
-        )
+            0.0, nothing, nothing, flange=self._flange, wrench=nothing, safety=ArmSafety.NORMAL, moving=False,
+            digital_inputs=0, digital_outputs=0,
+        )  # fmt: skip
 
     def grab(self, timeout: float = 2.0) -> Frame:
         """The next of its pictures."""
@@ -202,14 +192,9 @@ def _photograph(here: Workplace, folder: Path, told: dict[str, Any]) -> BoardFix
     camera = here.calibration.target.camera
     seen = _Kept(folder, told, (camera.height, camera.width))
     fix = photograph(
-        cast(Arm, seen),
-        cast(Camera, seen),
-        here.calibration.target,
-        spec=here.board,
-        limits=here.job.photo,
-        repeatability=here.repeatability,
-        count=len(told["files"]),
-    )
+        cast(Arm, seen), cast(Camera, seen), here.calibration.target, spec=here.board, limits=here.job.photo,
+        repeatability=here.repeatability, count=len(told["files"]),
+    )  # fmt: skip
     return settled(fix, here.config.arm.vehicle_from_base.se3().inverse())
 
 

@@ -41,13 +41,9 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
             "interpolated": cloud.interpolated.astype(np.uint8),
         }
         write_ply(
-            out,
-            cloud.points,
-            quality=deviations,
-            colours=colours,
-            scalars=scalars,
+            out, cloud.points, quality=deviations, colours=colours, scalars=scalars,
             comment=_comment(deviations, report),
-        )
+        )  # fmt: skip
     else:
         try:
             faces = triangles(cloud.points, cloud.line, cloud.row, cloud.sweep)

@@ -1,9 +1,8 @@
 """The picture of a run for the person at the cell: the board as found, the surface, the place error or the reason.
 
-Each panel shows what the run has of it. Where a run ended early the panels show what was looked at, and why that did
-not do. The panels themselves are drawn in `panels.py`.
-
-The panels of a run's picture. Lengths in mm, pictures in px; every scale says its unit."""
+Where a run ended early the panels show what was looked at, and why that did not do. Lengths are in mm, pictures in px;
+every scale says its unit.
+"""
 
 from __future__ import annotations
 

@@ -17,7 +17,6 @@ import numpy as np
 import pinocchio as pin
 
 from cell.base.storage import sealed, write_json
-from cell.base.version import release
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.measure.geometry.poses import difference, from_matrix, to_ur, transform
@@ -27,7 +26,7 @@ from cell.procedures.frame_store import FrameStore
 from cell.procedures.part_error import draws, part_points, placed_points, point_covariances, stated_bound, through
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.sweep.stored_sweep import SweepRecord
-from cell.run.folder import REPORT, timeless, when
+from cell.run.folder import REPORT, release, timeless, when
 from cell.run.report.evidence import last_frames, measured, refusal
 from drivers.interfaces import Vector
 from statemachine.runner import Event, RunResult
@@ -170,14 +169,10 @@ def _steps(result: RunResult) -> list[dict[str, object]]:
         made = result.results.get(step.name)
         rows.append(
             {
-                "name": step.name,
-                "state": step.state,
-                "duration_s": round(step.duration_s, 3),
-                "wall_s": round(step.wall_s, 3),
-                "retries": step.retries,
-                "result": summary_of(made),
+                "name": step.name, "state": step.state, "duration_s": round(step.duration_s, 3),
+                "wall_s": round(step.wall_s, 3), "retries": step.retries, "result": summary_of(made),
             }
-        )
+        )  # fmt: skip
     return rows
 
 

@@ -1,8 +1,7 @@
-"""An open cell as the work on it sees it: its devices, where results go, what world it stands in, how work is recorded.
+"""Opening a cell, and the open cell as work sees it: its devices, its folders, its world, how work is recorded.
 
-What goes on in it, one run at a time, is `cell.run.runs`'s; how it is opened, `cell.run.session.session`'s.
-
-Opening a cell: its devices, real or simulated, over wires or on the virtual clock, and the lock that holds them."""
+Devices are real or simulated, over wires or on the virtual clock, and a lock holds them.
+"""
 
 from __future__ import annotations
 
@@ -126,7 +125,7 @@ class SessionRequest:
     confirm: Confirm | None
     only: Collection[str]
     clock: str
-    truth: str | Path | None = None
+    truth: str | Path | None
 
     def open(self, undo: ExitStack) -> Opened:
         """Connect as `Cell.open` says, and raise what it says. What is to be undone if that fails goes to `undo`."""

@@ -2,22 +2,18 @@
 
 with Cell.open("cell.toml", sim="all", seed=7) as cell:
     result = cell.run(job="pot")
-
-    run = cell.start(job="pot")  # or hold it while it goes on
-    run.pause()
-    run.go_on()
-    result = run.result()
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import TypeVar
 
+from cell.base.compiled import load
 from cell.base.lateness import LATENESS
 from cell.config.calibrations.store import CalibrationEdited, CellCalibration
 from cell.config.cell_config import DEVICES, CellConfig, Confirm
@@ -48,6 +44,7 @@ HOMED = {"rail": ("rail",), "arm": ("arm", "vehicle")}
 while the vehicle is braked."""
 
 Made = TypeVar("Made")
+_OnStored = Callable[[Opened, Run[object], CellCalibration, Job], Made]
 
 log = logging.getLogger(__name__)
 
@@ -59,27 +56,20 @@ class Cell:
     SIGTERM and SIGHUP end the program as Ctrl-C does: through the safe stop.
     """
 
-    def __init__(
-        self,
-        config: CellConfig,
-        folder: Path,
-        lock: AbstractContextManager[object],
-        devices: Devices,
-        simulated: Simulation | None,
-    ) -> None:
-        self.config = config
-        self.folder = folder
-        self.devices = devices
-        self.simulated = simulated
-        self._here = Opened(config, folder, lock, devices, simulated)
-        if simulated is not None and "vehicle" in simulated.simulated and "vehicle" in devices:
+    def __init__(self, opened: Opened) -> None:
+        self._here = opened
+        self.config: CellConfig = opened.config
+        self.folder: Path = opened.folder
+        self.devices: Devices = opened.devices
+        self.simulated: Simulation | None = opened.simulated
+        if self.simulated is not None and "vehicle" in self.simulated.simulated and "vehicle" in self.devices:
             # The world that this process has just started puts the vehicle there.
             self.whereabouts.say_at_start()
-        self._runs = Runs(config.cell.name)
+        self._runs = Runs(self.config.cell.name)
         self._signals = EndSignals()
-        self._fed = simulated is None or simulated.facts.get("clock") != "virtual"
+        self._fed = self.simulated is None or self.simulated.facts.get("clock") != "virtual"
         if self._fed:
-            LATENESS.begin(config.cell.time_scale)
+            LATENESS.begin(self.config.cell.time_scale)
 
     @classmethod
     def open(
@@ -119,11 +109,12 @@ class Cell:
             NotConnectedError, DeviceFault: This device does not answer.
         """
         with EndSignals(), ExitStack() as undo:
-            made = SessionRequest(
+            load()
+            request = SessionRequest(
                 config=config, sim=sim, seed=seed, level=level, speed=speed, job=job, confirm=confirm, only=only,
                 clock=clock, truth=truth,
-            ).open(undo)  # fmt: skip
-            cell = cls(made.config, made.folder, made.lock, made.devices, made.simulated)
+            )  # fmt: skip
+            cell = cls(request.open(undo))
             undo.pop_all()
         # After the context above has given the handlers back: of two that are nested the outer one would win.
         cell._signals.__enter__()
@@ -289,8 +280,6 @@ class Cell:
         """Do work outside a job, such as a jog, as a recorded run, and wait for its end. `stops` as in `begin`."""
         return self.begin(kind, lambda run: self._here.recorded(run, kind, work, info), observer, stops).result()
 
-    # --- jobs ---
-
     def run(
         self,
         job: str | Path = "pot",
@@ -373,21 +362,14 @@ class Cell:
         """
         folder = find_run(self.runs_folder, None if run is None else str(run), "job")
         before = UnfinishedRun.find(folder, scripted=not script.idle)
-        info, until = {"resumed_from": before.folder.name}, before.info.get("until")
+        info: dict[str, object] = {"resumed_from": before.folder.name}
+        until = before.info.get("until")
         return self._start(before.job, observer, info, before, at_start=at_start, until=until, script=script).result()
 
     def _start(
-        self,
-        job: str | Path,
-        observer: Observer | None,
-        info: dict[str, Any],
-        before: UnfinishedRun | None,
-        inline: tuple[Observer, ...] = (),
-        *,
-        at_start: bool,
-        until: str | None = None,
-        script: Script = NO_SCRIPT,
-    ) -> Run[RunOutcome]:
+        self, job: str | Path, observer: Observer | None, info: dict[str, object], before: UnfinishedRun | None,
+        inline: tuple[Observer, ...] = (), *, at_start: bool, until: str | None, script: Script,
+    ) -> Run[RunOutcome]:  # fmt: skip
         self._runs.require_free()
         self._runs.require_no_late_stop()
         stops = self.stops
@@ -407,8 +389,6 @@ class Cell:
         info |= {**self._here.world, **ready.info}
         work = JobWork(self._here, job, ready, info, stored=stored, before=before, inline=inline, at_start=at_start)
         return self.begin("job", work.perform, observer, stops)
-
-    # --- calibration ---
 
     def calibration(self) -> CellCalibration:
         """The stored calibration of this very cell as configured; see `find_calibration`, also for what it raises."""
@@ -441,12 +421,7 @@ class Cell:
             CalibrationStale: There is no calibration, or one without a reference.
             RefusedError: A board is not seen.
         """
-        stops = self.stops
-        loaded, _ = load_job(job)
-        calibration = self.calibration()
-        return self.begin(
-            "verification", lambda run: sessions.verify(self._here, run, calibration, loaded), observer, stops
-        ).result()
+        return self._on_stored("verification", sessions.verify, observer, job)
 
     def time_stamps(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:
         """Measure how late the scan camera's time stamps come, by sweeps to and fro over the fine board.
@@ -462,12 +437,14 @@ class Cell:
             CalibrationStale: There is no calibration.
             RefusedError: A rolling shutter, stamps that no correction mends, or sweeps that do not tell.
         """
+        return self._on_stored("timing", sessions.time_stamps, observer, job)
+
+    def _on_stored(self, kind: str, work: _OnStored[Made], observer: Observer | None, job: str | Path) -> Made:
+        """Work on the stored calibration, with the part of `job` in the claw, as a run; wait for its end."""
         stops = self.stops
         loaded, _ = load_job(job)
         calibration = self.calibration()
-        return self.begin(
-            "timing", lambda run: sessions.time_stamps(self._here, run, calibration, loaded), observer, stops
-        ).result()
+        return self.begin(kind, lambda run: work(self._here, run, calibration, loaded), observer, stops).result()
 
     def recover(self, by: str, observer: Observer | None = None) -> None:
         """Unlock the arm's protective stop, connect a lost link, clear the vehicle's fault. Nothing moves.

@@ -112,48 +112,17 @@ def assert_refused(code: int, shown: str, words: tuple[str, ...]) -> None:
 WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
     # addresses and ports
     ("arm.address", '"300.1.2.3"', ("arm.address", "0 to 255")),
-    ("arm.address", '"192.168.0"', ("arm.address", "four numbers")),
-    ("arm.address", '""', ("arm.address", "is no address")),
-    ("arm.address", '"arm one"', ("arm.address", "is no address")),
-    ("arm.address", '"10.0.0.5:30004"', ("arm.address", "leave out port")),
-    ("arm.address", '"http://10.0.0.5"', ("arm.address", "leave out port, scheme")),
-    ("arm.address", '"0.0.0.0"', ("arm.address", "not the address of one device")),
-    ("arm.address", '"255.255.255.255"', ("arm.address", "not the address of one device")),
     ("arm.address", "5", ("arm.address", "is no text; write it in quotes")),
     ("scan_camera.address", '"10.0.0.20:0"', ("scan_camera.address", "1 to 65535")),
-    ("scan_camera.address", '"10.0.0.20:65536"', ("scan_camera.address", "1 to 65535")),
-    ("scan_camera.address", '"10.0.0.20:-1"', ("scan_camera.address", "1 to 65535")),
-    ("scan_camera.address", '"10.0.0.20"', ("scan_camera.address", "has no port", "HOST:PORT")),
-    ("scan_camera.address", '"10.0.0.256:5000"', ("scan_camera.address", "0 to 255")),
-    ("scan_camera.address", '"10.0.0.20:five"', ("scan_camera.address", "1 to 65535")),
-    ("scan_camera.address", '":5000"', ("scan_camera.address", "HOST:PORT")),
     ("target_camera.address", '"192.0.2.20:5000"', ("scan_camera.address and target_camera.address are both",)),
     ("cell.truth", '"nowhere"', ("cell.truth", "HOST:PORT")),
     ("cell.truth", '"192.0.2.20:5000"', ("scan_camera.address and cell.truth are both",)),
     # the rail's line
     ("rail.url", '""', ("rail.url", "no serial port", "/dev/ttyUSB0")),
-    ("rail.url", '"ttyACM0"', ("rail.url", "no serial port")),
-    ("rail.url", '"/dev/"', ("rail.url", "no serial port")),
-    ("rail.url", '"/dev/../etc/passwd"', ("rail.url", "no serial port")),
-    ("rail.url", '"telnet://10.0.0.5:4001"', ("rail.url", '"telnet" is not one of')),
-    ("rail.url", '"socket://10.0.0.5"', ("rail.url", "has no port")),
-    ("rail.url", '"socket://10.0.0.5:70000"', ("rail.url", "1 to 65535")),
-    ("rail.url", '"socket://"', ("rail.url", "names no port")),
-    ("rail.url", '"rfc2217://10.0.0.999:4001"', ("rail.url", "0 to 255")),
     ("rail.url", '"/dev/ttyUSB0"', ("rail.url and vehicle.channel are both",)),
     # CAN
     ("vehicle.interface", '"canfoo"', ("vehicle:", '"canfoo" is unknown', "socketcan")),
-    ("vehicle.interface", '""', ("vehicle:", "is unknown")),
-    ("vehicle.interface", '"virtual"', ("vehicle:", "reaches no vehicle")),
-    ("vehicle.interface", '"socketcan"', ("vehicle:", "/dev/ttyUSB0", '"can0"')),
-    ("vehicle.interface", '"pcan"', ("vehicle:", "PCAN_USBBUS1")),
-    ("vehicle.interface", '"kvaser"', ("vehicle:", "a number")),
-    ("vehicle.interface", '"socketcand"', ("vehicle:", "host and a port")),
-    ("vehicle.interface", '"udp_multicast"', ("vehicle:", "multicast address")),
     ("vehicle.channel", '"can0"', ("vehicle:", '"slcan"', "no serial port")),
-    ("vehicle.channel", '""', ("vehicle:", "no serial port")),
-    ("vehicle.channel", '"/dev/ttyUSB0@fast"', ("vehicle:", "no speed of a serial line")),
-    ("vehicle.channel", '"socket://10.0.0.5:0"', ("vehicle:", "1 to 65535")),
     ("vehicle.bitrate", '"123 kbit/s"', ("vehicle:", "123 kbit/s", "500")),
     ("vehicle.bitrate", '"500 kHz"', ("vehicle.bitrate", "not a quantity in kbit/s")),
     # inputs and outputs of the arm
@@ -167,15 +136,11 @@ WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("claw.feedback", "18", ("claw.feedback", "0 to 17")),
     # numbers and units
     ("rail.lead", "2", ("rail.lead", "has no unit", '"0.1 mm"')),
-    ("rail.lead", '"2"', ("rail.lead", "has no unit")),
     ("rail.lead", '"2 kg"', ("rail.lead", "not a quantity in mm")),
-    ("rail.lead", '"2 furlongz"', ("rail.lead", "not a quantity in mm")),
     ("rail.lead", '"two mm"', ("rail.lead", "not a number and a unit")),
-    ("rail.lead", '"nan mm"', ("rail.lead", "not a number and a unit")),
     ("rail.lead", '"1e999 mm"', ("rail.lead", "outside the allowed range")),
     ("rail.lead", '"2 mm^9^9^9"', ("rail.lead", "not a number and a unit")),
     ("rail.lead", '"-2 mm"', ("rail.lead", "0.1 to 50 mm")),
-    ("rail.lead", '""', ("rail.lead", "not a number and a unit")),
     ("rail.lead", "[2]", ("rail.lead", "has no unit")),
     ("rail.lead", "1979-05-27", ("rail.lead", "has no unit")),
     ("rail.microsteps", "3", ("rail.microsteps", "1, 2, 4, 8")),
@@ -231,10 +196,7 @@ WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("calibration.stripe_exposure", '"0 ms"', ("calibration.stripe_exposure", "0.01 to 100 ms")),
     # the cell as a whole
     ("cell.name", '""', ("cell.name", "is no name")),
-    ("cell.name", '"a/b"', ("cell.name", "no slash")),
     ("cell.runs", '"/var/runs"', ("cell.runs", "no absolute path")),
-    ("cell.runs", '"../runs"', ("cell.runs", 'no ".."')),
-    ("cell.runs", '""', ("cell.runs", "no folder beside this file")),
     ("cell.runs", '"calibrations"', ("cell:", "both")),
     ("cell.calibrations", '"~/store"', ("cell.calibrations", "no folder beside this file")),
     ("cell.time_scale", "3.0", ("cell:", "real devices need time_scale = 1")),
@@ -259,10 +221,6 @@ def test_a_wrong_configuration_does_not_pass_the_check(
 
 WRONG_JOBS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("job.name", '"a/b"', ("job.name", "no slash")),
-    ("job.name", '""', ("job.name", "is no name")),
-    ("job.name", '"../pot"', ("job.name", "is no name")),
-    ("job.name", '".."', ("job.name", "is no name")),
-    ("job.name", '"two\\nlines"', ("job.name", "is no name")),
     ("job.name", "7", ("job.name", "write it in quotes")),
     ("job.colour", '"red"', ("job.colour", "unknown key")),
     ("board.spec", '"chess:7x6:10mm"', ("board.spec", "unknown kind")),
@@ -387,15 +345,10 @@ def test_all_that_is_wrong_is_told_at_once_and_as_json(cell: Run, place: Path) -
 
 
 RIGHT_CONFIGURATIONS = [
-    ("arm.address", '"arm-1.factory.local"'),
     ("rail.url", '"socket://10.0.0.5:4001"'),
-    ("rail.url", '"rfc2217://moxa:4001?logging=debug"'),
-    ("rail.url", '"COM3"'),
-    ("rail.url", '"/dev/serial/by-id/usb-Trinamic_TMCM-1110-if00"'),
     ("rail.microsteps", "64"),
     ("rail.travel", '["5 mm", "120 mm"]'),
     ("rail.lead", '"0.1 inch"'),
-    ("vehicle.channel", '"/dev/ttyUSB0@115200"'),
     ("vehicle.channel", '"socket://10.0.0.6:3000"'),
     ("arm.max_tool_speed", '"0.25 m/s"'),
     ("arm.max_joint_speed", '"1 rad/s"'),
@@ -405,7 +358,6 @@ RIGHT_CONFIGURATIONS = [
     ("laser.tan_theta", "3"),
     ("scan_camera.photo_exposure", '"5 ms"'),
     ("calibration.max_age", '"2 week"'),
-    ("cell.runs", '"data/runs 2026"'),
     ("cell.confirm", '"person"'),
 ]
 
@@ -447,37 +399,21 @@ def test_a_mesh_in_millimetres_passes_with_its_unit(cell: Run, place: Path) -> N
     assert cell("check")[0] == 0
 
 
-WRONG_FILES: list[tuple[str, bytes, tuple[str, ...]]] = [
-    ("folder", b"", ("is a folder", "name the file")),
-    ("binary", bytes(range(256)), ("no text in UTF-8",)),
-    ("latin", '[cell]\nname = "Prüfzelle"\n'.encode("latin-1"), ("no text in UTF-8", "save it as UTF-8")),
-    ("large", b"#" * 1_000_001, ("larger than 1 MB",)),
-    ("open quote", b'[cell]\nname = "cell\n', ("line 2", "name =")),
-    ("open table", b"[cell\n", ("not valid TOML",)),
-    ("open end", b'[cell]\nname = """cell', ("not valid TOML", "close every quote")),
-    ("no value", b"[cell]\nname =\n", ("line 2", "KEY = VALUE")),
-    ("twice", b'[cell]\nname = "a"\nname = "b"\n', ("line 3", "remove one")),
-    ("table twice", b"[cell]\n[cell]\n", ("line 2", "remove one")),
-    ("deep", b"a = " + b"[" * 5000, ("not valid TOML",)),
-    ("nothing", b"", ("missing",)),
-    ("another", b'colour = "red"\n', ("colour", "unknown key")),
-    ("no table", b"cell = 3\n", ("cell", "is no table")),
-]
-
-
-@pytest.mark.parametrize(("kind", "content", "words"), WRONG_FILES, ids=[row[0] for row in WRONG_FILES])
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"[cell\n", ("wrong.toml", "not valid TOML")),
+        (b"", ("missing",)),
+        (b'colour = "red"\n', ("colour", "unknown key")),
+        (b"cell = 3\n", ("cell",)),
+    ],
+)
 @pytest.mark.parametrize("option", ["-c", "-j"])
 def test_a_file_that_is_none_is_refused(
-    cell: Run, place: Path, option: str, kind: str, content: bytes, words: tuple[str, ...]
+    cell: Run, place: Path, option: str, content: bytes, words: tuple[str, ...]
 ) -> None:
-    path = place / "wrong.toml"
-    if kind == "folder":
-        path.mkdir()
-    else:
-        path.write_bytes(content)
-    if kind in ("another", "no table") and option == "-j":
-        words = (words[0],)
-    assert_refused(*cell("check", option, str(path)), words)
+    (place / "wrong.toml").write_bytes(content)
+    assert_refused(*cell("check", option, "wrong.toml"), words)
 
 
 @pytest.mark.parametrize(
@@ -499,15 +435,8 @@ def test_a_file_that_is_none_is_refused(
         (("calibrate", "verify"), ("there is no cell.toml",)),
         (("jog", "rail", "+5mm"), ("there is no cell.toml", "`cell jog rail +5mm --sim all`")),
         (("jog", "rail", "5"), ("has no unit", "rail +5mm")),
-        (("jog", "rail", "+5kg"), ("not a quantity", "rail +5mm")),
-        (("jog", "rail", "nanmm"), ("write it like",)),
-        (("jog", "rail", "+5mm^9^9"), ("write it like",)),
         (("jog", "arm", "q", "5mm"), ("cannot jog", "write it like")),
-        (("jog", "arm", "j7", "5deg"), ("cannot jog", "write it like")),
-        (("jog", "arm", "z", "5deg"), ("write it like",)),
-        (("jog", "tower", "5mm"), ("cannot jog", "write it like")),
         (("jog", "vehicle", "+9m"), ("outside the allowed range", "-0.5 to 0.5 m")),
-        (("jog", "rail"), ("cannot jog", "write it like")),
         (("home", "--sim", "some"), ('"all"',)),
         (("diag", "--sim", "some"), ('"all"',)),
         (("dry-run", "--seed", "-1"), ("--seed",)),

@@ -128,24 +128,14 @@ def _run_page(folder: Path, report: Report) -> RunPage:
     except CellError as error:
         unreadable = str(error)
     return RunPage(
-        run=str(report["run"]),
-        what=f"Job {report.get('job')}" if kind == "job" else kind.capitalize(),
-        outcome=str(report["outcome"]),
-        simulated=simulated_words(report.get("simulated")),
-        world=f"seed {report.get('seed')}, level {report.get('level')}",
-        verdict=verdict(report),
-        reason=str(report.get("reason") or ""),
-        refused=refused,
-        judged=judged(report),
-        compared=compared(report),
-        surface=surface,
-        unreadable=unreadable,
-        course=timeline(folder, report),
-        trend=Trend(past_runs(folder, report), tolerance) if kind == "job" else None,
-        used=identities(folder, report),
-        noise=[TableRow(row) for row in noise_rows(noise)],
-        noise_level=str(noise.get("level") or ""),
-    )
+        run=str(report["run"]), what=f"Job {report.get('job')}" if kind == "job" else kind.capitalize(),
+        outcome=str(report["outcome"]), simulated=simulated_words(report.get("simulated")),
+        world=f"seed {report.get('seed')}, level {report.get('level')}", verdict=verdict(report),
+        reason=str(report.get("reason") or ""), refused=refused, judged=judged(report), compared=compared(report),
+        surface=surface, unreadable=unreadable, course=timeline(folder, report),
+        trend=Trend(past_runs(folder, report), tolerance) if kind == "job" else None, used=identities(folder, report),
+        noise=[TableRow(row) for row in noise_rows(noise)], noise_level=str(noise.get("level") or ""),
+    )  # fmt: skip
 
 
 def _with_photographs(page: RunPage, folder: Path, report: Report, room: int) -> RunPage:

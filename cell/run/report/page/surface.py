@@ -78,13 +78,9 @@ def surface_view(folder: Path, report: Report) -> SurfaceView | None:
     compared = scan.deviation is not None
     stops = [f"rgb({r},{g},{b})" for r, g, b in _palette(compared)[:SHADES:15]]
     return SurfaceView(
-        map=map_picture(scan, span),
-        cloud=view_data(scan, span),
-        compared=compared,
-        why=scan.why,
-        span_mm=span,
+        map=map_picture(scan, span), cloud=view_data(scan, span), compared=compared, why=scan.why, span_mm=span,
         stops=stops,
-    )
+    )  # fmt: skip
 
 
 def scanned(folder: Path, report: Report) -> Scanned | None:
@@ -211,16 +207,11 @@ def view_data(scan: Scanned, span_mm: float) -> Mapping[str, Any]:
     share = np.clip((values[chosen] - begin) / (end - begin), 0.0, 1.0)
     shades = np.where(np.isfinite(share), np.nan_to_num(share) * (SHADES - 1), SHADES).astype(np.uint8)
     return {
-        "points": _base64(np.round((points - middle) / step).astype("<i2")),
-        "shades": _base64(shades),
-        "palette": _base64(_palette(compared)),
-        "step": step,
-        "apart": float(np.sqrt(np.prod(np.maximum((high - low)[:2], 0.1)) / max(1, len(points)))),
-        "count": len(points),
-        "total": total,
-        "from": begin,
-        "to": end,
-    }
+        "points": _base64(np.round((points - middle) / step).astype("<i2")), "shades": _base64(shades),
+        "palette": _base64(_palette(compared)), "step": step,
+        "apart": float(np.sqrt(np.prod(np.maximum((high - low)[:2], 0.1)) / max(1, len(points)))), "count": len(points),
+        "total": total, "from": begin, "to": end,
+    }  # fmt: skip
 
 
 def _palette(compared: bool) -> NDArray[np.uint8]:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
-from pathlib import Path
-
-import pytest
 
 from tests.support import ROOT
 
@@ -23,8 +19,10 @@ sys.meta_path.insert(0, Missing())
 with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     import cell.run.session.supervisor
+    from cell.base.compiled import load
     from cell.measure.vision import extract
     from lab.bench.stripe.truth import Cell, draw
+    load()
 
 image, centres = draw(Cell(2, 100), (64, 320), 1)
 error = abs(extract(image).centres - centres).max()
@@ -62,36 +60,12 @@ print(sum(before.values()) < sum(rehearsed.values()), loaded() == rehearsed)
 """
 
 
+def test_the_door_itself_does_not_wait_for_numba() -> None:
+    words = "import sys; from cell import Cell; print('numba' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, timeout=120)
+    assert done.stdout.split() == ["False"], done.stderr
+
+
 def test_nothing_is_loaded_or_compiled_any_more_when_a_sweep_has_begun() -> None:
     done = subprocess.run([sys.executable, "-c", REHEARSED], capture_output=True, text=True, timeout=300, cwd=ROOT)
     assert done.stdout.split() == ["True", "True"], done.stdout + done.stderr
-
-
-@pytest.mark.campaign
-def test_what_a_first_job_compiles_was_compiled_ahead(tmp_path: Path) -> None:
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kept")}
-
-    def ours() -> set[str]:
-        return {path.name for path in (tmp_path / "kept").rglob("*.nbi") if "optics" not in path.parent.name}
-
-    with subprocess.Popen(
-        [sys.executable, "-m", "cell.run.session.warm_up"], stdin=subprocess.PIPE, env=environment
-    ) as ahead:
-        assert ahead.wait(200) == 0
-    before = ours()
-    command = [sys.executable, "-c", "from cell.apps.cli import main; main()", "dry-run", "--clock", "virtual"]
-    subprocess.run(command, check=True, cwd=tmp_path, capture_output=True, timeout=300, env=environment)
-    assert len(before) > 40
-    # Only a line that is hard to follow needs this one.
-    assert {name.partition("-")[0] for name in ours() - before} <= {"follow._chain"}
-
-
-def test_who_compiles_ahead_ends_with_the_other(tmp_path: Path) -> None:
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    with subprocess.Popen(
-        [sys.executable, "-m", "cell.run.session.warm_up"], stdin=subprocess.PIPE, env=environment
-    ) as ahead:
-        assert ahead.stdin is not None
-        ahead.stdin.close()
-        assert ahead.wait(60) == 0
-    assert len(list(tmp_path.rglob("*.nbi"))) < 40

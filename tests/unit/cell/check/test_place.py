@@ -6,18 +6,12 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pinocchio as pin
 import pytest
 
 from cell.base.toml_file import read_toml, validate
 from cell.check.place import contact_notes, contact_problems, under_part
-from cell.check.reach import _sweeps, _unreached, nominal_scan
 from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import Job, load_job, shipped_jobs
-from cell.motion.kinematics import Unreachable
-from cell.procedures.arm.photograph import scan_plans
-from cell.procedures.sweep.sweeping import RUN_UP_S
 
 POT = load_job("pot")[1].with_suffix(".toml")
 
@@ -77,37 +71,3 @@ def test_how_deep_the_surface_reaches_into_the_part_is_noted() -> None:
     mesh: Path = POT.with_suffix(".ply")
     deeper = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "-5 mm"])
     assert "13.4 mm into the part's box of 20 mm" in next(contact_notes(deeper, mesh))
-
-
-# --- what the arm has to reach ---
-
-
-def test_sweeps_are_planned_with_the_scan_head_as_drawn(config: CellConfig) -> None:
-    head = nominal_scan(config)
-    np.testing.assert_array_equal(head.rail_direction, [1.0, 0.0, 0.0])
-    assert not head.covariance.any()
-
-
-@pytest.mark.parametrize(("mode", "run_up"), [("rail", 0.0), ("arm", RUN_UP_S * 0.015)])
-def test_a_sweep_by_the_arm_reaches_from_its_run_up_to_its_run_out(
-    mode: str, run_up: float, config: CellConfig
-) -> None:
-    job = changed("scan.mode", mode)
-    surface = pin.SE3(np.eye(3), np.array([0.7, 0.3, 0.1]))
-    (plan,) = scan_plans(config, job, surface, nominal_scan(config))
-    (_, begin, _), (_, end, _) = _sweeps(job, config, surface)
-    ahead = [surface.actInv(pose).translation[0] for pose in (begin, plan.base_from_flange, plan.base_from_flange_end)]
-    ahead.append(surface.actInv(end).translation[0])
-    assert np.diff(ahead) == pytest.approx([run_up, job.scan.length * (mode == "arm"), run_up], abs=1e-9)
-
-
-def test_of_many_poses_out_of_reach_three_are_told() -> None:
-    class Short:
-        def reach(self, goal: pin.SE3, joints: object, what: str, allowed: object) -> object:
-            if what == "near":
-                return joints
-            raise Unreachable("out of reach")
-
-    goals = [(what, pin.SE3.Identity(), ()) for what in ("near", "a", "b", "near", "c", "d")]
-    told = list(_unreached(Short(), iter(goals)))  # type: ignore[arg-type]
-    assert told == [f"{what}: out of reach" for what in "abc"]

@@ -4,7 +4,6 @@ Boxes that a configuration or a job names are kept away from: by planned ways, b
 
 from __future__ import annotations
 
-import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.check.fit import require_fit
 from cell.config.cell_config import CellConfig, StationObstacle, default_toml, load_config, validate
-from cell.config.job import Job, job_path, load_job
+from cell.config.job import Job, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.inversion import NominalSurface
@@ -211,16 +209,8 @@ def test_the_shipped_configuration_is_valid() -> None:
     ("changes", "words"),
     [
         ({"rail__laed": "2 mm"}, ["rail.laed", "unknown key"]),
-        ({"rail__lead": 2}, ["rail.lead", "has no unit"]),
-        ({"rail__lead": "2000 mm"}, ["rail.lead", "0.1 to 50 mm"]),
         ({"rail__lead": "50.1 mm"}, ["rail.lead", "0.1 to 50 mm"]),
         ({"rail__lead": "0.09 mm"}, ["rail.lead", "0.1 to 50 mm"]),
-        ({"rail__lead": None}, ["rail.lead", "missing"]),
-        ({"rail__travel": ["100 mm", "0 mm"]}, ["rail", "the first must be smaller"]),
-        ({"rail__microsteps": 3}, ["rail.microsteps"]),
-        ({"arm__max_joint_speed": "0 deg/s"}, ["arm.max_joint_speed", "1 to 120 deg/s"]),
-        ({"claw__output": 0}, ["laser.output and claw.output are both", "arm output 0"]),
-        ({"calibration__fine__board": "marked_dots:11"}, ["calibration.fine.board"]),
         ({"vehicle__driver": "tank"}, ["vehicle.driver", '"tank"', '"agilex"']),
     ],
 )
@@ -248,20 +238,3 @@ def test_addresses_do_not_make_a_calibration_foreign_but_optics_do() -> None:
 def test_a_job_that_does_not_exist_lists_those_that_do() -> None:
     with pytest.raises(ConfigError, match="pot"):
         load_job("teapot")
-
-
-@pytest.mark.parametrize(
-    ("edit", "words"),
-    [
-        (('length = "64 mm"', 'length = "99.5 mm"'), "scan.length 99.5 mm"),
-        (('speed = "15 mm/s"', 'speed = "45 mm/s"'), "scan.speed 45 mm/s exceeds rail.max_speed, 40 mm/s"),
-        (('speed = "0.4 m/s"', 'speed = "0.9 m/s"'), "approach.speed 900 mm/s exceeds vehicle.max_speed, 500 mm/s"),
-    ],
-)
-def test_a_job_that_asks_too_much_of_the_cell_is_refused(tmp_path: Path, edit: tuple[str, str], words: str) -> None:
-    source = job_path("pot")
-    path = tmp_path / "mine.toml"
-    path.write_text(source.read_text().replace(*edit).replace("pot.ply", str(source.parent / "pot.ply")))
-    job, mesh = load_job(path)
-    with pytest.raises(ConfigError, match=re.escape(words)):
-        require_fit(job, load_config(None), mesh)

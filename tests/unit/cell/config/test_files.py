@@ -83,15 +83,6 @@ def test_nothing_moves_at_an_address_that_is_only_the_example(
     assert "still the example's" in shown
 
 
-def test_the_supervisor_script_is_held_to_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match="there is no cell"):
-        Cell.open()
-    Path("cell.toml").write_text(default_toml())
-    with pytest.raises(ConfigError, match="still the example's"):
-        Cell.open()
-
-
 def test_what_is_named_wins_and_a_simulated_cell_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert find_config(None, simulated=True) is None

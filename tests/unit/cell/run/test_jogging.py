@@ -32,7 +32,8 @@ def test_a_jog_is_read_with_its_unit(words: list[str], expected: Jog) -> None:
 @pytest.mark.parametrize(
     "words",
     [["rail", "5"], ["rail"], ["arm", "+5mm"], ["arm", "j7", "5deg"], ["arm", "z", "5deg"], ["laser", "1mm"],
-     ["rail", "+2m"], ["vehicle", "+5"], ["arm", "j3", "+5mm"], ["rail", "-501mm"], ["vehicle", "+0.51m"],
+     ["rail", "+2m"], ["vehicle", "+5"], ["arm", "j3", "+5mm"], ["rail", "+5kg"], ["rail", "nanmm"],
+     ["rail", "+5mm^9^9"], ["arm", "q", "5mm"], ["tower", "5mm"], ["rail", "-501mm"], ["vehicle", "+0.51m"],
      ["vehicle", "-0.51m"], ["arm", "x", "501mm"], ["arm", "j1", "-91deg"], ["vehicle", "91deg"]],
 )  # fmt: skip
 def test_anything_else_is_refused_with_examples(words: list[str]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
@@ -72,36 +72,28 @@ def test_a_sweep_is_not_read_under_another_calibration_or_configuration(
     assert said in why
 
 
-def test_a_sweep_that_a_script_rejected_is_not_used(tmp_path: Path) -> None:
-    run, job = cut_short(tmp_path)
-    journal = Journal(run.folder, "later", run.info)
-    journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
+def rejected(journal: Journal) -> None:
     journal.event("decided", "invert_pose", {"reason": "too few points", "again": "board_photo", "why": "wiped"})
-    journal.close()
-    sweep, why = UnfinishedRun.find(run.folder).sweep(load_job(job)[0], CONFIG, CALIBRATION)
-    assert sweep is None
-    assert "had not finished its sweep" in why
 
 
-def test_a_sweep_that_failed_when_it_was_done_again_is_not_used(tmp_path: Path) -> None:
-    run, job = cut_short(tmp_path)
-    journal = Journal(run.folder, "later", run.info)
-    journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
+def failed(journal: Journal) -> None:
     journal.step_ended(journal.step_started("laser_sweep", 2), 1.0, error="the arm was pushed")
+
+
+def begun_again(journal: Journal) -> None:
+    journal.step_started("laser_sweep", 1)
+
+
+@pytest.mark.parametrize("then", [rejected, failed, begun_again])
+def test_a_sweep_that_did_not_stay_the_last_word_is_not_used(tmp_path: Path, then: Callable[[Journal], None]) -> None:
+    run, job = cut_short(tmp_path)
+    journal = Journal(run.folder, "later", run.info)
+    journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
+    then(journal)
     journal.close()
     sweep, why = UnfinishedRun.find(run.folder).sweep(load_job(job)[0], CONFIG, CALIBRATION)
     assert sweep is None
     assert "had not finished its sweep" in why
-
-
-def test_a_sweep_that_was_begun_again_is_not_used(tmp_path: Path) -> None:
-    run, job = cut_short(tmp_path)
-    journal = Journal(run.folder, "later", run.info)
-    journal.step_ended(journal.step_started("laser_sweep", 1), 1.0, {})
-    journal.step_started("laser_sweep", 1)
-    journal.close()
-    sweep, _ = UnfinishedRun.find(run.folder).sweep(load_job(job)[0], CONFIG, CALIBRATION)
-    assert sweep is None
 
 
 def placing(folder: Path, *parts: str) -> Path:

@@ -22,19 +22,16 @@ from cell.config.calibrations.store import (
     save_calibration,
 )
 from cell.config.cell_config import load_config
-from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration import ScanCalibration, TargetCalibration
 from cell.measure.calibration.archive import _pose
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, PlateLine
 from cell.measure.calibration.solve.results import KEPT, Quality
 from cell.measure.geometry.light_plane import LightPlane
-from cell.run.calibration import marked, serial_numbers
-from drivers.errors import CalibrationStale, ConfigError, NotConnectedError
+from drivers.errors import CalibrationStale, ConfigError
 
 DEVICES = {"arm": "A1", "rail": "R1", "scan_camera": "S1", "target_camera": "T1"}
 CONFIGURATION = "0123456789abcdef"
 DAY = 86400.0
-MAX_AGE = 30 * DAY
 
 
 def made(
@@ -51,137 +48,10 @@ def made(
     return CellCalibration(scan, target, dict(devices), configuration, time.time() - age)
 
 
-def found(folder: Path) -> CellCalibration:
-    return find_calibration(folder, DEVICES, CONFIGURATION, MAX_AGE)
-
-
-def test_the_own_one_is_found_as_it_was_stored(tmp_path: Path) -> None:
-    stored = made()
-    save_calibration(stored, tmp_path / "own.json")
-    assert found(tmp_path).as_dict() == stored.as_dict()
-
-
-def test_of_several_the_newest_is_taken(tmp_path: Path) -> None:
-    for age in (3, 1, 2):
-        save_calibration(made(age * DAY), tmp_path / f"{age}.json")
-    assert (time.time() - found(tmp_path).made) / DAY == pytest.approx(1, abs=0.01)
-
-
-def test_none_at_all_says_how_to_get_one(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationStale, match=r"no calibration of these devices.*run `cell calibrate`"):
-        found(tmp_path / "missing")
-
-
-@pytest.mark.parametrize("device", sorted(DEVICES))
-def test_that_of_another_device_is_not_taken(tmp_path: Path, device: str) -> None:
-    save_calibration(made(devices={**DEVICES, device: "other"}), tmp_path / "other.json")
-    with pytest.raises(CalibrationStale, match=rf"no calibration of these devices.*{device} {DEVICES[device]}.*of 1"):
-        found(tmp_path)
-
-
-@pytest.mark.parametrize(("kept", "now"), [("UR10e 0a1b", "UR10e 2c3d"), ("", "UR10e 2c3d"), ("UR10e 0a1b", "")])
-def test_that_of_another_kinematics_of_the_arm_is_not_taken(tmp_path: Path, kept: str, now: str) -> None:
-    save_calibration(replace(made(), kinematics=kept), tmp_path / "own.json")
-    with pytest.raises(CalibrationStale, match="another kinematics of the arm") as caught:
-        find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, now)
-    for word in (kept or "it does not say which", now or "none that is known", "30001", "run `cell calibrate`"):
-        assert word in str(caught.value)
-    assert find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, kept).kinematics == kept
-
-
-def test_an_arm_that_was_not_asked_is_asked_again_before_anything_is_calibrated_anew(tmp_path: Path) -> None:
-    save_calibration(replace(made(), kinematics="UR10e 0a1b"), tmp_path / "own.json")
-    why = "port 30001 of 10.0.0.5 sent none within 10 s"
-    with pytest.raises(NotConnectedError, match=f"30001 was not read now: {why}; .*UR10e 0a1b.*connect anew") as caught:
-        find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, "UR10e as drawn", why)
-    assert "cell calibrate" not in str(caught.value)
-    with pytest.raises(CalibrationStale, match="holds no calibration of these devices"):
-        find_calibration(tmp_path / "none", DEVICES, CONFIGURATION, MAX_AGE, "UR10e as drawn", why)
-
-
-def test_the_arm_that_was_exchanged_is_named(tmp_path: Path) -> None:
-    save_calibration(made(devices={**DEVICES, "arm": "B7"}), tmp_path / "other.json")
-    save_calibration(made(devices={**DEVICES, "arm": "B8", "rail": "R9"}), tmp_path / "far.json")
-    with pytest.raises(CalibrationStale, match=r"was made with another one: arm B7; run"):
-        found(tmp_path)
-
-
-def test_that_of_fewer_or_more_devices_is_not_taken(tmp_path: Path) -> None:
-    save_calibration(made(devices={"arm": "A1"}), tmp_path / "fewer.json")
-    save_calibration(made(devices={**DEVICES, "mirror": "M1"}), tmp_path / "more.json")
-    with pytest.raises(CalibrationStale, match="of 2 stored"):
-        found(tmp_path)
-
-
-def test_that_of_another_configuration_is_not_taken(tmp_path: Path) -> None:
-    save_calibration(made(configuration="fedcba9876543210"), tmp_path / "own.json")
-    with pytest.raises(CalibrationStale, match=r"another configuration \(fedcba9876543210, now 0123456789abcdef\)"):
-        found(tmp_path)
-
-
-@pytest.mark.parametrize("age", [MAX_AGE + 60.0, 400 * DAY])
-def test_one_that_is_too_old_is_not_taken(tmp_path: Path, age: float) -> None:
-    save_calibration(made(age), tmp_path / "own.json")
-    with pytest.raises(CalibrationStale, match=r"days old, allowed are 30\.0"):
-        found(tmp_path)
-    save_calibration(made(MAX_AGE - 60.0), tmp_path / "own.json")
-    found(tmp_path)
-
-
-def test_a_newer_one_that_does_not_fit_does_not_hide_the_own_one(tmp_path: Path) -> None:
-    own = made(5 * DAY)
-    save_calibration(own, tmp_path / "own.json")
-    save_calibration(made(1 * DAY, configuration="fedcba9876543210"), tmp_path / "a.json")
-    save_calibration(made(1 * DAY, devices={**DEVICES, "rail": "R2"}), tmp_path / "z.json")
-    assert found(tmp_path).made == pytest.approx(own.made)
-
-
-def test_a_torn_file_is_named_and_not_taken(tmp_path: Path) -> None:
-    save_calibration(made(), tmp_path / "own.json")
-    text = (tmp_path / "own.json").read_text(encoding="utf-8")
-    (tmp_path / "own.json").write_text(text[: len(text) // 2], encoding="utf-8")
-    with pytest.raises(CalibrationStale, match=r"1 unreadable \(own\.json\)"):
-        found(tmp_path)
-
-
 def test_its_hash_tells_two_calibrations_apart() -> None:
     one = made()
     other = replace(one, target=replace(one.target, hand_eye_covariance=2.0 * np.eye(6)))
     assert one.hash() == replace(one).hash() != other.hash()
-
-
-def test_one_from_the_future_is_not_taken(tmp_path: Path) -> None:
-    save_calibration(made(-2 * DAY), tmp_path / "future.json")
-    with pytest.raises(CalibrationStale, match=r"48\.0 hours in the future"):
-        found(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("stored", "now"),
-    [(("scan_camera", "laser"), ()), ((), ("scan_camera",)), (("scan_camera",), ("scan_camera", "rail"))],
-)
-def test_one_with_simulated_devices_is_none_of_the_real_ones_nor_the_other_way_round(
-    tmp_path: Path, stored: tuple[str, ...], now: tuple[str, ...]
-) -> None:
-    save_calibration(made(devices=marked(DEVICES, stored)), tmp_path / "own.json")
-    with pytest.raises(CalibrationStale, match="no calibration of these devices"):
-        find_calibration(tmp_path, marked(DEVICES, now), CONFIGURATION, MAX_AGE)
-    assert find_calibration(tmp_path, marked(DEVICES, stored), CONFIGURATION, MAX_AGE).identities["arm"] == "A1"
-
-
-def test_a_calibration_belongs_to_the_arm_the_rail_and_both_cameras() -> None:
-    """An exchanged one of these is another cell: each is asked itself."""
-    devices = VirtualCell(load_config(None), 1).devices
-    assert serial_numbers(devices) == {name: getattr(devices, name).identity().serial for name in DEVICES}
-
-
-def test_a_file_of_another_format_or_with_a_number_missing_is_none(tmp_path: Path) -> None:
-    save_calibration(made(), tmp_path / "own.json")
-    data = json.loads((tmp_path / "own.json").read_text(encoding="utf-8"))
-    for spoilt in ({**data, "format": data["format"] + 1}, {key: data[key] for key in data if key != "made"}):
-        (tmp_path / "own.json").write_text(json.dumps(spoilt), encoding="utf-8")
-        with pytest.raises(CalibrationStale, match=r"unreadable \(own\.json\)"):
-            found(tmp_path)
 
 
 def test_a_kept_pose_that_is_mirrored_sheared_or_scaled_is_none() -> None:
@@ -234,47 +104,20 @@ def test_an_edit_is_refused_by_name_until_a_person_accepts_it(
         accept_calibration(path, "ann", "again")
 
 
-def test_another_cells_edited_file_does_not_hide_the_own_one(tmp_path: Path) -> None:
-    save_calibration(made(), tmp_path / "own.json")
-    save_calibration(made(devices={**DEVICES, "arm": "B7"}), tmp_path / "other.json")
-    edited(tmp_path / "other.json", "made", value=1.7e9)
-    assert found(tmp_path).identities == DEVICES
-
-
-def test_an_edited_copy_does_not_hide_the_intact_one(tmp_path: Path) -> None:
-    own = made()
-    save_calibration(own, tmp_path / "own.json")
-    save_calibration(made(0.5 * DAY), tmp_path / "copy.json")
-    edited(tmp_path / "copy.json", "scan", "flange_from_camera", 0, 3, value=0.001)
-    assert found(tmp_path).hash() == own.hash()
-    (note,) = found(tmp_path).scan.unread
-    assert "copy.json was changed after it was written: scan.flange_from_camera" in note
-    assert note in found(tmp_path).summary()["notes"]
-
-
-def test_an_edited_file_of_the_cell_itself_is_refused_beside_any_copy(tmp_path: Path) -> None:
-    path = tmp_path / f"{made().name}.json"
-    save_calibration(made(), path)
-    save_calibration(made(0.5 * DAY), tmp_path / "copy.json")
-    edited(path, "scan", "flange_from_camera", 0, 3, value=0.001)
-    with pytest.raises(CalibrationEdited, match="changed after it was written"):
-        found(tmp_path)
-
-
 def test_one_without_its_digest_is_edited_and_one_from_before_is_read_with_a_note(tmp_path: Path) -> None:
     path, own = tmp_path / "own.json", made()
     path.write_text(json.dumps(own.as_dict()), encoding="utf-8")
     with pytest.raises(CalibrationEdited, match="its digest, which is missing"):
-        found(tmp_path)
+        read_calibration(path)
     path.write_text(json.dumps({**own.as_dict(), "format": 1}), encoding="utf-8")
-    assert found(tmp_path).hash() == own.hash()
-    assert "before its file had a digest" in found(tmp_path).scan.unread[0]
+    assert read_calibration(path).hash() == own.hash()
+    assert "before its file had a digest" in read_calibration(path).scan.unread[0]
     # Stored again, by a verification for one, it is no better known than before.
-    save_calibration(replace(found(tmp_path), kinematics=""), path)
+    save_calibration(replace(read_calibration(path), kinematics=""), path)
     assert "sha256" not in json.loads(path.read_text())
-    assert "before its file had a digest" in found(tmp_path).scan.unread[0]
+    assert "before its file had a digest" in read_calibration(path).scan.unread[0]
     accept_calibration(path, "ann", "the one of last week")
-    assert found(tmp_path).scan.unread == ()
+    assert read_calibration(path).scan.unread == ()
 
 
 def _scan(**changes: object) -> CellCalibration:

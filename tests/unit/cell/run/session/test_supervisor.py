@@ -17,6 +17,7 @@ from cell.devices.lock import CellLock
 from cell.measure.geometry.poses import from_ur
 from cell.motion.kinematics import HOME
 from cell.run.jogging import jog, parse_jog
+from cell.run.session.session import Opened
 from cell.run.session.supervisor import Cell
 from drivers.errors import Aborted, ConfigError, InterlockError
 from tests.unit.cell.devices.gate.test_interlocks import CONFIG, LASER, at_rest, refused
@@ -24,7 +25,7 @@ from tests.unit.cell.devices.gate.test_interlocks import CONFIG, LASER, at_rest,
 
 @pytest.fixture
 def cell(tmp_path: Path) -> Iterator[Cell]:
-    made = Cell(CONFIG, tmp_path, CellLock(CONFIG), at_rest().devices, None)
+    made = Cell(Opened(CONFIG, tmp_path, CellLock(CONFIG), at_rest().devices, None))
     yield made
     made.close()
 

@@ -1,0 +1,154 @@
+"""A stored calibration is taken for its own devices, its own configuration and its own time only."""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from cell.config.calibrations.finding import find_calibration
+from cell.config.calibrations.store import CalibrationEdited, CellCalibration, save_calibration
+from cell.run.calibration import marked
+from drivers.errors import CalibrationStale, NotConnectedError
+from tests.unit.cell.config.calibrations.test_store import CONFIGURATION, DAY, DEVICES, edited, made
+
+MAX_AGE = 30 * DAY
+
+
+def found(folder: Path) -> CellCalibration:
+    return find_calibration(folder, DEVICES, CONFIGURATION, MAX_AGE)
+
+
+def test_the_own_one_is_found_as_it_was_stored(tmp_path: Path) -> None:
+    stored = made()
+    save_calibration(stored, tmp_path / "own.json")
+    assert found(tmp_path).as_dict() == stored.as_dict()
+
+
+def test_of_several_the_newest_is_taken(tmp_path: Path) -> None:
+    for age in (3, 1, 2):
+        save_calibration(made(age * DAY), tmp_path / f"{age}.json")
+    assert (time.time() - found(tmp_path).made) / DAY == pytest.approx(1, abs=0.01)
+
+
+OTHER = "fedcba9876543210"
+
+
+def of(**other: str) -> CellCalibration:
+    return made(devices={**DEVICES, **other})
+
+
+@pytest.mark.parametrize(
+    ("stored", "says"),
+    [
+        ([], r"no calibration of these devices.*run `cell calibrate`"),
+        *(
+            ([of(**{device: "other"})], rf"no calibration of these devices.*{device} {serial}.*of 1")
+            for device, serial in DEVICES.items()
+        ),
+        ([of(arm="B7"), of(arm="B8", rail="R9")], r"was made with another one: arm B7; run"),
+        ([made(devices={"arm": "A1"}), of(mirror="M1")], "of 2 stored"),
+        ([made(configuration=OTHER)], rf"another configuration \({OTHER}, now {CONFIGURATION}\)"),
+        ([made(MAX_AGE + 60.0)], r"days old, allowed are 30\.0"),
+        ([made(400 * DAY)], r"days old, allowed are 30\.0"),
+        ([made(-2 * DAY)], r"\d\d\.\d hours in the future"),
+    ],
+)
+def test_one_that_does_not_fit_is_not_taken(tmp_path: Path, stored: list[CellCalibration], says: str) -> None:
+    for k, calibration in enumerate(stored):
+        save_calibration(calibration, tmp_path / f"{k}.json")
+    with pytest.raises(CalibrationStale, match=says):
+        found(tmp_path)
+
+
+def test_one_is_taken_up_to_its_greatest_age(tmp_path: Path) -> None:
+    save_calibration(made(MAX_AGE - 60.0), tmp_path / "own.json")
+    found(tmp_path)
+
+
+@pytest.mark.parametrize(("kept", "now"), [("UR10e 0a1b", "UR10e 2c3d"), ("", "UR10e 2c3d"), ("UR10e 0a1b", "")])
+def test_that_of_another_kinematics_of_the_arm_is_not_taken(tmp_path: Path, kept: str, now: str) -> None:
+    save_calibration(replace(made(), kinematics=kept), tmp_path / "own.json")
+    with pytest.raises(CalibrationStale, match="another kinematics of the arm") as caught:
+        find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, now)
+    for word in (kept or "it does not say which", now or "none that is known", "30001", "run `cell calibrate`"):
+        assert word in str(caught.value)
+    assert find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, kept).kinematics == kept
+
+
+def test_an_arm_that_was_not_asked_is_asked_again_before_anything_is_calibrated_anew(tmp_path: Path) -> None:
+    save_calibration(replace(made(), kinematics="UR10e 0a1b"), tmp_path / "own.json")
+    why = "port 30001 of 10.0.0.5 sent none within 10 s"
+    with pytest.raises(NotConnectedError, match=f"30001 was not read now: {why}; .*UR10e 0a1b.*connect anew") as caught:
+        find_calibration(tmp_path, DEVICES, CONFIGURATION, MAX_AGE, "UR10e as drawn", why)
+    assert "cell calibrate" not in str(caught.value)
+    with pytest.raises(CalibrationStale, match="holds no calibration of these devices"):
+        find_calibration(tmp_path / "none", DEVICES, CONFIGURATION, MAX_AGE, "UR10e as drawn", why)
+
+
+def test_a_newer_one_that_does_not_fit_does_not_hide_the_own_one(tmp_path: Path) -> None:
+    own = made(5 * DAY)
+    save_calibration(own, tmp_path / "own.json")
+    save_calibration(made(1 * DAY, configuration="fedcba9876543210"), tmp_path / "a.json")
+    save_calibration(made(1 * DAY, devices={**DEVICES, "rail": "R2"}), tmp_path / "z.json")
+    assert found(tmp_path).made == pytest.approx(own.made)
+
+
+def test_a_torn_file_is_named_and_not_taken(tmp_path: Path) -> None:
+    save_calibration(made(), tmp_path / "own.json")
+    text = (tmp_path / "own.json").read_text(encoding="utf-8")
+    (tmp_path / "own.json").write_text(text[: len(text) // 2], encoding="utf-8")
+    with pytest.raises(CalibrationStale, match=r"1 unreadable \(own\.json\)"):
+        found(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("stored", "now"),
+    [(("scan_camera", "laser"), ()), ((), ("scan_camera",)), (("scan_camera",), ("scan_camera", "rail"))],
+)
+def test_one_with_simulated_devices_is_none_of_the_real_ones_nor_the_other_way_round(
+    tmp_path: Path, stored: tuple[str, ...], now: tuple[str, ...]
+) -> None:
+    save_calibration(made(devices=marked(DEVICES, stored)), tmp_path / "own.json")
+    with pytest.raises(CalibrationStale, match="no calibration of these devices"):
+        find_calibration(tmp_path, marked(DEVICES, now), CONFIGURATION, MAX_AGE)
+    assert find_calibration(tmp_path, marked(DEVICES, stored), CONFIGURATION, MAX_AGE).identities["arm"] == "A1"
+
+
+def test_a_file_of_another_format_or_with_a_number_missing_is_none(tmp_path: Path) -> None:
+    save_calibration(made(), tmp_path / "own.json")
+    data = json.loads((tmp_path / "own.json").read_text(encoding="utf-8"))
+    for spoilt in ({**data, "format": data["format"] + 1}, {key: data[key] for key in data if key != "made"}):
+        (tmp_path / "own.json").write_text(json.dumps(spoilt), encoding="utf-8")
+        with pytest.raises(CalibrationStale, match=r"unreadable \(own\.json\)"):
+            found(tmp_path)
+
+
+def test_another_cells_edited_file_does_not_hide_the_own_one(tmp_path: Path) -> None:
+    save_calibration(made(), tmp_path / "own.json")
+    save_calibration(made(devices={**DEVICES, "arm": "B7"}), tmp_path / "other.json")
+    edited(tmp_path / "other.json", "made", value=1.7e9)
+    assert found(tmp_path).identities == DEVICES
+
+
+def test_an_edited_copy_does_not_hide_the_intact_one(tmp_path: Path) -> None:
+    own = made()
+    save_calibration(own, tmp_path / "own.json")
+    save_calibration(made(0.5 * DAY), tmp_path / "copy.json")
+    edited(tmp_path / "copy.json", "scan", "flange_from_camera", 0, 3, value=0.001)
+    assert found(tmp_path).hash() == own.hash()
+    (note,) = found(tmp_path).scan.unread
+    assert "copy.json was changed after it was written: scan.flange_from_camera" in note
+    assert note in found(tmp_path).summary()["notes"]
+
+
+def test_an_edited_file_of_the_cell_itself_is_refused_beside_any_copy(tmp_path: Path) -> None:
+    path = tmp_path / f"{made().name}.json"
+    save_calibration(made(), path)
+    save_calibration(made(0.5 * DAY), tmp_path / "copy.json")
+    edited(path, "scan", "flange_from_camera", 0, 3, value=0.001)
+    with pytest.raises(CalibrationEdited, match="changed after it was written"):
+        found(tmp_path)

@@ -1,0 +1,39 @@
+"""How a cell may be opened: what does not go together is refused before anything is started."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from cell import Cell, ConfigError
+from cell.config.cell_config import default_toml
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"sim": "all", "clock": "sundial"}, 'clock="sundial" is not offered'),
+        ({"sim": "all", "clock": "virtual", "speed": 2.0}, "speed means nothing on it"),
+        ({"sim": "none", "clock": "virtual"}, 'only a simulated cell, sim="all", has one'),
+        ({"sim": "rail", "clock": "virtual"}, 'only a simulated cell, sim="all", has one'),
+        ({"sim": "none", "truth": "cell.toml"}, "truth describes a cell that is all simulated"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(
+    options: dict[str, Any], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("cell.toml").write_text(default_toml())
+    with pytest.raises(ConfigError, match=says):
+        Cell.open(**options)
+
+
+def test_the_supervisor_script_is_held_to_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="there is no cell"):
+        Cell.open()
+    Path("cell.toml").write_text(default_toml())
+    with pytest.raises(ConfigError, match="still the example's"):
+        Cell.open()

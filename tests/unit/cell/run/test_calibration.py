@@ -1,0 +1,14 @@
+"""A calibration is made for the devices that are there, and what is refused of their times is kept."""
+
+from __future__ import annotations
+
+from cell.config.cell_config import load_config
+from cell.devices.simulated.direct import VirtualCell
+from cell.run.calibration import serial_numbers
+from tests.unit.cell.config.calibrations.test_store import DEVICES
+
+
+def test_a_calibration_belongs_to_the_arm_the_rail_and_both_cameras() -> None:
+    """An exchanged one of these is another cell: each is asked itself."""
+    devices = VirtualCell(load_config(None), 1).devices
+    assert serial_numbers(devices) == {name: getattr(devices, name).identity().serial for name in DEVICES}
