@@ -1,12 +1,8 @@
-"""One thing about this computer: how it is, whether the cell needs it, and the command that mends it.
+"""How this computer is: each check says whether the cell needs it, and the command that mends it.
 
-What every cell asks of its computer: Python, room, clocks, timing, a browser. Read from the system below `root`.
-
-What the configured devices ask of this computer: ports, CAN interface, libraries. No device is opened or asked.
-
-The installed packages against what this program's distribution asks for, with its pins.
-
-All checks of this computer for one configuration, in the order in which a person reads them."""
+Every cell asks for Python, room, clocks, timing and packages; its configured devices for ports, CAN interfaces and
+libraries. Read from the system below `root`. No device is opened or asked.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +14,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from importlib.util import find_spec
 from pathlib import Path
@@ -44,10 +40,6 @@ class DoctorCheck:
     state: State
     found: str
     mend: str = ""
-
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return asdict(self)
 
 
 def judged(what: str, problem: str, found: str, mend: str = "", *, needed: bool = True) -> DoctorCheck:
@@ -264,9 +256,7 @@ def asked_for(extras: Iterable[str]) -> dict[str, list[Requirement]]:
         groups = table.get("optional-dependencies", {})
         lines = {ALWAYS: table["dependencies"], **{extra: groups.get(extra, []) for extra in extras}}
         asked = {extra: map(Requirement, wanted) for extra, wanted in lines.items()}
-        return {
-            extra: [one for one in wanted if not one.marker or one.marker.evaluate()] for extra, wanted in asked.items()
-        }
+        return {extra: [o for o in wanted if not o.marker or o.marker.evaluate()] for extra, wanted in asked.items()}
     found: dict[str, list[Requirement]] = {extra: [] for extra in (ALWAYS, *extras)}
     for requirement in map(Requirement, requires(DISTRIBUTION) or ()):
         marker = requirement.marker
@@ -335,11 +325,9 @@ def examine_computer(path: Path | None, root: Path = ROOT) -> list[DoctorCheck]:
     rows += [python_check(), *package_checks(sorted(needed), [name for name in OTHER_EXTRAS if name not in needed])]
     rows.append(shadow_check())
     rows.append(disk_check(runs_folder(source) if source is not None else beside(source) / "runs"))
-    rows += [
-        date_check(clock_synchronised(), bool(real)),
-        clock_check(root, bool(real)),
-        scheduling_check(root, bool(real)),
-    ]
+    needed_here = bool(real)
+    rows += [date_check(clock_synchronised(), needed_here), clock_check(root, needed_here)]
+    rows.append(scheduling_check(root, needed_here))
     if config is None:
         rows.append(DoctorCheck("devices", "not needed", "no cell.toml here: simulated cells need no port"))
     elif whole:

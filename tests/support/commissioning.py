@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cell.apps.commission.check import CommissionCheck, Result, write_protocol
 from cell.apps.commission.sequence import CHECKS, Commissioning, begin, chosen
-from cell.apps.commission.workplace import PersonAtTheConsole, SimulatedPerson
+from cell.apps.commission.workplace import Person, SimulatedPerson
 from cell.config.cell_config import default_toml
 
 SEED = 3
@@ -43,7 +43,7 @@ def files(folder: Path, truth: Callable[[str], str] = same, cell: Callable[[str]
 
 
 def opened(folder: Path, shown: Shown, ask: Callable[[str], bool] | None = None, job: str = "pot") -> Commissioning:
-    person = SimulatedPerson(lambda text: None) if ask is None else PersonAtTheConsole(ask)
+    person = SimulatedPerson(lambda text: None) if ask is None else Person(ask)
     return begin(
         folder / "cell.toml", person, shown, job=job, sim="all", seed=SEED, clock="virtual", truth=folder / "true.toml"
     )

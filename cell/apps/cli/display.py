@@ -1,7 +1,8 @@
-"""The screen at the end of a run, and the tables that are asked for.
+"""What a person sees: the end of a run on one screen, the list of runs, a calibration.
 
-The end of a run on one screen, 80 columns by 24 lines with the prompt: how it ended, its steps, what was measured
-beside its limit, what went wrong on the way, where the report is, and what to type next."""
+The screen has 80 columns by 24 lines with the prompt: how the run ended, its steps, what was measured beside its limit,
+what went wrong on the way, where the report is, and what to type next.
+"""
 
 from __future__ import annotations
 
@@ -39,11 +40,8 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH, *, w
     if (advice := next_step(report, folder)) is not None:
         tail += _labelled("next", advice, width)
     room = HEIGHT - 1 - len(steps) - len(tail) - (2 if measured else 1)
-    text, shown = (
-        f"{report['outcome']}  {report.get('reason', '')}",
-        room - max(0, min(len(measured), room - REASON_LINES)),
-    )
-    most = len(text) if whole else max(REASON_LINES, shown)
+    text = f"{report['outcome']}  {report.get('reason', '')}"
+    most = len(text) if whole else max(REASON_LINES, room - max(0, min(len(measured), room - REASON_LINES)))
     head = [*_cut_lines(text, width, most), _cut(_facts(report), width)]
     figures = [_cut(_figure(row), width) for row in measured]
     fit = len(figures) if whole else max(0, room + 1 - len(head))
@@ -86,9 +84,8 @@ def next_step(report: Mapping[str, object], folder: Path) -> str | None:
 def _dry_run(report: Mapping[str, object]) -> str:
     """The command that runs in the same simulated world; what is the default is not named."""
     usual = {"seed": 1, "level": "nominal", "clock": "wall"}
-    return " ".join(
-        ["cell dry-run", *(f"--{key} {report[key]}" for key in usual if report.get(key, usual[key]) != usual[key])]
-    )
+    options = (f"--{key} {report[key]}" for key, value in usual.items() if report.get(key, value) != value)
+    return " ".join(["cell dry-run", *options])
 
 
 def _job(report: Mapping[str, object]) -> str:

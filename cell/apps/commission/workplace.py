@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -40,47 +40,34 @@ SLOW_TOOL = 0.15
 WIDEST_PICTURE = 640
 
 
-class Person(Protocol):
-    """Whoever stands beside the cell: confirms what is to move, says what sensors cannot see, lends a hand."""
+class Person:
+    """Whoever stands beside the cell: confirms what is to move, says what sensors cannot see, lends a hand.
 
-    def go_ahead(self, text: str) -> bool:
-        """Whether what `text` announces may begin."""
-
-    def sees(self, question: str) -> bool:
-        """Yes or no to a question about what there is to be seen."""
-
-    def again(self, question: str) -> bool:
-        """Whether something was changed meanwhile and is to be measured again."""
-
-    def does(self, task: str, by_itself: Callable[[], None] | None = None) -> bool:
-        """Have a person do something; False if they would not. A simulated person does it as `by_itself` says."""
-
-
-class PersonAtTheConsole:
-    """Asks on the console; `ask` shows a text and gives yes or no."""
+    `ask` shows a text and gives yes or no.
+    """
 
     def __init__(self, ask: Callable[[str], bool]) -> None:
         self._ask = ask
 
     def go_ahead(self, text: str) -> bool:
-        """See `Person.go_ahead`."""
+        """Whether what `text` announces may begin."""
         return self._ask(f"{text}\n  A hand on the emergency stop. Go ahead?")
 
     def sees(self, question: str) -> bool:
-        """See `Person.sees`."""
+        """Yes or no to a question about what there is to be seen."""
         return self._ask(question)
 
     def again(self, question: str) -> bool:
-        """See `Person.again`."""
+        """Whether something was changed meanwhile and is to be measured again."""
         return self._ask(question)
 
     def does(self, task: str, by_itself: Callable[[], None] | None = None) -> bool:
-        """See `Person.does`."""
+        """Have a person do something; False if they would not. A simulated person does it as `by_itself` says."""
         return self._ask(f"{task} Done?")
 
 
-class SimulatedPerson:
-    """Of a simulated cell: agrees to everything, and says so through `tell`."""
+class SimulatedPerson(Person):
+    """Of a simulated cell: agrees to everything, has changed nothing, and says so through `tell`."""
 
     def __init__(self, tell: Callable[[str], None]) -> None:
         self._tell = tell
@@ -96,7 +83,7 @@ class SimulatedPerson:
         return True
 
     def again(self, question: str) -> bool:
-        """See `Person.again`: nobody has changed anything."""
+        """See `Person.again`."""
         return False
 
     def does(self, task: str, by_itself: Callable[[], None] | None = None) -> bool:

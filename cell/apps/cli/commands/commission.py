@@ -97,11 +97,11 @@ def _print_mended(made: Commissioning, console: Console) -> None:
 
 
 def _person(simulated: bool, console: Console) -> Person:
-    from cell.apps.commission.workplace import PersonAtTheConsole, SimulatedPerson
+    from cell.apps.commission.workplace import Person, SimulatedPerson
 
     if simulated:
         return SimulatedPerson(lambda text: console.print(text, style="dim", markup=False))
-    return PersonAtTheConsole(lambda text: typer.confirm(text, err=True))
+    return Person(lambda text: typer.confirm(text, err=True))
 
 
 def _show(console: Console, check: CommissionCheck, verdict: str, result: Result | None) -> None:

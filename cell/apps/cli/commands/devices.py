@@ -199,11 +199,13 @@ def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
 
     Touches no device. Exit code 1 when something is wrong that the configured cell needs; what mends it is beside it.
     """
+    from dataclasses import asdict
+
     from cell.apps.doctor import examine_computer
 
     rows = examine_computer(config)
     if json:
-        print_json([row.as_dict() for row in rows])
+        print_json([asdict(row) for row in rows])
     else:
         from rich.text import Text
 

@@ -58,9 +58,8 @@ class Address:
             try:
                 ssl.create_default_context(ssl.Purpose.CLIENT_AUTH).load_cert_chain(self.certificate, self.key)
             except (OSError, ssl.SSLError) as error:
-                raise ConfigError(
-                    f"certificate {self.certificate} and key {self.key} cannot be used: {error}"
-                ) from error
+                unusable = f"certificate {self.certificate} and key {self.key} cannot be used: {error}"
+                raise ConfigError(unusable) from error
         if self.host != _LOOPBACK and (self.token_file is None or self.certificate is None):
             raise ConfigError(
                 f"the console listens at {_LOOPBACK} only; at {self.host} it moves an arm for whoever reaches it, so "
@@ -107,8 +106,7 @@ class Console:
     ) -> None:
         address = address or Address()
         token = address.checked()
-        self.link = ""
-        self._cell = cell
+        self.link, self._cell = "", cell
         self._told, self._gone = told, gone
         self._scheme = "http" if address.certificate is None else "https"
         self._names = address.hosts
@@ -161,9 +159,8 @@ class Console:
 
         The page is told that it is being computed, and offers its motion when it is.
         """
-        rehearsals, seed = self.desk.rehearsals, None
-        if self._cell.simulated is not None:
-            seed = self._cell.simulated.facts["seed"]
+        rehearsals = self.desk.rehearsals
+        seed = None if self._cell.simulated is None else self._cell.simulated.facts["seed"]
         about = {"job": job, "seed": seed, "run": None}
         rehearsals.present = {"state": "running", "text": "computing", "by_command": True, **about}
 

@@ -25,6 +25,7 @@ from cell.procedures.steps.kinds import find_kind
 from cell.run.jogging import Jog
 from cell.run.runs import Run
 from drivers.errors import CellError, InterlockError
+from statemachine.runner import Script
 
 if TYPE_CHECKING:
     from cell.run.session.supervisor import Cell
@@ -50,14 +51,10 @@ class ConsoleController:
         say: Callable[[str, dict[str, object]], None],
         began: Callable[[Run[object], str | None], None] = lambda run, job: None,
     ) -> None:
-        self.cell = cell
-        self.job = job
-        self.questions = Questions()
-        self.rehearsals = Rehearsals(cell)
-        self.holders = Holders(self._lost)
-        self.presses = Presses()
-        self._say = say
-        self._began = began
+        self.cell, self.job = cell, job
+        self.questions, self.rehearsals = Questions(), Rehearsals(cell)
+        self.holders, self.presses = Holders(self._lost), Presses()
+        self._say, self._began = say, began
         self._beginning = threading.Lock()
         self.starting: str | None = None
         """What was asked for and has not begun yet."""
@@ -169,12 +166,14 @@ class ConsoleController:
         until, at_start = words["until"], words["at_start"]
 
         def begin() -> None:
-            script = self.questions.script(find_kind(load_job(job)[0].job.kind).names)
-            run = self.cell.start(job, at_start=at_start, until=until, script=script)
+            run = self.cell.start(job, at_start=at_start, until=until, script=self._script(job))
             self.questions.hold(run)
             self._began(run, job)
 
         return self._soon(client, f"job {job}", begin)
+
+    def _script(self, job: str) -> Script:
+        return self.questions.script(find_kind(load_job(job)[0].job.kind).names)
 
     def _require_nothing_starting(self) -> None:
         """Take `_beginning`, or raise `InterlockError` while something else has it."""
@@ -223,10 +222,8 @@ class ConsoleController:
         return f"{what} has begun" if ended.is_set() else f"starting {what} …"
 
     def _resume(self, client: str, words: Words) -> str:
-
         def resume() -> object:
-            script = self.questions.script(find_kind(load_job(self.job)[0].job.kind).names)
-            return self.cell.resume(words["run"], script=script)
+            return self.cell.resume(words["run"], script=self._script(self.job))
 
         return self._long(client, "resumed job", resume)
 
@@ -272,9 +269,7 @@ class ConsoleController:
         if (run := self.cell.current) is None:
             raise InterlockError("cell", f"nothing is going on that could {what}")
         act(run)
-        return {"pause": f"asked the {run.kind} to hold before its next motion"}.get(
-            what, f"asked the {run.kind} to {what}"
-        )
+        return f"asked the {run.kind} to {'hold before its next motion' if what == 'pause' else what}"
 
     def _abort(self, client: str, words: Words) -> str:
         return self._running("end", lambda run: run.abort(f"{self.holders.name(client)}: {words['reason']}"))
@@ -292,10 +287,10 @@ class ConsoleController:
     # --- devices ---
 
     def _manual(self, client: str, words: Words) -> str:
-        if words["on"]:
-            with self._nothing_starting():
-                return self.manual.begin(self.holders.name(client))
-        return self.manual.end()
+        if not words["on"]:
+            return self.manual.end()
+        with self._nothing_starting():
+            return self.manual.begin(self.holders.name(client))
 
     def _jog_step(self, client: str, words: Words) -> Answer:
         told = self.manual.step(Jog(words["device"], words["axis"], words["amount"]))
@@ -330,7 +325,6 @@ class ConsoleController:
         return 1 if seed is None else int(seed)
 
     def _job(self, words: Words) -> str:
-        """The job that is named, one of those that `/api/cell` lists; the console's own without one."""
         return self.named_job(words["job"])
 
     def named_job(self, name: str | None) -> str:

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
@@ -200,10 +201,8 @@ class Manual:
             self._on.clear()
             self._failure = None
             self._wanted = queue.SimpleQueue()
-            stops = self._cell.stops
-            self._thread = threading.Thread(
-                target=self._perform, args=(by, stops), name="manual mode", daemon=True
-            )  # fmt: skip
+            work = partial(self._perform, by, self._cell.stops)
+            self._thread = threading.Thread(target=work, name="manual mode", daemon=True)
             self._thread.start()
             while not self._on.wait(0.02) and self._thread.is_alive() and timeout > 0:
                 timeout -= 0.02
@@ -253,12 +252,9 @@ class Manual:
     def _perform(self, by: str, stops: int) -> None:
         try:
             self._cell.perform("jog", self._work, info={"moved": "manual mode", "by": by}, stops=stops)
-        except Aborted as error:
+        except (Aborted, CellError) as error:
             self._failure = error
-            log.info("manual mode: %s", error)
-        except CellError as error:
-            self._failure = error
-            log.warning("manual mode: %s", error)
+            log.log(logging.INFO if isinstance(error, Aborted) else logging.WARNING, "manual mode: %s", error)
         finally:
             self._on.clear()
 
@@ -288,20 +284,12 @@ class Manual:
         wish = step.wish
         try:
             answer: dict[str, str] | BaseException = moved(self._cell, wish, self._job, hands)
-            log.info("jog step: %s %s %+g: %s", wish.device, wish.axis, wish.amount, answer)
         except (Aborted, CellError) as error:
             answer = error
-            log.info("jog step: %s %s %+g: %s", wish.device, wish.axis, wish.amount, error)
-        finally:
-            hands_ended = None
-            try:
-                hands.check()
-            except BaseException as ended:
-                hands_ended = ended
+        log.info("jog step: %s %s %+g: %s", wish.device, wish.axis, wish.amount, answer)
         step.answer.append(answer)
         step.done.set()
-        if hands_ended is not None:
-            raise hands_ended
+        hands.check()
         if _needs_person(answer):
             raise answer
 

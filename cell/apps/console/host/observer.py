@@ -146,11 +146,8 @@ class CellObserver:
         for folder in reversed(list_runs(self._cell.runs_folder)[-RECENT_RUNS:]):
             with suppress(CellError, OSError, KeyError, TypeError, ValueError):
                 report = read_report(folder)
-                if (
-                    report.get("job") == job
-                    and report["outcome"] in ("placed", "done")
-                    and report.get("clock") == "wall"
-                ):
+                ended = report["outcome"] in ("placed", "done")
+                if ended and report.get("job") == job and report.get("clock") == "wall":
                     return {step["name"]: float(step["wall_s"]) for step in report["steps"]}
         return {}
 

@@ -46,8 +46,8 @@ class Rehearsals:
             if self.present is not None and self.present["state"] == "running":
                 raise InterlockError("cell", "another dry run is being computed; wait for it or cancel it")
             self._cancelled = False
-            self.present = {"state": "running", "job": job, "seed": seed, "text": "starting", "fraction": 0.0,
-                            "run": None}  # fmt: skip
+            about = {"job": job, "seed": seed, "run": None}
+            self.present = {"state": "running", "text": "starting", "fraction": 0.0, **about}
         threading.Thread(target=self._perform, args=(job, seed), name="console dry run", daemon=True).start()
         return f"the dry run of {job} is being computed"
 

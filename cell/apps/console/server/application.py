@@ -74,11 +74,9 @@ class AccessGuard:
 
         async def sent(message: Message) -> None:
             if message["type"] == "http.response.start":
-                known = {name for name, _ in message["headers"]}
-                message["headers"] = [
-                    *message["headers"],
-                    *((n.encode(), v.encode()) for n, v in HEADERS.items() if n.encode() not in known),
-                ]
+                known = dict(message["headers"])
+                own = [(name.encode(), value.encode()) for name, value in HEADERS.items()]
+                message["headers"] = [*message["headers"], *(pair for pair in own if pair[0] not in known)]
             await send(message)
 
         if refusal is None:
@@ -128,22 +126,11 @@ class Application:
     """The routes. `cell` is `/api/cell`'s answer, and `of_job` the same with another job's station."""
 
     def __init__(
-        self,
-        access: Access,
-        pages: Pages,
-        archive: Archive,
-        cell: Mapping[str, object],
-        do: Ask,
-        stop: Callable[[], Awaitable[str | None]],
-        of_job: Callable[[str], Awaitable[tuple[int, Mapping[str, object]]]],
-    ) -> None:
-        self._access = access
-        self._pages = pages
-        self._archive = archive
-        self._cell = cell
-        self._do = do
-        self._stop = stop
-        self._of_job = of_job
+        self, access: Access, pages: Pages, archive: Archive, *, cell: Mapping[str, object], do: Ask,
+        stop: Callable[[], Awaitable[str | None]], of_job: Callable[[str], Awaitable[tuple[int, Mapping[str, object]]]],
+    ) -> None:  # fmt: skip
+        self._access, self._pages, self._archive, self._cell = access, pages, archive, cell
+        self._do, self._stop, self._of_job = do, stop, of_job
 
     def asgi(self) -> ASGIApp:
         """What is served."""
@@ -237,13 +224,12 @@ class Application:
             return _no("content", "this is no JSON object", 400)
         if words.get("do") == "stop":
             trouble = await self._stop()
-            return _json({"ok": True, "text": "the cell was stopped"}) if trouble is None else _no(
-                "DeviceFault", trouble, 500
-            )  # fmt: skip
+            if trouble is not None:
+                return _no("DeviceFault", trouble, 500)
+            return _json({"ok": True, "text": "the cell was stopped"})
         if not request.scope["session"].commands.take():
             return _no("rate", "too many commands; wait a moment", 429)
-        page = self._pages.by_key(words.pop("key", None))
-        if page is None:
+        if (page := self._pages.by_key(words.pop("key", None))) is None:
             return _no("InterlockError", "this page has no live link to the cell; load it again", 403)
         try:
             checked_command(words)

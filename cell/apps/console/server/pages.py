@@ -166,10 +166,9 @@ class Pages:
             page.mailbox.show(camera, packed)
         sending = asyncio.create_task(self._send(page, socket))
         try:
-            await self._hear(page, socket)
-        except (WebSocketDisconnect, RuntimeError):
             # RuntimeError: closed by the sender meanwhile.
-            pass
+            with suppress(WebSocketDisconnect, RuntimeError):
+                await self._hear(page, socket)
         finally:
             self._pages.pop(page.id, None)
             self._tell(Left(page.id))

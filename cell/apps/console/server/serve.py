@@ -95,9 +95,7 @@ class Server:
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[Answer]] = {}
         self._unsent: queue.SimpleQueue[object] = queue.SimpleQueue()
-        self.access = Access(
-            setup.hosts, setup.port, secure=setup.cert is not None, lasting=setup.lasting
-        )  # fmt: skip
+        self.access = Access(setup.hosts, setup.port, secure=setup.cert is not None, lasting=setup.lasting)
         self.pages = Pages(self._tell, self._begin_stop)
         self._stopping: dict[int, tuple[float, asyncio.Future[str | None]]] = {}
         self._next: asyncio.Future[str | None] | None = None
@@ -106,14 +104,9 @@ class Server:
         """Until the program at the other end is gone."""
         self._loop = asyncio.get_running_loop()
         application = Application(
-            self.access,
-            self.pages,
-            Archive(Path(self._setup.runs)),
-            cell=self._setup.cell,
-            do=self._do,
-            stop=self._stop,
-            of_job=self._of_job,
-        )
+            self.access, self.pages, Archive(Path(self._setup.runs)), cell=self._setup.cell, do=self._do,
+            stop=self._stop, of_job=self._of_job,
+        )  # fmt: skip
         config = uvicorn.Config(
             application.asgi() if self._setup.lasting is not None else _entering(application.asgi(), self._renew),
             http=Patient, ws="websockets-sansio", lifespan="off", loop="asyncio",

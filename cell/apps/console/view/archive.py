@@ -1,8 +1,7 @@
-"""The runs of a cell as the page lists them; read from their folders, for whoever asks.
+"""The runs of a cell as the page lists them, and how the cell moved in one, for the replay: read from their folders.
 
-How the cell moved in a run, by its `record.mcap`: for the replay with a slider.
-
-Run as a module by the server, in a process of its own: `python -m cell.apps.console.view.archive FILE`."""
+The server reads a record in a process of its own: `python -m cell.apps.console.view.archive FILE`.
+"""
 
 from __future__ import annotations
 
@@ -77,11 +76,6 @@ def _note_step(steps: list[dict[str, object]], event: Mapping[str, object], now:
         steps[-1]["end"] = now
 
 
-if __name__ == "__main__":
-    end_with_parent()
-    print(json.dumps(motion(Path(sys.argv[1]))))
-
-
 RUN = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
 PICTURE = re.compile(r"[\w][\w.+-]*\.png")
 READ = ("report.json", "journal.sqlite")
@@ -142,15 +136,12 @@ class Archive:
             return None
         page = Path(self._pages.name) / f"{name}.html"
         with self._drawing:
-            if not page.exists() and not self._drawn(folder, page):
+            if not page.exists() and self._printed("-c", _DRAW, str(folder), str(page)) is None:
                 return None
             if not (folder / "report.json").exists():
                 # A run that goes on is drawn anew each time.
                 return page.rename(page.with_suffix(".now.html"))
         return page
-
-    def _drawn(self, folder: Path, page: Path) -> bool:
-        return self._printed("-c", _DRAW, str(folder), str(page)) is not None
 
     def _printed(self, *arguments: str) -> bytes | None:
         """What a process of its own, which gives way and ends with this one, prints; None when it fails."""
@@ -224,3 +215,8 @@ def _stated(report: Mapping[str, Any]) -> float | None:
         return round(math.hypot(*(float(value) for value in report["place_sigma"]["translation_mm"])), 4)
     except (KeyError, TypeError, ValueError):
         return None
+
+
+if __name__ == "__main__":
+    end_with_parent()
+    print(json.dumps(motion(Path(sys.argv[1]))))

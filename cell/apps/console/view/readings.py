@@ -1,9 +1,9 @@
 """What the devices tell of themselves, for the page: only what is there already, so that no line is kept busy.
 
 The rail is asked while nothing goes on; in a run it is where its own motion has read it. The simulated devices on the
-virtual clock have no time of the wall and are not read here.
-
-What a page asks once: which cell this is, what can be jogged and run, and what it looks like."""
+virtual clock have no time of the wall and are not read here. What a page asks once stands below: which cell this is,
+what can be jogged and run, and what it looks like.
+"""
 
 from __future__ import annotations
 
@@ -169,14 +169,8 @@ class Readings:
 
 
 def _vehicle(state: VehicleState) -> dict[str, object]:
-    return {
-        "x": round(state.x, 5),
-        "y": round(state.y, 5),
-        "yaw": round(state.yaw, 6),
-        "speed": round(state.speed, 4),
-        "yaw_rate": round(state.yaw_rate, 5),
-        "braked": state.braked,
-    }
+    digits = {"x": 5, "y": 5, "yaw": 6, "speed": 4, "yaw_rate": 5}
+    return {**{key: round(getattr(state, key), n) for key, n in digits.items()}, "braked": state.braked}
 
 
 MM, DEG = 1e-3, 3.141592653589793 / 180
@@ -241,7 +235,6 @@ def _jogs(cell: Cell, name: str) -> list[dict[str, object]]:
             return [*lines, *turns, *joints]
         case "vehicle" if cell.config.vehicle.DRIVES:
             return [
-                {**length, "axis": "x", "hold": False, "speed": None},
-                {**angle, "axis": "yaw", "hold": False, "speed": None},
+                {**way, "axis": axis, "hold": False, "speed": None} for way, axis in ((length, "x"), (angle, "yaw"))
             ]
     return []

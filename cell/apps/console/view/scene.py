@@ -1,13 +1,10 @@
 """The cell's bodies for drawing: the same boxes and capsules that the planner keeps apart, each in its own frame.
 
 Made once for a configuration and a job. Whoever draws it turns the joints, shifts the carriage and places the station
-as the readings say; nothing here moves. Lengths are in m, poses 16 numbers of a 4×4 matrix, row after row.
-
-Pictures of the links: a folder of meshes that the 3-D scene shows in place of the planner's capsules.
-
-They are for the eye only; the planner keeps apart what it kept apart before.
-
-What a run has told of the place, the part and the arm's way, in the arm's base: for drawing, beside `scene`."""
+as the readings say. A folder of meshes may stand in place of the arm's capsules, for the eye only. `SceneNow` tells
+what a run has found of the place, the part and the arm's way. Lengths are in m, poses 16 numbers of a 4×4 matrix, row
+after row.
+"""
 
 from __future__ import annotations
 
@@ -51,26 +48,21 @@ def link_meshes(folder: Path) -> list[dict[str, object]]:
     try:
         files = sorted(path for path in folder.iterdir() if below(folder, path.name) and not path.name.startswith("."))
     except OSError as error:
-        raise ConfigError(
-            f"cell.meshes: the folder {folder} cannot be read ({error.strerror}); create it or remove the line"
-        ) from error
+        unread = f"cell.meshes: the folder {folder} cannot be read ({error.strerror}); create it or remove the line"
+        raise ConfigError(unread) from error
+    names = f"the names are {', '.join(NAMES)} with {', '.join(KINDS)}"
     found: dict[str, Path] = {}
     for path in files:
         if path.suffix.lower() not in KINDS:
             continue
         if path.stem not in NAMES:
-            raise ConfigError(
-                f"cell.meshes: {path} belongs to no link; the names are {', '.join(NAMES)} with {', '.join(KINDS)}"
-            )
+            raise ConfigError(f"cell.meshes: {path} belongs to no link; {names}")
         if path.stem in found:
-            raise ConfigError(
-                f"cell.meshes: {path.name} and {found[path.stem].name} in {folder} are the same link; keep one"
-            )
+            both = f"{path.name} and {found[path.stem].name} in {folder}"
+            raise ConfigError(f"cell.meshes: {both} are the same link; keep one")
         found[path.stem] = path
     if not found:
-        raise ConfigError(
-            f"cell.meshes: {folder} holds no mesh; the names are {', '.join(NAMES)} with {', '.join(KINDS)}"
-        )
+        raise ConfigError(f"cell.meshes: {folder} holds no mesh; {names}")
     return [_drawn(name, path) for name, path in found.items()]
 
 
@@ -154,7 +146,7 @@ def scene(
         "rail": {
             "travel": list(carried.travel),
             "head": _body(head),
-            "direction": carried.scan.rotation[:, 0].round(9).tolist(),
+            "direction": _rounded(carried.scan.rotation[:, 0]),
         },
         "cameras": {
             "scan": _camera(config.scan_camera, carried.scan, SIGHT_M["scan"]),
@@ -171,12 +163,8 @@ def _station(config: CellConfig, job: Job, mesh: Path) -> dict[str, object]:
     vertices, triangles = coarser(*read_mesh(mesh, job.surface.mesh_unit))
     place_from_surface = job.surface.place_from_surface.se3()
     centre = pin.SE3(np.eye(3), centre_of(parse_board(job.board.spec)))
-    bodies = station_bodies(
-        pin.SE3.Identity(),
-        job.place_from_board * centre,
-        place_from_surface,
-        (vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()),
-    )
+    box = vertices.min(axis=0).tolist(), vertices.max(axis=0).tolist()
+    bodies = station_bodies(pin.SE3.Identity(), job.place_from_board * centre, place_from_surface, box)
     return {
         "bodies": [_body(body) for body in (*bodies, *station_obstacles(job.obstacle, pin.SE3.Identity()))],
         "surface": {
@@ -202,22 +190,14 @@ def _sheet(config: CellConfig, job: Job | None) -> dict[str, object]:
 def _camera(camera: CameraConfig, flange_from_camera: pin.SE3, depth: float) -> dict[str, object]:
     """Its mounting, and the half width and half height of what it sees at `depth` m."""
     half = 0.5 * depth * camera.pixel / camera.focal_length
-    return {
-        "flange_from_camera": numbers(flange_from_camera),
-        "sight": [half * camera.width, half * camera.height, depth],
-        "size": [camera.width, camera.height],
-    }
+    sight = [half * camera.width, half * camera.height, depth]
+    return {"flange_from_camera": numbers(flange_from_camera), "sight": sight, "size": [camera.width, camera.height]}
 
 
 def _body(body: Body) -> dict[str, object]:
     """`parent` 0 is the base (the place frame at the station), 1 … 6 a joint, 7 the flange."""
-    return {
-        "name": body.name,
-        "parent": body.parent,
-        "placement": numbers(body.placement),
-        "size": _rounded(body.size),
-        "radius": body.radius,
-    }
+    placed = {"placement": numbers(body.placement), "size": _rounded(body.size)}
+    return {"name": body.name, "parent": body.parent, **placed, "radius": body.radius}
 
 
 def numbers(pose: pin.SE3) -> list[float]:
@@ -247,14 +227,9 @@ class SceneNow:
         """`place` (base_from_place) once the board was measured, `part` (base_from_part) once it was let go, each 16
         numbers or None, and `path`, the flange's points (m) on the way that the arm follows now, or None."""
         told = {body.name: body for body in situation.station}
-        return {
-            "place": self._place(told.get(self._table.name)),
-            "part": _part(told.get(PLACED)),
-            "path": self._followed(situation),
-        }
-
-    def _place(self, table: Body | None) -> list[float] | None:
-        return None if table is None else numbers(table.placement * self._table.placement.inverse())
+        table = told.get(self._table.name)
+        place = None if table is None else numbers(table.placement * self._table.placement.inverse())
+        return {"place": place, "part": _part(told.get(PLACED)), "path": self._followed(situation)}
 
     def _followed(self, situation: Situation) -> dict[str, object] | None:
         way, motion = situation.way, situation.last
