@@ -428,13 +428,13 @@ def measure(desk: CommissionWorkplace, result: Result, eye: Eye) -> tuple[Axes, 
     desk.keep(result, f"{eye.name}-board", first.frame, first.view.pixels)
     shifts = [from_parts(sign * eye.step * np.eye(3)[axis]) for axis in (0, 1, 2) for sign in (1.0, -1.0)]
     shifted = _views(desk, eye, [first.base_from_flange * shift for shift in shifts])
-    axes = _axes([first, *shifted])
+    seen = [first, *shifted]
+    axes = axes_from_shifts(*_poses(seen))
     # Nothing is known yet of where the camera sits: small turns first, then larger ones about the board.
     hand = from_parts(eye.config.flange_from_camera.se3().translation, axes.flange_from_camera)
-    seen = [first, *shifted]
     for turn in (SMALL_TURN, TURN):
         seen += _views(desk, eye, _turned(eye, first, hand, axes.across, turn))
-        found = _solved(seen, axes)
+        found = solve_mounting(*_poses(seen), axes.flange_from_camera, axes.across)
         hand = found.flange_from_camera
     if len(seen) < 1 + len(shifted) + LEAST_TURNED:
         raise RefusedError(
@@ -461,8 +461,9 @@ def _views(desk: CommissionWorkplace, eye: Eye, goals: Iterable[pin.SE3]) -> lis
     return made
 
 
-def _axes(seen: Sequence[SeenBoard]) -> Axes:
-    return axes_from_shifts([one.base_from_flange for one in seen], [one.camera_from_board for one in seen])
+def _poses(seen: Sequence[SeenBoard]) -> tuple[list[pin.SE3], list[pin.SE3]]:
+    """base_from_flange and camera_from_board of each view."""
+    return [one.base_from_flange for one in seen], [one.camera_from_board for one in seen]
 
 
 def _turned(eye: Eye, first: SeenBoard, hand: pin.SE3, scale: float, turn: float) -> list[pin.SE3]:
@@ -481,12 +482,3 @@ def _turned(eye: Eye, first: SeenBoard, hand: pin.SE3, scale: float, turn: float
             rotation = pin.exp3(sign * turn * np.eye(3)[axis])
             made.append(middle * from_parts(np.zeros(3), rotation) * from_parts((0.0, 0.0, -depth)) * hand.inverse())
     return made
-
-
-def _solved(seen: Sequence[SeenBoard], axes: Axes) -> RoughMounting:
-    return solve_mounting(
-        [one.base_from_flange for one in seen],
-        [one.camera_from_board for one in seen],
-        axes.flange_from_camera,
-        axes.across,
-    )

@@ -128,6 +128,11 @@ class Served:
         options = {"subprotocols": ["cell", self.key], "max_size": None, "compression": None} | options
         return connect(url, additional_headers=headers, origin=origin, **options)
 
+    def head(self, request: str = "POST /api/do", *lines: str) -> str:
+        """The head of a request as this browser's page sends it, still open; `lines` come last."""
+        own = f"Host: {self.host}", f"Origin: {self.origin}", f"Cookie: {self.cookie}", f"X-Cell-Key: {self.key}"
+        return "\r\n".join([f"{request} HTTP/1.1", *own, "Content-Type: application/json", *lines, ""])
+
     def raw(self, request: bytes) -> bytes:
         """What comes back to these bytes, until the other side has nothing more to say."""
         with socket.create_connection(("127.0.0.1", self.port), timeout=20) as link:

@@ -11,6 +11,8 @@ from cell.apps.cli import options
 from cell.apps.cli.options import ConfigOption, JsonOption, Level, new_table, print_json, wide_console
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from cell.devices.diagnosis.diagnosis import Diagnosis
     from cell.devices.diagnosis.local_devices import Found
 
@@ -222,8 +224,6 @@ def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
 def _print_table(rows: list[Diagnosis]) -> None:
     from rich.console import Console
 
-    from cell.apps.commission.check import bounds
-
     console = Console()
     columns = ("device", "identity", "address", ">ms p50\np99", "errors", "state")
     table = new_table("devices", *columns, show_lines=True)
@@ -233,19 +233,24 @@ def _print_table(rows: list[Diagnosis]) -> None:
         identity = "\n".join(part for part in (row.model, row.serial, row.firmware) if part)
         times = "\n".join("" if ms is None else f"{ms:.2f}" for ms in (row.p50_ms, row.p99_ms))
         errors = ", ".join(f"{name} {count}" for name, count in sorted(row.errors.items())) or "none"
-        cells = f"{row.device}\n{mark}", identity, row.address, times, errors, row.state
-        table.add_row(*cells)
+        table.add_row(f"{row.device}\n{mark}", identity, row.address, times, errors, row.state)
     console.print(table)
+    _print_figures(console, rows)
+
+
+def _print_figures(console: Console, rows: list[Diagnosis]) -> None:
+    from cell.apps.commission.check import bounds
+
     columns = ("device", "figure", ">value", "unit", ">allowed", "")
     figures = new_table("figures and what they may be", *columns)
     outside: list[str] = []
-    for row in rows:
-        for reading in row.readings:
-            mark = "[green]ok[/]" if reading.ok else "[red]outside[/]"
-            told = f"{reading.value:.4g}", reading.unit, bounds(reading)
-            figures.add_row(row.device, reading.what, *told, mark if told[-1] else "")
-            if not reading.ok:
-                outside.append(f"{row.device}, {reading.what} {told[0]} {told[1]}, allowed {told[2]}: {reading.remedy}")
+    for row, reading in ((each, reading) for each in rows for reading in each.readings):
+        value, allowed = f"{reading.value:.4g}", bounds(reading)
+        mark = "[green]ok[/]" if reading.ok else "[red]outside[/]"
+        figures.add_row(row.device, reading.what, value, reading.unit, allowed, mark if allowed else "")
+        if not reading.ok:
+            told = f"{row.device}, {reading.what} {value} {reading.unit}, allowed {allowed}"
+            outside.append(f"{told}: {reading.remedy}")
     if figures.row_count:
         console.print(figures)
     for line in outside:

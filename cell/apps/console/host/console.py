@@ -24,7 +24,6 @@ from cell.apps.console.view.readings import cell_facts
 from cell.config.job import load_job
 from cell.procedures.steps.kinds import find_kind
 from cell.run.job_run import RunOutcome
-from cell.run.runs import Run
 from drivers.errors import CellError, ConfigError, InterlockError
 from statemachine.runner import Script
 
@@ -146,12 +145,13 @@ class Console:
 
     def script(self, job: str) -> Script:
         """For a job that somebody else than a page begins: a refusal is asked about at the page, if one is open."""
-        return self.desk.questions.script(find_kind(load_job(job)[0].job.kind).names, lambda: self.seen)
 
-    def began(self, run: Run[object], job: str | None) -> None:
-        """A run was begun by somebody else than a page; it is shown as well."""
-        self.desk.questions.hold(run)
-        self._look.began(run, job)
+        def seen() -> bool:
+            if (run := self._cell.current) is not None:
+                self.desk.questions.hold(run)
+            return self.seen
+
+        return self.desk.questions.script(find_kind(load_job(job)[0].job.kind).names, seen)
 
     @contextmanager
     def computing(self, job: str) -> Iterator[Callable[[RunOutcome], None]]:

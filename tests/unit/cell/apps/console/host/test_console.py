@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 from cell.apps.console.host.console import Address, Console
 from cell.run.session.supervisor import Cell
 from drivers.errors import ConfigError
+from statemachine.step import Failure, Outcome
 from tests.support.console.server import Browser, until
 
 
@@ -68,3 +70,19 @@ def test_a_token_that_others_know_or_guess_is_refused_and_not_shown(tmp_path: Pa
     with pytest.raises(ConfigError) as refused:
         Address(token_file=token).checked()
     assert not text or text not in str(refused.value)
+
+
+def test_a_question_about_a_job_that_a_command_began_ends_with_it(cell: Cell, console: Console) -> None:
+    run, made = cell.begin("jog", lambda run: until(lambda: run.control.token.reason is not None)), list[object]()
+    decide = console.script("pot").on_refusal
+    assert decide is not None
+    with Browser(console.link).live():
+        assert until(lambda: console.seen)
+        failure = Failure(Outcome.REFUSED, "no board")
+        asked = threading.Thread(target=lambda: made.append(decide("board_photo", failure)), daemon=True)
+        asked.start()
+        assert until(lambda: console.desk.questions.present(None) is not None)
+        run.abort("interrupted")
+        asked.join(5)
+    assert made == [None]
+    run.ended(10)

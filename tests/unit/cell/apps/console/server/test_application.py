@@ -25,18 +25,12 @@ def test_names_that_are_too_long_are_refused_in_words(server: Served) -> None:
 
 def test_what_is_half_said_is_closed_within_ten_seconds(server: Served) -> None:
     """Half a head, half a body, half a second request, a refused one's body that never comes."""
-    head = f"POST /api/do HTTP/1.1\r\nHost: {server.host}\r\nOrigin: {server.origin}\r\nCookie: {server.cookie}\r\n"
-    head += f"Content-Type: application/json\r\nX-Cell-Key: {server.key}\r\n"
+    head = server.head()
     half = "Content-Length: 100\r\n\r\n{"
     whole = 'Content-Length: 13\r\n\r\n{"do": "stop"}'
     with ExitStack() as links:
-        opened = []
-        for sent in (
-            "GET /api/cell HTTP/1.1\r\nHost:",
-            head + half,
-            head + whole + head,
-            head.replace("POST", "PUT") + half,
-        ):
+        opened, put = [], head.replace("POST", "PUT")
+        for sent in ("GET /api/cell HTTP/1.1\r\nHost:", head + half, head + whole + head, put + half):
             link = links.enter_context(socket.create_connection(("127.0.0.1", server.port)))
             link.sendall(sent.encode())
             opened.append(link)
@@ -77,11 +71,8 @@ def test_what_is_not_understood_is_refused(server: Served, body: bytes) -> None:
 
 def test_a_command_has_a_largest_size_also_when_it_does_not_say_its_own(server: Served) -> None:
     assert server.ask("POST", "/api/do", json.dumps({"do": "x" * 5000})).status == 413
-    head = f"POST /api/do HTTP/1.1\r\nHost: {server.host}\r\nOrigin: {server.origin}\r\nCookie: {server.cookie}\r\n"
-    head += f"X-Cell-Key: {server.key}\r\nContent-Type: application/json\r\nTransfer-Encoding: chunked\r\n\r\n"
-    assert server.raw(head.encode() + b"1000\r\n" + b"x" * 4096 + b"\r\n1000\r\n" + b"x" * 4096 + b"\r\n").startswith(
-        b"HTTP/1.1 413"
-    )
+    head, part = server.head("POST /api/do", "Transfer-Encoding: chunked", ""), b"1000\r\n" + b"x" * 4096 + b"\r\n"
+    assert server.raw(head.encode() + 2 * part).startswith(b"HTTP/1.1 413")
 
 
 def test_a_command_needs_the_key_of_a_live_link_and_a_stop_does_not(server: Served) -> None:
@@ -107,8 +98,7 @@ def test_a_stop_waits_for_nothing_that_is_under_way(server: Served) -> None:
         key = json.loads(page.recv(timeout=10))["key"]
         links = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(30)]
         body = json.dumps({"do": "diag", "key": key})
-        head = f"POST /api/do HTTP/1.1\r\nHost: {server.host}\r\nOrigin: {server.origin}\r\nCookie: {server.cookie}\r\n"
-        head += f"X-Cell-Key: {server.key}\r\nContent-Type: application/json\r\nContent-Length: {len(body)}\r\n\r\n"
+        head = server.head("POST /api/do", f"Content-Length: {len(body)}", "")
         for link in links:
             link.sendall((head + body).encode())
         begun = time.monotonic()

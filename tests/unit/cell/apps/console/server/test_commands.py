@@ -107,19 +107,16 @@ def mutated(chance: random.Random, text: str) -> bytes | str:
     return bytes(data) if chance.random() < 0.1 else data.decode("utf-8", "replace")
 
 
-def test_the_desk_answers_whatever_is_said(cell: Cell) -> None:
+COUNTS = pytest.mark.parametrize("count", [600, pytest.param(50_000, marks=pytest.mark.campaign)])
+
+
+@COUNTS
+def test_the_desk_answers_whatever_is_said(cell: Cell, count: int) -> None:
     with Console(cell, "pot") as console:
-        desk_hears(console, 600)
+        desk_hears(console, count)
 
 
-def test_the_server_answers_whatever_is_said(tmp_path: Path) -> None:
+@COUNTS
+def test_the_server_answers_whatever_is_said(tmp_path: Path, count: int) -> None:
     with serving(tmp_path) as server:
-        socket_hears(server, 600)
-
-
-@pytest.mark.campaign
-def test_a_hundred_thousand_are_answered(cell: Cell, tmp_path: Path) -> None:
-    with Console(cell, "pot") as console:
-        desk_hears(console, 50_000)
-    with serving(tmp_path) as server:
-        socket_hears(server, 50_000)
+        socket_hears(server, count)

@@ -51,11 +51,9 @@ def test_a_page_that_talks_too_much_is_put_out_and_lets_go(server: Served, said:
 def test_a_page_that_is_lost_without_a_word_lets_go_within_seconds(server: Served) -> None:
     """Its cable is out: nothing is closed, nothing answers. Nobody else could take hold until it is given up."""
     server.forget()
-    ask = (
-        f"GET /live HTTP/1.1\r\nHost: {server.host}\r\nOrigin: {server.origin}\r\nCookie: {server.cookie}\r\n"
-        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-        f"Sec-WebSocket-Key: {'a' * 22}==\r\nSec-WebSocket-Protocol: cell, {server.key}\r\n\r\n"
-    )
+    upgrade = "Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"
+    key = f"Sec-WebSocket-Key: {'a' * 22}==", f"Sec-WebSocket-Protocol: cell, {server.key}"
+    ask = server.head("GET /live", *upgrade, *key, "")
     with socket.create_connection(("127.0.0.1", server.port), timeout=20) as lost:
         lost.sendall(ask.encode())
         joined = server.heard.get(timeout=20)

@@ -61,9 +61,10 @@ def status(pid: int, what: str) -> int:
     return int(next(line.split()[1] for line in lines if line.startswith(what)))
 
 
-def flooded(folder: Path, seconds: float) -> None:
-    """Presses STOP three times a second during a flood; each is carried out, and begun, in time."""
-    with serving(folder) as server:
+@pytest.mark.parametrize("seconds", [4.0, pytest.param(60.0, marks=pytest.mark.campaign)])
+def test_a_stop_is_carried_out_in_a_flood(tmp_path: Path, seconds: float) -> None:
+    """Pressed three times a second during a flood; each is carried out, and begun, in time."""
+    with serving(tmp_path) as server:
         server.stop_s = 0.1
         with Flood(server) as flood:
             cookie, key = server.enter()
@@ -84,15 +85,6 @@ def flooded(folder: Path, seconds: float) -> None:
     assert max(late) < WITHIN_S
     assert max(after["Threads"]) <= max(before["Threads"]) + 8
     assert after["VmRSS"][0] - before["VmRSS"][0] < 20_000
-
-
-def test_a_stop_is_carried_out_in_a_flood(tmp_path: Path) -> None:
-    flooded(tmp_path, 4.0)
-
-
-@pytest.mark.campaign
-def test_a_stop_is_carried_out_in_a_flood_of_a_minute(tmp_path: Path) -> None:
-    flooded(tmp_path, 60.0)
 
 
 def test_stops_at_once_have_one_stop_in_common(tmp_path: Path) -> None:
