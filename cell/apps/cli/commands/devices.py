@@ -233,7 +233,8 @@ def _print_table(rows: list[Diagnosis]) -> None:
         identity = "\n".join(part for part in (row.model, row.serial, row.firmware) if part)
         times = "\n".join("" if ms is None else f"{ms:.2f}" for ms in (row.p50_ms, row.p99_ms))
         errors = ", ".join(f"{name} {count}" for name, count in sorted(row.errors.items())) or "none"
-        table.add_row(f"{row.device}\n{mark}", identity, row.address, times, errors, row.state)
+        cells = f"{row.device}\n{mark}", identity, row.address, times, errors, row.state
+        table.add_row(*cells)
     console.print(table)
     _print_figures(console, rows)
 
@@ -247,7 +248,8 @@ def _print_figures(console: Console, rows: list[Diagnosis]) -> None:
     for row, reading in ((each, reading) for each in rows for reading in each.readings):
         value, allowed = f"{reading.value:.4g}", bounds(reading)
         mark = "[green]ok[/]" if reading.ok else "[red]outside[/]"
-        figures.add_row(row.device, reading.what, value, reading.unit, allowed, mark if allowed else "")
+        cells = row.device, reading.what, value, reading.unit, allowed, mark if allowed else ""
+        figures.add_row(*cells)
         if not reading.ok:
             told = f"{row.device}, {reading.what} {value} {reading.unit}, allowed {allowed}"
             outside.append(f"{told}: {reading.remedy}")
