@@ -1,7 +1,7 @@
 """A scan head drawn from a seed and what its calibration would see, by code that shares nothing with the estimator.
 
 The simulator's lens, and rays, planes and poses written anew here, so that errors cannot cancel. Everything hangs on
-one vector of parameters, which lets `calibration_bound` differentiate the very generator of the observations.
+one vector of parameters, which lets `cramer_rao` differentiate the very generator of the observations.
 """
 
 from __future__ import annotations

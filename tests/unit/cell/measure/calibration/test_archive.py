@@ -11,8 +11,7 @@ import pytest
 from cell.config.calibrations.store import solve_observations
 from cell.measure.calibration.archive import read_archive, write_archive
 from drivers.errors import ConfigError
-from lab.bench.calibration.bound import cramer_rao
-from lab.bench.calibration.campaign import one_trial
+from lab.bench.calibration.campaign import cramer_rao, one_trial
 from lab.bench.calibration.world import Noise
 
 

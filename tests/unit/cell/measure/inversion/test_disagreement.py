@@ -32,10 +32,8 @@ from cell.measure.reconstruction import Cloud
 from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.place import STEP
 from drivers.errors import RefusedError
-from lab.bench.inversion.campaign import task
-from lab.bench.inversion.parts import PARTS, nominal
-from lab.bench.inversion.refusals import BOARD, TOLERANCE, judge_case
-from lab.bench.inversion.scenes import TRUE, Setting, scan
+from lab.bench.inversion.campaign import BOARD, TOLERANCE, judge_case, task
+from lab.bench.inversion.scenes import PARTS, TRUE, Setting, nominal, scan
 from lab.bench.job.whole_job import JobRecord, NoFrames
 from statemachine.runner import StepContext
 from tests.support.report_runs import CONFIG, at_station, pot, work_of

@@ -21,10 +21,9 @@ from cell.measure.inversion.place_pose import balance
 from cell.measure.inversion.registration import register
 from cell.measure.reconstruction import Cloud, merge
 from drivers.errors import ConfigError, NotObservable, RefusedError
-from lab.bench.inversion.parts import PARTS
-from lab.bench.inversion.parts import nominal as part_surface
-from lab.bench.inversion.refusals import judge_case
-from lab.bench.inversion.scenes import Setting, scan
+from lab.bench.inversion.campaign import judge_case
+from lab.bench.inversion.scenes import PARTS, Setting, scan
+from lab.bench.inversion.scenes import nominal as part_surface
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]

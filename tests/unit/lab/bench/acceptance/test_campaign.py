@@ -8,17 +8,23 @@ import pytest
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.reconstruction import ScanGeometry
 from drivers.errors import RefusedError
-from lab.bench.acceptance import artefacts
 from lab.bench.acceptance.campaign import (
+    BALL_DIAMETER,
     NOISE_FACTOR,
+    SPACING,
     _flatness,
     _probing,
     _spacing,
+    ball_places,
+    bar_places,
     cap,
     fit_sphere,
+    flat_poses,
     form_95,
     form_all,
     plane_deviations,
+    scan_balls,
+    scan_flat,
 )
 from lab.bench.calibration.world import Noise
 from lab.paper.rig import RigSpec, draw_head
@@ -100,14 +106,14 @@ def exact():
 def test_a_head_that_is_known_exactly_measures_the_artefacts_true(exact) -> None:
     spec, head, geometry = exact
     rng = np.random.default_rng(0)
-    ends = artefacts.bar_places(spec)[5]
-    clouds = artefacts.scan_balls(spec, head, geometry, list(ends), rng)
-    assert abs(_spacing(clouds, artefacts.SPACING)["spacing_mm"]) < 0.004
-    probing = _probing(clouds[0], artefacts.BALL_DIAMETER)
+    ends = bar_places(spec)[5]
+    clouds = scan_balls(spec, head, geometry, list(ends), rng)
+    assert abs(_spacing(clouds, SPACING)["spacing_mm"]) < 0.004
+    probing = _probing(clouds[0], BALL_DIAMETER)
     assert abs(probing["size_mm"]) < 0.006
     # The sensor alone, without speckle: some hundredths of a pixel, at 0.3 mm of depth each.
     assert probing["form_95_mm"] < 0.05
-    flat = _flatness(artefacts.scan_flat(spec, head, geometry, artefacts.flat_poses(spec)[4], rng))
+    flat = _flatness(scan_flat(spec, head, geometry, flat_poses(spec)[4], rng))
     assert flat["form_95_mm"] < 0.05
 
 
@@ -116,19 +122,19 @@ def test_a_wrong_scale_of_the_rail_shows_in_the_spacing(exact) -> None:
     wrong = ScanGeometry(
         geometry.camera, geometry.light_plane, 1.002 * geometry.rail_direction, geometry.flange_from_camera
     )
-    ends = artefacts.bar_places(spec)[0]
-    clouds = artefacts.scan_balls(spec, head, wrong, list(ends), np.random.default_rng(0))
-    assert _spacing(clouds, artefacts.SPACING)["spacing_mm"] == pytest.approx(0.1, abs=0.01)
+    ends = bar_places(spec)[0]
+    clouds = scan_balls(spec, head, wrong, list(ends), np.random.default_rng(0))
+    assert _spacing(clouds, SPACING)["spacing_mm"] == pytest.approx(0.1, abs=0.01)
 
 
 def test_places_cover_the_volume_as_the_standard_asks() -> None:
     spec = RigSpec()
-    assert len(artefacts.ball_places(spec)) == 10
-    bars = artefacts.bar_places(spec)
+    assert len(ball_places(spec)) == 10
+    bars = bar_places(spec)
     assert len(bars) == 7
     for first, second in bars:
-        assert np.linalg.norm(second - first) == pytest.approx(artefacts.SPACING)
-    assert len(artefacts.flat_poses(spec)) == 6
+        assert np.linalg.norm(second - first) == pytest.approx(SPACING)
+    assert len(flat_poses(spec)) == 6
 
 
 def test_every_level_has_its_noise() -> None:
