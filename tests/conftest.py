@@ -47,7 +47,7 @@ GROUPS = (
         "unit/drivers/arm/test_ur.py",
         "unit/drivers/camera/test_stream.py",
         "unit/drivers/camera/genicam/test_camera.py",
-        "integration/wire/camera/test_aravis_fake_camera.py",
+        "unit/drivers/camera/genicam/test_aravis.py",
         "unit/drivers/relay/test_boards.py",
         "unit/drivers/claw/test_robotiq.py",
     ),

@@ -11,8 +11,10 @@ from typing import Any
 
 import can
 import numpy as np
+import pytest
 
 from drivers.clock import Clock
+from drivers.errors import DeviceFault
 from drivers.vehicle.cia402.feedback import WheelDrives
 from drivers.vehicle.cia402.setup import Watchdog
 from drivers.vehicle.cia402.vehicle import CanopenVehicle
@@ -94,3 +96,10 @@ def with_output_brake(locks: bool) -> tuple[CanopenSettings, WheelDrives]:
     """Brakes on output 17 of the drives."""
     settings = replace(SETTINGS, brake_bit=17, brake_locks=locks)
     return settings, replace(WHEELS, brake_output=17, brake_locks=locks)
+
+
+def fault_of(bench: Bench) -> DeviceFault:
+    """What ends a drive that goes on."""
+    with pytest.raises(DeviceFault) as met:
+        bench.drive_on()
+    return met.value

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from cell.config.cell_config import default_toml
 from drivers.clock import Clock
 from statemachine.journal import JournalError, read
 
@@ -118,3 +119,13 @@ def wait_for_step(folder: Path, step: str, process: subprocess.Popen[str], timeo
                 return run
         Clock().sleep(0.05)
     raise AssertionError(f"no run came to {step} within {timeout} s, or before its process ended: {process.poll()}")
+
+
+def named(tmp_path: Path, driver: str, address: str) -> Path:
+    """The shipped configuration with another scan camera."""
+    before, camera, after = default_toml().partition("[scan_camera]")
+    after = after.replace('driver = "stream"', f'driver = "{driver}"', 1)
+    after = after.replace('address = "192.0.2.20:5000"', address, 1)
+    path = tmp_path / "cell.toml"
+    path.write_text(before + camera + after, encoding="utf-8")
+    return path

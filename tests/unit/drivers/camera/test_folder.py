@@ -9,16 +9,16 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.config.cell_config import default_toml, load_config
-from cell.devices.assembly import connect, connect_one
+from cell.config.cell_config import load_config
+from cell.devices.assembly import connect
 from cell.devices.contracts import Bench, CameraContract
-from cell.makes import installed, make_of
+from cell.makes import make_of
 from drivers.camera.folder import RecordedCamera
-from drivers.camera.genicam import aravis
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault, LimitError, NotConnectedError, RefusedError
 from drivers.interfaces import Camera
 from drivers.make import Surroundings
+from tests.support.wire.cells import named
 
 RATE_HZ, EXPOSURE_S = 10.0, 0.005
 
@@ -111,71 +111,11 @@ def test_a_cut_picture_is_refused_by_name_and_the_next_one_comes(tmp_path: Path)
     assert camera.grab().frame_id == 3
 
 
-# --- makes ---
-
-
-def named(tmp_path: Path, driver: str, address: str) -> Path:
-    """The shipped configuration with another scan camera."""
-    before, camera, after = default_toml().partition("[scan_camera]")
-    after = after.replace('driver = "stream"', f'driver = "{driver}"', 1)
-    after = after.replace('address = "192.0.2.20:5000"', address, 1)
-    path = tmp_path / "cell.toml"
-    path.write_text(before + camera + after, encoding="utf-8")
-    return path
-
-
-@pytest.mark.parametrize(
-    ("driver", "address", "words"),
-    [
-        ("gige", 'address = "camera.local"', "no IPv4 address"),
-        ("gige", 'address = "255.255.255.255"', "not the address of one camera"),
-        ("gige", 'address = "192.0.2.20"\npacket_size = 100', "576 to 16000"),
-        ("gige", 'address = "192.0.2.20"\npixel_format = "YUV422"', "pixel_format"),
-        ("gige", 'address = "192.0.2.20"\npacket_delay = 5', "no unit"),
-        ("usb3", 'guid = "12"', "guid"),
-        ("v4l2", 'device = "video0"', "device"),
-    ],
-)
-def test_the_makes_values_are_checked(tmp_path: Path, driver: str, address: str, words: str) -> None:
-    with pytest.raises(ConfigError, match=words):
-        load_config(named(tmp_path, driver, address))
-
-
-def test_a_region_changes_what_a_calibration_fits_and_an_address_does_not(tmp_path: Path) -> None:
-    def hash_of(address: str) -> str:
-        return load_config(named(tmp_path, "gige", address)).calibration_hash()
-
-    own = hash_of('address = "192.0.2.20"')
-    assert own != load_config(None).calibration_hash()
-    assert hash_of('address = "192.0.2.21"\nresend = false') == own
-    assert hash_of('address = "192.0.2.20"\noffset = [16, 0]') != own
-
-
-def test_without_aravis_its_makes_are_listed_as_not_installed_with_the_remedy(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(aravis, "LIBRARIES", ("libaravis-none.so",))
-    aravis.load.cache_clear()
-    try:
-        rows = {row.make: row for row in installed() if row.kind == "camera"}
-        assert rows["gige"].state == rows["usb3"].state
-        assert rows["gige"].state.startswith("not installed: install the library Aravis: apt-get install libaravis")
-        assert rows["stream"].ok and rows["v4l2"].ok and rows["folder"].ok
-        config = load_config(named(tmp_path, "gige", 'address = "127.0.0.1"'))
-        with pytest.raises(NotConnectedError, match="scan_camera: install the library Aravis"):
-            connect_one(config, "scan_camera", Clock())
-    finally:
-        aravis.load.cache_clear()
-
-
 def test_nothing_moves_by_a_recording(tmp_path: Path) -> None:
     record(tmp_path / "frames", [1, 2])
     config = load_config(named(tmp_path, "folder", f'folder = "{tmp_path / "frames"}"'))
     with pytest.raises(ConfigError, match=r'scan_camera\.driver = "folder" plays recorded pictures, .*rail'):
         connect(config, ("rail", "scan_camera"))
-
-
-# --- V4L2, of which no camera was at hand ---
 
 
 def test_a_device_file_without_a_camera_is_named_with_remedies() -> None:

@@ -1,17 +1,25 @@
-"""The GenICam driver against a camera that was not written here: Aravis' simulated one."""
+"""The contract of cameras at the two that Aravis simulates itself: one on GigE Vision, one in its own process.
+
+The latter stands for USB3 Vision: everything but the USB transport itself is tested, without addresses, heartbeat and
+resends."""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 
-from cell.devices.contracts import Bench
-from cell.devices.contracts.device import EXPOSURE_S, PATIENCE_S, RATE_HZ, CameraContract
+from cell.devices.contracts import Bench, CameraContract
+from cell.devices.contracts.device import EXPOSURE_S, PATIENCE_S, RATE_HZ
+from drivers.camera.genicam.aravis import LIBRARIES, Aravis
+from drivers.camera.genicam.camera import GenicamCamera, GenicamSetup, Region
 from drivers.clock import Clock
 from drivers.interfaces import Camera
 from tests.support.wire.aravis_fake import fake_camera, opened
+from tests.support.wire.gige_bench import require_aravis
 
 # This camera sends a picture in one burst and sends nothing again: what the receiver is too late for is lost.
 pytestmark = pytest.mark.wire
@@ -44,3 +52,27 @@ class TestContract(CameraContract):
         assert np.median(periods) == pytest.approx(1.0, abs=0.2)
         assert periods.min() > 0.5 and periods.max() < 2.5
         assert [frame.received for frame in made] == sorted(frame.received for frame in made)
+
+
+class InProcess:
+    """Where Aravis' own camera is: as `UsbPlace`, nobody else can hold it."""
+
+    control, text, absent = False, "the library's own camera", "see that the library is whole"
+
+    def open(self, library: Aravis) -> Any:
+        make = ctypes.CDLL(LIBRARIES[0]).arv_fake_device_new
+        make.restype, make.argtypes = ctypes.c_void_p, [ctypes.c_char_p, ctypes.c_void_p]
+        return make(b"TEST0", None)
+
+
+class TestUsb3(CameraContract):
+    @pytest.fixture(scope="class")
+    @classmethod
+    def bench(cls) -> Iterator[Bench[Camera]]:
+        require_aravis()
+        clock = Clock()
+        made: Bench[Camera] = Bench(
+            lambda: GenicamCamera("scan_camera", InProcess(), GenicamSetup(Region(512, 512)), clock=clock), clock
+        )
+        yield made
+        made.over()
