@@ -18,7 +18,7 @@ from drivers.vehicle.cia402.make import look_at_nodes
 from drivers.vehicle.cia402.setup import Watchdog
 from drivers.vehicle.cia402.vehicle import CanopenVehicle
 from tests.support.wire.other_drives import OtherDrives
-from tests.unit.drivers.vehicle.cia402.test_feedback import config
+from tests.unit.drivers.vehicle.cia402.test_make import config
 
 pytestmark = pytest.mark.wire
 

@@ -3,104 +3,25 @@
 from __future__ import annotations
 
 import math
-import socket
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import can
-import numpy as np
 import pytest
-import serial
 
 from cell.config.job import load_job
 from cell.procedures.drive.way import Whereabouts
-from drivers.clock import Clock
 from drivers.errors import (
-    ConfigError,
-    DeadlineError,
     DeviceFault,
     InterlockError,
     LimitError,
-    NotConnectedError,
     RefusedError,
 )
 from drivers.interfaces import Vehicle
-from drivers.vehicle.agilex import AgilexVehicle
-from sim_backends.clock import WorldClock
-from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams
-from sim_backends.peers.vehicle.agilex import AgilexPeer
+from sim_backends.models.vehicle import Mode
+from tests.support.wire.vehicle_bench import SPEED, STANDSTILL, Bench, benched
 
 pytestmark = pytest.mark.wire
-
-SPEED = 5.0
-TRACK = 0.583
-STANDSTILL = 0.0025
-"""Up to 2 mm/s count as standstill, m/s, and the vehicle reports whole mm/s."""
-
-
-@dataclass
-class Bench:
-    """A vehicle on its bus: the driver and the vehicle's truth."""
-
-    vehicle: AgilexVehicle
-    model: VehicleModel
-    peer: AgilexPeer
-    world: WorldClock
-    clock: Clock
-
-    def truth(self) -> tuple[float, float, float]:
-        """True x, y in m and yaw in rad."""
-        return self.model.planar(self.world.now())
-
-    def true_speed(self) -> float:
-        """True wheel speed in m/s."""
-        return self.model.feedback(self.world.now()).speed
-
-    def drive_for(self, seconds: float, speed: float, yaw_rate: float = 0.0) -> None:
-        """Keep driving as a controller does, renewing the command."""
-        end = self.clock.now() + seconds
-        while self.clock.now() < end:
-            self.vehicle.drive(speed, yaw_rate)
-            self.clock.sleep(0.05)
-
-    def until(self, happened: Callable[[], bool], timeout: float = 5.0) -> None:
-        """Wait for something, at most `timeout` s."""
-        end = self.clock.now() + timeout
-        while not happened():
-            assert self.clock.now() < end
-            self.clock.sleep(0.02)
-
-
-def connect(peer: AgilexPeer, clock: Clock) -> AgilexVehicle:
-    return AgilexVehicle(
-        "vehicle", peer.interface, peer.channel, track=TRACK, max_speed=0.5, max_yaw_rate=0.8, clock=clock
-    )
-
-
-def threads() -> list[str]:
-    return [
-        thread.name for thread in threading.enumerate() if thread.name in ("vehicle receiver", "vehicle keep-alive")
-    ]
-
-
-@contextmanager
-def benched(speed: float) -> Iterator[Bench]:
-    world, clock = WorldClock(speed), Clock(speed)
-    model = VehicleModel(VehicleParams(start=(0.0, 0.0, 0.0), track=TRACK), np.random.default_rng(5))
-    peer = AgilexPeer(model, world)
-    peer.start()
-    vehicle = connect(peer, clock)
-    try:
-        yield Bench(vehicle, model, peer, world, clock)
-    finally:
-        try:
-            vehicle.close()
-        finally:
-            peer.stop()
-    assert threads() == []
 
 
 @pytest.fixture
@@ -355,105 +276,3 @@ def test_where_it_stands_is_not_known_any_more_after_its_link_was_lost(enabled: 
     enabled.vehicle.enable()
     with pytest.raises(RefusedError, match="bus failed and was opened again"):
         whereabouts.pose()
-
-
-def test_a_dead_bus_is_a_fault_and_enabling_opens_it_again(enabled: Bench) -> None:
-    enabled.drive_for(0.5, 0.3)
-    enabled.peer.fault("can.bus_off")
-    with pytest.raises(DeviceFault, match="CAN bus") as caught:
-        enabled.drive_for(2.0, 0.3)
-    assert caught.value.code == "vehicle.link_lost"
-    with pytest.raises(DeviceFault):
-        enabled.vehicle.state()
-    with pytest.raises(DeviceFault):
-        enabled.vehicle.stop()
-    # Without commands the vehicle stops by itself.
-    enabled.until(lambda: enabled.true_speed() == 0.0)
-    enabled.vehicle.enable()
-    enabled.drive_for(0.5, 0.3)
-    assert enabled.true_speed() > 0.0
-    x, _, _ = enabled.truth()
-    # Odometry has counted the way that was rolled while the bus was down.
-    assert enabled.vehicle.state().x == pytest.approx(x, abs=0.05)
-    assert enabled.vehicle.statistics.errors["link_lost"] == 1
-    assert enabled.vehicle.statistics.errors["reopened"] == 1
-
-
-def test_an_adapter_that_refuses_every_frame_is_a_fault_within_half_a_second() -> None:
-    with benched(1.0) as made:
-        made.vehicle.enable()
-        made.drive_for(0.3, 0.2)
-        made.peer.fault("can.refused_frames")
-        begun = made.clock.now()
-        with pytest.raises(DeviceFault, match=r"the adapter refuses every frame, \d+ in a row") as met:
-            made.drive_for(2.0, 0.2)
-        assert made.clock.now() - begun < 0.5
-        assert met.value.code == "vehicle.link_lost"
-        made.peer.clear()
-        made.vehicle.enable()
-        made.drive_for(0.3, 0.2)
-
-
-def test_silence_is_never_taken_for_a_fresh_reading(enabled: Bench) -> None:
-    enabled.peer._stopping.set()  # the vehicle falls silent while the bus stays up
-    enabled.clock.sleep(3.0)
-    with pytest.raises(DeadlineError, match="old"):
-        enabled.vehicle.state()
-    with pytest.raises(DeviceFault, match="no feedback") as caught:
-        enabled.vehicle.drive(0.1, 0.0)
-    assert caught.value.code == "vehicle.silent"
-    with pytest.raises(DeadlineError, match="standstill"):
-        enabled.vehicle.close()
-
-
-def test_commands_come_every_20_ms_and_closing_ends_them() -> None:
-    world = WorldClock(1.0)
-    peer = AgilexPeer(VehicleModel(VehicleParams(), np.random.default_rng(1)), world)
-    peer.start()
-    observer = can.Bus(interface=peer.interface, channel=peer.channel, sleep_after_open=0, timeout=0.005)
-    try:
-        vehicle = connect(peer, Clock())
-        vehicle.enable()
-        stamps = []
-        while len(stamps) < 20:
-            message = observer.recv(1.0)
-            assert message is not None
-            if message.arbitration_id == 0x111:
-                stamps.append(message.timestamp)
-        assert np.median(np.diff(stamps)) == pytest.approx(0.020, abs=0.006)
-        vehicle.close()
-        assert threads() == []
-    finally:
-        observer.shutdown()
-        peer.stop()
-
-
-def test_nobody_on_the_bus_is_named() -> None:
-    with pytest.raises(NotConnectedError, match="no vehicle reports on virtual:empty"):
-        AgilexVehicle("vehicle", "virtual", "empty", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock())
-    with pytest.raises(NotConnectedError, match="cannot be opened"):
-        AgilexVehicle(
-            "vehicle", "slcan", "socket://127.0.0.1:1", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock()
-        )
-    with pytest.raises(ConfigError, match="carrier-pigeon"):
-        AgilexVehicle("vehicle", "carrier-pigeon", "x", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock())
-
-
-def test_a_writer_that_was_not_run_for_long_is_not_a_stuck_adapter() -> None:
-    """What the other end took at once was not late; one that takes nothing is."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = serial.serial_for_url(f"bufsocket://127.0.0.1:{server.getsockname()[1]}", write_timeout=1e-9)
-        other, _ = server.accept()
-        with other:
-            for _ in range(200):
-                assert port.write(b"t1118\r") == 6
-            assert other.recv(5) == b"t1118"
-            port.write_timeout = 0.05
-            with pytest.raises(serial.SerialTimeoutException):
-                for _ in range(1000):
-                    port.write(bytes(65536))
-            other.shutdown(socket.SHUT_RDWR)
-        with pytest.raises(serial.SerialException):
-            for _ in range(1000):
-                port.write(b"t1118\r")
-        port.close()

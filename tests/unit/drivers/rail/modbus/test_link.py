@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
+import socket
+import struct
+import threading
+import time
+from contextlib import suppress
+
 import pytest
 from pymodbus.framer import FramerRTU
 
+from drivers.clock import Clock
+from drivers.errors import Aborted, DeadlineError
+from drivers.interfaces import LinkStatistics
 from drivers.rail.modbus import link as modbus_link
-from drivers.rail.modbus.link import Number, Rate
+from drivers.rail.modbus.link import Action, ModbusLink, ModbusRefused, Number, Rate
+from tests.support.modbus_maps import PATHS
+from tests.support.wire.modbus_bench import UNIT, Drive, config
 
 
 def test_frames_carry_the_checksum_that_pymodbus_computes() -> None:
@@ -29,3 +41,110 @@ def test_a_ramp_in_the_drives_unit_is_never_longer_than_reckoned() -> None:
         rate = Rate(Number(0), unit)
         for turns in (0.7, 3.3, 41.7, 100.0, 777.7):
             assert rate.decode(rate.encode(turns, 4096), 4096) >= turns * (1 - 1e-12)
+
+
+@pytest.mark.wire
+def test_a_line_that_repeats_what_is_sent_is_noticed() -> None:
+    drive = Drive.of(config(PATHS), echo=True)
+    rail = drive.homed()
+    rail.move_to(0.005).wait(30.0)
+    assert rail.state().position == pytest.approx(0.005, abs=1e-6)
+    rail.close()
+    drive.peer.stop()
+
+
+@pytest.mark.wire
+def test_a_lost_reply_is_asked_for_again_and_a_silent_drive_is_told_with_what_to_check(drive: Drive) -> None:
+    rail = drive.homed()
+    drive.peer.fault("rail.drop_reply")
+    assert rail.state().homed
+    assert rail.statistics.errors["retries"] == 1
+    rail.close()
+    with pytest.raises(DeadlineError, match=r"rail\.unit.*rail\.baud, rail\.parity, rail\.stop_bits"):
+        drive.rail(unit=UNIT + 1)
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("late", [0.2, 0.4, 0.6])
+def test_late_answers_never_become_those_to_later_questions(late: float) -> None:
+    """Two replies are late, those behind them come at once after them; a drive that reads two registers at a time."""
+    listener, asked, ready = socket.create_server(("127.0.0.1", 0)), itertools.count(), threading.Event()
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            while request := connection.recv(8):
+                address, count = struct.unpack(">HH", request[2:6])
+                if ready.is_set() and next(asked) < 2:
+                    time.sleep(late)
+                body = bytes([UNIT, 3, 2 * count]) + struct.pack(">H", address) * count
+                connection.sendall(body + FramerRTU.compute_CRC(body).to_bytes(2, "big"))
+
+    threading.Thread(target=serve, daemon=True).start()
+    link = ModbusLink(
+        "rail", f"socket://127.0.0.1:{listener.getsockname()[1]}", unit=UNIT, baud=115200, parity="none", stop_bits=1,
+        stop_action=Action(1, 1), clock=Clock(), statistics=LinkStatistics(),
+    )  # fmt: skip
+    assert link.read(7, 2) == [7, 7]
+    ready.set()
+    right = 0
+    for address in (16, 32, 48, 64, 80, 96):
+        with suppress(DeadlineError):
+            assert link.read(address, 2) == [address, address]
+            right += 1
+    assert right >= 3
+    link.close()
+    listener.close()
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("spoilt", ["a bit", "another drive's", "another function's"])
+def test_a_reply_that_is_spoilt_or_anothers_is_asked_for_again(spoilt: str) -> None:
+    listener, ready = socket.create_server(("127.0.0.1", 0)), threading.Event()
+    spoiling = itertools.count()
+
+    def serve() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            while request := connection.recv(8):
+                address, count = struct.unpack(">HH", request[2:6])
+                spoil = ready.is_set() and next(spoiling) == 0
+                unit = UNIT + (spoil and spoilt == "another drive's")
+                function = 3 + (spoil and spoilt == "another function's")
+                body = bytes([unit, function, 2 * count]) + struct.pack(">H", address + spoil) * count
+                reply = bytearray(body + FramerRTU.compute_CRC(body).to_bytes(2, "big"))
+                if spoil and spoilt == "a bit":
+                    reply[4] ^= 0x10
+                connection.sendall(reply)
+
+    threading.Thread(target=serve, daemon=True).start()
+    statistics = LinkStatistics()
+    link = ModbusLink(
+        "rail", f"socket://127.0.0.1:{listener.getsockname()[1]}", unit=UNIT, baud=115200, parity="none", stop_bits=1,
+        stop_action=Action(1, 1), clock=Clock(), statistics=statistics,
+    )  # fmt: skip
+    assert link.read(7, 2) == [7, 7]
+    ready.set()
+    assert link.read(16, 2) == [16, 16]
+    assert next(spoiling) >= 2, "it was asked for again"
+    link.close()
+    listener.close()
+
+
+@pytest.mark.wire
+def test_a_register_that_the_drive_does_not_have_is_named() -> None:
+    wrong = {**PATHS, "homed": {"address": 0x1004, "bit": 6}}
+    drive = Drive.of(config(PATHS))
+    with pytest.raises(ModbusRefused, match="register 0x1004: it has no such register"):
+        drive.rail(registers=config(wrong).registers)
+    drive.peer.stop()
+
+
+@pytest.mark.wire
+def test_what_was_decided_before_a_stop_is_not_sent_after_it(drive: Drive) -> None:
+    rail = drive.homed()
+    decided = rail._link.stops
+    rail.stop()
+    with pytest.raises(Aborted):
+        rail._link.do(rail.registers.start, issued=decided, moves=True)
+    rail.close()

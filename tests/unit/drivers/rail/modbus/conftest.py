@@ -1,0 +1,17 @@
+"""A simulated Modbus drive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from tests.support.modbus_maps import PATHS
+from tests.support.wire.modbus_bench import Drive, config
+
+
+@pytest.fixture
+def drive() -> Iterator[Drive]:
+    made = Drive.of(config(PATHS))
+    yield made
+    made.peer.stop()

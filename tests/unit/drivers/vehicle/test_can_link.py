@@ -1,0 +1,104 @@
+"""Promises of `drivers.vehicle.can_link`."""
+
+from __future__ import annotations
+
+import can
+import numpy as np
+import pytest
+
+from drivers.clock import Clock
+from drivers.errors import (
+    ConfigError,
+    DeadlineError,
+    DeviceFault,
+    NotConnectedError,
+)
+from drivers.vehicle.agilex import AgilexVehicle
+from sim_backends.clock import WorldClock
+from sim_backends.models.vehicle import VehicleModel, VehicleParams
+from sim_backends.peers.vehicle.agilex import AgilexPeer
+from tests.support.wire.vehicle_bench import TRACK, Bench, benched, connect, threads
+
+pytestmark = pytest.mark.wire
+
+
+def test_a_dead_bus_is_a_fault_and_enabling_opens_it_again(enabled: Bench) -> None:
+    enabled.drive_for(0.5, 0.3)
+    enabled.peer.fault("can.bus_off")
+    with pytest.raises(DeviceFault, match="CAN bus") as caught:
+        enabled.drive_for(2.0, 0.3)
+    assert caught.value.code == "vehicle.link_lost"
+    with pytest.raises(DeviceFault):
+        enabled.vehicle.state()
+    with pytest.raises(DeviceFault):
+        enabled.vehicle.stop()
+    # Without commands the vehicle stops by itself.
+    enabled.until(lambda: enabled.true_speed() == 0.0)
+    enabled.vehicle.enable()
+    enabled.drive_for(0.5, 0.3)
+    assert enabled.true_speed() > 0.0
+    x, _, _ = enabled.truth()
+    # Odometry has counted the way that was rolled while the bus was down.
+    assert enabled.vehicle.state().x == pytest.approx(x, abs=0.05)
+    assert enabled.vehicle.statistics.errors["link_lost"] == 1
+    assert enabled.vehicle.statistics.errors["reopened"] == 1
+
+
+def test_an_adapter_that_refuses_every_frame_is_a_fault_within_half_a_second() -> None:
+    with benched(1.0) as made:
+        made.vehicle.enable()
+        made.drive_for(0.3, 0.2)
+        made.peer.fault("can.refused_frames")
+        begun = made.clock.now()
+        with pytest.raises(DeviceFault, match=r"the adapter refuses every frame, \d+ in a row") as met:
+            made.drive_for(2.0, 0.2)
+        assert made.clock.now() - begun < 0.5
+        assert met.value.code == "vehicle.link_lost"
+        made.peer.clear()
+        made.vehicle.enable()
+        made.drive_for(0.3, 0.2)
+
+
+def test_silence_is_never_taken_for_a_fresh_reading(enabled: Bench) -> None:
+    enabled.peer._stopping.set()  # the vehicle falls silent while the bus stays up
+    enabled.clock.sleep(3.0)
+    with pytest.raises(DeadlineError, match="old"):
+        enabled.vehicle.state()
+    with pytest.raises(DeviceFault, match="no feedback") as caught:
+        enabled.vehicle.drive(0.1, 0.0)
+    assert caught.value.code == "vehicle.silent"
+    with pytest.raises(DeadlineError, match="standstill"):
+        enabled.vehicle.close()
+
+
+def test_commands_come_every_20_ms_and_closing_ends_them() -> None:
+    world = WorldClock(1.0)
+    peer = AgilexPeer(VehicleModel(VehicleParams(), np.random.default_rng(1)), world)
+    peer.start()
+    observer = can.Bus(interface=peer.interface, channel=peer.channel, sleep_after_open=0, timeout=0.005)
+    try:
+        vehicle = connect(peer, Clock())
+        vehicle.enable()
+        stamps = []
+        while len(stamps) < 20:
+            message = observer.recv(1.0)
+            assert message is not None
+            if message.arbitration_id == 0x111:
+                stamps.append(message.timestamp)
+        assert np.median(np.diff(stamps)) == pytest.approx(0.020, abs=0.006)
+        vehicle.close()
+        assert threads() == []
+    finally:
+        observer.shutdown()
+        peer.stop()
+
+
+def test_nobody_on_the_bus_is_named() -> None:
+    with pytest.raises(NotConnectedError, match="no vehicle reports on virtual:empty"):
+        AgilexVehicle("vehicle", "virtual", "empty", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock())
+    with pytest.raises(NotConnectedError, match="cannot be opened"):
+        AgilexVehicle(
+            "vehicle", "slcan", "socket://127.0.0.1:1", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock()
+        )
+    with pytest.raises(ConfigError, match="carrier-pigeon"):
+        AgilexVehicle("vehicle", "carrier-pigeon", "x", track=TRACK, max_speed=1.0, max_yaw_rate=1.0, clock=Clock())
