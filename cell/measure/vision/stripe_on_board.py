@@ -36,11 +36,7 @@ def on_plane(camera: CameraModel, camera_from_board: pin.SE3, pixels: Array) -> 
 
 
 def points_on_board(
-    camera: CameraModel,
-    camera_from_board: pin.SE3,
-    spec: BoardSpec,
-    profile: StripeProfile,
-    dot_radius: float,
+    camera: CameraModel, camera_from_board: pin.SE3, spec: BoardSpec, profile: StripeProfile, dot_radius: float
 ) -> NDArray[np.intp]:
     """Rows of the profile whose stripe lies cleanly on the board; empty when there are too few."""
     rows = profile.rows

@@ -61,13 +61,7 @@ def find_chessboard(image: Image, spec: BoardSpec, quick: bool = False) -> Board
 
 
 def _view(
-    image: Image,
-    lit: Image,
-    spec: BoardSpec,
-    corners: Corners,
-    index: NDArray[np.intp],
-    places: Places,
-    share: float,
+    image: Image, lit: Image, spec: BoardSpec, corners: Corners, index: NDArray[np.intp], places: Places, share: float
 ) -> BoardView:
     index, places = _extended(corners, index, places, spec.name)
     pixels = corners.places[index]

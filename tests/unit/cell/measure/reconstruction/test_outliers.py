@@ -7,9 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cell.measure.reconstruction import (
-    outliers,
-)
+from cell.measure.reconstruction import outliers
 from cell.measure.reconstruction.outliers import find_outliers
 from lab.bench.reconstruction.scenes import KINDS, scene
 

@@ -7,10 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.measure.reconstruction import (
-    deviation_colours,
-    write_ply,
-)
+from cell.measure.reconstruction import deviation_colours, write_ply
 
 
 def test_a_ply_with_columns_of_different_length_is_refused(tmp_path: Path) -> None:
