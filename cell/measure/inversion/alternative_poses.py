@@ -10,8 +10,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.geometry.poses import difference, perturbed
-from cell.measure.inversion.closest import Array
-from cell.measure.inversion.nominal import NominalSurface, Scan, sigmas_along
+from cell.measure.inversion.nominal import Array, NominalSurface, Scan, sigmas_along
 from cell.measure.inversion.nominal import correspondences as matched
 from cell.measure.inversion.observability import FREE
 from cell.measure.inversion.registration import MOST_SHIFT, Prior, candidates

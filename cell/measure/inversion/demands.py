@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.measure.inversion.closest import Array
 from cell.measure.inversion.disagreement import Dissent
-from cell.measure.inversion.nominal import NominalSurface, Scan
+from cell.measure.inversion.nominal import Array, NominalSurface, Scan
 from cell.measure.inversion.observability import Tolerance
 from cell.measure.inversion.registration import Prior, Registration, across
 from drivers.errors import Measured, RefusedError

@@ -18,8 +18,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.measure.inversion.closest import Array, Indices
-from cell.measure.inversion.nominal import NominalSurface, Scan, correspondences, robust_scale, sigmas_along
+from cell.measure.inversion.nominal import (
+    Array,
+    Indices,
+    NominalSurface,
+    Scan,
+    correspondences,
+    robust_scale,
+    sigmas_along,
+)
 from cell.measure.inversion.observability import Tolerance
 from cell.measure.inversion.registration import across
 from cell.measure.reconstruction.cloud import Cloud

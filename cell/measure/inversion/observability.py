@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.measure.inversion.closest import Array
+from cell.measure.inversion.nominal import Array
 from drivers.errors import Measured, NotObservable
 
 PURE = 0.15

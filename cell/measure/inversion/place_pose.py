@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import difference, perturbed
 from cell.measure.inversion.alternative_poses import require_alone
-from cell.measure.inversion.closest import Array
 from cell.measure.inversion.demands import (
     Demands,
     fit_figures,
@@ -34,7 +33,7 @@ from cell.measure.inversion.demands import (
     require_whole,
 )
 from cell.measure.inversion.disagreement import dissent
-from cell.measure.inversion.nominal import SIGMA_FLOOR, NominalSurface, Scan
+from cell.measure.inversion.nominal import SIGMA_FLOOR, Array, NominalSurface, Scan
 from cell.measure.inversion.observability import PoseVerdict, Tolerance, determined, judge
 from cell.measure.inversion.registration import Prior, Registration, by_lines, register
 from cell.measure.reconstruction.cloud import Cloud

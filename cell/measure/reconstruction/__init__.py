@@ -7,10 +7,9 @@ from cell.measure.reconstruction.build import (
     flange_motions,
     lean_motions,
 )
-from cell.measure.reconstruction.cloud import Cloud, Filled, merge
+from cell.measure.reconstruction.cloud import Cloud, Filled, Seam, find_seams, merge
 from cell.measure.reconstruction.holes import fill_holes
 from cell.measure.reconstruction.ply import deviation_colours, write_cloud, write_ply
-from cell.measure.reconstruction.seams import Seam, find_seams
 
 __all__ = [
     "Cloud",

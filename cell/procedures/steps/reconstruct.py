@@ -17,8 +17,7 @@ from cell.measure.reconstruction import (
     merge,
     write_cloud,
 )
-from cell.measure.reconstruction.cloud import Array, Indices
-from cell.measure.reconstruction.seams import Motions
+from cell.measure.reconstruction.cloud import Array, Indices, Motions
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import RefusedError

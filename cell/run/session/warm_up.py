@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from cell.base.compiled import is_kept
 from cell.measure.inversion import NominalSurface
-from cell.measure.inversion.closest import closest
+from cell.measure.inversion.nominal import closest
 from cell.measure.inversion.registration import candidates
 from cell.measure.reconstruction import Cloud, fill_holes
 from cell.measure.reconstruction.outliers import find_outliers

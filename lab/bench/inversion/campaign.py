@@ -20,8 +20,7 @@ from scipy.stats import chi2
 
 from cell.measure.geometry.poses import difference, perturbed
 from cell.measure.inversion import Prior, Tolerance, invert_pose
-from cell.measure.inversion.closest import Array
-from cell.measure.inversion.nominal import Scan
+from cell.measure.inversion.nominal import Array, Scan
 from cell.measure.inversion.registration import register
 from cell.measure.reconstruction import Cloud
 from drivers.errors import CellError, RefusedError

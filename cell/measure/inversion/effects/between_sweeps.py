@@ -21,12 +21,10 @@ import scipy
 from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import perturbed
-from cell.measure.inversion.closest import Array
-from cell.measure.inversion.nominal import NominalSurface, Scan, correspondences
+from cell.measure.inversion.nominal import Array, NominalSurface, Scan, correspondences
 from cell.measure.inversion.observability import Tolerance, name, sorted_out
 from cell.measure.inversion.place_pose import PlacePose
-from cell.measure.reconstruction.cloud import Cloud, Indices
-from cell.measure.reconstruction.seams import Motions
+from cell.measure.reconstruction.cloud import Cloud, Indices, Motions
 
 GATE_M = 5e-3
 """Points farther from where the surface was are not of it; where it has moved farther, few are left."""

@@ -15,9 +15,8 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.geometry.poses import perturbed
-from cell.measure.inversion.closest import Array
 from cell.measure.inversion.effects.during_sweep import LARGEST_OVERTONES
-from cell.measure.inversion.nominal import NominalSurface, Scan, correspondences
+from cell.measure.inversion.nominal import Array, NominalSurface, Scan, correspondences
 from cell.measure.inversion.place_pose import PATCH_M
 from cell.measure.inversion.registration import across
 from cell.measure.reconstruction.cloud import Cloud

@@ -21,8 +21,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.measure.inversion.closest import Array
-from cell.measure.inversion.nominal import NominalSurface, Scan, correspondences
+from cell.measure.inversion.nominal import Array, NominalSurface, Scan, correspondences
 from cell.measure.reconstruction.cloud import Cloud, Indices
 from drivers.errors import Measured, RefusedError
 

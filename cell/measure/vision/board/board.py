@@ -1,12 +1,12 @@
 """A calibration board in a picture: its points, and its pose in front of a calibrated camera.
 
-The one way in for all kinds of boards; each refusal says why. `spec.py` names boards; `chess.py`, `charuco.py`,
-`dot_board.py` and `tags.py` find them.
+The one way in for all kinds of boards; each refusal says why. `view.py` names boards; `chess.py`, `dots.py` and
+`markers.py` find them.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -15,12 +15,10 @@ import pinocchio as pin
 from cell.measure.geometry.board_projection import pose_equations, seen_points
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.poses import difference, from_parts, perturbed, transform
-from cell.measure.vision.board.charuco import find_charuco
 from cell.measure.vision.board.chess import find_chessboard
-from cell.measure.vision.board.dot_board import find_dots
+from cell.measure.vision.board.dots import find_dots
 from cell.measure.vision.board.ends import OtherBoard
-from cell.measure.vision.board.outliers import without_outliers
-from cell.measure.vision.board.tags import find_tags
+from cell.measure.vision.board.markers import find_charuco, find_tags
 from cell.measure.vision.board.view import DOTS, BoardSpec, BoardView
 from cell.measure.vision.pictures import Image, PictureRefused, Reason, check_picture
 
@@ -33,6 +31,12 @@ CLEAR_CHI2 = 16.0
 OUTLYING = 3.0
 MEDIAN_SQUARE = 1.386
 ROUNDS = 3
+# Of points that a glint moved: times the median departure, at least so many px.
+STRAY, LEAST_PX, STRAY_ROUNDS = 6.0, 0.2, 6
+# Median length of two Gaussian variables.
+MEDIAN_LENGTH = 1.177
+# So many points tell a lens, which bends by third powers, from points that lie astray.
+LENS_POINTS = 28
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,12 +64,10 @@ def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = Non
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"the board needs a grey 8-bit image, not {image.dtype} of shape {image.shape}")
     check_picture(image, size)
-    if spec.kind in DOTS:
-        return without_outliers(_find_dots(image, spec))
-    if spec.kind == "aprilgrid":
-        return without_outliers(find_tags(image, spec))
-    found = find_charuco(image, spec) if spec.kind == "charuco" else find_chessboard(image, spec, quick)
-    return without_outliers(found)
+    if spec.kind == "chessboard":
+        return without_outliers(find_chessboard(image, spec, quick))
+    find = _find_dots if spec.kind in DOTS else find_tags if spec.kind == "aprilgrid" else find_charuco
+    return without_outliers(find(image, spec))
 
 
 def _find_dots(image: Image, spec: BoardSpec) -> BoardView:
@@ -222,3 +224,40 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
             if damping > 1e6:
                 break
     return _PoseFit(pose, residual, residual / view.sigma[:, None], weights, normal)
+
+
+def without_outliers(view: BoardView) -> BoardView:
+    """The view without the points that a laser line, a glint or a finger moved: the others say where they should lie.
+
+    A flat board is seen through a homography and a smooth lens; what departs from both is dropped.
+    """
+    flat = view.object_points[:, :2] / view.spec.pitch
+    terms = 10 if len(flat) >= LENS_POINTS else 6 if len(flat) >= 20 else 3
+    homography, _ = cv2.findHomography(flat, view.pixels, cv2.RANSAC, 3.0)
+    if homography is None or len(flat) < 12:
+        return view
+    mapped = np.column_stack([flat, np.ones(len(flat))]) @ np.asarray(homography, dtype=np.float64).T
+    residual = view.pixels - mapped[:, :2] / mapped[:, 2:]
+    x, y = ((flat - flat.mean(axis=0)) / np.ptp(flat, axis=0).max()).T
+    powers = (np.ones_like(x), x, y, x * x, x * y, y * y, x**3, x * x * y, x * y * y, y**3)
+    design = np.column_stack(powers[:terms])
+    weight = 1.0 / view.sigma
+    keep = np.ones(len(flat), dtype=np.bool_)
+    for _ in range(STRAY_ROUNDS):
+        # Weighted: points that a laser line moved alike are many, but their edges were seen to be doubtful.
+        inverse = np.linalg.pinv((weight[:, None] * design)[keep]) * weight[keep]
+        # A point at the board's corner draws the fit to itself: what counts is its distance from the fit without it.
+        own = np.zeros(len(flat))
+        own[keep] = np.einsum("nk,kn->n", design[keep], inverse)
+        away = np.linalg.norm(residual - design @ (inverse @ residual[keep]), axis=1) / np.maximum(1 - own, 0.05)
+        limit = max(LEAST_PX, STRAY * float(np.median(away[keep])))
+        new = away < limit
+        if new.sum() < terms + 4 or (new == keep).all():
+            break
+        keep = new
+    sigma = view.sigma[keep]
+    if view.spec.kind == "aprilgrid":
+        # What is printed inside a blurred tag draws its sides alike, which their own straightness does not show.
+        more = float(np.median(away[keep] / sigma)) / MEDIAN_LENGTH
+        sigma = sigma * max(1.0, more)
+    return replace(view, ids=view.ids[keep], pixels=view.pixels[keep], sigma=sigma)

@@ -5,16 +5,19 @@ Corners come in one order: x along the columns, y down the rows, z into the boar
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
-from cell.measure.vision.board.corners import WINDOW_SHARE, Corners, corner_lattices, find_corners, fit_corners
-from cell.measure.vision.board.ends import check_chess_ends, grey
-from cell.measure.vision.board.identify import Places, by_outline
-from cell.measure.vision.board.lattice import PlaneMap
+from cell.measure.vision.board.corners import WINDOW_SHARE, fit_corners
+from cell.measure.vision.board.ends import check_chess_ends, grey, next_places
+from cell.measure.vision.board.lattice import Places, PlaneMap, Seeds, by_outline, lattices
 from cell.measure.vision.board.view import BoardSpec, BoardView
 from cell.measure.vision.pictures import Image, PictureRefused, Reason, only_one
 
@@ -31,6 +34,14 @@ SCALES = (0.5, 1.0, 0.25)
 # A laser line is thinner than this and longer than this share of the picture.
 STREAK_PX = 31
 STREAK_SHARE = 0.15
+# Crossings: a ring of samples around each, how alike it is to itself turned by half a turn, and its contrast.
+SAMPLES = 32
+RADII = (4.5, 7.0)
+MOST = 1200
+LEAST_ANTIPODAL = 0.55
+LEAST_SECOND = 0.5
+LEAST_CONTRAST_DN = 5.0
+SEEDS = 40
 
 
 def find_chessboard(image: Image, spec: BoardSpec, quick: bool = False) -> BoardView:
@@ -95,16 +106,8 @@ def _view(
 
 def _check_none_beyond(image: Image, spec: BoardSpec, plane: PlaneMap, contrast: float) -> None:
     """Refuse a larger board: one with crossings of at least `contrast` DN where the next row or column would be."""
-    cols, rows = spec.grid
-    i, j = np.arange(cols, dtype=np.float64), np.arange(rows, dtype=np.float64)
     quarters = 0.25 * np.array([[1, 1], [-1, -1], [1, -1], [-1, 1]])
-    for name, x, y in (
-        ("first row", i, np.full(cols, -1.0)),
-        ("last row", i, np.full(cols, float(rows))),
-        ("first column", np.full(rows, -1.0), j),
-        ("last column", np.full(rows, float(cols)), j),
-    ):
-        places = np.column_stack([x, y])
+    for name, places in next_places(spec):
         around = grey(image, plane.pixels((places[:, None, :] + quarters).reshape(-1, 2))).reshape(-1, 4)
         one, other = around[:, :2], around[:, 2:]
         step = np.maximum(one.min(axis=1) - other.max(axis=1), other.min(axis=1) - one.max(axis=1))
@@ -204,3 +207,84 @@ def _near(lit: Image, corners: Array, reach: int) -> NDArray[np.bool_]:
     x = np.round(corners[:, 0]).astype(int).clip(0, lit.shape[1] - 1)
     y = np.round(corners[:, 1]).astype(int).clip(0, lit.shape[0] - 1)
     return np.asarray(wide[y, x] > 0, dtype=np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class Corners:
+    """Crossings of two edges: `places` (n, 2) in px and `dark` (n,), the direction in rad of a dark sector's middle."""
+
+    places: Array
+    dark: Array
+
+
+def find_corners(image: Image, scale: float) -> Corners:
+    """Saddles of an 8-bit image (h, w), looked for in the picture shrunk to `scale`."""
+    small = image
+    if scale < 1.0:
+        small = np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    smooth = np.asarray(cv2.GaussianBlur(small.astype(np.float32), (0, 0), 1.4), dtype=np.float32)
+    xx = cv2.Sobel(smooth, cv2.CV_32F, 2, 0, ksize=3, scale=0.25)
+    yy = cv2.Sobel(smooth, cv2.CV_32F, 0, 2, ksize=3, scale=0.25)
+    xy = cv2.Sobel(smooth, cv2.CV_32F, 1, 1, ksize=3, scale=0.25)
+    saddle = xy * xy - xx * yy
+    top = cv2.dilate(saddle, np.ones((7, 7), np.uint8))
+    rows, columns = np.nonzero((saddle == top) & (saddle > 0.05))
+    inside = (rows > 8) & (columns > 8) & (rows < saddle.shape[0] - 9) & (columns < saddle.shape[1] - 9)
+    rows, columns = rows[inside], columns[inside]
+    strongest = np.argsort(-saddle[rows, columns])[:MOST]
+    rows, columns = rows[strongest], columns[strongest]
+    # Newton's step to where the gradient vanishes.
+    gx, gy = (cv2.Sobel(smooth, cv2.CV_32F, a, b, ksize=3, scale=0.125)[rows, columns] for a, b in ((1, 0), (0, 1)))
+    determinant = np.minimum(-saddle[rows, columns], -1e-6)
+    a, b, c = xx[rows, columns], xy[rows, columns], yy[rows, columns]
+    move = np.column_stack([-(c * gx - b * gy) / determinant, -(a * gy - b * gx) / determinant])
+    places = np.column_stack([columns, rows]) + np.clip(move, -1.5, 1.5)
+    crossing, dark = _crossings(smooth, places)
+    return Corners((places[crossing] + 0.5) / scale - 0.5, dark[crossing])
+
+
+def _crossings(smooth: NDArray[np.float32], places: Array) -> tuple[NDArray[np.bool_], Array]:
+    """Which places (n, 2) look alike when turned by half a turn and change their sign four times around (n,)."""
+    angles = np.arange(SAMPLES) * 2 * np.pi / SAMPLES
+    unit = np.column_stack([np.cos(angles), np.sin(angles)])
+    good = np.zeros(len(places), dtype=np.bool_)
+    dark = np.zeros(len(places))
+    if not len(places):
+        return good, dark
+    for radius in RADII:
+        at = (places[:, None, :] + radius * unit).astype(np.float32)
+        ring = cv2.remap(smooth, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        ring = ring.reshape(len(places), SAMPLES).astype(np.float64)
+        span = np.ptp(ring, axis=1)
+        # The middle between bright and dark, not the mean: sectors seen obliquely are not equally wide.
+        level = ring - 0.5 * (ring.max(axis=1) + ring.min(axis=1))[:, None]
+        power = (level**2).sum(axis=1) + 1e-9
+        antipodal = (level * np.roll(level, SAMPLES // 2, axis=1)).sum(axis=1) / power
+        turns = (np.sign(level) != np.sign(np.roll(level, 1, axis=1))).sum(axis=1)
+        second = (level - level.mean(axis=1)[:, None]) @ np.exp(2j * angles)
+        share = 2 * np.abs(second) ** 2 / SAMPLES / ((level - level.mean(axis=1)[:, None]) ** 2).sum(axis=1).clip(1e-9)
+        new = (antipodal > LEAST_ANTIPODAL) & (turns == 4) & (share > LEAST_SECOND) & (span > LEAST_CONTRAST_DN) & ~good
+        dark[new] = 0.5 * np.angle(second[new]) + np.pi / 2
+        good |= new
+    return good, dark
+
+
+def corner_lattices(corners: Corners, least: int) -> Iterator[tuple[NDArray[np.intp], Places]]:
+    """Lattices of at least `least` corners, none sharing a corner: indices (m,) and places (m, 2).
+
+    Neighbours have their dark sectors at right angles to each other. Places are right-handed as the picture is.
+    """
+    n = len(corners.places)
+    if n < least:
+        return
+    tree = scipy.spatial.cKDTree(corners.places)
+    distances, who = map(np.asarray, tree.query(corners.places, k=min(n, 13)))
+    dark: list[float] = corners.dark.tolist()
+    # Regular surroundings first: the corners whose fourth neighbour is not much farther than the first.
+    order = np.argsort(distances[:, min(4, who.shape[1] - 1)] / np.maximum(distances[:, 1], 1e-9))
+
+    def opposite(a: int, b: int) -> bool:
+        return abs(math.sin(dark[a] - dark[b])) > 0.7
+
+    seeds = Seeds(order, who, opposite, first_steps=4, least_sine=0.3, most=SEEDS)
+    yield from lattices(corners.places, tree, seeds, least)

@@ -44,7 +44,7 @@ def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArra
     around = 1.65 * radius * np.column_stack([f(np.arange(8) * np.pi / 4) for f in (np.cos, np.sin)])
     own = lattice[found]
     level = grey(smooth, plane.pixels(own))
-    for name, beyond in _sides(spec):
+    for name, beyond in next_places(spec):
         ends = further = seen = 0
         spots, outward = _spots(own, beyond, around, radius)
         there = grey(smooth, plane.pixels(spots.reshape(-1, 2))).reshape(spots.shape[:2])
@@ -201,8 +201,8 @@ def grey(image: Image, pixels: Array) -> Array:
     return np.asarray(np.where(inside, values.ravel().astype(np.float64), np.nan), dtype=np.float64)
 
 
-def _sides(spec: BoardSpec) -> list[tuple[str, Array]]:
-    """For each side of a board of dots: its name and the places that would come next."""
+def next_places(spec: BoardSpec) -> list[tuple[str, Array]]:
+    """For each side of a board: its name and the places (n, 2) of the points that would come next."""
     cols, rows = spec.grid
     i, j = np.arange(cols), np.arange(rows)
 

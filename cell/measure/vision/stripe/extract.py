@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 
 from cell.measure.vision.pictures import Dark, Taken
 from cell.measure.vision.stripe.careful.careful import read_carefully
-from cell.measure.vision.stripe.careful.follow import DOUBLE
+from cell.measure.vision.stripe.careful.follow import FAINTEST, CoarseLines, choose_mix, coarse, refuse_unsure
 from cell.measure.vision.stripe.careful.surroundings import widen_what_departs
-from cell.measure.vision.stripe.ordinary.quick import QuickVerdict, read_quickly, refuse_white
-from cell.measure.vision.stripe.overview import LEAST_SCORE, CoarseLines, choose_mix, coarse, refuse_unsure
+from cell.measure.vision.stripe.ordinary.quick import DOUBLE, QuickVerdict, read_quickly, refuse_white
 from cell.measure.vision.stripe.planes import FULL, Picture, as_picture
 from cell.measure.vision.stripe.planes import LaserChannel as LaserChannel
 from cell.measure.vision.stripe.profile import Array as Array
@@ -174,7 +173,7 @@ def read_stripe(
         value = part.plane(mix)[0] if shade is None else part.plane(mix)[0] - shade.plane(mix)[0]
         looks["rows" if axis == "rows" else "columns"] = coarse(value), mix
     best = max(looks, key=lambda axis: looks[axis][0].chain.score)
-    if looks[best][0].chain.score < LEAST_SCORE:
+    if looks[best][0].chain.score < FAINTEST:
         return None
     refuse_unsure(*looks[best])
     profile = extract(image, off, best, settings, laser=laser)

@@ -157,6 +157,20 @@ DOUBT = 0.3
 
 
 @compiled
+def trimmed_square(counts: NDArray[np.int64], total: int) -> float:
+    """Mean square of `total` sizes, of which there are `counts`: structure makes large ones, which are left out."""
+    median, below = 0, int(counts[0])
+    while 2 * below < total:
+        median += 1
+        below += int(counts[median])
+    kept, squares = 0, 0.0
+    for size in range(min(len(counts), 4 * (median + 1) + 1)):
+        kept += counts[size]
+        squares += float(counts[size]) * size * size
+    return squares / max(kept, 1)
+
+
+@compiled
 def pixel_noise(image: Image, gain_dn: float, declared_dn2: float) -> tuple[float, float]:
     """(variance without photons, whole variance) of a pixel of an 8-bit image's background, DN².
 
@@ -172,15 +186,6 @@ def pixel_noise(image: Image, gain_dn: float, declared_dn2: float) -> tuple[floa
             counts[abs(one - other)] += 1
             total += int(one + other)
         pairs += n // 2
-    # Structure makes large steps and is trimmed away.
-    median, below = 0, int(counts[0])
-    while 2 * below < pairs:
-        median += 1
-        below += int(counts[median])
-    kept, squares = 0, 0
-    for size in range(min(256, 4 * (median + 1) + 1)):
-        kept += counts[size]
-        squares += counts[size] * size * size
-    whole = squares / kept / 2
+    whole = trimmed_square(counts, pairs) / 2
     excess = whole - gain_dn * (total / (2 * pairs)) - declared_dn2
     return declared_dn2 + (excess if excess > DOUBT * whole else 0.0), max(declared_dn2, whole)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.vision.stripe.careful.speckle import Speckle
+from cell.measure.vision.stripe.ordinary.speckle import Speckle
 
 if TYPE_CHECKING:
     from cell.measure.vision.stripe.careful.careful import Learned
@@ -139,7 +139,7 @@ class StripeProfile:
     sensor's range in `saturated` rows), `width` the stripe's σ in px. `double` marks rows with a second peak of
     comparable energy: the one nearer to where the neighbours' stripe runs was taken, else the stronger. The deviations
     were made with `speckle`, None where it was assumed, for too few lines show any, or declared, and with `noise`: the
-    variance of a pixel in DN², without photons and whole (`stripe_noise.pixel_noise`). `rival` (n,) is the height of
+    variance of a pixel in DN², without photons and whole (`planes.pixel_noise`). `rival` (n,) is the height of
     the next best peak over the stripe's, `misfit` (n,) χ² over what is usual in the picture, and `learned` what the
     picture taught; all None where the picture is an ordinary one.
     """

@@ -21,48 +21,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.base.compiled import compiled
-from cell.measure.vision.stripe.careful.follow import CANDIDATES, SCALES, Candidates, StripeChain, candidates, follow
+from cell.measure.vision.stripe.careful.follow import (
+    ALONG,
+    BINNED_WIDTH,
+    CANDIDATES,
+    FAINTEST,
+    SCALES,
+    SURE,
+    Candidates,
+    StripeChain,
+    candidates,
+    choose_mix,
+    coarse,
+    difference,
+    follow,
+)  # fmt: skip
 from cell.measure.vision.stripe.careful.learning import FREE_SCALE, learn_profile
 from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, Shape, binned, fit_shape
 from cell.measure.vision.stripe.careful.surroundings import around, carried, surrounded, wander
-from cell.measure.vision.stripe.ordinary.find import CENTRE, CORE
-from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, CHI2, FISHER, FIT_CENTRE, SIGMA, WIDTH
-from cell.measure.vision.stripe.overview import ALONG, BINNED_WIDTH, LEAST_SCORE, SURE, choose_mix, coarse, difference
+from cell.measure.vision.stripe.ordinary.quick import MISFIT_SIGMAS
 from cell.measure.vision.stripe.planes import MIXES, LaserChannel, Picture
 
 if TYPE_CHECKING:
     from cell.measure.vision.stripe.profile import StripeSettings
-
-
-# A misfit that noise makes once in some hundred lines; beyond it, the deviation grows with the misfit.
-MISFIT_SIGMAS = 3.0
-
-
-@compiled
-def believe(
-    fitted: Array, start: Array, length: int, narrowest: float, widest: float, least: float, excess: float,
-    double: NDArray[np.bool_], saturated: NDArray[np.bool_],
-) -> None:  # fmt: skip
-    """Put NaN into the lines of `fitted` (FITTED, lines) that are no stripe of a picture of `length` px a line.
-
-    A stripe has a width in px within the range, an amplitude above `least` DN, its whole peak in the picture, and its
-    centre near the start's. The variance of the others grows by `excess` and with their misfit. `double` and
-    `saturated` (lines,) are True of no line that is none; the latter is told here.
-    """
-    for r in range(fitted.shape[1]):
-        centre, width, fisher = fitted[FIT_CENTRE, r], fitted[WIDTH, r], fitted[FISHER, r]
-        keep = width > narrowest and width < widest and fitted[AMPLITUDE, r] > least
-        keep = keep and centre > 1.5 * width and centre < length - 1 - 1.5 * width
-        keep = keep and abs(centre - start[r, 0, CENTRE]) < max(3.0, 2 * width)
-        if keep and fisher < max(1.0, 0.5 * width):
-            pixels = 8 * width + 2
-            allowed = 1 + MISFIT_SIGMAS * np.sqrt(2 / pixels)
-            fitted[SIGMA, r] *= np.sqrt(excess * max(1.0, fitted[CHI2, r] / allowed))
-            saturated[r] = start[r, 0, CORE] > 0
-        else:
-            fitted[FIT_CENTRE, r] = fitted[SIGMA, r] = fitted[AMPLITUDE, r] = fitted[WIDTH, r] = np.nan
-            double[r] = saturated[r] = False
 
 
 Array = NDArray[np.float64]
@@ -252,7 +233,7 @@ def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidate
     typical, along = (like.scale, like.along) if like is not None else (0.0, ALONG)
     if not typical:
         found, chain, along = coarse(value)
-        if not len(chain.rows) or chain.score < LEAST_SCORE:
+        if not len(chain.rows) or chain.score < FAINTEST:
             return found, StripeChain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0, along
         # What a shrunken picture answers at may be wider than any stripe that is looked for.
         typical = float(np.median(found.scale[chain.rows, chain.which]))

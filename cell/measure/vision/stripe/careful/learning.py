@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, Shape, fit_shape, gaussian, learn
-from cell.measure.vision.stripe.careful.speckle import speckled
+from cell.measure.vision.stripe.ordinary.speckle import ASSUMED_GRAIN
 
 Array = NDArray[np.float64]
 
@@ -24,7 +26,11 @@ BETTER, SURE = 0.01, 4.0
 """Held-out lines have to fit better by this share, and by so many standard deviations, for a profile to be believed."""
 FAINT_SPECKLE = 0.03
 FREE_SCALE, SHARED_SCALE, LEAST_SCALE = 0.25, 0.15, 0.001
-"""Standard deviations of the logarithm of a line's scale: before it is known, and the least ever assumed."""
+"""Standard deviations of the logarithm of a line's scale: before it is known, once it is, and the least assumed."""
+ALIKE, LEAST_ALIKE, KEPT = 0.35, 12, 0.95
+"""Lines whose amplitude differs from the typical one by no more than this share tell the speckle; how many of them."""
+SPECKLE_SIGMAS = 3.0
+PHASES = (-0.375, -0.125, 0.125, 0.375)
 
 
 def learn_profile(
@@ -190,3 +196,48 @@ def _better(one: Fitted, other: Fitted) -> bool:
     gain = gain[np.abs(gain - np.median(gain)) <= np.quantile(np.abs(gain - np.median(gain)), 0.95)]
     chance = float(gain.std()) / np.sqrt(len(gain))
     return bool(gain.mean() > SURE * chance and gain.mean() > BETTER * np.median(one.chi2[good]))
+
+
+def speckled(fitted: Fitted, clear: NDArray[np.bool_], noise: Noise, shape: Shape) -> Noise:
+    """The noise with the contrast that the residuals of the `clear` lines (m,) show under the stripe, at most 1."""
+    if not clear.any():
+        return noise
+    typical = float(np.median(fitted.amplitude[clear]))
+    whole = np.isfinite(fitted.variance).mean(axis=1) > 0.9
+    alike = clear & whole & (np.abs(fitted.amplitude - typical) < ALIKE * typical)
+    if alike.sum() < LEAST_ALIKE:
+        return replace(noise, contrast=0.0)
+    usable = np.isfinite(fitted.variance[alike])
+    height = fitted.amplitude[alike, None]
+    profile = np.where(usable, fitted.stripe[alike] / height, 0.0)
+    power = np.sum(profile**2 * (np.where(usable, fitted.residual[alike], 0.0) / height) ** 2, axis=1)
+    power = power[power <= np.quantile(power, KEPT)]
+    level = float(np.median(fitted.level[alike]))
+    photons, speckle = _left(shape, typical, level, noise)
+    excess = float(power.mean()) - photons * KEPT
+    if excess < SPECKLE_SIGMAS * float(power.std()) / np.sqrt(len(power)):
+        return replace(noise, contrast=0.0)
+    return replace(noise, contrast=float(np.sqrt(min(excess / speckle, 1.0))))
+
+
+def _left(shape: Shape, amplitude: float, level: float, noise: Noise) -> tuple[float, float]:
+    """What the fit leaves of the noise without speckle and of speckle of contrast 1, as `speckled` sums it."""
+    half = int(np.ceil(shape.reach)) + 1
+    photons, speckle = 0.0, 0.0
+    for phase in PHASES:
+        x: Array = np.arange(-half, half + 1.0) - np.float64(phase)
+        profile, slope = shape.at(x)
+        variance = noise.floor + noise.gain * np.maximum(amplitude * profile + level, 0.0)
+        weight = 1 / (variance + (noise.contrast * amplitude * profile) ** 2)
+        jacobian = np.stack(
+            [amplitude * slope, profile, amplitude * slope * x, np.ones_like(x), x / half], axis=1
+        )  # fmt: skip
+        normal = jacobian.T @ (weight[:, None] * jacobian)
+        normal[2, 2] += SHARED_SCALE**-2
+        kept = np.eye(len(x)) - jacobian @ np.linalg.solve(normal, (weight[:, None] * jacobian).T)
+        rows = kept * profile[:, None] / amplitude
+        photons += float(np.sum(rows**2 * variance)) / len(PHASES)
+        pulled = rows * (amplitude * profile)
+        grain = np.exp(-((x[:, None] - x) ** 2) / (4 * ASSUMED_GRAIN**2))
+        speckle += float(np.sum((pulled @ grain) * pulled)) / len(PHASES)
+    return photons, speckle

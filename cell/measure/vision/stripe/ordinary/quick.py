@@ -1,11 +1,9 @@
 """The stripe of ordinary pictures, grey and of 8 bits, by the compiled search and the fit of a Gaussian.
 
-Says also whether the picture is an ordinary one; if not, `careful.py` has the word.
-
-Whether a picture is an ordinary one, for which the quick search and the fit of a Gaussian say all there is to say.
-
-Asked once for each picture, or for the first of a stream's block, of a few of its lines. Where the answer is no, the
-stripe is read carefully (`careful.py`)."""
+Says also, from a few of a picture's lines, whether it is an ordinary one; if not, `careful.py` has the word. Asked once
+for each picture, or for the first of a stream's block. Which of two peaks in a line is the stripe only the neighbours
+tell: those that show one peak say where it runs, else the peak with more energy stays, and the line is marked.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +17,11 @@ from numpy.typing import NDArray
 
 from cell.base.compiled import compiled
 from cell.measure.vision.pictures import Dark, PictureRefused, Reason
-from cell.measure.vision.stripe.careful.careful import believe
-from cell.measure.vision.stripe.careful.follow import choose, survey
-from cell.measure.vision.stripe.careful.speckle import ASSUMED_GRAIN, correlation, measure_speckle, neighbours
 from cell.measure.vision.stripe.ordinary import find, fit
-from cell.measure.vision.stripe.ordinary import search as stripe_search
-from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY, Floats, Shade, Whole
-from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH
-from cell.measure.vision.stripe.planes import pixel_noise
+from cell.measure.vision.stripe.ordinary.find import CENTRE, CORE, ENERGY, Floats, Shade
+from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, CHI2, FISHER, FIT_CENTRE, LEVEL, SIGMA, SLOPE, WIDTH
+from cell.measure.vision.stripe.ordinary.speckle import ASSUMED_GRAIN, correlation, measure_speckle, neighbours
+from cell.measure.vision.stripe.planes import pixel_noise, trimmed_square
 from cell.measure.vision.stripe.profile import Array, Axis, Image, StripeProfile, StripeSettings
 
 BINS, WITHIN = 28, 3.5
@@ -79,7 +74,7 @@ def is_profile_gaussian(image: Image, dark: Shade, fitted: Array, start: Array) 
             sums[k] += off
             squares[k] += off * off
             counts[k] += 1
-    pattern, power, chance, used = 0.0, 0.0, 0.0, 0
+    pattern, chance, used = 0.0, 0.0, 0
     for k in range(BINS):
         if counts[k] < 8:
             continue
@@ -87,92 +82,39 @@ def is_profile_gaussian(image: Image, dark: Shade, fitted: Array, start: Array) 
         variance = max(squares[k] / counts[k] - mean * mean, 1e-3)
         pattern += mean * mean / variance
         chance += counts[k] * mean * mean / variance
-        power += 1.0
         used += 1
     if used < BINS // 4:
         return True
     return not (pattern / used > PATTERN and chance / used > SIGNIFICANT * SIGNIFICANT)
 
 
-@compiled
-def is_line_whole(fitted: Array, start: Array) -> bool:
+def is_line_whole(fitted: Array, start: Array, found: NDArray[np.intp]) -> bool:
     """True when few lines with a peak are no stripe, and few stripes stand where neither neighbour has its."""
-    lines = fitted.shape[1]
-    peaks, found, broken = 0, 0, 0
-    before, joined = -1, False
-    for r in range(lines):
-        peaks += start[r, 0, ENERGY] > 0
-        if not np.isfinite(fitted[FIT_CENTRE, r]):
-            continue
-        found += 1
-        # A stripe that goes on at one side at least is no stray.
-        near = before >= 0 and r - before <= 3
-        near = near and abs(fitted[FIT_CENTRE, r] - fitted[FIT_CENTRE, before]) <= 4.0 * (r - before) + fitted[WIDTH, r]
-        if before >= 0 and not near and not joined:
-            broken += 1
-        joined = near
-        before = r
-    if before >= 0 and not joined:
-        broken += 1
-    return peaks - found <= REFUSED * lines and broken <= BROKEN * found + 2
+    apart, aside = np.diff(found), np.abs(np.diff(fitted[FIT_CENTRE, found]))
+    near = (apart <= 3) & (aside <= 4.0 * apart + fitted[WIDTH, found[1:]])
+    # A stripe that goes on at one side at least is no stray.
+    broken = np.count_nonzero(~(np.append(False, near) | np.append(near, False)))
+    refused = np.count_nonzero(start[:, 0, ENERGY] > 0) - len(found)
+    return bool(refused <= REFUSED * len(start) and broken <= BROKEN * len(found) + 2)
 
 
-@compiled
-def is_too_wide(fitted: Array, start: Array) -> bool:
-    """True when the stripes that were found are wider than the search's window takes, or hardly any was."""
-    found, wide = 0, 0
-    for r in range(fitted.shape[1]):
-        if np.isfinite(fitted[FIT_CENTRE, r]):
-            found += 1
-            wide += fitted[WIDTH, r] > WIDEST
-    return 2 * wide >= found or found < HARDLY_ANY * fitted.shape[1]
-
-
-@compiled
-def is_saturated(fitted: Array, start: Array) -> bool:
-    """True when the cores of most stripes are saturated: what flanks look like is seldom a Gaussian."""
-    found, hidden = 0, 0
-    for r in range(fitted.shape[1]):
-        if np.isfinite(fitted[FIT_CENTRE, r]):
-            found += 1
-            hidden += start[r, 0, CORE] > 1
-    return 2 * hidden > found
-
-
-@compiled
-def is_surface_even(dark: Shade, fitted: Array) -> bool:
+def is_surface_even(dark: Shade, fitted: Array, found: NDArray[np.intp]) -> bool:
     """True when the picture without the laser shows no edges of the surface's albedo under the stripe, or is dark."""
-    found, uneven, total = 0, 0, 0.0
-    n = dark.shape[1]
     if len(dark) < fitted.shape[1]:
         return True
-    for r in range(fitted.shape[1]):
-        centre, width = fitted[FIT_CENTRE, r], fitted[WIDTH, r]
-        if not np.isfinite(centre):
-            continue
-        left, right = int(centre - 1.5 * width), int(centre + 1.5 * width + 1)
-        if left < 0 or right >= n:
-            continue
-        one, other = float(dark[r, left]), float(dark[r, right])
-        found += 1
-        total += 0.5 * (one + other)
-        uneven += abs(one - other) > UNEVEN * 0.5 * (one + other)
-    return total < BRIGHT_DN * found or uneven <= BROKEN * found
+    centre, width = fitted[FIT_CENTRE, found], fitted[WIDTH, found]
+    left, right = (centre - 1.5 * width).astype(np.intp), (centre + 1.5 * width + 1).astype(np.intp)
+    inside = (left >= 0) & (right < dark.shape[1])
+    one, other = (dark[found[inside], side[inside]].astype(np.float64) for side in (left, right))
+    uneven = np.count_nonzero(np.abs(one - other) > UNEVEN * 0.5 * (one + other))
+    return bool(np.sum(0.5 * (one + other)) < BRIGHT_DN * len(one) or uneven <= BROKEN * len(one))
 
 
-@compiled
-def has_rivals(fitted: Array, start: Array) -> bool:
+def has_rivals(fitted: Array, start: Array, found: NDArray[np.intp]) -> bool:
     """True when centres jump and many lines have a second peak: the wrong one may have been taken."""
-    rivals, found, jumps, before = 0, 0, 0, -1
-    for r in range(fitted.shape[1]):
-        rivals += start[r, 1, ENERGY] > 0
-        if not np.isfinite(fitted[FIT_CENTRE, r]):
-            continue
-        found += 1
-        aside = abs(fitted[FIT_CENTRE, r] - fitted[FIT_CENTRE, before]) if before >= 0 else 0.0
-        jumps += before == r - 1 and aside > 6.0 + 2 * fitted[WIDTH, r]
-        before = r
-    return jumps > 0 and rivals > REFUSED * found
+    aside = np.abs(np.diff(fitted[FIT_CENTRE, found]))
+    jumps = (np.diff(found) == 1) & (aside > 6.0 + 2 * fitted[WIDTH, found[1:]])
+    return bool(jumps.any() and np.count_nonzero(start[:, 1, ENERGY] > 0) > REFUSED * len(found))
 
 
 @compiled
@@ -188,22 +130,8 @@ def is_textured(image: Image) -> bool:
             near[abs(np.int64(image[r, i - 1]) + np.int64(image[r, i + 1]) - here)] += 1
             far[abs(np.int64(image[r, i - FAR_LAG]) + np.int64(image[r, i + FAR_LAG]) - here)] += 1
             total += 1
-    distant, next_ = _trimmed(far, total), _trimmed(near, total)
+    distant, next_ = trimmed_square(far, total), trimmed_square(near, total)
     return bool(distant > 6 * TEXTURE_DN2 and distant > TEXTURE_RATIO * next_)
-
-
-@compiled
-def _trimmed(counts: Whole, total: int) -> float:
-    """Mean square of what was counted, without what is far beyond its median."""
-    median, below = 0, int(counts[0])
-    while 2 * below < total:
-        median += 1
-        below += int(counts[median])
-    kept, squares = 0, 0.0
-    for size in range(min(len(counts), 4 * (median + 1) + 1)):
-        kept += counts[size]
-        squares += float(counts[size]) * size * size
-    return squares / max(kept, 1)
 
 
 ASSUMED_CONTRAST = 0.15
@@ -215,6 +143,15 @@ SECOND_ORDER = 3.0
 BLINDED_SHARE = 0.6
 MISTAKABLE = 0.02
 """Share of the lines with a second peak from which the quick search may have followed the wrong one."""
+
+
+DOUBLE, RIVAL = 0.5, 0.15
+"""Energy of the weaker peak over that of the stronger from which a line is marked as double, or asks its neighbours."""
+# Lines on either side that are asked where the stripe runs, how many of them at most, and how near it has to be.
+BESIDE, MOST_ASKED, NEAR = 30, 7, 4.0
+SMOOTHED = 7
+# A misfit that noise makes once in some hundred lines; beyond it, the deviation grows with the misfit.
+MISFIT_SIGMAS = 3.0
 
 
 class QuickVerdict(Enum):
@@ -239,7 +176,7 @@ def read_quickly(
     least = max(settings.least_peak_dn, 5 * sqrt(whole))
     start = np.zeros((len(work), find.CANDIDATES, find.START))
     cut, cut_at = np.empty((len(work), find.CUT), np.uint8), np.full(len(work), find.NOWHERE)
-    several = stripe_search.find_lines(
+    several = find.find_lines(
         work, seen, shade, saturation=settings.saturation_dn, least_peak=least, start=start, cut=cut, cut_at=cut_at
     )
     double = choose(start) if several else np.zeros(len(start), np.bool_)
@@ -284,14 +221,21 @@ def read_quickly(
 
 
 def _is_ordinary(fitted: Array, start: Array, work: Image, *, shade: Image, seen: Image, several: bool) -> bool:
-    """Whether the stripe is whole, narrow, unsaturated, Gaussian, the only one, and on an even, plain surface."""
+    """Whether the stripe is whole, narrow, unsaturated, Gaussian, the only one, and on an even, plain surface.
+
+    One that is wider than the search's window takes, or hardly there, is not; what flanks look like beside a saturated
+    core is seldom a Gaussian.
+    """
+    found = np.flatnonzero(np.isfinite(fitted[FIT_CENTRE]))
+    wide, hidden = fitted[WIDTH, found] > WIDEST, start[found, 0, CORE] > 1
     return (
-        is_line_whole(fitted, start)
-        and not is_too_wide(fitted, start)
-        and not is_saturated(fitted, start)
+        is_line_whole(fitted, start, found)
+        and len(found) >= HARDLY_ANY * len(start)
+        and 2 * np.count_nonzero(wide) < len(found)
+        and 2 * np.count_nonzero(hidden) <= len(found)
         and is_profile_gaussian(work, shade, fitted, start)
-        and not (several and has_rivals(fitted, start))
-        and is_surface_even(shade, fitted)
+        and not (several and has_rivals(fitted, start, found))
+        and is_surface_even(shade, fitted, found)
         and not is_textured(seen)
     )
 
@@ -345,3 +289,85 @@ def refuse_white(saturated: NDArray[np.bool_]) -> None:
             f"the stripe's picture is saturated: {share:.0%} of its pixels are at the end of their range, allowed "
             f"{BLINDED_SHARE:.0%}; shorten the exposure or keep the ambient light off",
         )
+
+
+def choose(start: Array) -> NDArray[np.bool_]:
+    """True (lines,) where two peaks compete; `start` (lines, 2, …) is put in order, the chosen one first."""
+    energy = start[:, :, ENERGY]
+    rival = energy[:, 1] > RIVAL * energy[:, 0]
+    double: NDArray[np.bool_] = energy[:, 1] > DOUBLE * energy[:, 0]
+    if not rival.any():
+        return double
+    alone = np.flatnonzero((energy[:, 0] > 0) & ~rival)
+    for line in np.flatnonzero(rival):
+        here = np.searchsorted(alone, line)
+        sides = (alone[max(0, here - MOST_ASKED) : here], alone[here : here + MOST_ASKED])
+        asked = np.concatenate([side[np.abs(side - line) <= BESIDE] for side in sides])
+        if len(asked) < 3:
+            continue
+        slope, middle = _line_through(asked - line, start[asked, 0, CENTRE])
+        away = np.abs(start[line, :, CENTRE] - middle)
+        tolerance = NEAR + 0.5 * abs(slope) + start[line, 0, WIDTH]
+        if away[1] < tolerance < away[0]:
+            start[line] = start[line, ::-1]
+            double[line] = True
+    return double
+
+
+def _line_through(x: Array, y: Array) -> tuple[float, float]:
+    """Slope and value at 0 of a line that one bad point in four does not move: medians of slopes and of values."""
+    i, j = np.triu_indices(len(x), 1)
+    slope = float(np.median((y[j] - y[i]) / (x[j] - x[i])))
+    return slope, float(np.median(y - slope * x))
+
+
+@compiled
+def survey(start: Array, low: float, high: float) -> tuple[NDArray[np.int64], Array]:
+    """What the lines say together: those found (m,) and how wide the stripe is about each line (lines,).
+
+    The width in px is the running mean over 15 lines of the start widths within low … high, which are counts of pixels
+    and coarse one by one.
+    """
+    lines = len(start)
+    found = np.empty(lines, np.int64)
+    # Sums over the lines before each.
+    totals, counts = np.zeros(lines + 1), np.zeros(lines + 1, np.int64)
+    for r in range(lines):
+        totals[r + 1], counts[r + 1] = totals[r], counts[r]
+        if start[r, 0, ENERGY] > 0:
+            totals[r + 1] += min(max(start[r, 0, WIDTH], low), high)
+            found[counts[r]] = r
+            counts[r + 1] += 1
+    widths = np.empty(lines)
+    overall = totals[lines] / counts[lines] if counts[lines] > 0 else min(max(1.0, low), high)
+    for r in range(lines):
+        first, end = max(0, r - SMOOTHED), min(lines, r + SMOOTHED + 1)
+        here = counts[end] - counts[first]
+        widths[r] = (totals[end] - totals[first]) / here if here > 0 else overall
+    return found[: counts[lines]], widths
+
+
+@compiled
+def believe(
+    fitted: Array, start: Array, length: int, narrowest: float, widest: float, least: float, excess: float,
+    double: NDArray[np.bool_], saturated: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Put NaN into the lines of `fitted` (FITTED, lines) that are no stripe of a picture of `length` px a line.
+
+    A stripe has a width in px within the range, an amplitude above `least` DN, its whole peak in the picture, and its
+    centre near the start's. The variance of the others grows by `excess` and with their misfit. `double` and
+    `saturated` (lines,) are True of no line that is none; the latter is told here.
+    """
+    for r in range(fitted.shape[1]):
+        centre, width, fisher = fitted[FIT_CENTRE, r], fitted[WIDTH, r], fitted[FISHER, r]
+        keep = width > narrowest and width < widest and fitted[AMPLITUDE, r] > least
+        keep = keep and centre > 1.5 * width and centre < length - 1 - 1.5 * width
+        keep = keep and abs(centre - start[r, 0, CENTRE]) < max(3.0, 2 * width)
+        if keep and fisher < max(1.0, 0.5 * width):
+            pixels = 8 * width + 2
+            allowed = 1 + MISFIT_SIGMAS * np.sqrt(2 / pixels)
+            fitted[SIGMA, r] *= np.sqrt(excess * max(1.0, fitted[CHI2, r] / allowed))
+            saturated[r] = start[r, 0, CORE] > 0
+        else:
+            fitted[FIT_CENTRE, r] = fitted[SIGMA, r] = fitted[AMPLITUDE, r] = fitted[WIDTH, r] = np.nan
+            double[r] = saturated[r] = False

@@ -17,7 +17,7 @@ from cell.measure.calibration.drift.decision import Figure, Suspect
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing
 from cell.measure.calibration.drift.slip import Slip, WitnessCheck
 from cell.measure.calibration.drift.timing import Shutter, StampTiming
-from cell.measure.reconstruction.seams import Seam
+from cell.measure.reconstruction.cloud import Seam
 from cell.procedures.arm.touch import TouchCheck, TouchHeight
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from lab.bench.job.whole_job import JobRecord

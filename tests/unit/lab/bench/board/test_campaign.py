@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 
 from cell.measure.geometry.poses import difference
-from cell.measure.vision import PictureRefused, Reason, board_pose, find_board
+from cell.measure.vision import board_pose, find_board
 from cell.measure.vision.board.view import KINDS, BoardView
 from lab.bench.board.campaign import Tally as BoardTally
 from lab.bench.board.campaign import camera_of, judge
@@ -69,35 +69,6 @@ def test_dots_seen_through_a_lens_leave_no_bias_in_the_pose(kind, tilt):
     assert np.abs(error[3:]).max() < 3e-5
     # Corners where the dots are: without the conic's projection the same pixels give a worse fit.
     assert board_pose(replace(view, dot_radius=0.0), camera_of(lens)).rms_px > 10 * found.rms_px
-
-
-@pytest.mark.parametrize(
-    ("name", "kind"),
-    [
-        ("mirrored", "marked_dots"),
-        ("mirrored", "charuco"),
-        ("a smaller board instead", "marked_dots"),
-        ("a larger board instead", "marked_dots"),
-        ("a larger board instead", "chessboard"),
-        ("a smaller board instead", "asymmetric_dots"),
-        ("another kind instead", "charuco"),
-        ("nothing but noise", "dots"),
-    ],
-)
-def test_what_is_not_the_named_board_is_refused(name, kind):
-    view = seen(name, kind)
-    with pytest.raises(PictureRefused) as refused:
-        find_board(view.picture, view.spec)
-    assert refused.value.reason in (Reason.NO_BOARD, Reason.AMBIGUOUS, Reason.MIRRORED)
-    assert len(str(refused.value)) > 20
-
-
-@pytest.mark.parametrize("kind", ["marked_dots", "chessboard", "charuco"])
-def test_two_boards_that_could_both_be_meant_are_refused(kind):
-    view = seen("two of the same board", kind, 2)
-    with pytest.raises(PictureRefused) as refused:
-        find_board(view.picture, view.spec)
-    assert refused.value.reason is Reason.AMBIGUOUS
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -9,23 +9,18 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 import pytest
-from scipy.special import erf, ndtr
+from scipy.special import ndtr
 
 from cell.measure.geometry.poses import difference
 from cell.measure.vision import board_pose
-from cell.measure.vision.board.corners import fit_corners
+from cell.measure.vision.board.board import without_outliers
 from cell.measure.vision.board.dots import measure_dots
 from cell.measure.vision.board.lattice import Blobs
-from cell.measure.vision.board.outliers import without_outliers
 from cell.measure.vision.board.view import BoardView
 from lab.bench.board.campaign import camera_of
 from lab.bench.board.conditions import LENSES, draw_pose, draw_spec
 from lab.bench.board.render import Placed, true_pixels
-
-BRIGHT, DARK, PSF = 170.0, 14.0, 0.7
-# A fifth of what levels taken beside the edges and light that is only added would do.
-MOST_MOVED_PX = 0.004
-SLOPES = [(0.003, 0.0), (-0.002, 0.002)]
+from tests.support.board_pictures import BRIGHT, MOST_MOVED_PX, PSF, SLOPES, uneven_picture
 
 
 def drawn(kind, rng, tilt):
@@ -88,35 +83,6 @@ def test_a_few_points_far_off_do_not_move_the_pose():
     assert error @ np.linalg.solve(found.covariance, error) < 22.5  # χ² of 6 degrees of freedom, one in a thousand
 
 
-def picture(pattern, slope, middle=(64.0, 64.0)):
-    """An 8-bit picture (129, 129): light that changes by `slope` (2,) of itself per px, times a pattern."""
-    v, u = np.mgrid[0:129, 0:129].astype(np.float64)
-    light = 1 + slope[0] * (u - middle[0]) + slope[1] * (v - middle[1])
-    return np.clip(np.round(light * pattern(u, v)), 0, 255).astype(np.uint8)
-
-
-@pytest.mark.parametrize("slope", SLOPES)
-def test_light_that_falls_off_moves_no_corner(slope):
-    rng = np.random.default_rng(4)
-    errors = []
-    for _ in range(30):
-        x, y = 64 + rng.uniform(-0.5, 0.5, 2)
-
-        def crossing(u, v, x=x, y=y):
-            a, b = (-(u - x) * 0.3 + (v - y)), ((u - x) + (v - y) * 0.3)
-            half = 0.5 * (BRIGHT - DARK)
-            return 0.5 * (BRIGHT + DARK) - half * erf(a / 1.044 / PSF / 1.414) * erf(b / 1.044 / PSF / 1.414)
-
-        steps = 40.0 * np.array([[[1.0, -0.3], [0.3, 1.0]]])
-        uneven, even = (
-            fit_corners(picture(crossing, g), np.array([[64.0, 64.0]]), steps, np.array([True]))[0][0]
-            for g in (slope, (0.0, 0.0))
-        )
-        assert np.linalg.norm(even - (x, y)) < 0.02
-        errors.append(uneven - even)
-    assert np.abs(np.mean(errors, axis=0)).max() < MOST_MOVED_PX
-
-
 @pytest.mark.parametrize("white", [BRIGHT, 340.0])
 @pytest.mark.parametrize("slope", SLOPES)
 def test_light_that_falls_off_moves_no_dot_not_even_where_white_saturates(slope, white):
@@ -129,7 +95,7 @@ def test_light_that_falls_off_moves_no_dot_not_even_where_white_saturates(slope,
             return 0.1 * white + 0.9 * white * ndtr((np.hypot(u - x, v - y) - radius) / PSF)
 
         start = Blobs(np.array([[64.0, 64.0]]), radius * np.eye(2)[None])
-        uneven, even = (measure_dots(picture(dot, g), start)[0].centres[0] for g in (slope, (0.0, 0.0)))
+        uneven, even = (measure_dots(uneven_picture(dot, g), start)[0].centres[0] for g in (slope, (0.0, 0.0)))
         assert np.linalg.norm(even - (x, y)) < 0.04
         errors.append(uneven - even)
     # The dots, a tenth as bright, tell the light less well; taken as it is, white that saturates moves them by .03 px.

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cell.measure.vision.stripe.extract import extract
-from cell.measure.vision.stripe.ordinary.find import CANDIDATES, CUT, ENERGY, NOWHERE, START, find_line
-from cell.measure.vision.stripe.ordinary.search import find_lines
+from cell.measure.vision.stripe.ordinary.find import CANDIDATES, CUT, ENERGY, NOWHERE, START, find_line, find_lines
 from lab.bench.stripe.truth import Cell, draw
 
 SHAPE = (200, 333)

@@ -81,3 +81,20 @@ def test_markers_beyond_the_named_board_propose_the_right_counts():
     sheet = cv2.aruco.CharucoBoard((9, 6), 0.03, 0.02, dictionary).generateImage((900, 620), marginSize=20)
     with pytest.raises(PictureRefused, match="By the markers read it has 9x6"):
         find_board(cv2.GaussianBlur(sheet, (0, 0), 1.0), parse_board("charuco:7x5:30mm:20mm"))
+
+
+def test_charuco_corners_are_read_also_in_part():
+    text = "charuco:8x6:15mm"
+    spec = parse_board(text)
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    drawn = cv2.aruco.CharucoBoard((8, 6), 0.015, 0.0105, dictionary).generateImage((800, 600), marginSize=0)
+    picture = np.full((768, 1024), 180, np.uint8)
+    picture[100:700, 120:920] = drawn
+    view = find_board(picture, spec)
+    assert view.complete
+    # Pixel (0, 0) of the drawing is the middle of its corner pixel; squares are 100 px.
+    expected = (spec.lattice() + 1) * 100.0 + (120, 100) - 0.5
+    assert np.abs(view.pixels - expected[view.ids]).max() < 0.3
+    part = find_board(np.where(np.arange(1024) < 560, picture, 180).astype(np.uint8), spec)
+    assert 6 <= len(part.ids) < 35
+    assert np.abs(part.pixels - expected[part.ids]).max() < 0.5

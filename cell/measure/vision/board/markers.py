@@ -1,10 +1,13 @@
-"""Grids of AprilTags in a picture: which tag is which is read, its corners come from the lines of its four sides.
+"""Boards of markers in a picture: ChArUco boards and grids of AprilTags. Which marker is which is read by OpenCV.
 
-A part of the grid is enough. Corners of tags are rounded by blur, their sides are not.
+The markers say where every point must be, so a part of the board is enough; one that does not lie where the others put
+it counts for nothing. A ChArUco board's points are its chessboard corners, a tag's the corners where the lines of its
+four sides meet: corners of tags are rounded by blur, their sides are not.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -12,7 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
-from cell.measure.vision.board.charuco import best_dictionary
+from cell.measure.vision.board.chess import LEAST_CORNERS, LEAST_SIGMA_PX
+from cell.measure.vision.board.corners import fit_corners
+from cell.measure.vision.board.ends import check_hidden_sides, smoothed
+from cell.measure.vision.board.lattice import PlaneMap
 from cell.measure.vision.board.view import BoardSpec, BoardView, propose_counts
 from cell.measure.vision.pictures import Image, PictureRefused, Reason
 
@@ -23,8 +29,163 @@ TOLERANCE, ROUGH = 0.15, 0.3
 PLACES = np.linspace(0.12, 0.88, 16)
 ACROSS = 0.09
 STEPS, LEVEL = 33, 6
-LEAST_SIGMA_PX = 0.01
+LEAST_SIDE_SIGMA_PX = 0.01
 SMALLEST_SIDE_PX = 12.0
+LEAST_MARKERS = 3
+# Markers that agree with one another but not with the board found, or that it does not have: a second board.
+MOST_FOREIGN = 2
+MARKER_TOLERANCE = 0.2
+# Each kind of marker with its smaller sets first: a smaller one is the likelier name for what both can read.
+DICTIONARIES = (
+    *(f"DICT_{n}X{n}_{count}" for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)),
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_16h5",
+    "DICT_APRILTAG_25h9",
+    "DICT_APRILTAG_36h10",
+    "DICT_APRILTAG_36h11",
+    "DICT_ARUCO_MIP_36h12",
+)
+
+
+def find_charuco(image: Image, spec: BoardSpec) -> BoardView:
+    """The chessboard corners of a ChArUco board in an 8-bit image (h, w). Raises PictureRefused."""
+    most = 0
+    for picture in _variants(image):
+        corners, ids = read_markers(picture, spec.dictionary)
+        most = max(most, len(ids))
+        if len(ids) < LEAST_MARKERS:
+            continue
+        layouts = (False, True) if spec.rows % 2 == 0 else (False,)
+        solved = [s for legacy in layouts if (s := _solve(spec, corners, ids, legacy)) is not None]
+        if not solved:
+            continue
+        plane, used, legacy = max(solved, key=lambda s: int(s[1].sum()))
+        if used.sum() >= LEAST_MARKERS:
+            _check_alone(spec, corners, ids, used, legacy)
+            return _view(image, spec, plane, legacy)
+    raise PictureRefused(
+        Reason.NO_BOARD,
+        f"{most} markers of {spec.name} were read, at least {LEAST_MARKERS} that fit together are needed: "
+        + _why(image, spec, most),
+    )
+
+
+def _why(image: Image, spec: BoardSpec, most: int) -> str:
+    """What else the picture shows: markers of another dictionary, or of another layout."""
+    picture = next(_variants(image))
+    if most >= LEAST_MARKERS:
+        corners, ids = read_markers(picture, spec.dictionary)
+        return (
+            f"those read have ids up to {ids.max()} and do not lie as on this board; are its columns and rows right?"
+            f"{propose_counts(spec, corners, ids)}"
+        )
+    best, name = best_dictionary(picture)
+    if best >= LEAST_MARKERS:
+        return f"there are {best} markers of {name}; name the board with :{name} at its end"
+    return "no dictionary that is known has more of them; is the board in focus, and large enough in the picture?"
+
+
+def best_dictionary(image: Image) -> tuple[int, str]:
+    """The dictionary of which most markers can be read, of equals the smallest, and how many."""
+    counts = [len(read_markers(image, name)[1]) for name in DICTIONARIES]
+    best = max(counts)
+    return best, DICTIONARIES[counts.index(best)]
+
+
+def read_markers(image: Image, name: str, border: int = 1) -> tuple[Array, NDArray[np.intp]]:
+    """Corners (n, 4, 2) in px and ids (n,) of the markers of a dictionary, whose black border is so many bits wide."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
+    if not len(corners):
+        return np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)
+    return np.array(corners, dtype=np.float64).reshape(-1, 4, 2), np.asarray(ids, dtype=np.intp).ravel()
+
+
+def _variants(image: Image) -> Iterator[Image]:
+    """The picture stretched in contrast, evened out locally, and smoothed."""
+    low, high = np.percentile(image[::4, ::4], (0.5, 97))
+    span = max(float(high - low), 8.0)
+    table = np.clip((np.arange(256) - low) * (235 / span) + 10, 0, 255).astype(np.uint8)
+    stretched = np.asarray(cv2.LUT(image, table), dtype=np.uint8)
+    yield stretched
+    yield np.asarray(cv2.GaussianBlur(stretched, (0, 0), 1.5), dtype=np.uint8)
+    yield np.asarray(cv2.createCLAHE(4.0, (8, 8)).apply(stretched), dtype=np.uint8)
+
+
+def _layout_of(spec: BoardSpec, legacy: bool) -> Array:
+    """Corners (n, 4, 2) of the markers in pitches from the first inner corner, in their reading order.
+
+    The older layout of boards with an even number of rows begins with a marker, the present one with a black square.
+    """
+    j, i = np.divmod(np.arange(spec.cols * spec.rows), spec.cols)
+    holds = (i + j) % 2 == (0 if legacy else 1)
+    middle = np.column_stack([i[holds], j[holds]]) - 0.5
+    half = 0.5 * spec.marker / spec.pitch
+    return np.asarray(middle[:, None, :] + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), dtype=np.float64)
+
+
+def _solve(
+    spec: BoardSpec, corners: Array, ids: NDArray[np.intp], legacy: bool
+) -> tuple[PlaneMap, NDArray[np.bool_], bool] | None:
+    """The map of the board that most markers agree on, and which do (n,)."""
+    layout = _layout_of(spec, legacy)
+    own = ids < len(layout)
+    if own.sum() < LEAST_MARKERS:
+        return None
+    places, pixels = layout[ids[own]].reshape(-1, 2), corners[own].reshape(-1, 2)
+    side = float(np.median(np.linalg.norm(np.diff(corners[own], axis=1), axis=2))) * spec.pitch / spec.marker
+    homography, inside = cv2.findHomography(places, pixels, cv2.RANSAC, max(2.0, MARKER_TOLERANCE * side))
+    if homography is None or len(inside) == 0:
+        return None
+    whole = inside.reshape(-1, 4).all(axis=1)
+    used = np.zeros(len(ids), dtype=np.bool_)
+    used[np.flatnonzero(own)[whole]] = True
+    if used.sum() < LEAST_MARKERS:
+        return None
+    plane = PlaneMap.fit(layout[ids[used]].reshape(-1, 2), corners[used].reshape(-1, 2), 10 * side, spec.name)
+    if (np.linalg.det(plane.steps(np.array([spec.lattice().mean(axis=0)]))) <= 0).any():
+        raise PictureRefused(Reason.MIRRORED, f"{spec.name} is seen mirrored: the picture is flipped")
+    return plane, used, legacy
+
+
+def _check_alone(spec: BoardSpec, corners: Array, ids: NDArray[np.intp], used: NDArray[np.bool_], legacy: bool) -> None:
+    """Refuse two boards of these markers in view, and a board with more markers than the named one has."""
+    foreign = int((ids >= spec.cols * spec.rows // 2).sum())
+    if foreign >= MOST_FOREIGN:
+        raise PictureRefused(
+            Reason.NO_BOARD,
+            f"{foreign} markers in the picture are none of {spec.name}, which has {spec.cols * spec.rows // 2}: is it "
+            f"the board that the set-up names?{propose_counts(spec, corners, ids)}",
+        )
+    if (~used).sum() >= LEAST_MARKERS and _solve(spec, corners[~used], ids[~used], legacy) is not None:
+        raise PictureRefused(
+            Reason.AMBIGUOUS, f"two boards that could be {spec.name} are in view; cover or remove one of them"
+        )
+
+
+def _view(image: Image, spec: BoardSpec, plane: PlaneMap, legacy: bool) -> BoardView:
+    lattice = spec.lattice()
+    flat = lattice.astype(np.float64)
+    dark = np.asarray((lattice.sum(axis=1) % 2 == 0) != legacy, dtype=np.bool_)
+    # Up to the markers inside the white squares.
+    share = 0.62 * (1 - spec.marker / spec.pitch)
+    steps = plane.steps(flat)
+    measured, sigma, _ = fit_corners(image, plane.pixels(flat), steps, dark, share)
+    good = np.isfinite(sigma)
+    if good.sum() >= LEAST_CORNERS:
+        # Once more from the corners found: the markers bend a little less than the lens does.
+        better = PlaneMap.fit(flat[good], measured[good], 3.0, spec.name)
+        measured, sigma, _ = fit_corners(image, better.pixels(flat), better.steps(flat), dark, share)
+        good = np.isfinite(sigma)
+    if good.sum() < LEAST_CORNERS or np.linalg.matrix_rank(flat[good] - flat[good].mean(axis=0)) < 2:
+        raise PictureRefused(
+            Reason.NO_BOARD, f"{good.sum()} corners of {spec.name} could be measured; show more of it, in focus"
+        )
+    ids = np.flatnonzero(good)
+    check_hidden_sides(smoothed(image), spec, plane, ids, 1.3)
+    return BoardView(spec, (image.shape[1], image.shape[0]), ids, measured[ids], np.hypot(sigma[ids], LEAST_SIGMA_PX))
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,14 +252,7 @@ def _single(image: Image, spec: BoardSpec, corners: Array) -> BoardView:
 
 def _read(image: Image, spec: BoardSpec) -> tuple[Array, NDArray[np.intp]]:
     """Corners (n, 4, 2) in px and ids (n,) of the tags, with a black border of one bit or of two."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
-    best: tuple[Array, NDArray[np.intp]] = np.zeros((0, 4, 2)), np.zeros(0, dtype=np.intp)
-    for border in (1, 2):
-        parameters = cv2.aruco.DetectorParameters()
-        parameters.markerBorderBits = border
-        found, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
-        if len(found) > len(best[1]):
-            best = np.array(found, dtype=np.float64).reshape(-1, 4, 2), np.asarray(ids, dtype=np.intp).ravel()
+    best = max((read_markers(image, spec.dictionary, border) for border in (1, 2)), key=lambda found: len(found[1]))
     own = np.full(len(best[1]), spec.single) | (best[1] < spec.cols * spec.rows)
     if (~own).sum() >= 2:
         raise PictureRefused(
@@ -199,5 +353,5 @@ def _meetings(
     # At its end a line through n places is known to 2/√n of their spread.
     error = 2 / np.sqrt(len(PLACES)) * np.sqrt(0.5 * (spread**2 + np.roll(spread, 1, axis=1) ** 2))
     moved = np.linalg.norm(corners - begin, axis=-1)
-    sigma = np.where(moved < 0.1 * length + 2, np.hypot(error, LEAST_SIGMA_PX), np.nan)
+    sigma = np.where(moved < 0.1 * length + 2, np.hypot(error, LEAST_SIDE_SIGMA_PX), np.nan)
     return corners.reshape(-1, 2), np.asarray(sigma, dtype=np.float64).ravel()

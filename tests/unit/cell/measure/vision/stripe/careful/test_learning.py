@@ -1,11 +1,23 @@
-"""Promises of `lab.bench.stripe.profiles`."""
+"""The profile that lines share is learned from a picture, and comes near its own bound."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
+from cell.measure.vision.stripe.extract import StripeStream
 from lab.bench.stripe.profiles import measure, within_limits
-from lab.bench.stripe.workshop import Scene
+from lab.bench.stripe.workshop import Scene, draw
+
+
+def test_in_a_stream_the_profile_of_a_block_is_that_of_its_first_picture():
+    pictures = [draw(Scene("flat top", 2.0), seed) for seed in range(3)]
+    stream = StripeStream()
+    profiles = [stream.extract(image) for image, _ in pictures]
+    assert profiles[0].learned is not None
+    assert profiles[1].learned is profiles[2].learned is profiles[0].learned
+    for profile, (_, centres) in zip(profiles, pictures, strict=True):
+        assert np.sqrt(np.mean((profile.centres - centres) ** 2)) < 0.021
 
 
 @pytest.mark.parametrize(

@@ -1,19 +1,13 @@
 """How strong and how coarse the laser's speckle is, measured in the picture itself.
 
-Residuals of fitted lines are compared with what the fit leaves of photon noise and of speckle of contrast 1, for its
-grain: the fit swallows much of a coarse speckle, and that share is computed, not guessed. The grain is seen across the
-lines, where nothing is swallowed: round grains correlate a line with the next as they correlate a pixel with the next.
-Without speckle in the weights centres scatter 1.6 to 2 times as far, and a stated σ is 3 to 4 times too small
-(docs/explanation/theory.md, section 5).
-
-How strong the speckle is in lines that were fitted with a profile of any shape.
-
-As `speckle.py` does for a Gaussian: what the fit leaves of speckle is computed, not guessed, for it swallows most of
-what is coarse. The texture of a surface that the laser lights shows in the same way and counts as speckle."""
+Residuals of fitted lines are compared with what the fit leaves of photon noise and of speckle of contrast 1: the fit
+swallows much of a coarse speckle, and that share is computed, not guessed. The grain is seen across the lines, where
+nothing is swallowed: round grains correlate a line with the next as they correlate a pixel with the next. Without
+speckle in the weights a stated σ is 3 to 4 times too small (docs/explanation/theory.md, section 5).
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 from math import exp, log, sqrt
 from typing import NamedTuple
@@ -22,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.base.compiled import compiled
-from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Shape
 from cell.measure.vision.stripe.ordinary.find import CORE, ENERGY, Array, Floats, Image, Shade, Whole
-from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, FIT_CENTRE, LEVEL, SLOPE, WIDTH, WIDTH_PRIOR
-from cell.measure.vision.stripe.ordinary.lanes import LAGS
+from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, FIT_CENTRE, LAGS, LEVEL, SLOPE, WIDTH, WIDTH_PRIOR
 
 # Correlation of two pixels at distance r is exp(−r²/4 grain²); a lens at f/4 to f/8 with pixels of 5 µm gives .3 to 1.
 GRAINS = np.array([0.3, 0.45, 0.6, 0.75, 0.9, 1.1, 1.3])
@@ -230,56 +222,3 @@ def measure_speckle(
 def correlation(grain: float) -> Floats:
     """Correlations (LAGS,) of speckle at lags 1, 2, … px."""
     return np.exp(-(np.arange(1, LAGS + 1) ** 2) / (4 * grain**2)).astype(np.float32)
-
-
-ALIKE = 0.35
-"""Lines whose amplitude differs from the typical one by no more than this share are compared with it."""
-LEAST_LINES, KEPT = 12, 0.95
-SHAPED_SIGNIFICANT = 3.0
-SCALE_PRIOR = 0.15
-SHAPED_PHASES = (-0.375, -0.125, 0.125, 0.375)
-
-
-def speckled(fitted: Fitted, clear: NDArray[np.bool_], noise: Noise, shape: Shape) -> Noise:
-    """The noise with the contrast that the residuals of the `clear` lines (m,) show under the stripe, at most 1."""
-    if not clear.any():
-        return noise
-    typical = float(np.median(fitted.amplitude[clear]))
-    whole = np.isfinite(fitted.variance).mean(axis=1) > 0.9
-    alike = clear & whole & (np.abs(fitted.amplitude - typical) < ALIKE * typical)
-    if alike.sum() < LEAST_LINES:
-        return replace(noise, contrast=0.0)
-    usable = np.isfinite(fitted.variance[alike])
-    height = fitted.amplitude[alike, None]
-    profile = np.where(usable, fitted.stripe[alike] / height, 0.0)
-    power = np.sum(profile**2 * (np.where(usable, fitted.residual[alike], 0.0) / height) ** 2, axis=1)
-    power = power[power <= np.quantile(power, KEPT)]
-    level = float(np.median(fitted.level[alike]))
-    photons, speckle = _left(shape, typical, level, noise)
-    excess = float(power.mean()) - photons * KEPT
-    if excess < SHAPED_SIGNIFICANT * float(power.std()) / np.sqrt(len(power)):
-        return replace(noise, contrast=0.0)
-    return replace(noise, contrast=float(np.sqrt(min(excess / speckle, 1.0))))
-
-
-def _left(shape: Shape, amplitude: float, level: float, noise: Noise) -> tuple[float, float]:
-    """What the fit leaves of the noise without speckle and of speckle of contrast 1, as `speckled` sums it."""
-    half = int(np.ceil(shape.reach)) + 1
-    photons, speckle = 0.0, 0.0
-    for phase in SHAPED_PHASES:
-        x: Array = np.arange(-half, half + 1.0) - np.float64(phase)
-        profile, slope = shape.at(x)
-        variance = noise.floor + noise.gain * np.maximum(amplitude * profile + level, 0.0)
-        weight = 1 / (variance + (noise.contrast * amplitude * profile) ** 2)
-        jacobian = np.stack(
-            [amplitude * slope, profile, amplitude * slope * x, np.ones_like(x), x / half], axis=1
-        )  # fmt: skip
-        normal = jacobian.T @ (weight[:, None] * jacobian)
-        normal[2, 2] += SCALE_PRIOR**-2
-        kept = np.eye(len(x)) - jacobian @ np.linalg.solve(normal, (weight[:, None] * jacobian).T)
-        rows = kept * profile[:, None] / amplitude
-        photons += float(np.sum(rows**2 * variance)) / len(SHAPED_PHASES)
-        pulled = rows * (amplitude * profile)
-        grain = np.exp(-((x[:, None] - x) ** 2) / (4 * ASSUMED_GRAIN**2))
-        speckle += float(np.sum((pulled @ grain) * pulled)) / len(SHAPED_PHASES)
-    return photons, speckle

@@ -1,0 +1,44 @@
+"""A surface that creeps between two sweeps: its cloud is put back, its place carried on with what is not known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from cell.measure.geometry.poses import difference
+from cell.measure.inversion.effects.between_sweeps import Creep
+from lab.bench.job.whole_job import JobRecord
+
+
+def test_what_is_not_known_of_a_rate_grows_with_the_time(placed_pot: JobRecord) -> None:
+    made = placed_pot.results
+    pose, cloud, times = made["invert_pose"], made["reconstruct"].cloud, made["laser_sweep"].times
+    unsure = np.diag([1e-6**2, 0.0, 0.0, 0.0, 0.0, 2e-6**2])
+    creep = Creep(np.array([3e-6, 0, 0, 0, 0, 0]), unsure, pose.base_from_surface.translation, times[0] + 1.0)
+    later = creep.carried(pose, times[0] + 4.0)
+    np.testing.assert_allclose(later.covariance - pose.covariance, 9.0 * unsure, atol=1e-16)
+    np.testing.assert_allclose(later.systematic - pose.systematic, 9.0 * unsure, atol=1e-16)
+    np.testing.assert_allclose(
+        difference(later.base_from_surface, pose.base_from_surface), 3.0 * creep.rate, atol=1e-12
+    )
+    lines, rows = (each[::997] for each in np.nonzero(cloud.valid))
+    moved = creep.motions(cloud, lines, rows, times)
+    arms, seconds = cloud.points[lines, rows] - creep.origin, (times[lines] - creep.since)[:, None]
+    turned = np.cross([0.0, 0.0, 2e-6], arms)
+    expected = np.einsum("ni,nj->nij", seconds * [1e-6, 0, 0], seconds * [1e-6, 0, 0])
+    expected += np.einsum("ni,nj->nij", seconds * turned, seconds * turned)
+    np.testing.assert_allclose(np.einsum("nim,njm->nij", moved, moved), expected, atol=1e-18)
+
+
+def test_a_cloud_that_crept_is_put_back_to_where_it_was_in_the_middle_of_the_sweep(placed_pot: JobRecord) -> None:
+    cloud, times = placed_pot.results["reconstruct"].cloud, placed_pot.results["laser_sweep"].times
+    origin, since = cloud.points[cloud.valid].mean(axis=0), float(times.mean())
+    creep = Creep(np.array([3e-4, -2e-4, 1e-4, 0.0, 0.0, 2e-3]), np.zeros((6, 6)), origin, since)
+    seconds = (times - since)[:, None, None]
+    arms = cloud.points - origin
+    turned = 2e-3 * np.stack([-arms[..., 1], arms[..., 0], np.zeros(arms.shape[:2])], axis=-1)
+    crept = replace(cloud, points=cloud.points + seconds * (np.array([3e-4, -2e-4, 1e-4]) + turned))
+    # What is left is of second order: the arms are those of points that crept.
+    left = (creep.undone(crept, times).points - cloud.points)[cloud.valid]
+    assert np.abs(left).max() < 1e-6 < np.abs((crept.points - cloud.points)[cloud.valid]).max()

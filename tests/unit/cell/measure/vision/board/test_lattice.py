@@ -1,0 +1,34 @@
+"""Which dot of a board is which: by its rings also in part, and of a symmetric board by an assumption."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from cell.measure.vision import PictureRefused, Reason, find_board, parse_board
+from tests.support.board_pictures import FINE, LARGE, SCAN, TARGET, photograph, placed, true_pixels
+
+
+def test_a_part_of_a_marked_board_is_enough():
+    pose = placed(FINE, 0.130, 15, shift=(0.008, 0.006))
+    view = find_board(photograph(SCAN, FINE, pose), parse_board(FINE))
+    assert 60 < len(view.ids) < 99
+    assert np.abs(view.pixels - true_pixels(SCAN, pose, view)).max() < 0.1
+
+
+def test_symmetric_dots_say_that_their_order_is_assumed():
+    text = "dots:6x6:34mm"
+    pose = placed(text, 1.0, 40)
+    view = find_board(photograph(TARGET, text, pose), parse_board(text))
+    assert view.order_assumed
+    true = [true_pixels(TARGET, pose, turn) for turn in view.turns()]
+    assert len(true) == 4
+    assert min(np.abs(view.pixels - t).max() for t in true) < 0.1
+
+
+def test_a_board_without_its_rings_is_refused():
+    picture = photograph(TARGET, LARGE, placed(LARGE, 1.0, 30))
+    half = np.where(np.arange(1280) < 640, picture, 90).astype(np.uint8)
+    with pytest.raises(PictureRefused) as refused:
+        find_board(half, parse_board(LARGE))
+    assert refused.value.reason in (Reason.AMBIGUOUS, Reason.NO_BOARD)
