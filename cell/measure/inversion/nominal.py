@@ -76,17 +76,9 @@ class Walk:
 
 @compiled
 def closest(
-    points: Array,
-    within: float,
-    low: Array,
-    cell: float,
-    owner: NDArray[np.int32],
-    corners: Array,
-    normals: Array,
-    corner_of: NDArray[np.int64],
-    start: NDArray[np.int32],
-    fan: NDArray[np.int32],
-) -> tuple[Indices, Indices, Array, Array, Array, NDArray[np.bool_]]:
+    points: Array, within: float, low: Array, cell: float, owner: NDArray[np.int32], corners: Array, normals: Array,
+    corner_of: NDArray[np.int64], start: NDArray[np.int32], fan: NDArray[np.int32],
+) -> tuple[Indices, Indices, Array, Array, Array, NDArray[np.bool_]]:  # fmt: skip
     """Of the points (n, 3) those within `within` m of the mesh (corners (m, 3, 3), unit normals (m, 3)).
 
     Their indices, the triangles on which their closest points lie, those points and the normals there, how far the
@@ -260,17 +252,9 @@ class NominalSurface:
         p = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
         grid, walk = self.grid, self._walk
         chosen, hit, feet, normals, heights, inner = closest(
-            p,
-            float(within),
-            grid.low,
-            cell=grid.cell,
-            owner=grid.owner,
-            corners=self._corners,
-            normals=self.normals,
-            corner_of=walk.corner_of,
-            start=walk.start,
-            fan=walk.fan,
-        )
+            p, float(within), grid.low, cell=grid.cell, owner=grid.owner, corners=self._corners, normals=self.normals,
+            corner_of=walk.corner_of, start=walk.start, fan=walk.fan,
+        )  # fmt: skip
         if self._border is not None:
             doubtful = np.flatnonzero(self._maybe_rim[hit])
             inner[doubtful] &= self._border.query(feet[doubtful], distance_upper_bound=self._rim)[0] > self._rim

@@ -164,18 +164,10 @@ Resolve = Callable[[NDArray[np.intp], NDArray[np.intp]], Array]
 
 
 def invert_pose(
-    cloud: Cloud,
-    nominal: NominalSurface,
-    prior: Prior,
-    tolerance: Tolerance,
-    *,
-    systematic: Array | None = None,
-    calibration: Resolve | None = None,
-    sweeps: Resolve | None = None,
-    start: pin.SE3 | None = None,
-    demands: Demands | None = None,
-    most_points: int = 10_000,
-) -> PlacePose:
+    cloud: Cloud, nominal: NominalSurface, prior: Prior, tolerance: Tolerance, *, systematic: Array | None = None,
+    calibration: Resolve | None = None, sweeps: Resolve | None = None, start: pin.SE3 | None = None,
+    demands: Demands | None = None, most_points: int = 10_000,
+) -> PlacePose:  # fmt: skip
     """The pose of the nominal surface in the arm base, from a cloud in the arm base and the board's pose as prior.
 
     `systematic` (6×6, base axes) is an uncertainty of the pose that all points share, such as the arm's; `calibration`

@@ -344,17 +344,10 @@ def _result(
     total = np.linalg.inv(information + prior.information())
     over = correspondences(pose, scan, nominal, 0.003)
     found = Registration(
-        base_from_surface=pose,
-        scan_information=information,
-        covariance=np.asarray(total, dtype=np.float64),
-        follow=-total @ weighted.T,
-        used=rows.index[keep],
-        heights=rows.heights[keep],
-        normals=rows.normals[keep],
-        arms=rows.arms[keep],
-        sigmas=sigmas[keep],
-        share=len(keep) / max(1, len(over.index)),
-    )
+        base_from_surface=pose, scan_information=information, covariance=np.asarray(total, dtype=np.float64),
+        follow=-total @ weighted.T, used=rows.index[keep], heights=rows.heights[keep], normals=rows.normals[keep],
+        arms=rows.arms[keep], sigmas=sigmas[keep], share=len(keep) / max(1, len(over.index)),
+    )  # fmt: skip
     lines = by_lines(found.follow, scan, found)
     return replace(found, covariance=found.covariance + lines @ lines.T)
 

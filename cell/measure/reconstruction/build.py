@@ -135,15 +135,10 @@ class ProfileBuilder:
         rejected = find_outliers(points @ view, np.abs(spread @ view.astype(np.float32)))
         points[rejected] = np.nan
         return Cloud(
-            points=points,
-            stripe_spread=spread,
-            rail_spread=np.asarray(line_spread, dtype=np.float64),
-            centres=self._centres[which].copy(),
-            rail=np.asarray(rail, dtype=np.float64),
-            rejected=rejected,
-            flanges=np.array(flanges),
-            sweeps=np.zeros(len(lines), dtype=np.intp),
-        )
+            points=points, stripe_spread=spread, rail_spread=np.asarray(line_spread, dtype=np.float64),
+            centres=self._centres[which].copy(), rail=np.asarray(rail, dtype=np.float64), rejected=rejected,
+            flanges=np.array(flanges), sweeps=np.zeros(len(lines), dtype=np.intp),
+        )  # fmt: skip
 
     def _grow(self) -> None:
         """Double the room for lines."""
@@ -155,13 +150,9 @@ class ProfileBuilder:
 
 
 def calibration_motions(
-    cloud: Cloud,
-    lines: NDArray[np.intp],
-    rows: NDArray[np.intp],
-    base_from_flange: pin.SE3 | None,
-    geometry: ScanGeometry,
-    variants: Sequence[ScanGeometry],
-) -> Array:
+    cloud: Cloud, lines: NDArray[np.intp], rows: NDArray[np.intp], base_from_flange: pin.SE3 | None,
+    geometry: ScanGeometry, variants: Sequence[ScanGeometry],
+) -> Array:  # fmt: skip
     """(n, 3, m) displacements in m, base axes, of the n points at (lines, rows) under each of m other geometries.
 
     The flange stood at `base_from_flange`, or with None where the cloud itself says for each line. With variants along

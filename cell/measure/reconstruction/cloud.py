@@ -261,15 +261,11 @@ def _seam(
     apart = motions(lines_b[good], rows_b[good]) - motions(lines_a[first], rows_a[first])
     along = np.einsum("ni,nim->nm", normals, apart)
     return Seam(
-        first=pair[0],
-        second=pair[1],
-        points=len(heights),
-        mean=float(heights.mean()),
-        rms=float(np.sqrt(np.mean(heights**2))),
-        p95=float(np.percentile(np.abs(heights), 95)),
+        first=pair[0], second=pair[1], points=len(heights), mean=float(heights.mean()),
+        rms=float(np.sqrt(np.mean(heights**2))), p95=float(np.percentile(np.abs(heights), 95)),
         expected_mean=float(np.sqrt(np.sum(along.mean(axis=0) ** 2) + noise.mean() / len(noise))),
         expected_rms=float(np.sqrt(np.mean(noise + np.sum(along**2, axis=1)))),
-    )
+    )  # fmt: skip
 
 
 def _around(cloud: Cloud, sweep: slice, lines: Indices, rows: Indices) -> tuple[tuple[Indices, Indices], Mask]:

@@ -63,16 +63,9 @@ def _pass(values: Array, kept: Array, noise: Array, level: float, settled: Mask)
     middle = len(values) // 2
     with ThreadPoolExecutor(1, "outliers") as pool:
         other = pool.submit(
-            _judge,
-            values,
-            kept,
-            noise,
-            level=level,
-            first=middle,
-            last=len(values),
-            supported=supported,
+            _judge, values, kept, noise, level=level, first=middle, last=len(values), supported=supported,
             outliers=outliers,
-        )
+        )  # fmt: skip
         _judge(values, kept, noise, level=level, first=0, last=middle, supported=supported, outliers=outliers)
         other.result()
     return outliers, supported

@@ -25,15 +25,9 @@ _KINDS = {
 
 
 def write_ply(
-    path: Path,
-    points: ArrayLike,
-    *,
-    normals: ArrayLike | None = None,
-    quality: ArrayLike | None = None,
-    colours: ArrayLike | None = None,
-    scalars: Mapping[str, NDArray[np.generic]] | None = None,
-    comment: str = "",
-) -> int:
+    path: Path, points: ArrayLike, *, normals: ArrayLike | None = None, quality: ArrayLike | None = None,
+    colours: ArrayLike | None = None, scalars: Mapping[str, NDArray[np.generic]] | None = None, comment: str = "",
+) -> int:  # fmt: skip
     """Write the finite points (…, 3), in m; their number. Rows with NaN are left out.
 
     Optional, one per point: unit `normals` (…, 3), a scalar `quality` (such as the deviation in m), `colours` (…, 3)

@@ -37,25 +37,17 @@ class Condition:
 
 
 CONDITIONS = (
-    Condition("even light"),
-    Condition("tilt 0-15 deg", tilt=(0, 15)),
-    Condition("tilt 15-35 deg", tilt=(15, 35)),
-    Condition("tilt 35-50 deg", tilt=(35, 50)),
-    Condition("light falls off 4:1", changes={"gradient": 4.0}),
+    Condition("even light"), Condition("tilt 0-15 deg", tilt=(0, 15)), Condition("tilt 15-35 deg", tilt=(15, 35)),
+    Condition("tilt 35-50 deg", tilt=(35, 50)), Condition("light falls off 4:1", changes={"gradient": 4.0}),
     Condition("edge of a shadow 4:1", changes={"shadow": 4.0}),
     Condition("contrast of 20 DN", changes={"contrast": 20.0}),
     Condition("dark, white at 25 DN", changes={"exposure": 30.0}),
     Condition("glare saturates a spot", changes={"glare": 600.0}),
-    Condition("white saturates", changes={"exposure": 400.0}),
-    Condition("defocus sigma 1.5 px", changes={"blur": 1.5}),
-    Condition("defocus sigma 3 px", changes={"blur": 3.0}),
-    Condition("motion 5 px", changes={"motion": 5.0}),
-    Condition("noise sigma 8 DN", changes={"noise": 8.0}),
-    Condition("hidden 10-20 %", changes={"hidden": 0.15}),
-    Condition("hidden 20-30 %", changes={"hidden": 0.25}),
-    Condition("a cable across", changes={"cable": 1.0}),
-    Condition("laser line across", changes={"laser": 1.0}),
-    Condition("cluttered background", changes={"clutter": 1.0}),
+    Condition("white saturates", changes={"exposure": 400.0}), Condition("defocus sigma 1.5 px", changes={"blur": 1.5}),
+    Condition("defocus sigma 3 px", changes={"blur": 3.0}), Condition("motion 5 px", changes={"motion": 5.0}),
+    Condition("noise sigma 8 DN", changes={"noise": 8.0}), Condition("hidden 10-20 %", changes={"hidden": 0.15}),
+    Condition("hidden 20-30 %", changes={"hidden": 0.25}), Condition("a cable across", changes={"cable": 1.0}),
+    Condition("laser line across", changes={"laser": 1.0}), Condition("cluttered background", changes={"clutter": 1.0}),
     Condition("another board beside", changes={"other": 1.0}),
     Condition("all of it a little", changes={"gradient": 2.5, "blur": 1.2, "noise": 3.0, "clutter": 1.0, "laser": 1.0}),
     Condition("two of the same board", "refused", changes={"twin": 1.0}),
@@ -66,7 +58,7 @@ CONDITIONS = (
     Condition("another kind instead", "refused", changes={"instead": 1.0}),
     Condition("clutter, no board", "refused", changes={"clutter": 1.0, "none": 1.0}),
     Condition("nothing but noise", "refused", changes={"none": 1.0, "noise": 30.0}),
-)
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,13 +123,9 @@ def draw_view(condition: Condition, kind: Kind, rng: np.random.Generator) -> Vie
     if "resized" in has:
         grow = int(has["resized"])
         shown = BoardSpec(
-            kind,
-            spec.cols + 2 * grow * int(rng.integers(0, 2)),
-            spec.rows + 2 * grow,
-            PITCH,
-            spec.marker,
+            kind, spec.cols + 2 * grow * int(rng.integers(0, 2)), spec.rows + 2 * grow, PITCH, spec.marker,
             spec.dictionary,
-        )
+        )  # fmt: skip
     if "instead" in has:
         others: list[Kind] = ["marked_dots", "asymmetric_dots", "dots", "chessboard", "charuco"]
         others.remove(kind)

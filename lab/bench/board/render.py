@@ -206,15 +206,9 @@ def _seen(
 
 @compiled
 def _paint(
-    image: NDArray[np.float32],
-    ray_x: Array,
-    ray_y: Array,
-    inverse: Scalars,
-    window: Whole,
-    shape: Whole,
-    size: Scalars,
-    markers: NDArray[np.uint8],
-) -> None:  # pragma: no cover
+    image: NDArray[np.float32], ray_x: Array, ray_y: Array, inverse: Scalars, window: Whole, shape: Whole,
+    size: Scalars, markers: NDArray[np.uint8],
+) -> None:  # pragma: no cover  # fmt: skip
     height, width = image.shape
     first, count = window[0], window[2] - window[0]
     # What is seen at the middles of the pixels, of their sides and at their corners: in rows half a pixel apart.

@@ -200,13 +200,10 @@ class _Beside:
         feet = found.arms - found.heights[:, None] * found.normals
         moved = by_poses(lines[found.index], rows[found.index])
         return cls(
-            feet @ pose.rotation,
-            found.heights,
-            -found.jacobian,
-            by_poses=np.einsum("ni,nim->nm", found.normals, moved),
-            lines=scan.lines[found.index],
+            feet @ pose.rotation, found.heights, -found.jacobian,
+            by_poses=np.einsum("ni,nim->nm", found.normals, moved), lines=scan.lines[found.index],
             share=len(found.index) / max(1, len(lines)),
-        )
+        )  # fmt: skip
 
 
 CREEP_EVIDENCE = 32.0

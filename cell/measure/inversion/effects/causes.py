@@ -169,23 +169,14 @@ class _Cells:
         ray = np.einsum("ni,ni->n", scan.stripe_spread[found.index], normals)
         ray = ray / np.maximum(np.linalg.norm(scan.stripe_spread[found.index], axis=1), 1e-12)
         return cls(
-            heights=raw - free @ (free.T @ raw),
-            raw=raw,
-            poses=poses,
-            free=free,
-            lines=np.round(at[:, 0]),
-            times=at[:, 1] - at[:, 1].mean(),
-            rows=2.0 * at[:, 2] / cloud.shape[1] - 1.0,
-            places=mean((points - pose.translation) @ pose.rotation),
-            sides=across(nominal)[1],
-            scatter=np.array(scatter),
-            normals=mean(normals),
+            heights=raw - free @ (free.T @ raw), raw=raw, poses=poses, free=free, lines=np.round(at[:, 0]),
+            times=at[:, 1] - at[:, 1].mean(), rows=2.0 * at[:, 2] / cloud.shape[1] - 1.0,
+            places=mean((points - pose.translation) @ pose.rotation), sides=across(nominal)[1],
+            scatter=np.array(scatter), normals=mean(normals),
             turns=mean(np.cross(points - base_from_vehicle.translation, normals)),
-            along=mean(np.einsum("ni,ni->n", _ahead(cloud)[line], normals))[:, 0],
-            ray=mean(ray)[:, 0],
-            pitch=_pitch(cloud),
-            rate=1.0 / max(1e-6, float(np.median(np.abs(np.diff(times))))),
-        )
+            along=mean(np.einsum("ni,ni->n", _ahead(cloud)[line], normals))[:, 0], ray=mean(ray)[:, 0],
+            pitch=_pitch(cloud), rate=1.0 / max(1e-6, float(np.median(np.abs(np.diff(times))))),
+        )  # fmt: skip
 
     @property
     def mean_square(self) -> float:

@@ -145,14 +145,9 @@ class _Sweep:
 
 
 def rocking_motions(
-    cloud: Cloud,
-    lines: NDArray[np.intp],
-    rows: NDArray[np.intp],
-    base_from_vehicle: pin.SE3,
-    times: Array,
-    hz: float,
+    cloud: Cloud, lines: NDArray[np.intp], rows: NDArray[np.intp], base_from_vehicle: pin.SE3, times: Array, hz: float,
     size: float = EXPECTED_RAD,
-) -> Array:
+) -> Array:  # fmt: skip
     """(n, 3, 4 s) displacements in m, base axes, of the points at (lines, rows) by the sine and the cosine of roll and
     pitch, each of `size` rad, in each of s sweeps."""
     arms = cloud.points[lines, rows] - base_from_vehicle.translation

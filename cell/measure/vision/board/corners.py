@@ -40,29 +40,18 @@ def fit_corners(
     sigma = np.empty(len(starts))
     contrast = np.empty(len(starts))
     _fit(
-        np.ascontiguousarray(image),
-        np.ascontiguousarray(starts, dtype=np.float64),
-        np.ascontiguousarray(steps, dtype=np.float64),
-        dark_first=np.ascontiguousarray(dark_first),
-        share=share,
-        places=places,
-        sigma=sigma,
-        contrast=contrast,
-    )
+        np.ascontiguousarray(image), np.ascontiguousarray(starts, dtype=np.float64),
+        np.ascontiguousarray(steps, dtype=np.float64), dark_first=np.ascontiguousarray(dark_first), share=share,
+        places=places, sigma=sigma, contrast=contrast,
+    )  # fmt: skip
     return places, sigma, contrast
 
 
 @compiled
 def _fit(
-    image: Image,
-    starts: Array,
-    steps: Array,
-    dark_first: NDArray[np.bool_],
-    share: float,
-    places: Array,
-    sigma: Array,
+    image: Image, starts: Array, steps: Array, dark_first: NDArray[np.bool_], share: float, places: Array, sigma: Array,
     contrast: Array,
-) -> None:  # pragma: no cover
+) -> None:  # pragma: no cover  # fmt: skip
     for n in range(len(starts)):
         first = math.hypot(steps[n, 0, 0], steps[n, 1, 0])
         second = math.hypot(steps[n, 0, 1], steps[n, 1, 1])
@@ -73,32 +62,16 @@ def _fit(
         angle_1 = math.atan2(steps[n, 1, 0], steps[n, 0, 0])
         angle_2 = math.atan2(steps[n, 1, 1], steps[n, 0, 1])
         _one(
-            image,
-            starts[n],
-            reach,
-            angle_1=angle_1,
-            angle_2=angle_2,
-            dark=dark_first[n],
-            n=n,
-            places=places,
-            sigma=sigma,
-            contrast=contrast,
-        )
+            image, starts[n], reach, angle_1=angle_1, angle_2=angle_2, dark=dark_first[n], n=n, places=places,
+            sigma=sigma, contrast=contrast,
+        )  # fmt: skip
 
 
 @compiled
 def _one(
-    image: Image,
-    start: Array,
-    reach: float,
-    angle_1: float,
-    angle_2: float,
-    dark: bool,
-    n: int,
-    places: Array,
-    sigma: Array,
-    contrast: Array,
-) -> None:  # pragma: no cover
+    image: Image, start: Array, reach: float, angle_1: float, angle_2: float, dark: bool, n: int, places: Array,
+    sigma: Array, contrast: Array,
+) -> None:  # pragma: no cover  # fmt: skip
     height, width = image.shape
     u0, v0 = int(start[0] + 0.5), int(start[1] + 0.5)
     half = int(reach) + 1

@@ -39,14 +39,9 @@ TRUSTED_SHARE = 0.98
 
 
 def extract(
-    image: Taken,
-    dark: Dark | None = None,
-    axis: Axis = "rows",
-    settings: StripeSettings | None = None,
-    *,
-    like: StripeProfile | None = None,
-    laser: LaserChannel | str = LaserChannel.AUTO,
-) -> StripeProfile:
+    image: Taken, dark: Dark | None = None, axis: Axis = "rows", settings: StripeSettings | None = None, *,
+    like: StripeProfile | None = None, laser: LaserChannel | str = LaserChannel.AUTO,
+) -> StripeProfile:  # fmt: skip
     """Stripe centres of an image (h, w), (h, w, 3) or (h, w, 4), one per row (or per column with axis "columns").
 
     8 or 16 bits, 10 to 14 of them at either end; colours red first; alpha is left out. `laser` names the channel to

@@ -383,15 +383,8 @@ def find_lines(
         for j in range(size):
             if notes[_OPEN, j]:
                 found_two = find_line(
-                    image,
-                    seen,
-                    dark,
-                    r=first + j,
-                    saturation=saturation,
-                    least_peak=least_peak,
-                    window=line,
-                    rises=rises,
-                    start=start,
-                )
+                    image, seen, dark, r=first + j, saturation=saturation, least_peak=least_peak, window=line,
+                    rises=rises, start=start,
+                )  # fmt: skip
                 several = several or found_two
     return several

@@ -90,15 +90,9 @@ _QUAD = (
 
 
 def scanned(
-    height: Height,
-    seed: int,
-    *,
-    true: pin.SE3 = TRUE,
-    missing: float = 0.0,
-    outliers: float = 0.01,
-    sigma: float = SIGMA,
-    shift: tuple[float, float] = (0.0015, -0.001),
-) -> Cloud:
+    height: Height, seed: int, *, true: pin.SE3 = TRUE, missing: float = 0.0, outliers: float = 0.01,
+    sigma: float = SIGMA, shift: tuple[float, float] = (0.0015, -0.001),
+) -> Cloud:  # fmt: skip
     """A cloud as a sweep gives it: the surface, the flat table around it, stripe and rail noise, outliers, gaps."""
     rng = np.random.default_rng(seed)
     lines, rows = 160, 240
@@ -117,13 +111,10 @@ def scanned(
         points[slant > np.quantile(slant, 1 - missing)] = np.nan
     spread = np.broadcast_to(across @ true.rotation.T, points.shape).astype(np.float32)
     return Cloud(
-        points=points @ true.rotation.T + true.translation,
-        stripe_spread=spread,
-        rail_spread=np.tile(true.rotation[:, 0] * RAIL_SIGMA, (lines, 1)),
-        centres=np.zeros((lines, rows)),
-        rail=np.linspace(0, 0.07, lines),
-        rejected=np.zeros((lines, rows), dtype=bool),
-    )
+        points=points @ true.rotation.T + true.translation, stripe_spread=spread,
+        rail_spread=np.tile(true.rotation[:, 0] * RAIL_SIGMA, (lines, 1)), centres=np.zeros((lines, rows)),
+        rail=np.linspace(0, 0.07, lines), rejected=np.zeros((lines, rows), dtype=bool),
+    )  # fmt: skip
 
 
 def start_away(rng: np.random.Generator, metres: float, degrees: float) -> pin.SE3:
@@ -249,13 +240,9 @@ def test_the_calibrations_part_is_what_a_disturbed_calibration_does() -> None:
     seen = np.zeros((6, 6))
     for k in range(2):
         other = Cloud(
-            cloud.points + moved[:, :, :, k],
-            cloud.stripe_spread,
-            cloud.rail_spread,
-            cloud.centres,
-            cloud.rail,
+            cloud.points + moved[:, :, :, k], cloud.stripe_spread, cloud.rail_spread, cloud.centres, cloud.rail,
             cloud.rejected,
-        )
+        )  # fmt: skip
         step = difference(inverted(freeform, other, prior).base_from_surface, plain.base_from_surface)
         seen += np.outer(step, step)
     unit = np.sqrt(np.maximum(np.diag(seen), 1e-14))
