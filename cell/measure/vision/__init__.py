@@ -25,45 +25,22 @@ if TYPE_CHECKING:
     from cell.measure.vision.stripe.planes import read_colours
 
 __all__ = [
-    "BoardPose",
-    "BoardSpec",
-    "BoardView",
-    "LaserChannel",
-    "Mark",
-    "PictureRefused",
-    "Reason",
-    "StripeProfile",
-    "StripeSettings",
-    "StripeStream",
-    "board_pose",
-    "check_picture",
-    "extract",
-    "find_board",
-    "parse_board",
-    "read_colours",
-    "read_picture",
-    "read_stripe",
-]
+    "BoardPose", "BoardSpec", "BoardView", "LaserChannel", "Mark", "PictureRefused", "Reason", "StripeProfile",
+    "StripeSettings", "StripeStream", "board_pose", "check_picture", "extract", "find_board", "parse_board",
+    "read_colours", "read_picture", "read_stripe",
+]  # fmt: skip
 
 _ROOMS = {
-    "board.board": ("BoardPose", "board_pose", "find_board"),
-    "board.view": ("BoardSpec", "BoardView", "parse_board"),
-    "pictures": ("PictureRefused", "Reason", "check_picture", "read_picture"),
-    "stripe.extract": (
-        "LaserChannel",
-        "Mark",
-        "StripeProfile",
-        "StripeSettings",
-        "StripeStream",
-        "extract",
-        "read_stripe",
-    ),
-    "stripe.planes": ("read_colours",),
+    "board.board": "BoardPose board_pose find_board",
+    "board.view": "BoardSpec BoardView parse_board",
+    "pictures": "PictureRefused Reason check_picture read_picture",
+    "stripe.extract": "LaserChannel Mark StripeProfile StripeSettings StripeStream extract read_stripe",
+    "stripe.planes": "read_colours",
 }
 
 
 def __getattr__(name: str) -> object:
     for room, names in _ROOMS.items():
-        if name in names:
+        if name in names.split():
             return getattr(import_module(f"{__name__}.{room}"), name)
     raise AttributeError(f"module '{__name__}' has no attribute {name!r}")

@@ -218,7 +218,7 @@ def _ellipses(outlines: list[Outline], size: tuple[int, int]) -> Blobs:
             cross * (x * x + x * xn + xn * xn) / 12,
             cross * (x * (2 * y + yn) + xn * (y + 2 * yn)) / 24,
             cross * (y * y + y * yn + yn * yn) / 12,
-        ]  # fmt: skip
+        ]
     )
     area, sx, sy, xx, xy, yy = np.add.reduceat(terms, begins, axis=1)
     sign = np.where(area < 0, -1.0, 1.0)

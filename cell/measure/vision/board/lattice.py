@@ -214,9 +214,6 @@ class PlaneMap:
         return np.asarray(by_place, dtype=np.float64)
 
 
-Places = NDArray[np.intp]
-
-
 def identify(spec: BoardSpec, places: Places, ring_scores: Array) -> tuple[Places, bool]:
     """Board places (n, 2) of lattice places (n, 2), and whether the order rests on an assumption.
 

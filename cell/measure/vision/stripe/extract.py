@@ -95,12 +95,8 @@ def _carefully(
     taught = like.learned if like is not None else None
     seen = read_carefully(picture, off, laser, settings=settings, like=taught, starts=starts)
     widen_what_departs(seen.centres, seen.sigma)
-    double = np.nan_to_num(seen.rival) > DOUBLE
-    return StripeProfile(
-        axis, seen.centres, seen.sigma, amplitude=seen.amplitude, width=seen.width, saturated=seen.saturated,
-        double=double & np.isfinite(seen.centres), speckle=None, noise=None, rival=seen.rival, misfit=seen.misfit,
-        learned=seen.learned,
-    )  # fmt: skip
+    assert seen.rival is not None
+    return replace(seen, axis=axis, double=(np.nan_to_num(seen.rival) > DOUBLE) & seen.valid)
 
 
 def subtracted(image: Taken, dark: Dark | None, settings: StripeSettings) -> tuple[Picture, Picture | None]:

@@ -3,19 +3,15 @@
 Slower than the search and fit of ordinary pictures: the plane is chosen in which the laser stands out, the stripe is
 followed as a line, its profile learned, and the deviation told from what surrounds it. `extract` comes here by itself.
 
-Which fitted lines are believable stripes, and how far the stated deviation has to grow where the model misfits.
-
-Pieces of a line that are much wider or narrower than the rest of it: out of focus, or on what shines.
-
-A picture teaches one width, and what differs from it by more than twice is not believed. Rows that stay without a
-stripe so are read once more by themselves, and what they show is taken where it goes on from the rest of the line.
+A picture teaches one width, and what differs from it by more than twice is not believed: pieces that are out of focus,
+or on what shines. Rows that stay without a stripe so are read once more by themselves, and what they show is taken
+where it goes on from the rest of the line.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -35,16 +31,14 @@ from cell.measure.vision.stripe.careful.follow import (
     coarse,
     difference,
     follow,
-)  # fmt: skip
+    without_line,
+)
 from cell.measure.vision.stripe.careful.learning import FREE_SCALE, learn_profile
 from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, Shape, binned, fit_shape
 from cell.measure.vision.stripe.careful.surroundings import around, carried, surrounded, wander
 from cell.measure.vision.stripe.ordinary.quick import MISFIT_SIGMAS
 from cell.measure.vision.stripe.planes import MIXES, LaserChannel, Picture
-
-if TYPE_CHECKING:
-    from cell.measure.vision.stripe.profile import StripeSettings
-
+from cell.measure.vision.stripe.profile import StripeProfile, StripeSettings
 
 Array = NDArray[np.float64]
 
@@ -58,7 +52,7 @@ MOST_LIGHT = 4.0
 """Times more or less light than the rest of the line: a laser has the same everywhere, a surface takes its share."""
 
 
-def fill_gaps(line: Careful, read: Callable[[slice], Careful]) -> None:
+def fill_gaps(line: StripeProfile, read: Callable[[slice], StripeProfile]) -> None:
     """Fill into `line` what `read` finds in its longer gaps, where that is the same line in another width."""
     seen = np.isfinite(line.centres)
     if seen.mean() < LEAST_LINE:
@@ -85,7 +79,7 @@ def _gaps(seen: NDArray[np.bool_]) -> list[slice]:
     return [slice(int(a), int(b)) for a, b, *ends in beside if b - a >= LEAST_ROWS and max(ends) >= END_ROWS]
 
 
-def _goes_on(line: Careful, gap: slice, piece: Careful) -> bool:
+def _goes_on(line: StripeProfile, gap: slice, piece: StripeProfile) -> bool:
     """Whether the piece meets the line at one of its ends, at least."""
     rows = np.flatnonzero(np.isfinite(line.centres))
     own = gap.start + np.flatnonzero(np.isfinite(piece.centres))
@@ -108,7 +102,7 @@ class _End:
     light: float
 
 
-def _end(line: Careful, rows: NDArray[np.intp], first: int) -> _End:
+def _end(line: StripeProfile, rows: NDArray[np.intp], first: int) -> _End:
     """Of `rows` of the picture, of which `first` is the line's first."""
     at = rows - first
     slope, place = np.polyfit(rows - rows.mean(), line.centres[at], 1)
@@ -146,26 +140,11 @@ class Learned:
     along: float
 
 
-@dataclass(frozen=True)
-class Careful:
-    """What `read_carefully` found, arrays (lines,) as in `StripeProfile`; `rival` is how high the next best peak of a
-    line is over the stripe's, 0 where there is none, and `misfit` χ² over what is usual in the picture."""
-
-    centres: Array
-    sigma: Array
-    amplitude: Array
-    width: Array
-    saturated: NDArray[np.bool_]
-    rival: Array
-    misfit: Array
-    learned: Learned | None
-
-
 def read_carefully(
     picture: Picture, off: Picture | None, laser: LaserChannel, settings: StripeSettings, like: Learned | None = None,
     starts: Array | None = None,
-) -> Careful:  # fmt: skip
-    """The stripe of `picture`, whose rows it crosses; `off` is the same view without the laser.
+) -> StripeProfile:  # fmt: skip
+    """The stripe of `picture`, whose rows it crosses; `off` is the same view without the laser. Marks no line `double`.
 
     `starts` (lines,) in px, NaN where there is none, spare the following. Pieces of another width are read where the
     picture itself teaches the profile.
@@ -182,7 +161,7 @@ def read_carefully(
 def _of_one_width(
     picture: Picture, off: Picture | None, laser: LaserChannel, settings: StripeSettings, like: Learned | None,
     starts: Array | None,
-) -> Careful:  # fmt: skip
+) -> StripeProfile:  # fmt: skip
     """`read_carefully` without what differs in width from the rest by more than twice."""
     lines = picture.value.shape[0]
     mix = like.mix if like is not None else choose_mix(picture, off, laser)
@@ -221,10 +200,7 @@ def _of_one_width(
     # A surface may be rough: lines that wander tell of errors only where something is there to make them.
     unquiet = noise.contrast > 0.02 or (correlation[1:] != 0).any()
     factor = min(wander(out.centres, out.sigma), MOST_WANDER) if unquiet else 1.0
-    return Careful(
-        out.centres, out.sigma * factor, out.amplitude, width=out.width, saturated=out.saturated, rival=rival,
-        misfit=out.misfit, learned=learned
-    )  # fmt: skip
+    return replace(out, sigma=out.sigma * factor, rival=rival, learned=learned)
 
 
 def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, StripeChain, float, float]:
@@ -273,10 +249,7 @@ def _rivals(found: Candidates, chain: StripeChain) -> Array:
 
 def _second_line(found: Candidates, chain: StripeChain) -> Array:
     """Response of a second line that runs beside the chain over the chain's (m,): its mean in rows where it hides."""
-    scale = float(np.median(found.scale[chain.rows, chain.which]))
-    own = np.interp(np.arange(len(found.rows)), chain.rows, found.place[chain.rows, chain.which])
-    clear = np.where(np.abs(found.place - own[:, None]) > 4 * scale, found.clear, 0.0)
-    other = follow(Candidates(found.rows, found.place, found.response, clear, found.scale))
+    other = follow(without_line(found, chain))
     rival = np.zeros(len(found.rows))
     height = float(np.median(found.response[chain.rows, chain.which]))
     for one in np.unique(other.piece):
@@ -302,7 +275,7 @@ def _albedo(shade: NDArray[np.float32] | None, usable: NDArray[np.bool_]) -> NDA
 
 def _believed(
     fitted: Fitted, sigma: Array, at: Array, shape: Shape, k: int, lines: int, plane: Plane, noise: Noise,
-) -> Careful:  # fmt: skip
+) -> StripeProfile:  # fmt: skip
     """The fits that are a stripe, in px of the picture and lines of all of it."""
     width = shape.width
     # Speckle makes a stripe's height uncertain, not that there is one.
@@ -315,26 +288,25 @@ def _believed(
         keep &= np.abs(fitted.log_scale - usual) < 0.8
     n = plane.value.shape[1]
     keep &= (fitted.centre > 1.0) & (fitted.centre < n - 2.0)
-    out = {name: np.full(lines, np.nan) for name in ("centres", "sigma", "amplitude", "width", "misfit")}
+    out = _nothing(lines)
+    assert out.misfit is not None
     rows = fitted.lines[keep]
-    out["centres"][rows] = k * fitted.centre[keep] + 0.5 * (k - 1)
-    out["amplitude"][rows] = fitted.amplitude[keep]
-    out["width"][rows] = k * width * np.exp(fitted.log_scale[keep])
+    out.centres[rows] = k * fitted.centre[keep] + 0.5 * (k - 1)
+    out.amplitude[rows] = fitted.amplitude[keep]
+    out.width[rows] = k * width * np.exp(fitted.log_scale[keep])
     usual = float(np.median(fitted.chi2[keep])) if keep.any() else 1.0
     misfit = fitted.chi2[keep] / max(usual, 1e-6)
     allowed = 1 + MISFIT_SIGMAS * np.sqrt(2 / (8 * width + 2))
-    out["sigma"][rows], out["misfit"][rows] = k * sigma[keep] * np.sqrt(np.maximum(1.0, misfit / allowed)), misfit
-    saturated = np.zeros(lines, np.bool_)
+    out.sigma[rows], out.misfit[rows] = k * sigma[keep] * np.sqrt(np.maximum(1.0, misfit / allowed)), misfit
     inside = (np.abs(fitted.x) < width) & np.isinf(fitted.variance)
-    saturated[rows] = inside[keep].any(axis=1)
-    return Careful(
-        out["centres"], out["sigma"], out["amplitude"], width=out["width"], saturated=saturated, rival=np.zeros(lines),
-        misfit=out["misfit"], learned=None
-    )  # fmt: skip
+    out.saturated[rows] = inside[keep].any(axis=1)
+    return out
 
 
-def _nothing(lines: int) -> Careful:
-    none, no = np.full(lines, np.nan), np.zeros(lines, np.bool_)
-    return Careful(
-        none, none.copy(), none.copy(), none.copy(), no, rival=np.zeros(lines), misfit=none.copy(), learned=None
+def _nothing(lines: int) -> StripeProfile:
+    """A profile without a stripe."""
+    centres, sigma, amplitude, width, misfit = np.full((5, lines), np.nan)
+    no, rival = np.zeros((2, lines), np.bool_), np.zeros(lines)
+    return StripeProfile(
+        "rows", centres, sigma, amplitude, width=width, saturated=no[0], double=no[1], rival=rival, misfit=misfit
     )

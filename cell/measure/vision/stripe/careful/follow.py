@@ -8,7 +8,7 @@ of colours the line stands out, and whether it is surely the laser's.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import cv2
@@ -326,15 +326,19 @@ APART = 4.0
 """Widths beside the line from which on another one begins."""
 
 
+def without_line(found: Candidates, chain: StripeChain) -> Candidates:
+    """The candidates of which those within APART widths of the line that was followed count nothing."""
+    width = float(np.median(found.scale[chain.rows, chain.which]))
+    own = np.interp(np.arange(len(found.rows)), chain.rows, found.place[chain.rows, chain.which])
+    return replace(found, clear=np.where(np.abs(found.place - own[:, None]) > APART * width, found.clear, 0.0))
+
+
 def rivalry(look: CoarseLines) -> float:
     """What the next best line of a picture says for itself, over what the one that was followed says."""
     found, chain = look.found, look.chain
     if not len(chain.rows):
         return 0.0
-    width = float(np.median(found.scale[chain.rows, chain.which]))
-    own = np.interp(np.arange(len(found.rows)), chain.rows, found.place[chain.rows, chain.which])
-    clear = np.where(np.abs(found.place - own[:, None]) > APART * width, found.clear, 0.0)
-    rest = Candidates(found.rows, found.place, found.response, clear, found.scale)
+    rest = without_line(found, chain)
     return _said(rest, follow(rest)) / max(_said(found, chain), 1e-6)
 
 

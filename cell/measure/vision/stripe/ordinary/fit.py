@@ -24,7 +24,7 @@ from cell.measure.vision.stripe.ordinary.find import (
     Image,
     Shade,
     Whole,
-)  # fmt: skip
+)
 
 LAGS = 6
 # Pixels on either side of a lane's origin, at row MIDDLE of `values` and `variance` (ROWS, LANES).
@@ -404,19 +404,27 @@ def fit_lines(
         for j in range(LANES):
             fisher[j] = s[_ROW + j]
             fitted_width[j] = exponential(s[_LOG_WIDTH + j])
-        correlated = len(rho) > 0 and contrast2 > 0.0
+        correlated = bool(len(rho) > 0 and contrast2 > 0.0)
         if correlated:
             influence(s, variance, half, noise2=noise2, gain=gain, contrast2=contrast2, rho=rho, moved=moved)
-        for j in range(size):
-            used = s[_USED + j]
-            if used <= PARAMETERS or not s[_GOOD + j] > SINGULAR:
-                continue
-            r = lines[j]
-            out[FIT_CENTRE, r] = origins[j] + s[_CENTRE + j]
-            out[SIGMA, r] = np.sqrt(s[_VARIANCE + j] if correlated else fisher[j])
-            out[AMPLITUDE, r] = s[_AMPLITUDE + j]
-            out[WIDTH, r] = fitted_width[j]
-            out[LEVEL, r] = s[_LEVEL + j]
-            out[SLOPE, r] = s[_SLOPE + j] / UNIT
-            out[CHI2, r] = s[_MISFIT + j] / (used - PARAMETERS)
-            out[FISHER, r] = np.sqrt(fisher[j])
+        _note(s, lines[:size], origins, fisher=fisher, widths=fitted_width, correlated=correlated, out=out)
+
+
+@compiled
+def _note(
+    s: Floats, lines: Whole, origins: Whole, fisher: Floats, widths: Floats, correlated: bool, out: Array
+) -> None:
+    """The lanes' results into `out` (FITTED, lines); those with too few pixels or a singular matrix are left alone."""
+    for j in range(len(lines)):
+        used = s[_USED + j]
+        if used <= PARAMETERS or not s[_GOOD + j] > SINGULAR:
+            continue
+        r = lines[j]
+        out[FIT_CENTRE, r] = origins[j] + s[_CENTRE + j]
+        out[SIGMA, r] = np.sqrt(s[_VARIANCE + j] if correlated else fisher[j])
+        out[AMPLITUDE, r] = s[_AMPLITUDE + j]
+        out[WIDTH, r] = widths[j]
+        out[LEVEL, r] = s[_LEVEL + j]
+        out[SLOPE, r] = s[_SLOPE + j] / UNIT
+        out[CHI2, r] = s[_MISFIT + j] / (used - PARAMETERS)
+        out[FISHER, r] = np.sqrt(fisher[j])

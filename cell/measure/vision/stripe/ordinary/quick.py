@@ -19,6 +19,7 @@ from cell.base.compiled import compiled
 from cell.measure.vision.pictures import Dark, PictureRefused, Reason
 from cell.measure.vision.stripe.ordinary import find, fit
 from cell.measure.vision.stripe.ordinary.find import CENTRE, CORE, ENERGY, Floats, Shade
+from cell.measure.vision.stripe.ordinary.find import WIDTH as PEAK_WIDTH
 from cell.measure.vision.stripe.ordinary.fit import AMPLITUDE, CHI2, FISHER, FIT_CENTRE, LEVEL, SIGMA, SLOPE, WIDTH
 from cell.measure.vision.stripe.ordinary.speckle import ASSUMED_GRAIN, correlation, measure_speckle, neighbours
 from cell.measure.vision.stripe.planes import pixel_noise, trimmed_square
@@ -228,7 +229,7 @@ def _is_ordinary(fitted: Array, start: Array, work: Image, *, shade: Image, seen
     """
     found = np.flatnonzero(np.isfinite(fitted[FIT_CENTRE]))
     wide, hidden = fitted[WIDTH, found] > WIDEST, start[found, 0, CORE] > 1
-    return (
+    return bool(
         is_line_whole(fitted, start, found)
         and len(found) >= HARDLY_ANY * len(start)
         and 2 * np.count_nonzero(wide) < len(found)
@@ -307,7 +308,7 @@ def choose(start: Array) -> NDArray[np.bool_]:
             continue
         slope, middle = _line_through(asked - line, start[asked, 0, CENTRE])
         away = np.abs(start[line, :, CENTRE] - middle)
-        tolerance = NEAR + 0.5 * abs(slope) + start[line, 0, WIDTH]
+        tolerance = NEAR + 0.5 * abs(slope) + start[line, 0, PEAK_WIDTH]
         if away[1] < tolerance < away[0]:
             start[line] = start[line, ::-1]
             double[line] = True
@@ -335,7 +336,7 @@ def survey(start: Array, low: float, high: float) -> tuple[NDArray[np.int64], Ar
     for r in range(lines):
         totals[r + 1], counts[r + 1] = totals[r], counts[r]
         if start[r, 0, ENERGY] > 0:
-            totals[r + 1] += min(max(start[r, 0, WIDTH], low), high)
+            totals[r + 1] += min(max(start[r, 0, PEAK_WIDTH], low), high)
             found[counts[r]] = r
             counts[r + 1] += 1
     widths = np.empty(lines)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.measure.vision import read_colours
-from cell.measure.vision.stripe.careful.careful import Careful, fill_gaps
+from cell.measure.vision import StripeProfile, read_colours
+from cell.measure.vision.stripe.careful.careful import fill_gaps
 from cell.measure.vision.stripe.extract import extract
 from lab.bench.stripe.workshop import Scene, draw
 
@@ -50,11 +50,13 @@ def test_pieces_of_a_line_that_are_much_wider_or_narrower_than_the_rest_are_read
             assert 0.4 < score < 1.25, score
 
 
-def careful(centres: np.ndarray, light: float = 240.0) -> Careful:
+def careful(centres: np.ndarray, light: float = 240.0) -> StripeProfile:
     """What the careful way found: a line 2 px wide."""
     seen = np.isfinite(centres)
     width, zero = np.where(seen, 2.0, np.nan), np.zeros(len(centres))
-    return Careful(centres.copy(), 0.02 * width, 0.5 * light * width / 2, width, zero > 0, zero, width / 2, None)
+    deviations = {"sigma": 0.02 * width, "amplitude": 0.5 * light * width / 2, "width": width}
+    flags = {"saturated": zero > 0, "double": zero > 0, "rival": zero, "misfit": width / 2}
+    return StripeProfile("rows", centres.copy(), **deviations, **flags)
 
 
 @pytest.mark.parametrize(
@@ -73,7 +75,7 @@ def test_a_gap_of_a_line_is_filled_only_with_the_same_line(piece, taken):
     line = careful(np.where(np.arange(480) < 330, centres, np.nan))
     asked = []
 
-    def read(rows: slice) -> Careful:
+    def read(rows: slice) -> StripeProfile:
         asked.append(rows)
         return piece(centres[rows])
 
