@@ -242,18 +242,16 @@ def stripe(
     json: JsonOption = False,
 ) -> None:
     """Stripe centres: RMS error, bias and stated deviation beside the bound, and speed."""
-    from lab.bench.stripe import accuracy as stripe_accuracy
-    from lab.bench.stripe import profiles as stripe_profiles
-    from lab.bench.stripe import speed as stripe_speed
+    from lab.bench.stripe import campaign
 
     result = {}
     with bar() as told:
         if speed:
-            result["speed"] = stripe_speed.compare(told)
+            result["speed"] = campaign.speed(told)
         if accuracy:
-            result["accuracy"] = stripe_accuracy.campaign(told, pictures)
+            result["accuracy"] = campaign.accuracy(told, pictures)
         if profiles:
-            result["profiles"] = stripe_profiles.campaign(told, pictures)
+            result["profiles"] = campaign.profiles(told, pictures)
     show(result, json)
 
 

@@ -10,8 +10,7 @@ import pytest
 import trimesh
 
 from cell.measure.reconstruction import Cloud, Filled, fill_holes, merge, write_cloud
-from cell.measure.reconstruction.cloud import triangles, write_mesh
-from cell.measure.reconstruction.ply import deviation_colours, read_cloud, write_e57
+from cell.measure.reconstruction.ply import deviation_colours, read_cloud, triangles, write_e57, write_mesh
 from drivers.errors import ConfigError
 from lab.bench.reconstruction.scenes import Scene, cut_holes, scene
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cell.measure.vision.stripe.extract import StripeStream
-from lab.bench.stripe.profiles import measure, within_limits
+from lab.bench.stripe.campaign import measure_scene, within_limits
 from lab.bench.stripe.workshop import Scene, draw
 
 
@@ -41,5 +41,5 @@ def test_in_a_stream_the_profile_of_a_block_is_that_of_its_first_picture():
     ids=lambda scene: f"{scene.name} {scene.width}",
 )
 def test_every_stripe_comes_near_its_own_bound_with_a_true_deviation(scene):
-    row = measure(scene, seed=5)
+    row = measure_scene(scene, seed=5)
     assert within_limits(row), row

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cell.measure.vision.stripe.extract import StripeSettings, extract
-from lab.bench.stripe.accuracy import measure
+from lab.bench.stripe.campaign import measure
 from lab.bench.stripe.truth import Cell, bound, draw
 
 SMALL = (256, 384)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cell.measure.vision.stripe.extract import BLOCK, StripeStream, extract
-from lab.bench.stripe.accuracy import measure
+from lab.bench.stripe.campaign import measure
 from lab.bench.stripe.truth import Cell, draw
 
 SMALL = (256, 384)
