@@ -9,7 +9,16 @@ import pytest
 from cell.measure.geometry.camera import seen_centres
 from cell.measure.geometry.poses import difference, transform
 from cell.measure.vision import PictureRefused, Reason, board_pose, find_board, parse_board
-from tests.support.board_pictures import FINE, LARGE, SCAN, TARGET, model, photograph, placed, true_pixels
+from tests.unit.cell.measure.vision.board.drawn_boards import (
+    FINE,
+    LARGE,
+    SCAN,
+    TARGET,
+    model,
+    photograph,
+    placed,
+    true_pixels,
+)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from cell.measure.vision import find_board, parse_board
 from sim_backends.optics.scene import LaserOptics
-from tests.support.board_pictures import FINE, SCAN, photograph, placed, true_pixels
+from tests.unit.cell.measure.vision.board.drawn_boards import FINE, SCAN, photograph, placed, true_pixels
 
 
 @pytest.mark.parametrize("text", [FINE, "chessboard:11x8:3mm"])

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import erf
 
 from cell.measure.vision.board.corners import fit_corners
-from tests.support.board_pictures import BRIGHT, DARK, MOST_MOVED_PX, PSF, SLOPES, uneven_picture
+from tests.unit.cell.measure.vision.board.drawn_boards import BRIGHT, DARK, MOST_MOVED_PX, PSF, SLOPES, uneven_picture
 
 
 @pytest.mark.parametrize("slope", SLOPES)

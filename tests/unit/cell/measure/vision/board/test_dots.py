@@ -20,7 +20,7 @@ from cell.measure.vision.board.view import BoardView
 from lab.bench.board.campaign import camera_of
 from lab.bench.board.conditions import LENSES, draw_pose, draw_spec
 from lab.bench.board.render import Placed, true_pixels
-from tests.support.board_pictures import BRIGHT, MOST_MOVED_PX, PSF, SLOPES, uneven_picture
+from tests.unit.cell.measure.vision.board.drawn_boards import BRIGHT, MOST_MOVED_PX, PSF, SLOPES, uneven_picture
 
 
 def drawn(kind, rng, tilt):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cell.measure.vision import PictureRefused, Reason, find_board, parse_board
-from tests.support.board_pictures import FINE, LARGE, SCAN, TARGET, photograph, placed, true_pixels
+from tests.unit.cell.measure.vision.board.drawn_boards import FINE, LARGE, SCAN, TARGET, photograph, placed, true_pixels
 
 
 def test_a_part_of_a_marked_board_is_enough():

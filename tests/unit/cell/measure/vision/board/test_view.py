@@ -6,7 +6,7 @@ import pytest
 
 from cell.measure.vision import parse_board
 from drivers.errors import ConfigError
-from tests.support.board_pictures import FINE
+from tests.unit.cell.measure.vision.board.drawn_boards import FINE
 
 
 @pytest.mark.parametrize("name", [FINE, "chessboard:7x6:10mm", "dots:6x6:34mm", "asymmetric_dots:4x11:15mm"])
