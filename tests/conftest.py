@@ -71,7 +71,6 @@ GROUPS = (
         "unit/cell/procedures/steps/test_invert_pose.py",
         "unit/cell/procedures/sweep/test_second_look.py",
         "unit/cell/measure/inversion/effects/test_between_sweeps.py",
-        "unit/cell/measure/inversion/effects/test_during_sweep.py",
         "unit/cell/measure/inversion/effects/test_causes.py",
         "unit/cell/measure/inversion/test_disagreement.py",
         "unit/drivers/vehicle/test_fixed.py",
