@@ -166,10 +166,31 @@ def cut(
 
 
 @compiled
+def met_after(corners: Vector, px: float, py: float, pz: float, dx: float, dy: float, dz: float) -> float:
+    """How far from p along d the triangle `corners` (3, 3) is met; infinite where it is not (Möller–Trumbore)."""
+    ax, ay, az = corners[0, 0], corners[0, 1], corners[0, 2]
+    e1x, e1y, e1z = corners[1, 0] - ax, corners[1, 1] - ay, corners[1, 2] - az
+    e2x, e2y, e2z = corners[2, 0] - ax, corners[2, 1] - ay, corners[2, 2] - az
+    hx, hy, hz = dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x
+    det = e1x * hx + e1y * hy + e1z * hz
+    if det == 0.0:
+        return np.inf
+    sx, sy, sz = px - ax, py - ay, pz - az
+    u = (sx * hx + sy * hy + sz * hz) / det
+    if u < 0.0 or u > 1.0:
+        return np.inf
+    qx, qy, qz = sy * e1z - sz * e1y, sz * e1x - sx * e1z, sx * e1y - sy * e1x
+    v = (dx * qx + dy * qy + dz * qz) / det
+    if v < 0.0 or u + v > 1.0:
+        return np.inf
+    return float((e2x * qx + e2y * qy + e2z * qz) / det)
+
+
+@compiled
 def shadow(
     corners: Vector, low: Vector, high: Vector, points: Vector, eye: Vector, start: float, seen: NDArray[np.bool_]
 ) -> None:
-    """Clear `seen[i]` where any triangle lies between `points[i]` and `eye` (Möller–Trumbore, any hit)."""
+    """Clear `seen[i]` where any triangle lies between `points[i]` and `eye`."""
     first_leaf = low.shape[0] // 2
     stack = np.empty(64, dtype=np.int64)
     for i in range(points.shape[0]):
@@ -208,22 +229,7 @@ def shadow(
                 continue
             begin = (node - first_leaf) * LEAF
             for t in range(begin, begin + LEAF):
-                ax, ay, az = corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]
-                e1x, e1y, e1z = corners[t, 1, 0] - ax, corners[t, 1, 1] - ay, corners[t, 1, 2] - az
-                e2x, e2y, e2z = corners[t, 2, 0] - ax, corners[t, 2, 1] - ay, corners[t, 2, 2] - az
-                hx, hy, hz = dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x
-                det = e1x * hx + e1y * hy + e1z * hz
-                if det == 0.0:
-                    continue
-                sx, sy, sz = px - ax, py - ay, pz - az
-                u = (sx * hx + sy * hy + sz * hz) / det
-                if u < 0.0 or u > 1.0:
-                    continue
-                qx, qy, qz = sy * e1z - sz * e1y, sz * e1x - sx * e1z, sx * e1y - sy * e1x
-                v = (dx * qx + dy * qy + dz * qz) / det
-                if v < 0.0 or u + v > 1.0:
-                    continue
-                distance = (e2x * qx + e2y * qy + e2z * qz) / det
+                distance = met_after(corners[t], px, py, pz=pz, dx=dx, dy=dy, dz=dz)
                 if start < distance < length - 1e-6:
                     seen[i] = False
                     break

@@ -126,12 +126,35 @@ def albedo_at(bx: float, by: float, pattern: Vector) -> float:
 
 
 @compiled
-def classify(board: Vector, pattern: Vector, albedo: Image) -> None:
-    """Albedo of a line of pixels where it is sure, `EDGE` where an edge is within a pixel's reach, `OUTSIDE` else."""
+def dotted(bx: float, by: float, reach: float, pattern: Vector) -> float:
+    """Albedo of a point inside a board of dots where it is sure, `EDGE` where a dot's edge is within `reach` m."""
     kind, cols, rows, p = int(pattern[0]), int(pattern[1]), int(pattern[2]), pattern[3]
-    x0, x1, y0, y1 = pattern[4], pattern[5], pattern[6], pattern[7]
     white, black, outer, inner = pattern[8], pattern[9], pattern[10], pattern[11]
     ring_col, ring_row = (cols - 1) // 2, (rows - 1) // 2
+    per_pitch = 1.0 / p
+    j = min(max(int(by * per_pitch + 1.5) - 1, 0), rows - 1)
+    if kind == ASYMMETRIC:
+        shift = j & 1
+        i = 2 * min(max(int((bx * per_pitch - shift) * 0.5 + 1.5) - 1, 0), cols - 1) + shift
+    else:
+        i = min(max(int(bx * per_pitch + 1.5) - 1, 0), cols - 1)
+    dx, dy = bx - i * p, by - j * p
+    d2 = dx * dx + dy * dy
+    if d2 > (outer + reach) * (outer + reach):
+        return float(white)
+    if d2 > (outer - reach) * (outer - reach) or reach > inner:
+        return EDGE
+    ring = (j == ring_row and (i == ring_col or i == ring_col + 2)) or (j == ring_row + 1 and i == ring_col)
+    if kind == MARKED and ring and d2 < (inner + reach) * (inner + reach):
+        return float(white) if d2 < (inner - reach) * (inner - reach) else EDGE
+    return float(black)
+
+
+@compiled
+def classify(board: Vector, pattern: Vector, albedo: Image) -> None:
+    """Albedo of a line of pixels where it is sure, `EDGE` where an edge is within a pixel's reach, `OUTSIDE` else."""
+    kind, p, white = int(pattern[0]), pattern[3], pattern[8]
+    x0, x1, y0, y1 = pattern[4], pattern[5], pattern[6], pattern[7]
     per_pitch = 1.0 / p
     for u in range(albedo.shape[0]):
         bx, by, reach = board[0, u], board[1, u], board[2, u]
@@ -148,26 +171,7 @@ def classify(board: Vector, pattern: Vector, albedo: Image) -> None:
             else:
                 albedo[u] = albedo_at(bx, by, pattern)
         else:
-            j = min(max(int(by * per_pitch + 1.5) - 1, 0), rows - 1)
-            if kind == ASYMMETRIC:
-                shift = j & 1
-                i = 2 * min(max(int((bx * per_pitch - shift) * 0.5 + 1.5) - 1, 0), cols - 1) + shift
-            else:
-                i = min(max(int(bx * per_pitch + 1.5) - 1, 0), cols - 1)
-            dx, dy = bx - i * p, by - j * p
-            d2 = dx * dx + dy * dy
-            if d2 > (outer + reach) * (outer + reach):
-                albedo[u] = white
-            elif d2 > (outer - reach) * (outer - reach) or reach > inner:
-                albedo[u] = EDGE
-            elif (
-                kind == MARKED
-                and ((j == ring_row and (i == ring_col or i == ring_col + 2)) or (j == ring_row + 1 and i == ring_col))
-                and d2 < (inner + reach) * (inner + reach)
-            ):
-                albedo[u] = white if d2 < (inner - reach) * (inner - reach) else EDGE
-            else:
-                albedo[u] = black
+            albedo[u] = dotted(bx, by, reach, pattern)
 
 
 @compiled

@@ -145,6 +145,35 @@ def _with_rim(instance: PlaneInstance, laser: LaserOptics) -> PlaneInstance:
 
 
 @compiled
+def seen_part(
+    ax: float, ay: float, az: float, dx: float, dy: float, dz: float, reach_x: float, reach_y: float
+) -> tuple[float, float]:
+    """Where, from 0 to 1, a segment from a along d is in front of the camera and within its cone.
+
+    Beyond it the distortion folds back.
+    """
+    low, high = 0.0, 1.0
+    for side in range(5):
+        if side == 0:
+            f0, df = az - 1e-3, dz
+        elif side == 1:
+            f0, df = reach_x * az - ax, reach_x * dz - dx
+        elif side == 2:
+            f0, df = reach_x * az + ax, reach_x * dz + dx
+        elif side == 3:
+            f0, df = reach_y * az - ay, reach_y * dz - dy
+        else:
+            f0, df = reach_y * az + ay, reach_y * dz + dy
+        if f0 < 0.0 and f0 + df < 0.0:
+            high = -1.0
+        elif f0 < 0.0:
+            low = max(low, -f0 / df)
+        elif f0 + df < 0.0:
+            high = min(high, -f0 / df)
+    return low, high
+
+
+@compiled
 def follow(
     segments: Vector, normals: Vector, intrinsics: Vector, width: int, height: int, rows: NDArray[np.int64],
     values: Vector,
@@ -154,28 +183,10 @@ def follow(
     for s in range(segments.shape[0]):
         ax, ay, az = segments[s, 0, 0], segments[s, 0, 1], segments[s, 0, 2]
         bx, by, bz = segments[s, 1, 0], segments[s, 1, 1], segments[s, 1, 2]
-        # Only the part in front of the camera and within its cone counts: beyond it the distortion folds back.
-        low, high = 0.0, 1.0
         dx, dy, dz = bx - ax, by - ay, bz - az
         reach_x = 1.5 * max(width - intrinsics[2], intrinsics[2]) / intrinsics[0]
         reach_y = 1.5 * max(height - intrinsics[3], intrinsics[3]) / intrinsics[1]
-        for side in range(5):
-            if side == 0:
-                f0, df = az - 1e-3, dz
-            elif side == 1:
-                f0, df = reach_x * az - ax, reach_x * dz - dx
-            elif side == 2:
-                f0, df = reach_x * az + ax, reach_x * dz + dx
-            elif side == 3:
-                f0, df = reach_y * az - ay, reach_y * dz - dy
-            else:
-                f0, df = reach_y * az + ay, reach_y * dz + dy
-            if f0 < 0.0 and f0 + df < 0.0:
-                high = -1.0
-            elif f0 < 0.0:
-                low = max(low, -f0 / df)
-            elif f0 + df < 0.0:
-                high = min(high, -f0 / df)
+        low, high = seen_part(ax, ay, az, dx=dx, dy=dy, dz=dz, reach_x=reach_x, reach_y=reach_y)
         if low >= high:
             continue
         z = az + low * dz
