@@ -21,13 +21,9 @@ from pymodbus.pdu.register_message import (
 )
 
 from sim_backends.clock import WorldClock
-from sim_backends.faults import RAIL_FAULTS as FAULTS
-from sim_backends.faults import RAIL_MODEL_FAULTS
 from sim_backends.models.rail import RailModel
-from sim_backends.peers.server import SerialServer
+from sim_backends.peers.rail.tmcl import RailPeer
 
-LATE_S = 0.2
-"""Wall seconds by which `rail.late_reply` delays every reply."""
 SEARCH_RPM, CREEP_RPM = 600.0, 120.0
 """Speeds of a search for the reference switch, which a drive keeps in parameters of its own."""
 _ALARM_STALL = 0x0E0
@@ -39,7 +35,7 @@ class ModbusDriveServer:
 
     def __init__(self, rail: RailModel, clock: WorldClock, wire: Mapping[str, Any]) -> None:
         self.rail = rail
-        self._clock = clock
+        self.clock = clock
         self._map: dict[str, Any] = wire["registers"]
         self._turn = int(wire["counts_per_turn"])
         self._lock = threading.Lock()
@@ -52,24 +48,16 @@ class ModbusDriveServer:
                 self._writable |= set(range(entry["address"], entry["address"] + entry["words"]))
         self._power_on()
 
-    def fault(self, name: str) -> None:
-        """Cause a fault of the rail's own."""
-        self.rail.fault(name, self._clock.now())
-
-    def clear(self) -> None:
-        """Take the rail's own faults away."""
-        self.rail.clear(self._clock.now())
-
     def reset(self) -> None:
         """Start anew, as after a loss of power: the drive has forgotten its zero and what was written to it."""
         with self._lock:
             self._homed = self._searching = False
-            self.rail.reset(self._clock.now())
+            self.rail.reset(self.clock.now())
             self._power_on()
 
     def _power_on(self) -> None:
         self._written = dict.fromkeys(self._writable, 0)
-        t = self._clock.now()
+        t = self.clock.now()
         settings = dataclasses.replace(
             self.rail.settings, microsteps=0, search_mode=5, search_speed=round(SEARCH_RPM / 60.0 * self._turn),
             switch_speed=round(CREEP_RPM / 60.0 * self._turn),
@@ -88,7 +76,7 @@ class ModbusDriveServer:
             return [there[number] for number in range(address, address + count)]
 
     def _readable(self, inputs: bool) -> dict[int, int]:
-        t, rail = self._clock.now(), self.rail
+        t, rail = self.clock.now(), self.rail
         numbers = {
             "position": rail.position(t),
             "alarm": _ALARM_STALL if rail.stalled(t) else 0,
@@ -117,7 +105,7 @@ class ModbusDriveServer:
 
     def _look(self) -> None:
         """A search that has come to its end has found the zero."""
-        t = self._clock.now()
+        t = self.clock.now()
         if self._searching and not self.rail.searching(t) and self.rail.velocity(t) == 0:
             self._searching, self._homed = False, True
 
@@ -133,7 +121,7 @@ class ModbusDriveServer:
             if given:
                 for name in given:
                     if self._map[name]["value"] == values[0]:
-                        getattr(self, f"_{name}")(self._clock.now())
+                        getattr(self, f"_{name}")(self.clock.now())
                 return True
             numbers = range(address, address + len(values))
             if not self._writable.issuperset(numbers):
@@ -187,8 +175,8 @@ class ModbusDriveServer:
         return words[::-1] if self._map["word_order"] == "low first" else words
 
 
-class ModbusPeer(SerialServer):
-    """Serves one drive over TCP, as behind a serial server, at `url`, and on request at the device file `pty`."""
+class ModbusPeer(RailPeer):
+    """Serves one drive."""
 
     def __init__(self, drive: ModbusDriveServer, unit: int, *, pty: bool = False, echo: bool = False) -> None:
         """With `echo` the line repeats what is sent, as an adapter to two wires does."""
@@ -196,28 +184,7 @@ class ModbusPeer(SerialServer):
         self._unit = unit
         self._echo = echo
         self._framer = FramerRTU(DecodePDU(True))
-        self._drop = 0
-        self._late = False
-        super().__init__("modbus", self._hear, pty=pty)
-
-    def fault(self, name: str) -> None:
-        """Cause a fault of `FAULTS`, as `sim_backends.peers.rail.tmcl` has them; ValueError for another name."""
-        match name:
-            case "rail.drop_reply":
-                self._drop += 1
-            case "rail.late_reply":
-                self._late = True
-            case "rail.reset":
-                self.drive.reset()
-            case _ if name in RAIL_MODEL_FAULTS:
-                self.drive.fault(name)
-            case _:
-                raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")
-
-    def clear(self) -> None:
-        """Take away all faults; a drive that was reset stays so."""
-        self._drop, self._late = 0, False
-        self.drive.clear()
+        super().__init__("modbus", drive, self._hear, pty=pty)
 
     def _hear(self, data: bytes, write: Callable[[bytes], object]) -> bytes:
         used, request = self._framer.handleFrame(data, 0, 0)
@@ -229,12 +196,7 @@ class ModbusPeer(SerialServer):
             return data[used:]
         reply = self._answer(request)
         reply.dev_id = self._unit
-        if self._late:
-            self.stopping.wait(LATE_S)
-        if self._drop:
-            self._drop -= 1
-        else:
-            write(self._framer.buildFrame(reply))
+        self.reply(write, self._framer.buildFrame(reply))
         return data[used:]
 
     def _answer(self, request: ModbusPDU) -> ModbusPDU:

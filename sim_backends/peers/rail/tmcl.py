@@ -11,13 +11,12 @@ import dataclasses
 import struct
 import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 from sim_backends.clock import WorldClock
-from sim_backends.faults import RAIL_FAULTS as FAULTS
-from sim_backends.faults import RAIL_MODEL_FAULTS
+from sim_backends.faults import RAIL_FAULTS, RAIL_MODEL_FAULTS
 from sim_backends.models.rail import RailModel, RailSettings
-from sim_backends.peers.server import SerialServer
+from sim_backends.peers.server import SerialServer, Take
 
 SETTINGS: dict[int, tuple[str, int, int]] = {
     4: ("max_velocity", 0, 7_999_774), 5: ("max_acceleration", 0, 7_629_278), 12: ("right_stop", 0, 1),
@@ -79,7 +78,7 @@ class TmclModule:
 
     def __init__(self, rail: RailModel, clock: WorldClock) -> None:
         self.rail = rail
-        self._clock = clock
+        self.clock = clock
         self._lock = threading.Lock()
         self._globals = {number: value for number, (value, _, _) in GLOBALS.items()}
         self._stored: dict[int, int] = {}
@@ -99,24 +98,16 @@ class TmclModule:
         self._axis = {number: value for number, (value, _, _) in PLAIN.items()}
         self._variables = [self._stored_variables.get(number, 0) for number in range(USER_VARIABLES)]
         self._outputs = [0, 0]
-        now = self._clock.now()
+        now = self.clock.now()
         self.rail.configure(now, dataclasses.replace(self.rail.settings, **FACTORY_RAMP))
 
     def reset(self) -> None:
         """Lose all that is not in the EEPROM: counter, motion, outputs, settings and variables that were not stored."""
         with self._lock:
-            self.rail.reset(self._clock.now())
+            self.rail.reset(self.clock.now())
             self._power_on()
             for kind, value in self._stored.items():
                 self._set_axis(kind, 0, value)
-
-    def fault(self, name: str) -> None:
-        """Cause a fault of the rail's own."""
-        self.rail.fault(name, self._clock.now())
-
-    def clear(self) -> None:
-        """Take the rail's own faults away."""
-        self.rail.clear(self._clock.now())
 
     def handle(self, request: bytes) -> bytes | None:
         """The reply to nine bytes, or None when they are addressed to another module."""
@@ -155,13 +146,13 @@ class TmclModule:
 
     def _rotate(self, kind: int, motor: int, value: int) -> int:
         _check(abs(value), 0, SETTINGS[4][2])
-        self.rail.rotate(self._clock.now(), value)
+        self.rail.rotate(self.clock.now(), value)
         return value
 
     def _move(self, kind: int, motor: int, value: int) -> int:
         if kind not in (0, 1):
             raise TmclRefused(BAD_TYPE)
-        t = self._clock.now()
+        t = self.clock.now()
         target = value if kind == 0 else self._base(t) + value
         _check(target, -(2**31), 2**31 - 1)
         self.rail.move_to(t, target)
@@ -171,7 +162,7 @@ class TmclModule:
         return self.rail.position(t) if self._axis[127] else self.rail.target()
 
     def _search(self, kind: int, motor: int, value: int) -> int:
-        t = self._clock.now()
+        t = self.clock.now()
         if kind == 0:
             self.rail.search(t)
         elif kind == 1:
@@ -185,7 +176,7 @@ class TmclModule:
     # --- axis parameters ---
 
     def _get_axis(self, kind: int, motor: int, value: int) -> int:
-        rail, t = self.rail, self._clock.now()
+        rail, t = self.rail, self.clock.now()
         if kind in SETTINGS:
             setting = int(getattr(rail.settings, SETTINGS[kind][0]))
             return 1 - setting if kind in (12, 13) else setting
@@ -207,7 +198,7 @@ class TmclModule:
         return readings[kind]()
 
     def _set_axis(self, kind: int, motor: int, value: int) -> int:
-        t = self._clock.now()
+        t = self.clock.now()
         if kind in SETTINGS:
             name, low, high = SETTINGS[kind]
             _check(value, low, high)
@@ -249,7 +240,7 @@ class TmclModule:
         if bank == 0 and kind in self._globals:
             return self._globals[kind]
         if bank == 0 and kind == 132:
-            return int(self._clock.now() * 1000.0) & 0x7FFFFFFF
+            return int(self.clock.now() * 1000.0) & 0x7FFFFFFF
         if bank == 2:
             return self._variables[kind]
         raise TmclRefused(BAD_TYPE if bank == 0 else BAD_VALUE)
@@ -310,56 +301,74 @@ LATE_S = 0.2
 _REQUEST = 9
 
 
-class TmclPeer(SerialServer):
-    """Serves one module at `url` (`socket://127.0.0.1:port` for pyserial) and, on request, at the device `pty`."""
+class RailController(Protocol):
+    """What moves the rail as its protocol says."""
 
-    def __init__(self, model: RailModel, clock: WorldClock, pty: bool = False) -> None:
-        self.module = TmclModule(model, clock)
+    rail: RailModel
+    clock: WorldClock
+
+    def reset(self) -> None:
+        """Start anew, as after a loss of power."""
+
+
+class RailPeer(SerialServer):
+    """A rail's controller on its line: at `url` (`socket://127.0.0.1:port` for pyserial), on request at a `pty`."""
+
+    def __init__(self, name: str, controller: RailController, take: Take, *, pty: bool) -> None:
+        self._controller = controller
         self._drop = 0
         self._late = False
-        self._lock = threading.Lock()
-        super().__init__("rail", self._hear, pty=pty)
+        self._drop_lock = threading.Lock()
+        super().__init__(name, take, pty=pty)
 
     def fault(self, name: str) -> None:
-        """Cause a fault of `FAULTS`; ValueError for another name.
+        """Cause a fault of `RAIL_FAULTS`; ValueError for another name.
 
         `rail.drop_reply`: the next request is carried out, but its reply is lost. `rail.late_reply`: from now on every
-        reply comes `LATE_S` after its request was carried out. `rail.reset`: the module starts anew. The others
+        reply comes `LATE_S` after its request was carried out. `rail.reset`: the controller starts anew. The others
         are the rail's own.
         """
         match name:
             case "rail.drop_reply":
-                with self._lock:
+                with self._drop_lock:
                     self._drop += 1
             case "rail.late_reply":
                 self._late = True
             case "rail.reset":
-                self.module.reset()
+                self._controller.reset()
             case _ if name in RAIL_MODEL_FAULTS:
-                self.module.fault(name)
+                self._controller.rail.fault(name, self._controller.clock.now())
             case _:
-                raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(FAULTS)}")
+                raise ValueError(f"unknown rail fault {name!r}; known: {', '.join(RAIL_FAULTS)}")
 
     def clear(self) -> None:
-        """Take away all faults; a module that was reset stays so."""
-        with self._lock:
+        """Take away all faults; a controller that was reset stays so."""
+        with self._drop_lock:
             self._drop = 0
         self._late = False
-        self.module.clear()
+        self._controller.rail.clear(self._controller.clock.now())
+
+    def reply(self, write: Callable[[bytes], object], data: bytes | None) -> None:
+        """Send a reply, if there is one, as late as replies are, unless it is to be lost."""
+        if self._late:
+            self.stopping.wait(LATE_S)
+        if data is None:
+            return
+        with self._drop_lock:
+            lost, self._drop = self._drop > 0, max(0, self._drop - 1)
+        if not lost:
+            write(data)
+
+
+class TmclPeer(RailPeer):
+    """Serves one module."""
+
+    def __init__(self, model: RailModel, clock: WorldClock, pty: bool = False) -> None:
+        self.module = TmclModule(model, clock)
+        super().__init__("rail", self.module, self._hear, pty=pty)
 
     def _hear(self, data: bytes, write: Callable[[bytes], object]) -> bytes:
         while len(data) >= _REQUEST:
-            reply = self.module.handle(data[:_REQUEST])
+            self.reply(write, self.module.handle(data[:_REQUEST]))
             data = data[_REQUEST:]
-            if self._late:
-                self.stopping.wait(LATE_S)
-            if reply is not None and not self._lost():
-                write(reply)
         return data
-
-    def _lost(self) -> bool:
-        with self._lock:
-            if self._drop:
-                self._drop -= 1
-                return True
-            return False

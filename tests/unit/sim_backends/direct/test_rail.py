@@ -6,17 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import Aborted, InterlockError
-from tests.support.virtual_devices import CONFIG, ideal_cell
-
-
-def test_a_rail_move_takes_the_time_of_its_trapezoid(cell):
-    rail = cell.rail
-    rail.move_to(0.010).wait(30.0)
-    begun = cell.clock.now()
-    rail.move_to(0.090).wait(30.0)
-    speed, acceleration = CONFIG.rail.max_speed, CONFIG.rail.acceleration
-    assert cell.clock.now() - begun == pytest.approx(0.080 / speed + speed / acceleration, abs=0.02)
-    assert rail.state().position == pytest.approx(0.090, abs=1e-7)
+from tests.support.virtual_devices import ideal_cell
 
 
 def test_a_sweep_knows_where_the_rail_was_at_any_time_of_it(cell):

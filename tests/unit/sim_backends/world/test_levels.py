@@ -117,15 +117,6 @@ def test_texture_has_the_size_told_and_stays_on_the_surface() -> None:
     assert grain_at(*places[0], pattern) == albedo[0]
 
 
-def test_a_rolling_shutter_shears_what_moves_and_nothing_else() -> None:
-    still = World(2, "nominal+rolling_shutter", clock=SteppedClock())
-    plain = World(2, "nominal", clock=SteppedClock())
-    for world in (still, plain):
-        world.arm.tick(0.1)
-        world.vehicle.tick(0.1)
-    assert still.render("scan", 0.1, 0.002).shape == plain.render("scan", 0.1, 0.002).shape
-
-
 def test_a_carriage_that_droops_sinks_and_rolls_by_its_way_and_nothing_else_changes() -> None:
     plain, worn = (World(2, level, clock=SteppedClock()) for level in ("nominal", "nominal+droop"))
     for world in (plain, worn):

@@ -31,3 +31,16 @@ def arm(session: Client) -> Client:
 @pytest.fixture
 def controller() -> Controller:
     return Controller()
+
+
+@pytest.fixture(scope="module")
+def running() -> Iterator[ArmBench]:
+    with ArmBench() as bench:
+        yield bench
+
+
+@pytest.fixture
+def address(running: ArmBench) -> str:
+    running.ask("clear")
+    running.ask("reset")
+    return str(running.address)

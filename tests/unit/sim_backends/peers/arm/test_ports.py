@@ -19,21 +19,6 @@ from tests.support.wire.arm_bench import ArmBench
 from tests.support.wire.ur_client import dashboard
 
 pytestmark = pytest.mark.wire
-
-
-@pytest.fixture(scope="module")
-def running() -> Iterator[ArmBench]:
-    with ArmBench() as bench:
-        yield bench
-
-
-@pytest.fixture
-def address(running: ArmBench) -> str:
-    running.ask("clear")
-    running.ask("reset")
-    return str(running.address)
-
-
 PARTS = [
     (0, 47), (1, 251), (4, 101), (5, 225), (9, 53), (3, 75), (2, 37), (6, 445), (7, 61), (8, 9), (10, 43), (11, 26),
     (12, 8),

@@ -206,11 +206,11 @@ def test_a_reset_takes_what_is_not_in_the_eeprom(peer: TmclPeer, module: TMCM126
     module.rotate(0, 10 * STEPS)
     WorldClock().sleep(0.1)
     peer.fault("rail.reset")
-    stands = model.carriage(peer.module._clock.now())
+    stands = model.carriage(peer.module.clock.now())
     assert (axis.actual_position, axis.actual_velocity, axis.target_position) == (0, 0, 0)
     assert [module.get_global_parameter(number, 2) for number in (0, 7, 8, 200)] == [4711, 70, 0, 0]
     assert axis.get_axis_parameter(axis.AP.MaxVelocity) == 512_000
-    assert model.carriage(peer.module._clock.now()) == stands
+    assert model.carriage(peer.module.clock.now()) == stands
 
 
 def test_late_replies_are_late_until_the_faults_are_cleared(peer: TmclPeer, port: serial.SerialBase) -> None:

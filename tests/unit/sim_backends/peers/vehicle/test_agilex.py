@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import can
@@ -16,52 +15,11 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
 from tests.support import ROOT
+from tests.support.wire.can_bus import message, open_bus, receive
 from tests.support.wire.clocks import until
 
 pytestmark = pytest.mark.wire
 DBC = ROOT / "drivers" / "vehicle" / "agilex_v2.dbc"
-
-
-def message(identifier: int, data: list[int]) -> can.Message:
-    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
-
-
-def receive(bus: can.BusABC, wanted: Callable[[can.Message], bool], seconds: float = 20.0) -> can.Message:
-    wall = WorldClock()
-    while wall.now() < seconds:
-        frame = bus.recv(0.1)
-        if frame is not None and wanted(frame):
-            return frame
-    raise AssertionError("the frame did not come within the deadline")
-
-
-def open_bus(peer: AgilexPeer) -> can.BusABC:
-    return can.Bus(interface=peer.interface, channel=peer.channel, bitrate=500_000, sleep_after_open=0)
-
-
-@pytest.fixture
-def clock() -> WorldClock:
-    return WorldClock(4.0)
-
-
-@pytest.fixture
-def model() -> VehicleModel:
-    return VehicleModel(VehicleParams(), np.random.default_rng(1))
-
-
-@pytest.fixture
-def peer(model: VehicleModel, clock: WorldClock) -> Iterator[AgilexPeer]:
-    peer = AgilexPeer(model, clock)
-    peer.start()
-    yield peer
-    peer.stop()
-
-
-@pytest.fixture
-def bus(peer: AgilexPeer) -> Iterator[can.BusABC]:
-    bus = open_bus(peer)
-    yield bus
-    bus.shutdown()
 
 
 def test_the_vehicle_drives_at_the_commanded_speed(bus: can.BusABC, model: VehicleModel, clock: WorldClock) -> None:

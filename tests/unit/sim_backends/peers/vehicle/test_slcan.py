@@ -5,49 +5,15 @@ from __future__ import annotations
 import contextlib
 import socket
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import can
-import numpy as np
 import pytest
 
-from sim_backends.clock import WorldClock
-from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
+from tests.support.wire.can_bus import message, open_bus, receive
 
 pytestmark = pytest.mark.wire
-
-
-def message(identifier: int, data: list[int]) -> can.Message:
-    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
-
-
-def receive(bus: can.BusABC, wanted: Callable[[can.Message], bool], seconds: float = 20.0) -> can.Message:
-    wall = WorldClock()
-    while wall.now() < seconds:
-        frame = bus.recv(0.1)
-        if frame is not None and wanted(frame):
-            return frame
-    raise AssertionError("the frame did not come within the deadline")
-
-
-def open_bus(peer: AgilexPeer) -> can.BusABC:
-    return can.Bus(interface=peer.interface, channel=peer.channel, bitrate=500_000, sleep_after_open=0)
-
-
-@pytest.fixture
-def peer() -> Iterator[AgilexPeer]:
-    peer = AgilexPeer(VehicleModel(VehicleParams(), np.random.default_rng(1)), WorldClock(4.0))
-    peer.start()
-    yield peer
-    peer.stop()
-
-
-@pytest.fixture
-def bus(peer: AgilexPeer) -> Iterator[can.BusABC]:
-    bus = open_bus(peer)
-    yield bus
-    bus.shutdown()
 
 
 @pytest.fixture

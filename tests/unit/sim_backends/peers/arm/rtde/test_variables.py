@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import socket
 import struct
-from collections.abc import Iterator
 from itertools import pairwise
 
 import pytest
-
-from tests.support.wire.arm_bench import ArmBench
 
 pytestmark = pytest.mark.wire
 
@@ -52,19 +49,6 @@ class Rtde:
         return found
 
 
-@pytest.fixture(scope="module")
-def running() -> Iterator[ArmBench]:
-    with ArmBench() as bench:
-        yield bench
-
-
-@pytest.fixture
-def address(running: ArmBench) -> str:
-    running.ask("clear")
-    running.ask("reset")
-    return str(running.address)
-
-
 NUMBERED = ("int_register", "double_register")
 NAMES = [
     "timestamp", "target_q", "target_qd", "target_qdd", "target_current", "target_moment", "actual_q", "actual_qd",
@@ -86,6 +70,8 @@ NAMES = [
     *(f"{way}_{kind}_{i}" for way in ("input", "output") for kind in NUMBERED for i in range(48)),
 ]  # fmt: skip
 """The 393 outputs that the maker's own recording example can ask for."""
+
+
 SIZES = {
     "BOOL": 1, "UINT8": 1, "UINT32": 4, "UINT64": 8, "INT32": 4, "DOUBLE": 8, "VECTOR3D": 24, "VECTOR6D": 48,
     "VECTOR6INT32": 24,
