@@ -18,8 +18,11 @@ from sim_backends import serve
 from sim_backends.clock import SteppedClock
 from sim_backends.serve import main
 from sim_backends.world.world import World
+from tests.support.wire.rtde_client import Rtde
 
 pytestmark = pytest.mark.wire
+
+
 SERVE = [sys.executable, "-m", "sim_backends.serve"]
 
 
@@ -84,35 +87,6 @@ def camera_request(address: str, operation: str) -> dict[str, Any]:
     return reply
 
 
-class Rtde:
-    """Just enough of the protocol's second version to write digital outputs (docs/reference/protocols.md, section
-    1)."""
-
-    def __init__(self, address: str) -> None:
-        self._socket = socket.create_connection((address, 30004), 5.0)
-        self._stream = self._socket.makefile("rb")
-        assert self.request("V", b"\0\2") == b"\1"
-        reply = self.request("I", b"standard_digital_output_mask,standard_digital_output")
-        self._recipe = reply[0]
-        assert reply[1:] == b"UINT8,UINT8"
-
-    def request(self, kind: str, payload: bytes) -> bytes:
-        self._send(kind, payload)
-        size, answered = struct.unpack(">HB", self._stream.read(3))
-        assert chr(answered) == kind
-        return self._stream.read(size - 3)
-
-    def write_output(self, index: int, on: bool) -> None:
-        self._send("U", bytes([self._recipe, 1 << index, int(on) << index]))
-
-    def _send(self, kind: str, payload: bytes) -> None:
-        self._socket.sendall(struct.pack(">HB", 3 + len(payload), ord(kind)) + payload)
-
-    def close(self) -> None:
-        self._stream.close()
-        self._socket.close()
-
-
 def test_every_device_answers_at_its_endpoint_in_its_own_protocol(served: Served) -> None:
     endpoints = served.endpoints
     scan = camera_request(endpoints["scan_camera"]["address"], "identify")
@@ -158,16 +132,15 @@ def test_switching_outputs_turns_the_laser_on_and_drops_the_part(served: Served)
     assert before["part"]["held"]
     assert before["digital_outputs"][:2] == [False, True]
     rtde = Rtde(served.endpoints["arm"]["address"])
-    try:
-        for index, on in ((0, True), (1, False)):
-            rtde.write_output(index, on)
-        # A request is answered in the period after its writes took effect.
-        rtde.request("v", b"")
-        rtde.request("v", b"")
-        after = served.ask_truth(op="truth")["truth"]
-        rtde.write_output(0, False)
-    finally:
-        rtde.close()
+    recipe = rtde.ask("I", b"standard_digital_output_mask,standard_digital_output")[0]
+    for index, on in ((0, True), (1, False)):
+        rtde.tell(bytes([recipe, 1 << index, int(on) << index]))
+    # A request is answered in the period after its writes took effect.
+    rtde.ask("v")
+    rtde.ask("v")
+    after = served.ask_truth(op="truth")["truth"]
+    rtde.tell(bytes([recipe, 1, 0]))
+    rtde.socket.close()
     assert after["laser_on"]
     assert not after["part"]["held"]
 
