@@ -62,7 +62,6 @@ class RailSettings:
     switch_speed: int = 51_200
     left_stop: bool = True
     right_stop: bool = True
-    soft_stop: bool = False
     reverse_shaft: bool = False
 
 
@@ -357,20 +356,12 @@ class RailModel:
             side = (direction + 1) // 2
             # A limit switch stops the direction that the controller believes to lead to it.
             if enabled and not self.backwards and EXCHANGED_SWITCHES not in self._faults:
-                pieces = self._stop_at(pieces, self._motor(self.params.switches[side], direction), direction)
+                pieces, _ = ramp.clip(pieces, self._motor(self.params.switches[side], direction), direction)
             end = self.params.screw.motor(self.params.ends[side], direction)
             pieces, stalled = ramp.clip(pieces, end, direction)
             if stalled is not None:
                 self._stalled_at = stalled
         self._append(pieces, searching=False)
-
-    def _stop_at(self, pieces: list[ramp.Piece], limit: float, direction: int) -> list[ramp.Piece]:
-        cut, time = ramp.clip(pieces, limit, direction)
-        if time is None or not self.settings.soft_stop:
-            return cut
-        before = [piece for piece in pieces if piece.t <= time][-1]
-        x, v = before.at(time)
-        return cut[:-1] + ramp.to_velocity(time, x, v, 0.0, self._acceleration())
 
     def _run(self, pieces: list[ramp.Piece], goal: float, pps: int) -> list[ramp.Piece]:
         """Go on from the rest at the end of `pieces` at `pps` until the motor is at `goal`, stopping dead there."""

@@ -79,7 +79,7 @@ class Workshop:
 
 @dataclass(frozen=True)
 class Scene:
-    """Where everything really is. Poses are (4, 4), metres, named `a_from_b`; frames as in `nominal`.
+    """Where everything really is. Poses are (4, 4), metres, named `a_from_b`; frames as in `drawing`.
 
     The station carries table and surface: where `world_from_surface` is off, the table is off with it.
     """
