@@ -43,30 +43,14 @@ class Bench:
 
 
 def connect(
-    url: str,
-    clock: Clock,
-    travel: tuple[float, float] = (0.0, 0.1),
-    address: int = 1,
-    control: bool = True,
-    reversed: bool = False,
-    reference_mode: int = 5,
-) -> TmclRail:
+    url: str, clock: Clock, travel: tuple[float, float] = (0.0, 0.1), address: int = 1, control: bool = True,
+    reversed: bool = False, reference_mode: int = 5,
+) -> TmclRail:  # fmt: skip
     return TmclRail(
-        "rail",
-        url,
-        lead=0.002,
-        steps_per_turn=200,
-        microsteps=256,
-        travel=travel,
-        max_speed=MAX_SPEED,
-        acceleration=ACCELERATION,
-        address=address,
-        motor=0,
-        reference_mode=reference_mode,
-        reversed=reversed,
-        control=control,
-        clock=clock,
-    )
+        "rail", url, lead=0.002, steps_per_turn=200, microsteps=256, travel=travel, max_speed=MAX_SPEED,
+        acceleration=ACCELERATION, address=address, motor=0, reference_mode=reference_mode, reversed=reversed,
+        control=control, clock=clock,
+    )  # fmt: skip
 
 
 def telegram(command: int, kind: int, value: int) -> bytes:

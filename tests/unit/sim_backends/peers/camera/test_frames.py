@@ -155,14 +155,6 @@ def test_free_running_frames_lie_on_the_grid_of_the_device_clock(client: Client,
         assert called >= t_mid + 0.002
 
 
-def test_a_picture_is_rendered_as_soon_as_its_exposure_is_over(client: Client, scene: Scene, clock: WorldClock) -> None:
-    client.ask(op="start", frame_rate=50.0)
-    for _ in range(40):
-        client.frame()
-    late = [(called - t_mid - 0.5 * exposure) / clock.speed for called, t_mid, exposure in scene.calls]
-    assert np.median(late) < 0.01
-
-
 def test_slow_rendering_drops_exposures_beyond_the_backlog_and_says_so(
     client: Client, scene: Scene, clock: WorldClock
 ) -> None:
