@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cell.devices.simulated.direct import VirtualCell
-from tests.support.virtual_devices import ideal_cell
+from tests.support.simulator.virtual_devices import ideal_cell
 
 
 @pytest.fixture(scope="module")

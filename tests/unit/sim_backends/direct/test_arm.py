@@ -6,7 +6,7 @@ import pytest
 
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmSafety
-from tests.support.virtual_devices import CONFIG, ideal_cell
+from tests.support.simulator.virtual_devices import CONFIG, ideal_cell
 
 
 def test_a_protective_stop_is_unlocked_on_a_persons_word_after_its_delay_with_the_laser_off():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.errors import DeadlineError
-from tests.support.virtual_devices import ideal_cell
+from tests.support.simulator.virtual_devices import ideal_cell
 
 
 def test_a_silent_camera_is_a_deadline_and_a_lost_frame_is_counted():

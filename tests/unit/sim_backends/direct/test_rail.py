@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.errors import Aborted, InterlockError
-from tests.support.virtual_devices import ideal_cell
+from tests.support.simulator.virtual_devices import ideal_cell
 
 
 def test_a_sweep_knows_where_the_rail_was_at_any_time_of_it(cell):

@@ -10,7 +10,7 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams, Power, Safety
 from sim_backends.models.arm_kinematics import UR10E_DH, matrix_from_pose, pose_error, pose_from_matrix
 from sim_backends.models.arm_motion import JointMove, JointSpeed, LinearSpeed, Servo
-from tests.support.simulated_arm import TICK, finish, make_arm, pinocchio_flange, run
+from tests.support.simulator.simulated_arm import TICK, finish, make_arm, pinocchio_flange, run
 
 Array = NDArray[np.float64]
 

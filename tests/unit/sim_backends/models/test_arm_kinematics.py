@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 
 from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics, TruePose, rotation_vector
-from tests.support.simulated_arm import pinocchio_arm, pinocchio_flange
+from tests.support.simulator.simulated_arm import pinocchio_arm, pinocchio_flange
 
 
 def test_inverse_kinematics_says_when_a_pose_is_out_of_reach() -> None:

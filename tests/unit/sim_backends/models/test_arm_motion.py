@@ -9,7 +9,7 @@ import pytest
 from sim_backends.models.arm import Safety
 from sim_backends.models.arm_kinematics import UR10E_DH
 from sim_backends.models.arm_motion import ForceMode, JointMove, JointSpeed, LinearMove, LinearSpeed, Servo, StopMotion
-from tests.support.simulated_arm import TICK, finish, make_arm, pinocchio_flange, run
+from tests.support.simulator.simulated_arm import TICK, finish, make_arm, pinocchio_flange, run
 
 
 def test_a_joint_move_takes_the_time_of_its_trapezoid_and_arrives_exactly() -> None:

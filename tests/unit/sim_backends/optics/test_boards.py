@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sim_backends.optics import Board, BoardInstance
-from tests.support.optics_scene import FINE, LARGE, SCAN, TARGET, expose, pose
+from tests.support.simulator.optics_scene import FINE, LARGE, SCAN, TARGET, expose, pose
 
 
 def outline(optics, camera_from_board, centre, radius):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sim_backends.optics import PlaneInstance, sensor
-from tests.support.optics_scene import SCAN, expose, pose
+from tests.support.simulator.optics_scene import SCAN, expose, pose
 
 
 def test_a_board_out_of_focus_is_blurred_by_the_thin_lens_formula():

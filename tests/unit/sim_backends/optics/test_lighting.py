@@ -3,7 +3,7 @@
 import numpy as np
 
 from sim_backends.optics import BoardInstance, Light, PlaneInstance
-from tests.support.optics_scene import FINE, LARGE, SCAN, TARGET, expose, pose
+from tests.support.simulator.optics_scene import FINE, LARGE, SCAN, TARGET, expose, pose
 
 
 def test_boards_are_exposed_as_the_cameras_expect():

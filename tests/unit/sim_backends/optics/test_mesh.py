@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_backends.optics import Mesh, MeshInstance, PlaneInstance, expected_image
-from tests.support.stripe_scene import OPTICS, facing, height_field, stripe
+from tests.support.simulator.stripe_scene import OPTICS, facing, height_field, stripe
 
 
 def test_a_wall_between_camera_and_stripe_hides_it():

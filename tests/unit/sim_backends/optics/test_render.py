@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_backends.optics import BoardInstance, CameraOptics, render
-from tests.support.optics_scene import FINE, FOCAL_PX, LENS, SCAN, expose, pose
+from tests.support.simulator.optics_scene import FINE, FOCAL_PX, LENS, SCAN, expose, pose
 
 
 @pytest.mark.parametrize(

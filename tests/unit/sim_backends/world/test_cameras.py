@@ -7,7 +7,7 @@ import pytest
 
 from sim_backends.world import drawing
 from sim_backends.world.bodies.surfaces import HALF_Y, surface
-from tests.support.standing_world import StandingWorld
+from tests.support.simulator.standing_world import StandingWorld
 
 
 @pytest.fixture(scope="module")

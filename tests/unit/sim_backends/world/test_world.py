@@ -9,7 +9,7 @@ import pytest
 
 from sim_backends.world import drawing
 from sim_backends.world.world import World, truth
-from tests.support.standing_world import StandingWorld
+from tests.support.simulator.standing_world import StandingWorld
 
 
 def test_the_scan_camera_moves_along_the_rails_true_direction() -> None:

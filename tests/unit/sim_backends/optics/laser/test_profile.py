@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sim_backends.optics import PlaneInstance, expected_image, render
-from tests.support.stripe_scene import CLEAN, DARK, LASER, OPTICS, centroids, facing, stripe
+from tests.support.simulator.stripe_scene import CLEAN, DARK, LASER, OPTICS, centroids, facing, stripe
 
 
 def test_brightness_follows_exposure_distance_incidence_and_albedo():

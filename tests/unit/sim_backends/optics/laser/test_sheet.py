@@ -9,7 +9,7 @@ import pytest
 
 from sim_backends.optics import CameraOptics, LaserOptics, PlaneInstance
 from sim_backends.optics.laser.stripe import crossings
-from tests.support.stripe_scene import CLEAN, FOCAL_PX, facing, stripe
+from tests.support.simulator.stripe_scene import CLEAN, FOCAL_PX, facing, stripe
 
 
 def test_what_stands_in_the_sheet_takes_the_light_from_behind_it():

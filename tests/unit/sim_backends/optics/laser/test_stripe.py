@@ -6,7 +6,7 @@ import pytest
 
 from sim_backends.optics import Board, BoardInstance, MeshInstance, PlaneInstance
 from sim_backends.optics.laser.stripe import crossings
-from tests.support.stripe_scene import LASER, LENS, MATRIX, OPTICS, centroids, facing, height_field, stripe
+from tests.support.simulator.stripe_scene import LASER, LENS, MATRIX, OPTICS, centroids, facing, height_field, stripe
 
 
 @pytest.mark.parametrize("tilt", [[0.0, 0.0, 0.0], [0.35, 0.0, 0.0], [0.0, -0.5, 0.0], [0.2, 0.4, 0.3]])

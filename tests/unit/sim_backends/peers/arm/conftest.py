@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.support.script_controller import Controller
+from tests.support.simulator.script_controller import Controller
 from tests.support.wire.arm_bench import ArmBench
 from tests.support.wire.ur_client import SPEED, Client
 

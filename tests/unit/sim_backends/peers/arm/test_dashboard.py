@@ -11,7 +11,7 @@ import pytest
 
 from sim_backends.models.arm import Power
 from sim_backends.peers.arm.dashboard import DashboardServer
-from tests.support.script_controller import Controller
+from tests.support.simulator.script_controller import Controller
 
 
 @pytest.fixture

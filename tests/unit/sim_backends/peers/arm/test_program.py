@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim_backends.peers.arm.program import RuntimeState
-from tests.support.script_controller import Controller
+from tests.support.simulator.script_controller import Controller
 
 GOAL = [1.0, -1.57, -1.57, -1.57, 1.57, 0.0]
 MOVE = f"def program():\n  movej({GOAL}, a=2.0, v=0.5)\nend\n"

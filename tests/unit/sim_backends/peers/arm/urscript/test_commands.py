@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sim_backends.peers.arm.program import RuntimeState
-from tests.support.script_controller import TICK, Controller, program
+from tests.support.simulator.script_controller import TICK, Controller, program
 
 
 def test_moves_arrive_in_the_time_they_are_given(controller: Controller) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.support.script_controller import Controller, program
+from tests.support.simulator.script_controller import Controller, program
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sim_backends.peers.arm.program import RuntimeState
-from tests.support.script_controller import Controller, program
+from tests.support.simulator.script_controller import Controller, program
 
 
 def test_threads_share_globals_take_turns_and_are_joined_and_killed(controller: Controller) -> None:

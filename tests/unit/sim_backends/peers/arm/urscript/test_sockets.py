@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 
 from sim_backends.peers.arm.program import RuntimeState
-from tests.support.script_controller import Controller, program
+from tests.support.simulator.script_controller import Controller, program
 
 
 def test_a_script_talks_with_a_server_and_only_on_loopback(controller: Controller) -> None:

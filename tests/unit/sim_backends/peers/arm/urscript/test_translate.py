@@ -6,7 +6,7 @@ import pytest
 
 from sim_backends.peers.arm.program import RuntimeState
 from sim_backends.peers.arm.urscript.translate import ScriptCollector
-from tests.support.script_controller import Controller, program
+from tests.support.simulator.script_controller import Controller, program
 
 
 def test_functions_loops_branches_and_scopes(controller: Controller) -> None:
