@@ -18,7 +18,7 @@ from sim_backends import serve
 from sim_backends.clock import SteppedClock
 from sim_backends.serve import main
 from sim_backends.world.world import World
-from tests.support.wire.rtde_client import Rtde
+from tests.support.simulator.rtde_client import Rtde
 
 pytestmark = pytest.mark.wire
 

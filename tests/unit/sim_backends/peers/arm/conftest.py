@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import pytest
 
 from tests.support.simulator.script_controller import Controller
+from tests.support.simulator.ur_client import SPEED, Client
 from tests.support.wire.arm_bench import ArmBench
-from tests.support.wire.ur_client import SPEED, Client
 
 
 @pytest.fixture(scope="module")

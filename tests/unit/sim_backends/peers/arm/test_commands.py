@@ -10,7 +10,7 @@ import pytest
 from rtde_control import Path as MovePath
 from rtde_control import PathEntry, RTDEControlInterface
 
-from tests.support.wire.ur_client import CLOCK, HOME, SPEED, Client, distance, flange, se3, until
+from tests.support.simulator.ur_client import CLOCK, HOME, SPEED, Client, distance, flange, se3, until
 
 pytestmark = pytest.mark.wire
 

@@ -15,8 +15,8 @@ from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.arm.ports import robot_mode, robot_state, version_message
 from tests.support.simulator.script_controller import Controller
+from tests.support.simulator.ur_client import dashboard
 from tests.support.wire.arm_bench import ArmBench
-from tests.support.wire.ur_client import dashboard
 
 pytestmark = pytest.mark.wire
 PARTS = [

@@ -11,7 +11,7 @@ import pytest
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
-from tests.support.wire.can_bus import open_bus
+from tests.support.simulator.can_bus import open_bus
 
 
 @pytest.fixture

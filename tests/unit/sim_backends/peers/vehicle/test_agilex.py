@@ -15,7 +15,7 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
 from tests.support import ROOT
-from tests.support.wire.can_bus import message, open_bus, receive
+from tests.support.simulator.can_bus import message, open_bus, receive
 from tests.support.wire.clocks import until
 
 pytestmark = pytest.mark.wire

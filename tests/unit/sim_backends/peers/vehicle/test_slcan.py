@@ -11,7 +11,7 @@ import can
 import pytest
 
 from sim_backends.peers.vehicle.agilex import AgilexPeer
-from tests.support.wire.can_bus import message, open_bus, receive
+from tests.support.simulator.can_bus import message, open_bus, receive
 
 pytestmark = pytest.mark.wire
 

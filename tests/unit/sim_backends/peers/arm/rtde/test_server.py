@@ -10,8 +10,8 @@ import pytest
 from dashboard_client import DashboardClient
 from rtde_control import RTDEControlInterface
 
+from tests.support.simulator.ur_client import CLOCK, HOME, SPEED, Client, dashboard, distance, flange, se3, until
 from tests.support.wire.arm_bench import ArmBench
-from tests.support.wire.ur_client import CLOCK, HOME, SPEED, Client, dashboard, distance, flange, se3, until
 
 pytestmark = pytest.mark.wire
 

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from tests.support.wire.rtde_client import Rtde
+from tests.support.simulator.rtde_client import Rtde
 
 pytestmark = pytest.mark.wire
 
