@@ -43,7 +43,7 @@ def table1(seeds: SeedsOption = 20, json: JsonOption = False, out: OutOption = N
     from lab.paper.table1 import table1 as campaign
 
     with bar() as told:
-        result = campaign(range(seeds), 0, lambda done, total: told(done, "heads", total))
+        result = campaign(range(seeds), lambda done, total: told(done, "heads", total))
     _show(result, json, out, "table1")
 
 

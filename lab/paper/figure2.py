@@ -33,9 +33,9 @@ class Head:
     theta: float
 
     @classmethod
-    def at_stand_off(cls, baseline: float, focal: float, stand_off: float = STAND_OFF) -> Head:
-        """The head whose light plane meets the optical axis at `stand_off` m (equation 6)."""
-        return cls(baseline, focal, float(np.arctan2(stand_off, baseline)))
+    def at_stand_off(cls, baseline: float, focal: float) -> Head:
+        """The head whose light plane meets the optical axis at `STAND_OFF` (equation 6)."""
+        return cls(baseline, focal, float(np.arctan2(STAND_OFF, baseline)))
 
     @property
     def stand_off(self) -> float:
@@ -52,9 +52,9 @@ class Head:
         d = self.vanishing - np.asarray(x, dtype=np.float64)
         return np.where(d > 0, self.baseline * self.focal / np.where(d > 0, d, 1.0), np.inf)
 
-    def usable_depth(self, half: float = HALF_SENSOR) -> tuple[float, float]:
-        """Nearest and farthest Z in m within |x'| ≤ `half`."""
-        near, far = self.depth([-half, half])
+    def usable_depth(self) -> tuple[float, float]:
+        """Nearest and farthest Z in m within |x'| ≤ `HALF_SENSOR`."""
+        near, far = self.depth([-HALF_SENSOR, HALF_SENSOR])
         return float(near), float(far)
 
 
@@ -75,14 +75,14 @@ def errors(head: Head, x: ArrayLike, y: ArrayLike, delta: float) -> dict[str, Ar
     return {name: np.where(np.isfinite(value), value, np.inf) for name, value in found.items()}
 
 
-def largest_dz(head: Head, delta: float, half: float = HALF_SENSOR) -> float:
-    """The largest |dZ| in m for |x'| ≤ `half` m: it is at x' = +half, nearest to the vanishing line."""
-    return float(errors(head, half, 0.0, delta)["dz"])
+def largest_dz(head: Head, delta: float) -> float:
+    """The largest |dZ| in m for |x'| ≤ `HALF_SENSOR`: it is at x' = +1 mm, nearest to the vanishing line."""
+    return float(errors(head, HALF_SENSOR, 0.0, delta)["dz"])
 
 
-def delta_limit(head: Head, demand: float, half: float = HALF_SENSOR) -> float:
-    """The largest stripe error δ in m at which |dZ| ≤ `demand` m for |x'| ≤ `half` m; 0 when none is small enough."""
-    per_metre = largest_dz(head, 1.0, half)
+def delta_limit(head: Head, demand: float) -> float:
+    """The largest stripe error δ in m at which |dZ| ≤ `demand` m for |x'| ≤ `HALF_SENSOR`; 0 when there is none."""
+    per_metre = largest_dz(head, 1.0)
     return demand / per_metre if np.isfinite(per_metre) else 0.0
 
 
@@ -124,9 +124,9 @@ def peak_power(head: Head, x: ArrayLike, light: Light) -> Array:
     return np.asarray(row_power(head, x, light) * erf(1 / (2 * np.sqrt(2) * sigma)), dtype=np.float64)
 
 
-def uniformity(head: Head, light: Light, half: float = HALF_SENSOR) -> float:
-    """Smallest over largest peak power for |x'| ≤ `half` m; 0 when part of it is beyond the vanishing line."""
-    powers = peak_power(head, np.linspace(-half, half, 201), light)
+def uniformity(head: Head, light: Light) -> float:
+    """Smallest over largest peak power for |x'| ≤ `HALF_SENSOR`; 0 when part of it is beyond the vanishing line."""
+    powers = peak_power(head, np.linspace(-HALF_SENSOR, HALF_SENSOR, 201), light)
     return float(powers.min() / powers.max())
 
 
@@ -143,10 +143,10 @@ DEMAND = 0.2e-3
 LEVELS_MM = (0.02, 0.05, 0.1, 0.2)
 
 
-def smallest_baseline(delta: float, demand: float = DEMAND) -> float | None:
-    """The smallest baseline in m on the 5 mm grid that keeps |dZ| ≤ `demand` m at a stripe error of `delta` m."""
+def smallest_baseline(delta: float) -> float | None:
+    """The smallest baseline in m on the 5 mm grid that keeps |dZ| ≤ `DEMAND` at a stripe error of `delta` m."""
     for baseline in GRID:
-        if delta_limit(Head.at_stand_off(baseline, FOCAL), demand) >= delta:
+        if delta_limit(Head.at_stand_off(baseline, FOCAL), DEMAND) >= delta:
             return baseline
     return None
 

@@ -67,9 +67,9 @@ NEAR_MM, FAR_MM = (0.3, 0.85), (1.0, 6.0)
 STREAK_ROWS = (4, 10)
 
 
-def table1(seeds: Iterable[int], workers: int = 0, progress: Progress | None = None) -> dict[str, Any]:
+def table1(seeds: Iterable[int], progress: Progress) -> dict[str, Any]:
     """Both tests over the seeds, summarised beside the paper's figures. All lengths in mm."""
-    runs = run_all(one_seed, seeds, workers, progress)
+    runs = run_all(one_seed, seeds, progress=progress)
     ways = ("nominal", "staged", "joint")
     return {
         "note": "simulated; the paper's figures were measured on its hardware and are quoted as printed",

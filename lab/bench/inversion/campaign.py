@@ -54,9 +54,9 @@ def _moved(cloud: Cloud, motions: Array) -> Cloud:
     return replace(cloud, points=cloud.points + motions)
 
 
-def _warped(warp: Callable[[Array, Array, np.random.Generator], Array], setting: Setting | None = None) -> Draw:
+def _warped(warp: Callable[[Array, Array, np.random.Generator], Array]) -> Draw:
     def draw(rng: np.random.Generator) -> Drawn:
-        return scan(PARTS["pot"], rng, setting, height=lambda x, y: _POT(x, y) + warp(x, y, rng)), TRUE, (TRUE,)
+        return scan(PARTS["pot"], rng, height=lambda x, y: _POT(x, y) + warp(x, y, rng)), TRUE, (TRUE,)
 
     return draw
 

@@ -196,9 +196,7 @@ def scan(
     rng: np.random.Generator,
     setting: Setting | None = None,
     *,
-    sigma: float = STRIPE_SIGMA,
     height: Callable[[Array, Array], Array] | None = None,
-    true: pin.SE3 = TRUE,
 ) -> Cloud:
     """A cloud of `part` and the table around it, arm base; `height` is another surface that lies in its place."""
     setting = setting or Setting()
@@ -214,16 +212,16 @@ def scan(
     if setting.missing:
         z = np.where(_hidden(x, y, inside, setting.missing, rng), np.nan, z)
     points = np.stack([x, y, z], -1)
-    across = np.array([0.06, 0.0, 1.0]) * sigma
+    across = np.array([0.06, 0.0, 1.0]) * STRIPE_SIGMA
     points += across * rng.standard_normal((LINES, ROWS, 1))
     points[:, :, 0] += RAIL_SIGMA * rng.standard_normal((LINES, 1))
     wild = rng.random((LINES, ROWS)) < setting.wild
     points[wild, 2] += rng.uniform(-0.004, 0.004, int(wild.sum()))
     points[~np.isfinite(z)] = np.nan
     return Cloud(
-        points=points @ true.rotation.T + true.translation,
-        stripe_spread=np.broadcast_to(across @ true.rotation.T, points.shape).astype(np.float32),
-        rail_spread=np.tile(true.rotation[:, 0] * RAIL_SIGMA, (LINES, 1)),
+        points=points @ TRUE.rotation.T + TRUE.translation,
+        stripe_spread=np.broadcast_to(across @ TRUE.rotation.T, points.shape).astype(np.float32),
+        rail_spread=np.tile(TRUE.rotation[:, 0] * RAIL_SIGMA, (LINES, 1)),
         centres=np.zeros((LINES, ROWS)),
         rail=np.linspace(0.0, 2 * reach_x, LINES),
         rejected=np.zeros((LINES, ROWS), dtype=bool),
@@ -259,8 +257,8 @@ def _hidden(x: Array, y: Array, inside: Mask, share: float, rng: np.random.Gener
     return np.asarray(hidden)
 
 
-def start_away(rng: np.random.Generator, metres: float, degrees: float, true: pin.SE3 = TRUE) -> pin.SE3:
-    """A pose `metres` and `degrees` away from `true`, in random directions."""
+def start_away(rng: np.random.Generator, metres: float, degrees: float) -> pin.SE3:
+    """A pose `metres` and `degrees` away from `TRUE`, in random directions."""
     way, axis = rng.normal(size=3), rng.normal(size=3)
     turn = np.radians(degrees) * axis / np.linalg.norm(axis)
-    return perturbed(true, np.concatenate([metres * way / np.linalg.norm(way), turn]))
+    return perturbed(TRUE, np.concatenate([metres * way / np.linalg.norm(way), turn]))

@@ -264,11 +264,10 @@ def _scatter(normal: Normal, inverse: Inverse, name: str) -> float:
     return float(np.clip(np.sqrt(block.squares / expected_cost(name, block, inverse)), 0.1, 10.0))
 
 
-def shared_mask(*, plane: bool, rail: bool, tangential: bool = True) -> NDArray[np.bool_]:
+def shared_mask(*, plane: bool, rail: bool) -> NDArray[np.bool_]:
     """Which of the 27 shared parameters move: always fx … k1, hand-eye and board; k3 never (it is not observable)."""
     free = np.ones(SHARED, dtype=np.bool_)
     free[CAMERA.start + 8] = False
-    free[6:8] = tangential
     free[PLANE] = plane
     free[RAIL] = rail
     return free

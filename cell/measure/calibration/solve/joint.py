@@ -172,7 +172,6 @@ def solve_joint(
     observations: Sequence[ScanObservation],
     staged: Staged,
     priors: Priors,
-    tangential: bool = True,
     held_out: bool = True,
 ) -> Joint:
     """Adjust everything together, and predict the views of every fourth rest from the others in turn."""
@@ -182,7 +181,7 @@ def solve_joint(
         rows = staged.plane.rows
     views = [view_data(o, r) for o, r in zip(observations, rows, strict=True)]
     rail = float(np.ptp([o.rail_position for o in observations])) > 1e-3
-    free = shared_mask(plane=staged.plane is not None, rail=rail, tangential=tangential)
+    free = shared_mask(plane=staged.plane is not None, rail=rail)
     problem = Adjustment(views, free, priors)
     adjusted = with_bow(problem, problem.solve(start_state(staged)))
     px, stripe = float("nan"), float("nan")

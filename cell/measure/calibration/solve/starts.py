@@ -328,17 +328,20 @@ def solve_hand_eye(
     return _scatter(base_from_flange, camera_from_board, readings, flange_from_camera, direction)
 
 
+BALANCE = 0.3
+
+
 def refine_hand_eye(
-    base_from_flange: Sequence[pin.SE3], camera_from_board: Sequence[pin.SE3], start: HandEye, balance: float = 0.3
+    base_from_flange: Sequence[pin.SE3], camera_from_board: Sequence[pin.SE3], start: HandEye
 ) -> tuple[HandEye, Array, Array]:
-    """Hand-eye and board together by robust least squares on the poses; 1 rad counts like `balance` m.
+    """Hand-eye and board together by robust least squares on the poses; 1 rad counts like `BALANCE` m.
 
     Also the deviations (6,) of the hand-eye, m and rad, by leaving each pair out in turn, and how far (n,) in m each
     left-out pair puts the board from where the others do. For pairs of poses without pictures; where there are
     pictures the joint adjustment does better. The rail rests.
     """
     hand_eye, board = start.flange_from_camera, start.base_from_board
-    weight = np.array([1.0, 1.0, 1.0, balance, balance, balance])
+    weight = np.repeat([1.0, BALANCE], 3)
 
     def residuals(x: pin.SE3, b: pin.SE3) -> Array:
         return np.array(
