@@ -234,8 +234,8 @@ def dots_terms(
             row = jacobian[i, axis]
             row[:] = 0.0
             f = lens[axis]
-            _lens_columns(lens, axis, x=x, y=y, seen=u if axis == 0 else v, row=row)
-            by_x, by_y = (f * jxx / mid[2], f * jxy / mid[2]) if axis == 0 else (f * jxy / mid[2], f * jyy / mid[2])
+            _lens_columns(lens, axis, x=x, y=y, seen=(u, v)[axis], row=row)
+            by_x, by_y = f * (jxx, jxy)[axis] / mid[2], f * (jxy, jyy)[axis] / mid[2]
             by_z = -(by_x * x + by_y * y)
             # Farther away the circle is smaller, and its ellipse's centre nearer to the picture of its own.
             nearer = (by_x * aside[0] + by_y * aside[1] + by_z * aside[2]) * share / seen[2]
