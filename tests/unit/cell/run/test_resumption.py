@@ -142,6 +142,7 @@ def test_a_damaged_journal_is_an_error_in_our_words_and_never_a_part_that_is_hel
     tmp_path: Path, parts: tuple[str, ...], older: bool
 ) -> None:
     folder = placing(tmp_path, *parts)
+    whole = None if parts else UnfinishedRun.find(folder)
     path = folder / FILE_NAME
     base = sqlite3.connect(path, isolation_level=None)
     if older:
@@ -162,9 +163,9 @@ def test_a_damaged_journal_is_an_error_in_our_words_and_never_a_part_that_is_hel
             continue
         resumed += 1
         assert not parts or older, "of a part that was put down already"
-        assert older or found.info["job_hash"] == job_hash(tmp_path / "pot.toml")
-    # What is empty in the file may hold anything; all else was refused.
-    assert resumed < (250 if older else 25)
+        # What is empty in the file may hold anything; all else was refused.
+        assert older or found == whole
+    assert resumed < (250 if older else 50)
 
 
 COLUMNS = {
