@@ -234,14 +234,14 @@ class DirectArm(DirectDevice):
 
     def set_digital_output(self, index: int, value: bool) -> None:
         """Set an output and let a tick pass, in which the world follows it."""
-        self._check_index("output", index)
+        self._check_index(index)
         self.model.write_digital_outputs(1 << index, int(value) << index)
         self.clock.sleep(TICK_S)
 
     @contextmanager
     def trying(self, index: int) -> Iterator[None]:
         """See `drivers.interfaces.TriesOutputs`."""
-        self._check_index("output", index)
+        self._check_index(index)
         self._tried.append(index)
         try:
             yield
@@ -250,7 +250,7 @@ class DirectArm(DirectDevice):
 
     def digital_input(self, index: int) -> bool:
         """What is wired to input `index`."""
-        self._check_index("input", index)
+        self._check_index(index)
         return bool(self.model.digital_inputs >> index & 1)
 
     def recover(self, *, confirmed: bool = False) -> None:
@@ -325,9 +325,10 @@ class DirectArm(DirectDevice):
         if self._motion is not None and not self._motion.done:
             self._motion.after_tick(t)
 
-    def _check_index(self, what: str, index: int) -> None:
+    def _check_index(self, index: int) -> None:
         if not 0 <= index < _OUTPUTS:
-            raise LimitError(self.name, f"digital {what} {index} does not exist, 0 to {_OUTPUTS - 1} do")
+            which = "0-7 standard, 8-15 configurable, 16-17 tool"
+            raise LimitError(self.name, f"digital input or output {index} does not exist: {which}")
 
     def _require_free(self) -> None:
         self._require_remote()

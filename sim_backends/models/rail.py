@@ -62,6 +62,7 @@ class RailSettings:
     switch_speed: int = 51_200
     left_stop: bool = True
     right_stop: bool = True
+    soft_stop: bool = False
     reverse_shaft: bool = False
 
 
@@ -97,6 +98,7 @@ class RailModel:
         self._losing = False
         self._lock = threading.RLock()
         self._edge = 0.0
+        self._switch_distance = 0
         self._stalled_at: float | None = None
         motor = params.screw.nut(params.start)
         self._zero = motor
@@ -168,6 +170,11 @@ class RailModel:
         """True while a reference search is running."""
         with self._lock:
             return self._leg(t).searching
+
+    def switch_distance(self) -> int:
+        """Microsteps between the switches as found by the last search of both, else 0."""
+        with self._lock:
+            return self._switch_distance
 
     def fault(self, name: str, t: float) -> None:
         """Until `clear`: the wires of the limit switches are exchanged, or the motor loses a tenth of its steps on its
@@ -258,6 +265,7 @@ class RailModel:
                 legs = self._run(legs, zero, self.settings.search_speed)
             legs = self._run(legs, self._motor(edge + _BACK_OFF, +1), self.settings.search_speed)
             legs = self._run(legs, zero, self.settings.switch_speed)
+            self._switch_distance = round((right - zero) * self._steps()) if mode in (2, 3) else 0
             self._append(legs[:-1], searching=True)
             self._zero = zero
             self._append(legs[-1:], searching=False)
@@ -356,12 +364,20 @@ class RailModel:
             side = (direction + 1) // 2
             # A limit switch stops the direction that the controller believes to lead to it.
             if enabled and not self.backwards and EXCHANGED_SWITCHES not in self._faults:
-                pieces, _ = ramp.clip(pieces, self._motor(self.params.switches[side], direction), direction)
+                pieces = self._stop_at(pieces, self._motor(self.params.switches[side], direction), direction)
             end = self.params.screw.motor(self.params.ends[side], direction)
             pieces, stalled = ramp.clip(pieces, end, direction)
             if stalled is not None:
                 self._stalled_at = stalled
         self._append(pieces, searching=False)
+
+    def _stop_at(self, pieces: list[ramp.Piece], limit: float, direction: int) -> list[ramp.Piece]:
+        cut, time = ramp.clip(pieces, limit, direction)
+        if time is None or not self.settings.soft_stop:
+            return cut
+        before = [piece for piece in pieces if piece.t <= time][-1]
+        x, v = before.at(time)
+        return cut[:-1] + ramp.to_velocity(time, x, v, 0.0, self._acceleration())
 
     def _run(self, pieces: list[ramp.Piece], goal: float, pps: int) -> list[ramp.Piece]:
         """Go on from the rest at the end of `pieces` at `pps` until the motor is at `goal`, stopping dead there."""

@@ -179,7 +179,10 @@ def _transmit(descriptor: int, data: bytes) -> None:
 
 
 Operation = Callable[[Mapping[str, Any]], Mapping[str, object] | None]
-"""Carries out a request and gives what its reply says beside "ok"; ValueError, TypeError or KeyError refuse it."""
+"""Carries out a request and gives what its reply says beside "ok".
+
+ValueError, TypeError, KeyError or IndexError refuse the request.
+"""
 
 
 class JsonLinesPeer(TcpServer):
@@ -202,13 +205,14 @@ class JsonLinesPeer(TcpServer):
     def _answer(self, line: bytes) -> dict[str, object]:
         try:
             request = json.loads(line)
-            operation = self._operations[request["op"]]
+            name = request["op"]
         except (ValueError, TypeError, KeyError):
-            known = ", ".join(self._operations)
-            return {"ok": False, "error": f'a request is one line with a JSON object whose "op" is one of: {known}'}
+            return {"ok": False, "error": 'a request is one line with a JSON object that has "op"'}
+        if (operation := self._operations.get(str(name))) is None:
+            return {"ok": False, "error": f"unknown op {name!r}; known: {', '.join(self._operations)}"}
         try:
             return {"ok": True, **(operation(request) or {})}
-        except (ValueError, TypeError, KeyError) as error:
+        except (ValueError, TypeError, KeyError, IndexError) as error:
             told = str(error) if type(error) is ValueError else f"{type(error).__name__}: {error}"
             return {"ok": False, "error": told}
 

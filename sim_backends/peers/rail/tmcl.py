@@ -21,7 +21,7 @@ from sim_backends.peers.server import SerialServer, Take
 SETTINGS: dict[int, tuple[str, int, int]] = {
     4: ("max_velocity", 0, 7_999_774), 5: ("max_acceleration", 0, 7_629_278), 12: ("right_stop", 0, 1),
     13: ("left_stop", 0, 1), 15: ("first_acceleration", 0, 7_629_278), 16: ("first_speed", 0, 1_000_000),
-    17: ("max_deceleration", 1, 7_629_278), 18: ("last_deceleration", 1, 7_629_278),
+    17: ("max_deceleration", 1, 7_629_278), 18: ("last_deceleration", 1, 7_629_278), 26: ("soft_stop", 0, 1),
     140: ("microsteps", 0, 8), 193: ("search_mode", 1, 8), 194: ("search_speed", 1, 7_999_774),
     195: ("switch_speed", 1, 7_999_774), 251: ("reverse_shaft", 0, 1),
 }  # fmt: skip
@@ -32,7 +32,7 @@ SEARCH_MODES = (1, 2, 3, 4, 5, 6, 7)
 
 PLAIN: dict[int, tuple[int, int, int]] = {
     6: (128, 0, 255), 7: (8, 0, 255), 14: (0, 0, 1), 19: (0, 0, 7_999_774), 20: (10, 1, 7_999_774), 21: (0, 0, 65535),
-    24: (0, 0, 1), 25: (0, 0, 1), 26: (0, 0, 1), 31: (0, 0, 65535), 127: (0, 0, 1), 153: (0, 0, 13), 154: (3, 0, 13),
+    24: (0, 0, 1), 25: (0, 0, 1), 31: (0, 0, 65535), 127: (0, 0, 1), 153: (0, 0, 13), 154: (3, 0, 13),
     181: (0, 0, 7_999_774), 204: (0, 0, 65535), 214: (200, 0, 65535), 254: (0, 0, 0), 255: (1, 1, 1),
 }  # fmt: skip
 """Axis parameters that are only remembered: number → (value at power-on, smallest, largest value)."""
@@ -190,7 +190,7 @@ class TmclModule:
             0: rail.target, 1: lambda: rail.position(t), 2: rail.target_velocity, 3: lambda: rail.velocity(t),
             8: lambda: int(rail.reached(t)), 9: lambda: int(rail.home_switch(t)),
             10: lambda: int(rail.right_switch(t)), 11: lambda: int(rail.left_switch(t)), 29: lambda: rail.velocity(t),
-            202: lambda: rail.params.steps_per_turn, 206: lambda: 0,
+            196: rail.switch_distance, 202: lambda: rail.params.steps_per_turn, 206: lambda: 0,
             208: lambda: int(rail.stalled(t)) | (int(rail.velocity(t) == 0) << 7),
         }  # fmt: skip
         if kind not in readings:

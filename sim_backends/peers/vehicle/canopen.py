@@ -194,12 +194,11 @@ class CanopenPeer(CanPeer):
         self._t = clock.now()
         model.set_mode(self._t, Mode.CAN)
 
-    def start(self) -> None:
-        """Begin to serve; the drives say that they were switched on."""
-        super().start()
+    def _run(self) -> None:
         with self._lock:
             for drive in self.drives:
                 drive.node.boot()
+        super()._run()
 
     def fault(self, name: str) -> None:
         """As `CanPeer`; `can.node_lost`: the left drive hears and says nothing any more."""

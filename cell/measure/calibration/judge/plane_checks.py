@@ -148,7 +148,8 @@ def planes_of_cameras(
         clouds = [on_plane(camera, board_pose(view, camera).camera_from_board, pixels) for view, pixels in lit]
         return robust_plane(np.concatenate(clouds))[0]
 
-    return [plane(0.0), *(plane(column) for column in covariance_root(pictures.covariance).T if np.any(column))]
+    directions = covariance_root(pictures.covariance).T
+    return [plane(0.0), *(plane(column) for column in directions if np.any(np.abs(column) > 0))]
 
 
 def planes_without_one(clouds: Sequence[Array]) -> list[LightPlane]:
@@ -168,19 +169,20 @@ def plane_checks(
     """
     reach = float(np.median(cloud[:, 2]))
     words = f"from {frames} frames, each left out in turn; take further frames at other distances and tilts"
-    left_out_check = QualityCheck(
-        "light_plane", "stripes that are left out", 100 * left_out / (frames + left_out), 25.0, refuse=40.0, unit="%",
-        says=f"{left_out} of {frames + left_out} lie in no plane with the others, too many for slips: was the "
-        "laser or the camera moved in between, or are there several lines? Calibrate each part by itself",
-    )  # fmt: skip
-    missing = QualityCheck(
-        "light_plane", "frames that are missing", LEAST_CHECKED - frames, doubt=0.5, refuse=np.inf, unit="",
-        says=f"{frames} frames show the stripe and check each other little; take {LEAST_CHECKED} or more",
-    )  # fmt: skip
+    checks = [plane_fit_check(rms, own, cloud)]
+    if left_out:
+        checks.append(QualityCheck(
+            "light_plane", "stripes that are left out", 100 * left_out / (frames + left_out), 25.0, 40.0, unit="%",
+            says=f"{left_out} of {frames + left_out} lie in no plane with the others, too many for slips: was the "
+            "laser or the camera moved in between, or are there several lines? Calibrate each part by itself",
+        ))  # fmt: skip
+    if frames < LEAST_CHECKED:
+        checks.append(QualityCheck(
+            "light_plane", "frames that are missing", LEAST_CHECKED - frames, doubt=0.5, refuse=np.inf, unit="",
+            says=f"{frames} frames show the stripe and check each other little; take {LEAST_CHECKED} or more",
+        ))  # fmt: skip
     return [
-        plane_fit_check(rms, own, cloud),
-        *([left_out_check] if left_out else []),
-        *([missing] if frames < LEAST_CHECKED else []),
+        *checks,
         QualityCheck(
             "light_plane", "σ of its place where it was seen", 100 * known.place / reach, doubt=0.5, refuse=4.0,
             unit="% of the distance", says=f"{1e3 * known.place:.2f} mm at {1e3 * reach:.0f} mm, {words}",

@@ -71,3 +71,21 @@ def test_searches_scatter_by_the_repeatability() -> None:
         assert model.position(20.0 * i + 19.0) == 0
     assert np.mean(edges) == pytest.approx(0.0, abs=1e-6)
     assert np.std(edges) == pytest.approx(5e-6, rel=0.15)
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_limit_switch_stops_the_motor_at_once_or_on_the_ramp(soft: bool) -> None:
+    model = rail()
+    model.configure(0.0, RailSettings(max_velocity=5 * STEPS, max_acceleration=20 * STEPS, soft_stop=soft))
+    model.rotate(0.0, 5 * STEPS)
+    beyond = LEAD * 5.0**2 / (2 * 20.0) if soft else 0.0
+    assert model.carriage(29.0) == pytest.approx(0.102 + beyond, abs=1e-9)
+    assert not model.stalled(29.0)
+
+
+@pytest.mark.parametrize(("mode", "turns"), [(1, 0), (2, 52), (3, 52), (6, 0)])
+def test_a_search_of_both_switches_finds_their_distance(mode: int, turns: int) -> None:
+    model = rail()
+    model.configure(0.0, RailSettings(search_mode=mode))
+    model.search(0.0)
+    assert model.switch_distance() == turns * STEPS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import socket
 import struct
 import threading
@@ -10,7 +11,7 @@ from collections.abc import Callable
 import pytest
 import serial
 
-from sim_backends.peers.server import PAUSE_S, SerialServer, TcpServer
+from sim_backends.peers.server import PAUSE_S, JsonLinesPeer, SerialServer, TcpServer
 
 pytestmark = pytest.mark.wire
 
@@ -63,3 +64,23 @@ def test_a_serial_line_serves_a_terminal_and_a_socket_and_forgets_half_a_request
     with socket.create_connection(("127.0.0.1", int(server.url.rsplit(":", 1)[1])), timeout=2.0):
         server.stop()
     assert set(threading.enumerate()) == before
+
+
+def test_a_wrong_line_of_json_is_refused_with_its_reason_and_the_connection_stays() -> None:
+    peer = JsonLinesPeer("lines", {"tell": lambda request: {"first": request["rows"][0][0]}})
+    peer.start()
+    told = {
+        b'{"op": "tell", "rows": [[]]}': "IndexError: list index out of range",
+        b'{"op": "tell"}': "KeyError: 'rows'",
+        b'{"op": "tell", "rows": 1}': "TypeError: 'int' object is not subscriptable",
+        b'{"op": "dance"}': "unknown op 'dance'; known: tell",
+        b'{"op": ["tell"]}': "unknown op ['tell']; known: tell",
+        b"[]": 'a request is one line with a JSON object that has "op"',
+    }
+    with socket.create_connection((peer.host, peer.port), timeout=2.0) as client, client.makefile("rwb") as lines:
+        for line in (*told, b'{"op": "tell", "rows": [[3]]}'):
+            lines.write(line + b"\n")
+            lines.flush()
+            error = {"ok": False, "error": told[line]} if line in told else {"ok": True, "first": 3}
+            assert json.loads(lines.readline()) == error
+    peer.stop()

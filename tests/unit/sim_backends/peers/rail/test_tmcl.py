@@ -119,6 +119,18 @@ def test_the_switches_stop_the_motion_and_let_it_go_the_other_way(
     assert model.carriage(clock.now()) == pytest.approx(-0.002, abs=1e-8)
 
 
+def test_a_soft_stop_and_the_distance_of_the_switches_are_axis_parameters(
+    client: SerialTmclInterface, module: TMCM1260, model: RailModel
+) -> None:
+    axis = module.motors[0]
+    axis.set_axis_parameter(axis.AP.SoftStop, 1)
+    assert (model.settings.soft_stop, axis.get_axis_parameter(axis.AP.SoftStop)) == (True, 1)
+    assert axis.get_axis_parameter(axis.AP.ReferenceSwitchDistance) == 0
+    axis.set_axis_parameter(axis.AP.ReferenceSearchMode, 2)
+    client.reference_search(0, 0)
+    assert axis.get_axis_parameter(axis.AP.ReferenceSwitchDistance) == 52 * STEPS
+
+
 def test_without_its_switches_the_rail_stalls_at_its_mechanical_end(
     module: TMCM1260, model: RailModel, clock: WorldClock
 ) -> None:

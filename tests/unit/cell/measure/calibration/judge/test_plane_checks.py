@@ -56,6 +56,8 @@ def test_a_plane_is_as_sure_as_it_is_without_each_frame_and_one_that_scatters_is
         verdicts = {check.name: check.verdict for check in plane_checks(rms, 2e-5, cloud, 6, known[-1])}
         fits = verdicts["RMS of the stripe's points"]
         assert fits == ("ok" if sigma < 1e-3 else "refused")
+    few = [check.name for check in plane_checks(2e-5, 2e-5, cloud, 0, known[0])]
+    assert "frames that are missing" in few and "stripes that are left out" not in few
     # Of 360 points a plane is known to about σ √(3/360).
     assert known[0].place == pytest.approx(2e-5 * np.sqrt(3 / 360), rel=0.8)
     assert known[1].place > 50 * known[0].place and known[1].tilt > 50 * known[0].tilt
