@@ -7,12 +7,14 @@ other, because they share what is made once for a worker, or because devices ove
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
 import pytest
 from xdist.scheduler import LoadFileScheduling
 
+from cell.apps.cli import main
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
 
@@ -201,3 +203,18 @@ def ends(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> End
         return made[make]
 
     return get
+
+
+@pytest.fixture
+def typed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str, str]]:
+    """Gives what a `cell` command comes to, run in this process and folder: exit code, output, complaints."""
+
+    def run(*words: str) -> tuple[int, str, str]:
+        monkeypatch.setattr("sys.argv", ["cell", *words])
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main()
+        out, error = capsys.readouterr()
+        return int(ended.value.code or 0), out, error
+
+    return run

@@ -1,40 +1,46 @@
-"""`Cell.verify` on the simulated cell: a good calibration passes, a disturbed one is told with its part."""
+"""`cell calibrate verify` and `accept`, typed: a good calibration passes, a disturbed one is told with its part."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from cell import Cell
-from cell.config.calibrations.store import accept_calibration, save_calibration
+from cell.config.calibrations.store import save_calibration
 from drivers.errors import CalibrationStale
 from lab.bench.job.whole_job import JobRecord
 
 
 def test_verify_tells_a_disturbed_calibration_from_a_good_one(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: Callable[..., tuple[int, str, str]]
 ) -> None:
     assert placed_pot.calibration is not None
     file = tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json"
     save_calibration(placed_pot.calibration, file)
     monkeypatch.chdir(tmp_path)
-    with Cell.open(sim="all", seed=2, clock="virtual") as cell:
-        assert cell.verify().good
+    monkeypatch.setattr(Cell, "open", partial(Cell.open, clock="virtual"))
+    verify = ("calibrate", "verify", "--sim", "all", "--seed", "2", "--json")
+    code, out, _ = typed(*verify)
+    assert (code, json.loads(out)["good"]) == (0, True)
     stored = json.loads(file.read_text())
     stored["scan"]["flange_from_camera"][0][3] += 0.2e-3
     file.write_text(json.dumps(stored))
-    with Cell.open(sim="all", seed=2, clock="virtual") as cell:
-        for refused in (cell.verify, cell.run):
-            with pytest.raises(
-                CalibrationStale, match=r"was changed after it was written: scan\.flange_from_camera\. "
-            ):
-                refused()
-    accept_calibration(file, "the test", "a mount that slipped")
-    with Cell.open(sim="all", seed=2, clock="virtual") as cell:
-        found = dict(cell.verify().summary())
-    assert not found["good"]
+    code, _, error = typed(*verify)
+    assert (code, "was changed after it was written: scan.flange_from_camera. " in error) == (1, True), error
+    with Cell.open(sim="all", seed=2) as cell, pytest.raises(CalibrationStale, match="was changed after"):
+        cell.run()
+    assert typed("calibrate", "accept", file.stem, "--why", " ")[0] == 2
+    code, out, _ = typed("calibrate", "accept", file.stem, "--why", "a mount that slipped", "--by", "Ann", "--json")
+    edit = json.loads(out)
+    assert (code, edit["who"], edit["why"]) == (0, "Ann", "a mount that slipped")
+    assert edit["changed"] == ["scan.flange_from_camera"]
+    code, out, _ = typed(*verify)
+    found = json.loads(out)
+    assert (code, found["good"]) == (1, False)
     assert "scan camera" in found["suspects"][0]["part"]
     assert found["suspects"][0]["place_error_mm"] > 0.05
 

@@ -67,6 +67,8 @@ def require_safe(report: dict[str, Any]) -> None:
     assert not end["arm"]["moving"]
     assert end["vehicle"]["braked"] and end["vehicle"]["stopped"]
     assert end["collisions"] == []
+    # Whatever fails before the release, the part stays in the claw.
+    assert end["part"]["held"] == (report["outcome"] != "placed")
 
 
 def plain_record(folder: Path) -> list[Any]:
@@ -141,11 +143,14 @@ def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
         ("vehicle.motor_fault@drive_to_target:40%", "vehicle.error"),
         ("arm.emergency_stop@board_photo", "arm.emergency_stop"),
         ("target_camera.silent@drive_to_target", "DeadlineError"),
+        ("arm.protective_stop@place:40%", "arm.protective_stop"),
+        ("vehicle.motor_fault@place:40%", "vehicle.error"),
     ],
 )
 def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe(inject: str, code: str) -> None:
-    outcome = done((inject,))
+    outcome = done((inject,), confirm="simulated")
     assert (outcome.outcome, outcome.report["code"]) == ("faulted", code)
+    assert outcome.reason.startswith(inject.partition(".")[0])
     require_safe(dict(outcome.report))
 
 
@@ -184,6 +189,8 @@ def test_a_protective_stop_waits_for_a_persons_word() -> None:
         run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"], until="drive_to_target")
         needed = upto(run, ConfirmNeeded)
         assert isinstance(needed, ConfirmNeeded)
+        with pytest.raises(InterlockError, match="a job is going on"):
+            cell.home()
         before = cell.devices.clock.now()
         assert run.confirm("the test", needed.number)
         outcome = run.result(60.0)
@@ -214,6 +221,8 @@ def test_without_a_word_the_run_waits_and_can_be_ended() -> None:
         assert cell.devices.clock.now() == before
         run.abort("enough waited")
         outcome = run.result(60.0)
+        assert cell.simulated is not None
+        assert cell.simulated.truth()["arm"]["safety"] == "protective_stop"
     assert (outcome.outcome, outcome.reason) == ("aborted", "enough waited")
 
 
@@ -228,11 +237,20 @@ def test_a_job_that_does_not_fit_what_is_there_is_refused(folder: Path) -> None:
     require_safe(dict(outcome.report))
 
 
-@pytest.mark.parametrize("way", ["handle", "journal", "stop", "close"])
-def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str) -> None:
+@pytest.mark.parametrize(
+    ("way", "step", "reason"),
+    [
+        ("handle", "drive_to_target", "by its handle"),
+        ("journal", "drive_to_target", "by the journal"),
+        ("stop", "laser_sweep", "Cell.stop()"),
+        ("stop", "reconstruct", "Cell.stop()"),
+        ("close", "drive_to_target", "closed"),
+    ],
+)
+def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str, step: str, reason: str) -> None:
     with opened() as cell:
         run = cell.start("pot.toml")
-        upto(run, StepStarted, "laser_sweep" if way == "stop" else "drive_to_target")
+        upto(run, StepStarted, step)
         assert run.folder is not None
         match way:
             case "handle":
@@ -243,8 +261,17 @@ def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str) -> None:
                 cell.stop()
             case "close":
                 cell.close()
+        assert cell.simulated is not None
+        stood = cell.simulated.truth()["poses"]["base_from_flange"]
         outcome = run.result(60.0)
-    assert outcome.outcome == "aborted"
+        if step == "reconstruct":
+            # It only computed: nothing may move after the stop.
+            assert cell.simulated.truth()["poses"]["base_from_flange"] == stood
+        if way == "close":
+            with pytest.raises(InterlockError, match="was closed"):
+                cell.start("pot.toml")
+    assert (outcome.outcome, reason in outcome.reason) == ("aborted", True), outcome.reason
+    assert [(row["name"], row["state"]) for row in outcome.report["steps"]][-1] == ("place", "open")
     require_safe(dict(outcome.report))
 
 

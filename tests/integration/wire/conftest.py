@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from cell import Cell
-from cell.apps.cli import main
 from cell.run.folder import list_runs, read_report
 from tests.project.test_readme import block
 from tests.support.wire.cells import Supervised
@@ -41,18 +39,3 @@ def supervise(folder: Path) -> Supervised:
 def place(supervised: Supervised) -> Path:
     """A folder with the calibration of the simulated cell of seed 3; tests run jobs in it."""
     return supervised.folder
-
-
-@pytest.fixture
-def typed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str, str]]:
-    """Gives what a `cell` command comes to, run in this process and folder: exit code, output, complaints."""
-
-    def run(*words: str) -> tuple[int, str, str]:
-        monkeypatch.setattr("sys.argv", ["cell", *words])
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main()
-        out, error = capsys.readouterr()
-        return int(ended.value.code or 0), out, error
-
-    return run

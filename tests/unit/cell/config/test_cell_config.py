@@ -211,6 +211,7 @@ def test_the_shipped_configuration_is_valid() -> None:
         ({"rail__laed": "2 mm"}, ["rail.laed", "unknown key"]),
         ({"rail__lead": "50.1 mm"}, ["rail.lead", "0.1 to 50 mm"]),
         ({"rail__lead": "0.09 mm"}, ["rail.lead", "0.1 to 50 mm"]),
+        ({"calibration__fine__board": "marked_dots:11"}, ["calibration.fine.board"]),
         ({"vehicle__driver": "tank"}, ["vehicle.driver", '"tank"', '"agilex"']),
     ],
 )

@@ -107,6 +107,10 @@ def test_the_report_keeps_its_contract(placed: Ended) -> None:
     report = read_strictly(placed.folder / "report.json")
     assert {"outcome", "seed", "level", "steps", "place_pose", "place_sigma", "assumed_noise", "truth"} <= set(report)
     assert all({"name", "state", "duration_s", "retries", "wall_s"} <= set(step) for step in report["steps"])
-    assert {"points", "error_mm", "d_p95", "sensor_mm", "bound_mm"} <= set(report["truth"])
+    truth = report["truth"]
+    assert (truth["points"], set(truth["error_mm"])) == (45, {"x", "y", "z", "d"})
+    assert {"mean", "p85"} <= set(truth["sensor_mm"])
+    assert 0 < truth["bound_mm"] < 0.5
+    assert truth["d_p95"] <= truth["error_mm"]["d"]["max"] + 1e-9
     assert (report["kind"], len(report["mesh"]["sha256"])) == ("job", 64)
     assert report["started"] < report["ended"]
