@@ -174,8 +174,8 @@ def realism(
     from sim_backends.world.levels import Effects
 
     known = (ALONE, *Effects.names(), TOGETHER)
-    # No parts of the workshop: a scan camera needs a global shutter, a carriage that droops is a broken one.
-    options = ("rolling_shutter", "droop")
+    # No parts of the workshop: a scan camera needs a global shutter, what droops is broken, oil is wiped off.
+    options = ("rolling_shutter", "droop", "oil")
     chosen = list(dict.fromkeys(effect or [name for name in known if name not in options]))
     if unknown := [name for name in chosen if name not in known]:
         raise ConfigError(f"--effect {unknown[0]} is none of {', '.join(known)}")

@@ -94,17 +94,27 @@ class PlaneInstance:
 
 
 @dataclass(frozen=True)
+class Puddle:
+    """Oil on a surface: `centre` (x, y) and `radius` in the mesh's frame, `thickness` in the middle, m."""
+
+    centre: tuple[float, float]
+    radius: float
+    thickness: float
+
+
+@dataclass(frozen=True)
 class Grain:
     """How a surface is uneven in colour and gloss, the same at the same place whenever it is seen.
 
     `texture`: RMS of the albedo, relative, in grains of 0.3 and 1 mm. `spots` of dust per cm², dark, 0.4 to 1 mm
     across.
-    `gloss`: light mirrored straight into the camera, of that scattered, in a lobe of 0.2 rad.
+    `gloss`: light mirrored straight into the camera, of that scattered, in a lobe of 0.2 rad. `oil`: where it is wet.
     """
 
     texture: float = 0.0
     spots: float = 0.0
     gloss: float = 0.0
+    oil: Puddle | None = None
 
 
 @dataclass(frozen=True, eq=False)

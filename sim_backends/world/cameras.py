@@ -21,6 +21,7 @@ from sim_backends.optics.scene import (
     Light,
     MeshInstance,
     PlaneInstance,
+    Puddle,
     SceneObject,
     Sun,
 )
@@ -63,7 +64,6 @@ class Cameras:
             bow=scene.workshop.sheet_bow * BOW_AT[0] / BOW_AT[1] ** 2, end=effects.sheet_ends,
             shadows=((-0.06, 0.004, 0.7), (0.035, 0.002, 0.9)) if effects.dust else (),
         )  # fmt: skip
-        self._grain = Grain(effects.texture, effects.dust, effects.gloss)
         gx, gy = (float(v) for v in scene.light_gradient)
         self._light = Light(level=scene.light_level, gradient=(gx, gy))
         self._witness_pose = cell.witness
@@ -74,6 +74,12 @@ class Cameras:
 
     def show(self, scene: Scene, station: Station) -> None:
         """From now on the cameras see this station, in a scene of the same cell."""
+        effects, (x, y, radius) = scene.effects, (float(v) for v in scene.workshop.oil)
+        ground, oil = station.ground, None
+        if effects.oil:
+            at = (ground.centre[0] + x * ground.half_x, ground.centre[1] + y * ground.half_y)
+            oil = Puddle(at, radius, effects.oil)
+        self._grain = Grain(effects.texture, effects.dust, effects.gloss, oil)
         self._shown = scene, station, Board.parse(scene.drawing.station.board)
 
     def picture(

@@ -104,6 +104,13 @@ class Effects:
         "a carriage on one guide, worn where it works; size assumed",
         option=True,
     )
+    oil: float = _row(
+        0.12e-3,
+        "m",
+        "thickness, in its middle, of a puddle of oil on the surface, 12 to 20 mm wide",
+        "what stands on metal at 4 degrees of contact: 2 sin 2° of its capillary length, 1.8 mm; angle assumed",
+        option=True,
+    )
 
     @classmethod
     def names(cls) -> tuple[str, ...]:

@@ -63,7 +63,7 @@ class Workshop:
     far the light sheet is off its plane at the place that `Effects` names, m. Once all is warm: `pointing`, turn of
     the light plane about the stripe's direction, rad; `shift` (2, 2) of the scan and the target camera's principal
     points, px; `zoom`, relative. `rocking`: roll and pitch (2,), rad, at `rocking_hz` with `rocking_phase` (2,),
-    rad. `sun_start` in m.
+    rad. `sun_start` in m. `oil` (3,): the puddle's place, x and y from -1 to 1 across the surface, and its radius, m.
     """
 
     harmonics: Vector
@@ -75,6 +75,7 @@ class Workshop:
     rocking_hz: float
     rocking_phase: Vector
     sun_start: float
+    oil: Vector
 
 
 @dataclass(frozen=True)
@@ -131,10 +132,10 @@ class _Draws:
     """Cut Gaussian draws, one stream a name."""
 
     def __init__(self, seed: int) -> None:
-        self._seed = seed
+        self.seed = seed
 
     def vector(self, name: str, sigma: float, size: int = 3) -> Vector:
-        drawn = stream(self._seed, name).standard_normal(size)
+        drawn = stream(self.seed, name).standard_normal(size)
         return sigma * np.clip(drawn, -CUT, CUT)
 
     def scalar(self, name: str, sigma: float) -> float:
@@ -142,7 +143,7 @@ class _Draws:
 
     def even(self, name: str, most: float) -> float:
         """Anywhere from 0 to `most`."""
-        return most * float(stream(self._seed, name).uniform())
+        return most * float(stream(self.seed, name).uniform())
 
     def moved(self, name: str, at: Pose, translation: float, turn: float, about: Sequence[float] = (0, 0, 0)) -> Pose:
         """`at`, moved and turned about the point `about` of its own frame."""
@@ -283,4 +284,5 @@ def _workshop(d: _Draws, effects: Effects) -> Workshop:
         rocking_hz=4.0 * (1.0 + d.scalar("rocking.frequency", 0.05)),
         rocking_phase=d.vector("rocking.phase", 1.0, 2) * np.pi,
         sun_start=d.scalar("sun", 0.05),
+        oil=bool(effects.oil) * stream(d.seed, "oil").uniform((-0.6, -0.6, 6e-3), (0.6, 0.6, 10e-3)),
     )

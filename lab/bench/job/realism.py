@@ -48,6 +48,7 @@ WORDS: dict[str, tuple[str, ...]] = {
     "sheet_ends": ("sheet ends",),
     "sunlight": ("ambient light",),
     "droop": ("carriage",),
+    "oil": ("oil, ",),
 }
 """A refusal with one of these words names the effect: words that no other refusal has."""
 

@@ -18,7 +18,7 @@ from sim_backends.optics.boards import appearance
 from sim_backends.optics.camera import CameraOptics, distort, distort_jacobian
 from sim_backends.optics.compiled import compiled
 from sim_backends.optics.laser.profile import expose
-from sim_backends.optics.laser.sheet import bend, laser_frame, light_at, lit
+from sim_backends.optics.laser.sheet import HALO, HALO_AT, WET, bend, laser_frame, light_at, lit, oiled, slide
 from sim_backends.optics.pattern import grain_parameters
 from sim_backends.optics.scene import LaserOptics, MeshInstance, PlaneInstance, SceneObject
 
@@ -110,14 +110,30 @@ def render_stripe(
             pattern = grain_parameters(instance.albedo, grain)
         else:
             pose, pattern = appearance(instance)
-        points, normals = np.ascontiguousarray(found.points), np.ascontiguousarray(found.normals)
-        expose(
-            image, touched, found.rows, columns=found.columns, slopes=found.slopes, points=points, normals=normals,
-            factors=light_at(points, normals, laser, grain) * (1.0 if share is None else share),
-            intrinsics=optics.intrinsics, camera=camera, plane_normal=normal, origin=origin, sheet=laser.width,
-            brightness=laser.brightness * exposure, pose=np.ascontiguousarray(pose), pattern=pattern,
-        )  # fmt: skip
+        factors = light_at(found.points, found.normals, laser, grain) * (1.0 if share is None else share)
+        thick = oiled(found.points, pose, None if grain is None else grain.oil)
+        wet = thick > 0.0
+        drawn = [(found, np.where(wet, WET, 1.0) * factors)]
+        if wet.any():
+            drawn.append((_halo(found.keep(wet), thick[wet], optics, laser), HALO * WET * factors[wet]))
+        for crossed, light in drawn:
+            points, normals = np.ascontiguousarray(crossed.points), np.ascontiguousarray(crossed.normals)
+            expose(
+                image, touched, crossed.rows, columns=crossed.columns, slopes=crossed.slopes, points=points,
+                normals=normals, factors=light, intrinsics=optics.intrinsics, camera=camera, plane_normal=normal,
+                origin=origin, sheet=laser.width, brightness=laser.brightness * exposure,
+                pose=np.ascontiguousarray(pose), pattern=pattern,
+            )  # fmt: skip
     return touched
+
+
+def _halo(found: Crossings, thick: Vector, optics: CameraOptics, laser: LaserOptics) -> Crossings:
+    """The crossings of the light that leaves oil so `thick` (n,) beside the stripe, on the laser's far side."""
+    columns, points = found.columns.copy(), np.array(found.points)
+    normals, (plane, _, origin) = np.ascontiguousarray(found.normals), laser_frame(laser)
+    away = -np.sign(origin[0] * plane[0])
+    slide(columns, points, normals, optics.intrinsics, plane=plane, sag=away * HALO_AT * thick)
+    return replace(found, columns=columns, points=points)
 
 
 RIM = 3.0

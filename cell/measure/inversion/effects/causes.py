@@ -275,7 +275,7 @@ class _Cells:
         key, columns, _ = self.best((key, disc(*key)) for key in product(*ways, PATCH_RADII))
         inside = columns[:, 0] > 0.3
         rough = np.median(self.scatter[inside]) > ROUGHER * np.median(self.scatter[~inside])
-        what = "oil, water or a reflection" if rough else "wear, a dent or something that lies"
+        what = "oil, water or a reflection" if rough else "wear, a dent, or what lies (oil, dirt)"
         middle = 1e3 * np.average(self.places, axis=0, weights=columns[:, 0])
         words = f"{what} on the surface around ({middle[0]:.0f}, {middle[1]:.0f}) mm, {2e3 * key[2]:.0f} mm wide"
         yield "patch", words, "surface", columns, 3

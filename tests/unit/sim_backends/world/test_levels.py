@@ -40,7 +40,7 @@ def test_every_effect_can_be_had_alone_and_workshop_has_all_but_the_options() ->
         assert getattr(alone, name) == getattr(ALONE, name) > 0
         assert sum(bool(getattr(alone, other)) for other in Effects.names()) == 1
     off = [name for name in Effects.names() if not getattr(effects_of("workshop"), name)]
-    assert off == ["rolling_shutter", "droop"]
+    assert off == ["rolling_shutter", "droop", "oil"]
     for level in ("ideal", "nominal", "harsh"):
         assert effects_of(level) == Effects()
 
@@ -62,12 +62,13 @@ def test_no_two_levels_share_a_serial_number() -> None:
     assert len({number_of(level) for level in levels}) == len(levels)
 
 
-def test_an_effect_leaves_everything_else_as_it_was() -> None:
-    plain, one = draw(5, "nominal"), draw(5, "nominal+sheet_bow")
-    assert one.workshop.sheet_bow != 0.0 == plain.workshop.sheet_bow
+@pytest.mark.parametrize("effect", ["sheet_bow", "oil"])
+def test_an_effect_leaves_everything_else_as_it_was(effect: str) -> None:
+    plain, one = draw(5, "nominal"), draw(5, f"nominal+{effect}")
+    assert np.any(getattr(one.workshop, effect)) and not np.any(getattr(plain.workshop, effect))
     assert (one.light_plane_normal == plain.light_plane_normal).all()
     assert (one.flange_from_part == plain.flange_from_part).all()
-    assert deviations("nominal+sheet_bow") == deviations("nominal")
+    assert deviations(f"nominal+{effect}") == deviations("nominal")
 
 
 def test_joints_are_off_by_seven_hundredths_of_a_milliradian() -> None:

@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sim_backends.optics import CameraOptics, LaserOptics, PlaneInstance
+from sim_backends.optics import CameraOptics, LaserOptics, MeshInstance, PlaneInstance
+from sim_backends.optics.laser.sheet import HALO, HALO_AT, WET
 from sim_backends.optics.laser.stripe import crossings
-from tests.support.simulator.stripe_scene import CLEAN, FOCAL_PX, facing, stripe
+from sim_backends.optics.scene import Grain, Puddle
+from tests.support.simulator.stripe_scene import CLEAN, FOCAL_PX, centroids, facing, height_field, stripe
 
 
 def test_what_stands_in_the_sheet_takes_the_light_from_behind_it():
@@ -55,3 +57,20 @@ def test_a_bowed_sheet_is_seen_where_geometry_says() -> None:
     sag = bow * flat.points[:, 1] ** 2 / along
     assert bent.columns - flat.columns == pytest.approx(1667.0 / 0.130 * sag / laser.normal[0], abs=2e-3)
     assert sag.max() > 0.9e-4
+
+
+def test_oil_darkens_the_stripe_and_draws_its_centre_away_from_the_laser() -> None:
+    puddle, flat = Puddle((0.002, 0.004), 0.007, 0.1e-3), height_field(lambda x, y: 0 * x)
+    dry, wet = (MeshInstance(facing([0, 0, 0], 0.130), flat, 0.6, Grain(oil=oil)) for oil in (None, puddle))
+    (before, light), (after, left) = centroids(stripe([dry])), centroids(stripe([wet]))
+    where = crossings(CameraOptics(640, 480, FOCAL_PX, FOCAL_PX, 319.5, 239.5), CLEAN, dry)
+    local = (where.points - dry.camera_from_mesh[:3, 3]) @ dry.camera_from_mesh[:3, :2]
+    off = np.linalg.norm(local - puddle.centre, axis=1)
+    outside, inside = where.rows[off > puddle.radius + 1e-3], where.rows[off < puddle.radius - 4e-3]
+    assert len(outside) > 50 and len(inside) > 50
+    assert after[outside] == pytest.approx(before[outside], abs=1e-6, nan_ok=True)
+    assert left[outside] == pytest.approx(light[outside])
+    assert left[inside] == pytest.approx(WET * (1.0 + HALO) * light[inside], rel=0.02)
+    # The halo's share of the light, so far to the side as a film nearly as thick as in the middle puts it.
+    most = HALO / (1.0 + HALO) * HALO_AT * puddle.thickness / CLEAN.normal[0] * FOCAL_PX / 0.130
+    assert (after[inside] - before[inside] > 0.8 * most).all() and (after[inside] - before[inside] < most).all()

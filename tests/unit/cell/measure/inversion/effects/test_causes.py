@@ -14,6 +14,7 @@ from cell.measure.reconstruction import Cloud
 from cell.procedures.steps.invert_pose import LineTimes
 from cell.procedures.steps.invert_pose import invert_pose as step
 from drivers.errors import RefusedError
+from lab.bench.job.accuracy import figures
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.support.report_runs import CONFIG, pot
 
@@ -135,3 +136,17 @@ def test_causes_over_several_worlds(tmp_path: Path) -> None:
     for effect, called in table.items():
         print(f"{effect:16} {dict(called)}")
     assert right >= 0.9 * 2 * draws * len(NAMES)
+
+
+@pytest.mark.campaign
+def test_oil_that_the_world_shows_is_placed_within_what_is_stated_or_named(tmp_path: Path) -> None:
+    """Prints for each world what became of it."""
+    for seed in (1, 2, 3, 4):
+        job, nominal = pot()
+        record = run_whole_job(CONFIG, job, nominal, seed, "nominal+oil", runs=tmp_path)
+        made = figures(record, CONFIG, job, nominal)
+        print(seed, record.outcome, record.reason, made.get("covered"))
+        if record.outcome == "placed":
+            assert made["covered"]["place_pose"] and made["within_tolerance"]
+        else:
+            assert "oil, " in record.reason
