@@ -312,13 +312,19 @@ class Surroundings:
     look: bool = False
     arm: Arm | None = None
     safe_off_outputs: tuple[int, ...] = ()
-    reach: float = math.inf
+    reach: float | None = None
     forward_of: Callable[[LinkTable | None], Callable[[Vector], Vector]] | None = None
 
     def require_arm(self) -> Arm:
         """The arm, for makes with `on_arm`."""
         assert self.arm is not None
         return self.arm
+
+    def require_reach(self) -> float:
+        """See the class; `ConfigError` where it was left out: no pose would be refused as too far."""
+        if self.reach is None:
+            raise ConfigError("an arm is connected with its reach in m: Surroundings(…, reach=1.3)")
+        return self.reach
 
 
 def serial_number(device: Device) -> str:

@@ -56,7 +56,7 @@ def _connect(name: str, config: UrArmConfig, around: Surroundings) -> UrArm:
             joint_speeds=(config.max_joint_speed,) * 6,
             joint_acceleration=config.max_joint_acceleration,
             linear_speed=config.max_tool_speed,
-            reach=around.reach,
+            reach=around.require_reach(),
             payload=MOST_PAYLOAD[config.model],
         ),
         payload=(config.payload, config.payload_centre),

@@ -153,7 +153,7 @@ class RailMotion:
 
 MARGIN_M = 0.010
 """So much farther than the travel a search may go: limit switches and ends lie beyond the travel."""
-STANDSTILL_S = 1.0
+SEARCH_STANDSTILL_S = 1.0
 """A search in which the count stands for this long has a motor that does not follow; drives pause as they turn back."""
 BEGINS_S = 2.0
 """The same before the first motion."""
@@ -224,7 +224,7 @@ class CarriageWatch:
         if self._length is None:
             return
         detected = stalled()
-        if detected or now - self._moved > patience(self._clock, STANDSTILL_S if self._began else BEGINS_S):
+        if detected or now - self._moved > patience(self._clock, SEARCH_STANDSTILL_S if self._began else BEGINS_S):
             raise DeviceFault(
                 self._name,
                 "rail.stalled",

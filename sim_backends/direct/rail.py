@@ -12,13 +12,10 @@ import numpy as np
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, check_range
 from drivers.interfaces import LONGEST_NUDGE_M, Identity, RailState, Vector
-from drivers.rail.motion import POLL_S, SWEEP_MARGIN_M, CarriageWatch, ZeroCheck, run_up_distance
+from drivers.rail.motion import POLL_S, STANDSTILL_S, SWEEP_MARGIN_M, CarriageWatch, ZeroCheck, run_up_distance
 from drivers.rail.sweep import EvenMotion
 from sim_backends.direct.switches import DirectDevice
 from sim_backends.models.rail import RailModel
-
-STANDSTILL_S = 0.5
-"""A motor that has not moved for this long before its target has stalled."""
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ def decide(
     """
     fits, problems = _fits(series, boards, wanted, setup)
     own = {f.series.name: f for f in fits if f.boards_own and f.score_scaled < AGREES}
-    if 0 < len(own) == len(series):
+    if own and all(one.name in own for one in series):
         raise RefusedError(_boards_own(next(iter(own.values()))))
     fits = [f for f in fits if f.series.name not in own]
     if not fits:

@@ -77,12 +77,12 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     belonging, strange = match_series(series, listing, links)
     # A plan tells of boards and poses; to read stripes takes seconds for each picture.
     frames, channel = read_frames(listing, spec, links, None if options.plan else options.laser, options.plan)
-    late = {one.name: one for one in series if not one.of and in_order_of_views(one, frames)}
-    unread += [(name, reason) for name, reason in strange if name not in late]
+    late = [one for one in series if not one.of and in_order_of_views(one, frames)]
+    unread += [(name, reason) for name, reason in strange if name not in [one.name for one in late]]
     result = RecordedResult(spec.name, laser=channel.figures())
     result.notes += _doubtful_lines(frames)
     result.unread = [{"name": name, "reason": reason} for name, reason in [*listing.unread, *unread]]
-    _from_frames(frames, [*belonging, *late.values()], options, result)
+    _from_frames(frames, [*belonging, *late], options, result)
     result.frames = [frame.figures() for frame in frames]
     return result
 

@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components
 
 from cell.apps.recordings.result import Figures
 from cell.apps.recordings.series import Listing, frame_key
-from cell.apps.recordings.stripes import ChosenChannel, ReadStripe, Source, choose_channel, read_on_board
+from cell.apps.recordings.stripes import ChosenChannel, ReadStripe, Source, calmest, choose_channel, read_on_board
 from cell.apps.recordings.texts import PICTURES
 from cell.measure.geometry.poses import difference, mean
 from cell.measure.vision.board.board import find_board
@@ -41,6 +41,8 @@ SAME_DN, CHANGED_DN, LARGEST_SHARE = 6.0, 40, 0.2
 """Half of the pixels differ by less than the first; what differs by more than the second was drawn: a small share."""
 COLOURED_DN, COLOURED_SHARE = 60, 0.6
 """Drawn pixels are by so much more coloured than before; most of them are."""
+THICK = 80
+"""Lines are thinner than the picture's width over this."""
 HUES, HUE_SHARE = 6, 0.15
 """A laser's line has one hue; axes, markers and corners have several, or are at most of the board's points."""
 AT_POINTS, NEAR_PX = 0.6, 6
@@ -48,6 +50,7 @@ AT_POINTS, NEAR_PX = 0.6, 6
 # other numbers are one view when they differ by the second, which is what noise and another file format make. Views
 # whose middles differ by more than the third are not compared.
 SAME_PLACE_PX, SAME_VIEW_PX, FAR_PX = 2.0, 0.1, 20.0
+STRAIGHTENED = re.compile(r"undist|rectif|remap|straight", re.IGNORECASE)
 LASER_WORDS = re.compile(r"laser|stripe|(?<![a-z])(?:line|las|on)(?![a-z])")
 OFF_WORDS = re.compile(r"(?<![a-z])(?:off|no|without)(?![a-z])|laseroff|nolaser")
 # Two pictures are of one stop when their boards lie at the same pixels, as well as a corner is found in a poor
@@ -184,16 +187,26 @@ def _refuse_same_files(frames: Sequence[RecordedFrame]) -> None:
 
 
 def _refuse_drawn(frames: Sequence[RecordedFrame], small: Sequence[Small | None]) -> None:
-    """Refuse frames that are others with corners, axes or markers drawn in; `small` copies (n,) by frame."""
+    """Refuse frames that are others with something drawn in, or straightened; `small` copies (n,) by frame.
+
+    Corners, axes and markers are found by their pixels. A straightened copy differs everywhere a little: there its name
+    has to say it, too.
+    """
     coloured = cache(_has_colour)
     for frame, mine in zip(frames, small, strict=True):
         for other, its in zip(frames, small, strict=True):
             if other is frame or mine is None or its is None or frame.reason is Reason.DUPLICATE or other.shows:
                 continue
-            alike = np.abs(mine - its).mean() <= ALIKE_DN and not frame.lit
-            if alike and coloured(frame.path) and _drawn_into(frame, other):
-                frame.shows = other
-                frame.refuse(Reason.DUPLICATE, f"it is {other.name} with lines drawn into it")
+            if np.abs(mine - its).mean() > ALIKE_DN:
+                continue
+            if STRAIGHTENED.search(frame.name) and not STRAIGHTENED.search(other.name):
+                text = f"by its name it is {other.name}, straightened"
+            elif not frame.lit and coloured(frame.path) and _drawn_into(frame, other):
+                text = f"it is {other.name} with lines drawn into it"
+            else:
+                continue
+            frame.shows = other
+            frame.refuse(Reason.DUPLICATE, text)
 
 
 def _has_colour(path: Path) -> bool:
@@ -213,7 +226,7 @@ def _spread(image: NDArray[np.uint8]) -> NDArray[np.int16]:
 
 
 def _drawn_into(frame: RecordedFrame, other: RecordedFrame) -> bool:
-    """True where a frame's picture is the other's with coloured lines over it."""
+    """True where a frame's picture is the other's with thin coloured lines over it."""
     try:
         drawn, plain = (_coloured(read_colours(f.path)) for f in (frame, other))
     except PictureRefused:
@@ -224,7 +237,8 @@ def _drawn_into(frame: RecordedFrame, other: RecordedFrame) -> bool:
     changed = apart > CHANGED_DN
     lines = changed & (_spread(drawn) - _spread(plain) > COLOURED_DN)
     few = 0 < changed.mean() < LARGEST_SHARE and np.median(apart) <= SAME_DN
-    if not few or lines.sum() < COLOURED_SHARE * changed.sum():
+    thick = cv2.erode(changed.astype(np.uint8), np.ones((max(5, drawn.shape[1] // THICK),) * 2, np.uint8))
+    if not few or lines.sum() < COLOURED_SHARE * changed.sum() or thick.sum() > 0.1 * changed.sum():
         return False
     hue = cv2.cvtColor(drawn, cv2.COLOR_RGB2HSV)[:, :, 0][lines]
     # Hues count to 180; each primary in the middle of its part.
@@ -252,14 +266,15 @@ class _Place:
     others: list[RecordedFrame]
 
     @property
-    def off(self) -> Path | None:
-        """The picture without the laser, by its name."""
-        return next((f.path for f in self.others if f.dark), None)
+    def dark(self) -> list[Path]:
+        """Pictures without the laser, by their names."""
+        return [f.path for f in self.others if f.dark]
 
     def sources(self) -> list[tuple[RecordedFrame, Source]]:
-        """Where the stripe may be, each with the picture without the laser."""
+        """Where the stripe may be, each with the picture without the laser that takes most of the board away."""
         lit = [f for f in self.others if f.lit] or [f for f in self.others if not f.dark]
-        return [(f, Source(f.path, self.view, self.off or self.board.path)) for f in lit]
+        offs = [*self.dark, self.board.path]
+        return [(f, Source(f.path, self.view, calmest(f.path, offs, self.view))) for f in lit]
 
 
 def _find_places(frames: Sequence[RecordedFrame], links: Sequence[dict[str, str]]) -> list[_Place]:
@@ -362,7 +377,7 @@ def _read_place(place: _Place, sources: Sequence[tuple[RecordedFrame, Source]], 
     reads = [(frame, source, read_on_board(source, channel)) for frame, source in sources]
     lit = max((r for r in reads if r[2].profile is not None), key=lambda r: r[2].points, default=None)
     if lit is None or not lit[0].lit:
-        mine = read_on_board(Source(board.path, place.view, place.off), channel)
+        mine = read_on_board(Source(board.path, place.view, next(iter(place.dark), None)), channel)
         if mine.profile is not None:
             board.take(mine)
             lit = None

@@ -1,10 +1,11 @@
-"""Series of recorded poses, and the picture of each: by a table, by name, folder or number, or in order.
+"""Series of recorded poses, and the picture of each: by a table, by name, folder, number or time, or in order.
 
 Also what lies in a recording's folder and its sub-folders: pictures, texts, and what is neither, by name.
 """
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections import Counter
@@ -43,6 +44,7 @@ ROLES = (
     "laser|stripe|line|image|img|frame|picture|pic|photo|pose|poses|tcp|robot|flange|board|chess|chessboard|charuco|"
     "color|colour|rgb|gray|grey|cam|camera|on|off|light|dark|copy|kopie|copie"
 )
+CLOCK = re.compile(r"\d{9,}(?:[._]\d+)?")
 
 
 @dataclass
@@ -246,7 +248,7 @@ def _match_pictures(one: Series, listing: Listing, linked: dict[str, int]) -> No
     if not single or len(found.of) < LEAST:
         beside = {r.path.parent for r in one.records if single}
         which = [k for k in which if listing.pictures[k].parent in beside] or which
-        found = _match([listing.name(listing.pictures[k]) for k in which], labels)
+        found = _match([listing.name(listing.pictures[k]) for k in which], labels, [r.time for r in one.records])
     one.by, one.of = found.by, {which[k]: one.records[i] for k, i in found.of.items()}
     one.alone = [one.records[i] for i in found.alone]
     one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
@@ -295,18 +297,20 @@ def _by_table(labels: Sequence[str], linked: dict[str, int]) -> _Match:
     return _Match("table", of, [k for k, label in enumerate(labels) if label not in linked])
 
 
-def _match(pictures: Sequence[str], labels: Sequence[str]) -> _Match:
+def _match(pictures: Sequence[str], labels: Sequence[str], times: Sequence[float | None]) -> _Match:
     """The label that belongs to each picture (names below the folder); the first way that serves most of them."""
     both = pictures, [label.replace("\\", "/") for label in labels]
-    ways = [("name", [list(map(way, side)) for side in both]) for way in (str, frame_key)]
+    named = (str, lambda name: Path(name).name, _stem, frame_key)
+    ways = [("name", [list(map(way, side)) for side in both]) for way in named]
     # A folder for each pose.
     ways.append(("folder", [[str(Path(name).parent) for name in side] for side in both]))
     if not any(label.startswith("[") for label in labels):
         ways.append(("number", [_numbers(side) for side in both]))
     best = max((_equal(left, right, by) for by, (left, right) in ways), key=lambda found: len(found.of))
-    if len(labels) == len(pictures) and len(best.of) < 2:
+    by_time = _nearest(pictures, labels, times) if len(best.of) < len(pictures) / 2 else None
+    if by_time is None and len(labels) == len(pictures) and len(best.of) < 2:
         return _Match("order", {k: k for k in range(len(labels))}, [])
-    return best
+    return by_time or best
 
 
 def _equal(left: list[str], right: list[str], by: str) -> _Match:
@@ -333,6 +337,35 @@ def _numbers(names: Sequence[str]) -> list[str]:
     if varying and len({f[varying[-1]] for f in usual}) == len(usual):
         varying = varying[-1:]
     return ["-".join(str(f[k]) for k in varying) if len(f) == length else "" for f in found]
+
+
+def _nearest(pictures: Sequence[str], labels: Sequence[str], times: Sequence[float | None]) -> _Match | None:
+    """The pose of the nearest time, where names and table have times of the same clock."""
+    shown = [_clock(Path(name).name) for name in pictures]
+    told = [t if t is not None and math.isfinite(t) else _clock(x) for t, x in zip(times, labels, strict=True)]
+    timed = [k for k, t in enumerate(told) if t is not None]
+    if len(timed) < 2 or 2 * len(timed) < len(told) or None in shown:
+        return None
+    table = np.array([t for t in told if t is not None])
+    for scale in (1.0, 1e-3, 1e-6, 1e-9):
+        clock = np.array([s for s in shown if s is not None]) * scale
+        apart = np.abs(clock[:, None] - table[None, :])
+        near, reach = apart.argmin(axis=1), 0.5 * float(np.median(np.diff(np.sort(clock)))) if len(clock) > 1 else 0.1
+        good = apart.min(axis=1) <= max(reach, 1e-3)
+        if good.mean() > 0.5 and len(set(near[good].tolist())) == int(good.sum()):
+            of = {k: timed[near[k]] for k in np.flatnonzero(good).tolist()}
+            return _Match("time", of, [k for k in range(len(labels)) if k not in of.values()])
+    return None
+
+
+def _stem(name: str) -> str:
+    path = Path(name)
+    return path.stem if path.suffix.lower() in (*PICTURES, *TEXTS) else path.name
+
+
+def _clock(name: str) -> float | None:
+    found = CLOCK.search(name)
+    return None if found is None else float(found[0].replace("_", "."))
 
 
 def _series_name(name: str) -> str:

@@ -214,13 +214,13 @@ def _with_poses(
     posed: Sequence[RecordedFrame], camera: Intrinsics, result: RecordedResult, setup: str, hold_camera: bool
 ) -> list[QualityCheck]:
     """Put what frames with poses give into the result; its checks."""
+    checks: list[QualityCheck] = []
     try:
         chain = solve_chain([merged(stop) for stop in by_stop(posed)], camera, setup, hold_camera)
         checks = check_chain(chain, camera)
         report_chain(chain, camera, result)
     except (RefusedError, np.linalg.LinAlgError) as error:
         result.refused["hand_eye"] = f"no hand-eye: {error}"
-        return []
     return checks
 
 

@@ -48,6 +48,7 @@ NAMED_COLUMNS = [
 ]
 POSITIONS = ("position", "translation", "t", "trans", "tvec", "pos", "xyz")
 ROTATIONS = ("orientation", "rotation", "quaternion", "quat", "q", "r", "rot", "rvec", "rpy")
+TIMING = re.compile(r"time|stamp|t$|sec")
 NUMBERING = re.compile(r"id|index|frame|image|file|name|no\b|num|^n$|pic")
 HALVES = re.compile(
     r"r|rot|rotations?|rmats?|rvecs?|rotvecs?|q|quats?|quaternions?|(t|trans|translations?|tvecs?|pos|positions?|xyz|p)"
@@ -60,7 +61,7 @@ class PoseRecord:
     """Numbers (n,) that may be a pose; `field` is their place in the file, `label` the picture or number they name.
 
     `named`: "quaternion" (x, y, z, qx, qy, qz, qw) or "rotation" (x, y, z, then three angles) where names said so.
-    `exact`: its place with the numbers in the names that `field` leaves out.
+    `exact`: its place with the numbers in the names that `field` leaves out. `time`: of the pose, where it has one.
     """
 
     path: Path
@@ -69,6 +70,7 @@ class PoseRecord:
     numbers: Array
     named: str = ""
     exact: str = ""
+    time: float | None = None
 
 
 @dataclass
@@ -120,8 +122,9 @@ class Content:
         label = label or next((part for part in reversed(place) if re.search(r"\d", part)), None)
         pattern = "/".join(re.sub(r"\d+", "N", part) for part in place)
         exact = "/".join(re.sub(r"\[\d+\]", "[N]", part) for part in place)
-        pose = _squared(numbers[len(numbers) not in COUNTS :])
-        self.records.append(PoseRecord(self.path, pattern, label, pose, named=named, exact=exact))
+        time = float(numbers[0]) if len(numbers) not in COUNTS else None
+        pose = _squared(numbers if time is None else numbers[1:])
+        self.records.append(PoseRecord(self.path, pattern, label, pose, named=named, exact=exact, time=time))
 
 
 def read_content(path: Path) -> Content:
@@ -209,23 +212,27 @@ def _numbered(data: Any) -> Any:
 def _scalar(word: str) -> float | str:
     """The number of a word, or the word."""
     try:
-        return float(word.replace(".nan", "nan").replace(".NaN", "nan").replace(".inf", "inf"))
+        return float(re.sub(r"\.(?=nan|inf)", "", word, flags=re.IGNORECASE))
     except ValueError:
         return word.strip()
+
+
+def _of_text(text: str) -> Any:
+    """The number or the numbers of a text, or the text."""
+    words = [_scalar(word) for word in text.split()]
+    return words if len(words) > 1 and not any(isinstance(word, str) for word in words) else _scalar(text)
 
 
 def _element(element: ElementTree.Element) -> Any:
     """An XML element as a map, list, number or word; elements of one name are a list."""
     text = element.text or ""
-    words = [_scalar(word) for word in text.split()]
-    numbers = words if len(words) > 1 and not any(isinstance(word, str) for word in words) else _scalar(text)
-    parts: dict[str, list[Any]] = {key: [_scalar(value)] for key, value in element.attrib.items()}
+    parts: dict[str, list[Any]] = {key: [_of_text(value)] for key, value in element.attrib.items()}
     for child in element:
         parts.setdefault(child.tag, []).append(_element(child))
     # An attribute beside a text says what the text is (type_id); beside none it is what the element holds.
     if parts and (len(element) or not text.strip()):
         return {key: values[0] if len(values) == 1 else values for key, values in parts.items()}
-    return numbers
+    return _of_text(text)
 
 
 def _is_pose(array: Array) -> bool:
@@ -369,6 +376,7 @@ def _half_of_table(lines: Sequence[_TableLine]) -> Array | None:
 def _timed(seven: Sequence[list[float]]) -> bool:
     """Whether of seven numbers the first is a time, because no four of them are a quaternion."""
     rows = np.array(seven).reshape(-1, 7)
+    rows = rows[np.isfinite(rows).all(axis=1)]
     quaternions = (rows[:, 3:], rows[:, :4])
     return len(rows) > 0 and all(np.abs(np.linalg.norm(q, axis=1) - 1).max() >= UNIT_OFF for q in quaternions)
 
@@ -387,24 +395,26 @@ def _table_record(path: Path, k: int, block: Sequence[_TableLine], header: Seque
     """The record of the lines of one pose; `timed`: of seven numbers the first is a time. Raises ValueError."""
     words, cells = [word.strip(":=") for line in block for word in line.words], block[0].cells
     label = [*filter(_is_picture, words), *filter(re.compile(r"\d").search, [] if header else words), ""][0]
-    pose, named, number = _by_header(header, cells)
+    pose, named, number, time = _by_header(header, cells)
     if pose is not None:
-        return PoseRecord(path, "row", label or number or f"[{k}]", pose, named)
+        return PoseRecord(path, "row", label or number or f"[{k}]", pose, named, time=time)
     found = _numbers_of(block)
     if len(found) - 1 in COUNTS and (len(found) != 7 or timed):
-        label, found = label or _number_word(found[0]), found[1:]
+        time, found = found[0], found[1:]
+        label = label or _number_word(time)
     if len(found) not in COUNTS:
         raise ValueError(f"line {k + 1} of its table holds {len(found)} numbers; {NEEDED}")
-    return PoseRecord(path, "row", label or f"[{k}]", _squared(np.array(found)))
+    return PoseRecord(path, "row", label or f"[{k}]", _squared(np.array(found)), time=time)
 
 
-def _by_header(header: Sequence[str], cells: Sequence[str]) -> tuple[Array | None, str, str]:
-    """The pose that a row's columns name, how they name its rotation, and the number of the row."""
+def _by_header(header: Sequence[str], cells: Sequence[str]) -> tuple[Array | None, str, str, float | None]:
+    """The pose that a row's columns name, how they name its rotation, and the row's number and time."""
     if len(cells) != len(header):
-        return None, "", ""
+        return None, "", "", None
     values = [float(cell) if NUMBER.fullmatch(cell) else np.nan for cell in cells]
     numbers = (cell for name, cell in zip(header, cells, strict=True) if NUMBERING.search(name.lower()))
-    return *_named_numbers(header, values), next(numbers, "")
+    times = (value for name, value in zip(header, values, strict=True) if TIMING.match(name.lower()))
+    return *_named_numbers(header, values), next(numbers, ""), next(times, None)
 
 
 def _number_word(number: float) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,7 +28,7 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
 from cell.motion.collision import Body
-from cell.motion.kinematics import arm_kinematics
+from cell.motion.kinematics import ArmKinematics, arm_kinematics
 from cell.procedures.frame_store import FrameFile
 from cell.run.record.file import CAMERAS
 from drivers.errors import CellError
@@ -64,11 +65,7 @@ class RecordDrawing:
     """
 
     def __init__(self, config: CellConfig, devices: Devices, calibration: CellCalibration | None) -> None:
-        try:
-            told = devices.arm.link_table() if "arm" in devices else None
-        except CellError:
-            told = None
-        self._kinematics = arm_kinematics(config.arm.model, told)
+        self._model, self._devices = config.arm.model, devices
         self._calibration = calibration
         if calibration is not None:
             mounts = [calibration.scan.flange_from_camera, calibration.target.flange_from_camera]
@@ -79,6 +76,15 @@ class RecordDrawing:
         self._mounts: dict[str, pin.SE3] = dict(zip(CAMERAS, mounts, strict=True))
         self._joints: Vector | None = None
         self._rail = 0.0
+
+    @cached_property
+    def _kinematics(self) -> ArmKinematics:
+        """Made when the joints are drawn first: what is wrong with the arm's table takes no other message away."""
+        try:
+            told = self._devices.arm.link_table() if "arm" in self._devices else None
+        except CellError:
+            told = None
+        return arm_kinematics(self._model, told)
 
     def arm(self, at: int, state: ArmState | None = None) -> bytes:
         """Root, base, joints, flange and target camera; nothing of the rail, whose readings have other times."""

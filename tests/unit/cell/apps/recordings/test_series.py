@@ -74,6 +74,39 @@ def test_a_folder_of_several_recordings_is_refused(tmp_path, pictures):
     assert ("tuesday/", "a recording of its own: name it with --from") in listing.unread
 
 
+def test_times_match_poses_to_pictures(tmp_path, pictures, seen):
+    names, rows = {}, []
+    for k, (path, pose) in enumerate(zip(sorted(pictures.iterdir()), POSES, strict=True)):
+        name = f"{1690000000 + 2 * k}.250.png"
+        (tmp_path / name).symlink_to(path)
+        names[name] = seen[path.name]
+        rows.append(row([1690000000 + 2 * k + 0.2, *pose[:3, 3], *quaternion(pose)]))
+        rows.append(row([1690000000 + 2 * k + 1.2, *(pose[:3, 3] + 0.1), *quaternion(pose)]))
+    for unknown in ("", "time,x,y,z,qx,qy,qz,qw\nn/a," + row([0.1] * 7, ",") + "\n"):
+        text = "\n".join(r.replace(" ", "," if unknown else " ") for r in rows)
+        (tmp_path / "trajectory.txt").write_text((unknown or "# timestamp tx ty tz qx qy qz qw\n") + text)
+        frames, understood, _ = understand(tmp_path, names)
+        assert understood.about["matched_by"] == "time"
+        for frame, pose in zip(frames, POSES, strict=True):
+            assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
+
+
+def test_names_with_a_sign_are_matched_as_they_are(tmp_path, pictures, seen):
+    chosen = list(zip(sorted(pictures.iterdir()), POSES, ("-20", "-10", "10", "20"), strict=False))
+    (tmp_path / "tilts").mkdir()
+    names = {}
+    for path, _, tilt in chosen:
+        (tmp_path / f"tilts/tilt_{tilt}.png").symlink_to(path)
+        names[f"tilt_{tilt}.png"] = seen[path.name]
+    lines = [f"tilt_{tilt}.png " + row([*pose[:3, 3], *quaternion(pose)]) for _, pose, tilt in reversed(chosen)]
+    (tmp_path / "poses.txt").write_text("\n".join(lines))
+    frames, understood, _ = understand(tmp_path, names)
+    assert understood.about["matched_by"] == "name"
+    expected = {f"tilts/tilt_{tilt}.png": pose for _, pose, tilt in chosen}
+    for frame in frames:
+        assert np.abs(frame.base_from_flange.homogeneous - expected[frame.name]).max() < 1e-6
+
+
 def test_poses_that_name_no_picture_belong_to_those_that_are_left(tmp_path, pictures):
     """Cropped copies lie beside the pictures: they take no pose."""
     (tmp_path / "poses.txt").write_text("\n".join(row([*p[:3, 3], *quaternion(p)]) for p in POSES[:5]))

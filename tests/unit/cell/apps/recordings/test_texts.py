@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from cell.apps.recordings.series import list_folder, read_series
+from cell.apps.recordings.texts import read_content
 from tests.unit.cell.apps.recordings.pictures import (
     CAMERA,
     POSES,
@@ -94,6 +95,10 @@ TEXTS = {
         )
         + "</opencv_storage>",
     ),
+    "xml with a pose in an attribute": (
+        "robot.xml",
+        "<stops>" + of_each(lambda k, p: f"<pose_{k} value='{row([*p[:3, 3], *quaternion(p)])}'/>") + "</stops>",
+    ),
     "xml with joints beside": ("robot.xml", f"<stops>{of_each(joints_and_pose)}</stops>"),
     "times before rotation vectors": (
         "poses.txt",
@@ -120,6 +125,7 @@ SPELLINGS = {
     yaml_in_a_sub_folder: ("xyz+quaternion-xyzw", "m", "name"),
     numpy_stack_by_columns: ("matrix-4x4-by-columns", "m", "order"),
     "opencv xml": ("matrix-4x4", "m", "name"),
+    "xml with a pose in an attribute": ("xyz+quaternion-xyzw", "m", "name"),
     "xml with joints beside": ("xyz+rpy-rad", "mm", "name"),
     "wxyz in mm with names": ("xyz+quaternion-wxyz", "mm", "name"),
     "named columns in another order": ("xyz+quaternion-xyzw", "m", "number"),
@@ -168,6 +174,15 @@ def test_spoilt_texts_raise_nothing_but_their_reason(recording, seed):
         path.write_bytes(bytes(data[: rng.integers(1, len(data) + 1)]))
     _, _, unread = read_series(list_folder(recording))
     assert all(len(reason) > 5 for _, reason in unread)
+
+
+@pytest.mark.parametrize("word", [".nan", ".Nan", ".NAN", "-.Inf"])
+def test_a_number_that_is_none_in_yaml_leaves_the_other_poses_whole(tmp_path, word):
+    path = tmp_path / "poses.yaml"
+    path.write_text(f"pose1: [0.1, 0.2, 0.3, 0, 0, 0, 1]\npose2: [0.1, {word}, 0.3, 0, 0, 0, 1]\n")
+    first, second = read_content(path).records
+    assert np.isfinite(first.numbers).all()
+    assert np.isfinite(second.numbers).tolist() == [True, False, *[True] * 5]
 
 
 def test_a_damaged_file_beside_the_poses_is_named_and_the_others_are_read(recording, seen):
