@@ -150,7 +150,8 @@ class Run(Generic[Result]):
         try:
             return self._work(self)
         except BaseException as error:
-            log.error("the %s ended: %s", self.kind, error)
+            # Who asked for the end knows of it.
+            log.log(logging.INFO if isinstance(error, Aborted) else logging.ERROR, "the %s ended: %s", self.kind, error)
             raise
         finally:
             with self._telling:

@@ -55,7 +55,8 @@ def next_step(report: Mapping[str, object], folder: Path) -> str | None:
     look = "cell diag: the state of every device; "
     again, see = (_dry_run(report), "") if report.get("simulated") is True else ("cell run", look)
     if job := report.get("for_job"):
-        return f"cell diag: the state of every device; put that right, then {again} -j {_job({'job_file': job})}"
+        other = "another --seed draws another world; " if report.get("simulated") is True else look
+        return f"{other}put that right, then {again} -j {_job({'job_file': job})}"
     if kind != "job":
         if outcome == "done":
             return "cell calibrate verify: how good it is" if kind == "calibration" else None
@@ -73,12 +74,16 @@ def next_step(report: Mapping[str, object], folder: Path) -> str | None:
         case "refused" if report.get("code") == "CalibrationStale":
             return f"cell calibrate, then {again} -j {_job(report)}"
         case "refused":
-            return f"picture.png shows why; put that right, then {again} -j {_job(report)}"
+            return f"{_why(folder)}put that right, then {again} -j {_job(report)}"
         case "faulted":
             return f"{see}cell resume {name}: go on with the job"
         case "aborted":
             return f"cell resume {name}: go on with the job"
     return f"cell abort {name}, if it is still going on; cell resume {name}, if its process died"
+
+
+def _why(folder: Path) -> str:
+    return "picture.png beside it shows why; " if (folder / "picture.png").is_file() else ""
 
 
 def _dry_run(report: Mapping[str, object]) -> str:
@@ -152,10 +157,15 @@ def _trouble(report: Mapping[str, Any], width: int) -> list[str]:
     faults, retried = report["faults"], [row for row in report.get("steps") or () if row.get("retries")]
     if not faults and not retried:
         return [f"{'faults':<{LABEL}}none, and no retries"]
-    told = "; ".join(f"{fault.get('code')} in {fault.get('step')}, {fault.get('remedy')}" for fault in faults)
+    told = "; ".join(f"{_named(fault)} in {fault.get('step')}, {fault.get('remedy')}" for fault in faults)
     lines = [_cut(f"{'faults':<{LABEL}}{len(faults)}: {told}" if faults else f"{'faults':<{LABEL}}none", width)]
     again = ", ".join(f"{row['name']} {row['retries']}" for row in retried) or "none"
     return [*lines, _cut(f"{'retries':<{LABEL}}{again}", width)]
+
+
+def _named(fault: Mapping[str, Any]) -> str:
+    """The code of a device's fault; a refusal is none of a device."""
+    return "a refusal" if fault.get("code") == "RefusedError" else str(fault.get("code"))
 
 
 def _labelled(label: str, text: str, width: int) -> list[str]:

@@ -242,16 +242,21 @@ def match_series(
 def _match_pictures(one: Series, listing: Listing, linked: dict[str, int]) -> None:
     """Find the picture of each record: as a table `linked` files and pictures, or by what both are called."""
     single = len({r.path for r in one.records}) == len(one.records)
-    labels = [listing.name(r.path) if single else r.label or "" for r in one.records]
+    labels, times = _labels(one, listing, single), [r.time for r in one.records]
     which = list(range(len(listing.pictures)))
     found = _by_table(labels, linked)
     if not single or len(found.of) < LEAST:
         beside = {r.path.parent for r in one.records if single}
         which = [k for k in which if listing.pictures[k].parent in beside] or which
-        found = _match([listing.name(listing.pictures[k]) for k in which], labels, [r.time for r in one.records])
+        found = _match([listing.name(listing.pictures[k]) for k in which], labels, times)
     one.by, one.of = found.by, {which[k]: one.records[i] for k, i in found.of.items()}
     one.alone = [one.records[i] for i in found.alone]
     one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
+
+
+def _labels(one: Series, listing: Listing, single: bool) -> list[str]:
+    """What each record is called: its file where it is alone in it, else what the file calls it."""
+    return [listing.name(r.path) if single else r.label or "" for r in one.records]
 
 
 def in_order_of_views(one: Series, frames: Sequence[RecordedFrame]) -> bool:
@@ -300,10 +305,9 @@ def _by_table(labels: Sequence[str], linked: dict[str, int]) -> _Match:
 def _match(pictures: Sequence[str], labels: Sequence[str], times: Sequence[float | None]) -> _Match:
     """The label that belongs to each picture (names below the folder); the first way that serves most of them."""
     both = pictures, [label.replace("\\", "/") for label in labels]
-    named = (str, lambda name: Path(name).name, _stem, frame_key)
-    ways = [("name", [list(map(way, side)) for side in both]) for way in named]
-    # A folder for each pose.
-    ways.append(("folder", [[str(Path(name).parent) for name in side] for side in both]))
+    # The last is that of a folder for each pose.
+    named = (str, _base, _stem, frame_key, _folder)
+    ways = [("folder" if way is _folder else "name", [list(map(way, side)) for side in both]) for way in named]
     if not any(label.startswith("[") for label in labels):
         ways.append(("number", [_numbers(side) for side in both]))
     best = max((_equal(left, right, by) for by, (left, right) in ways), key=lambda found: len(found.of))
@@ -341,21 +345,29 @@ def _numbers(names: Sequence[str]) -> list[str]:
 
 def _nearest(pictures: Sequence[str], labels: Sequence[str], times: Sequence[float | None]) -> _Match | None:
     """The pose of the nearest time, where names and table have times of the same clock."""
-    shown = [_clock(Path(name).name) for name in pictures]
-    told = [t if t is not None and math.isfinite(t) else _clock(x) for t, x in zip(times, labels, strict=True)]
-    timed = [k for k, t in enumerate(told) if t is not None]
-    if len(timed) < 2 or 2 * len(timed) < len(told) or None in shown:
+    shown = np.array([_clock(Path(name).name) for name in pictures])
+    own = np.array([math.nan if time is None else time for time in times])
+    told = np.where(np.isfinite(own), own, [_clock(label) for label in labels])
+    timed = np.flatnonzero(np.isfinite(told))
+    if len(timed) < 2 or 2 * len(timed) < len(told) or not np.isfinite(shown).all():
         return None
-    table = np.array([t for t in told if t is not None])
     for scale in (1.0, 1e-3, 1e-6, 1e-9):
-        clock = np.array([s for s in shown if s is not None]) * scale
-        apart = np.abs(clock[:, None] - table[None, :])
+        clock = shown * scale
+        apart = np.abs(clock[:, None] - told[timed])
         near, reach = apart.argmin(axis=1), 0.5 * float(np.median(np.diff(np.sort(clock)))) if len(clock) > 1 else 0.1
         good = apart.min(axis=1) <= max(reach, 1e-3)
         if good.mean() > 0.5 and len(set(near[good].tolist())) == int(good.sum()):
-            of = {k: timed[near[k]] for k in np.flatnonzero(good).tolist()}
+            of = {k: int(timed[near[k]]) for k in np.flatnonzero(good).tolist()}
             return _Match("time", of, [k for k in range(len(labels)) if k not in of.values()])
     return None
+
+
+def _base(name: str) -> str:
+    return Path(name).name
+
+
+def _folder(name: str) -> str:
+    return str(Path(name).parent)
 
 
 def _stem(name: str) -> str:
@@ -363,9 +375,10 @@ def _stem(name: str) -> str:
     return path.stem if path.suffix.lower() in (*PICTURES, *TEXTS) else path.name
 
 
-def _clock(name: str) -> float | None:
+def _clock(name: str) -> float:
+    """The time in a name, NaN where there is none."""
     found = CLOCK.search(name)
-    return None if found is None else float(found[0].replace("_", "."))
+    return math.nan if found is None else float(found[0].replace("_", "."))
 
 
 def _series_name(name: str) -> str:

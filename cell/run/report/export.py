@@ -35,6 +35,8 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
     nominal surface of `job` (the run's own, unless given), the colours' ends at ±`limit` m. Raises `ConfigError` when
     the run has no cloud or the job is not found.
     """
+    if not (folder / "cloud.ply").is_file():
+        raise ConfigError(f"run {folder.name} has no cloud: it ended before `reconstruct`; `cell runs` lists others")
     cloud = read_cloud(folder / "cloud.ply")
     report = read_report(folder)
     deviations = _deviations(cloud, report, job)
