@@ -27,7 +27,9 @@ LEAST_POINTS, LEAST_CELLS, LEAST_LINES = 4, 200, 20
 """Of a cell (one line, one group of rows); of a scan that is judged."""
 EXPLAINS = 0.5
 """Share of the residuals' squares that the best cause explains at least."""
-PATCH_RADII, PATCH_STEP = (5e-3, 8e-3, 12e-3), 3e-3
+PATCH_RADII, PATCH_STEP = (5e-3, 8e-3, 12e-3, 18e-3), 3e-3
+PATCH_SHAPES = (2, 8)
+"""Powers of the distance from its middle by which a patch falls off: worn round, or flat to its rim as a puddle is."""
 WAVES = 6
 """Cosines along each side of the surface, and over the rows."""
 ROUGHER = 1.6
@@ -268,11 +270,12 @@ class _Cells:
         bent = np.column_stack([np.cos(i * x) * np.cos(j * y) for i, j in orders])
         yield "bent", "the surface is bent, worn or another one", "surface", bent, 0
 
-        def disc(x: float, y: float, radius: float) -> Array:
-            return np.asarray(np.maximum(0.0, 1.0 - np.sum((places - (x, y)) ** 2, axis=1) / radius**2))[:, None]
+        def disc(x: float, y: float, radius: float, power: int) -> Array:
+            away = np.linalg.norm(places - (x, y), axis=1) / radius
+            return np.asarray(np.maximum(0.0, 1.0 - away**power))[:, None]
 
         ways = [np.arange(a, b + PATCH_STEP, PATCH_STEP) for a, b in zip(low, high, strict=True)]
-        key, columns, _ = self.best((key, disc(*key)) for key in product(*ways, PATCH_RADII))
+        key, columns, _ = self.best((key, disc(*key)) for key in product(*ways, PATCH_RADII, PATCH_SHAPES))
         inside = columns[:, 0] > 0.3
         rough = np.median(self.scatter[inside]) > ROUGHER * np.median(self.scatter[~inside])
         what = "oil, water or a reflection" if rough else "wear, a dent, or what lies (oil, dirt)"
