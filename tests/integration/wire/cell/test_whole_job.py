@@ -105,6 +105,7 @@ def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
         assert_safe(endpoints)
 
 
+@pytest.mark.campaign
 def test_cell_abort_ends_a_run_of_another_process(place: Path, typed: Callable[..., tuple[int, str, str]]) -> None:
     with served(place, "--seed", "3") as endpoints:
         with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
