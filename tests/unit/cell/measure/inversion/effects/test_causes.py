@@ -27,6 +27,7 @@ NAMES = {
     "creep": ("drift", "creeps"),
     "pushed": ("push", "was pushed at line"),
     "oil": ("patch", "oil, water or a reflection"),
+    "wide film": ("patch", "oil, dirt"),
     "wear": ("patch", "wear, a dent"),
     "bent": ("bent", "is bent"),
     "rows": ("rows", "of the camera's rows"),
@@ -79,6 +80,10 @@ def planted(record: JobRecord, effect: str, seed: int) -> Cloud:
             film = np.maximum(0.0, 1.0 - off**8) * (1.0 + 0.5 * rng.normal(size=off.shape))
             deep = film if effect == "oil" else np.maximum(0.0, 1.0 - off**2)
             moved = -rng.uniform(0.25, 0.45) * 1e-3 * deep[:, :, None] * pose.rotation[:, 2]
+        case "wide film":
+            low, high = np.nanpercentile(local[:, :, :2], [25, 75], axis=(0, 1))
+            off = np.linalg.norm(local[:, :, :2] - rng.uniform(low, high), axis=2) / rng.uniform(14e-3, 18e-3)
+            moved = -0.25e-3 * np.maximum(0.0, 1.0 - off**8)[:, :, None] * pose.rotation[:, 2]
         case "bent":
             x, y = local[:, :, 0], local[:, :, 1]
             bow = rng.normal(size=3) @ np.stack([x * x, x * y, y * y]).transpose(1, 0, 2)
