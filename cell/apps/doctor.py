@@ -329,7 +329,8 @@ def examine_computer(path: Path | None, root: Path = ROOT) -> list[DoctorCheck]:
     rows += [date_check(clock_synchronised(), needed_here), clock_check(root, needed_here)]
     rows.append(scheduling_check(root, needed_here))
     if config is None:
-        rows.append(DoctorCheck("devices", "not needed", "no cell.toml here: simulated cells need no port"))
+        found = "no cell.toml here: simulated cells need no port" if source is None else "see configuration first"
+        rows.append(DoctorCheck("devices", "not needed", found))
     elif whole:
         rows.append(DoctorCheck("devices", "not needed", "all are simulated"))
     else:

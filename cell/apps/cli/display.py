@@ -49,6 +49,9 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH, *, w
     return [*head, *steps, *([""] * bool(figures[:fit])), *figures[:fit], more, *tail]
 
 
+LOOK_AT_PART = {"released": "look at the part, it is down", "unknown": "look what has become of the part"}
+
+
 def next_step(report: Mapping[str, object], folder: Path) -> str | None:
     """What a person would type after a run that ended so; None where there is nothing to add."""
     outcome, kind, name = report["outcome"], report.get("kind", "job"), folder.name.split("-")[-1]
@@ -62,10 +65,8 @@ def next_step(report: Mapping[str, object], folder: Path) -> str | None:
             return "cell calibrate verify: how good it is" if kind == "calibration" else None
         return "cell diag: the state of every device"
     part = None if outcome in ("placed", "done") else report.get("part")
-    if part == "released":
-        return f"look at the part, it is down; cell home: fold the arm; then {again} -j {_job(report)}: the next part"
-    if part == "unknown":
-        return f"look what has become of the part; cell home: fold the arm; then {again} -j {_job(report)}"
+    if part in LOOK_AT_PART:
+        return f"{LOOK_AT_PART[part]}; cell home: fold the arm; then {again} -j {_job(report)}: the next part"
     match outcome:
         case "done":
             return f"cell report {name}: what was measured; nothing was placed"

@@ -379,7 +379,10 @@ class Injection:
         """
         match = _FORM.fullmatch(text.strip())
         if match is None:
-            raise ConfigError(f'"{text}" is no scheduled fault: write it as "arm.protective_stop@laser_sweep:40%"')
+            raise ConfigError(
+                f'"{text}" is no scheduled fault: write it as "arm.protective_stop@laser_sweep:40%"; the faults are '
+                f"{', '.join(FAULT_NAMES)}"
+            )
         fault, step, percent = match["fault"], match["step"], float(match["percent"] or 0.0)
         if fault not in FAULT_NAMES:
             raise ConfigError(f'"{text}": the simulated cell has no fault "{fault}"; known: {", ".join(FAULT_NAMES)}')

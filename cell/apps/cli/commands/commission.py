@@ -146,4 +146,10 @@ def _list(made: Commissioning, checks: list[CommissionCheck], json: bool) -> Non
     table = new_table(None, *columns, show_lines=True)
     for row in rows:
         table.add_row(*(str(row[name]) for name in columns))
-    wide_console().print(table)
+    console = wide_console()
+    console.print(table)
+    if any(row["standing"] == "stale" for row in rows):
+        console.print(
+            "stale: its part of cell.toml or of the job, a check that it needs, or the cell is another now.\n"
+            "A simulated cell is another with other --sim, --seed, --level, --clock or --truth: give the same again."
+        )

@@ -9,7 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from cell.apps.cli.app import app
-from cell.apps.commission.sequence import CHECKS
+from cell.apps.commission.check import FILE, VERSION
+from cell.apps.commission.sequence import CHECKS, FOLDER
 from cell.config.cell_config import default_toml
 
 
@@ -25,6 +26,13 @@ def test_the_list_of_checks_connects_nothing_and_names_all_up_to_the_last_that_i
     assert [(row["name"], row["standing"]) for row in rows] == [(check.name, "open") for check in CHECKS]
     shown = CliRunner().invoke(app, ["commission", "--sim", "all", "--list", "--until", "arm_axes"])
     assert "links" in shown.stdout and "arm_axes" in shown.stdout and "payload" not in shown.stdout
+
+
+def test_the_list_says_what_makes_a_result_stale(tmp_path: Path) -> None:
+    done = {"version": VERSION, "results": {"links": {"rests_on": "another cell", "verdict": "good"}}, "mended": []}
+    (tmp_path / FOLDER).mkdir()
+    (tmp_path / FOLDER / FILE).write_text(json.dumps(done))
+    assert "the cell is another now" in CliRunner().invoke(app, ["commission", "--sim", "all", "--list"]).stdout
 
 
 @pytest.mark.parametrize("words", [("--truth", "true.toml"), ("--confirm", "simulated"), ("--until", "nothing")])
