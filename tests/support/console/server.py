@@ -121,12 +121,13 @@ class Served:
         return self.ask("POST", "/api/do", json.dumps(words))
 
     def live(self, **options: Any) -> ClientConnection:
-        """A page's live link."""
+        """A page's live link; a context as well, or to be closed."""
         headers = {"cookie": self.cookie} | options.pop("headers", {})
         origin = options.pop("origin", self.origin)
         url = options.pop("url", f"ws://{self.host}/live")
         options = {"subprotocols": ["cell", self.key], "max_size": None, "compression": None} | options
-        return connect(url, additional_headers=headers, origin=origin, **options)
+        # Some versions of websockets connect as the context begins.
+        return connect(url, additional_headers=headers, origin=origin, **options).__enter__()
 
     def head(self, request: str = "POST /api/do", *lines: str) -> str:
         """The head of a request as this browser's page sends it, still open; `lines` come last."""
