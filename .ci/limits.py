@@ -119,13 +119,23 @@ def measured() -> tuple[dict[str, float], dict[str, list[str]]]:
     return figures, met
 
 
+def read(text: str) -> tuple[dict[str, float], dict[str, float]]:
+    """The limits of a `limits.toml`, and the lines that open issues may add."""
+    limits = tomllib.loads(text)
+    return limits, limits.pop("budget", {})
+
+
 def main() -> int:
     """Compare, and say which limit is broken and where to look."""
-    limits = tomllib.loads((ROOT / LIMITS).read_text(encoding="utf-8"))
+    limits, budgets = read((ROOT / LIMITS).read_text(encoding="utf-8"))
     before: dict[str, float] = {}
     for commit in git("log", "--format=%H", "--", LIMITS).split():
-        for name, limit in tomllib.loads(git("show", f"{commit}:{LIMITS}")).items():
-            before[name] = min(limit, before.get(name, limit))
+        for table in read(git("show", f"{commit}:{LIMITS}")):
+            for name, limit in table.items():
+                before[name] = min(limit, before.get(name, limit))
+    for issue in budgets:
+        if budgets[issue] > before.get(issue, budgets[issue]):
+            sys.exit(f"{issue}: the budget rose")
     figures, met = measured()
     if unpaired := sorted(limits.keys() ^ figures.keys()):
         sys.exit(f"{', '.join(unpaired)}: each figure needs a limit in {LIMITS}, and each limit a figure")
@@ -133,6 +143,7 @@ def main() -> int:
     for name, limit in limits.items():
         value = figures[name]
         rose = limit > before.get(name, limit)
+        limit += sum(budgets.values()) if name == "lines_of_python" else 0
         over = value > limit
         wrong |= rose or over
         told = "the limit rose" if rose else "over" if over else ""
