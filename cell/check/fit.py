@@ -48,7 +48,7 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
     ]  # fmt: skip
     problems = problems or list(_sight(job, config))
     extent = mesh_box(mesh, job.surface.mesh_unit)
-    problems += [*surface_problems(job, extent), *_stripe(job, config, extent[0][2], extent[1][2])]
+    problems += [*surface_problems(job, extent, mesh), *_stripe(job, config, extent[0][2], extent[1][2])]
     # The arm's poses follow from the others: where these are wrong, it would only be told twice.
     problems = problems or list(reach_problems(job, config, extent, calibrates=calibrates))
     problems += contact_problems(job, config, mesh)

@@ -216,9 +216,18 @@ def place_problems(job: Job) -> Iterator[str]:
     yield from _above_table("place.surface_from_part and surface.place_from_surface put the part", part, corners)
 
 
-def surface_problems(job: Job, extent: Box) -> Iterator[str]:
-    """What is wrong with where the nominal surface lies: not on the table, or not where it is scanned."""
+def surface_problems(job: Job, extent: Box, mesh: Path) -> Iterator[str]:
+    """What is wrong with where the nominal surface lies: not on the table, upside down, or not where it is scanned."""
     low, high = extent
+    vertices, triangles = read_mesh(mesh, job.surface.mesh_unit)
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    up = np.cross(b - a, c - a) @ job.place.surface_from_part.se3().rotation[:, 2]
+    # As much of a solid faces up as down; what of it is seen is not known here.
+    if up.sum() < -0.5 * np.abs(up).sum():
+        yield (
+            f'surface.mesh "{job.surface.mesh}": its triangles face away from the part that is placed onto it; '
+            "`cell new-job --flip yes` turns them, or correct place.surface_from_part"
+        )
     on_place = job.surface.place_from_surface.se3()
     yield from _above_table("surface.place_from_surface puts the surface", on_place, _corners(low, high))
     half = 0.5 * job.scan.length

@@ -93,7 +93,7 @@ def _loaded(path: Path) -> tuple[Array, Faces]:
             ) from error
         settings = {"tol_linear": STEP_CHORD, "tol_angular": STEP_ANGLE}
     try:
-        mesh = trimesh.load_mesh(path, process=True, **settings)
+        mesh = trimesh.load_mesh(path, process=False, **settings)
         return np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
     except Exception as error:  # every reader of trimesh raises its own
         raise ConfigError(f"{path} cannot be read as a mesh; give an STL, PLY or STEP") from error

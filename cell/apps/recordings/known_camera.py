@@ -37,7 +37,7 @@ def read_camera(path: Path) -> CameraModel:
         # A result of `cell calibrate --from`; files of others have no digest.
         if isinstance(data, dict) and not is_intact(data):
             raise EditedError("it was changed after `cell calibrate --from` wrote it; use the result as it was")
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"--camera {path}: it cannot be read: {error}") from error
     try:
         if not isinstance(data, dict):
@@ -45,7 +45,7 @@ def read_camera(path: Path) -> CameraModel:
         return _camera(_inner(data))
     except ConfigError as error:
         raise ConfigError(f"--camera {path}: {error}") from error
-    except (KeyError, TypeError, ValueError) as error:
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
         raise ConfigError(f"--camera {path}: {FORM}; {error} is missing or no number") from error
 
 

@@ -38,7 +38,7 @@ def read_pose_pairs(folder: Path) -> list[Pair]:
     for path in sorted(folder.glob("*.json")):
         try:
             pairs: Array = np.asarray(json.loads(path.read_text(encoding="utf-8")), dtype=np.float64)
-        except (ValueError, TypeError, OSError, RecursionError):
+        except (ArithmeticError, ValueError, TypeError, OSError, RecursionError):
             continue
         if pairs.ndim != 4 or pairs.shape[1:] != (2, 4, 4):
             continue
@@ -138,10 +138,10 @@ def _check_unit(pairs: Sequence[Pair]) -> None:
     """Refuse positions that cannot be in m. Raises ConfigError."""
     for place, (what, farthest) in enumerate(FARTHEST_M.items()):
         far = float(np.median([np.linalg.norm(pair[place].translation) for pair in pairs]))
-        if far > farthest:
+        if not 0.0 < far <= farthest:
             raise ConfigError(
-                f"pairs of poses: {what} would be {far:.4g} m (median, allowed {farthest:g} m); both positions of a "
-                "pair must be in m: are these in mm? Divide them by 1000"
+                f"pairs of poses: {what} would be {far:.4g} m (median, allowed: above 0, up to {farthest:g} m); "
+                "both positions of a pair must be in m: are these in mm? Divide them by 1000"
             )
 
 

@@ -338,11 +338,15 @@ def _read(file: _MeshFile, unit: str) -> tuple[Array, NDArray[np.int64]]:
 
     path = file.path
     try:
-        mesh = trimesh.load_mesh(path, process=True)
+        mesh = trimesh.load_mesh(path, process=False)
+        # Corners that are no numbers are looked for first: `process` drops them, and leaves a hole.
+        finite = bool(np.isfinite(mesh.vertices).all())
+        mesh.process()
         vertices, faces = np.array(mesh.vertices, dtype=np.float64), np.array(mesh.faces, dtype=np.int64)
+        alike = bool(mesh.is_winding_consistent)
     except Exception as error:  # every reader of trimesh raises its own
         raise ConfigError(UNREADABLE.format(path)) from error
-    if vertices.ndim != 2 or not len(faces) or not np.isfinite(vertices).all():
+    if vertices.ndim != 2 or not len(faces) or not finite:
         raise ConfigError(
             f"nominal surface {path} holds {len(faces)} triangles, or corners that are not numbers; give an STL or PLY "
             "of the surface"
@@ -354,6 +358,11 @@ def _read(file: _MeshFile, unit: str) -> tuple[Array, NDArray[np.int64]]:
             f"nominal surface {path} measures {1e3 * extent:.3g} mm with mesh_unit = {unit!r} (allowed: 1 to 5000 mm); "
             "check surface.mesh_unit in the job"
         )
+    if not alike:
+        raise ConfigError(
+            f"nominal surface {path}: neighbouring triangles face opposite ways, so nobody knows which side is up; "
+            "`cell new-job` turns them, or turn them in the drawing"
+        )
     vertices.flags.writeable = faces.flags.writeable = False
     return vertices, faces
 
@@ -361,7 +370,9 @@ def _read(file: _MeshFile, unit: str) -> tuple[Array, NDArray[np.int64]]:
 def _samples(corners: Array, areas: Array) -> tuple[Array, Indices]:
     """Points on the triangles at about `SPACING`, at least one in each, and the triangle of each point."""
     edge = np.max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2), axis=1)
-    spacing = max(SPACING, float(np.sqrt(areas.sum() / MOST_SAMPLES)))
+    # A long thin triangle is divided as often across as along: it has as many points as its edge squared.
+    square = max(areas.sum(), 0.25 * float((edge**2).sum()))
+    spacing = max(SPACING, float(np.sqrt(square / MOST_SAMPLES)))
     divisions = np.maximum(1, np.ceil(edge / spacing)).astype(np.intp)
     points, owners = [], []
     for n in np.unique(divisions):

@@ -170,10 +170,10 @@ def invert_pose(
 ) -> PlacePose:  # fmt: skip
     """The pose of the nominal surface in the arm base, from a cloud in the arm base and the board's pose as prior.
 
-    `systematic` (6×6, base axes) is an uncertainty of the pose that all points share, such as the arm's; `calibration`
-    says how the calibration's uncertainty moves each point, and is propagated through the registration; `sweeps` how
-    each sweep's own uncertainty moves its points, which is taken out as far as the sweeps tell it. `start` is where the
-    search begins unless at the prior.
+    `systematic` (6×6, base axes) is what the place is off by whether scan or board decides it, such as the arm's error
+    as it goes there; `calibration` says how the calibration's uncertainty moves each point, and is propagated through
+    the registration; `sweeps` how each sweep's own uncertainty moves its points, which is taken out as far as the
+    sweeps tell it. `start` is where the search begins unless at the prior.
 
     Raises `RefusedError` when the scan does not fit the surface, covers too little of it or contradicts the board, and
     `NotObservable` when three standard deviations exceed `tolerance` in some direction, which is named.
@@ -255,7 +255,7 @@ class _Inversion:
 def _shared(found: Registration, displaced: list[Array], systematic: Array | None) -> Array:
     """Covariance (6, 6) of what all points share: `systematic`, what displaces them together, and the patches."""
     _, by_patches = shared_by_patches(found)
-    shared = np.zeros((6, 6)) if systematic is None else found.gain @ systematic @ found.gain.T
+    shared = np.zeros((6, 6)) if systematic is None else systematic
     for moved in displaced:
         by_parameter = found.follow @ np.einsum("ni,nim->nm", found.normals, moved[found.used])
         shared = shared + by_parameter @ by_parameter.T

@@ -171,11 +171,6 @@ class Registration:
     share: float
 
     @property
-    def gain(self) -> Array:
-        """How the pose follows a motion of the whole scan (6, 6): I where the scan decides."""
-        return np.asarray(self.follow @ np.concatenate([self.normals, np.cross(self.arms, self.normals)], axis=1))
-
-    @property
     def rms(self) -> float:
         """Root mean square of the accepted points' distances from the surface, m."""
         return float(np.sqrt(np.mean(self.heights**2)))

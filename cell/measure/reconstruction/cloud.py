@@ -274,6 +274,10 @@ def _around(cloud: Cloud, sweep: slice, lines: Indices, rows: Indices) -> tuple[
     ways = [cloud.points[sweep.start + 1 : sweep.stop] - cloud.points[sweep.start : sweep.stop - 1]]
     ways.append(cloud.points[sweep, 1:] - cloud.points[sweep, :-1])
     across, along = (float(np.nanmedian(np.linalg.norm(way, axis=2))) for way in ways)
+    if not (np.isfinite(across) and along > 0.0):
+        # Lines or rows without neighbours are no surface to compare with.
+        nothing = np.empty((0, 15), dtype=np.intp)
+        return (nothing, nothing), np.zeros(len(lines), dtype=np.bool_)
     stride = max(1, round(0.5 * across / along))
     steps = np.array([(i, j * stride) for i in (-1, 0, 1) for j in (-2, -1, 0, 1, 2)])
     line, row = lines[:, None] + steps[:, 0], rows[:, None] + steps[:, 1]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from cell.base.toml_file import read_toml, validate
-from cell.check.place import contact_notes, contact_problems, under_part
+from cell.check.place import contact_notes, contact_problems, mesh_box, surface_problems, under_part
 from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import Job, load_job, shipped_jobs
 
@@ -71,3 +71,10 @@ def test_how_deep_the_surface_reaches_into_the_part_is_noted() -> None:
     mesh: Path = POT.with_suffix(".ply")
     deeper = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "-5 mm"])
     assert "13.4 mm into the part's box of 20 mm" in next(contact_notes(deeper, mesh))
+
+
+@pytest.mark.parametrize(("turn", "wrong"), [("0 deg", False), ("180 deg", True)])
+def test_a_surface_that_faces_away_from_the_part_is_refused(turn: str, wrong: bool) -> None:
+    mesh: Path = POT.with_suffix(".ply")
+    job = changed("place.surface_from_part.rotation", [turn, "0 deg", "0 deg"])
+    assert any("face away" in text for text in surface_problems(job, mesh_box(mesh, "m"), mesh)) == wrong

@@ -76,6 +76,15 @@ def test_a_matrix_that_is_no_camera_is_refused(tmp_path, matrix, words):
         read_camera(file_of(tmp_path, "plumb_bob", "0, 0, 0, 0, 0", matrix))
 
 
+@pytest.mark.parametrize(
+    "text", ['{"width": Infinity}', "[" * 3000, '{"model": [], "image_width": 1, "image_height": 1}']
+)
+def test_a_file_of_senseless_numbers_is_refused_in_words(tmp_path, text):
+    (tmp_path / "camera.json").write_text(text)
+    with pytest.raises(ConfigError, match="--camera"):
+        read_camera(tmp_path / "camera.json")
+
+
 VISP = """<?xml version="1.0"?><root><camera><name>Camera</name>
 <image_width>1280</image_width><image_height>960</image_height>
 <model><type>perspectiveProjWithoutDistortion</type><px>1380</px><py>1390</py><u0>650</u0><v0>470</v0></model>

@@ -79,7 +79,12 @@ def test_a_scale_that_stands_alone_is_a_doubt_beside_the_value(seed):
 
 @pytest.mark.parametrize(
     ("flange", "board", "words"),
-    [(1e3, 1e3, "flange's .* Divide"), (1e3, 1.0, "flange's .* Divide"), (1.0, 1e3, "board's .* Divide")],
+    [
+        (1e3, 1e3, "flange's .* Divide"),
+        (1e3, 1.0, "flange's .* Divide"),
+        (1.0, 1e3, "board's .* Divide"),
+        (0, 1, "be 0"),
+    ],
 )
 def test_pairs_that_are_not_in_metres_are_refused(flange, board, words):
     pairs = [

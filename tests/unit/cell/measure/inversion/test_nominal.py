@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
 from cell.measure.inversion import NominalSurface
+from cell.measure.inversion.nominal import MOST_SAMPLES, _samples, read_mesh
+from drivers.errors import ConfigError
+
+PLY = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 2\n"
 
 
 def test_closest_points_of_large_triangles_agree_with_a_brute_force_search() -> None:
@@ -30,3 +36,30 @@ def test_the_rim_of_a_large_triangle_is_left_out() -> None:
     found = plate.deviations([[0.02, 0.0003, 1e-4], [0.02, 0.001, 1e-4]])
     assert np.isnan(found[0])
     assert found[1] == pytest.approx(1e-4)
+
+
+@pytest.mark.parametrize(
+    ("corner", "second", "words"),
+    [("9 9 0", "0 2 3", ""), ("9 9 0", "0 3 2", "opposite ways"), ("9 9 nan", "0 2 3", "not")],
+)
+def test_a_mesh_whose_sides_or_corners_are_not_told_is_refused(
+    tmp_path: Path, corner: str, second: str, words: str
+) -> None:
+    text = f"property list uchar int vertex_indices\nend_header\n0 0 0\n9 0 0\n{corner}\n0 9 0\n3 0 1 2\n3 {second}\n"
+    (tmp_path / "surface.ply").write_text(PLY + text)
+    if not words:
+        assert read_mesh(tmp_path / "surface.ply", "mm")[0].shape == (4, 3)
+        return
+    with pytest.raises(ConfigError, match=words):
+        read_mesh(tmp_path / "surface.ply", "mm")
+
+
+def test_a_tube_of_long_thin_triangles_has_no_more_samples_than_another_mesh() -> None:
+    angle = np.linspace(0.0, np.pi, 33)
+    ends = np.stack([[np.full(33, x), 0.02 * np.cos(angle), 0.02 * np.sin(angle)] for x in (0.0, 0.3)]).transpose(
+        2, 0, 1
+    )
+    strips = ends[:-1, 0], ends[:-1, 1], ends[1:, 1], ends[1:, 0]
+    corners = np.concatenate([np.stack(strips[:3], axis=1), np.stack([strips[0], *strips[2:]], axis=1)])
+    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    assert len(_samples(corners, areas)[0]) < 5 * MOST_SAMPLES

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import difference
-from cell.measure.inversion import Prior, invert_pose
+from cell.measure.inversion import Prior, Tolerance, invert_pose
 from cell.measure.inversion.nominal import SIGMA_FLOOR, Scan
 from cell.measure.inversion.place_pose import PATCH_M, shared_by_patches
 from cell.measure.inversion.registration import register
@@ -57,3 +57,13 @@ def test_the_stated_deviation_holds_where_neighbours_err_together(monkeypatch: p
     assert (np.abs(off) < 3.0 * found.sigma).all()
     # The turn that the ledges tell: three times as much as the points' own noise leaves of it.
     assert found.sigma[5] > 2.0 * np.sqrt(found.random[5, 5])
+
+
+def test_what_the_arm_is_off_by_counts_where_the_board_decides_as_well() -> None:
+    def ridge(x: Array, y: Array) -> Array:
+        return 0.006 * np.exp(-((y / 0.006) ** 2))
+
+    prior, arm = Prior(TRUE, np.diag([5e-5**2] * 3 + [1e-3**2] * 3)), np.diag([0.5e-3**2] * 3 + [0.0] * 3)
+    found = invert_pose(scanned(ridge, 1), nominal(ridge), prior, Tolerance(5e-3, 5e-2), systematic=arm)
+    assert found.verdict.unseen
+    assert (found.sigma[:3] > 0.5e-3).all()

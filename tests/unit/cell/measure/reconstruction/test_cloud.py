@@ -115,6 +115,11 @@ def test_what_moves_both_sweeps_alike_is_not_expected_at_the_seam(pair: Cloud) -
     assert seam.expected_mean < 2e-6
 
 
+def test_a_sweep_without_neighbouring_lines_makes_no_seam(pair: Cloud) -> None:
+    pair.points[0:15:2] = np.nan
+    assert find_seams(pair, lambda lines, rows: flange_motions(pair, lines, rows, repeatability(1e-5))) == []
+
+
 def test_a_pose_error_moves_its_own_sweep_as_the_motions_say() -> None:
     told = [np.zeros((6, 6)), np.diag([0, 0, 9e-10, 1e-8, 0, 0])]
     cloud = merge([swept((0, 0, 0), np.zeros(3), 1, 8), swept((0, 0.012, 0), np.zeros(3), 2, 8)])
