@@ -35,6 +35,8 @@ class CancelToken:
 
     def cancel(self, reason: str) -> bool:
         """End the run. True for the first who asks; later reasons are not kept."""
+        # A terminal may hand on bytes that are no text, which no file takes.
+        reason = reason.encode(errors="backslashreplace").decode()
         with self._lock:
             if self._reason is not None:
                 return False

@@ -301,9 +301,10 @@ def request(folder: Path, kind: str, reason: str, number: int | None = None) -> 
     """
     if kind not in REQUESTS:
         raise ValueError(f"request '{kind}' is unknown; a run takes {', '.join(REQUESTS)}")
-
     if kind == "confirm" and number is None:
         raise ValueError("a confirmation needs the number of its question")
+    # Bytes that are no text would keep it from being written.
+    reason = reason.encode(errors="backslashreplace").decode()
 
     def write(base: sqlite3.Connection) -> None:
         base.execute(

@@ -202,11 +202,10 @@ class StepContext:
 
         self._control.safe_point(self.token, say, self._look)
 
-    def was_held(self) -> bool:
-        """A `safe_point`, and whether the run was held there: what was seen before may have changed meanwhile."""
-        before = self._control.held_s
-        self.safe_point()
-        return self._control.held_s > before
+    @property
+    def held_s(self) -> float:
+        """For how long, wall seconds, the run was held so far: what was seen before a hold may have changed in it."""
+        return self._control.held_s
 
     def progress(self, fraction: float, text: str = "") -> None:
         """Tell the observer how far the step is, 0 to 1; not written to the journal. Raises like `check`."""

@@ -269,7 +269,7 @@ class JobRun:
             return work
 
         after = {name: entered(look) for name, look in script.after.items()}
-        return Script(after, None if script.on_refusal is None else entered(script.on_refusal))
+        return replace(script, after=after, on_refusal=script.on_refusal and entered(script.on_refusal))
 
 
 def each_of(observers: tuple[Observer, ...]) -> Observer:

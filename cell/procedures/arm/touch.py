@@ -145,7 +145,8 @@ def felt_touch(states: Sequence[ArmState], origin: Vector, normal: Vector) -> To
     forces = np.array([state.wrench[:3] for state in chosen]) @ normal
     tried = np.arange(heights.min(), heights.max(), GRID_M)
     if len(tried) < LEAST_STATES:
-        return None
+        # Touched as soon as it was felt for: somewhere on that short way.
+        return TouchHeight(float(heights.mean()), float(np.hypot(heights.std(), FELT_M)))
     left = np.array([np.sum(_left(heights, forces, touch) ** 2) for touch in tried])
     best = int(np.argmin(left))
     # How fast the squares grow away from the best tells how far off the touch may be.

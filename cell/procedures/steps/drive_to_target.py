@@ -99,7 +99,7 @@ class TargetDrive:
         The arm stands in its looking pose already and the vehicle is enabled. On odometry alone it goes no further than
         the staging pose, and only when `whereabouts` knows where it stands.
         Raises `RefusedError` when the vehicle neither sees the board nor knows where it stands, when its way leads too
-        close to the station, and when the tolerance is not met after five tries.
+        close to the station, and when the tolerance is not met after nine photographs.
         """
         self._require_known_place()
         staging = Planar.of(self.job.approach.staging.se3())
@@ -117,7 +117,9 @@ class TargetDrive:
             if near and abs(error.yaw) < 0.5 * approach.tolerance_angle:
                 self.vehicle.brake()
                 return VehicleArrival(base_from_place, fix, error.x, error.y, error_yaw=error.yaw, photographs=count)
-            self._correct(error, near)
+            # Not after the last: nobody would see where that brought it.
+            if count < 2 * MAX_TRIES - 1:
+                self._correct(error, near)
         self.vehicle.brake()
         remedy = self._remedy_of_a_miss()
         raise _off_target(error, self.job, fix, who="the vehicle", after=f" after {count} photographs", remedy=remedy)

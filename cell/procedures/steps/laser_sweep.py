@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from cell.config.calibrations.store import changed, doubt_of, link_of
 from cell.config.cell_config import CellConfig
-from cell.config.job import ScanSection
+from cell.config.job import LONGEST_SWEEP_S, ScanSection
 from cell.devices.devices import Devices
 from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.drift.reference_plate import PlateLine, Pointing
@@ -100,7 +100,9 @@ def unhurried(scan: ScanSection, attempt: int) -> ScanSection:
 
     What loses frames most often is a machine that does not keep up with them.
     """
-    share = 0.5 ** (attempt - 1)
+    seconds = len(scan.swath) * scan.length / scan.speed
+    # No slower than the step has time for.
+    share = max(0.5 ** (attempt - 1), min(1.0, seconds / LONGEST_SWEEP_S))
     return scan.model_copy(update={"speed": share * scan.speed, "frame_rate": max(1.0, share * scan.frame_rate)})
 
 
@@ -113,14 +115,17 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
         # After a fault the arm's base may stand elsewhere.
         require_unmoved(here, fix, "before the fault that ended the sweep", lambda _, text: context.progress(0.0, text))
         context.note(text="the board has not moved since the fault")
-    if here.earlier is not None:
+    # Used once: whoever has it swept again was not content with it.
+    earlier, here.earlier = here.earlier, None
+    if earlier is not None:
         try:
-            sweep = here.earlier.confirmed_by(fix)
+            sweep = earlier.confirmed_by(fix)
         except CalibrationStale as moved:
             context.note(text=f"{moved}: sweeping again")
         else:
-            here.earlier.copy_to(here.folder)
-            context.note(text=f"the board has not moved: the sweep of run {here.earlier.folder.name} holds")
+            earlier.copy_to(here.folder)
+            for note in (f"the board has not moved: the sweep of run {earlier.folder.name} holds", *sweep.notes):
+                context.note(text=note)
             return sweep
     sweep = _sweep(here, context, fix)
     save_sweep(here.folder, sweep, fix, here.frames.settle())

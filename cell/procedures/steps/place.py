@@ -25,7 +25,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.second_look import SecondLook, require_in_place
 from cell.procedures.sweep.stored_sweep import SweepRecord
-from drivers.errors import Measured, RefusedError
+from drivers.errors import Measured, NotObservable, RefusedError
 from drivers.interfaces import Arm, ArmState, Claw, Vector
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
@@ -131,7 +131,8 @@ class Placing:
 
     def _approach(self) -> None:
         self.progress(0.05, "approaching")
-        self.mover.to(self._flange_at(self.job.place.approach), "the approach pose")
+        # Not held before it: nobody would look at the surface again.
+        self.mover.follow(self.mover.plan_to(self._flange_at(self.job.place.approach), "the approach pose"))
         self.check()
         if not self.claw.holding:
             raise RefusedError("the claw does not hold the part any more before the descent; look where it was lost")
@@ -215,10 +216,12 @@ def require_held(part: PartProgress) -> None:
 def _at(here: Workplace, context: StepContext) -> PlaceResult:
     pose = context.made(PlacePose)
     require_held(here.part)
-    look = _looked_again(here, pose, context)
-    # Whoever has the run held may be about to reach in.
-    while context.was_held():
+    # Whoever has the run held may reach in, also in the middle of a look.
+    held = -1.0
+    while context.held_s > held:
+        held = context.held_s
         look = _looked_again(here, pose, context)
+        context.safe_point()
     if look is not None and look.creep is not None:
         swept = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
         pose = carried_on(here, *swept, look.creep)
@@ -237,7 +240,7 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
 def carried_on(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix, creep: Creep) -> PlacePose:
     """The place when the part touches it, of a surface that creeps, from the sweep freed of that.
 
-    Raises what `inverted` raises: what is not known of the rate may be too much.
+    Raises what `inverted` raises, and `NotObservable` where too little is known of the rate.
     """
 
     def by_poses(lines: Indices, rows: Indices) -> Vector:
@@ -247,7 +250,15 @@ def carried_on(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: B
     still = replace(scan, cloud=creep.undone(scan.cloud, sweep.times), by_poses=by_poses)
     plan = here.job.place
     until = APPROACH_S + plan.approach / plan.speed + plan.contact_travel / plan.contact_speed
-    return creep.carried(inverted(here, sweep, still, fix), here.devices.clock.now() + until)
+    pose = creep.carried(inverted(here, sweep, still, fix), here.devices.clock.now() + until / here.pace.share)
+    turn = np.kron(np.eye(2), pose.base_from_surface.rotation) / ([plan.tolerance] * 3 + [plan.tolerance_angle] * 3)
+    if not (open_ := 3.0 * float(np.sqrt(np.linalg.eigvalsh(turn.T @ pose.covariance @ turn)[-1]))) <= 1.0:
+        raise NotObservable(
+            f"{creep.words}. When the part touches it, its place is known to {open_:.2f} tolerances (3 sigma; allowed: "
+            "1). Let vehicle and surface come to rest, then run the job again",
+            Measured("3 sigma of a place that creeps, in tolerances", open_, most=1.0),
+        )
+    return pose
 
 
 def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> SecondLook | None:

@@ -110,8 +110,8 @@ def save_sweep(folder: Path, sweep: SweepRecord, fix: BoardFix, frames: Mapping[
     data: dict[str, Any] = {
         "format": np.array(FORMAT),
         "base_from_board": fix.base_from_board.homogeneous,
-        "board_covariance": fix.covariance,
-    }
+        "board_covariance": fix.covariance, "doubts": np.array(sweep.doubts, dtype=np.str_),
+    }  # fmt: skip
     if sweep.pointing is not None:
         data["pointing"] = np.array(astuple(sweep.pointing))
     if sweep.slip is not None:
@@ -167,7 +167,8 @@ class StoredSweep:
             require_covariance("board_covariance", covariance.reshape(6, 6), range(0))
         except (OSError, ValueError, KeyError, EOFError, TypeError, IndexError, zipfile.BadZipFile, CellError) as error:
             raise RefusedError(f"{path} cannot be read as a sweep: {error}") from error
-        return cls(folder, SweepRecord(swaths, pointing, slip=slip), base_from_board, covariance)
+        doubts = tuple(map(str, stored.get("doubts", ())))
+        return cls(folder, SweepRecord(swaths, pointing, doubts, slip), base_from_board, covariance)
 
     def confirmed_by(self, fix: BoardFix) -> SweepRecord:
         """The sweep, if the board stands where it stood; its covariance holds what two photographs leave open.

@@ -24,10 +24,10 @@ from cell.run.events import ConfirmNeeded, Held, RunEnded, RunEvent, StepStarted
 from cell.run.job_run import RunOutcome
 from cell.run.record.reading import Parts, said
 from cell.run.runs import Run
-from drivers.errors import Aborted, ConfigError, InterlockError
+from drivers.errors import Aborted, ConfigError, InterlockError, RefusedError
 from lab.bench.job.whole_job import JobRecord
 from statemachine.journal import request
-from statemachine.runner import Script
+from statemachine.runner import Again, Script
 from statemachine.step import Event
 from tests.golden.golden import plain_journal, plain_report
 
@@ -116,6 +116,22 @@ def test_a_vehicle_that_was_moved_in_a_fault_is_not_swept_from_where_it_stood() 
     assert outcome.report["refusal"]["step"] == "laser_sweep"
     require_safe(dict(outcome.report))
     assert re.search(r"the board has moved by \d+\.\d+ mm .* since it was photographed", outcome.reason)
+
+
+def test_a_script_that_allows_one_decision_is_asked_once() -> None:
+    asked: list[str] = []
+
+    def refuse(_: object) -> None:
+        raise RefusedError("not content")
+
+    def again(name: str, _: object) -> Again:
+        asked.append(name)
+        return Again("drive_to_target", "once more")
+
+    script = Script({"drive_to_target": refuse}, again, most=1)
+    with opened() as cell:
+        assert cell.run("pot.toml", until="drive_to_target", script=script).outcome == "refused"
+    assert asked == ["drive_to_target"]
 
 
 def test_it_takes_the_course_of_another_seed_otherwise() -> None:

@@ -50,6 +50,12 @@ def test_held_work_ends_with_its_own_token_though_the_run_stays_paused():
     assert 0.0 < control.held_s < 1.0
 
 
+def test_a_reason_with_bytes_that_are_no_text_ends_the_run_all_the_same():
+    token = CancelToken()
+    assert token.cancel("J\udcf6rg says stop")
+    assert token.reason == "J\\udcf6rg says stop"
+
+
 def test_what_begins_after_its_run_was_ended_is_ended_as_it_begins():
     run, told = CancelToken(), []
     run.cancel("enough")

@@ -69,7 +69,7 @@ def test_a_vehicle_that_stands_beside_its_target_or_turned_is_brought_there_and_
 def test_a_target_that_is_not_met_is_refused_with_the_vehicle_braked(shimmers: bool) -> None:
     """The board is seen turned about the vehicle, by a degree more each time as in shimmering air, or always by three
     from where it stood at first: however the vehicle turns, it is off."""
-    site, seen, first = Site(), 0.0, []
+    site, seen, first, stood = Site(), 0.0, [], []
     target = Planar.of(JOB.approach.target.se3())
     model = site.cell.world.vehicle
     model._x, model._y, model._yaw = target.x, target.y, target.yaw
@@ -80,6 +80,7 @@ def test_a_target_that_is_not_met_is_refused_with_the_vehicle_braked(shimmers: b
         nonlocal seen
         seen = seen + math.radians(1.0) if shimmers else math.radians(3.0)
         first.append(photograph())
+        stood.append(site.truth())
         fix = first[-1 if shimmers else 0]
         about = VEHICLE_FROM_BASE.inverse() * pin.SE3(pin.exp3(np.array([0.0, 0.0, seen])), np.zeros(3))
         return replace(fix, base_from_board=about * VEHICLE_FROM_BASE * fix.base_from_board)
@@ -91,6 +92,8 @@ def test_a_target_that_is_not_met_is_refused_with_the_vehicle_braked(shimmers: b
     assert model.feedback(site.cell.clock.now()).braked
     # One before it drives, nine on the way and two that are compared with each other.
     assert len(first) == 12
+    # Nobody would see where a drive after the last of the nine leads.
+    assert (stood[9].x, stood[9].yaw) == pytest.approx((site.truth().x, site.truth().yaw), abs=1e-9)
 
 
 def test_a_vehicle_that_late_readings_let_pass_its_goal_is_brought_back_to_see_the_board() -> None:

@@ -214,6 +214,25 @@ def test_a_touch_within_what_is_stated_is_placed_and_told(too_low: float) -> Non
     assert result.notes == ()
 
 
+def test_a_stiff_touch_as_soon_as_it_is_felt_for_is_refused_with_the_part_held() -> None:
+    """The way on which the force grows is too short to tell where it began; where it ended tells enough."""
+    site = Site()
+    touch = site.cell.world.arm.contact
+    assert touch is not None
+    site.cell.world.arm.contact = lambda base_from_flange: 6.0 * np.asarray(touch(base_from_flange))
+    with pytest.raises(RefusedError, match="mm higher than the scan says"):
+        site.place(too_low=1.06e-3)
+    assert site.held
+
+
+def test_nothing_is_held_between_the_last_look_and_the_release() -> None:
+    """A surface that is moved in a pause there would not be looked at again."""
+    site, held = Site(), []
+    site.mover.hold = lambda: held.append(site.held)
+    site.place()
+    assert held == [False]
+
+
 def test_a_part_that_meets_nothing_is_not_released() -> None:
     site = Site()
     with pytest.raises(RefusedError, match=r"no contact within 1\.00 mm"):

@@ -24,9 +24,10 @@ from cell.measure.reconstruction.cloud import Filled
 from cell.procedures.arm.touch import felt_touch
 from cell.procedures.steps import place as place_step
 from cell.procedures.steps.kinds import PLACE
+from cell.procedures.sweep import second_look
 from cell.procedures.sweep.second_look import LINES, SecondLook, by_times, require_in_place, require_points, sparse
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION
-from drivers.errors import CellError, DeviceFault, LimitError, RefusedError
+from drivers.errors import CellError, DeviceFault, LimitError, NotObservable, RefusedError
 from lab.bench.job.scan_errors import own_base
 from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
 from sim_backends.world.world import World
@@ -222,8 +223,15 @@ def test_what_late_replies_leave_open_lies_along_the_sweep_and_is_even(placed_po
     np.testing.assert_allclose(by_times(replace(swath, shift=0.15e-3)), expected)
 
 
-def test_after_a_pause_it_is_looked_at_anew(placed_pot: JobRecord, tmp_path: Path) -> None:
+@pytest.mark.parametrize("photographed", [False, True])
+def test_after_a_pause_it_is_looked_at_anew(
+    placed_pot: JobRecord, tmp_path: Path, photographed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also after one within a look, before a photograph of the board that it takes after its sweep."""
     held: list[bool] = []
+    if photographed:
+        monkeypatch.setattr(SurfaceMotion, "hidden", lambda *_: ["(a motion that does not show)"])
+        monkeypatch.setattr(second_look, "require_board_unmoved", lambda *_: site.context.safe_point())
 
     def tell(event: Event) -> None:
         if "9 profiles" in event.data.get("text", "") and not held:
@@ -321,9 +329,18 @@ def test_a_place_that_creeps_is_carried_on_to_the_time_of_the_contact(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     site, until = Site(placed_pot, tmp_path, *pot()), []
-    monkeypatch.setattr(Creep, "carried", lambda creep, pose, time: until.append(time))
+    monkeypatch.setattr(Creep, "carried", lambda creep, pose, time: until.append(time) or pose)
+    site.work.pace.share = 0.5
     made = (site.made[name] for name in ("laser_sweep", "reconstruct", "board_photo"))
     place_step.carried_on(site.work, *made, Creep(np.zeros(6), 1e-16 * np.eye(6), np.zeros(3), 0.0))
     plan, now = site.job.place, site.cell.clock.now()
     descent = plan.approach / plan.speed + plan.contact_travel / plan.contact_speed
-    assert until == [pytest.approx(now + place_step.APPROACH_S + descent)]
+    assert until == [pytest.approx(now + (place_step.APPROACH_S + descent) / 0.5)]
+
+
+def test_a_place_that_creeps_and_is_not_known_any_more_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
+    site = Site(placed_pot, tmp_path, *pot())
+    made = [site.made[name] for name in ("laser_sweep", "reconstruct", "board_photo")]
+    unknown = Creep(np.zeros(6), np.diag([30e-6**2] * 3 + [1e-12] * 3), np.zeros(3), float(made[0].times.mean()))
+    with pytest.raises(NotObservable, match=r"known to \d+\.\d+ tolerances"):
+        place_step.carried_on(site.work, *made, unknown)

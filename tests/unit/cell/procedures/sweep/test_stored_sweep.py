@@ -74,10 +74,11 @@ def test_what_may_have_moved_unnoticed_reaches_the_flange_by_its_lever(stored: S
 
 def test_a_sweep_is_kept_with_what_was_seen_on_the_plate_before_it(stored: StoredSweep, tmp_path: Path) -> None:
     pointing, slip = Pointing(1e-4, 2e-5, 3e-5, 4e-5, 5e-5), Slip(1e-5, -2e-5, 3e-3, True, 0.08)
-    save_sweep(tmp_path, replace(stored.sweep, pointing=pointing, slip=slip), fix(BOARD))
+    save_sweep(tmp_path, replace(stored.sweep, pointing=pointing, slip=slip, doubts=("lost steps?",)), fix(BOARD))
     with np.load(tmp_path / FILE) as kept:
         data = dict(kept)
     assert data["pointing"].tolist() == [1e-4, 2e-5, 3e-5, 4e-5, 5e-5]
+    assert data["doubts"].tolist() == ["lost steps?"]
     assert data["slip"].tolist() == [1e-5, -2e-5, 3e-3, 0.08, 1.0]
     assert data["base_from_board"].tolist() == BOARD.homogeneous.tolist()
     assert data["board_covariance"].tolist() == SEEN.tolist()
@@ -101,6 +102,9 @@ def begun(stored: StoredSweep, folder: Path, seen: pin.SE3, attempt: int) -> lis
     context = StepContext(STEP.policy, attempt, 1e9, {"board_photo": fix(seen)}, cell.clock, events.append)
     with pytest.raises((InterlockError, AttributeError)):
         STEP.work(here, context)
+    assert attempt > 1 or here.earlier is None, (
+        "what is to be swept again was not good enough"
+    )
     assert not (folder / FILE).exists(), "should this run be cut short now, it is not resumed with that"
     return [str(event.data.get("text")) for event in events]
 
