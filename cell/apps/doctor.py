@@ -304,7 +304,7 @@ def _wrong(requirement: Requirement, installed: Callable[[str], str]) -> str:
 
 EXTRA_OF_DRIVER = {"canopen": "canopen"}
 """Extras of this program that a device's driver needs."""
-OTHER_EXTRAS = ("e57", "step", "canopen", "modbus")
+OTHER_EXTRAS = ("step", "canopen", "modbus")
 
 
 def examine_computer(path: Path | None, root: Path = ROOT) -> list[DoctorCheck]:

@@ -1,7 +1,6 @@
-"""Clouds as files: binary PLY with all that a later export needs, meshes (PLY or STL), and E57 (ASTM E2807).
+"""Clouds as files: binary PLY with all that a later export needs, and meshes (PLY or STL).
 
-Coordinates are in metres. A mesh has triangles between neighbours of the organised cloud, none across a depth edge. E57
-has one scan a sweep, of measured points only: the format has no mark for interpolated ones.
+Coordinates are in metres. A mesh has triangles between neighbours of the organised cloud, none across a depth edge.
 """
 
 from __future__ import annotations
@@ -123,9 +122,16 @@ def read_cloud(path: Path) -> StoredCloud:
     head, mark, body = data.partition(b"end_header\n")
     words = [line.split() for line in head.decode("ascii", "replace").splitlines()]
     kinds = [(w[2], _KINDS.get(w[1], "")) for w in words if w[:1] == ["property"] and len(w) == 3]
-    count = next((int(w[2]) for w in words if w[:2] == ["element", "vertex"]), -1)
+    counts = [w[2] for w in words if w[:2] == ["element", "vertex"] and len(w) == 3 and w[2].isdecimal()]
+    count, twice = int((*counts, "-1")[0]), len(dict(kinds)) < len(kinds)
     needed = {"x", "y", "z", "sigma", "line", "row", "sweep", "interpolated"} - {name for name, _ in kinds}
-    if not mark or needed or not all(kind for _, kind in kinds) or count * np.dtype(kinds).itemsize != len(body):
+    if (
+        not mark
+        or needed
+        or twice
+        or not all(kind for _, kind in kinds)
+        or count * np.dtype(kinds).itemsize != len(body)
+    ):
         lacking = f"lacks {', '.join(sorted(needed))}" if needed else "is not whole"
         raise ConfigError(f"{path} is no cloud of this program: it {lacking}; name the folder of a run of this version")
     records = np.frombuffer(body, dtype=kinds, count=count)
@@ -147,36 +153,6 @@ def deviation_colours(deviations: ArrayLike, limit: float) -> NDArray[np.uint8]:
     colours = np.stack([np.clip(share, 0, 1), 1.0 - np.abs(share), np.clip(-share, 0, 1)], axis=-1)
     colours[~np.isfinite(d)] = 0.5
     return np.asarray(np.round(255 * colours), dtype=np.uint8)
-
-
-def write_e57(path: Path, cloud: StoredCloud, colours: NDArray[np.uint8] | None = None) -> int:
-    """Write the measured points, in m, arm base, with their row and column in the organised cloud; their number.
-
-    `colours` (n, 3) uint8 are of all points of the cloud. Raises `ConfigError` that names the extra when the library
-    is missing.
-    """
-    try:
-        import pye57
-    except ImportError as error:
-        raise ConfigError(
-            "E57 needs the library pye57, which is not installed: pip install 'assembly-cell[e57]'"
-        ) from error
-    path.unlink(missing_ok=True)
-    file = pye57.E57(str(path), mode="w")
-    count = 0
-    try:
-        for k in np.unique(cloud.sweep):
-            mine = np.flatnonzero((cloud.sweep == k) & ~cloud.interpolated)
-            data = {f"cartesian{axis}": cloud.points[mine, i] for i, axis in enumerate("XYZ")}
-            data["rowIndex"] = cloud.row[mine].astype(np.int64)
-            data["columnIndex"] = (cloud.line[mine] - cloud.line[mine].min()).astype(np.int64)
-            if colours is not None:
-                data |= {f"color{name}": colours[mine, i] for i, name in enumerate(("Red", "Green", "Blue"))}
-            file.write_scan_raw(data, name=f"sweep {k + 1}")
-            count += len(mine)
-    finally:
-        file.close()
-    return count
 
 
 STEEPEST = np.cos(np.radians(80.0))

@@ -16,7 +16,6 @@ from cell.measure.reconstruction.ply import (
     deviation_colours,
     read_cloud,
     triangles,
-    write_e57,
     write_mesh,
     write_ply,
 )
@@ -24,7 +23,7 @@ from cell.run.folder import Report, read_report
 from cell.run.report.figures import simulated_words
 from drivers.errors import ConfigError
 
-SUFFIXES = {"ply": ".ply", "e57": ".e57", "stl": ".stl", "mesh": ".ply"}
+SUFFIXES = {"ply": ".ply", "stl": ".stl", "mesh": ".ply"}
 """Of each format; "mesh" is a coloured mesh, "ply" a coloured cloud."""
 
 
@@ -42,9 +41,7 @@ def export_run(folder: Path, kind: str, out: Path, job: str | None, limit: float
     deviations = _deviations(cloud, report, job)
     colours = None if deviations is None else deviation_colours(deviations, limit)
     written: dict[str, object] = {"run": folder.name, "format": kind, "file": str(out), "points": len(cloud.points)}
-    if kind == "e57":
-        written["points"] = write_e57(out, cloud, colours)
-    elif kind == "ply":
+    if kind == "ply":
         scalars: dict[str, NDArray[np.generic]] = {
             "sigma": cloud.sigma.astype(np.float32),
             "interpolated": cloud.interpolated.astype(np.uint8),

@@ -30,7 +30,6 @@ class Format(StrEnum):
     """What can be written."""
 
     ply = "ply"
-    e57 = "e57"
     stl = "stl"
     mesh = "mesh"
 
@@ -180,7 +179,7 @@ def report(
 def export(
     name: RunArgument = None,
     kind: Annotated[
-        Format, typer.Option("--format", "-f", help="ply, e57: the points; stl, mesh: triangles (mesh: coloured PLY).")
+        Format, typer.Option("--format", "-f", help="ply: the points; stl, mesh: triangles (mesh: coloured PLY).")
     ] = Format.ply,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="The file. Without it, in the run's folder.")] = None,
     job: Annotated[
@@ -190,7 +189,7 @@ def export(
     config: ConfigOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Write a run's cloud as PLY, E57 or mesh, coloured by its deviation from the nominal surface, in metres."""
+    """Write a run's cloud as PLY or mesh, coloured by its deviation from the nominal surface, in metres."""
     from cell.config.cell_config import beside, find_config, load_config
     from cell.run.folder import find_run
     from cell.run.report.export import SUFFIXES, export_run

@@ -17,17 +17,17 @@ from drivers.vehicle.health import CanInterface
 
 def test_packages_are_held_against_the_pins() -> None:
     def installed(name: str) -> str:
-        if name in ("canopen", "pye57"):
+        if name in ("canopen", "cascadio"):
             raise PackageNotFoundError(name)
         return "1.7.0" if name == "ur-rtde" else version(name)
 
-    rows = package_checks(["canopen"], ["e57"], installed)
+    rows = package_checks(["canopen"], ["step"], installed)
     assert rows[0].state == "wrong"
     assert rows[0].found.startswith("ur-rtde is 1.7.0, asked for is ")
     assert rows[0].mend == "pip install 'ur-rtde<1.7,>=1.6.3'"
     assert (rows[1].state, rows[1].found) == ("wrong", "canopen is not installed")
     # What this cell does without is told, and is not wrong.
-    assert (rows[2].state, rows[2].mend) == ("not needed", "pip install 'pye57>=0.4.13'")
+    assert (rows[2].state, rows[2].mend) == ("not needed", "pip install 'cascadio<0.2,>=0.1'")
 
 
 def test_a_package_of_the_same_name_is_told(tmp_path: Path) -> None:

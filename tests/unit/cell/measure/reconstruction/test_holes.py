@@ -10,7 +10,7 @@ import pytest
 import trimesh
 
 from cell.measure.reconstruction import Cloud, Filled, fill_holes, merge, write_cloud
-from cell.measure.reconstruction.ply import deviation_colours, read_cloud, triangles, write_e57, write_mesh
+from cell.measure.reconstruction.ply import deviation_colours, read_cloud, triangles, write_mesh
 from drivers.errors import ConfigError
 from lab.bench.reconstruction.scenes import Scene, cut_holes, scene
 
@@ -118,24 +118,6 @@ def test_a_file_that_is_no_cloud_is_refused(tmp_path: Path, content: bytes) -> N
         read_cloud(tmp_path / "cloud.ply")
     with pytest.raises(ConfigError, match="did the run come as far"):
         read_cloud(tmp_path / "missing.ply")
-
-
-def test_an_e57_holds_the_measured_points(tmp_path: Path) -> None:
-    pye57 = pytest.importorskip("pye57")
-    write_cloud(tmp_path / "cloud.ply", two_sweeps())
-    stored = read_cloud(tmp_path / "cloud.ply")
-    colours = deviation_colours(stored.points[:, 2], 1e-3)
-    count = write_e57(tmp_path / "cloud.e57", stored, colours)
-    assert count == np.count_nonzero(~stored.interpolated)
-    file = pye57.E57(str(tmp_path / "cloud.e57"))
-    assert file.scan_count == 2
-    for k in range(2):
-        read = file.read_scan_raw(k)
-        mine = (stored.sweep == k) & ~stored.interpolated
-        assert np.array_equal(np.column_stack([read[f"cartesian{a}"] for a in "XYZ"]), stored.points[mine])
-        assert np.array_equal(np.column_stack([read[f"color{c}"] for c in ("Red", "Green", "Blue")]), colours[mine])
-        assert np.array_equal(read["rowIndex"], stored.row[mine])
-        assert np.array_equal(read["columnIndex"], stored.line[mine] - stored.line[mine].min())
 
 
 def test_a_mesh_lies_on_the_surface_faces_the_camera_and_spans_no_edge(tmp_path: Path) -> None:

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from cell.measure.reconstruction import deviation_colours, write_ply
+from cell.measure.reconstruction.ply import read_cloud
+from drivers.errors import ConfigError
 
 
 def test_a_ply_with_columns_of_different_length_is_refused(tmp_path: Path) -> None:
@@ -20,3 +22,12 @@ def test_deviation_colours_run_from_blue_over_green_to_red() -> None:
     assert colours.tolist() == [[0, 0, 255], [0, 0, 255], [0, 255, 0], [255, 0, 0], [128, 128, 128]]
     with pytest.raises(ValueError, match="greater than 0"):
         deviation_colours([0.0], 0.0)
+
+
+@pytest.mark.parametrize("count", ["abcd", "-1", "3"])
+def test_a_cloud_whose_header_is_spoilt_is_refused(tmp_path: Path, count: str) -> None:
+    names = ("x", "y", "z", "sigma", "line", "row", "sweep", "interpolated", "x")
+    kinds = "".join(f"property float {name}\n" for name in names)
+    (tmp_path / "cloud.ply").write_text(f"ply\nelement vertex {count}\n{kinds}end_header\n{'0000' * 27}")
+    with pytest.raises(ConfigError, match="is no cloud of this program"):
+        read_cloud(tmp_path / "cloud.ply")
