@@ -452,7 +452,7 @@ def _shortest(name: str, link: RtdeLink, clock: Clock) -> Latch:
         ("a start of its states", "S", b""),
     ):
         reply = link.ask(kind, payload)
-        if reply[:1] in (b"", b"\0"):
+        if reply[:1] in (b"", b"\0") or b"NOT_FOUND" in reply or b"IN_USE" in reply:
             raise fault(name, "arm.refused", f"it does not give {what}")
         if kind == "I":
             recipe = reply[0]

@@ -7,6 +7,7 @@ taken before each acquisition. A frame is handed out once and never as an answer
 from __future__ import annotations
 
 import json
+import math
 import socket
 import struct
 import threading
@@ -116,7 +117,7 @@ class StreamCamera:
         with self._exclusive():
             set_to = self._link.request("configure", exposure_s=exposure, frame_rate_hz=frame_rate)[0]
         for key, asked in (("exposure_s", exposure), ("frame_rate_hz", frame_rate)):
-            if abs(float(set_to[key]) - asked) > _SETTING_TOLERANCE * asked:
+            if abs(self._number(set_to, "configure", key) - asked) > _SETTING_TOLERANCE * asked:
                 raise DeviceFault(
                     self.name,
                     "camera.setting",
@@ -191,13 +192,23 @@ class StreamCamera:
                 float(about["frame_rate_max_hz"]),
             )
         except (KeyError, TypeError, ValueError) as error:
-            raise DeviceFault(
-                self.name,
-                "camera.protocol",
-                f"the answer to 'identify' cannot be used: {error!r}",
-                recoverable=False,
-                hint="Check that the peer speaks frame stream version 1 with mono8 pictures.",
-            ) from error
+            raise self._unusable("identify", repr(error)) from error
+
+    def _number(self, reply: Header, op: str, key: str) -> float:
+        """A finite number of a reply; `DeviceFault` (camera.protocol) where there is none."""
+        value = reply.get(key)
+        if not isinstance(value, int | float) or not math.isfinite(value):
+            raise self._unusable(op, f"{key} is {value!r}")
+        return float(value)
+
+    def _unusable(self, op: str, why: str) -> DeviceFault:
+        return DeviceFault(
+            self.name,
+            "camera.protocol",
+            f"the answer to {op!r} cannot be used: {why}",
+            recoverable=False,
+            hint="Check that the peer speaks frame stream version 1 with mono8 pictures.",
+        )
 
     def _compare_clocks(self) -> None:
         latches: list[Latch] = []
@@ -206,7 +217,7 @@ class StreamCamera:
             len(latches) < _MAX_LATCHES and min(latch.after - latch.before for latch in latches) > good
         ):
             reply, before, after = self._link.request("latch")
-            latches.append(Latch(before, float(reply["device_ns"]) * 1e-9, after))
+            latches.append(Latch(before, self._number(reply, "latch", "device_ns") * 1e-9, after))
         self._map.add(latches)
 
     @contextmanager

@@ -133,6 +133,8 @@ class RobotiqLink:
                 if whole or data:
                     return data
                 raise
+            if time.monotonic() > until:
+                raise TimeoutError
             if not chunk:
                 raise ConnectionResetError("it was closed by the other side")
             data += chunk

@@ -414,6 +414,8 @@ class BoardLaser(_OnBoard):
         self._control = control
         self._closed = False
         self._owner = threading.Lock()
+        # Lighting it and closing it: whatever was lit before the end goes off in it, and nothing is lit after it.
+        self._ending = threading.Lock()
         self._last_words: LastWords | None = None
         self._last_words_for = 0
         if control and not board.reads_back:
@@ -438,9 +440,11 @@ class BoardLaser(_OnBoard):
                 raise InterlockError(
                     self.name, f"relay {self._relay} is already on and not ours. Switch it off with stop() first"
                 )
-            self._off_after_death()
             with in_the_end(self._off):
-                self._board.switch(self._relay, True)
+                with self._ending:
+                    self._require_control()
+                    self._off_after_death()
+                    self._board.switch(self._relay, True)
                 yield
         finally:
             self._owner.release()
@@ -463,15 +467,16 @@ class BoardLaser(_OnBoard):
 
     def close(self) -> None:
         """Laser off, unless it is only looked at, then release the board."""
-        if self._closed:
-            return
-        self._closed = True
-        try:
-            if self._control:
-                self._board.switch(self._relay, False)
-        finally:
-            self._goodbye()
-            self._board.port.close()
+        with self._ending:
+            if self._closed:
+                return
+            self._closed = True
+            try:
+                if self._control:
+                    self._board.switch(self._relay, False)
+            finally:
+                self._goodbye()
+                self._board.port.close()
 
     def _off(self) -> None:
         """Off at the end of a context; `close` has done that already."""

@@ -197,9 +197,12 @@ class CanLink:
         while not self._closing.is_set() and self._failure is None:
             try:
                 begun = time.monotonic()
-                frame = self._bus.recv(RECEIVE_TIMEOUT_S)
-                # Also while others talk on the bus. A thread that was not run did not wait any longer.
-                self._idle(min(time.monotonic() - begun, RECEIVE_TIMEOUT_S))
+                try:
+                    frame = self._bus.recv(RECEIVE_TIMEOUT_S)
+                finally:
+                    # Also while others talk on the bus, or what comes is no frame. A thread that was not run did not
+                    # wait any longer.
+                    self._idle(min(time.monotonic() - begun, RECEIVE_TIMEOUT_S))
                 if self._refused >= MOST_REFUSED:
                     self._fail(
                         f"the adapter refuses every frame, {self._refused} in a row: see whether it listens only, is "

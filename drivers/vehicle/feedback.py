@@ -240,7 +240,8 @@ class MessageFeedback:
         self._travel = Travel(clock, statistics, track=track, max_speed=max_speed, max_yaw_rate=max_yaw_rate)
         self._news = threading.Condition(threading.RLock())
         self._newest: dict[str, tuple[float, dict[str, float]]] = {}
-        self._quiet = 0.0
+        self._quiet = dict.fromkeys(CYCLIC, 0.0)
+        """Wall seconds for which the receiver has waited since each of them came."""
         self._version = VersionAnswer()
         self._still = 0
         """Frames in a row that say standstill."""
@@ -251,9 +252,9 @@ class MessageFeedback:
         now = self._clock.now()
         with self._news:
             if message in CYCLIC:
-                if self._quiet > QUIET_S:
-                    self.interrupt(f"nothing was heard of it for {self._quiet:.1f} s")
-                self._quiet = 0.0
+                if (quiet := min(self._quiet.values())) > QUIET_S:
+                    self.interrupt(f"nothing was heard of it for {quiet:.1f} s")
+                self._quiet[message] = 0.0
             if message == "Odometry":
                 self._travel.count(now, int(signals["Left"]), int(signals["Right"]))
                 self._compare_counts((signals["Left"], signals["Right"]))
@@ -280,7 +281,8 @@ class MessageFeedback:
     def idle(self, seconds: float) -> None:
         """The receiver has waited for `seconds` on the wall; what came then may have been another's."""
         with self._news:
-            self._quiet += seconds
+            for message in CYCLIC:
+                self._quiet[message] += seconds
 
     def commanded_to_move(self) -> None:
         """The driver has just sent a velocity."""
@@ -424,7 +426,7 @@ class MessageFeedback:
             oldest, which = min((self._newest[message][0], message) for message in CYCLIC)
             system, disturbance = self._newest["SystemState"][1], self._travel.disturbance
             trouble = self._trouble(commanded=in_command)
-            quiet = self._quiet
+            quiet = max(self._quiet.values())
             self.require_one()
         silent = self._clock.now() - oldest
         if silent > patience(self._clock, SILENCE_S) if driving else quiet > QUIET_S:

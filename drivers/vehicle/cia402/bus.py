@@ -248,6 +248,8 @@ class CanopenBus:
                 if refusal.code in (*_ABSENT, _READ_ONLY):
                     raise Absent(f"node {node}: {what}: {refusal}") from refusal
                 raise unfit(self.name, f"the drive with node number {node} refuses {what}: {refusal}") from refusal
+            except struct.error as error:
+                raise unfit(self.name, f"the drive with node number {node} answers {what} in too few bytes") from error
             except SdoCommunicationError as silence:
                 self._link.check()
                 self._statistics.count("timeouts")

@@ -239,6 +239,8 @@ class SideDrive:
         """Whether it is set up; a drive that was switched off is not any more."""
         self.quiet = 0.0
         """Wall seconds for which nothing of it was heard."""
+        self.untold = {STATUS: 0.0, MOTION: 0.0}
+        """The same of its status and of its motion: a heartbeat tells neither."""
         self.waited = 0
         """How many times it was asked to tell its state since it did last."""
 
@@ -250,6 +252,8 @@ class SideDrive:
     def take(self, service: int, data: bytes, now: float) -> bool:
         """Take a frame; True when it restarted. Raises ValueError for one of another length."""
         self.quiet = 0.0
+        if service in self.untold:
+            self.untold[service] = 0.0
         try:
             return self._take(service, data, now)
         except struct.error as error:

@@ -242,6 +242,8 @@ class DriveFeedback:
         with self._news:
             for drive in self.drives:
                 drive.quiet += seconds
+                for service in drive.untold:
+                    drive.untold[service] += seconds
 
     # --- what was commanded ---
 
@@ -431,10 +433,10 @@ class DriveFeedback:
         with self._news:
             late = min(self.drives, key=lambda drive: min(drive.told, drive.moved))
             silent = self._clock.now() - min(late.told, late.moved)
-            quiet = max(self.drives, key=lambda drive: drive.quiet)
+            untold, side = max((max(drive.untold.values()), drive.side) for drive in self.drives)
             reported, contradicted = self._reported(), self._contradicted()
-        if quiet.quiet > QUIET_S:
-            raise no_feedback(self._name, f"nothing of the {quiet.side} drive for {quiet.quiet:.2f} s")
+        if untold > QUIET_S:
+            raise no_feedback(self._name, f"the {side} drive does not tell its state, for {untold:.2f} s")
         if driving and silent > patience(self._clock, SILENCE_S):
             raise no_feedback(self._name, f"no feedback of the {late.side} drive for {silent:.2f} s")
         if reported is not None:

@@ -258,10 +258,22 @@ class Master:
             self.bus.command(drive.node, od.START)
 
     def lock_brakes(self, *, locked: bool) -> None:
-        """Switch brakes that hang on outputs; others follow the drives' states."""
-        if self._wheels.brake_output is not None:
-            for drive in self._drives:
+        """Switch brakes that hang on outputs; others follow the drives' states.
+
+        A drive whose brake cannot be locked keeps no other one open: the first error is raised after all were tried.
+        """
+        if self._wheels.brake_output is None:
+            return
+        failed: list[CellError] = []
+        for drive in self._drives:
+            try:
                 lock(self.bus, drive, self._wheels, locked=locked)
+            except CellError as error:
+                if not locked:
+                    raise
+                failed.append(error)
+        if failed:
+            raise failed[0]
 
     def end_operation(self) -> None:
         """Lock the brakes, end operation, and let drives that do not turn any more be left alone."""

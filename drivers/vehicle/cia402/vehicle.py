@@ -313,10 +313,13 @@ class CanopenVehicle:
         finally:
             # No drive() between the standstill and the brake.
             with self._master.command:
-                self._braked, self._interruptions = True, self._feedback.interruptions
+                # Until it has been read back that it is locked nobody knows.
+                self._braked, interruptions = None, self._feedback.interruptions
                 self._master.enabled = False
                 self._master.stops -= 1
             self._master.end_operation()
+            with self._master.command:
+                self._braked, self._interruptions = True, interruptions
 
     def close(self) -> None:
         """Stop the vehicle and lock its brake, end the threads and shut the bus down."""

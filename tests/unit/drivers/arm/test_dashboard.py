@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 
 import pytest
 
@@ -17,11 +18,15 @@ def test_the_dashboard_answers_line_by_line_over_one_connection(server):
             client.sendall(b"Connected\n")
             for question in client.makefile("rb"):
                 client.sendall(b"you said " + question)
+                if question == b"stop\n":
+                    client.sendall(b"nobody asked for this\n")
 
     threading.Thread(target=serve, daemon=True).start()
     dashboard = Dashboard("arm", server.getsockname()[0])
     assert dashboard.ask("robotmode") == "you said robotmode"
     assert dashboard.ask("stop") == "you said stop"
+    time.sleep(0.1)
+    assert dashboard.ask("robotmode") == "you said robotmode"
     dashboard.close()
 
 

@@ -250,6 +250,26 @@ def test_settings_are_checked_before_anything_is_sent(bench: Bench) -> None:
 
 
 @pytest.mark.wire
+def test_an_answer_without_a_number_is_a_fault_of_the_protocol(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    ask = bench.camera._link.request
+    wrong: dict[str, object] = {"exposure_s": math.nan}
+
+    def spoilt(op: str, **values: object) -> object:
+        header, *rest = ask(op, **values)
+        return {**header, **wrong}, *rest
+
+    monkeypatch.setattr(bench.camera._link, "request", spoilt)
+    for name, use in (
+        ("exposure_s", lambda: bench.camera.configure(0.002, 100.0)),
+        ("device_ns", bench.camera._compare_clocks),
+    ):
+        wrong[name] = None if name == "device_ns" else math.nan
+        with pytest.raises(DeviceFault, match=f"{name} is (nan|None)") as caught:
+            use()
+        assert caught.value.code == "camera.protocol"
+
+
+@pytest.mark.wire
 def test_stop_ends_a_stream_that_waits(bench: Bench) -> None:
     bench.camera.configure(exposure=0.5, frame_rate=0.5)
     with bench.camera.stream() as stream:

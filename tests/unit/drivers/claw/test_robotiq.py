@@ -138,5 +138,10 @@ def test_what_is_no_gripper_is_told(bench: Bench) -> None:
     with pytest.raises(DeadlineError, match="b'hello' came"):
         RobotiqClaw("claw", silly.address, GRIP, clock=Clock())
     silly.stop()
+    babbling = TcpServer("babbling", lambda link: [link.sendall(b"x" * 200) for _ in iter(int, 1)])  # type: ignore[arg-type, return-value]
+    babbling.start()
+    with pytest.raises(DeadlineError):
+        RobotiqClaw("claw", babbling.address, GRIP, clock=Clock())
+    babbling.stop()
     with pytest.raises(NotConnectedError, match="takes no connection"):
         RobotiqClaw("claw", silly.address, GRIP, clock=Clock())

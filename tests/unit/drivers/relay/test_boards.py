@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,7 +16,7 @@ import pytest
 from numato_usb_relay.relay import Relay as VendorsClient
 
 from drivers.clock import Clock
-from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
+from drivers.errors import CellError, DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.relay.boards import BoardClaw, BoardLaser, LcusBoard, RelayPort, open_board, open_numato
 from sim_backends.peers.switches import LcusPeer, NumatoPeer, RelayBoard
 
@@ -156,6 +158,23 @@ def test_after_a_lost_link_nobody_knows_such_a_relay_until_it_is_switched_off(lc
     laser.stop()
     assert not laser.is_on
     laser.close()
+
+
+def test_what_is_lit_while_it_is_closed_goes_off(numato: str, wired: Wired, monkeypatch: pytest.MonkeyPatch) -> None:
+    laser = BoardLaser(open_board("laser", "laser", "numato", numato, baud=19200), LASER)
+    closer = threading.Thread(target=laser.close)
+    waited: list[bool] = []
+
+    def lighting() -> None:
+        closer.start()
+        closer.join(0.3)
+        waited.append(closer.is_alive())
+
+    monkeypatch.setattr(laser, "_off_after_death", lighting)
+    with contextlib.suppress(CellError), laser.lit():
+        pass
+    closer.join(10.0)
+    assert waited == [True] and not wired.on[LASER]
 
 
 def test_who_only_looks_sends_nothing(lcus: LcusPeer, wired: Wired) -> None:

@@ -106,6 +106,17 @@ def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_o
         bench.feedback.check(in_command=True, driving=False)
 
 
+def test_a_message_that_stopped_is_missed_though_the_others_go_on() -> None:
+    bench = Bench()
+    for _ in range(25):
+        bench.feedback.idle(0.1)
+        bench.feedback.take("Odometry", {"Left": 0, "Right": 0})
+        bench.feedback.take("MotionState", {"Speed": 0.0, "YawRate": 0.0})
+    with pytest.raises(DeviceFault, match="no feedback"):
+        bench.feedback.check(in_command=True, driving=False)
+    assert bench.interruption() == (0, "")
+
+
 @pytest.mark.parametrize("late", ["Odometry", "MotionState", "SystemState"])
 def test_a_reading_is_as_old_as_the_oldest_of_what_it_is_made_of(late: str) -> None:
     bench = Bench()

@@ -102,9 +102,7 @@ def begun(stored: StoredSweep, folder: Path, seen: pin.SE3, attempt: int) -> lis
     context = StepContext(STEP.policy, attempt, 1e9, {"board_photo": fix(seen)}, cell.clock, events.append)
     with pytest.raises((InterlockError, AttributeError)):
         STEP.work(here, context)
-    assert attempt > 1 or here.earlier is None, (
-        "what is to be swept again was not good enough"
-    )
+    assert attempt > 1 or here.earlier is None, "what is to be swept again was not good enough"
     assert not (folder / FILE).exists(), "should this run be cut short now, it is not resumed with that"
     return [str(event.data.get("text")) for event in events]
 

@@ -7,16 +7,19 @@ import time
 
 import pytest
 
-from drivers.errors import InterlockError
+from drivers.errors import DeadlineError, DeviceFault, InterlockError
+from drivers.vehicle.feedback import QUIET_S
 from sim_backends.peers.vehicle.canopen import WheelState
 from tests.support.canopen_bench import (
     WATCHDOG_S,
     Bench,
     at_bench,
+    with_output_brake,
 )
 
 pytestmark = pytest.mark.wire
 
+PRE_OPERATIONAL = 0x7F
 RAMP_WALL_S = 0.3
 """From 0.3 m/s to standstill, and the time to notice, on the wall at three times its pace."""
 
@@ -41,6 +44,28 @@ def test_it_drives_as_told_stops_and_locks_its_brake(bench: Bench) -> None:
     with pytest.raises(InterlockError, match="the brake is locked"):
         vehicle.drive(0.1, 0.0)
     assert vehicle.state().battery_volts == 26.4
+
+
+def test_a_drive_that_is_lost_keeps_no_other_brake_open_and_nobody_says_braked() -> None:
+    settings, wheels = with_output_brake(False)
+    with at_bench(settings, wheels=wheels) as bench:
+        left, right = bench.peer.drives
+        left.node.silent = True
+        with pytest.raises(DeadlineError, match="node 1 does not answer"):
+            bench.vehicle.brake()
+        bench.until(lambda: right.locked)
+        assert not left.locked and bench.vehicle._braked is None
+        left.node.silent = False
+
+
+def test_heartbeats_do_not_pass_for_readings(bench: Bench) -> None:
+    bench.vehicle.brake()
+    for drive in bench.peer.drives:
+        drive.node.state = PRE_OPERATIONAL
+    time.sleep(QUIET_S + 0.5)
+    with pytest.raises(DeviceFault, match="does not tell its state") as caught:
+        bench.vehicle.check()
+    assert caught.value.code == "vehicle.silent"
 
 
 @pytest.mark.parametrize("guarding", ["heartbeat", "node"])
