@@ -88,7 +88,7 @@ def test_a_planted_bug_is_noticed(copy: Path, bug: Bug) -> None:
     assert text.count(bug.old) == 1, f"{bug.old!r} stands {text.count(bug.old)} times in {bug.file}; plant it anew"
     file.write_text(text.replace(bug.old, bug.new), encoding="utf-8")
     try:
-        # What is wrong fails at once; looked at again, a fixture that it has spoilt would end the tests before they fail.
+        # What is wrong fails at once; tried again, a fixture that it has spoilt may be an error before that.
         done = run(copy, "-p", "no:rerunfailures", *bug.tests)
     finally:
         shutil.copy2(ROOT / bug.file, file)

@@ -133,6 +133,8 @@ def misplacements(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict
     Nothing is misplaced where no hand-eye can be had, or where most frames would be.
     """
     index, found = list(range(len(flanges))), {}
+    # Frames of one orientation put the board wherever the hand-eye has it: they tell little of what is usual.
+    votes = turn_votes(flanges, boards)
     while len(index) > LEAST_JUDGES:
         try:
             off, reach = _misplacements([flanges[k] for k in index], [boards[k] for k in index])
@@ -141,7 +143,8 @@ def misplacements(flanges: Sequence[pin.SE3], boards: Sequence[pin.SE3]) -> dict
         worst = int(np.argmax(off / reach))
         # Six unknowns of 3 n figures follow the frames: of a few, what is left over is smaller than their scatter.
         left = len(index) - 1
-        others = float(np.median(np.delete(off, worst))) * np.sqrt(left / (left - 2))
+        usual = weighted_median(np.delete(off, worst), np.delete(votes[np.ix_(index, index)].sum(axis=1), worst))
+        others = float(usual) * np.sqrt(left / (left - 2))
         if off[worst] < max(MISPLACED_SHARE * reach[worst], MISPLACED_RATIO * others):
             break
         found[index[worst]] = (float(off[worst]), others)

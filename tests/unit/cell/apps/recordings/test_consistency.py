@@ -39,7 +39,7 @@ def test_two_exchanged_poses_of_seven_do_not_hide_the_reading(recording, seen, a
     assert {f.name for f in frames if f not in kept} == {f"frame{k + 3:02d}.png" for k in (a, b)}
 
 
-@pytest.mark.parametrize("seed", [3, 6])
+@pytest.mark.parametrize("seed", [3, 11, 13])
 def test_views_that_do_not_turn_carry_no_vote(seed):
     """Of 15 views 11 have one orientation, and agree with every rotation; wrong ones among the others are named."""
     pairs = given_pairs(scene(seed, count=15, arm_mm=0.5, arm_mrad=2.0, laser=False))
