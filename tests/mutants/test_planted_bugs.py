@@ -65,7 +65,7 @@ def run(copy: Path, *tests: str) -> subprocess.CompletedProcess[str]:
     """The tests in the copy; nothing that is compiled there outlives it."""
     return subprocess.run(
         [sys.executable, "-m", "pytest", "-x", "-q", "--no-header", "-p", "no:cacheprovider", "-n0", *tests],
-        cwd=copy, capture_output=True, text=True, timeout=TIMEOUT_S,
+        cwd=copy, capture_output=True, text=True, errors="replace", timeout=TIMEOUT_S,
         env={**os.environ, "PYTHONPATH": str(copy), "PYTHONDONTWRITEBYTECODE": "1"},
     )  # fmt: skip
 
