@@ -1,6 +1,6 @@
 """What several test files need and what takes long to make, once for all of them; and which files run beside which.
 
-Four workers share the two cores: tests over the wires mostly wait, and what only computes gets what they leave. Files
+Three workers share the two cores: tests over the wires mostly wait, and what only computes gets what they leave. Files
 of a group run on one worker, one after the other, because they share what is made once for a worker, or because devices
 over wires would disturb each other's time.
 """

@@ -122,7 +122,8 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
             assert soon(lambda: lateness(arm, prompt) > 0.08 * rate)
             late = min((arm.latch_clock() for _ in range(4)), key=lambda latch: latch.bound)
             # The states show nothing of it, but half of their lateness of 0.1 s is what is not known now.
-            assert late.bound == pytest.approx(0.05 * rate, rel=0.2)
+            # On a busy machine some of them are less late.
+            assert 0.03 * rate < late.bound < 0.06 * rate
             error = (late.host - late.device) - (prompt.host - prompt.device)
             assert 0.04 * rate < error < late.bound + prompt.bound + 0.004 * rate
             bench.ask("clear")
