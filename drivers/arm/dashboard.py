@@ -12,6 +12,7 @@ import time
 
 from drivers.errors import DeadlineError, NotConnectedError
 from drivers.interfaces import Traffic
+from drivers.ports import forget_unasked
 
 PORT = 29999
 
@@ -45,7 +46,9 @@ class Dashboard:
             if self._socket is None:
                 self._connect(deadline)
             assert self._socket is not None
-            self._forget_unasked(self._socket)
+            self._rest = b""
+            forget_unasked(self._socket)
+            self._socket.settimeout(_left(deadline))
             self._socket.sendall(command.encode() + b"\n")
             self._traffic.sent(command)
             reply = self._line(deadline)
@@ -75,17 +78,6 @@ class Dashboard:
         self._socket = socket.create_connection((self._address, PORT), timeout=_left(deadline))
         self._rest = b""
         self._line(deadline)
-
-    def _forget_unasked(self, link: socket.socket) -> None:
-        """A line that came unasked would be the answer to this command, and each answer that of the command before."""
-        self._rest = b""
-        link.setblocking(False)
-        try:
-            if link.recv(4096) == b"":
-                raise ConnectionResetError("the server closed the connection")
-        except BlockingIOError:
-            pass
-        link.settimeout(self._timeout)
 
     def _line(self, deadline: float) -> str:
         assert self._socket is not None

@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from drivers.clock import Clock
 from drivers.errors import UNTOLD, DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import Identity, LinkStatistics, Reading
+from drivers.ports import forget_unasked
 
 REPLY_TIMEOUT_S = 1.0
 """Wall seconds for a reply: the controller's program that serves the socket asks the gripper every 8 ms or so."""
@@ -110,13 +111,7 @@ class RobotiqLink:
         )
 
     def _exchange(self, link: socket.socket, request: bytes, reply: re.Pattern[bytes]) -> bytes:
-        link.setblocking(False)
-        try:
-            # What came unasked, or too late, answers nothing.
-            if link.recv(4096) == b"":
-                raise ConnectionResetError("it was closed by the other side")
-        except BlockingIOError:
-            pass
+        forget_unasked(link)
         link.settimeout(REPLY_TIMEOUT_S)
         link.sendall(request)
         self._statistics.traffic.sent(request)

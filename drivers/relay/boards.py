@@ -31,7 +31,7 @@ from drivers.errors import (
 )
 from drivers.interfaces import Identity, LinkStatistics
 from drivers.last_words import LastWords, descriptor_of
-from drivers.serial_port import FAILURES, open_port
+from drivers.ports import FAILURES, open_port
 from drivers.switches import ConfirmedClaw
 
 REPLY_TIMEOUT_S = 0.3

@@ -273,8 +273,9 @@ def _around(cloud: Cloud, sweep: slice, lines: Indices, rows: Indices) -> tuple[
     lines as along them, and which of the n have all of them."""
     ways = [cloud.points[sweep.start + 1 : sweep.stop] - cloud.points[sweep.start : sweep.stop - 1]]
     ways.append(cloud.points[sweep, 1:] - cloud.points[sweep, :-1])
-    across, along = (float(np.nanmedian(np.linalg.norm(way, axis=2))) for way in ways)
-    if not (np.isfinite(across) and along > 0.0):
+    lengths = [np.linalg.norm(way, axis=2) for way in ways]
+    across, along = (float(np.median(each[each > 0.0])) if (each > 0.0).any() else 0.0 for each in lengths)
+    if not across * along > 0.0:
         # Lines or rows without neighbours are no surface to compare with.
         nothing = np.empty((0, 15), dtype=np.intp)
         return (nothing, nothing), np.zeros(len(lines), dtype=np.bool_)

@@ -111,6 +111,15 @@ class StoredCloud:
     interpolated: NDArray[np.bool_]
 
 
+def _columns(head: bytes) -> tuple[list[tuple[str, str]], int]:
+    """Name and kind of each column that the header tells, and the number of points; -1 where it is spoilt."""
+    words = [line.split() for line in head.decode("ascii", "replace").splitlines() if line.count(" ") == 2]
+    kinds = [(name, _KINDS.get(kind, "")) for what, kind, name in words if what == "property"]
+    counts = [many for *what, many in words if what == ["element", "vertex"] and many.isdecimal()]
+    sound = len(counts) == 1 and len(dict(kinds)) == len(kinds) and all(kind for _, kind in kinds)
+    return kinds, int(counts[0]) if sound else -1
+
+
 def read_cloud(path: Path) -> StoredCloud:
     """Read what `write_cloud` wrote. Raises `ConfigError` when the file is not there or holds something else."""
     try:
@@ -120,18 +129,9 @@ def read_cloud(path: Path) -> StoredCloud:
             f"the cloud {path} cannot be read: {error}; did the run come as far as `reconstruct`?"
         ) from error
     head, mark, body = data.partition(b"end_header\n")
-    words = [line.split() for line in head.decode("ascii", "replace").splitlines()]
-    kinds = [(w[2], _KINDS.get(w[1], "")) for w in words if w[:1] == ["property"] and len(w) == 3]
-    counts = [w[2] for w in words if w[:2] == ["element", "vertex"] and len(w) == 3 and w[2].isdecimal()]
-    count, twice = int((*counts, "-1")[0]), len(dict(kinds)) < len(kinds)
+    kinds, count = _columns(head)
     needed = {"x", "y", "z", "sigma", "line", "row", "sweep", "interpolated"} - {name for name, _ in kinds}
-    if (
-        not mark
-        or needed
-        or twice
-        or not all(kind for _, kind in kinds)
-        or count * np.dtype(kinds).itemsize != len(body)
-    ):
+    if not mark or needed or count < 0 or count * np.dtype(kinds).itemsize != len(body):
         lacking = f"lacks {', '.join(sorted(needed))}" if needed else "is not whole"
         raise ConfigError(f"{path} is no cloud of this program: it {lacking}; name the folder of a run of this version")
     records = np.frombuffer(body, dtype=kinds, count=count)

@@ -18,7 +18,7 @@ from cell.motion.collision import TOUCHES
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover, PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.arm.touch import TouchCheck, TouchHeight, expected_touch, felt_touch
+from cell.procedures.arm.touch import FELT_M, REFUSED, TouchCheck, TouchHeight, expected_touch, felt_touch
 from cell.procedures.steps.board_photo import require_unmoved
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -107,7 +107,7 @@ class Placing:
         reached = from_ur(self.arm.state().flange)
         off = self._depth()
         self._require_contact(contact, off)
-        touch = self._require_expected(states)
+        touch = self._require_expected(states, off)
         self._release(reached)
         self._retreat()
         return PlaceResult(reached, contact, off, touch)
@@ -174,13 +174,14 @@ class Placing:
                 Measured("reached without contact", 1e3 * off, "mm"),
             )
 
-    def _require_expected(self, states: Sequence[ArmState]) -> TouchCheck | None:
+    def _require_expected(self, states: Sequence[ArmState], off: float) -> TouchCheck | None:
         """Where the part touched first, beside where the scan says; None from an arm that tells too few states."""
         at = self._flange_at(0.0).translation
         touched = felt_touch(states, at, self._base_from_part.rotation[:, 2])
-        if touched is None:
+        # It touched no lower than where it stands now.
+        touch = TouchCheck(touched or TouchHeight(off, FELT_M), self.expected)
+        if touched is None and touch.off <= REFUSED * touch.sigma:
             return None
-        touch = TouchCheck(touched, self.expected)
         try:
             touch.require()
         except RefusedError:
@@ -214,18 +215,18 @@ def require_held(part: PartProgress) -> None:
 
 
 def _at(here: Workplace, context: StepContext) -> PlaceResult:
-    pose = context.made(PlacePose)
     require_held(here.part)
-    # Whoever has the run held may reach in, also in the middle of a look.
-    held = -1.0
-    while context.held_s > held:
-        held = context.held_s
+    while True:
+        held, pose = context.held_s, context.made(PlacePose)
         look = _looked_again(here, pose, context)
+        if look is not None and look.creep is not None:
+            swept = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
+            pose = carried_on(here, *swept, look.creep)
+        expected = expected_touch(here.job, here.nominal, pose, here.repeatability)
         context.safe_point()
-    if look is not None and look.creep is not None:
-        swept = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
-        pose = carried_on(here, *swept, look.creep)
-    expected = expected_touch(here.job, here.nominal, pose, here.repeatability)
+        # Whoever has the run held may reach in, also in the middle of a look: then it is looked at again.
+        if context.held_s == held:
+            break
     placing = Placing(
         here.job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
         part=here.part, check=context.check, progress=context.progress,
@@ -252,11 +253,12 @@ def carried_on(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: B
     until = APPROACH_S + plan.approach / plan.speed + plan.contact_travel / plan.contact_speed
     pose = creep.carried(inverted(here, sweep, still, fix), here.devices.clock.now() + until / here.pace.share)
     turn = np.kron(np.eye(2), pose.base_from_surface.rotation) / ([plan.tolerance] * 3 + [plan.tolerance_angle] * 3)
-    if not (open_ := 3.0 * float(np.sqrt(np.linalg.eigvalsh(turn.T @ pose.covariance @ turn)[-1]))) <= 1.0:
+    excess = 3.0 * float(np.sqrt(np.linalg.eigvalsh(turn.T @ pose.covariance @ turn)[-1]))
+    if not excess <= 1.0:
         raise NotObservable(
-            f"{creep.words}. When the part touches it, its place is known to {open_:.2f} tolerances (3 sigma; allowed: "
-            "1). Let vehicle and surface come to rest, then run the job again",
-            Measured("3 sigma of a place that creeps, in tolerances", open_, most=1.0),
+            f"the surface creeps against the arm: its place at the touch would be known to {excess:.2f} tolerances (3 "
+            "sigma, allowed: 1). Let vehicle and surface come to rest, then run the job again",
+            Measured("3 sigma of a place that creeps, in tolerances", excess, most=1.0),
         )
     return pose
 

@@ -20,7 +20,7 @@ from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
 from drivers.last_words import LastWords, attended_by, descriptor_of
-from drivers.serial_port import FAILURES, open_port
+from drivers.ports import FAILURES, open_port
 
 SPEED_UNITS = {"counts/s": None, "rpm": 60.0, "0.1 rpm": 600.0, "1/240 rps": 240.0}
 """Units that speeds are given to drives in: how many of them are one turn per second; None: the counts of a turn."""

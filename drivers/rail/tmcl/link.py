@@ -17,12 +17,11 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import TypeVar
 
-import serial
-
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
 from drivers.last_words import LastWords, attended_by, descriptor_of
+from drivers.ports import FAILURES, open_port
 
 TELEGRAM_BYTES = 9
 STATUS_OK = 100
@@ -155,8 +154,6 @@ def decode_firmware(data: bytes) -> str:
 
 REPLY_TIMEOUT_S = 0.5
 """Wall seconds for a reply: modules answer within a few ms, a loaded machine may add tens."""
-WRITE_TIMEOUT_S = 2.0
-"""Wall seconds after which a port that takes no bytes counts as stuck."""
 WRONG_CHECKSUM, NO_SUCH_TYPE, WRONG_VALUE = 1, 3, 4
 """Some of the status codes of a reply."""
 _QUIET_S = 0.05
@@ -207,14 +204,7 @@ class TmclLink:
         self._stops = 0
         self._in_step = True
         self._closed = False
-        try:
-            self._port = serial.serial_for_url(
-                url, baudrate=baud, timeout=REPLY_TIMEOUT_S, write_timeout=WRITE_TIMEOUT_S
-            )
-        except (serial.SerialException, OSError, ValueError) as error:
-            raise NotConnectedError(
-                name, f"port {url} cannot be opened: {error}. Check the address and that nothing else has it open"
-            ) from error
+        self._port = open_port(name, url, baud=baud, timeout=REPLY_TIMEOUT_S)
         stops = (
             TmclRequest(address, TmclCommand.REFERENCE_SEARCH, ReferenceSearch.STOP, motor),
             TmclRequest(address, TmclCommand.MOTOR_STOP, 0, motor),
@@ -338,7 +328,7 @@ class TmclLink:
                     # The first says most: the others may only not be in step any more.
                     failure = failure or error
                     self._in_step = False
-                except (serial.SerialException, OSError) as error:
+                except FAILURES as error:
                     self._statistics.count("link_lost")
                     raise DeviceFault(
                         self.name,

@@ -8,6 +8,7 @@ import socket
 import struct
 import time
 from contextlib import contextmanager
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -104,19 +105,19 @@ def test_no_arm_and_a_silent_arm_at_the_start_are_not_connected():
         assert time.monotonic() - begun < 4.0
 
 
-# At five times the wall's pace 1.5 ms are 0.3 on the wall. Even at once the pace some machines do not keep it: there a
-# bench is either right each time or wrong each time, and why is not known yet.
-@pytest.mark.campaign
-@pytest.mark.parametrize("rate", [1.0, 5.0])
+# At five times the wall's pace 1.5 ms are 0.3 on the wall, which three workers on two cores do not keep.
+@pytest.mark.parametrize("rate", [1.0, pytest.param(5.0, marks=pytest.mark.campaign)])
 def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
     with ArmBench(speed=rate) as bench:
         clock = Clock(rate)
         arm = UrArm("arm", bench.address, clock=clock)
 
         def promptly():
-            # A busy machine answers late now and then.
+            # A busy machine answers late now and then. A simulated controller that was held up, as at its start,
+            # makes up for it: those states have earlier stamps, and show what was asked only now.
             latches = (arm.latch_clock() for _ in range(40))
-            return next(latch for latch in latches if latch.bound < 0.0015 * rate)
+            prompt = list(islice((latch for latch in latches if latch.bound < 0.0015 * rate), 10))
+            return min(prompt, key=lambda latch: latch.host - latch.device)
 
         try:
             prompt = promptly()

@@ -19,6 +19,7 @@ from cell.measure.vision import parse_board
 from cell.motion.collision import CollisionError
 from cell.motion.kinematics import HOME
 from cell.motion.trajectory import Trajectory
+from cell.procedures.arm import touch as touch_height
 from cell.procedures.arm.moves import PLACED, Mover, PartProgress, PartState
 from cell.procedures.arm.touch import TouchHeight
 from cell.procedures.drive.way import Whereabouts
@@ -214,9 +215,17 @@ def test_a_touch_within_what_is_stated_is_placed_and_told(too_low: float) -> Non
     assert result.notes == ()
 
 
-def test_a_stiff_touch_as_soon_as_it_is_felt_for_is_refused_with_the_part_held() -> None:
-    """The way on which the force grows is too short to tell where it began; where it ended tells enough."""
+@pytest.mark.parametrize("told", [True, False])
+def test_a_stiff_touch_as_soon_as_it_is_felt_for_is_refused_with_the_part_held(
+    told: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The way on which the force grows is too short to tell where it began; where it ended tells enough.
+
+    Also for an arm that tells too few states on that way.
+    """
     site = Site()
+    if not told:
+        monkeypatch.setattr(touch_height, "LEAST_STATES", 10_000)
     touch = site.cell.world.arm.contact
     assert touch is not None
     site.cell.world.arm.contact = lambda base_from_flange: 6.0 * np.asarray(touch(base_from_flange))

@@ -1,6 +1,8 @@
-"""Opening a serial port for one program alone."""
+"""Serial ports, opened for one program alone, and what came unasked over a socket."""
 
 from __future__ import annotations
+
+import socket
 
 import serial
 
@@ -34,3 +36,16 @@ def open_port(
         raise NotConnectedError(
             name, f"port {url} cannot be opened: {error}. Check the address and that nothing else has it open"
         ) from error
+
+
+def forget_unasked(link: socket.socket) -> None:
+    """Throw away what came before a question: it answers nothing, and the answer would be taken for the next one's.
+
+    The link waits for nothing afterwards until it is given a timeout. Raises OSError when the other side closed it.
+    """
+    link.setblocking(False)
+    try:
+        if link.recv(4096) == b"":
+            raise ConnectionResetError("it was closed by the other side")
+    except BlockingIOError:
+        return
