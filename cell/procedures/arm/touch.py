@@ -132,7 +132,7 @@ def expected_touch(job: Job, nominal: NominalSurface, pose: PlacePose, placing: 
 
 
 def felt_touch(states: Sequence[ArmState], origin: Vector, normal: Vector) -> TouchHeight | None:
-    """Where the force began, from the `states` of a guarded descent; None from too few of them.
+    """Where the force began, from the `states` of a guarded descent; None from too few of them, or too short a way.
 
     Heights are those of the flange over `origin` (3,), m, along `normal` (3,), which points up from the surface, both
     in base axes. The force is taken to grow with the way beyond the touch and with its square, as it does whatever of
@@ -145,8 +145,7 @@ def felt_touch(states: Sequence[ArmState], origin: Vector, normal: Vector) -> To
     forces = np.array([state.wrench[:3] for state in chosen]) @ normal
     tried = np.arange(heights.min(), heights.max(), GRID_M)
     if len(tried) < LEAST_STATES:
-        # Touched as soon as it was felt for: somewhere on that short way.
-        return TouchHeight(float(heights.mean()), float(np.hypot(heights.std(), FELT_M)))
+        return None
     left = np.array([np.sum(_left(heights, forces, touch) ** 2) for touch in tried])
     best = int(np.argmin(left))
     # How fast the squares grow away from the best tells how far off the touch may be.

@@ -56,7 +56,10 @@ class PlaceResult:
         """What is not as usual, for people."""
         seen = () if self.look is None else self.look.notes
         if self.touch is None:
-            return (*seen, "the first touch was not held against the scan: the arm told too few states on the way down")
+            return (
+                *seen,
+                "the first touch was not held against the scan: the arm told too little of the way down",
+            )
         return (*seen, *self.touch.notes)
 
     def summary(self) -> dict[str, object]:
@@ -175,7 +178,7 @@ class Placing:
             )
 
     def _require_expected(self, states: Sequence[ArmState], off: float) -> TouchCheck | None:
-        """Where the part touched first, beside where the scan says; None from an arm that tells too few states."""
+        """Where the part touched first, beside where the scan says; None where the states on the way do not tell it."""
         at = self._flange_at(0.0).translation
         touched = felt_touch(states, at, self._base_from_part.rotation[:, 2])
         # It touched no lower than where it stands now.
