@@ -22,8 +22,8 @@ def test_every_built_in_make_keeps_the_contract_of_its_kind(tmp_path: Path) -> N
         assert endpoints["scan_camera"]["driver"] == ("gige" if gige else "stream")
         environment = {**os.environ, "CELL_CONTRACTS": "sim.toml", "CELL_CONTRACTS_MOTION": "1"}
         done = subprocess.run(
-            [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--pyargs",
-             "cell.devices.contracts.test_configured"],
+            [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--reruns", "2", "--reruns-delay", "2",
+             "--pyargs", "cell.devices.contracts.test_configured"],
             cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300,
         )  # fmt: skip
     assert done.returncode == 0, done.stdout
