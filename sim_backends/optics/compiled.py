@@ -6,7 +6,8 @@ another file. They are therefore kept in a folder named after the text of all of
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar, cast
 
@@ -23,15 +24,28 @@ def _cache_folder() -> str:
     return str(root / f"kernels-{digest}")
 
 
-if not getattr(config, "CACHE_DIR", ""):
-    vars(config)["CACHE_DIR"] = _cache_folder()
+_FOLDER = _cache_folder()
+
+
+@contextmanager
+def _kept_there() -> Iterator[None]:
+    """What is handed over in this block is kept in the folder, unless the user names another; nothing else is: the
+    cell's own kernels are then compiled once, whether a process has a simulator in it or not."""
+    named = getattr(config, "CACHE_DIR", "")
+    vars(config)["CACHE_DIR"] = named or _FOLDER
+    try:
+        yield
+    finally:
+        vars(config)["CACHE_DIR"] = named
 
 
 def compiled(function: Function) -> Function:
     """Compile with strict floating point; division by zero gives infinity as in numpy."""
-    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    with _kept_there():
+        return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
 
 
 def compiled_fast(function: Function) -> Function:
     """Compile with reordering of sums allowed, for loops over pixels that hold neither infinities nor NaN."""
-    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)(function))
+    with _kept_there():
+        return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy", fastmath=True)(function))
