@@ -143,9 +143,9 @@ def solve_chain(
     choice, pictures = with_doubt_of_camera(choice, pictures)
     unsure = _unsure(choice.best, pictures, scale)
     plane = _plane_known(choice, stripes, observations, pictures, unsure)
-    if scale is not None and scale.believed and plane is not None:
+    if scale is not None and plane is not None:
         reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
-        plane = replace(plane, place=math.hypot(plane.place, (scale.value - 1) * reach))
+        plane = replace(plane, place=math.hypot(plane.place, scale.unsure * (scale.value - 1) * reach))
     best, closed = (replace(s, unsure=np.abs(unsure)) for s in (choice.best, choice.closed))
     choice = replace(choice, best=best, closed=closed)
     return CalibrationChain(
@@ -158,9 +158,9 @@ def _unsure(best: Solution, pictures: Intrinsics, scale: Scale | None) -> Array:
     unsure = np.zeros(SHARED)
     if pictures.bend is not None and pictures.bend.believed:
         unsure = moved_by_bend(Adjustment(best.views, best.free, best.adjusted.priors), best.adjusted.state)
-    if scale is not None and scale.believed:
+    if scale is not None:
         place = slice(HAND.start, HAND.start + 3)
-        unsure[place] = np.hypot(unsure[place], scale.shift)
+        unsure[place] = np.hypot(unsure[place], scale.unsure * scale.shift)
     return unsure
 
 

@@ -229,7 +229,13 @@ def match_series(
             linked[others[0]] = shown[0]
     for one in series:
         _match_pictures(one, listing, linked)
-    belonging = [s for s in series if s.of]
+    shifted = [
+        replace(one, by="order", of=dict(enumerate(one.records)), alone=[])
+        for one in series
+        if one.by == "number" and len(one.records) == len(names) == len(one.of) + 1
+    ]
+    # Counted from 0 and from 1: the numbers fit all but one each, and each picture gets its neighbour's pose.
+    belonging = [s for s in (*series, *shifted) if s.of]
     if below := _others(belonging, listing):
         # The folder's own recording is meant; those in its sub-folders have boards and bases of their own.
         listing.pictures = [p for p in listing.pictures if p.parent not in below]

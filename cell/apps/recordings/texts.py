@@ -113,16 +113,19 @@ class Content:
         if _is_pose(array):
             self._add(array.ravel(), place, label)
         elif array.ndim >= 2 and _is_pose(array[0]):
+            timed = array.shape[1:] == (7,) and _timed(array.tolist())
             for k, part in enumerate(array):
-                self._add(part.ravel(), [*place, f"[{k}]"], f"[{k}]")
+                self._add(part.ravel(), [*place, f"[{k}]"], f"[{k}]", timed=timed)
         elif (rows := _half_of(array)) is not None:
             self.halves.append((self.path, "/".join(place), rows))
 
-    def _add(self, numbers: Array, place: Sequence[str], label: str | None, named: str = "") -> None:
+    def _add(
+        self, numbers: Array, place: Sequence[str], label: str | None, named: str = "", *, timed: bool = False
+    ) -> None:
         label = label or next((part for part in reversed(place) if re.search(r"\d", part)), None)
         pattern = "/".join(re.sub(r"\d+", "N", part) for part in place)
         exact = "/".join(re.sub(r"\[\d+\]", "[N]", part) for part in place)
-        time = float(numbers[0]) if len(numbers) not in COUNTS else None
+        time = float(numbers[0]) if timed or len(numbers) not in COUNTS else None
         pose = _squared(numbers if time is None else numbers[1:])
         self.records.append(PoseRecord(self.path, pattern, label, pose, named=named, exact=exact, time=time))
 
@@ -152,9 +155,9 @@ def read_content(path: Path) -> Content:
 
 
 def decoded(data: bytes) -> str:
-    """The text of a file in UTF-8, UTF-16 with a mark, or Latin-1."""
+    """The text of a file in UTF-8, UTF-16 with a mark, or Latin-1; a minus sign of print is one."""
     try:
-        return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+        return data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig").replace("\u2212", "-")
     except UnicodeDecodeError:
         return data.decode("latin-1")
 
@@ -357,10 +360,10 @@ def _read_table(text: str, content: Content) -> None:
 def _table_lines(text: str) -> tuple[list[str], list[_TableLine]]:
     """The cells of a table's header, if it has one, and its other lines without comments."""
     kept = [line.strip() for line in text.splitlines() if line.strip() and line.strip()[0] not in "#%"]
-    # Commas between digits are decimal commas where something else separates.
-    lines = [
-        _TableLine.of(re.sub(r"(?<=\d),(?=\d)", ".", line) if re.search(r"[;\t]", line) else line) for line in kept
-    ]
+    # Commas between digits are decimal commas where something else separates, or quotes hold them.
+    kept = [re.sub(r'"(-?\d*),(\d+)"', r"\1.\2", line) for line in kept]
+    decimal = re.compile(r".*[;\t].*|([^,]*\s)?-?\d*,\d+(\s+-?\d*,\d+)+")
+    lines = [_TableLine.of(re.sub(r"(?<=\d),(?=\d)", ".", line) if decimal.fullmatch(line) else line) for line in kept]
     if len(lines) > 1 and not lines[0].numbers and max(len(line.numbers) for line in lines[1:]) >= min(COUNTS):
         return lines[0].cells, lines[1:]
     return [], lines

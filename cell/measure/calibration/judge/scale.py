@@ -25,7 +25,7 @@ UNITS = {1000.0: "mm", 100.0: "cm", 1 / 0.0254: "inches"}
 UNIT_SHARE = 0.2
 LEAST_FRAMES = 5
 DOUBT, REFUSE = 1.0, 5.0
-DOUBT_SIGMAS, REFUSE_SIGMAS = 3.0, 5.0
+DOUBT_SIGMAS, REFUSE_SIGMAS, UNSURE_SIGMAS = 3.0, 5.0, 2.0
 EXPLAINS, CLEARLY = 0.5, 0.7
 """Shares of the squared residuals from which a scale is believed, and from which it refuses by itself."""
 INDEPENDENT = (
@@ -58,6 +58,14 @@ class Scale:
         What that moves is not known better. A scale that explains little is picked up from something else.
         """
         return abs(self.value - 1) > DOUBT_SIGMAS * self.sigma and self.explained > EXPLAINS
+
+    @property
+    def unsure(self) -> float:
+        """Share of what a free scale would move that the hand-eye is not known to: all where it is believed.
+
+        Else as much as it is beyond chance: a board that is off by a few per mille never explains most of the rest.
+        """
+        return 1.0 if self.believed else min(1.0, abs(self.value - 1) / max(UNSURE_SIGMAS * self.sigma, 1e-12))
 
     def with_focal(self, share: float) -> Scale:
         """The same for a focal length that is known to `share` of itself: the boards' distances follow it."""

@@ -173,7 +173,7 @@ def _by_colour(spec: BoardSpec, orders: list[Places], pixels: Array, dark: Array
     matching = [f for f in fitting if f[0] > LEAST_COLOURS]
     if spec.symmetric and not matching:
         matching = [f for f in fitting if f[0] < 1 - LEAST_COLOURS]
-    if not matching or len(matching) > (2 if spec.symmetric else 1):
+    if not 0 < len(matching) <= spec.orders:
         raise PictureRefused(
             Reason.AMBIGUOUS,
             f"the corners found fit {spec.name} in {len(matching)} ways, so their order is not certain; show the whole "

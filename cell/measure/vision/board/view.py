@@ -122,6 +122,12 @@ class BoardSpec:
             return self.rows % 2 == 0
         return self.kind == "chessboard" and (self.cols + self.rows) % 2 == 0
 
+    @property
+    def orders(self) -> int:
+        """How many orders of the points a picture cannot tell apart: 4 where a quarter turn looks the same as well."""
+        square = self.cols == self.rows and (self.kind == "dots" or self.cols % 2 == 0)
+        return 1 if not self.symmetric else 4 if square else 2
+
 
 def parse_board(text: str, single_tag: bool = False) -> BoardSpec:
     """The board of a name; ConfigError says which part of the name is wrong and how it should look.
@@ -251,9 +257,8 @@ class BoardView:
         if not self.order_assumed:
             return [self]
         lattice = self.spec.lattice()
-        quarter = self.spec.kind == "dots" and self.spec.cols == self.spec.rows
         views = []
-        for turn in range(4) if quarter else (0, 2):
+        for turn in range(0, 4, 4 // self.spec.orders):
             places = {tuple(p): k for k, p in enumerate(turned_places(lattice, turn))}
             index = np.array([places[tuple(p)] for p in lattice])
             views.append(replace(self, ids=index[self.ids]))
