@@ -7,14 +7,13 @@ console. Nothing but the command line prints.
 from __future__ import annotations
 
 import logging
-import os
 import re
 import secrets
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -22,19 +21,26 @@ from typing import Any
 from cell.base.storage import EditedError, read_json
 from cell.base.storage import write_json as write_json
 from drivers.errors import CellError, ConfigError
+from statemachine.journal import FILE_NAME as JOURNAL
 from statemachine.journal import JournalError, JournalRecord, read
 
 DISTRIBUTION, REPORT = "assembly-cell", "report.json"
 Report = Mapping[str, Any]
 """What a run's `report.json` holds, or as much of it as its journal tells; docs/reference/report.md has its keys."""
 _NAME = re.compile(r"\d{8}T\d{6}-[0-9a-f]{4}")
+_STAMP = "%Y%m%dT%H%M%S"
 
 
 def new_run(root: Path) -> Path:
-    """Create the folder of a new run below `root`."""
+    """Create the folder of a new run below `root`, named after the local time.
+
+    Never before the newest that is there: summer time ends, and clocks are set back.
+    """
     root.mkdir(parents=True, exist_ok=True)
     while True:
-        folder = root / f"{time.strftime('%Y%m%dT%H%M%S')}-{secrets.token_hex(2)}"
+        now, before = time.strftime(_STAMP), [run.name.partition("-")[0] for run in list_runs(root)[-1:]]
+        later = [(datetime.strptime(stamp, _STAMP) + timedelta(seconds=1)).strftime(_STAMP) for stamp in before]
+        folder = root / f"{max([now, *later])}-{secrets.token_hex(2)}"
         try:
             folder.mkdir()
         except FileExistsError:
@@ -89,7 +95,7 @@ def is_going(folder: Path) -> bool:
         run = read(folder).run
     except (JournalError, ValueError, TypeError):
         return False
-    return run.ended is None and _lives(run.pid, run.started)
+    return run.ended is None and _lives(run.pid, folder)
 
 
 def listens(folder: Path) -> bool:
@@ -97,17 +103,22 @@ def listens(folder: Path) -> bool:
     return is_going(folder) and _info(folder).get("kind", "job") != "maintenance"
 
 
-def _lives(pid: object, since: float) -> bool:
-    """Whether the process `pid` lives and is the one that did at `since`, seconds since the epoch."""
+def _lives(pid: object, folder: Path) -> bool:
+    """Whether the process `pid` lives and has the journal in `folder` open, whatever became of the clock.
+
+    That of another user does not show its files: where it lives it is taken to be the one.
+    """
     if not isinstance(pid, int):
         return False
+    process, journal = Path(f"/proc/{pid}"), (folder / JOURNAL).resolve()
     try:
-        words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        ticks = float(words[19]) / os.sysconf("SC_CLK_TCK")
-        begun = time.time() - float(Path("/proc/uptime").read_text().split()[0]) + ticks
-    except (OSError, ValueError, IndexError):
+        if (process / "stat").read_text().rpartition(")")[2].split()[0] == "Z":
+            return False
+        return any(file.readlink() == journal for file in (process / "fd").iterdir())
+    except PermissionError:
+        return True
+    except OSError:
         return False
-    return words[0] != "Z" and begun < since + 1.0
 
 
 def _info(folder: Path) -> dict[str, object]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
@@ -14,6 +16,7 @@ from cell.config.job import Job, job_path, load_job
 from cell.procedures.arm.moves import PartState
 from cell.procedures.steps import laser_sweep
 from cell.procedures.sweep.stored_sweep import FILE, StoredSweep
+from cell.run.folder import list_runs
 from drivers.errors import ConfigError, RefusedError
 from statemachine.journal import JournalError, JournalRecord, read
 
@@ -50,6 +53,12 @@ class UnfinishedRun:
                 "cut short can be resumed. Run its job again"
             )
         _require_held(folder, record)
+        for later, told in _later(folder):
+            if told.run.info.get("resumed_from") == folder.name:
+                raise ConfigError(
+                    f"run {folder.name} was resumed already, by run {later.name}, which has ended "
+                    f"{told.run.outcome or 'without an outcome'}: resume that one, or run the job again"
+                )
         if run.info.get("scripted") and not scripted:
             raise ConfigError(
                 f"run {folder.name} was looked at by a script between its steps: without it, it is not resumed. Call "
@@ -71,6 +80,9 @@ class UnfinishedRun:
             return None, f"run {self.folder.name} had not finished its sweep"
         if self.info["simulated"]:
             return None, "the simulated world of that run has ended"
+        for later, told in _later(self.folder):
+            if told.run.info.get("job_file") == self.job and _part(told) != PartState.HELD.value:
+                return None, f"a part was put down since, by run {later.name}"
         now = {"configuration_hash": config.calibration_hash(), "calibration_hash": calibration.hash()}
         for name, value in now.items():
             if self.info.get(name) != value:
@@ -100,14 +112,27 @@ def _require_facts(folder: Path, info: dict[str, object]) -> None:
             raise ConfigError(f"the journal of run {folder.name} tells its {name} as {info[name]!r}; run the job again")
 
 
+def _later(folder: Path) -> Iterator[tuple[Path, JournalRecord]]:
+    """The runs beside this one that began after it, as far as their journals can be read."""
+    for other in list_runs(folder.parent):
+        if other.name > folder.name:
+            with suppress(JournalError, ValueError, TypeError):
+                yield other, read(other)
+
+
+def _part(record: JournalRecord) -> object:
+    """What a run tells last of its part."""
+    return next((e.data["part"] for e in reversed(record.events) if "part" in e.data), PartState.HELD.value)
+
+
 def _require_held(folder: Path, record: JournalRecord) -> None:
     """`ConfigError` when the part is not in the claw any more, or may not be."""
-    told = [event for event in record.events if "part" in event.data]
-    match told[-1].data["part"] if told else PartState.HELD.value:
+    match _part(record):
         case PartState.HELD.value:
             return
         case PartState.RELEASED.value:
-            failed = "what came after that" if told[-1].step in record.done else "only the retreat"
+            step = next(event.step for event in reversed(record.events) if "part" in event.data)
+            failed = "what came after that" if step in record.done else "only the retreat"
             raise ConfigError(
                 f"run {folder.name} had put its part down already, {failed} failed: there is nothing to resume. Look "
                 "at the part, fold the arm with `cell home`, then run the job with the next part"

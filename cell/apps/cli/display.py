@@ -6,6 +6,7 @@ what went wrong on the way, where the report is, and what to type next.
 
 from __future__ import annotations
 
+import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -101,7 +102,7 @@ def _job(report: Mapping[str, object]) -> str:
     path = Path(str(report.get("job_file", report.get("job"))))
     if path.suffix == ".toml" and path.stem in shipped_jobs() and path == job_path(path.stem):
         return path.stem
-    return str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path)
+    return shlex.quote(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
 
 
 def duration(seconds: float | None) -> str:

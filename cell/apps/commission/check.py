@@ -166,7 +166,10 @@ class Progress:
                 self._data = json.loads(self._file.read_text(encoding="utf-8"))
                 if self._data["version"] != VERSION:
                     raise ValueError(f"version {self._data['version']}, this program writes {VERSION}")
-            except (OSError, ValueError, KeyError, TypeError) as error:
+                for stored in self._data["results"].values():
+                    stored["rests_on"], stored["verdict"]
+                self._data["mended"][:]
+            except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
                 raise ConfigError(
                     f"{self._file} is no record of a commissioning: {error}; move it away to begin anew"
                 ) from error

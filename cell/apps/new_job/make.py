@@ -93,15 +93,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
             raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
         for target in targets[:2]:
             _copied(there / target.name, target).replace(target)
-    return Made(
-        targets[0],
-        targets[1],
-        targets[2],
-        name=name,
-        seen=proposal.share,
-        place=found,
-        notes=tuple(notes),
-    )
+    return Made(targets[0], targets[1], targets[2], name=name, seen=proposal.share, place=found, notes=tuple(notes))
 
 
 def _proposed(asker: Asker, laid: Laid, job: Job, config: CellConfig, *, step: float) -> tuple[Laid, Proposal]:

@@ -28,6 +28,8 @@ STEP_ANGLE = 0.1
 MOST_TRIANGLES = 3_000_000
 SAME_PLACE = 1e-6
 """Corners nearer than this share of the mesh's size are one."""
+FARTHEST = 1e9
+"""In the file's unit, whatever it is."""
 LEAST_SHARE = 1e-12
 """A triangle smaller than this share of the square of the mesh's size has no area."""
 
@@ -70,6 +72,11 @@ def read_drawing(path: Path) -> Drawn:
         )
     if bad := int((~np.isfinite(vertices)).any(axis=1).sum()):
         raise ConfigError(f"{bad} corners of the mesh {path} are no numbers; export it again")
+    if not (np.abs(vertices).max() <= FARTHEST and 0 <= faces.min() <= faces.max() < len(vertices)):
+        raise ConfigError(
+            f"the mesh {path} names corners that it does not have, or that lie farther than {FARTHEST:g} of its units "
+            "away; export it again"
+        )
     notes: list[str] = []
     vertices, faces = _joined(vertices, faces)
     faces = _without_area(vertices, faces, notes)

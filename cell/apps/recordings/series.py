@@ -232,7 +232,7 @@ def match_series(
     shifted = [
         replace(one, by="order", of=dict(enumerate(one.records)), alone=[])
         for one in series
-        if one.by == "number" and len(one.records) == len(names) == len(one.of) + 1
+        if one.by in ("name", "number") and len(one.records) == len(names) == len(one.of) + 1
     ]
     # Counted from 0 and from 1: the numbers fit all but one each, and each picture gets its neighbour's pose.
     belonging = [s for s in (*series, *shifted) if s.of]

@@ -29,10 +29,7 @@ from drivers.switches import ArmSwitchedClaw, ArmSwitchedLaser
 Sim = str | Sequence[str] | None
 """What may be asked for: "all", "none", names of devices in one text or in a list, or None for what `cell.sim` has."""
 
-NEEDS = {
-    "scan_camera": ("arm", "rail", "vehicle", "laser", "target_camera"),
-    "target_camera": ("arm", "vehicle"),
-}
+NEEDS = {"scan_camera": ("arm", "rail", "vehicle", "laser", "target_camera"), "target_camera": ("arm", "vehicle")}
 """What has to be real where a camera is real: it carries the camera, lights its picture or finds its station."""
 
 

@@ -56,10 +56,7 @@ class PlaceResult:
         """What is not as usual, for people."""
         seen = () if self.look is None else self.look.notes
         if self.touch is None:
-            return (
-                *seen,
-                "the first touch was not held against the scan: the arm told too little of the way down",
-            )
+            return (*seen, "the first touch was not held against the scan: the arm told too little of the way down")
         return (*seen, *self.touch.notes)
 
     def summary(self) -> dict[str, object]:

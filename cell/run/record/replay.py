@@ -9,7 +9,6 @@ other libraries, or changed files.
 from __future__ import annotations
 
 import hashlib
-import json
 import logging
 import tempfile
 from collections.abc import Callable
@@ -20,6 +19,7 @@ from typing import Any, cast
 import numpy as np
 import pinocchio as pin
 
+from cell.base.storage import read_json, write_json
 from cell.base.toml_file import restored
 from cell.config.calibrations.store import read_calibration
 from cell.config.cell_config import CellConfig
@@ -36,7 +36,6 @@ from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction, reconstructed
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep, SweepRecord
-from cell.run.folder import write_json
 from cell.run.record.file import FILE as RECORD
 from cell.run.record.reading import messages
 from drivers.camera.folder import read_image
@@ -48,6 +47,8 @@ from statemachine.runner import RunResult
 
 FILE, CLOUD = "perception.json", "cloud.ply"
 FORMAT = 1
+KEYS = frozenset({"earlier_sweep", "cloud_sha256", "points_sha256", "pose", "refused"})
+KEYS_OF_PHOTOGRAPH = frozenset({"files", "flange", "base_from_board", "covariance"})
 REPLAYED = ("reconstruct", "invert_pose")
 """Steps that are done again, so that their refusal is, too."""
 
@@ -97,10 +98,13 @@ def load(folder: Path) -> dict[str, Any]:
             "was made by an older version; `cell report` says how it ended"
         )
     try:
-        data: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        data = read_json(path).content
         if data["format"] != FORMAT:
             raise ValueError(f"format {data['format']}, this program reads {FORMAT}")
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        for part, keys in ((data, KEYS), (data["photograph"], KEYS_OF_PHOTOGRAPH)):
+            if not isinstance(part, dict) or not keys <= part.keys():
+                raise ValueError(f"it has not all of {', '.join(sorted(keys))}")
+    except (OSError, ValueError, KeyError) as error:
         raise CellError(f"{path} cannot be read: {error}") from error
     return data
 

@@ -156,10 +156,10 @@ def resume(
     from cell.run.session.supervisor import Cell
 
     before = UnfinishedRun.find(find_run(folder_of_runs(config), name, "job"))
-    simulated, clock = before.info["simulated"], before.info.get("clock", "wall")
+    simulated, clock, seed = before.info["simulated"], before.info.get("clock", "wall"), before.info.get("seed")
     whole = simulated is True
     opened = partial(
-        Cell.open, config, sim="all" if whole else simulated or "none", seed=before.info.get("seed") or 1,
+        Cell.open, config, sim="all" if whole else simulated or "none", seed=1 if seed is None else seed,
         level=before.info.get("level") or "nominal",
         speed=before.info.get("speed") if whole and clock == "wall" else None, job=before.job if simulated else "pot",
         clock=clock,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -168,7 +169,7 @@ def new_job(
              "expected": made.place.summary(), "told": told, "notes": list(made.notes)}
         )  # fmt: skip
     else:
-        _print_made(made, "" if source is None or config is None else f" -c {config}")
+        _print_made(made, "" if source is None or config is None else f" -c {shlex.quote(str(config))}")
 
 
 def _print_made(made: Made, where: str) -> None:
@@ -179,7 +180,8 @@ def _print_made(made: Made, where: str) -> None:
     for free in made.place.verdict.unseen:
         typer.echo(f"note: {free} is told by the board alone, not by the scan")
     typer.echo(f"wrote {made.job} and {made.mesh}")
-    typer.echo(f"next: cell check{where} -j {made.job}, then cell dry-run{where} -j {made.job} --clock virtual")
+    job = shlex.quote(str(made.job))
+    typer.echo(f"next: cell check{where} -j {job}, then cell dry-run{where} -j {job} --clock virtual")
 
 
 # --- a simulated cell ---

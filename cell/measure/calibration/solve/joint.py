@@ -169,10 +169,7 @@ def start_state(staged: Staged) -> AdjustmentState:
 
 
 def solve_joint(
-    observations: Sequence[ScanObservation],
-    staged: Staged,
-    priors: Priors,
-    held_out: bool = True,
+    observations: Sequence[ScanObservation], staged: Staged, priors: Priors, held_out: bool = True
 ) -> Joint:
     """Adjust everything together, and predict the views of every fourth rest from the others in turn."""
     if staged.plane is None:

@@ -11,12 +11,7 @@ import pytest
 
 from cell.config.job import load_job
 from cell.procedures.drive.way import Whereabouts
-from drivers.errors import (
-    DeviceFault,
-    InterlockError,
-    LimitError,
-    RefusedError,
-)
+from drivers.errors import DeviceFault, InterlockError, LimitError, RefusedError
 from drivers.interfaces import Vehicle
 from sim_backends.models.vehicle import Mode
 from tests.support.wire.vehicle_bench import SPEED, STANDSTILL, Bench, benched

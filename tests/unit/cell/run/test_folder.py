@@ -147,10 +147,26 @@ def test_a_run_that_ended_as_the_others_were_asked_to_end_is_no_failure(
 
 
 def test_a_process_that_took_over_the_number_of_a_dead_one_is_not_the_run(tmp_path: Path) -> None:
+    """It lives, and has not this journal open."""
     folder = new_run(tmp_path / "runs")
-    Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()})
-    assert is_going(folder)
-    base = sqlite3.connect(folder / "journal.sqlite")
-    base.execute("UPDATE runs SET started = ?", (time.time() - 30 * 86400.0,))
-    base.commit()
+    Journal(folder, folder.name, {"kind": "job", "pid": os.getppid()}).close()
     assert not is_going(folder)
+
+
+@pytest.mark.parametrize("days", [-30, 30])
+def test_a_clock_that_was_set_does_not_end_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, days: int) -> None:
+    folder, now = new_run(tmp_path / "runs"), time.time()
+    with monkeypatch.context() as set_to:
+        set_to.setattr("time.time", lambda: now + days * 86400.0)
+        journal = Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()})
+    assert is_going(folder)
+    journal.close()
+    assert not is_going(folder)
+
+
+def test_the_newest_run_is_the_last_whatever_the_clock_says(tmp_path: Path) -> None:
+    """Summer time ends, or the clock is set back: names go on where they were."""
+    (tmp_path / "20991231T235959-ffff").mkdir()
+    made = [new_run(tmp_path) for _ in range(3)]
+    assert [folder.name[:15] for folder in made] == ["21000101T000000", "21000101T000001", "21000101T000002"]
+    assert find_run(tmp_path, None) == made[-1]

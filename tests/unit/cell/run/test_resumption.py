@@ -214,3 +214,44 @@ def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only(tmp_path: P
     assert run.info["scripted"]
     with pytest.raises(ConfigError, match="was looked at by a script"):
         UnfinishedRun.find(run.folder)
+
+
+def later(run: UnfinishedRun, name: str, part: str, **info: Any) -> None:
+    """A run after it, in the same folder."""
+    folder = run.folder.parent / name
+    folder.mkdir()
+    journal = Journal(folder, name, {"job_file": run.job, **info})
+    journal.event("note", "place", {"part": part})
+    journal.run_ended("placed", "all steps done")
+    journal.close()
+
+
+def named(run: UnfinishedRun) -> UnfinishedRun:
+    """The run under a name as `new_run` gives them."""
+    return UnfinishedRun.find(run.folder.rename(run.folder.with_name("20261124T120000-aaaa")))
+
+
+def test_a_run_is_resumed_once(tmp_path: Path) -> None:
+    """Its part is placed by the run that resumed it: the claw may hold the next one since."""
+    run = named(cut_short(tmp_path)[0])
+    later(run, "20261124T120001-bbbb", "released", resumed_from=run.folder.name)
+    with pytest.raises(ConfigError, match="was resumed already, by run 20261124T120001-bbbb, which has ended placed"):
+        UnfinishedRun.find(run.folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "part", "said"),
+    [
+        ("20261124T120001-bbbb", "released", "a part was put down since, by run 20261124T120001-bbbb"),
+        ("20261124T120001-bbbb", "unknown", "a part was put down since"),
+        ("20261124T120001-bbbb", "held", "cannot be read as a sweep"),
+        ("20261124T115959-bbbb", "released", "cannot be read as a sweep"),
+    ],
+)
+def test_a_sweep_from_before_another_part_was_put_down_is_not_used(
+    tmp_path: Path, name: str, part: str, said: str
+) -> None:
+    run = named(cut_short(tmp_path)[0])
+    later(run, name, part)
+    found = UnfinishedRun.find(run.folder)
+    assert said in found.sweep(load_job(found.job)[0], CONFIG, CALIBRATION)[1]

@@ -7,13 +7,7 @@ from typing import Any
 
 import pytest
 
-from drivers.errors import (
-    Aborted,
-    DeadlineError,
-    DeviceFault,
-    InterlockError,
-    LimitError,
-)
+from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError
 from sim_backends.models.rail import RailParams
 from tests.support.wire.rail_bench import Bench, benched, connect
 

@@ -9,14 +9,7 @@ import numpy as np
 import pytest
 
 from drivers.clock import Clock
-from drivers.errors import (
-    Aborted,
-    CellError,
-    DeadlineError,
-    DeviceFault,
-    InterlockError,
-    NotConnectedError,
-)
+from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.rail.motion import RailMotion, move_duration, run_up_distance
 from tests.support.wire.rail_bench import benched, connect
 

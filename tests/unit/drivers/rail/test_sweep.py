@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 
 from drivers.clock import Clock
-from drivers.errors import (
-    DeviceFault,
-    InterlockError,
-)
+from drivers.errors import DeviceFault, InterlockError
 from drivers.interfaces import Vector
 from drivers.rail.motion import run_up_distance
 from drivers.rail.sweep import EvenMotion, RailSweep, fit_line

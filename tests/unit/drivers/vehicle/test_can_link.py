@@ -7,12 +7,7 @@ import numpy as np
 import pytest
 
 from drivers.clock import Clock
-from drivers.errors import (
-    ConfigError,
-    DeadlineError,
-    DeviceFault,
-    NotConnectedError,
-)
+from drivers.errors import ConfigError, DeadlineError, DeviceFault, NotConnectedError
 from drivers.vehicle.agilex import AgilexVehicle
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams

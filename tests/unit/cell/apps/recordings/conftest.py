@@ -9,11 +9,7 @@ import pytest
 
 from cell.apps.recordings.frames import RecordedFrame, read_frames
 from cell.apps.recordings.series import list_folder
-from tests.unit.cell.apps.recordings.pictures import (
-    BOARD,
-    POSES,
-    photograph,
-)
+from tests.unit.cell.apps.recordings.pictures import BOARD, POSES, photograph
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from tests.support.recorded_scenes import (
-    right,
-    scene,
-    solved,
-)
+from tests.support.recorded_scenes import right, scene, solved
 
 
 def test_a_clean_recording_is_solved_without_a_doubt():

@@ -16,12 +16,7 @@ from cell.apps.recordings.series import Series
 from cell.apps.recordings.solution import agreeing
 from cell.apps.recordings.texts import PoseRecord
 from tests.support.recorded_scenes import FLANGE_FROM_CAMERA, TRUTH, given_pairs, right, scene, solved
-from tests.unit.cell.apps.recordings.pictures import (
-    CAMERA,
-    POSES,
-    row,
-    understand,
-)
+from tests.unit.cell.apps.recordings.pictures import CAMERA, POSES, row, understand
 
 
 @pytest.mark.parametrize(("a", "b"), [(0, 3), (2, 6)])

@@ -8,11 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from cell.apps.recordings.conventions import TRIED, check_reading
 from drivers.errors import ConfigError
-from tests.unit.cell.apps.recordings.pictures import (
-    POSES,
-    row,
-    understand,
-)
+from tests.unit.cell.apps.recordings.pictures import POSES, row, understand
 
 # By scipy, beside the table of the product.
 TURNS = {

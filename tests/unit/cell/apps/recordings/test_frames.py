@@ -11,14 +11,7 @@ from cell.apps.recordings.frames import read_frames
 from cell.apps.recordings.series import list_folder
 from cell.measure.vision import read_colours
 from cell.measure.vision.pictures import read_picture
-from tests.unit.cell.apps.recordings.pictures import (
-    BASE_FROM_BOARD,
-    BOARD,
-    CAMERA,
-    FLANGE_FROM_CAMERA,
-    POSES,
-    lit,
-)
+from tests.unit.cell.apps.recordings.pictures import BASE_FROM_BOARD, BOARD, CAMERA, FLANGE_FROM_CAMERA, POSES, lit
 
 
 def test_the_quick_search_of_a_plan_finds_the_same_boards(pictures, seen):

@@ -12,16 +12,7 @@ from cell.apps.recordings.command import Options, attach_poses
 from cell.apps.recordings.frames import RecordedFrame, read_frames
 from cell.apps.recordings.series import in_order_of_views, list_folder, read_series
 from drivers.errors import ConfigError
-from tests.unit.cell.apps.recordings.pictures import (
-    BOARD,
-    CAMERA,
-    POSES,
-    matched,
-    quaternion,
-    row,
-    tuples,
-    understand,
-)
+from tests.unit.cell.apps.recordings.pictures import BOARD, CAMERA, POSES, matched, quaternion, row, tuples, understand
 
 
 def test_a_folder_for_each_pose_is_read(tmp_path, pictures, seen):

@@ -12,12 +12,7 @@ from cell.apps.recordings.solution import camera_of
 from cell.measure.calibration.judge.faults import foreign_view, own_cameras
 from cell.measure.calibration.solve.intrinsics import choose_lens
 from drivers.errors import RefusedError
-from tests.support.recorded_scenes import (
-    LENS,
-    MATRIX,
-    Z,
-    scene,
-)
+from tests.support.recorded_scenes import LENS, MATRIX, Z, scene
 
 
 @pytest.mark.parametrize(("focal", "count"), [(1.05, 8), pytest.param(1.3, 7, marks=pytest.mark.campaign), (0.7, 6)])

@@ -8,10 +8,7 @@ import numpy as np
 from cell.apps.recordings.frames import read_frames
 from cell.apps.recordings.series import list_folder
 from cell.measure.vision import LaserChannel
-from tests.unit.cell.apps.recordings.pictures import (
-    BOARD,
-    lit,
-)
+from tests.unit.cell.apps.recordings.pictures import BOARD, lit
 
 
 def test_a_red_laser_on_white_paper_is_read_in_colour_and_never_wrongly_in_grey(tmp_path, pictures):

@@ -100,10 +100,7 @@ TEXTS = {
         "<stops>" + of_each(lambda k, p: f"<pose_{k} value='{row([*p[:3, 3], *quaternion(p)])}'/>") + "</stops>",
     ),
     "xml with joints beside": ("robot.xml", f"<stops>{of_each(joints_and_pose)}</stops>"),
-    "times before rotation vectors": (
-        "poses.txt",
-        of_each(lambda k, p: row([1.7e9 + 3.7 * k, *p[:3, 3], *angles(p)])),
-    ),
+    "times before rotation vectors": ("poses.txt", of_each(lambda k, p: row([1.7e9 + 3.7 * k, *p[:3, 3], *angles(p)]))),
     "titles above rotation and position": (
         "info.txt",
         of_each(lambda k, p: f"{k}:\nRotation:\n{angles(p).tolist()}\nTranslation:\n{p[:3, 3].tolist()}\n"),

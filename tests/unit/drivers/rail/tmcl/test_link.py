@@ -16,12 +16,7 @@ from hypothesis import strategies as st
 from pytrinamic.tmcl import TMCLReply, TMCLRequest
 
 from drivers.clock import Clock
-from drivers.errors import (
-    DeadlineError,
-    DeviceError,
-    DeviceFault,
-    NotConnectedError,
-)
+from drivers.errors import DeadlineError, DeviceError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
 from drivers.rail.tmcl.link import (
     Axis,

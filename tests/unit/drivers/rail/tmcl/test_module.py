@@ -8,10 +8,7 @@ from dataclasses import replace
 import pytest
 
 from drivers.clock import Clock
-from drivers.errors import (
-    DeviceFault,
-    InterlockError,
-)
+from drivers.errors import DeviceFault, InterlockError
 from drivers.rail.tmcl.rail import TmclRail
 from tests.support.wire.rail_bench import ACCELERATION, MAX_SPEED, Bench, connect, reply, telegram
 

@@ -5,10 +5,7 @@ from __future__ import annotations
 import pytest
 
 from drivers.clock import Clock
-from drivers.errors import (
-    ConfigError,
-    InterlockError,
-)
+from drivers.errors import ConfigError, InterlockError
 from drivers.interfaces import Rail
 from drivers.rail.tmcl.rail import TmclRail
 from tests.support.wire.rail_bench import Bench, connect, telegram

@@ -6,10 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from tests.support.canopen_bench import (
-    Bench,
-    at_bench,
-)
+from tests.support.canopen_bench import Bench, at_bench
 
 
 @pytest.fixture(scope="module")

@@ -7,12 +7,7 @@ import struct
 import pytest
 
 from drivers.errors import DeadlineError, DeviceFault
-from tests.support.canopen_bench import (
-    RATE,
-    Bench,
-    fault_of,
-    frame,
-)
+from tests.support.canopen_bench import RATE, Bench, fault_of, frame
 
 pytestmark = pytest.mark.wire
 

@@ -13,9 +13,7 @@ from cell.makes import make_of
 from drivers.errors import ConfigError
 from drivers.vehicle.cia402.make import CanopenVehicleConfig
 from tests.support import ROOT
-from tests.support.canopen_bench import (
-    WHEELS,
-)
+from tests.support.canopen_bench import WHEELS
 
 
 def test_the_page_prints_a_vehicle_that_is_valid(tmp_path: Path) -> None:

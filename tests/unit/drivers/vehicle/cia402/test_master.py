@@ -9,13 +9,7 @@ import pytest
 from drivers.errors import DeviceFault, InterlockError
 from drivers.vehicle.cia402.master import last_words
 from sim_backends.peers.vehicle.canopen import WheelState
-from tests.support.canopen_bench import (
-    Bench,
-    at_bench,
-    fault_of,
-    frame,
-    with_output_brake,
-)
+from tests.support.canopen_bench import Bench, at_bench, fault_of, frame, with_output_brake
 
 pytestmark = pytest.mark.wire
 

@@ -9,15 +9,7 @@ import pytest
 from drivers.errors import ConfigError, DeviceFault
 from sim_backends.peers.vehicle.canopen import WheelState
 from sim_backends.peers.vehicle.canopen_node import WRONG_VALUE, Abort
-from tests.support.canopen_bench import (
-    SETTINGS,
-    WATCHDOG_S,
-    WHEELS,
-    Bench,
-    at_bench,
-    fault_of,
-    with_output_brake,
-)
+from tests.support.canopen_bench import SETTINGS, WATCHDOG_S, WHEELS, Bench, at_bench, fault_of, with_output_brake
 
 pytestmark = pytest.mark.wire
 

@@ -10,12 +10,7 @@ import pytest
 from drivers.errors import DeadlineError, DeviceFault, InterlockError
 from drivers.vehicle.feedback import QUIET_S
 from sim_backends.peers.vehicle.canopen import WheelState
-from tests.support.canopen_bench import (
-    WATCHDOG_S,
-    Bench,
-    at_bench,
-    with_output_brake,
-)
+from tests.support.canopen_bench import WATCHDOG_S, Bench, at_bench, with_output_brake
 
 pytestmark = pytest.mark.wire
 
