@@ -148,13 +148,9 @@ Recover = Callable[[BaseException, CancelToken, bool], None]
 
 
 def performed(
-    step: Step,
-    attempts: Attempts,
-    recover: Recover | None,
-    sequence: Sequence,
-    watchman: Watchman,
+    step: Step, attempts: Attempts, recover: Recover | None, sequence: Sequence, watchman: Watchman,
     hold: Callable[[], Failure | None] = lambda: None,
-) -> Failure | None:
+) -> Failure | None:  # fmt: skip
     """Do one step, with its repetitions; None when it has succeeded. `hold()` waits while the run is paused."""
     attempt = 1
     while (end := attempts.attempt(step, attempt)) is not None:

@@ -158,16 +158,9 @@ class StepContext:
     """
 
     def __init__(
-        self,
-        step: Step,
-        attempt: int,
-        deadline: float,
-        results: Mapping[str, object],
-        clock: RunClock,
-        tell: Observer,
-        control: RunControl | None = None,
-        look: Callable[[], None] = lambda: None,
-    ) -> None:
+        self, step: Step, attempt: int, deadline: float, results: Mapping[str, object], clock: RunClock,
+        tell: Observer, control: RunControl | None = None, look: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
         self.step = step
         self.attempt = attempt
         self.deadline = deadline

@@ -109,16 +109,10 @@ def safe_off_outputs(config: CellConfig) -> tuple[int, ...]:
 
 
 def behind_gate(
-    config: CellConfig,
-    clock: Clock,
-    arm: Arm | None = None,
-    rail: Rail | None = None,
-    vehicle: Vehicle | None = None,
-    scan_camera: Camera | None = None,
-    target_camera: Camera | None = None,
-    laser: Laser | None = None,
-    claw: Claw | None = None,
-) -> Devices:
+    config: CellConfig, clock: Clock, arm: Arm | None = None, rail: Rail | None = None,
+    vehicle: Vehicle | None = None, scan_camera: Camera | None = None, target_camera: Camera | None = None,
+    laser: Laser | None = None, claw: Claw | None = None,
+) -> Devices:  # fmt: skip
     """These devices, of whatever make, with everything that moves, shines or grips behind one gate."""
     ways = Ways(config, None if arm is None else arm.link_table())
     switched = (config.laser, "laser"), (config.claw, "claw")

@@ -30,18 +30,10 @@ class Devices:
     following: DeviceFollowing | None = None
 
     def __init__(
-        self,
-        clock: Clock,
-        gate: Gate,
-        *,
-        arm: Arm | None = None,
-        rail: GatedRail | None = None,
-        vehicle: Vehicle | None = None,
-        scan_camera: Camera | None = None,
-        target_camera: Camera | None = None,
-        laser: GatedLaser | None = None,
-        claw: Claw | None = None,
-    ) -> None:
+        self, clock: Clock, gate: Gate, *, arm: Arm | None = None, rail: GatedRail | None = None,
+        vehicle: Vehicle | None = None, scan_camera: Camera | None = None, target_camera: Camera | None = None,
+        laser: GatedLaser | None = None, claw: Claw | None = None,
+    ) -> None:  # fmt: skip
         self.clock = clock
         self.gate = gate
         self._arm = arm

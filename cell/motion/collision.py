@@ -373,13 +373,9 @@ def first_touch(
 
 
 def _onwards(
-    model: CollisionModel,
-    samples: NDArray[np.float64],
-    turned: NDArray[np.float64],
-    place: Joints,
-    sample: int,
+    model: CollisionModel, samples: NDArray[np.float64], turned: NDArray[np.float64], place: Joints, sample: int,
     room: NDArray[np.float64],
-) -> tuple[Joints, Joints, int]:
+) -> tuple[Joints, Joints, int]:  # fmt: skip
     """As far along as no pair can have come nearer by more than its `room` (pairs,) m.
 
     `turned` (n, 6) is by how much each joint has turned since the beginning, `place` (6,) the same where the last look

@@ -42,12 +42,9 @@ class Effort:
 
 
 def search(
-    free: Callable[[Joints], bool],
-    start: Joints,
-    end: Joints,
-    ranges: tuple[NDArray[np.float64], NDArray[np.float64]],
-    effort: Effort,
-) -> NDArray[np.float64] | None:
+    free: Callable[[Joints], bool], start: Joints, end: Joints,
+    ranges: tuple[NDArray[np.float64], NDArray[np.float64]], effort: Effort,
+) -> NDArray[np.float64] | None:  # fmt: skip
     """Corners (n, 6) rad of a way from `start` to `end`, straight between them, or None when none was found.
 
     `ranges` are the least and the greatest joint angles (6,); `free` says whether the arm may stand there.
@@ -104,12 +101,9 @@ def limits() -> str:
 
 
 def _over_one_corner(
-    free: Callable[[Joints], bool],
-    start: Joints,
-    end: Joints,
-    box: tuple[NDArray[np.float64], NDArray[np.float64]],
+    free: Callable[[Joints], bool], start: Joints, end: Joints, box: tuple[NDArray[np.float64], NDArray[np.float64]],
     effort: Effort,
-) -> NDArray[np.float64] | None:
+) -> NDArray[np.float64] | None:  # fmt: skip
     """The shortest of the first free ways (3, 6) rad over a corner drawn in `box`; None when none was found."""
     drawn = np.random.default_rng(effort.seed)
     best, shortest, found, left = None, np.inf, 0, effort.looks
@@ -163,12 +157,9 @@ class Planner:
     """
 
     def __init__(
-        self,
-        kinematics: ArmKinematics,
-        collisions: CollisionModel,
-        limits: JointLimits | None = None,
+        self, kinematics: ArmKinematics, collisions: CollisionModel, limits: JointLimits | None = None,
         tool_speed: float | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.kinematics = kinematics
         carried = carried_points(collisions.bodies)
         self._points = None if tool_speed is None else PointSpeed(kinematics, carried, tool_speed)

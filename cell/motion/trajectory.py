@@ -184,13 +184,9 @@ def plan_joint(
 
 
 def plan_line(
-    kinematics: ArmKinematics,
-    start: Joints,
-    base_from_end: pin.SE3,
-    line: LineLimits | None = None,
-    period: float = PERIOD,
-    points: PointSpeed | None = None,
-) -> Trajectory:
+    kinematics: ArmKinematics, start: Joints, base_from_end: pin.SE3, line: LineLimits | None = None,
+    period: float = PERIOD, points: PointSpeed | None = None,
+) -> Trajectory:  # fmt: skip
     """The flange in a straight line from where `start` (6,) holds it to `base_from_end`, turning evenly on the way.
 
     The branch of `start` is kept all along. Where a joint or one of `points` would be too fast the whole line is slowed

@@ -54,15 +54,10 @@ class ArmLink:
     """
 
     def __init__(
-        self,
-        name: str,
-        setup: ChildSetup,
-        connect_deadline: float,
-        on_snapshot: Callable[[Snapshot], None],
-        on_ended: Callable[[Ended], None],
-        on_lost: Callable[[DeviceFault], None],
+        self, name: str, setup: ChildSetup, connect_deadline: float, on_snapshot: Callable[[Snapshot], None],
+        on_ended: Callable[[Ended], None], on_lost: Callable[[DeviceFault], None],
         wanted: Callable[[], bool] = lambda: True,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Start the child and wait until it is connected; `NotConnectedError` if it is not within the deadline,
         or at once without ur-rtde.
 

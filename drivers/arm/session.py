@@ -94,16 +94,9 @@ class ArmSession:
     """
 
     def __init__(
-        self,
-        name: str,
-        setup: ChildSetup,
-        clock: Clock,
-        connect_timeout: float,
-        forward: Forward | None,
-        unknown: str,
-        on_ended: Callable[[Ended], None],
-        on_broken: Callable[[Exception], None],
-    ) -> None:
+        self, name: str, setup: ChildSetup, clock: Clock, connect_timeout: float, forward: Forward | None,
+        unknown: str, on_ended: Callable[[Ended], None], on_broken: Callable[[Exception], None],
+    ) -> None:  # fmt: skip
         """Connect. Raises `NotConnectedError`; `DeviceFault` in local control, and for another arm than it has to be.
 
         `unknown` says why the controller's own table is not known, if it is not.

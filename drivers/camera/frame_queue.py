@@ -111,16 +111,9 @@ class FrameQueue:
     """
 
     def __init__(
-        self,
-        name: str,
-        clock: Clock,
-        *,
-        capacity: int,
-        longest_gap: float,
-        check: Callable[[], None],
-        statistics: LinkStatistics,
-        exposure: float | None = None,
-    ) -> None:
+        self, name: str, clock: Clock, *, capacity: int, longest_gap: float, check: Callable[[], None],
+        statistics: LinkStatistics, exposure: float | None = None,
+    ) -> None:  # fmt: skip
         self.lost = 0
         self._name = name
         self._clock = clock

@@ -319,15 +319,9 @@ class FrameLink:
     """
 
     def __init__(
-        self,
-        name: str,
-        address: str,
-        clock: Clock,
-        *,
-        take_frame: Callable[[Header, bytearray, float], None],
-        lost: Callable[[], None],
-        statistics: LinkStatistics,
-    ) -> None:
+        self, name: str, address: str, clock: Clock, *, take_frame: Callable[[Header, bytearray, float], None],
+        lost: Callable[[], None], statistics: LinkStatistics,
+    ) -> None:  # fmt: skip
         host, _, port = address.rpartition(":")
         if not host or not port.isdecimal() or int(port) > 65535:
             raise ConfigError(f"{name}: address {address!r} is not HOST:PORT, like 192.168.1.20:5006. Correct it")

@@ -63,16 +63,9 @@ class RailAxis(ABC):
     _link: Link
 
     def __init__(
-        self,
-        name: str,
-        clock: Clock,
-        *,
-        travel: tuple[float, float],
-        max_speed: float,
-        acceleration: float,
-        counts: float,
-        control: bool,
-    ) -> None:
+        self, name: str, clock: Clock, *, travel: tuple[float, float], max_speed: float, acceleration: float,
+        counts: float, control: bool,
+    ) -> None:  # fmt: skip
         for what, value in {"speed": max_speed, "acceleration": acceleration, "counts to a metre": counts}.items():
             if not value > 0:
                 raise ConfigError(f"{name}: {what} {value} must be greater than 0. Correct it in the configuration")

@@ -60,16 +60,9 @@ class RailMotion:
     """
 
     def __init__(
-        self,
-        name: str,
-        clock: Clock,
-        *,
-        arrived: Callable[[], bool],
-        halt: Callable[[], None],
-        duration: float,
-        least: float = 0.0,
-        readings: Readings = (),
-    ) -> None:
+        self, name: str, clock: Clock, *, arrived: Callable[[], bool], halt: Callable[[], None], duration: float,
+        least: float = 0.0, readings: Readings = (),
+    ) -> None:  # fmt: skip
         self.readings = readings
         self._name = name
         self._clock = clock
@@ -266,14 +259,9 @@ class ZeroCheck:
     """
 
     def __init__(
-        self,
-        name: str,
-        begin: Callable[[float, float], Arrived],
-        position: Callable[[], float],
-        switch: Callable[[], bool],
-        forget: Callable[[], None],
-        speed: float,
-    ) -> None:
+        self, name: str, begin: Callable[[float, float], Arrived], position: Callable[[], float],
+        switch: Callable[[], bool], forget: Callable[[], None], speed: float,
+    ) -> None:  # fmt: skip
         self._name = name
         self._begin, self._position, self._switch, self._forget = begin, position, switch, forget
         self._speed = speed

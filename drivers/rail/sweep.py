@@ -143,19 +143,10 @@ class RailSweep(RailMotion):
     """A running sweep, constant between `start` and `stop` (m) at `speed` (m/s); `resolution` is a count in m."""
 
     def __init__(
-        self,
-        name: str,
-        clock: Clock,
-        *,
-        start: float,
-        stop: float,
-        speed: float,
-        resolution: float,
-        record: list[tuple[float, float, float]],
-        arrived: Callable[[], bool],
-        halt: Callable[[], None],
+        self, name: str, clock: Clock, *, start: float, stop: float, speed: float, resolution: float,
+        record: list[tuple[float, float, float]], arrived: Callable[[], bool], halt: Callable[[], None],
         duration: float,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._start = start
         self._stop = stop
         self._speed = speed

@@ -52,18 +52,9 @@ class AgilexVehicle:
     """
 
     def __init__(
-        self,
-        name: str,
-        interface: str,
-        channel: str,
-        *,
-        bitrate: int = 500_000,
-        track: float,
-        max_speed: float,
-        max_yaw_rate: float,
-        clock: Clock,
-        bus_options: Mapping[str, object] | None = None,
-    ) -> None:
+        self, name: str, interface: str, channel: str, *, bitrate: int = 500_000, track: float, max_speed: float,
+        max_yaw_rate: float, clock: Clock, bus_options: Mapping[str, object] | None = None,
+    ) -> None:  # fmt: skip
         self.name = name
         self.statistics = LinkStatistics()
         self._address = f"{interface}:{channel}"

@@ -34,19 +34,10 @@ class AgilexLink:
     """
 
     def __init__(
-        self,
-        name: str,
-        interface: str,
-        channel: str,
-        *,
-        bitrate: int,
-        options: Mapping[str, object],
-        database: Database,
-        wanted: frozenset[str],
-        receive: Callable[[str, dict[str, float]], None],
-        idle: Callable[[float], None],
-        statistics: LinkStatistics,
-    ) -> None:
+        self, name: str, interface: str, channel: str, *, bitrate: int, options: Mapping[str, object],
+        database: Database, wanted: frozenset[str], receive: Callable[[str, dict[str, float]], None],
+        idle: Callable[[float], None], statistics: LinkStatistics,
+    ) -> None:  # fmt: skip
         self._database = database
         self._wanted: dict[int, Message] = {
             message.frame_id: message for message in database.messages if message.name in wanted

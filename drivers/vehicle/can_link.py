@@ -42,18 +42,9 @@ class CanLink:
     """
 
     def __init__(
-        self,
-        name: str,
-        interface: str,
-        channel: str,
-        *,
-        bitrate: int,
-        options: Mapping[str, object],
-        receive: Callable[[can.Message], None],
-        idle: Callable[[float], None],
-        statistics: LinkStatistics,
-        alone: str,
-    ) -> None:
+        self, name: str, interface: str, channel: str, *, bitrate: int, options: Mapping[str, object],
+        receive: Callable[[can.Message], None], idle: Callable[[float], None], statistics: LinkStatistics, alone: str,
+    ) -> None:  # fmt: skip
         self._name = name
         self._address = f"{interface}:{channel}"
         self._alone = alone

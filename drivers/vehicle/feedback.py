@@ -92,15 +92,9 @@ class Travel:
     """
 
     def __init__(
-        self,
-        clock: Clock,
-        statistics: LinkStatistics,
-        *,
-        track: float,
-        max_speed: float,
-        max_yaw_rate: float,
+        self, clock: Clock, statistics: LinkStatistics, *, track: float, max_speed: float, max_yaw_rate: float,
         unit: float = 1e-3,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._clock = clock
         self._statistics = statistics
         self._unit = unit
@@ -226,15 +220,9 @@ class MessageFeedback:
     """The newest messages by name, each with its host time; filled by the receive thread through `take`."""
 
     def __init__(
-        self,
-        name: str,
-        clock: Clock,
-        *,
-        track: float,
-        max_speed: float,
-        max_yaw_rate: float,
+        self, name: str, clock: Clock, *, track: float, max_speed: float, max_yaw_rate: float,
         statistics: LinkStatistics,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._name = name
         self._clock = clock
         self._travel = Travel(clock, statistics, track=track, max_speed=max_speed, max_yaw_rate=max_yaw_rate)

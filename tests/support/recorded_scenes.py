@@ -53,19 +53,10 @@ BASE_FROM_BOARD = pose((np.pi - 0.02, 0.03, 0.2), (0.55, 0.1, 0.02))
 
 
 def scene(
-    seed: int = 0,
-    count: int = 9,
-    arm_mm: float = 0.05,
-    arm_mrad: float = 0.1,
-    bend: float = 0.0,
-    axes: int = 3,
-    second: tuple[int, ...] = (),
-    laser: bool = True,
-    board: str = BOARD.name,
-    focal: float = 1.0,
-    tilt: float = 0.45,
+    seed: int = 0, count: int = 9, arm_mm: float = 0.05, arm_mrad: float = 0.1, bend: float = 0.0, axes: int = 3,
+    second: tuple[int, ...] = (), laser: bool = True, board: str = BOARD.name, focal: float = 1.0, tilt: float = 0.45,
     spread: float = 1.0,
-) -> list[RecordedFrame]:
+) -> list[RecordedFrame]:  # fmt: skip
     """Frames with poses. `bend` in m at the board's edge; turns about `axes` axes; `second`: frames of another line.
 
     `focal`: the boards are seen with so many times the focal length. `tilt`: at most, rad, each way. `spread`: of the

@@ -164,17 +164,9 @@ def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tu
 
 
 def reported(
-    folder: Path,
-    config: CellConfig,
-    job: Job,
-    nominal: NominalSurface,
-    work: Workplace,
-    result: RunResult,
-    frames: FrameStore,
-    witness: TruthRecorder | None,
-    *,
-    simulated: bool = True,
-) -> Ended:
+    folder: Path, config: CellConfig, job: Job, nominal: NominalSurface, work: Workplace, result: RunResult,
+    frames: FrameStore, witness: TruthRecorder | None, *, simulated: bool = True,
+) -> Ended:  # fmt: skip
     """The report of a result, with the facts that `cell.run.job_run.JobRun` adds."""
     info: dict[str, Any] = {
         "kind": "job", "pid": os.getpid(), "part": work.part.state.value, "cell": config.cell.name, "job": job.job.name,

@@ -247,17 +247,9 @@ FOLDER = "commissioning"
 
 
 def begin(
-    config: Path | None,
-    person: Person,
-    show: Callable[[CommissionCheck, str, Result | None], None],
-    *,
-    job: str,
-    sim: str | None = None,
-    seed: int = 1,
-    level: str = "nominal",
-    clock: str = "wall",
-    truth: Path | None = None,
-) -> Commissioning:
+    config: Path | None, person: Person, show: Callable[[CommissionCheck, str, Result | None], None], *, job: str,
+    sim: str | None = None, seed: int = 1, level: str = "nominal", clock: str = "wall", truth: Path | None = None,
+) -> Commissioning:  # fmt: skip
     """A commissioning of the cell of this configuration, whose record is in `commissioning/` beside it.
 
     With `sim="all"` the cell is simulated, as `truth` describes it. `ConfigError` for what is wrong before anything is

@@ -66,13 +66,9 @@ class Proposal:
 
 
 def propose(
-    body: Laid,
-    job: Job,
-    config: CellConfig,
-    step: float,
-    reachable: Callable[[Job], str | None],
+    body: Laid, job: Job, config: CellConfig, step: float, reachable: Callable[[Job], str | None],
     tell: Callable[[str], None] = lambda text: None,
-) -> Proposal:
+) -> Proposal:  # fmt: skip
     """A scan of what lies open of `body`, with lines `step` m apart.
 
     `reachable` says what keeps the arm from the poses of a job's sweeps, None when nothing does; `tell` is told how far

@@ -113,12 +113,9 @@ class Decision:
 
 
 def decide(
-    series: Sequence[Series],
-    boards: dict[int, list[pin.SE3]],
-    pitch: float,
-    wanted: str | None = None,
+    series: Sequence[Series], boards: dict[int, list[pin.SE3]], pitch: float, wanted: str | None = None,
     setup: str | None = None,
-) -> Decision:
+) -> Decision:  # fmt: skip
     """The reading of the series that agrees with the boards that frames (by index) saw, in each order they allow.
 
     `pitch` of the board in m, as it was named. Raises RefusedError when none does, or when two do that mean different

@@ -165,12 +165,9 @@ def _unsure(best: Solution, pictures: Intrinsics, scale: Scale | None) -> Array:
 
 
 def _plane_known(
-    choice: Choice,
-    stripes: StripesOnBoards,
-    observations: Sequence[ScanObservation],
-    pictures: Intrinsics,
+    choice: Choice, stripes: StripesOnBoards, observations: Sequence[ScanObservation], pictures: Intrinsics,
     unsure: Array,
-) -> PlaneKnown | None:
+) -> PlaneKnown | None:  # fmt: skip
     """How well the light plane is known, None without one."""
     plane = choice.best.adjusted.state.plane
     if plane is None or stripes.plane is None:

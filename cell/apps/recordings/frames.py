@@ -125,12 +125,9 @@ def used(frames: Sequence[RecordedFrame]) -> list[RecordedFrame]:
 
 
 def read_frames(
-    listing: Listing,
-    spec: BoardSpec,
-    links: Sequence[dict[str, str]] = (),
-    laser: LaserChannel | None = LaserChannel.AUTO,
-    quick: bool = False,
-) -> tuple[list[RecordedFrame], ChosenChannel]:
+    listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str]] = (),
+    laser: LaserChannel | None = LaserChannel.AUTO, quick: bool = False,
+) -> tuple[list[RecordedFrame], ChosenChannel]:  # fmt: skip
     """Every picture of a listing, with board and stripe, or refused with a reason; and where the laser was read.
 
     `links` are pictures that a table names together; `laser` None looks for no stripe; a `quick` search for boards is

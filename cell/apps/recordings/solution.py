@@ -153,14 +153,9 @@ def agreeing(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[Recor
 
 
 def solve_frames(
-    frames: Sequence[RecordedFrame],
-    cameras: Cameras,
-    result: RecordedResult,
-    *,
-    setup: str = "eye_in_hand",
-    given: CameraModel | None = None,
-    hold_camera: bool = False,
-) -> None:
+    frames: Sequence[RecordedFrame], cameras: Cameras, result: RecordedResult, *, setup: str = "eye_in_hand",
+    given: CameraModel | None = None, hold_camera: bool = False,
+) -> None:  # fmt: skip
     """Put camera, hand-eye, light plane and their checks into the result; a part that fails a check is refused.
 
     `cameras` are those of `camera_of`; `setup` says where the camera is. With `hold_camera` the arm has no say in

@@ -160,14 +160,9 @@ class CellCalibration:
 
     @classmethod
     def solve(
-        cls,
-        scan: list[ScanObservation],
-        target: list[TargetObservation],
-        identities: dict[str, str],
-        config: CellConfig,
-        kinematics: str = "",
-        witness: PlateLine | None = None,
-    ) -> CellCalibration:
+        cls, scan: list[ScanObservation], target: list[TargetObservation], identities: dict[str, str],
+        config: CellConfig, kinematics: str = "", witness: PlateLine | None = None,
+    ) -> CellCalibration:  # fmt: skip
         """From the observations; raises `RefusedError` when they do not determine it."""
         return solve_observations(gathered(scan, target, identities, config, kinematics, witness=witness)).calibration
 
@@ -264,13 +259,9 @@ class Solved:
 
 
 def gathered(
-    scan: list[ScanObservation],
-    target: list[TargetObservation],
-    identities: dict[str, str],
-    config: CellConfig,
-    kinematics: str = "",
-    witness: PlateLine | None = None,
-) -> Observations:
+    scan: list[ScanObservation], target: list[TargetObservation], identities: dict[str, str], config: CellConfig,
+    kinematics: str = "", witness: PlateLine | None = None,
+) -> Observations:  # fmt: skip
     """The observations with all else that their solution depends on, as of now."""
     priors = Priors(
         arm_translation=config.arm.repeatability,

@@ -28,13 +28,9 @@ class VirtualCell(DirectCell):
     """The cell of one seed and level, and its devices behind the gate as the product takes them."""
 
     def __init__(
-        self,
-        config: CellConfig,
-        seed: int,
-        level: str = "nominal",
-        described: Described | None = None,
+        self, config: CellConfig, seed: int, level: str = "nominal", described: Described | None = None,
         truth: CellConfig | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """As configuration and job describe it; without one the job is `pot`.
 
         With `truth` the world is the cell of that configuration, and the product works on it with `config`.

@@ -168,13 +168,9 @@ class DeviceFollowing:
     """The real devices `followed` of a cell, told to the world that has the devices `simulated`."""
 
     def __init__(
-        self,
-        link: WorldLink,
-        devices: Devices,
-        config: CellConfig,
-        followed: Collection[str],
+        self, link: WorldLink, devices: Devices, config: CellConfig, followed: Collection[str],
         simulated: tuple[str, ...],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Begin. Raises `DeviceFault` when the world does not answer, or when readings reach it too late."""
         self.simulated = simulated
         self._link, self._devices, self._clock = link, devices, devices.clock

@@ -189,15 +189,9 @@ class MixedCell:
     """Opened: `config` with the simulated devices' addresses, the `lock` that is held, `devices`, the `world`."""
 
     def __init__(
-        self,
-        undo: ExitStack,
-        config: CellConfig,
-        job: str | Path,
-        seed: int,
-        level: str,
-        simulated: tuple[str, ...],
+        self, undo: ExitStack, config: CellConfig, job: str | Path, seed: int, level: str, simulated: tuple[str, ...],
         needed: Collection[str],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Simulate these of the `needed` devices and connect the others; what is to be undone goes to `undo`.
 
         Raises `ConfigError` for a mix that physics does not allow, else as `connect` and `DeviceFollowing`.

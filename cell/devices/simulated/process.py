@@ -190,18 +190,10 @@ class SimulatedCell:
     """
 
     def __init__(
-        self,
-        config: CellConfig,
-        described: Described,
-        *,
-        seed: int,
-        level: str,
-        speed: float,
-        gige: Collection[str] = (),
-        simulated: tuple[str, ...] = tuple(DEVICES),
-        follow: Collection[str] = (),
+        self, config: CellConfig, described: Described, *, seed: int, level: str, speed: float,
+        gige: Collection[str] = (), simulated: tuple[str, ...] = tuple(DEVICES), follow: Collection[str] = (),
         meanwhile: Callable[[], None] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Serve the cell as configuration and job describe it; `ConfigError` for what cannot be simulated so.
 
         `meanwhile` is done while the world starts, which takes as long, and waited for. Not by this thread: a signal

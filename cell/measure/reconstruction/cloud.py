@@ -224,12 +224,9 @@ def _points(cloud: Cloud, lines: slice) -> tuple[Indices, Indices]:
 
 
 def _seam(
-    cloud: Cloud,
-    pair: tuple[int, int],
-    parts: list[tuple[Indices, Indices]],
-    tree: scipy.spatial.cKDTree,
+    cloud: Cloud, pair: tuple[int, int], parts: list[tuple[Indices, Indices]], tree: scipy.spatial.cKDTree,
     motions: Motions,
-) -> Seam | None:
+) -> Seam | None:  # fmt: skip
     (lines_a, rows_a), (lines_b, rows_b) = parts[pair[0]], parts[pair[1]]
     near = tree.query(cloud.points[lines_b, rows_b], k=1, distance_upper_bound=REACH)[0] < REACH
     lines_b, rows_b = lines_b[near], rows_b[near]

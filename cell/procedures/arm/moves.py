@@ -80,15 +80,9 @@ class Mover:
     """
 
     def __init__(
-        self,
-        arm: Arm,
-        clock: Clock,
-        config: CellConfig,
-        job: Job | None,
-        hold: Callable[[], None] = lambda: None,
-        interlocks: Interlocks | None = None,
-        pace: Pace | None = None,
-    ) -> None:
+        self, arm: Arm, clock: Clock, config: CellConfig, job: Job | None, hold: Callable[[], None] = lambda: None,
+        interlocks: Interlocks | None = None, pace: Pace | None = None,
+    ) -> None:  # fmt: skip
         self.hold = hold
         self.pace = pace or Pace()
         self._arm = arm

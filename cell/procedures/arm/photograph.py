@@ -63,16 +63,10 @@ class BoardFix:
 
 
 def photograph(
-    arm: Arm,
-    camera: Camera,
-    calibration: TargetCalibration,
-    spec: BoardSpec,
-    limits: PhotoSection,
-    repeatability: Vector,
-    count: int = 1,
-    keep: Callable[[Frame], None] = lambda frame: None,
+    arm: Arm, camera: Camera, calibration: TargetCalibration, spec: BoardSpec, limits: PhotoSection,
+    repeatability: Vector, count: int = 1, keep: Callable[[Frame], None] = lambda frame: None,
     pause: Callable[[], None] = lambda: None,
-) -> BoardFix:
+) -> BoardFix:  # fmt: skip
     """Photograph the board `count` times with arm and vehicle at rest and average its pose.
 
     `repeatability` is the (6, 6) covariance of base_from_flange; `keep` is given each frame before it is looked at;
@@ -315,12 +309,9 @@ def verification_views(
 
 
 def rail_ends(
-    scan: ScanCalibration,
-    base_from_board: pin.SE3,
-    view: CalibrationView,
-    board: BoardSpec,
+    scan: ScanCalibration, base_from_board: pin.SE3, view: CalibrationView, board: BoardSpec,
     travel: tuple[float, float],
-) -> tuple[float, float]:
+) -> tuple[float, float]:  # fmt: skip
     """The rail positions farthest either way of a view at which the picture shows the rings and half of the dots.
 
     Raises `RefusedError` when they are less than `LEAST_WAY` apart.

@@ -49,14 +49,9 @@ MOST_MOVED_M = 1e-4
 
 
 def collect_timing(
-    config: CellConfig,
-    devices: Devices,
-    mover: Mover,
-    calibration: CellCalibration,
-    check: Check,
-    progress: Progress,
-    keep: Keep,
-) -> StampTiming:
+    config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, check: Check,
+    progress: Progress, keep: Keep,
+) -> StampTiming:  # fmt: skip
     """Sweep over the fine board to and fro, fast and slowly, and say how late the stamps are.
 
     Raises what `find_timing` raises, and `RefusedError` when the board is not seen.
@@ -104,14 +99,9 @@ def look_at_shutter(
 
 
 def _sweeps(
-    config: CellConfig,
-    devices: Devices,
-    mover: Mover,
-    calibration: CellCalibration,
-    pairs: Sequence[tuple[float, float]],
-    tell: Callable[[int, int], None],
-    keep: Keep,
-) -> tuple[pin.SE3, list[TimedSweep]]:
+    config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration,
+    pairs: Sequence[tuple[float, float]], tell: Callable[[int, int], None], keep: Keep,
+) -> tuple[pin.SE3, list[TimedSweep]]:  # fmt: skip
     """Where the flange stood, and sweeps to and fro for each of `pairs` of speed in m/s and exposure in s.
 
     `tell` is given each sweep's number and how many there are.

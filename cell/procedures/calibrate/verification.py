@@ -175,14 +175,9 @@ MAX_SHIFT = 0.15e-3
 
 
 def collect_verification(
-    config: CellConfig,
-    devices: Devices,
-    mover: Mover,
-    calibration: CellCalibration,
-    check: Check,
-    progress: Progress,
-    keep: Keep,
-) -> CheckObservations:
+    config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, check: Check,
+    progress: Progress, keep: Keep,
+) -> CheckObservations:  # fmt: skip
     """Take all pictures; each goes to `keep`.
 
     Raises `RefusedError` when a board or the laser's witness is not seen, `CalibrationStale` without a reference.
@@ -240,15 +235,9 @@ def _photographs(
 
 
 def _sweep(
-    config: CellConfig,
-    devices: Devices,
-    mover: Mover,
-    geometry: ScanGeometry,
-    view: CalibrationView,
-    ends: tuple[float, float],
-    progress: Callable[[float, str], None],
-    keep_frame: Callable[[Frame], None],
-) -> list[ScanObservation]:
+    config: CellConfig, devices: Devices, mover: Mover, geometry: ScanGeometry, view: CalibrationView,
+    ends: tuple[float, float], progress: Callable[[float, str], None], keep_frame: Callable[[Frame], None],
+) -> list[ScanObservation]:  # fmt: skip
     """To the view and over the board's plate from end to end."""
     length, exposure = f"{1e3 * (ends[1] - ends[0])} mm", f"{1e3 * config.calibration.stripe_exposure} ms"
     section = ScanSection.model_validate({

@@ -213,13 +213,9 @@ def _configured_noise(config: CellConfig) -> dict[str, object]:
 
 
 def _add_truth(
-    report: dict[str, Any],
-    job: Job,
-    nominal: NominalSurface,
-    repeatability: Vector,
-    result: RunResult,
+    report: dict[str, Any], job: Job, nominal: NominalSurface, repeatability: Vector, result: RunResult,
     witness: TruthRecorder,
-) -> None:
+) -> None:  # fmt: skip
     """The comparison with the simulated world; raises when that does not answer any more."""
     now = witness.ask()
     report["assumed_noise"]["sigmas"] = now["assumed_noise"]
@@ -281,14 +277,9 @@ def place_error(job: Job, nominal: NominalSurface, truth: dict[str, object]) -> 
 
 
 def expected_error(
-    job: Job,
-    nominal: NominalSurface,
-    pose: PlacePose,
-    base_from_sweep_flange: pin.SE3,
-    sweeps: int,
-    configured: Vector,
-    truth: dict[str, Any],
-) -> float:
+    job: Job, nominal: NominalSurface, pose: PlacePose, base_from_sweep_flange: pin.SE3, sweeps: int,
+    configured: Vector, truth: dict[str, Any],
+) -> float:  # fmt: skip
     """Mean D in mm over the 45 points to expect from the world's assumed noise.
 
     Stripe, rail and calibration as the pose's covariance states them; the arm's repeatability, once for each of the

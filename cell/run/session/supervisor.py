@@ -73,19 +73,10 @@ class Cell:
 
     @classmethod
     def open(
-        cls,
-        config: str | Path | None = None,
-        *,
-        sim: Sim = None,
-        seed: int = 1,
-        level: str = "nominal",
-        speed: float | None = None,
-        job: str | Path = "pot",
-        confirm: Confirm | None = None,
-        only: Collection[str] = tuple(DEVICES),
-        clock: str = "wall",
-        truth: str | Path | None = None,
-    ) -> Cell:
+        cls, config: str | Path | None = None, *, sim: Sim = None, seed: int = 1, level: str = "nominal",
+        speed: float | None = None, job: str | Path = "pot", confirm: Confirm | None = None,
+        only: Collection[str] = tuple(DEVICES), clock: str = "wall", truth: str | Path | None = None,
+    ) -> Cell:  # fmt: skip
         """Connect to the cell's devices and hold them; or start a simulated cell and hold that.
 
         Args:
@@ -270,26 +261,16 @@ class Cell:
         return self._runs.begin(kind, work, observer, stops)
 
     def perform(
-        self,
-        kind: str,
-        work: Callable[[Hands], Made],
-        observer: Observer | None = None,
-        info: Mapping[str, object] | None = None,
-        stops: int | None = None,
-    ) -> Made:
+        self, kind: str, work: Callable[[Hands], Made], observer: Observer | None = None,
+        info: Mapping[str, object] | None = None, stops: int | None = None,
+    ) -> Made:  # fmt: skip
         """Do work outside a job, such as a jog, as a recorded run, and wait for its end. `stops` as in `begin`."""
         return self.begin(kind, lambda run: self._here.recorded(run, kind, work, info), observer, stops).result()
 
     def run(
-        self,
-        job: str | Path = "pot",
-        observer: Observer | None = None,
-        inject: Sequence[str] = (),
-        *,
-        at_start: bool = False,
-        until: str | None = None,
-        script: Script = NO_SCRIPT,
-    ) -> RunOutcome:
+        self, job: str | Path = "pot", observer: Observer | None = None, inject: Sequence[str] = (), *,
+        at_start: bool = False, until: str | None = None, script: Script = NO_SCRIPT,
+    ) -> RunOutcome:  # fmt: skip
         """`start` a job, with the same arguments, and wait for its end.
 
         Returns:
@@ -301,15 +282,9 @@ class Cell:
         return self.start(job, observer, inject, at_start=at_start, until=until, script=script).result()
 
     def start(
-        self,
-        job: str | Path = "pot",
-        observer: Observer | None = None,
-        inject: Sequence[str] = (),
-        *,
-        at_start: bool = False,
-        until: str | None = None,
-        script: Script = NO_SCRIPT,
-    ) -> Run[RunOutcome]:
+        self, job: str | Path = "pot", observer: Observer | None = None, inject: Sequence[str] = (), *,
+        at_start: bool = False, until: str | None = None, script: Script = NO_SCRIPT,
+    ) -> Run[RunOutcome]:  # fmt: skip
         """Begin a job. A simulated cell is set up for it and its claw filled, and calibrated first if need be.
 
         Args:
@@ -339,13 +314,9 @@ class Cell:
         return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
 
     def resume(
-        self,
-        run: str | Path | None = None,
-        observer: Observer | None = None,
-        *,
-        at_start: bool = False,
+        self, run: str | Path | None = None, observer: Observer | None = None, *, at_start: bool = False,
         script: Script = NO_SCRIPT,
-    ) -> RunOutcome:
+    ) -> RunOutcome:  # fmt: skip
         """Do the job of a run that was aborted, faulted or cut short, as a new run, and wait for its end.
 
         The vehicle stays where it stands if it sees the board from there, and what was swept is not swept again if

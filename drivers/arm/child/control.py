@@ -31,13 +31,9 @@ class ControlThread:
     """Carries out requests on an `RTDEControlInterface`, or refuses them with the arm's problem when there is none."""
 
     def __init__(
-        self,
-        setup: ChildSetup,
-        control: RTDEControlInterface,
-        latest: Callable[[], Snapshot],
-        send: Callable[[ChildReply | Ended], None],
-        lose: Callable[[str], None],
-    ) -> None:
+        self, setup: ChildSetup, control: RTDEControlInterface, latest: Callable[[], Snapshot],
+        send: Callable[[ChildReply | Ended], None], lose: Callable[[str], None],
+    ) -> None:  # fmt: skip
         self._control = control
         self._send = send
         self._lose = lose

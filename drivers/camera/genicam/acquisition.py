@@ -181,14 +181,9 @@ class Acquisition:
     """
 
     def __init__(
-        self,
-        device: GenicamDevice,
-        network: Network | None,
-        buffers: int,
-        take: Callable[[AcquiredPicture], None],
-        failed: Callable[[], None],
-        statistics: LinkStatistics,
-    ) -> None:
+        self, device: GenicamDevice, network: Network | None, buffers: int, take: Callable[[AcquiredPicture], None],
+        failed: Callable[[], None], statistics: LinkStatistics,
+    ) -> None:  # fmt: skip
         self.failure: CellError | None = None
         self.incomplete = 0
         self._device = device

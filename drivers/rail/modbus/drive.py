@@ -189,16 +189,9 @@ class DriveArrival:
     """
 
     def __init__(
-        self,
-        drive: ModbusDrive,
-        clock: Clock,
-        *,
-        target: int,
-        near: int,
-        issued: int,
-        samples: Samples,
+        self, drive: ModbusDrive, clock: Clock, *, target: int, near: int, issued: int, samples: Samples,
         zero: DriveZero | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._drive = drive
         self._target = target
         self._near = near

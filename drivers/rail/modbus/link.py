@@ -188,18 +188,9 @@ class ModbusLink:
     """
 
     def __init__(
-        self,
-        name: str,
-        url: str,
-        *,
-        unit: int,
-        baud: int,
-        parity: str,
-        stop_bits: int,
-        stop_action: Action,
-        clock: Clock,
-        statistics: LinkStatistics,
-    ) -> None:
+        self, name: str, url: str, *, unit: int, baud: int, parity: str, stop_bits: int, stop_action: Action,
+        clock: Clock, statistics: LinkStatistics,
+    ) -> None:  # fmt: skip
         self.name = name
         self.url = url
         self._unit = unit

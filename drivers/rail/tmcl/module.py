@@ -274,16 +274,9 @@ class ArrivalWatch:
     """
 
     def __init__(
-        self,
-        link: TmclLink,
-        clock: Clock,
-        *,
-        target: int,
-        counts: float,
-        issued: int,
-        samples: Samples,
+        self, link: TmclLink, clock: Clock, *, target: int, counts: float, issued: int, samples: Samples,
         zero: ZeroMark | None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._link = link
         self._target = target
         self._counts = counts

@@ -49,24 +49,10 @@ class TmclRail(RailAxis):
     """
 
     def __init__(
-        self,
-        name: str,
-        url: str,
-        *,
-        lead: float,
-        steps_per_turn: int,
-        microsteps: int,
-        travel: tuple[float, float],
-        max_speed: float,
-        acceleration: float,
-        address: int = 1,
-        motor: int = 0,
-        clock: Clock,
-        baud: int = 9600,
-        reference_mode: int = 5,
-        reversed: bool = False,
-        control: bool = True,
-    ) -> None:
+        self, name: str, url: str, *, lead: float, steps_per_turn: int, microsteps: int, travel: tuple[float, float],
+        max_speed: float, acceleration: float, address: int = 1, motor: int = 0, clock: Clock, baud: int = 9600,
+        reference_mode: int = 5, reversed: bool = False, control: bool = True,
+    ) -> None:  # fmt: skip
         for what, value in {"lead": lead, "steps per turn": steps_per_turn}.items():
             if not value > 0:
                 raise ConfigError(f"{name}: {what} {value} must be greater than 0. Correct it in the configuration")

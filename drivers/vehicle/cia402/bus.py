@@ -124,21 +124,10 @@ class CanopenBus:
     """
 
     def __init__(
-        self,
-        name: str,
-        interface: str,
-        channel: str,
-        *,
-        bitrate: int,
-        options: Mapping[str, object],
-        own: int,
-        nodes: tuple[int, int],
-        take: Callable[[int, int, bytes], None],
-        other: Callable[[str], None],
-        idle: Callable[[float], None],
-        statistics: LinkStatistics,
-        alone: str,
-    ) -> None:
+        self, name: str, interface: str, channel: str, *, bitrate: int, options: Mapping[str, object], own: int,
+        nodes: tuple[int, int], take: Callable[[int, int, bytes], None], other: Callable[[str], None],
+        idle: Callable[[float], None], statistics: LinkStatistics, alone: str,
+    ) -> None:  # fmt: skip
         self.name = name
         self._own = own
         self._nodes = nodes

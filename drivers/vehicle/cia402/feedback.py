@@ -162,15 +162,9 @@ class DriveFeedback:
     """Both drives and the way of their wheels; `take` is called by the receive thread."""
 
     def __init__(
-        self,
-        name: str,
-        clock: Clock,
-        wheels: WheelDrives,
-        *,
-        max_speed: float,
-        max_yaw_rate: float,
+        self, name: str, clock: Clock, wheels: WheelDrives, *, max_speed: float, max_yaw_rate: float,
         statistics: LinkStatistics,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._name = name
         self._clock = clock
         self._wheels = wheels

@@ -95,15 +95,9 @@ class Master:
     """
 
     def __init__(
-        self,
-        name: str,
-        open_bus: Callable[[], CanopenBus],
-        feedback: DriveFeedback,
-        wheels: WheelDrives,
-        watchdog: Watchdog,
-        clock: Clock,
-        statistics: LinkStatistics,
-    ) -> None:
+        self, name: str, open_bus: Callable[[], CanopenBus], feedback: DriveFeedback, wheels: WheelDrives,
+        watchdog: Watchdog, clock: Clock, statistics: LinkStatistics,
+    ) -> None:  # fmt: skip
         self._name = name
         self._open = open_bus
         self._feedback, self._wheels, self._watchdog = feedback, wheels, watchdog

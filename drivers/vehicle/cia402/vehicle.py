@@ -27,14 +27,9 @@ from drivers.vehicle.health import MOST_LOAD, bus_readings, can_interface, most_
 
 
 def readings(
-    heard: Sequence[can.Message],
-    seconds: float,
-    bitrate: int,
-    others: int,
-    drives: Sequence[SideDrive],
-    system_name: str | None,
-    judged: bool,
-) -> list[Reading]:
+    heard: Sequence[can.Message], seconds: float, bitrate: int, others: int, drives: Sequence[SideDrive],
+    system_name: str | None, judged: bool,
+) -> list[Reading]:  # fmt: skip
     """Figures of what was heard in `seconds` of the clock; `others` frames by which somebody else commanded.
 
     Without `judged`, on a clock that is not the wall's, the load has no limit. `system_name` is the computer's CAN
@@ -75,20 +70,10 @@ class CanopenVehicle:
     """
 
     def __init__(
-        self,
-        name: str,
-        interface: str,
-        channel: str,
-        *,
-        wheels: WheelDrives,
-        watchdog: Watchdog,
-        max_speed: float,
-        max_yaw_rate: float,
-        clock: Clock,
-        bitrate: int = 500_000,
-        look: bool = False,
+        self, name: str, interface: str, channel: str, *, wheels: WheelDrives, watchdog: Watchdog, max_speed: float,
+        max_yaw_rate: float, clock: Clock, bitrate: int = 500_000, look: bool = False,
         bus_options: Mapping[str, object] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.name = name
         self.statistics = LinkStatistics()
         self._address = f"{interface}:{channel}"

@@ -127,13 +127,9 @@ def _window(spec: RigSpec, head: TrueHead, centre: Array, reach: float) -> Array
 
 
 def _scan(
-    spec: RigSpec,
-    head: TrueHead,
-    geometry: ScanGeometry,
-    objects: list[tuple[pin.SE3, Mesh | None]],
-    readings: Array,
-    rng: np.random.Generator,
-) -> Cloud:
+    spec: RigSpec, head: TrueHead, geometry: ScanGeometry, objects: list[tuple[pin.SE3, Mesh | None]],
+    readings: Array, rng: np.random.Generator,
+) -> Cloud:  # fmt: skip
     builder, stripes = ProfileBuilder(geometry, len(readings)), StripeStream()
     for reading in readings:
         scene: list[SceneObject] = []

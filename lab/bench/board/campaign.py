@@ -133,12 +133,9 @@ def _pitch_px(view: View) -> float:
 
 
 def campaign(
-    views: int,
-    seed: int,
-    kinds: Sequence[Kind] = KINDS,
-    conditions: Sequence[Condition] = CONDITIONS,
+    views: int, seed: int, kinds: Sequence[Kind] = KINDS, conditions: Sequence[Condition] = CONDITIONS,
     progress: Callable[[str], None] = lambda _: None,
-) -> dict[str, Any]:
+) -> dict[str, Any]:  # fmt: skip
     """The report over `views` random views for each kind and condition; the same seed gives the same pictures."""
     rows, by_kind = [], {kind: Tally() for kind in kinds}
     for number, condition in enumerate(conditions):

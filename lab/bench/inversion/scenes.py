@@ -192,12 +192,9 @@ SETTINGS = {
 
 
 def scan(
-    part: Part,
-    rng: np.random.Generator,
-    setting: Setting | None = None,
-    *,
+    part: Part, rng: np.random.Generator, setting: Setting | None = None, *,
     height: Callable[[Array, Array], Array] | None = None,
-) -> Cloud:
+) -> Cloud:  # fmt: skip
     """A cloud of `part` and the table around it, arm base; `height` is another surface that lies in its place."""
     setting = setting or Setting()
     reach_x, reach_y = (0.024, 0.024) if part.round else (0.038, 0.021)

@@ -84,16 +84,9 @@ class JobRecord:
 
 
 def run_whole_job(
-    config: CellConfig,
-    job: Job,
-    nominal: NominalSurface,
-    seed: int,
-    level: str,
-    progress: Progress | None = None,
-    calibrated: JobRecord | None = None,
-    stood: float = 0.0,
-    runs: Path | None = None,
-) -> JobRecord:
+    config: CellConfig, job: Job, nominal: NominalSurface, seed: int, level: str, progress: Progress | None = None,
+    calibrated: JobRecord | None = None, stood: float = 0.0, runs: Path | None = None,
+) -> JobRecord:  # fmt: skip
     """Calibrate the cell of `seed` and `level`, then do the job; raises nothing that the product names.
 
     `calibrated` is a record of the same cell, whose calibration is used again. The cell stands idle for `stood` s

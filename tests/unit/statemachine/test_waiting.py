@@ -36,12 +36,9 @@ def cell() -> VirtualCell:
 
 
 def run_step(
-    cell: VirtualCell,
-    folder: Path,
-    first: StepCall,
-    control: RunControl | None = None,
+    cell: VirtualCell, folder: Path, first: StepCall, control: RunControl | None = None,
     stop: Callable[[], object] = list,
-) -> RunResult:
+) -> RunResult:  # fmt: skip
     """Run a job whose first step is `first`, which has two seconds, and whose second one does nothing."""
     journal = Journal(folder, "here")
     try:

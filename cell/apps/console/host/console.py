@@ -96,13 +96,9 @@ class Console:
     """
 
     def __init__(
-        self,
-        cell: Cell,
-        job: str = "pot",
-        address: Address | None = None,
-        told: Callable[[str], None] = lambda link: None,
-        gone: Callable[[], None] = lambda: None,
-    ) -> None:
+        self, cell: Cell, job: str = "pot", address: Address | None = None,
+        told: Callable[[str], None] = lambda link: None, gone: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
         address = address or Address()
         token = address.checked()
         self.link, self._cell = "", cell

@@ -45,12 +45,9 @@ class ConsoleController:
     """One cell's desk. `say(client, message)` sends something to one page, `began(run, job)` hears of each run."""
 
     def __init__(
-        self,
-        cell: Cell,
-        job: str,
-        say: Callable[[str, dict[str, object]], None],
+        self, cell: Cell, job: str, say: Callable[[str, dict[str, object]], None],
         began: Callable[[Run[object], str | None], None] = lambda run, job: None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.cell, self.job = cell, job
         self.questions, self.rehearsals = Questions(), Rehearsals(cell)
         self.holders, self.presses = Holders(self._lost), Presses()

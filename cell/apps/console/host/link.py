@@ -227,13 +227,9 @@ class ServerProcess:
     cell and gives what was not confirmed, `gone` is called once when it has ended by itself."""
 
     def __init__(
-        self,
-        setup: Callable[[int], ServerSetup],
-        bound: socket.socket,
-        heard: Callable[[object], None],
-        stop: Callable[[], str | None],
-        gone: Callable[[], None],
-    ) -> None:
+        self, setup: Callable[[int], ServerSetup], bound: socket.socket, heard: Callable[[object], None],
+        stop: Callable[[], str | None], gone: Callable[[], None],
+    ) -> None:  # fmt: skip
         """Start it; `CellError` when it does not answer."""
         self._heard, self._stop, self._gone = heard, stop, gone
         self._outbox = ServerOutbox()

@@ -333,13 +333,9 @@ def changes(chain: str, state: AdjustmentState) -> list[Change]:
 
 
 def detectable(
-    evidences: Mapping[str, DriftEvidence],
-    states: Mapping[str, AdjustmentState],
-    tests: Sequence[tuple[str, Hypothesis]],
-    scores: Mapping[str, Array],
-    factors: Array,
-    threshold: float,
-) -> list[Detectable]:
+    evidences: Mapping[str, DriftEvidence], states: Mapping[str, AdjustmentState],
+    tests: Sequence[tuple[str, Hypothesis]], scores: Mapping[str, Array], factors: Array, threshold: float,
+) -> list[Detectable]:  # fmt: skip
     """For every kind of change of every chain.
 
     `scores` (n, 27) by chain are drawn for a good calibration, `factors` (n, tests) their logarithms of the Bayes

@@ -233,13 +233,9 @@ def read_edge(data: dict[str, Any] | None) -> Edge | None:
 
 
 def pointing(
-    before: PlateLine,
-    now: PlateLine,
-    camera: CameraModel,
-    plane: LightPlane,
-    exit_point: Array,
+    before: PlateLine, now: PlateLine, camera: CameraModel, plane: LightPlane, exit_point: Array,
     confirmed: ConfirmedTurn | None = None,
-) -> Pointing:
+) -> Pointing:  # fmt: skip
     """What a job reckons with: `turn_seen`, refused with `RefusedError` where no warmth takes the line.
 
     With a turn that was `confirmed`, the plate is held against what it told then, or against the calibration, whichever

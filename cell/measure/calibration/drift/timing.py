@@ -185,13 +185,9 @@ def roughly_late(scan: ScanCalibration, base_from_flange: pin.SE3, sweeps: Seque
 
 
 def find_timing(
-    scan: ScanCalibration,
-    base_from_flange: pin.SE3,
-    sweeps: Sequence[TimedSweep],
-    most_late: float,
-    lead: float,
+    scan: ScanCalibration, base_from_flange: pin.SE3, sweeps: Sequence[TimedSweep], most_late: float, lead: float,
     link: dict[str, str],
-) -> StampTiming:
+) -> StampTiming:  # fmt: skip
     """From sweeps at two speeds and two exposures, to and fro, the arm standing at `base_from_flange`.
 
     The rail's screw moves the carriage by `lead` m a turn; camera and rail are set up as `link` says.

@@ -80,12 +80,9 @@ class Joint:
 
 
 def solve_staged(
-    observations: Sequence[ScanObservation],
-    nominal: CameraModel | None = None,
-    rail_direction: Array | None = None,
-    stripe: bool = True,
-    camera: CameraModel | None = None,
-) -> Staged:
+    observations: Sequence[ScanObservation], nominal: CameraModel | None = None, rail_direction: Array | None = None,
+    stripe: bool = True, camera: CameraModel | None = None,
+) -> Staged:  # fmt: skip
     """Camera, then hand-eye, then light plane, each from the result before. All observations need a view.
 
     A `camera` that is known already is not estimated again.

@@ -292,13 +292,9 @@ def adjust_target(observations: Sequence[TargetObservation], nominal: CameraMode
 
 
 def _solve(
-    observations: Sequence[ScanObservation],
-    staged: Staged,
-    priors: Priors,
-    camera: str,
-    board: str,
+    observations: Sequence[ScanObservation], staged: Staged, priors: Priors, camera: str, board: str,
     nominal: CameraModel,
-) -> Joint:
+) -> Joint:  # fmt: skip
     """The joint adjustment, after and before the checks for faults that have a name, and the absolute ones."""
     rests = [o for o in observations if not o.same_rest]
     names = [o.name for o in rests]

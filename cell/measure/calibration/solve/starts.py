@@ -382,12 +382,9 @@ def refine_hand_eye(
 
 
 def _scatter(
-    base_from_flange: Sequence[pin.SE3],
-    camera_from_board: Sequence[pin.SE3],
-    rail: Array,
-    flange_from_camera: pin.SE3,
-    direction: Array,
-) -> HandEye:
+    base_from_flange: Sequence[pin.SE3], camera_from_board: Sequence[pin.SE3], rail: Array,
+    flange_from_camera: pin.SE3, direction: Array,
+) -> HandEye:  # fmt: skip
     boards = [
         f * flange_from_camera * from_parts(s * direction) * c
         for f, c, s in zip(base_from_flange, camera_from_board, rail, strict=True)

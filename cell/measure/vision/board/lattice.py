@@ -132,12 +132,9 @@ def lattices(
 
 
 def grow(
-    centres: Array,
-    tree: scipy.spatial.cKDTree,
-    seed: int,
-    basis: tuple[Array, Array],
+    centres: Array, tree: scipy.spatial.cKDTree, seed: int, basis: tuple[Array, Array],
     alike: Callable[[int, int], bool],
-) -> dict[tuple[int, int], int]:
+) -> dict[tuple[int, int], int]:  # fmt: skip
     """Place → point, from the seed outwards; each hands its own local steps to its neighbours.
 
     `alike(a, b)` says whether b can be a neighbour of a.

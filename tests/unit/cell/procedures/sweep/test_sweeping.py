@@ -56,13 +56,9 @@ def ready(made: VirtualCell | None) -> tuple[VirtualCell, Mover, pin.SE3]:
 
 
 def sweep(
-    meddle: Meddle = nothing,
-    late: float = 0.0,
-    camera_late: float = 0.0,
-    errors: SweepErrors = ERRORS,
-    made: VirtualCell | None = None,
-    scan: ScanSection = SCAN,
-) -> Swath:
+    meddle: Meddle = nothing, late: float = 0.0, camera_late: float = 0.0, errors: SweepErrors = ERRORS,
+    made: VirtualCell | None = None, scan: ScanSection = SCAN,
+) -> Swath:  # fmt: skip
     """Sweep 20 mm, at 20 mm/s if not told otherwise; half-way `meddle` is called once.
 
     Replies of rail and camera come so many s late.

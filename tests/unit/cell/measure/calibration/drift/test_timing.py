@@ -57,14 +57,9 @@ def calibration() -> ScanCalibration:
 
 
 def sweeps(
-    seed: int,
-    late: float,
-    play: float = 12e-6,
-    readout: float = 0.0,
-    by_exposure: float = 0.0,
-    jitter: float = 0.25e-3,
-    bound: float = 0.25e-3,
-) -> list[TimedSweep]:
+    seed: int, late: float, play: float = 12e-6, readout: float = 0.0, by_exposure: float = 0.0,
+    jitter: float = 0.25e-3, bound: float = 0.25e-3,
+) -> list[TimedSweep]:  # fmt: skip
     """Sixteen of them, as the cell makes them, of clocks that are known to ±`bound` s; each sweep's are off by anything
     up to ±`jitter` s.
     """
