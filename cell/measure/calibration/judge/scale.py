@@ -26,6 +26,8 @@ UNIT_SHARE = 0.2
 LEAST_FRAMES = 5
 DOUBT, REFUSE = 1.0, 5.0
 DOUBT_SIGMAS, REFUSE_SIGMAS, UNSURE_SIGMAS = 3.0, 5.0, 2.0
+NAMED_SHARE = 1e-3
+"""One standard deviation of a board's size beside its name: paper swells, printers scale."""
 EXPLAINS, CLEARLY = 0.5, 0.7
 """Shares of the squared residuals from which a scale is believed, and from which it refuses by itself."""
 INDEPENDENT = (
@@ -63,9 +65,12 @@ class Scale:
     def unsure(self) -> float:
         """Share of what a free scale would move that the hand-eye is not known to: all where it is believed.
 
-        Else as much as it is beyond chance: a board that is off by a few per mille never explains most of the rest.
+        Else as much as it is beyond chance, and as a board may be off its name where the pictures do not tell better: a
+        few per mille never explain most of what is left.
         """
-        return 1.0 if self.believed else min(1.0, abs(self.value - 1) / max(UNSURE_SIGMAS * self.sigma, 1e-12))
+        off = abs(self.value - 1)
+        beyond = min(1.0, off / max(UNSURE_SIGMAS * self.sigma, 1e-12))
+        return 1.0 if self.believed else math.hypot(beyond, min(self.sigma, NAMED_SHARE) / max(off, 1e-12))
 
     def with_focal(self, share: float) -> Scale:
         """The same for a focal length that is known to `share` of itself: the boards' distances follow it."""

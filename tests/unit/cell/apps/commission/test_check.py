@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.apps.commission.check import Progress, Result
+from cell.apps.commission.check import VERSION, Progress, Result
 from cell.apps.commission.sequence import CHECKS
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
@@ -26,8 +26,11 @@ def test_a_figure_outside_its_limits_and_a_demand_that_is_not_met_make_a_check_w
     assert (other.verdict, other.as_dict()["notes"]) == ("wrong", ["claw shows the part: 0, allowed ≥ 1."])
 
 
-def test_a_file_that_is_no_record_is_not_overwritten(tmp_path: Path) -> None:
-    (tmp_path / "progress.json").write_text('{"version": 99}')
+@pytest.mark.parametrize(
+    "text", ['{"version": 99}', '{"version": V}', "[]", '{"version": V, "results": {"links": {}}, "mended": []}']
+)
+def test_a_file_that_is_no_record_is_not_overwritten(tmp_path: Path, text: str) -> None:
+    (tmp_path / "progress.json").write_text(text.replace("V", str(VERSION)))
     with pytest.raises(ConfigError, match="no record of a commissioning"):
         Progress(tmp_path, {"name": "x"}, load_job("pot")[0])
 

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 
 from cell.apps.new_job.mesh_file import read_drawing
+from drivers.errors import ConfigError
 
 
 def step_of(box: trimesh.Trimesh, unit: str) -> str:
@@ -89,3 +90,14 @@ def test_what_is_wrong_with_a_mesh_is_named_and_put_right(tmp_path: Path) -> Non
         if body.closed:
             made = trimesh.Trimesh(body.vertices, body.triangles, process=False)
             assert made.volume == pytest.approx(1000.0)
+
+
+@pytest.mark.parametrize(
+    ("corner", "far"), [(99, 1.0), (-3, 1.0), (2, 1e200)], ids=["one too many", "one from the end", "far away"]
+)
+def test_a_mesh_with_corners_that_it_cannot_have_is_refused(tmp_path: Path, corner: int, far: float) -> None:
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty double x\nproperty double y\nproperty double z\n"
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "one.ply").write_text(f"{head}0 0 0\n1 0 0\n0 {far} 0\n3 0 1 {corner}\n")
+    with pytest.raises(ConfigError, match="names corners that it does not have"):
+        read_drawing(tmp_path / "one.ply")

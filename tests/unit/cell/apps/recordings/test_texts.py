@@ -58,6 +58,7 @@ LINKS = [
     for k, p in enumerate(POSES)
 ]
 LIST = [{"image": f"frame{k + 3:02d}.png", "robot": p.tolist(), "joints": [0.1] * 6} for k, p in enumerate(POSES)]
+PRINTED = str.maketrans(".-", ",\u2212")
 TEXTS = {
     "wxyz in mm with names": (
         "robot.csv",
@@ -99,6 +100,19 @@ TEXTS = {
         "robot.xml",
         "<stops>" + of_each(lambda k, p: f"<pose_{k} value='{row([*p[:3, 3], *quaternion(p)])}'/>") + "</stops>",
     ),
+    "decimal commas apart by spaces": (
+        "p.txt",
+        of_each(lambda k, p: row([*p[:3, 3], *quaternion(p)]).replace(".", ",")),
+    ),
+    "quoted decimal commas, minus signs of print": (
+        "p.csv",
+        of_each(lambda k, p: ",".join(f'"{v:.9f}"'.translate(PRINTED) for v in (*p[:3, 3], *quaternion(p)))),
+    ),
+    "json with a number before": ("p.json", json.dumps([[k, *p[:3, 3], *angles(p)] for k, p in enumerate(POSES)])),
+    "counted from another number": (
+        "p.txt",
+        "n x y z qx qy qz qw\n" + of_each(lambda k, p: row([k + 2, *p[:3, 3], *quaternion(p)])),
+    ),
     "xml with joints beside": ("robot.xml", f"<stops>{of_each(joints_and_pose)}</stops>"),
     "times before rotation vectors": ("poses.txt", of_each(lambda k, p: row([1.7e9 + 3.7 * k, *p[:3, 3], *angles(p)]))),
     "titles above rotation and position": (
@@ -124,6 +138,10 @@ SPELLINGS = {
     "opencv xml": ("matrix-4x4", "m", "name"),
     "xml with a pose in an attribute": ("xyz+quaternion-xyzw", "m", "name"),
     "xml with joints beside": ("xyz+rpy-rad", "mm", "name"),
+    "decimal commas apart by spaces": ("xyz+quaternion-xyzw", "m", "order"),
+    "quoted decimal commas, minus signs of print": ("xyz+quaternion-xyzw", "m", "order"),
+    "json with a number before": ("xyz+rotvec-rad", "m", "order"),
+    "counted from another number": ("xyz+quaternion-xyzw", "m", "order"),
     "wxyz in mm with names": ("xyz+quaternion-wxyz", "mm", "name"),
     "named columns in another order": ("xyz+quaternion-xyzw", "m", "number"),
     "decimal commas with bom and crlf": ("xyz+abc-deg", "mm", "order"),

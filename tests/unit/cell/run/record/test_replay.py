@@ -14,7 +14,7 @@ import pytest
 from cell.apps.cli import main
 from cell.run.record.replay import FILE as PERCEPTION
 from cell.run.record.replay import replay
-from drivers.errors import ConfigError
+from drivers.errors import CellError, ConfigError
 from lab.bench.job.whole_job import JobRecord
 
 
@@ -72,4 +72,11 @@ def test_a_picture_of_the_record_that_is_not_the_file_is_found(folder: Path, tmp
 
 def test_a_run_that_came_to_no_cloud_says_that_it_cannot_be_replayed(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"holds no perception\.json"):
+        replay(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", '{"format": 1}', '{"format": 1, "photograph": []}', "{"])
+def test_a_file_that_does_not_tell_what_perception_got_is_named(tmp_path: Path, text: str) -> None:
+    (tmp_path / PERCEPTION).write_text(text)
+    with pytest.raises(CellError, match=r"perception\.json cannot be read"):
         replay(tmp_path)
