@@ -232,9 +232,9 @@ def match_series(
     shifted = [
         replace(one, by="order", of=dict(enumerate(one.records)), alone=[])
         for one in series
-        if one.by in ("name", "number") and len(one.records) == len(names) == len(one.of) + 1
+        if one.by in ("name", "number") and len(one.records) == len(names) > len(one.of)
     ]
-    # Counted from 0 and from 1: the numbers fit all but one each, and each picture gets its neighbour's pose.
+    # Counted from 0 and from 1: all numbers but one fit, and each picture would get its neighbour's pose.
     belonging = [s for s in (*series, *shifted) if s.of]
     if below := _others(belonging, listing):
         # The folder's own recording is meant; those in its sub-folders have boards and bases of their own.

@@ -6,13 +6,16 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 import typer
 
-from cell.apps.cli.commands.run import _perform
+from cell.apps.cli.commands.run import _perform, resume
 from cell.run.job_run import RunOutcome
+from drivers.errors import ConfigError
 from statemachine.watch import SignalInterrupt
 
 Opened = Callable[[], AbstractContextManager[Any]]
@@ -62,3 +65,15 @@ def test_an_interrupt_before_there_is_an_outcome_goes_on_to_the_top() -> None:
 
     with pytest.raises(SignalInterrupt):
         _perform(nullcontext, work, False, False)
+
+
+def test_a_dry_run_is_resumed_in_its_own_world(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in world 0."""
+    before = SimpleNamespace(info={"simulated": True, "seed": 0, "clock": "virtual"}, job="pot", folder=tmp_path)
+    opened = Mock(side_effect=ConfigError("seen enough"))
+    monkeypatch.setattr("cell.run.folder.find_run", lambda *_: tmp_path)
+    monkeypatch.setattr("cell.run.resumption.UnfinishedRun.find", lambda folder: before)
+    monkeypatch.setattr("cell.run.session.supervisor.Cell.open", opened)
+    with pytest.raises(ConfigError, match="seen enough"):
+        resume()
+    assert opened.call_args.kwargs["seed"] == 0
