@@ -9,7 +9,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -229,13 +229,7 @@ def match_series(
             linked[others[0]] = shown[0]
     for one in series:
         _match_pictures(one, listing, linked)
-    shifted = [
-        replace(one, by="order", of=dict(enumerate(one.records)), alone=[])
-        for one in series
-        if one.by in ("name", "number") and len(one.records) == len(names) > len(one.of)
-    ]
-    # Counted from 0 and from 1: all numbers but one fit, and each picture would get its neighbour's pose.
-    belonging = [s for s in (*series, *shifted) if s.of]
+    belonging = [s for s in (*series, *_in_order(series, len(names))) if s.of]
     if below := _others(belonging, listing):
         # The folder's own recording is meant; those in its sub-folders have boards and bases of their own.
         listing.pictures = [p for p in listing.pictures if p.parent not in below]
@@ -243,6 +237,16 @@ def match_series(
         return match_series([s for s in series if not any(r.path.parent in below for r in s.records)], listing, links)
     why = f"poses for {len(names)} pictures, and none says which picture it belongs to"
     return belonging, [(s.name, f"{len(s.records)} {why}") for s in series if not s.of and names]
+
+
+def _in_order(series: Sequence[Series], pictures: int) -> Iterator[Series]:
+    """Series by their order, of as many poses as pictures, whose numbers fit some of these only.
+
+    One may count from 0 and the other from 1: all but one fit, and each picture would get its neighbour's pose.
+    """
+    for one in series:
+        if one.by in ("name", "number") and len(one.records) == pictures > len(one.of):
+            yield replace(one, by="order", of=dict(enumerate(one.records)), alone=[])
 
 
 def _match_pictures(one: Series, listing: Listing, linked: dict[str, int]) -> None:
