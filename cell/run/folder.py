@@ -11,7 +11,7 @@ import re
 import secrets
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from importlib.metadata import PackageNotFoundError, version
@@ -114,7 +114,12 @@ def _lives(pid: object, folder: Path) -> bool:
     try:
         if (process / "stat").read_text().rpartition(")")[2].split()[0] == "Z":
             return False
-        return any(file.readlink() == journal for file in (process / "fd").iterdir())
+        for file in (process / "fd").iterdir():
+            # It closes others meanwhile.
+            with suppress(FileNotFoundError):
+                if file.readlink() == journal:
+                    return True
+        return False
     except PermissionError:
         return True
     except OSError:
