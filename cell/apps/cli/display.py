@@ -37,7 +37,7 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH, *, w
     steps, measured = _steps(report), list(report.get("measured") or ())
     followed = report.get("following")
     late = _labelled("followed", following_words(followed), width) if followed else []
-    tail = [*_trouble(report, width), *late, *_labelled("report", _shown_path(folder), width)]
+    tail = [*_trouble(report, width), *late, *_labelled("report", f"{_from_here(folder)}/report.json", width)]
     if (advice := next_step(report, folder)) is not None:
         tail += _labelled("next", advice, width)
     room = HEIGHT - 1 - len(steps) - len(tail) - (2 if measured else 1)
@@ -56,36 +56,40 @@ LOOK_AT_PART = {"released": "look at the part, it is down", "unknown": "look wha
 def next_step(report: Mapping[str, object], folder: Path) -> str | None:
     """What a person would type after a run that ended so; None where there is nothing to add."""
     outcome, kind, name = report["outcome"], report.get("kind", "job"), folder.name.split("-")[-1]
-    look = "cell diag: the state of every device; "
+    where = _where(folder)
+    look = f"cell diag{where}: the state of every device; "
     again, see = (_dry_run(report), "") if report.get("simulated") is True else ("cell run", look)
+    again += where
     if job := report.get("for_job"):
         other = "another --seed draws another world; " if report.get("simulated") is True else look
         return f"{other}put that right, then {again} -j {_job({'job_file': job})}"
     if kind != "job":
         if outcome == "done":
-            return "cell calibrate verify: how good it is" if kind == "calibration" else None
-        return "cell diag: the state of every device"
+            return f"cell calibrate verify{where}: how good it is" if kind == "calibration" else None
+        return f"cell diag{where}: the state of every device"
     part = None if outcome in ("placed", "done") else report.get("part")
     if part in LOOK_AT_PART:
-        return f"{LOOK_AT_PART[part]}; cell home: fold the arm; then {again} -j {_job(report)}: the next part"
+        return f"{LOOK_AT_PART[part]}; cell home{where}: fold the arm; then {again} -j {_job(report)}: the next part"
     match outcome:
         case "done":
-            return f"cell report {name}: what was measured; nothing was placed"
+            return f"cell report {name}{where}: what was measured; nothing was placed"
         case "placed":
-            return f"cell report {name} --html: all of it as a page; cell export: the cloud"
+            return f"cell report {name}{where} --html: all of it as a page; cell export{where}: the cloud"
         case "refused" if report.get("code") == "CalibrationStale":
-            return f"cell calibrate, then {again} -j {_job(report)}"
+            return f"cell calibrate{where}, then {again} -j {_job(report)}"
         case "refused":
-            return f"{_why(folder)}put that right, then {again} -j {_job(report)}"
-        case "faulted":
-            return f"{see}cell resume {name}: go on with the job"
-        case "aborted":
-            return f"cell resume {name}: go on with the job"
-    return f"cell abort {name}, if it is still going on; cell resume {name}, if its process died"
+            why = "picture.png beside it shows why; " if (folder / "picture.png").is_file() else ""
+            return f"{why}put that right, then {again} -j {_job(report)}"
+        case "faulted" | "aborted":
+            return f"{see if outcome == 'faulted' else ''}cell resume {name}{where}: go on with the job"
+    return f"cell abort {name}{where}, if it is still going on; cell resume {name}{where}, if its process died"
 
 
-def _why(folder: Path) -> str:
-    return "picture.png beside it shows why; " if (folder / "picture.png").is_file() else ""
+def _where(folder: Path) -> str:
+    """The option that names a run's cell, where it is not that of the present folder."""
+    config = folder.parent.parent / "cell.toml"
+    here = folder.parent.resolve() == Path("runs").resolve() or not config.is_file()
+    return "" if here else f" -c {shlex.quote(_from_here(config))}"
 
 
 def _dry_run(report: Mapping[str, object]) -> str:
@@ -102,7 +106,7 @@ def _job(report: Mapping[str, object]) -> str:
     path = Path(str(report.get("job_file", report.get("job"))))
     if path.suffix == ".toml" and path.stem in shipped_jobs() and path == job_path(path.stem):
         return path.stem
-    return shlex.quote(str(path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path))
+    return shlex.quote(_from_here(path))
 
 
 def duration(seconds: float | None) -> str:
@@ -175,11 +179,10 @@ def _labelled(label: str, text: str, width: int) -> list[str]:
     return [f"{label if k == 0 else '':<{LABEL}}{line}" for k, line in enumerate(lines)]
 
 
-def _shown_path(folder: Path) -> str:
-    """The report's path, from the present folder if it lies below."""
-    here = Path.cwd()
-    folder = folder.resolve()
-    return f"{folder.relative_to(here) if folder.is_relative_to(here) else folder}/report.json"
+def _from_here(path: Path) -> str:
+    """A path, from the present folder if it lies below."""
+    here, path = Path.cwd(), path.resolve()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
 
 
 def _cut_lines(text: str, width: int, most: int) -> list[str]:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from cell.apps.cli import main
-from cell.apps.cli.display import HEIGHT, duration, end_screen, print_report
+from cell.apps.cli.display import HEIGHT, duration, end_screen, next_step, print_report
 from cell.run.folder import new_run, read_report, run_row, write_json
 from drivers.errors import CellError
 from statemachine.journal import Journal
@@ -262,3 +262,12 @@ def test_a_long_reason_keeps_what_to_do_about_it(tmp_path: Path) -> None:
     assert lines[2] == remedy
     assert lines[1].endswith(" …")
     assert remedy in " ".join(end_screen({"outcome": "refused", "reason": reason}, tmp_path))
+
+
+def test_the_next_command_names_a_cell_that_is_elsewhere(tmp_path: Path) -> None:
+    report = {"outcome": "aborted", "reason": "no", "job": "pot", "simulated": False}
+    folder = tmp_path / "my cell" / "runs" / "20261124T120000-aaaa"
+    folder.mkdir(parents=True)
+    assert next_step(report, folder) == "cell resume aaaa: go on with the job"
+    (tmp_path / "my cell" / "cell.toml").touch()
+    assert next_step(report, folder) == f"cell resume aaaa -c '{tmp_path}/my cell/cell.toml': go on with the job"
