@@ -32,12 +32,10 @@ _STAMP = "%Y%m%dT%H%M%S"
 
 
 def new_run(root: Path) -> Path:
-    """Create the folder of a new run below `root`, named after the local time.
-
-    Never before the newest that is there: summer time ends, and clocks are set back.
-    """
+    """Create the folder of a new run below `root`, named after the local time, or after the newest that is there."""
     root.mkdir(parents=True, exist_ok=True)
     while True:
+        # Summer time ends, and clocks are set back.
         now, before = time.strftime(_STAMP), [run.name.partition("-")[0] for run in list_runs(root)[-1:]]
         later = [(datetime.strptime(stamp, _STAMP) + timedelta(seconds=1)).strftime(_STAMP) for stamp in before]
         folder = root / f"{max([now, *later])}-{secrets.token_hex(2)}"
@@ -104,10 +102,7 @@ def listens(folder: Path) -> bool:
 
 
 def _lives(pid: object, folder: Path) -> bool:
-    """Whether the process `pid` lives and has the journal in `folder` open, whatever became of the clock.
-
-    That of another user does not show its files: where it lives it is taken to be the one.
-    """
+    """Whether the process `pid` lives and has the journal in `folder` open. Another user's does not show its files."""
     if not isinstance(pid, int):
         return False
     process, journal = Path(f"/proc/{pid}"), (folder / JOURNAL).resolve()
