@@ -45,7 +45,9 @@ def forget_unasked(link: socket.socket) -> None:
     """
     link.setblocking(False)
     try:
-        if link.recv(4096) == b"":
-            raise ConnectionResetError("it was closed by the other side")
+        # As much as a device that babbles can have sent; more is told by the answers.
+        for _ in range(1000):
+            if link.recv(4096) == b"":
+                raise ConnectionResetError("it was closed by the other side")
     except BlockingIOError:
         return

@@ -21,7 +21,6 @@ import numpy as np
 from drivers.camera.frame_queue import FrameQueue
 from drivers.clock import Clock, ClockMap, Latch
 from drivers.errors import (
-    CellError,
     ConfigError,
     DeadlineError,
     DeviceFault,
@@ -81,7 +80,7 @@ class StreamCamera:
                     f"{shape[1]}x{shape[0]}. Correct the configuration or the address"
                 )
             self._compare_clocks()
-        except CellError:
+        except BaseException:
             self._link.close()
             raise
 
@@ -191,7 +190,7 @@ class StreamCamera:
                 float(about["exposure_max_s"]),
                 float(about["frame_rate_max_hz"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise self._unusable("identify", repr(error)) from error
 
     def _number(self, reply: Header, op: str, key: str) -> float:
@@ -288,6 +287,11 @@ def encode(header: Header, payload: bytes = b"") -> bytes:
     """The bytes of one message."""
     text = json.dumps(header).encode("utf-8")
     return PREFIX.pack(MAGIC, len(text), len(payload)) + text + payload
+
+
+def answers(header: Header, awaited: int | None) -> bool:
+    """Whether a message answers the request of that number: by its own, or without one as a refusal alone."""
+    return header.get("id") == awaited or ("id" not in header and header.get("ok") is False)
 
 
 def read(receive: Callable[[int], bytearray]) -> tuple[Header, bytearray]:
@@ -425,7 +429,7 @@ class FrameLink:
                     self._take_frame(header, payload, received)
                 else:
                     with self._answered:
-                        if header.get("id") in (self._awaited, None):
+                        if answers(header, self._awaited):
                             self._answer = (header, received)
                             self._answered.notify_all()
                         else:

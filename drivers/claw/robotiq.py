@@ -48,7 +48,7 @@ class RobotiqLink:
 
     def get(self, variable: str) -> int:
         """Read a variable."""
-        wanted = re.compile(rb"\s*" + variable.encode() + rb"\s+(-?\d+)\s*")
+        wanted = re.compile(rb"\s*" + variable.encode() + rb"\s+(-?\d{1,9})\s*")
 
         def value(data: bytes) -> int:
             if (found := wanted.fullmatch(data)) is None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from typing import Protocol
 
 from drivers.clock import Clock
@@ -20,6 +20,7 @@ from drivers.rail.motion import (
     SWEEP_MARGIN_M,
     CarriageWatch,
     RailMotion,
+    Stops,
     ZeroCheck,
     move_duration,
     run_up_distance,
@@ -36,8 +37,8 @@ class Link(Protocol):
     """What an axis needs of the link to its drive."""
 
     @property
-    def stops(self) -> int:
-        """How many stops were asked for: a command is only sent if none came since the caller read this."""
+    def stops(self) -> Stops:
+        """Those that were asked for: a command is only sent if none came since the caller read their count."""
 
     @property
     def closed(self) -> bool:
@@ -126,7 +127,8 @@ class RailAxis(ABC):
             issued = self._free()
             self._homing = True
             try:
-                self._begin_homing(issued)
+                with self._halted_if_failed(issued):
+                    self._begin_homing(issued)
             except CellError:
                 self._homing = False
                 raise
@@ -165,7 +167,8 @@ class RailAxis(ABC):
         with self._starting:
             issued = self._free()
             goal = self._position() + distance
-            self._send(goal, speed, issued)
+            with self._halted_if_failed(issued):
+                self._send(goal, speed, issued)
             self._motion = RailMotion(
                 self.name,
                 self._clock,
@@ -277,9 +280,9 @@ class RailAxis(ABC):
     def _free(self) -> int:
         """The count of stops to issue a motion under; `InterlockError` while another motion runs."""
         self._require_control()
-        issued = self._link.stops
+        issued = self._link.stops.count
         if self._motion is not None and not self._motion.done:
-            if self._link.stops != self._motion_issued:
+            if self._link.stops.count != self._motion_issued:
                 self._motion.join(2.0)
             if not self._motion.done:
                 raise InterlockError(self.name, "another motion runs. Wait for it or stop() it first")
@@ -290,7 +293,8 @@ class RailAxis(ABC):
         """Send it there; the seconds that it should take, and those that `speed` alone takes, whatever the ramps."""
         self._require_zero()
         here = self._position()
-        self._send(position, speed, issued)
+        with self._halted_if_failed(issued):
+            self._send(position, speed, issued)
         return move_duration(position - here, speed, self._acceleration), abs(position - here) / speed
 
     def _watched(self, arrived: Callable[[], bool], length: float | None) -> Callable[[], bool]:
@@ -303,9 +307,21 @@ class RailAxis(ABC):
 
         return followed
 
+    @contextmanager
+    def _halted_if_failed(self, issued: int) -> Iterator[None]:
+        """A start whose reply was lost may have been taken: nobody would watch that motion."""
+        try:
+            yield
+        except CellError as error:
+            try:
+                self._halt(issued)()
+            except CellError as second:
+                error.add_note(f"and it could not be stopped: {second}")
+            raise
+
     def _halt(self, issued: int) -> Callable[[], None]:
         def halt() -> None:
-            if self._link.stops == issued:
+            if self._link.stops.count == issued or self._link.stops.failed:
                 self.stop()
 
         return halt

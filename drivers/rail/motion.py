@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, NotConnectedError, shown
@@ -48,6 +48,39 @@ def move_duration(distance: float, speed: float, acceleration: float) -> float:
 def patience(clock: Clock, seconds: float) -> float:
     """`seconds` of the clock, or what the wall floor takes on this clock if that is longer."""
     return max(seconds, WALL_FLOOR_S * clock.rate)
+
+
+class Stops:
+    """The stops of one link: how many were asked for, and what became of the last."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.failed = False
+        self._given = False
+
+    @contextmanager
+    def one_more(self) -> Iterator[None]:
+        """The block gives the drive a stop; it has failed where it raises."""
+        self.count += 1
+        self._given = self.failed = True
+        try:
+            yield
+            self.failed = False
+        finally:
+            self._given = False
+
+    def end(self, name: str, position: float) -> bool:
+        """How a motion ends that was stopped at `position`, m: not yet while the stop is given (False).
+
+        Raises `Aborted` once it was taken, `DeviceFault` where nobody knows that it was.
+        """
+        if self._given:
+            return False
+        if self.failed:
+            text = f"was told to stop and has not confirmed it; at {shown(position, 'm')} it may go on"
+            hint = "Press the emergency stop, then see the line to the drive."
+            raise DeviceFault(name, "rail.not_stopped", text, recoverable=True, hint=hint)
+        raise Aborted(f"{name}: stopped at {shown(position, 'm')} before its target")
 
 
 class RailMotion:

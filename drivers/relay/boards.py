@@ -22,6 +22,7 @@ import serial
 from drivers.clock import Clock
 from drivers.errors import (
     UNTOLD,
+    Aborted,
     ConfigError,
     DeadlineError,
     DeviceFault,
@@ -124,7 +125,9 @@ class RelayPort:
                 self._line.drop()
                 _lines.pop(self._key, None)
 
-    def ask(self, request: bytes, end: bytes, decode: Callable[[bytes], Answer]) -> tuple[Answer, float]:
+    def ask(
+        self, request: bytes, end: bytes, decode: Callable[[bytes], Answer], wanted: Callable[[], None] = lambda: None
+    ) -> tuple[Answer, float]:
         """Send `request`, read up to `end`: the decoded reply, and the round trip in wall seconds.
 
         What is sent has to mean the same when it is heard twice: a lost or damaged reply is asked for again.
@@ -134,6 +137,7 @@ class RelayPort:
             if attempt:
                 self.statistics.count("retries")
             with self._held() as port:
+                wanted()
                 before = time.monotonic()
                 port.write(request)
                 self.statistics.traffic.sent(request)
@@ -156,9 +160,10 @@ class RelayPort:
             f"the board at {self.url} is of this make, has its supply, and that its baud is {self._line.baud}",
         ) from failure
 
-    def tell(self, words: bytes) -> None:
+    def tell(self, words: bytes, wanted: Callable[[], None] = lambda: None) -> None:
         """Send what nobody answers."""
         with self._held() as port:
+            wanted()
             port.write(words)
             port.flush()
             self.statistics.traffic.sent(words)
@@ -226,8 +231,11 @@ class RelayWiring(Protocol):
     def ping(self) -> float:
         """One harmless round trip in wall seconds; of a board that never answers, that its port is there: 0 s."""
 
-    def switch(self, relay: int, on: bool) -> None:
-        """Set a relay, and see that it took it where the board can be asked."""
+    def switch(self, relay: int, on: bool, wanted: Callable[[], None] = lambda: None) -> None:
+        """Set a relay, and see that it took it where the board can be asked.
+
+        `wanted` raises, before each attempt, where it is not any more.
+        """
 
     def shows(self, relay: int) -> bool:
         """What a relay shows; `DeviceFault` (KIND.unknown) where nobody can know."""
@@ -253,9 +261,9 @@ class NumatoBoard:
         """Ask for its version."""
         return self.port.ask(b"ver\r", _PROMPT, lambda data: _answer(data, "ver"))[1]
 
-    def switch(self, relay: int, on: bool) -> None:
+    def switch(self, relay: int, on: bool, wanted: Callable[[], None] = lambda: None) -> None:
         """Set a relay and read it back; `DeviceFault` (KIND.relay) when it shows the other."""
-        self._ask(f"relay {'on' if on else 'off'} {_DIGITS[relay]}")
+        self._ask(f"relay {'on' if on else 'off'} {_DIGITS[relay]}", wanted)
         if self.shows(relay) != on:
             raise DeviceFault(
                 self.port.name,
@@ -278,8 +286,8 @@ class NumatoBoard:
         """An end of whatever the owner had begun, then the command."""
         return [b"\r", f"relay off {_DIGITS[relay]}\r".encode()]
 
-    def _ask(self, command: str) -> str:
-        return self.port.ask(f"{command}\r".encode(), _PROMPT, lambda data: _answer(data, command))[0]
+    def _ask(self, command: str, wanted: Callable[[], None] = lambda: None) -> str:
+        return self.port.ask(f"{command}\r".encode(), _PROMPT, lambda data: _answer(data, command), wanted)[0]
 
     def _level(self, command: str) -> bool:
         def level(data: bytes) -> bool:
@@ -325,11 +333,11 @@ class LcusBoard:
         self.port.touch()
         return 0.0
 
-    def switch(self, relay: int, on: bool) -> None:
+    def switch(self, relay: int, on: bool, wanted: Callable[[], None] = lambda: None) -> None:
         """Set a relay. Off is said twice: nobody would notice that a byte was lost."""
         self._sent.pop(relay, None)
         words = _lcus(relay, on)
-        self.port.tell(words if on else words + words)
+        self.port.tell(words if on else words + words, wanted)
         self._sent[relay] = self.port.opened, on
 
     def shows(self, relay: int) -> bool:
@@ -412,7 +420,8 @@ class BoardLaser(_OnBoard):
         super().__init__(board, relay)
         self._board = board
         self._control = control
-        self._closed = False
+        self._closed = self._released = False
+        self._stops = 0
         self._owner = threading.Lock()
         # Lighting it and closing it: whatever was lit before the end goes off in it, and nothing is lit after it.
         self._ending = threading.Lock()
@@ -433,6 +442,12 @@ class BoardLaser(_OnBoard):
         program or, where the board tells, by anything else that set the relay.
         """
         self._require_control()
+        stops = self._stops
+
+        def wanted() -> None:
+            if self._stops != stops:
+                raise Aborted(f"{self.name}: stopped before it was lit")
+
         if not self._owner.acquire(blocking=False):
             raise InterlockError(self.name, "is already lit by another owner. Wait until that one has finished")
         try:
@@ -444,7 +459,7 @@ class BoardLaser(_OnBoard):
                 with self._ending:
                     self._require_control()
                     self._off_after_death()
-                    self._board.switch(self._relay, True)
+                    self._board.switch(self._relay, True, wanted)
                 yield
         finally:
             self._owner.release()
@@ -462,25 +477,31 @@ class BoardLaser(_OnBoard):
 
     def stop(self) -> None:
         """Laser off now, whoever has it. After a lost link the port is opened again for it."""
-        self._require_control()
+        if self._released or not self._control:
+            self._require_control()
+        self._stops += 1
         self._board.switch(self._relay, False)
 
     def close(self) -> None:
-        """Laser off, unless it is only looked at, then release the board."""
+        """Laser off, unless it is only looked at, then release the board.
+
+        Where it cannot be switched off the port and the helper stay: the next call, the end of `lit` or the end of this
+        program tries again.
+        """
         with self._ending:
-            if self._closed:
+            if self._released:
                 return
             self._closed = True
-            try:
-                if self._control:
-                    self._board.switch(self._relay, False)
-            finally:
-                self._goodbye()
-                self._board.port.close()
+            self._stops += 1
+            if self._control:
+                self._board.switch(self._relay, False)
+            self._released = True
+            self._goodbye()
+            self._board.port.close()
 
     def _off(self) -> None:
         """Off at the end of a context; `close` has done that already."""
-        if not self._closed:
+        if not self._released:
             self._board.switch(self._relay, False)
 
     def _goodbye(self) -> None:

@@ -74,6 +74,7 @@ class AgilexVehicle:
         self._interruptions = 0
         """How many there had been when the brake was commanded: one more, and it may have been released since."""
         self._stopping = 0
+        self._ends = 0
         self._alarms = 0
         """Those of others on the bus that this program has answered by the brake."""
         self._closed = threading.Event()
@@ -170,9 +171,13 @@ class AgilexVehicle:
         Raises `DeviceFault` on an emergency stop or an error that does not clear, `DeadlineError` when the vehicle
         does not change to CAN mode.
         """
+        ends = self._ends
         self._take_command()
-        self._link.send("BrakeCommand", Locked=0)
         with self._command:
+            if self._ends != ends:
+                self._enabled = False
+                raise Aborted(f"{self.name}: it was stopped while it was enabled")
+            self._link.send("BrakeCommand", Locked=0)
             self._braked, self._interruptions = False, self._feedback.interruptions
 
     def recover(self) -> None:
@@ -246,6 +251,7 @@ class AgilexVehicle:
         with self._command:
             self._velocity = (0.0, 0.0)
             self._stopping += 1
+            self._ends += 1
         try:
             asked = self._clock.now()
             with self._command:

@@ -181,7 +181,9 @@ class Travel:
             self._rest = None
         elif self._rest is None:
             self._rest = (left, right)
-        elif (moved := self._unit * max(abs(left - self._rest[0]), abs(right - self._rest[1]))) > STANDS_M:
+        elif (
+            moved := self._unit * max(abs(difference(left, self._rest[0])), abs(difference(right, self._rest[1])))
+        ) > STANDS_M:
             self.disturb(f"it moved by {1e3 * moved:.0f} mm without a command")
             self._rest = (left, right)
 
@@ -263,7 +265,7 @@ class MessageFeedback:
     def _compare_counts(self, counts: tuple[float, float]) -> None:
         """Wheels that count on do not stand, whatever the speed says."""
         self._still_at = self._still_at or counts
-        if max(abs(a - b) for a, b in zip(counts, self._still_at, strict=True)) > _CREPT:
+        if max(abs(difference(int(a), int(b))) for a, b in zip(counts, self._still_at, strict=True)) > _CREPT:
             self._still, self._still_at = 0, counts
 
     def idle(self, seconds: float) -> None:

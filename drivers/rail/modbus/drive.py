@@ -6,7 +6,7 @@ Its flag goes off when the drive loses its zero; that it stands says neither who
 from __future__ import annotations
 
 from drivers.clock import Clock
-from drivers.errors import Aborted, DeviceFault, InterlockError, LimitError, shown
+from drivers.errors import DeviceFault, InterlockError, LimitError, shown
 from drivers.rail.axis import Samples
 from drivers.rail.modbus.link import Flag, ModbusLink, Number, Rate, RegisterMap
 from drivers.rail.motion import STANDSTILL_S, patience
@@ -208,8 +208,8 @@ class DriveArrival:
         drive = self._drive
         stamp, position, round_trip = drive.position()
         self._samples.append((stamp, position, round_trip))
-        if drive.link.stops != self._issued:
-            raise Aborted(f"{drive.name}: stopped at {shown(position, 'm')} before its target")
+        if drive.link.stops.count != self._issued:
+            return drive.link.stops.end(drive.name, position)
         there = abs(round(position * drive.counts) - self._target) <= self._near
         if there and not drive.says(drive.registers.moving):
             # A drive that was reset stands at its target, too, if that is 0.

@@ -21,6 +21,7 @@ from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedErro
 from drivers.interfaces import LinkStatistics
 from drivers.last_words import LastWords, attended_by, descriptor_of
 from drivers.ports import FAILURES, open_port
+from drivers.rail.motion import Stops
 
 SPEED_UNITS = {"counts/s": None, "rpm": 60.0, "0.1 rpm": 600.0, "1/240 rps": 240.0}
 """Units that speeds are given to drives in: how many of them are one turn per second; None: the counts of a turn."""
@@ -203,7 +204,7 @@ class ModbusLink:
         self._statistics = statistics
         self._stop_action = stop_action
         self._lock = threading.Lock()
-        self._stops = 0
+        self._stops = Stops()
         self._closed = False
         self._echoes: bool | None = None
         self._in_step = True
@@ -212,8 +213,8 @@ class ModbusLink:
         self._port = open_port(name, url, baud=baud, timeout=self._timeout_s, parity=parity, stop_bits=stop_bits)
 
     @property
-    def stops(self) -> int:
-        """How many stops were asked for: a command is only sent if none came since the caller read this."""
+    def stops(self) -> Stops:
+        """Those that were asked for: a command is only sent if none came since the caller read their count."""
         return self._stops
 
     @property
@@ -261,8 +262,8 @@ class ModbusLink:
 
     def stop(self) -> None:
         """Give the stop command; commands issued earlier are refused."""
-        self._stops += 1
-        self.do(self._stop_action)
+        with self._stops.one_more():
+            self.do(self._stop_action)
 
     def close(self) -> None:
         """Close the port; every later call raises `NotConnectedError`."""
@@ -299,7 +300,7 @@ class ModbusLink:
             with self._lock:
                 if self._closed:
                     raise NotConnectedError(self.name, "the rail was closed. Open it again")
-                if issued is not None and issued != self._stops:
+                if issued is not None and issued != self._stops.count:
                     raise Aborted(f"{self.name}: stopped before the command was sent")
                 try:
                     return self._once(request, length, what)

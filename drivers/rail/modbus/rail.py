@@ -156,7 +156,7 @@ class ModbusRail(RailAxis):
 
     def _home_found(self, issued: int) -> bool:
         found = self._zero.found()
-        if self._link.stops != issued:
+        if self._link.stops.count != issued:
             self._zero.forget()
             raise Aborted(f"{self.name}: stopped while searching the reference switch")
         self._homing = not found

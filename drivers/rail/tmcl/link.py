@@ -22,6 +22,7 @@ from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedErro
 from drivers.interfaces import LinkStatistics
 from drivers.last_words import LastWords, attended_by, descriptor_of
 from drivers.ports import FAILURES, open_port
+from drivers.rail.motion import Stops
 
 TELEGRAM_BYTES = 9
 STATUS_OK = 100
@@ -201,7 +202,7 @@ class TmclLink:
         self._clock = clock
         self._statistics = statistics
         self._lock = threading.Lock()
-        self._stops = 0
+        self._stops = Stops()
         self._in_step = True
         self._closed = False
         self._port = open_port(name, url, baud=baud, timeout=REPLY_TIMEOUT_S)
@@ -213,8 +214,8 @@ class TmclLink:
         self._last_words: LastWords | None = None
 
     @property
-    def stops(self) -> int:
-        """How many stops were asked for: a command is only sent if none came since the caller read this."""
+    def stops(self) -> Stops:
+        """Those that were asked for: a command is only sent if none came since the caller read their count."""
         return self._stops
 
     def get(self, axis: Axis) -> int:
@@ -243,11 +244,11 @@ class TmclLink:
 
     def stop(self) -> None:
         """Stop the reference search, whoever began it, and the motor; commands issued earlier are refused."""
-        self._stops += 1
-        try:
-            self.reference_search(ReferenceSearch.STOP)
-        finally:
-            self._command(TmclCommand.MOTOR_STOP, 0)
+        with self._stops.one_more():
+            try:
+                self.reference_search(ReferenceSearch.STOP)
+            finally:
+                self._command(TmclCommand.MOTOR_STOP, 0)
 
     def firmware(self) -> str:
         """The module's firmware text, like 1241V123."""
@@ -318,7 +319,7 @@ class TmclLink:
             with self._lock:
                 if self._closed:
                     raise NotConnectedError(self.name, "the rail was closed. Open it again")
-                if issued is not None and issued != self._stops:
+                if issued is not None and issued != self._stops.count:
                     raise Aborted(f"{self.name}: stopped before the command was sent")
                 if self._last_words is not None and request.command not in _STOPS:
                     self._last_words.require_unspoken("rail.owner_frozen")

@@ -19,7 +19,7 @@ import zlib
 from dataclasses import dataclass
 
 from drivers.clock import Clock
-from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, InterlockError, shown
+from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, shown
 from drivers.interfaces import Reading
 from drivers.rail.axis import Samples
 from drivers.rail.motion import STANDSTILL_S, patience
@@ -291,8 +291,8 @@ class ArrivalWatch:
         """Read the position once and judge it."""
         position, stamp, round_trip = self._link.get_stamped(Axis.POSITION)
         self._samples.append((stamp, position / self._counts, round_trip))
-        if self._link.stops != self._issued:
-            raise Aborted(f"{self._link.name}: stopped at {shown(position / self._counts, 'm')} before its target")
+        if self._link.stops.count != self._issued:
+            return self._link.stops.end(self._link.name, position / self._counts)
         near = abs(position - self._target) <= _NEAR
         if near and (self._link.get(Axis.POSITION_REACHED) or (position == self._last and not self._moving())):
             # A module that was reset stands at its target, too, if that is 0.

@@ -152,7 +152,7 @@ class TmclRail(RailAxis):
 
     def _home_found(self, issued: int) -> bool:
         searching = self._link.reference_search(ReferenceSearch.STATUS) != 0
-        if self._link.stops != issued:
+        if self._link.stops.count != issued:
             raise Aborted(f"{self.name}: stopped while searching the reference switch")
         self._homing = searching
         if not searching:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cell.devices.diagnosis.diagnosis import examine
 from drivers.camera.folder import FolderCamera, image_files, read_image
-from drivers.camera.stream import StreamCamera
+from drivers.camera.stream import StreamCamera, answers
 from drivers.clock import Clock, ClockMap, Latch
 from drivers.errors import (
     Aborted,
@@ -426,3 +426,17 @@ def test_a_folder_without_pictures_is_named(tmp_path: Path) -> None:
         FolderCamera("recording", tmp_path / "missing", clock=Clock())
     with pytest.raises(RefusedError, match=r"missing\.png"):
         read_image(tmp_path / "missing.png")
+
+
+@pytest.mark.parametrize(
+    ("header", "answer"),
+    [
+        ({"op": "stop", "id": 7, "ok": True}, True),
+        ({"op": "stop", "id": 6, "ok": True}, False),
+        ({"op": "event", "ok": True}, False),
+        ({"op": "event"}, False),
+        ({"ok": False, "error": "what was that?"}, True),
+    ],
+)
+def test_what_comes_unasked_answers_nothing(header: dict[str, object], answer: bool) -> None:
+    assert answers(header, 7) == answer

@@ -10,8 +10,8 @@ import pytest
 
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, NotConnectedError
-from drivers.rail.motion import RailMotion, move_duration, run_up_distance
-from tests.support.wire.rail_bench import benched, connect
+from drivers.rail.motion import RailMotion, Stops, move_duration, run_up_distance
+from tests.support.wire.rail_bench import Bench, benched, connect
 
 FAST = 100.0
 
@@ -106,3 +106,38 @@ def test_a_count_that_is_off_by_more_than_a_twentieth_of_a_millimetre_is_refused
         limited = connect(made.peer.url, made.clock, reference_mode=1)
         assert limited.check_zero() is None
         limited.close()
+
+
+def test_a_stopped_motion_ends_as_its_stop_did() -> None:
+    stops = Stops()
+    with stops.one_more():
+        assert not stops.end("rail", 0.005), "nobody knows yet"
+    with pytest.raises(Aborted, match="stopped at 5 mm before its target"):
+        stops.end("rail", 0.005)
+    with pytest.raises(DeadlineError), stops.one_more():
+        raise DeadlineError("rail", "no answer")
+    with pytest.raises(DeviceFault, match="has not confirmed it; at 5 mm it may go on") as told:
+        stops.end("rail", 0.005)
+    assert (told.value.code, stops.count) == ("rail.not_stopped", 2)
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize(("begin", "way"), [("move_to", 0.09), ("nudge", 0.01)])
+def test_a_start_whose_answer_was_lost_is_stopped(
+    homed: Bench, begin: str, way: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The drive may have taken it, and nobody would watch that motion."""
+    send = homed.rail._send
+
+    def lost(*words: object) -> None:
+        send(*words)  # type: ignore[arg-type]
+        raise DeadlineError("rail", "no answer")
+
+    monkeypatch.setattr(homed.rail, "_send", lost)
+    with pytest.raises(DeadlineError, match="no answer"):
+        getattr(homed.rail, begin)(way, 0.01)
+    homed.clock.sleep(0.3)
+    before = homed.carriage()
+    homed.clock.sleep(0.5)
+    assert homed.carriage() == pytest.approx(before, abs=1e-6)
+    assert before < 0.8 * way

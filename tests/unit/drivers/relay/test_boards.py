@@ -11,12 +11,13 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from unittest.mock import Mock
 
 import pytest
 from numato_usb_relay.relay import Relay as VendorsClient
 
 from drivers.clock import Clock
-from drivers.errors import CellError, DeadlineError, DeviceFault, InterlockError, NotConnectedError
+from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.relay.boards import BoardClaw, BoardLaser, LcusBoard, RelayPort, open_board, open_numato
 from sim_backends.peers.switches import LcusPeer, NumatoPeer, RelayBoard
 
@@ -109,8 +110,36 @@ def test_a_relay_that_sticks_says_so_when_it_is_switched_off_and_when_it_is_clos
         with pytest.raises(DeviceFault, match="shows on after it was switched off") as met:
             act()
         assert met.value.code == "laser.relay"
+    with pytest.raises(NotConnectedError), laser.lit():
+        pytest.fail("lit after close")
+    wired.stuck = False
+    laser.close()
+    assert not wired.on[LASER]
     with pytest.raises(NotConnectedError):
         laser.ping()
+
+
+def test_a_stop_while_it_is_being_lit_leaves_it_off(numato: str, wired: Wired, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between two attempts, or before the first."""
+    laser = BoardLaser(open_board("laser", "laser", "numato", numato, baud=19200), LASER)
+    monkeypatch.setattr(laser, "_off_after_death", laser.stop)
+    with pytest.raises(Aborted, match="stopped before it was lit"), laser.lit():
+        pytest.fail("lit")
+    assert not wired.on[LASER] and (LASER, True) not in wired.told
+    laser.close()
+
+
+def test_a_close_that_the_board_does_not_hear_can_be_done_again(
+    numato: str, wired: Wired, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    laser = BoardLaser(open_board("laser", "laser", "numato", numato, baud=19200), LASER)
+    with laser.lit():
+        with monkeypatch.context() as mute, pytest.raises(DeadlineError):
+            mute.setattr(laser._board, "switch", Mock(side_effect=DeadlineError("laser", "no answer")))
+            laser.close()
+        assert wired.on[LASER]
+    assert not wired.on[LASER]
+    laser.close()
 
 
 def test_the_makers_own_client_agrees_with_the_simulated_board(numato: str, wired: Wired) -> None:

@@ -14,7 +14,7 @@ import pytest
 from cell.devices.gate.interlocks import DeviceCommand, Interlocks, Situation
 from cell.devices.gate.rules import RULES
 from drivers.clock import Clock
-from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError
+from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, LimitError
 from drivers.vehicle.agilex import DEAD_MAN_S, AgilexVehicle
 from drivers.vehicle.agilex_link import load_database
 from drivers.vehicle.feedback import QUIET_S
@@ -238,3 +238,25 @@ def heard(vehicle: AgilexVehicle) -> bool:
     except DeadlineError:
         return False
     return True
+
+
+@pytest.mark.parametrize("end", ["stop", "brake"])
+def test_who_was_stopped_while_it_was_enabled_keeps_its_brake(
+    bench: Bench, end: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By another thread, while the vehicle took its time to change its mode."""
+    bench.vehicle.brake()
+    bench.until(bench.braked)
+    take = bench.vehicle._take_command
+
+    def late() -> None:
+        take()
+        getattr(bench.vehicle, end)()
+
+    monkeypatch.setattr(bench.vehicle, "_take_command", late)
+    with pytest.raises(Aborted, match="stopped while it was enabled"):
+        bench.vehicle.enable()
+    time.sleep(0.3)
+    assert bench.braked()
+    with pytest.raises(CellError):
+        bench.vehicle.drive(0.1, 0.0)

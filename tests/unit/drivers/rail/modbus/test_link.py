@@ -143,7 +143,7 @@ def test_a_register_that_the_drive_does_not_have_is_named() -> None:
 @pytest.mark.wire
 def test_what_was_decided_before_a_stop_is_not_sent_after_it(drive: Drive) -> None:
     rail = drive.homed()
-    decided = rail._link.stops
+    decided = rail._link.stops.count
     rail.stop()
     with pytest.raises(Aborted):
         rail._link.do(rail.registers.start, issued=decided, moves=True)
