@@ -264,10 +264,22 @@ _FORMAT = "%(asctime)s.%(msecs)03d %(levelname)-7s %(name)s: %(message)s"
 _DATE = "%Y-%m-%dT%H:%M:%S"
 
 
+class _RunLog(logging.FileHandler):
+    """A log that cannot be written, on a full disk for one, ends nothing and says nothing in what a person reads."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Leave the line out."""
+
+    def close(self) -> None:
+        """What cannot be written any more is left out."""
+        with suppress(OSError):
+            super().close()
+
+
 @contextmanager
 def run_log(folder: Path) -> Iterator[None]:
     """While the context is open, what the modules log goes to `run.log` in `folder` as well."""
-    handler = logging.FileHandler(folder / FILE_NAME, encoding="utf-8", delay=True)
+    handler = _RunLog(folder / FILE_NAME, encoding="utf-8", delay=True)
     handler.setFormatter(logging.Formatter(_FORMAT, _DATE))
     loggers = [logging.getLogger(name) for name in PACKAGES]
     for logger in loggers:

@@ -79,7 +79,7 @@ class Stops:
         if self.failed:
             text = f"was told to stop and has not confirmed it; at {shown(position, 'm')} it may go on"
             hint = "Press the emergency stop, then see the line to the drive."
-            raise DeviceFault(name, "rail.not_stopped", text, recoverable=True, hint=hint)
+            raise DeviceFault(name, "rail.not_stopped", text, recoverable=False, hint=hint)
         raise Aborted(f"{name}: stopped at {shown(position, 'm')} before its target")
 
 

@@ -181,9 +181,7 @@ class Travel:
             self._rest = None
         elif self._rest is None:
             self._rest = (left, right)
-        elif (
-            moved := self._unit * max(abs(difference(left, self._rest[0])), abs(difference(right, self._rest[1])))
-        ) > STANDS_M:
+        elif (moved := self._unit * max(map(abs, map(difference, (left, right), self._rest)))) > STANDS_M:
             self.disturb(f"it moved by {1e3 * moved:.0f} mm without a command")
             self._rest = (left, right)
 

@@ -20,12 +20,9 @@ UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 """Base of what typer raises for a wrong command line, whichever parser it carries."""
 
 _WORDS = (
-    (r"Value error, ", ""),
-    (r"Input should be", "it has to be"),
-    (r"a valid integer(, .*)?", "a whole number"),
-    (r"a valid number(, .*)?", "a number"),
-    (r"\.$", ""),
-)
+    (r"Value error, ", ""), (r"Input should be", "it has to be"), (r"a valid integer(, .*)?", "a whole number"),
+    (r"a valid number(, .*)?", "a number"), (r"\.$", ""),
+)  # fmt: skip
 
 
 class App(typer.Typer):
@@ -63,11 +60,9 @@ COMMANDS = "assembly_cell.commands"
 app = App(
     name="cell",
     help="Control of a laser-guided assembly cell: drive, photograph, sweep, reconstruct, invert, place.",
-    no_args_is_help=True,
-    add_completion=True,
-    pretty_exceptions_enable=False,
+    no_args_is_help=True, add_completion=True, pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
-)
+)  # fmt: skip
 
 
 def _show_version(wanted: bool) -> None:

@@ -71,13 +71,10 @@ class ProgressDisplay:
     def __init__(self, *, compiles: bool = False) -> None:
         self.console = _Unheard(stderr=True)
         columns = (
-            TextColumn("{task.fields[mark]}", table_column=Column(width=1)),
-            TextColumn("{task.fields[step]:<16}"),
-            BarColumn(bar_width=20),
-            TextColumn("{task.fields[state]:>4}"),
-            TimeElapsedColumn(),
+            TextColumn("{task.fields[mark]}", table_column=Column(width=1)), TextColumn("{task.fields[step]:<16}"),
+            BarColumn(bar_width=20), TextColumn("{task.fields[state]:>4}"), TimeElapsedColumn(),
             TextColumn("{task.description}", table_column=Column(ratio=1, no_wrap=True, overflow="ellipsis")),
-        )
+        )  # fmt: skip
         self._progress = Progress(*columns, console=self.console, expand=True)
         self._tasks: dict[str, TaskID] = {}
         self._ended = threading.Event()

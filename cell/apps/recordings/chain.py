@@ -264,14 +264,11 @@ def plane_figures(
     """A light plane n·P = d in the camera frame. `rms` and the stripe's own `noise` in m, `stripes` (n, 2) in px."""
     depths = plane.intersect(camera.rays(np.concatenate(stripes)))[:, 2]
     return {
-        "normal": plane.normal,
-        "distance_mm": 1e3 * plane.distance,
-        "rms_mm": 1e3 * rms,
+        "normal": plane.normal, "distance_mm": 1e3 * plane.distance, "rms_mm": 1e3 * rms,
         "depth_range_mm": [1e3 * float(np.nanmin(depths)), 1e3 * float(np.nanmax(depths))],
         "sigma_place_mm": None if known is None else 1e3 * known.place,
-        "sigma_normal_deg": None if known is None else math.degrees(known.tilt),
-        "stripe_noise_mm": 1e3 * noise,
-    }
+        "sigma_normal_deg": None if known is None else math.degrees(known.tilt), "stripe_noise_mm": 1e3 * noise,
+    }  # fmt: skip
 
 
 def plane_of_pictures(

@@ -218,17 +218,11 @@ def _apply(decision: Decision, frames: Sequence[RecordedFrame], pitch: float, op
     best = decision.best
     one, poses = best.series, best.series.poses(best.reading)
     about: Figures = {
-        "source": [one.name],
-        "reading": best.reading.name,
-        "text": best.reading.text,
-        "unit": best.unit,
-        "setup": best.setup,
-        "matched_by": one.by,
-        "given": [n for n in ("poses", "pose_field", "setup") if getattr(options, n)],
-        "evidence": decision.evidence,
-        "turn_deg": float(np.degrees(best.turn)),
-        "shift_mm": 1e3 * best.shift,
-    }
+        "source": [one.name], "reading": best.reading.name, "text": best.reading.text, "unit": best.unit,
+        "setup": best.setup, "matched_by": one.by,
+        "given": [n for n in ("poses", "pose_field", "setup") if getattr(options, n)], "evidence": decision.evidence,
+        "turn_deg": float(np.degrees(best.turn)), "shift_mm": 1e3 * best.shift,
+    }  # fmt: skip
     own = "not used: its poses are those of the board as the camera sees it, not of the flange"
     understood = Understood([one], best.setup, about, [f"{name} {own}" for name in decision.boards_own])
     problem, refused = scale_problem(best, pitch)

@@ -18,16 +18,13 @@ from cell.measure.geometry.poses import from_matrix, from_parts, from_quaternion
 from drivers.errors import ConfigError
 
 TRIED = {
-    "xyz+quaternion-xyzw": "quaternion xyzw",
-    "xyz+quaternion-wxyz": "quaternion wxyz",
-    "xyz+rotvec-rad": "rotation vector, in rad",
-    "xyz+rpy-rad": "roll, pitch, yaw about fixed x, y, z, in rad",
+    "xyz+quaternion-xyzw": "quaternion xyzw", "xyz+quaternion-wxyz": "quaternion wxyz",
+    "xyz+rotvec-rad": "rotation vector, in rad", "xyz+rpy-rad": "roll, pitch, yaw about fixed x, y, z, in rad",
     "xyz+rpy-deg": "roll, pitch, yaw about fixed x, y, z, in deg",
     "xyz+abc-deg": "KUKA's A, B, C about z, the new y, the new x, in deg",
-    "xyz+zyz-deg": "Euler angles about z, the new y, the new z, in deg",
-    "matrix-4x4": "4×4 matrix by rows",
+    "xyz+zyz-deg": "Euler angles about z, the new y, the new z, in deg", "matrix-4x4": "4×4 matrix by rows",
     "matrix-4x4-by-columns": "4×4 matrix by columns",
-}
+}  # fmt: skip
 """The readings that are tried without being asked for, with a text for people."""
 FORM = (
     "xyz+KIND or KIND+xyz, with KIND quaternion-xyzw, quaternion-wxyz, rotvec-rad, rpy-deg, or three axes such as "

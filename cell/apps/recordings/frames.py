@@ -94,19 +94,14 @@ class RecordedFrame:
     def figures(self) -> Figures:
         """What became of it, for the JSON."""
         return {
-            "name": self.name,
-            "used": self.reason is None,
-            "reason": None if self.reason is None else str(self.reason),
-            "text": self.text,
-            "rms_px": self.rms_px,
-            "points": 0 if self.view is None else len(self.view.ids),
-            "pose": self.base_from_flange is not None,
+            "name": self.name, "used": self.reason is None,
+            "reason": None if self.reason is None else str(self.reason), "text": self.text, "rms_px": self.rms_px,
+            "points": 0 if self.view is None else len(self.view.ids), "pose": self.base_from_flange is not None,
             **{name: getattr(self, name) or None for name in ("pose_from", "stripe_from", "stripe_off")},
-            "stripe": self.profile is not None,
-            "stripe_text": self.stripe_text,
+            "stripe": self.profile is not None, "stripe_text": self.stripe_text,
             "stripe_left_out": self.stripe_left_out,
             "order_assumed": self.view is not None and self.view.order_assumed,
-        }
+        }  # fmt: skip
 
     @property
     def dark(self) -> bool:

@@ -110,16 +110,12 @@ def hand_eye_figures(
         first, middle, last = first + math.pi, math.pi - middle, last + math.pi
         middle, last = (math.remainder(angle, 2 * math.pi) for angle in (middle, last))
     found: Figures = {
-        "method": method,
-        "setup": setup,
+        "method": method, "setup": setup,
         "pose": "flange_from_camera" if setup == "eye_in_hand" else "base_from_camera",
-        "translation_mm": 1e3 * pose.translation,
-        "rotation": r,
-        "rotation_vector_rad": pin.log3(r),
-        "euler_xyz_rad": [first, middle, last],
-        "scatter_mm": 1e3 * scatter[0],
+        "translation_mm": 1e3 * pose.translation, "rotation": r, "rotation_vector_rad": pin.log3(r),
+        "euler_xyz_rad": [first, middle, last], "scatter_mm": 1e3 * scatter[0],
         "scatter_deg": math.degrees(scatter[1]),
-    }
+    }  # fmt: skip
     if sigma is not None:
         found |= {"sigma_mm": 1e3 * sigma[:3], "sigma_deg": np.degrees(sigma[3:])}
     return found

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cell.base.storage import replacing
 from cell.measure.reconstruction.cloud import Array, Cloud, Indices
 from drivers.errors import ConfigError
 
@@ -53,7 +54,8 @@ def write_ply(
     header += [f"comment {line}" for line in comment.splitlines()]
     header.append(f"element vertex {len(records)}")
     header += [f"property {_WORDS[kind.lstrip('<')]} {name}" for name, kind, _ in columns]
-    path.write_bytes(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace") + records.tobytes())
+    with replacing(path) as file:
+        file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace") + records.tobytes())
     return len(records)
 
 
@@ -211,5 +213,6 @@ def write_mesh(path: Path, points: Array, faces: Indices, colours: NDArray[np.ui
         vertex_colors=None if colours is None else colours[used],
         process=False,
     )
-    mesh.export(path, file_type="stl" if path.suffix.lower() == ".stl" else "ply")
+    with replacing(path) as file:
+        mesh.export(file, file_type="stl" if path.suffix.lower() == ".stl" else "ply")
     return len(faces)

@@ -341,7 +341,10 @@ class Verification:
     @property
     def matters(self) -> bool:
         """Whether what changed may move the place by a `SHARE` of its tolerance or more."""
-        return self.verdict.changed and max(self.at_most) >= SHARE * self.tolerance
+        most: dict[int, float] = {}
+        for suspect, does in zip(self.verdict.suspects, self.at_most, strict=True):
+            most[suspect.round] = max(does, most.get(suspect.round, 0.0))
+        return self.verdict.changed and sum(most.values()) >= SHARE * self.tolerance
 
     @property
     def good(self) -> bool:
@@ -380,11 +383,13 @@ class Verification:
     def _decision(self) -> str:
         v, allowed = self.verdict, f"{1e3 * self.tolerance:.2f} mm"
         if v.changed and (self.matters or not v.badly_fitting):
-            named = " or ".join(
-                f"the {s.part}{_DECK.get(s.part, '')} ({s.probability:.0%}): place off by {1e3 * effect:.2f} mm, at "
-                f"most {1e3 * most:.2f} mm"
-                for s, effect, most in zip(v.suspects, self.effects, self.at_most, strict=True)
-            )
+            rounds: dict[int, list[str]] = {}
+            for s, effect, most in zip(v.suspects, self.effects, self.at_most, strict=True):
+                does = f"place off by {1e3 * effect:.2f} mm, at most {1e3 * most:.2f} mm"
+                rounds.setdefault(s.round, []).append(
+                    f"the {s.part}{_DECK.get(s.part, '')} ({s.probability:.0%}): {does}"
+                )
+            named = "; and as well ".join(" or ".join(words) for words in rounds.values())
             if self.matters:
                 return (
                     f"the calibration of {self.date} is not good any more. Changed has {named}; allowed at the place "

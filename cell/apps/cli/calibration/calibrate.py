@@ -146,14 +146,10 @@ def _options(
     if laser not in (None, *lasers):
         raise ConfigError(f"--laser {laser}: allowed are {', '.join(lasers)}")
     return Options(
-        poses,
-        pose_field,
-        setup=None if setup is None else setup.replace("-", "_"),
-        plan=plan,
+        poses, pose_field, setup=None if setup is None else setup.replace("-", "_"), plan=plan,
         camera=None if camera in (None, "pictures") else read_camera(Path(str(camera))),
-        hold_camera=camera == "pictures",
-        laser=None if laser == "none" else LaserChannel(laser or "auto"),
-    )
+        hold_camera=camera == "pictures", laser=None if laser == "none" else LaserChannel(laser or "auto"),
+    )  # fmt: skip
 
 
 def _from_folder(folder: Path, board: str | None, options: Options, json: bool, details: bool) -> None:

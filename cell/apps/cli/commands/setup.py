@@ -89,16 +89,10 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
     records = {name: loaded.device(name) for name in DEVICES}
     notes += [f'{name}.driver = "{r.driver}": {r.CAUTION}' for name, r in records.items() if r.CAUTION]
     told |= {
-        "ok": True,
-        "cell": loaded.cell.name,
-        "configuration_hash": loaded.calibration_hash(),
-        "simulated": bool(loaded.cell.truth) or list(loaded.cell.sim),
-        "confirm": loaded.cell.confirm,
-        "job": checked.job.name,
-        "mesh": str(mesh),
-        "problems": [],
-        "notes": notes,
-    }
+        "ok": True, "cell": loaded.cell.name, "configuration_hash": loaded.calibration_hash(),
+        "simulated": bool(loaded.cell.truth) or list(loaded.cell.sim), "confirm": loaded.cell.confirm,
+        "job": checked.job.name, "mesh": str(mesh), "problems": [], "notes": notes,
+    }  # fmt: skip
     if json:
         print_json(told)
         return

@@ -10,7 +10,7 @@ and the calibration's own covariance hide small changes.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,7 +44,7 @@ LENS = PARAMETERS[:9]
 class Suspect:
     """A part that may have changed: how probable among the parts, and the most probable change (27,) of the chain.
 
-    `spread` (27, k) is a root of the change's covariance.
+    `spread` (27, k) is a root of the change's covariance. Of another `round`: changed as well, not instead.
     """
 
     chain: str
@@ -52,6 +52,7 @@ class Suspect:
     probability: float
     change: Array
     spread: Array
+    round: int = 0
 
     def as_dict(self) -> dict[str, object]:
         """For reports, units in the names."""
@@ -122,8 +123,35 @@ def verdict(evidences: Mapping[str, DriftEvidence], states: Mapping[str, Adjustm
     figures = [figure for name in evidences for figure in _figures(name, evidences[name], states[name])]
     seen = detectable(evidences, states, tests, scores=scores, factors=drawn, threshold=threshold)
     return DriftVerdict(
-        float(log_mean(found[None])[0]), threshold, fit, _suspects(evidences, tests, found), figures, detectable=seen
+        float(log_mean(found[None])[0]),
+        threshold,
+        fit,
+        _all_suspects(evidences, tests, threshold),
+        figures,
+        detectable=seen,
     )
+
+
+def _all_suspects(
+    evidences: Mapping[str, DriftEvidence], tests: list[tuple[str, Hypothesis]], threshold: float
+) -> list[Suspect]:
+    """The suspects, and further ones for what the most probable change leaves unexplained beyond chance.
+
+    Parts that changed together are not rivals: one that does nothing to the place must not hide one that does.
+    """
+    made, left = list[Suspect](), dict(evidences)
+    while True:
+        found = np.array([log_factor(left[name], h, left[name].score[None])[0] for name, h in tests])
+        if made and not float(log_mean(found[None])[0]) > threshold:
+            return made
+        rounds = made[-1].round + 1 if made else 0
+        named = {(s.chain, s.part) for s in made}
+        more = [s for s in _suspects(left, tests, found) if (s.chain, s.part) not in named]
+        if not more:
+            return made
+        made += [replace(suspect, round=rounds) for suspect in more]
+        weighed = left[more[0].chain]
+        left[more[0].chain] = replace(weighed, score=weighed.score - weighed.information @ more[0].change)
 
 
 def _suspects(

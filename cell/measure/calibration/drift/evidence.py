@@ -63,14 +63,10 @@ class Reference:
         excess = {name: max(1.0, adjusted.excess.get(name, 1.0)) for name in ("shift", "turn", "rail")}
         priors = adjusted.priors
         return cls(
-            adjusted.state.base_from_board,
-            adjusted.reliable_covariance,
-            priors.arm_translation * excess["shift"],
-            arm_rotation=priors.arm_rotation * excess["turn"],
-            rail=priors.rail * excess["rail"],
-            dots_scale=priors.dots_scale,
-            stripe_scale=priors.stripe_scale,
-        )
+            adjusted.state.base_from_board, adjusted.reliable_covariance, priors.arm_translation * excess["shift"],
+            arm_rotation=priors.arm_rotation * excess["turn"], rail=priors.rail * excess["rail"],
+            dots_scale=priors.dots_scale, stripe_scale=priors.stripe_scale,
+        )  # fmt: skip
 
     def as_dict(self) -> dict[str, object]:
         """For storage."""
@@ -89,13 +85,10 @@ class Reference:
         sigma, scale = data["sigma"], data["scale"]
         return cls(
             from_matrix(data["base_from_board"]),
-            np.array(data["covariance"], dtype=np.float64).reshape(SHARED, SHARED),
-            float(sigma["arm_translation"]),
-            arm_rotation=float(sigma["arm_rotation"]),
-            rail=float(sigma["rail"]),
-            dots_scale=float(scale["dots"]),
+            np.array(data["covariance"], dtype=np.float64).reshape(SHARED, SHARED), float(sigma["arm_translation"]),
+            arm_rotation=float(sigma["arm_rotation"]), rail=float(sigma["rail"]), dots_scale=float(scale["dots"]),
             stripe_scale=float(scale["stripe"]),
-        )
+        )  # fmt: skip
 
 
 # The lens model itself is no better than this; it keeps few-thousandths noise from making a test of the model.

@@ -95,15 +95,11 @@ class StampTiming:
     def summary(self) -> dict[str, object]:
         """For reports and people, units in the names."""
         return {
-            "late_ms": round(1e3 * self.late, 4),
-            "sigma_ms": round(1e3 * self.sigma, 4),
-            "play_um": round(1e6 * self.play, 2),
-            "play_sigma_um": round(1e6 * self.play_sigma, 2),
-            "readout_ms": round(1e3 * self.readout, 4),
-            "readout_sigma_ms": round(1e3 * self.readout_sigma, 4),
-            "late_per_exposure": round(self.by_exposure, 4),
-            "date": self.date,
-        }
+            "late_ms": round(1e3 * self.late, 4), "sigma_ms": round(1e3 * self.sigma, 4),
+            "play_um": round(1e6 * self.play, 2), "play_sigma_um": round(1e6 * self.play_sigma, 2),
+            "readout_ms": round(1e3 * self.readout, 4), "readout_sigma_ms": round(1e3 * self.readout_sigma, 4),
+            "late_per_exposure": round(self.by_exposure, 4), "date": self.date,
+        }  # fmt: skip
 
 
 def _link(data: dict[str, Any]) -> dict[str, str]:

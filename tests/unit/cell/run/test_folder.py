@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sqlite3
 import time
@@ -20,6 +21,7 @@ from cell.run.folder import (
     list_runs,
     new_run,
     read_report,
+    run_log,
     run_row,
     write_json,
 )
@@ -170,3 +172,12 @@ def test_the_newest_run_is_the_last_whatever_the_clock_says(tmp_path: Path) -> N
     made = [new_run(tmp_path) for _ in range(3)]
     assert [folder.name[:15] for folder in made] == ["21000101T000000", "21000101T000001", "21000101T000002"]
     assert find_run(tmp_path, None) == made[-1]
+
+
+def test_a_log_that_cannot_be_written_ends_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Nor does it take the place of what went wrong. /dev/full is a disk without room."""
+    (tmp_path / "run.log").symlink_to("/dev/full")
+    with pytest.raises(ConfigError, match="the board is not seen"), run_log(tmp_path):
+        logging.getLogger("cell.run").warning("x" * 10_000)
+        raise ConfigError("the board is not seen")
+    assert capfd.readouterr().err == ""

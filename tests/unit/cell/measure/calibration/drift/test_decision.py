@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pinocchio as pin
 import pytest
 from scipy.optimize import brentq
 from scipy.stats import chi2, ncx2
@@ -131,6 +132,21 @@ def test_a_change_that_does_little_to_the_place_is_told_and_not_called_bad(calib
     assert place["error_mm"] <= place["error_at_most_mm"] < place["allowed_mm"] / 3 == pytest.approx(0.2)
     assert "Nothing has to be done now" in summary["reason"]
     assert summary["suspects"][0]["part"] == "scan camera's lens"
+
+
+def test_a_harmless_change_does_not_hide_one_that_matters(calibrated):
+    """One knock on the flange moves both cameras: the turned one fits the evidence by itself, and does little."""
+    cell, calibration = calibrated
+    turn = pin.SE3(pin.exp3(np.array([0.0, 0.0, 1.5e-3])), np.zeros(3)).homogeneous
+    turned = cell.truth.flange_from_scan @ turn
+    moved = cell.truth.flange_from_target @ shifted(np.array([0.35e-3, 0.0, 0.0]))
+    job, found = load_job("pot")[0], []
+    for truth in ({"flange_from_scan": turned}, {"flange_from_scan": turned, "flange_from_target": moved}):
+        seen = looked_again(cell, calibration, replace(cell.truth, **truth))
+        found.append(Verification.of(calibration, job, seen))
+    assert [verification.good for verification in found] == [True, False]
+    assert {s.chain for s in found[1].verdict.suspects} == {"scan", "target"}
+    assert "; and as well the " in found[1].reason
 
 
 def test_a_camera_bumped_by_a_third_of_the_tolerance_is_called_bad_with_the_mm_at_the_place(calibrated):
