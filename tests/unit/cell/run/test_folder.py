@@ -174,8 +174,12 @@ def test_the_newest_run_is_the_last_whatever_the_clock_says(tmp_path: Path) -> N
     assert find_run(tmp_path, None) == made[-1]
 
 
-def test_a_log_that_cannot_be_written_ends_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_log_that_cannot_be_written_ends_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Nor does it take the place of what went wrong. /dev/full is a disk without room."""
+    # What commands of other tests show lies with the logger as well.
+    monkeypatch.setattr(logging.getLogger("cell"), "handlers", [])
     (tmp_path / "run.log").symlink_to("/dev/full")
     with pytest.raises(ConfigError, match="the board is not seen"), run_log(tmp_path):
         logging.getLogger("cell.run").warning("nothing but this")
