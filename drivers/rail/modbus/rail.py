@@ -8,12 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drivers.clock import Clock
-from drivers.errors import UNTOLD, ConfigError, LimitError, shown
+from drivers.errors import UNTOLD, Aborted, ConfigError, LimitError, shown
 from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.modbus.drive import DriveArrival, DriveZero, ModbusDrive
 from drivers.rail.modbus.link import ModbusLink, Number, Rate, RegisterMap
-from drivers.rail.motion import SEARCHING
 
 ROUNDING = 0.01
 """By what share a speed may be rounded to the drive's unit; an acceleration by five times that."""
@@ -159,7 +158,7 @@ class ModbusRail(RailAxis):
         found = self._zero.found()
         if self._link.stops.count != issued:
             self._zero.forget()
-            return self._link.stops.end(self.name, self._position(), SEARCHING)
+            raise Aborted(f"{self.name}: stopped while searching the reference switch")
         self._homing = not found
         return found
 
