@@ -155,7 +155,8 @@ def test_a_broken_package_is_listed_with_its_error_and_stops_nothing(
     rows = {(row.kind, row.make): row for row in installed()}
     assert rows["rail", "acme"].state.startswith("broken: ")
     assert words in rows["rail", "acme"].state
-    assert all(rows[make.kind, make.name].ok for make in BUILT_IN)
+    # Not every machine has the library of every make.
+    assert all(rows[make.kind, make.name].state.startswith(("ok", "not installed: ")) for make in BUILT_IN)
     assert load_config(None).rail.driver == "tmcl"
     with pytest.raises(ConfigError) as caught:
         loaded(tmp_path)
