@@ -8,7 +8,6 @@ import math
 import threading
 from bisect import bisect_right
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,12 +51,13 @@ class UrMotion:
         """
         margin = _WALL_MARGIN_S * max(0.0, self._clock.rate - 1.0)
         if not self._clock.wait(self._ended, timeout + margin):
-            with suppress(DeviceError):
+            late = f"{self._what} did not end within {timeout:g} s"
+            try:
                 self._stop()
-            raise DeadlineError(
-                self._device,
-                f"{self._what} did not end within {timeout:g} s and was stopped. Allow more time or move faster.",
-            )
+            except DeviceError as error:
+                told = f"{late}, and the stop was not confirmed: {error}. Press the emergency stop."
+                raise DeadlineError(self._device, told) from error
+            raise DeadlineError(self._device, f"{late} and was stopped. Allow more time or move faster.")
         if self._error is not None:
             raise self._error
 

@@ -40,6 +40,7 @@ _GOOD_LATCH_WALL_S = 0.0005
 _QUEUE_BYTES = 64 * 1024 * 1024
 _LONGEST_GAP_S = 2.0
 _SETTING_TOLERANCE = 0.01
+_NUMBERS = ("height", "width", "exposure_min_s", "exposure_max_s", "frame_rate_max_hz")
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ class StreamCamera:
             self._compare_clocks()
             called = self._clock.now()
             with self._queue(capacity=4) as frames:
-                frames.expect(self._link.request("trigger")[0].get("next_frame_id"))
+                frames.expect(self._first_id("trigger", self._link.request("trigger")[0]))
                 while True:
                     frame = frames.next(timeout)
                     if frame.host_time >= called - self._map.uncertainty:
@@ -154,7 +155,7 @@ class StreamCamera:
         with self._exclusive():
             self._compare_clocks()
             with self._queue(capacity=max(8, _QUEUE_BYTES // (height * width))) as frames:
-                frames.expect(self._link.request("start", **settings)[0].get("next_frame_id"))
+                frames.expect(self._first_id("start", self._link.request("start", **settings)[0]))
                 with in_the_end(self._end_acquisition):
                     yield frames
 
@@ -183,13 +184,12 @@ class StreamCamera:
         try:
             if about["pixel_format"] != "mono8":
                 raise ValueError(f"pixel format {about['pixel_format']!r} instead of mono8")
-            return _About(
-                Identity(str(about["model"]), str(about["serial"]), str(about["firmware"]), self._address),
-                (int(about["height"]), int(about["width"])),
-                float(about["exposure_min_s"]),
-                float(about["exposure_max_s"]),
-                float(about["frame_rate_max_hz"]),
-            )
+            told = [about[name] for name in _NUMBERS]
+            if not all(isinstance(one, int | float) and 0 < one < math.inf for one in told):
+                raise ValueError(f"{', '.join(_NUMBERS)} are {told} instead of numbers above 0")
+            height, width, low, high, fastest = map(float, told)
+            named = Identity(str(about["model"]), str(about["serial"]), str(about["firmware"]), self._address)
+            return _About(named, (int(height), int(width)), low, high, fastest)
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise self._unusable("identify", repr(error)) from error
 
@@ -199,6 +199,10 @@ class StreamCamera:
         if not isinstance(value, int | float) or not math.isfinite(value):
             raise self._unusable(op, f"{key} is {value!r}")
         return float(value)
+
+    def _first_id(self, op: str, reply: Header) -> int | None:
+        """The id of an acquisition's first frame, where the camera tells it."""
+        return None if reply.get("next_frame_id") is None else int(self._number(reply, op, "next_frame_id"))
 
     def _unusable(self, op: str, why: str) -> DeviceFault:
         return DeviceFault(

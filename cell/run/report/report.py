@@ -9,6 +9,7 @@ import logging
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -90,14 +91,17 @@ class FinishedJob:
             except Exception as error:
                 report["truth_missing"] = f"{type(error).__name__}: {error}"
         report["measured"] = measured(self.result, self.job, report["truth"], report["place_bound_95"])
+        picture = self.folder / "picture.png"
         try:
             # Drawing is the slowest thing to load, and a command that jogs or stops the cell does not draw.
             from cell.run.report.pictures import draw_run
 
-            picture = self.folder / "picture.png"
             draw_run(picture, self.job, self.nominal, result=self.result, report=report, frames=self.frames)
         except Exception as error:
             report["picture_missing"] = f"{type(error).__name__}: {error}"
+            # Half of one shows nothing, and `cell` would point at it.
+            with suppress(OSError):
+                picture.unlink()
         report = sealed(strict(timeless(report)))
         _write(self.folder, report)
         return report

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.arm.motion import ArmLimits, JointTrajectory, UrMotion, pose_difference
 from drivers.clock import Clock
-from drivers.errors import Aborted, DeadlineError, DeviceFault, LimitError
+from drivers.errors import Aborted, DeadlineError, DeviceFault, LimitError, NotConnectedError
 
 
 def test_a_trajectory_is_straight_between_its_points_and_ends_at_its_last():
@@ -152,6 +152,14 @@ def test_a_motion_that_takes_too_long_is_stopped():
     with pytest.raises(DeadlineError, match=r"did not end within 0\.01 s and was stopped"):
         motion(stops).wait(0.01)
     assert stops == ["stop"]
+
+
+def test_a_motion_whose_stop_fails_is_not_told_as_stopped():
+    def failing():
+        raise NotConnectedError("arm", "the link is gone")
+
+    with pytest.raises(DeadlineError, match=r"the stop was not confirmed: .*the link is gone.*emergency stop"):
+        UrMotion("arm", "move", 1, Clock(), failing).wait(0.01)
 
 
 def test_a_stopped_or_failed_motion_never_returns():

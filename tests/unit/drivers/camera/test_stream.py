@@ -252,19 +252,24 @@ def test_settings_are_checked_before_anything_is_sent(bench: Bench) -> None:
 @pytest.mark.wire
 def test_an_answer_without_a_number_is_a_fault_of_the_protocol(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     ask = bench.camera._link.request
-    wrong: dict[str, object] = {"exposure_s": math.nan}
+    wrong: dict[str, object] = {}
 
     def spoilt(op: str, **values: object) -> object:
         header, *rest = ask(op, **values)
         return {**header, **wrong}, *rest
 
     monkeypatch.setattr(bench.camera._link, "request", spoilt)
-    for name, use in (
-        ("exposure_s", lambda: bench.camera.configure(0.002, 100.0)),
-        ("device_ns", bench.camera._compare_clocks),
+    for name, value, use in (
+        ("height", 0, bench.camera.identity),
+        ("exposure_min_s", math.nan, bench.camera.identity),
+        ("exposure_s", math.nan, lambda: bench.camera.configure(0.002, 100.0)),
+        ("next_frame_id", "7", bench.camera.grab),
+        ("next_frame_id", math.inf, bench.camera.grab),
+        ("device_ns", None, bench.camera._compare_clocks),
     ):
-        wrong[name] = None if name == "device_ns" else math.nan
-        with pytest.raises(DeviceFault, match=f"{name} is (nan|None)") as caught:
+        wrong.clear()
+        wrong[name] = value
+        with pytest.raises(DeviceFault, match=rf"{name}.* (is|are) .*{value!r}") as caught:
             use()
         assert caught.value.code == "camera.protocol"
 

@@ -100,6 +100,7 @@ def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(
 def test_what_went_wrong_with_the_report_itself_is_told_in_it(placed_pot: JobRecord, tmp_path: Path) -> None:
     run = report_runs.crippled(placed_pot, tmp_path / "runs")
     assert {"frames_missing", "truth_missing", "picture_missing"} <= set(run.report)
+    assert not (run.folder / "picture.png").is_symlink(), "the half of one was left"
     assert run.report["outcome"] == "placed"
 
 
