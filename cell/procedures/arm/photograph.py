@@ -20,7 +20,7 @@ from cell.config.job import Job, PhotoSection
 from cell.measure.calibration import ScanCalibration, TargetCalibration
 from cell.measure.calibration.drift.evidence import Reference
 from cell.measure.geometry.poses import compose_covariance, from_parts, from_ur, mean, transform
-from cell.measure.inversion.effects.during_sweep import require_firm
+from cell.measure.inversion.effects.during_sweep import require_firm, roll_of
 from cell.measure.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board
 from cell.measure.vision.board.view import centre_of
 from drivers.errors import CalibrationStale, Measured, RefusedError
@@ -155,8 +155,7 @@ def swing_covariance(swung: float, base_from_board: pin.SE3, base_from_vehicle: 
 
     Raises `RefusedError` when it rocks too much to put anything down.
     """
-    away = float(np.linalg.norm(base_from_board.translation - base_from_vehicle.translation))
-    angle = swung / away
+    angle = roll_of(swung, base_from_board, base_from_vehicle)
     require_firm(angle, swung, "the board")
     return np.diag([0.5 * swung**2] * 3 + [0.5 * angle**2] * 3)
 

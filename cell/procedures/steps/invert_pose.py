@@ -20,6 +20,7 @@ from cell.measure.inversion.effects.during_sweep import (
     find_rocking,
     rocking_covariance,
     rocking_motions,
+    roll_of,
     words,
 )
 from cell.measure.reconstruction.cloud import Indices
@@ -55,11 +56,14 @@ def invert_pose(
     placing. The prior is the board's pose carried on to the surface. Raises `RefusedError` when scan, surface and board
     do not fit together or the vehicle rocks too much, `NotObservable` when a direction is not known well enough.
     """
-    prior = _prior(fix, job)
+    prior, vehicle = _prior(fix, job), taken.base_from_vehicle
+    roll = roll_of(fix.swung, fix.base_from_board, vehicle)
+    place = prior.base_from_surface.translation
+    unknown = kinematic + rocking_covariance(None, vehicle, place, roll)
     tolerance = Tolerance(job.place.tolerance, job.place.tolerance_angle)
     registered = partial(register, scan.cloud, nominal, prior, tolerance)
     try:
-        found = registered(systematic=kinematic, calibration=scan.by_calibration, sweeps=scan.by_poses)
+        found = registered(systematic=unknown, calibration=scan.by_calibration, sweeps=scan.by_poses)
     except RefusedError as refused:
         pose = refused.seen.get("pose")
         if not isinstance(pose, pin.SE3) or isinstance(refused, NotObservable):
@@ -72,15 +76,15 @@ def invert_pose(
     by_calibration = partial(_by_calibration_and_droop, scan, droop)
     if droop is not None:
         try:
-            found = registered(systematic=kinematic, calibration=by_calibration, sweeps=scan.by_poses)
+            found = registered(systematic=unknown, calibration=by_calibration, sweeps=scan.by_poses)
         except NotObservable as refused:
             raise _told_before(refused, droop.words) from refused
         found = replace(found, notes=(droop.words,))
     if (rocking := find_rocking(scan.cloud, nominal, found.base_from_surface, taken.times)) is None:
         return found
     by_poses = partial(_by_poses_and_rocking, scan, taken, rocking.hz)
-    unknown = rocking_covariance(rocking, taken.base_from_vehicle, prior.base_from_surface.translation)
-    still = registered(systematic=kinematic + unknown, calibration=by_calibration, sweeps=by_poses)
+    unknown = kinematic + rocking_covariance(rocking, vehicle, place, roll)
+    still = registered(systematic=unknown, calibration=by_calibration, sweeps=by_poses)
     return replace(still, notes=(*found.notes, words(rocking)))
 
 

@@ -162,18 +162,30 @@ def rocking_motions(
     return motions
 
 
-def rocking_covariance(rocking: Rocking, base_from_vehicle: pin.SE3, at: Array) -> Array:
+def rocking_covariance(rocking: Rocking | None, base_from_vehicle: pin.SE3, at: Array, roll: float = 0.0) -> Array:
     """Covariance (6, 6), m² and rad², base axes, of a place `at` (3,), m, at a moment that nobody chose.
 
-    Raises `RefusedError` when it rocks too much to put anything down.
+    By ±`roll` rad the vehicle rolls in photographs; the heights of a scan before the vehicle do not show it. Raises
+    `RefusedError` when it rocks too much to put anything down.
     """
     arm = at - base_from_vehicle.translation
     axes = base_from_vehicle.rotation[:, :2]
-    beside = float(np.linalg.norm(axes.T @ arm))
-    angle = rocking.height / beside
-    require_firm(angle, rocking.height, "the place", rocking.hz)
-    columns = np.concatenate([np.cross(axes.T, arm).T, axes])
-    return np.asarray(0.5 * angle**2 * columns @ columns.T)
+    angle = 0.0
+    if rocking is not None:
+        angle = rocking.height / float(np.linalg.norm(axes.T @ arm))
+        require_firm(angle, rocking.height, "the place", rocking.hz)
+    columns = np.concatenate([np.cross(axes.T, arm).T, axes]) * [max(angle, roll), angle]
+    return np.asarray(0.5 * columns @ columns.T)
+
+
+def roll_of(swung: float, base_from_board: pin.SE3, base_from_vehicle: pin.SE3) -> float:
+    """The roll, rad, of a vehicle that moves a board to and fro by `swung` m before a camera that looks square at it.
+
+    A pitch moves such a board mostly along the camera's axis; the heights of a scan show it instead.
+    """
+    moved = np.cross(base_from_vehicle.rotation[:, 0], base_from_board.translation - base_from_vehicle.translation)
+    seen = base_from_board.rotation[:, :2].T @ moved
+    return swung / float(np.linalg.norm(seen)) if swung else 0.0
 
 
 def require_firm(angle: float, moved: float, what: str, hz: float | None = None) -> None:

@@ -168,6 +168,17 @@ def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square() -> None:
     assert covariance[2, 2] == pytest.approx(0.5 * 1e-4**2)
 
 
+def test_a_roll_that_photographs_show_shifts_the_place_to_the_side_where_the_scan_shows_less() -> None:
+    arm = SURFACE.translation - VEHICLE.translation
+    alone = rocking_covariance(None, VEHICLE, SURFACE.translation, 2e-4)
+    way = np.array([*np.cross([1.0, 0.0, 0.0], arm), 1.0, 0.0, 0.0])
+    np.testing.assert_allclose(alone, 0.5 * 2e-4**2 * np.outer(way, way), atol=1e-20)
+    seen = Rocking(4.0, 1e-4, 3.75e-3)
+    both = rocking_covariance(seen, VEHICLE, SURFACE.translation, 2e-4)
+    pitch = rocking_covariance(seen, VEHICLE, SURFACE.translation)[4, 4]
+    assert (both[3, 3], both[4, 4]) == pytest.approx((0.5 * 2e-4**2, pitch))
+
+
 def test_a_vehicle_that_rocks_too_much_is_waited_for() -> None:
     with pytest.raises(RefusedError, match=r"rocks.*Wait until it is quiet"):
         rocking_covariance(Rocking(3.0, 4 * LARGEST_RAD, 5e-3), VEHICLE, SURFACE.translation)
