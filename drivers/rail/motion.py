@@ -50,6 +50,9 @@ def patience(clock: Clock, seconds: float) -> float:
     return max(seconds, WALL_FLOOR_S * clock.rate)
 
 
+SEARCHING = "while it searched the reference switch"
+
+
 class Stops:
     """The stops of one link: how many were asked for, and what became of the last."""
 
@@ -69,8 +72,8 @@ class Stops:
         finally:
             self._given = False
 
-    def end(self, name: str, position: float) -> bool:
-        """How a motion ends that was stopped at `position`, m: not yet while the stop is given (False).
+    def end(self, name: str, position: float, doing: str = "before its target") -> bool:
+        """How a motion ends that was stopped at `position`, m, `doing` this: not yet while the stop is given (False).
 
         Raises `Aborted` once it was taken, `DeviceFault` where nobody knows that it was.
         """
@@ -80,7 +83,7 @@ class Stops:
             text = f"was told to stop and has not confirmed it; at {shown(position, 'm')} it may go on"
             hint = "Press the emergency stop, then see the line to the drive."
             raise DeviceFault(name, "rail.not_stopped", text, recoverable=False, hint=hint)
-        raise Aborted(f"{name}: stopped at {shown(position, 'm')} before its target")
+        raise Aborted(f"{name}: stopped at {shown(position, 'm')} {doing}")
 
 
 class RailMotion:

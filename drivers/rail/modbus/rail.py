@@ -8,11 +8,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drivers.clock import Clock
-from drivers.errors import UNTOLD, Aborted, ConfigError, LimitError, shown
+from drivers.errors import UNTOLD, ConfigError, DeviceFault, LimitError, shown
 from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.modbus.drive import DriveArrival, DriveZero, ModbusDrive
 from drivers.rail.modbus.link import ModbusLink, Number, Rate, RegisterMap
+from drivers.rail.motion import SEARCHING
 
 ROUNDING = 0.01
 """By what share a speed may be rounded to the drive's unit; an acceleration by five times that."""
@@ -155,10 +156,17 @@ class ModbusRail(RailAxis):
         self._zero.search(issued=issued)
 
     def _home_found(self, issued: int) -> bool:
-        found = self._zero.found()
-        if self._link.stops.count != issued:
+        stops, found = self._link.stops, False
+        if stops.count == issued:
+            try:
+                found = self._zero.found()
+            except DeviceFault:
+                # A search that is stopped looks like one that found nothing.
+                if stops.count == issued:
+                    raise
+        if stops.count != issued:
             self._zero.forget()
-            raise Aborted(f"{self.name}: stopped while searching the reference switch")
+            return stops.end(self.name, self._position(), SEARCHING)
         self._homing = not found
         return found
 

@@ -15,7 +15,7 @@ from pymodbus.client import ModbusSerialClient
 
 from cell.devices.contracts import Bench, Faults, RailContract
 from drivers.clock import Clock
-from drivers.errors import Aborted, ConfigError, LimitError
+from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, LimitError
 from drivers.interfaces import Rail
 from drivers.rail.modbus.make import register_map
 from sim_backends.peers.rail.modbus_drive import ModbusPeer
@@ -90,6 +90,27 @@ def test_a_stop_goes_before_whatever_was_not_sent_yet(drive: Drive) -> None:
     Clock().sleep(0.1)
     assert drive.model.velocity(drive.clock.now()) == 0
     assert drive.model.carriage(drive.clock.now()) < 0.02
+    rail.close()
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_a_search_ends_as_its_stop_did(drive: Drive, answered: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lost(*words: object, **more: object) -> None:
+        raise DeadlineError("rail", "no answer")
+
+    rail = drive.rail()
+    motion = rail.home()
+    if answered:
+        rail.stop()
+        with pytest.raises(Aborted, match="while it searched the reference switch"):
+            motion.wait(30.0)
+    else:
+        with monkeypatch.context() as silent, pytest.raises(DeadlineError):
+            silent.setattr(rail._link, "do", lost)
+            rail.stop()
+        with pytest.raises(DeviceFault, match="has not confirmed it") as told:
+            motion.wait(30.0)
+        assert told.value.code == "rail.not_stopped"
     rail.close()
 
 
