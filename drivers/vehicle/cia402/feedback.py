@@ -147,6 +147,10 @@ UNHEARD = 8
 """A drive that drives and was asked so many times for its state without an answer is lost."""
 STILL = 0.0035
 """Speeds up to this, m/s and rad/s, count as standstill."""
+CREPT_M = 0.001
+"""What a wheel may go on by its counts while its speed says standstill: a rotor hunts by some of them."""
+AT_REST = 3
+"""So many pairs of readings in a row have to say standstill: a speed alone may come from a drive that tells none."""
 _RELEASED_WALL_S = 0.3
 _FAST_AGE_WALL_S = 0.2
 _PAIR_WALL_S = 0.006
@@ -182,6 +186,8 @@ class DriveFeedback:
         self._news = threading.Condition(threading.RLock())
         self._single: tuple[int, float] | None = None
         self._units = [UnitCheck(clock, wheels), UnitCheck(clock, wheels)]
+        self._rests_at: tuple[int, ...] = ()
+        self._rested = 0
         self.mismatch = ""
         """How a wheel's speed and its counts contradict each other."""
         self.proving = False
@@ -216,6 +222,7 @@ class DriveFeedback:
             for drive, back in zip(self.drives, self._wheels.reversed, strict=True)
         )
         self._travel.count(now, left, right)
+        self._compare_rest()
         for drive, units in zip(self.drives, self._units, strict=True):
             if math.isfinite(drive.moved) and (ratio := units.contradiction(now, drive.position, drive.velocity)):
                 self.mismatch = (
@@ -223,6 +230,14 @@ class DriveFeedback:
                     f'"{self._wheels.velocity_unit}" and vehicle.counts_per_turn {self._wheels.counts} do not fit its '
                     "drive"
                 )
+
+    def _compare_rest(self) -> None:
+        """How many pairs in a row the counts have stayed where they are."""
+        counts = tuple(drive.position for drive in self.drives)
+        moved = [abs((a - b + 2**31) % 2**32 - 2**31) for a, b in zip(counts, self._rests_at, strict=False)]
+        if not moved or max(moved) * self._wheels.count_length > CREPT_M:
+            self._rests_at, self._rested = counts, 0
+        self._rested += 1
 
     def other(self, what: str) -> None:
         """Somebody else commands."""
@@ -331,8 +346,8 @@ class DriveFeedback:
         return any(may_turn(drive.state) for drive in self.drives)
 
     def stands(self, since: float) -> bool:
-        """True when both drives have reported standstill after host time `since`."""
-        if self._travel.swings():
+        """True when both drives have reported standstill after host time `since`, and their counts do not deny it."""
+        if self._travel.swings() or self._rested < AT_REST:
             return False
         step = 1.5 * self._wheels.velocity_step
         slow = max(STILL, step)

@@ -11,7 +11,7 @@ import pytest
 from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.cia402.drive import HEARTBEAT, MOTION, STATUS
-from drivers.vehicle.cia402.feedback import DriveFeedback, UnitCheck, WheelDrives
+from drivers.vehicle.cia402.feedback import AT_REST, CREPT_M, DriveFeedback, UnitCheck, WheelDrives
 from tests.support.inner_bus import Hand
 
 WHEELS = WheelDrives((1, 2), 0.1, 20.0, 4096, "0.1 rpm", (False, True), 0.58, 0.5, 1.0)
@@ -62,10 +62,12 @@ class Told:
         for node in (1, 2):
             self.tell(node)
 
-    def tell(self, node: int, velocity: int = 0, word: int = 0x0237, mode: int = 3, inputs: int = 0) -> None:
+    def tell(
+        self, node: int, velocity: int = 0, word: int = 0x0237, mode: int = 3, inputs: int = 0, count: int = 0
+    ) -> None:
         self.clock.time += 0.001
         self.feedback.take(node, MOTION, struct.pack("<iI", velocity, inputs))
-        self.feedback.take(node, STATUS, struct.pack("<Hib", word, 0, mode))
+        self.feedback.take(node, STATUS, struct.pack("<Hib", word, count, mode))
 
     def refusal(self, *, in_command: bool = True, driving: bool = False) -> DeviceFault:
         with pytest.raises(DeviceFault) as caught:
@@ -77,13 +79,30 @@ class Told:
 @pytest.mark.parametrize("velocity", [300, -300])
 def test_one_wheel_that_turns_either_way_is_no_standstill(node: int, velocity: int) -> None:
     told = Told()
-    asked = told.clock.time
-    told.tell(node)
-    assert not told.feedback.stands(asked), "the other one has told nothing since"
-    told.tell(3 - node)
+    for _ in range(AT_REST):
+        asked = told.clock.time
+        told.tell(node)
+        assert not told.feedback.stands(asked), "the other one has told nothing since"
+        told.tell(3 - node)
     assert told.feedback.stands(asked)
     told.tell(node, velocity)
     assert not told.feedback.stands(asked)
+
+
+@pytest.mark.parametrize("node", [1, 2])
+@pytest.mark.parametrize("way", [1, -1])
+def test_counts_that_go_on_deny_a_speed_of_zero(node: int, way: int) -> None:
+    told = Told()
+    asked, step = told.clock.time, round(1.2 * CREPT_M / WHEELS.count_length)
+    for k in range(1, 3 * AT_REST):
+        told.tell(node, count=way * k * step)
+        told.tell(3 - node)
+        assert not told.feedback.stands(asked)
+    for k in range(AT_REST):
+        # It hunts by some counts.
+        told.tell(node, count=way * (3 * AT_REST - 1) * step + 3 * (k % 2))
+        told.tell(3 - node)
+    assert told.feedback.stands(asked)
 
 
 @pytest.mark.parametrize("node", [1, 2])
