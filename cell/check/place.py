@@ -14,7 +14,8 @@ import pinocchio as pin
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.measure.geometry.poses import from_parts, transform
-from cell.measure.inversion.nominal import read_mesh
+from cell.measure.inversion.mating import MatingGap, drawn_gap
+from cell.measure.inversion.nominal import NominalSurface, read_mesh
 from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import Body, station_bodies, vehicle_bodies
@@ -93,6 +94,23 @@ def _height_problems(job: Job, over: float, highest: float) -> Iterator[str]:
         )
 
 
+def mating_problems(job: Job, mesh: Path) -> Iterator[str]:
+    """Whether the part as drawn lies on the surface as drawn; nothing without a mesh of the part."""
+    if job.part is None:
+        return
+    found = _drawn(job, mesh)
+    problem = "nothing of surface.mesh lies below it" if found is None else found.problem(job.place.tolerance)
+    if problem:
+        yield f'part.mesh "{Path(job.part.mesh).name}": {problem}'
+
+
+def _drawn(job: Job, mesh: Path) -> MatingGap | None:
+    assert job.part is not None
+    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+    part = NominalSurface.load(Path(job.part.mesh), unit=job.part.mesh_unit)
+    return drawn_gap(nominal, job.place.surface_from_part.se3(), part)
+
+
 def contact_notes(job: Job, mesh: Path) -> Iterator[str]:
     """What a person should know of the place before the first part."""
     over, highest = under_part(job, mesh)
@@ -100,6 +118,10 @@ def contact_notes(job: Job, mesh: Path) -> Iterator[str]:
         f"at the place the surface reaches {1e3 * highest:.1f} mm into the part's box of "
         f"{1e3 * job.grasp.size[2]:g} mm, and {100 * over:.0f} % of its footprint lie over the surface"
     )
+    if job.part is None:
+        yield "the job has no mesh of its part ([part]): whether its underside fits the surface is not looked at"
+    elif (found := _drawn(job, mesh)) is not None:
+        yield f"the part's mating face, as drawn: {found.words}"
 
 
 def under_part(job: Job, mesh: Path) -> tuple[float, float]:

@@ -81,6 +81,13 @@ class SurfaceSection(Table):
     prior_sigma_angle: Annotated[float, quantity("deg", 0.01, 20)]
 
 
+class PartSection(Table):
+    """The part as drawn, in its own frame; its underside is held against the scanned surface before the descent."""
+
+    mesh: Annotated[str, AfterValidator(_checked_mesh_name)]
+    mesh_unit: Literal["m", "mm"]
+
+
 class SwathSection(Table):
     """One sweep of several: `across` along the surface's y axis, from its middle.
 
@@ -180,6 +187,7 @@ class Job(Table):
     scan: ScanSection
     grasp: GraspSection
     place: PlaceSection
+    part: PartSection | None = None
     obstacle: tuple[StationObstacle, ...] = ()
 
     @model_validator(mode="after")
@@ -235,15 +243,24 @@ def ships(path: Path) -> bool:
 
 
 def load_job(name: str | Path) -> tuple[Job, Path]:
-    """Read and check a job; also gives the path of its mesh, which exists. Raises `ConfigError`."""
+    """Read and check a job; also gives the path of its surface's mesh. Raises `ConfigError`.
+
+    Meshes exist; that of the part is named by its whole path.
+    """
     path = job_path(name)
     job = validate(Job, read_toml(path, "job", "cell new-job"), str(path))
-    mesh = path.parent / job.surface.mesh
-    if not mesh.is_file():
-        raise ConfigError(
-            f"{path}: surface.mesh {job.surface.mesh!r} is not a file (looked for {mesh}); name an STL or PLY"
-        )
+    mesh = _mesh_of(path, "surface", job.surface.mesh)
+    if job.part is not None:
+        part = job.part.model_copy(update={"mesh": str(_mesh_of(path, "part", job.part.mesh).resolve())})
+        job = job.model_copy(update={"part": part})
     return job, mesh
+
+
+def _mesh_of(path: Path, section: str, name: str) -> Path:
+    mesh = path.parent / name
+    if not mesh.is_file():
+        raise ConfigError(f"{path}: {section}.mesh {name!r} is not a file (looked for {mesh}); name an STL or PLY")
+    return mesh
 
 
 def shipped_mesh(mesh: Path) -> str | None:

@@ -71,7 +71,7 @@ class UnfinishedRun:
         except (OSError, ValueError) as error:
             raise ConfigError(f"the job of run {folder.name} cannot be read: {error}; run a job anew") from error
         if changed:
-            raise ConfigError(f"{job} or its mesh was changed since run {folder.name}; run the job again")
+            raise ConfigError(f"{job} or a mesh of it was changed since run {folder.name}; run the job again")
         return cls(folder, job, run.info, _swept(record))
 
     def sweep(self, job: Job, config: CellConfig, calibration: CellCalibration) -> tuple[StoredSweep | None, str]:
@@ -157,18 +157,20 @@ def _swept(record: JournalRecord) -> bool:
 
 
 def job_source(name: str | Path) -> dict[str, object]:
-    """For journal and report: the job's file and its hash, and the file and the hash of its mesh alone."""
+    """For journal and report: the job's file and its hash, and the file and the hash of each of its meshes alone."""
     path = str(job_path(name).resolve())
-    _, mesh = load_job(path)
-    return {"job_file": path, "job_hash": job_hash(path), "mesh": mesh_source(mesh)}
+    job, mesh = load_job(path)
+    part = {} if job.part is None else {"part_mesh": mesh_source(Path(job.part.mesh))}
+    return {"job_file": path, "job_hash": job_hash(path), "mesh": mesh_source(mesh), **part}
 
 
 def mesh_source(mesh: Path) -> dict[str, str]:
-    """A surface's file, and its hash alone."""
+    """A mesh's file, and its hash alone."""
     return {"file": str(mesh.resolve()), "sha256": hashlib.sha256(mesh.read_bytes()).hexdigest()}
 
 
 def job_hash(name: str | Path) -> str:
-    """Hash of a job's file and of its mesh; `ConfigError` when there is no such job any more."""
-    _, mesh = load_job(name)
-    return hashlib.sha256(job_path(name).read_bytes() + mesh.read_bytes()).hexdigest()[:16]
+    """Hash of a job's file and of its meshes; `ConfigError` when there is no such job any more."""
+    job, mesh = load_job(name)
+    files = [job_path(name), mesh, *([] if job.part is None else [Path(job.part.mesh)])]
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]

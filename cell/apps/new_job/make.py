@@ -25,9 +25,10 @@ from cell.apps.new_job.text import job_text, pose_text
 from cell.check.fit import require_fit
 from cell.check.reach import sweep_problems
 from cell.config.cell_config import CellConfig
-from cell.config.job import Job, load_job
+from cell.config.job import Job, PartSection, load_job
 from cell.devices.simulated.described import Described
 from cell.measure.inversion import NominalSurface, PlacePose
+from cell.measure.inversion.nominal import read_mesh
 from drivers.common.units import parse_quantity
 from drivers.errors import CellError, ConfigError, NotObservable, RefusedError
 
@@ -58,9 +59,11 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     name = job_name(asker, mesh)
     targets = Path(folder / f"{name}.toml"), Path(folder / f"{name}.stl"), Path(folder / f"{name}.png")
     targets = (targets[0], _beside(targets[1], mesh), targets[2])
-    _require_room(asker, targets, overwrite)
+    part = _part(asker, folder, name)
+    _require_room(asker, targets if part is None or part.same else (*targets, part.target), overwrite)
     like = template(asker)
     job = station(asker, like, name, targets[1].name, laid)
+    job = job.model_copy(update={"part": None if part is None else part.section})
     step = asker.get("step", "Lines of the scan, how far apart", "0.5 mm", lambda t: parse_quantity(t, "mm", *STEP_MM))
 
     laid, proposal = _proposed(asker, laid, job, config, step=step)
@@ -74,6 +77,8 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         there = Path(place)
         written(proposal.surface, there / targets[1].name, f"{name}: what the sweeps see, mm, z up")
         (there / targets[0].name).write_text(job_text(proposal.job, heading), encoding="utf-8")
+        if part is not None:
+            (there / part.target.name).write_bytes(part.given.read_bytes())
         asker.tell("checking the job as the cell does, and whether the surface looks the same elsewhere …")
         notes = _checked(asker, there / targets[0].name, config, proposal)
         nominal = NominalSurface.load(there / targets[1].name, "mm")
@@ -91,7 +96,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         asker.tell(f"picture: {targets[2]}; look at it")
         if asker.ask is not None and asker.get("write", "Write the job", "yes", choice("yes", "no")) == "no":
             raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
-        for target in targets[:2]:
+        for target in (*targets[:2], *([] if part is None or part.same else [part.target])):
             _copied(there / target.name, target).replace(target)
     return Made(targets[0], targets[1], targets[2], name=name, seen=proposal.share, place=found, notes=tuple(notes))
 
@@ -116,6 +121,36 @@ def _proposed(asker: Asker, laid: Laid, job: Job, config: CellConfig, *, step: f
 
 def _read(text: str) -> Drawn:
     return read_drawing(Path(text.strip()).expanduser())
+
+
+@dataclass(frozen=True)
+class _PartFile:
+    """The mesh of the part as it was `given`, and where it goes, beside the job."""
+
+    given: Path
+    target: Path
+    section: PartSection
+
+    @property
+    def same(self) -> bool:
+        """Whether it lies there already."""
+        return self.target.exists() and self.target.samefile(self.given)
+
+
+def _part(asker: Asker, folder: Path, name: str) -> _PartFile | None:
+    """The part's mesh, where one was named; it keeps its own frame."""
+    if asker.given.get("part") is None:
+        return None
+    unit = asker.get("part-unit", "Unit of the part's mesh", "mm", choice("mm", "m"))
+    given = asker.get("part", "The mesh of the part (STL, PLY)", None, lambda text: _readable(text, unit))
+    target = folder / f"{name}-part{given.suffix.lower()}"
+    return _PartFile(given, target, PartSection.model_validate({"mesh": target.name, "mesh_unit": unit}))
+
+
+def _readable(text: str, unit: str) -> Path:
+    path = Path(text.strip()).expanduser()
+    read_mesh(path, unit)
+    return path
 
 
 def _beside(target: Path, mesh: Path) -> Path:

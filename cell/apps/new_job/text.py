@@ -49,6 +49,9 @@ def job_text(job: Job, heading: Sequence[str]) -> str:
     """The file of a job. `heading` are the lines of comment at its top: where it comes from, what was decided."""
     lines = [f"# {line}" for line in heading]
     lines += ["", *_station_lines(job), "", *_scan_lines(job), "", *_part_lines(job)]
+    if job.part is not None:
+        about = "  # beside this file, in the part's own frame: its underside is held against the scanned surface"
+        lines += ["", "[part]", f'mesh = "{job.part.mesh}"{about}', f'mesh_unit = "{job.part.mesh_unit}"']
     for obstacle in job.obstacle:
         lines += ["", "[[obstacle]]", *_obstacle(obstacle)]
     return "\n".join(lines) + "\n"

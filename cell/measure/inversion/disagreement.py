@@ -208,19 +208,25 @@ def _highest(square: Indices, lift: Array, line: Indices) -> tuple[int, float] |
 
     None where no square has enough.
     """
+    medians, middle, noise = squares(square, lift, line)
+    if not len(medians):
+        return None
+    best = int(np.argmax(middle - noise))
+    return int(medians[best]), float(middle[best] - noise[best])
+
+
+def squares(square: Indices, heights: Array, line: Indices) -> tuple[Indices, Array, Array]:
+    """Of each of the squares (n,) with points enough the point of its median height, that height, m, and `SIGMAS` of
+    its noise, m. The points come from the lines (n,) of a scan."""
     _, owner = np.unique(square, return_inverse=True)
     count = np.bincount(owner)
-    medians, middle = _medians(owner, lift, count)
+    medians, middle = _medians(owner, heights, count)
     # Points of one line share most of their noise.
     each = int(line.max()) + 1
     taken = np.bincount(np.unique(owner * each + line) // each)
-    _, spread = _medians(owner, np.abs(lift - middle[owner]), count)
-    height = middle - SIGMAS * 1.4826 * spread / np.sqrt(taken)
+    _, spread = _medians(owner, np.abs(heights - middle[owner]), count)
     enough = np.flatnonzero((count >= LEAST_POINTS) & (taken >= LEAST_LINES))
-    if not len(enough):
-        return None
-    best = enough[np.argmax(height[enough])]
-    return int(medians[best]), float(height[best])
+    return medians[enough], middle[enough], (SIGMAS * 1.4826 * spread / np.sqrt(taken))[enough]
 
 
 def _medians(owner: Indices, values: Array, count: Indices) -> tuple[Indices, Array]:

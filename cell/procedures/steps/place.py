@@ -13,6 +13,7 @@ from cell.measure.geometry.poses import from_parts, from_ur, to_ur
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.disagreement import highest_standing, require_bare
 from cell.measure.inversion.effects.between_sweeps import Creep
+from cell.measure.inversion.mating import NEXT_STEP, MatingGap, scanned_gap
 from cell.measure.reconstruction.cloud import Indices
 from cell.motion.collision import TOUCHES
 from cell.motion.kinematics import HOME
@@ -41,7 +42,8 @@ class PlaceResult:
     """Where the flange was when the part was let go, how far off in depth, m, and where the part touched first.
 
     `look` is what was seen of the surface between its sweep and the descent; None where it was measured without a
-    sweep. `pose` is where it was placed to: the inverted one, carried on where something creeps.
+    sweep. `pose` is where it was placed to: the inverted one, carried on where something creeps. `mating` is the gap
+    below the part as drawn, where the job has a mesh of it.
     """
 
     base_from_flange: pin.SE3
@@ -50,18 +52,21 @@ class PlaceResult:
     touch: TouchCheck | None = None
     look: SecondLook | None = None
     pose: PlacePose | None = None
+    mating: MatingGap | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What is not as usual, for people."""
         seen = () if self.look is None else self.look.notes
+        seen += () if self.mating is None else self.mating.notes
         if self.touch is None:
             return (*seen, "the first touch was not held against the scan: the arm told too little of the way down")
         return (*seen, *self.touch.notes)
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
-        return {
+        mating = {} if self.mating is None else {"mating": self.mating.as_dict()}
+        return mating | {
             "contact": self.contact,
             "depth_error_mm": round(1e3 * self.depth_error, 4),
             "touch": None if self.touch is None else self.touch.as_dict(),
@@ -218,6 +223,7 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
     require_held(here.part)
     while True:
         held, pose = context.held_s, context.made(PlacePose)
+        mating = _mated(here, pose, context)
         look = _looked_again(here, pose, context)
         if look is not None and look.creep is not None:
             swept = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
@@ -232,10 +238,31 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         part=here.part, check=context.check, progress=context.progress,
         note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
     )  # fmt: skip
-    done = replace(placing.put_down(), look=look, pose=pose)
+    done = replace(placing.put_down(), look=look, pose=pose, mating=mating)
     for note in done.notes:
         context.note(text=note)
     return done
+
+
+def _mated(here: Workplace, pose: PlacePose, context: StepContext) -> MatingGap | None:
+    """The gap between the part as drawn and the surface as scanned; None without a mesh of the part or a scan.
+
+    Raises `RefusedError` where they do not fit.
+    """
+    if here.part_mesh is None:
+        return None
+    context.progress(0.0, "holding the part's underside against the surface")
+    try:
+        cloud = context.made(Reconstruction).cloud
+    except LookupError:
+        # A kind of job that measures in another way.
+        return None
+    lies = here.job.place.surface_from_part.se3()
+    found = scanned_gap(cloud, pose.base_from_surface, here.nominal, lies, here.part_mesh)
+    if found is None:
+        raise RefusedError(f"nothing of the scanned surface lies below the part as drawn. {NEXT_STEP}")
+    found.require(here.job.place.tolerance)
+    return found
 
 
 def carried_on(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix, creep: Creep) -> PlacePose:

@@ -73,6 +73,12 @@ class Workplace:
         """The station's board."""
         return parse_board(self.job.board.spec)
 
+    @cached_property
+    def part_mesh(self) -> NominalSurface | None:
+        """The job's part as drawn, in its own frame; None where the job names no mesh of it."""
+        part = self.job.part
+        return None if part is None else NominalSurface.load(Path(part.mesh), unit=part.mesh_unit)
+
     @property
     def repeatability(self) -> Vector:
         """Covariance (6, 6) of base_from_flange each time the arm comes to rest, m² and rad²."""

@@ -77,6 +77,8 @@ def measured(
         found.append(Measured("contact depth", 1e3 * placed.depth_error, "mm", most=travel))
         if placed.touch is not None:
             found.append(placed.touch.measured)
+        if placed.mating is not None:
+            found.append(placed.mating.measured(job.place.tolerance))
     if isinstance(pose, PlacePose):
         found += fit_figures(pose.coverage, pose.share, pose.rms, pose.chi2_per_dof)
     if isinstance(fix, BoardFix):

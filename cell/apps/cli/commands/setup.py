@@ -118,6 +118,8 @@ def new_job(
     place: Annotated[str | None, typer.Option(help="Pose of the surface's origin in the place frame.")] = None,
     prior: PriorOption = None,
     prior_angle: Annotated[str | None, typer.Option(help="And how it is turned, 1 sigma.")] = None,
+    part: Annotated[str | None, typer.Option(help="STL or PLY of the part itself, in its own frame.")] = None,
+    part_unit: Annotated[str | None, typer.Option(help="Of the part's mesh: mm or m.")] = None,
     part_size: Annotated[str | None, typer.Option(help='The part in the claw: "70 mm, 36 mm, 20 mm".')] = None,
     grasp: Annotated[str | None, typer.Option(help="Pose of the part's origin in the flange's frame.")] = None,
     grasp_sigma: Annotated[str | None, typer.Option(help="How exactly it is held, 1 sigma.")] = None,
@@ -143,8 +145,9 @@ def new_job(
     given = {
         "mesh": mesh, "unit": unit, "bodies": bodies, "up": up, "turn": turn, "flip": flip, "name": name, "like": like,
         "board": board, "board-place": board_place, "place": place, "prior": prior, "prior-angle": prior_angle,
-        "part-size": part_size, "grasp": grasp, "grasp-sigma": grasp_sigma, "grasp-sigma-angle": grasp_sigma_angle,
-        "part-place": part_place, "tolerance": tolerance, "tolerance-angle": tolerance_angle, "step": step,
+        "part": part, "part-unit": part_unit, "part-size": part_size, "part-place": part_place, "grasp": grasp,
+        "grasp-sigma": grasp_sigma, "grasp-sigma-angle": grasp_sigma_angle, "tolerance": tolerance,
+        "tolerance-angle": tolerance_angle, "step": step,
     }  # fmt: skip
     told: list[str] = []
 

@@ -6,12 +6,16 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from cell.base.toml_file import read_toml, validate
-from cell.check.place import contact_notes, contact_problems, mesh_box, surface_problems, under_part
+from cell.check.fit import require_fit
+from cell.check.place import contact_notes, contact_problems, mating_problems, mesh_box, surface_problems, under_part
 from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import Job, load_job, shipped_jobs
+from drivers.errors import ConfigError
+from tests.support.part_meshes import job_with_part
 
 POT = load_job("pot")[1].with_suffix(".toml")
 
@@ -29,6 +33,26 @@ def changed(key: str, value: Any) -> Job:
         section = section[parent]
     section[last] = value
     return validate(Job, raw, "job")
+
+
+def test_the_drawing_of_the_part_is_held_against_that_of_the_surface(tmp_path: Path) -> None:
+    job, mesh = load_job(job_with_part(tmp_path, "pot"))
+    assert list(mating_problems(job, mesh)) == []
+    assert list(contact_notes(job, mesh))[-1].startswith("the part's mating face, as drawn: gap 0.00 to 0.00 mm")
+    wrong, mesh = load_job(job_with_part(tmp_path, "pot", lambda corners: corners - np.array([0.0, 0.0, 0.4e-3])))
+    (told,) = mating_problems(wrong, mesh)
+    assert re.search(r'part\.mesh "pot-part\.ply": the part as drawn goes 0\.40 mm into the surface at', told)
+    aside, mesh = load_job(job_with_part(tmp_path, "pot", lambda corners: corners + np.array([0.2, 0.0, 0.0])))
+    (told,) = mating_problems(aside, mesh)
+    assert "nothing of surface.mesh lies below it" in told
+    with pytest.raises(ConfigError, match=r"does not fit this cell:\n.*part\.mesh"):
+        require_fit(wrong, load_config(None), mesh)
+
+
+def test_without_a_mesh_of_the_part_it_is_told_what_is_not_looked_at() -> None:
+    job, mesh = load_job("pot")
+    assert list(mating_problems(job, mesh)) == []
+    assert "whether its underside fits the surface is not looked at" in list(contact_notes(job, mesh))[-1]
 
 
 @pytest.mark.parametrize("name", shipped_jobs())

@@ -16,9 +16,10 @@ import pytest
 from cell.config.job import load_job
 from cell.procedures.sweep.stored_sweep import FILE
 from cell.run.folder import is_going, run_row
-from cell.run.resumption import UnfinishedRun, job_hash
+from cell.run.resumption import UnfinishedRun, job_hash, job_source
 from drivers.errors import ConfigError
 from statemachine.journal import FILE_NAME, Journal
+from tests.support.part_meshes import job_with_part
 from tests.unit.cell.config.calibrations.test_store import made
 from tests.unit.cell.procedures.sweep.test_sweeping import CONFIG
 
@@ -189,6 +190,20 @@ def test_a_journal_with_another_type_in_a_row_is_no_traceback(tmp_path: Path) ->
                 UnfinishedRun.find(folder)
             assert run_row(folder)["outcome"] in ("unreadable", "not ended")
             assert not is_going(folder)
+
+
+def test_a_changed_mesh_of_the_part_is_a_changed_job(tmp_path: Path) -> None:
+    job = job_with_part(tmp_path, "pot")
+    before, told = job_hash(job), job_source(job)
+    assert told["part_mesh"]["file"] == str(tmp_path / "pot-part.ply")
+    assert job_hash(job) == before
+    (tmp_path / "pot-part.ply").write_bytes((tmp_path / "pot-part.ply").read_bytes() + b"\n")
+    assert job_hash(job) != before
+    (tmp_path / "pot-part.ply").unlink()
+    with pytest.raises(
+        ConfigError, match=r"part\.mesh 'pot-part\.ply' is not a file \(looked for .*\); name an STL or PLY"
+    ):
+        job_hash(job)
 
 
 @pytest.mark.parametrize("key", ["job_file", "job_hash", "simulated", "seed", "level", "clock", "speed", "until"])

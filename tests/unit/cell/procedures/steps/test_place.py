@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -31,11 +32,12 @@ from cell.run.resumption import UnfinishedRun
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
-from lab.bench.job.whole_job import NoFrames
+from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
 from sim_backends.world.drawing import inverse
 from statemachine.journal import Journal
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure
+from tests.support.part_meshes import job_with_part
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")
@@ -312,6 +314,30 @@ def test_nothing_is_placed_twice_and_nothing_moves_for_it() -> None:
     told = site.part.told("a later step failed")
     assert told.startswith("the part is already down")
     assert "retreat" not in told
+
+
+@pytest.mark.parametrize(
+    ("height", "outcome", "told"),
+    [
+        (0.0, "placed", ""),
+        (-0.5e-3, "refused", r"the part as drawn goes 0\.\d\d mm into the surface at .* half of the place's tolerance"),
+        (0.5e-3, "refused", r"the part as drawn lies 0\.\d\d mm or more above the surface"),
+    ],
+)
+def test_a_part_as_drawn_is_held_against_the_scanned_surface_before_it_goes_down(
+    placed_pot: JobRecord, tmp_path: Path, height: float, outcome: str, told: str
+) -> None:
+    job, mesh = load_job(job_with_part(tmp_path, "pot", lambda corners: corners + np.array([0.0, 0.0, height])))
+    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+    done = run_whole_job(CONFIG, job, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot)
+    assert done.outcome == outcome
+    assert re.search(told, done.reason)
+    if outcome == "placed":
+        found = done.results["place"].summary()["mating"]
+        assert found["seen"] > 0.75 and abs(found["median_mm"]) < 0.03
+        assert found["largest_mm"] < 0.3
+    else:
+        assert done.at_end is not None and done.at_end["part"]["held"]
 
 
 def test_placing_is_tried_once_whatever_becomes_of_it() -> None:

@@ -1,0 +1,158 @@
+"""The gap between the part as drawn and the surface below it, before the one is put onto the other.
+
+The place is told by the surface alone. A part that is drawn in another datum, of another revision, or exchanged does
+not lie where its pose says, and nothing but its own underside can tell.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+
+from cell.measure.inversion.disagreement import ALLOWED, REACH_M, ROWS, SQUARE_M, STEEPEST, squares
+from cell.measure.inversion.nominal import Array, Indices, NominalSurface
+from cell.measure.reconstruction.cloud import Cloud
+from drivers.errors import Measured, RefusedError
+
+LEAST_SEEN = 0.5
+"""Share of the mating face below which its gap says little."""
+SAMPLES = 40_000
+DEEPEST_M = 1.5e-3
+"""What was scanned farther below the drawn surface is not the surface: a table beside it, or a hole."""
+NEXT_STEP = (
+    "See that part.mesh is the drawing of this part, in the datum of grasp.flange_from_part and "
+    "place.surface_from_part, and that part and surface are of one revision"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class MatingGap:
+    """The gap between a part's mating face and the surface, in squares of 2 mm, along the part's z axis.
+
+    `places` (n, 3) m are the squares' middles on the surface, surface frame; `gaps` (n,) m, below 0 where both
+    interfere; `noise` (n,) m four standard deviations of each. `seen` is the share of the mating face with a square.
+    """
+
+    places: Array
+    gaps: Array
+    noise: Array
+    seen: float
+
+    @property
+    def overlap(self) -> float:
+        """By how much, m, both interfere in the worst square, beyond its noise; below 0 where they nowhere do."""
+        return float(np.max(-self.gaps - self.noise))
+
+    @property
+    def apart(self) -> float:
+        """By how much, m, they are apart in the nearest square, beyond its noise."""
+        return float(np.min(self.gaps - self.noise))
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        least, middle, most = self._figures(2)
+        return f"gap {least:.2f} to {most:.2f} mm, {middle:.2f} mm in the middle; {100 * self.seen:.0f} % of it seen"
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """For people, what was not looked at."""
+        if self.seen >= LEAST_SEEN:
+            return ()
+        return (
+            f"of the part's mating face {100 * self.seen:.0f} % lie over what was scanned (at least "
+            f"{100 * LEAST_SEEN:.0f} % tell): whether it fits there is hardly known. Widen scan.swath or scan.length",
+        )
+
+    def as_dict(self) -> dict[str, float]:
+        """For the journal."""
+        least, middle, most = self._figures(4)
+        return {"least_mm": least, "median_mm": middle, "largest_mm": most, "seen": round(self.seen, 3)}
+
+    def _figures(self, digits: int) -> tuple[float, ...]:
+        """The least, the middle and the largest gap, mm."""
+        return tuple(round(1e3 * float(v), digits) + 0.0 for v in np.percentile(self.gaps, [0, 50, 100]))
+
+    def measured(self, tolerance: float) -> Measured:
+        """How far the part would interfere with the surface, beside what is allowed at this `tolerance`, m."""
+        return Measured("part into the surface", 1e3 * self.overlap, "mm", most=1e3 * ALLOWED * tolerance)
+
+    def problem(self, tolerance: float) -> str | None:
+        """Why the part does not fit the place of this `tolerance`, m; None where it does."""
+        allowed = ALLOWED * tolerance
+        if self.overlap > allowed:
+            x, y, z = 1e3 * self.places[np.argmax(-self.gaps - self.noise)]
+            return (
+                f"the part as drawn goes {1e3 * self.overlap:.2f} mm into the surface at ({x:.0f}, {y:.0f}, {z:.0f}) "
+                f"mm. Allowed are {1e3 * allowed:.2f} mm, half of the place's tolerance. {NEXT_STEP}"
+            )
+        if self.apart > allowed:
+            return (
+                f"the part as drawn lies {1e3 * self.apart:.2f} mm or more above the surface everywhere. Allowed are "
+                f"{1e3 * allowed:.2f} mm, half of the place's tolerance. {NEXT_STEP}"
+            )
+        return None
+
+    def require(self, tolerance: float) -> None:
+        """Raise `RefusedError` where the part does not fit the place of this `tolerance`, m."""
+        if problem := self.problem(tolerance):
+            raise RefusedError(f"{problem}, then run the job again", self.measured(tolerance))
+
+
+def scanned_gap(
+    cloud: Cloud, pose: pin.SE3, nominal: NominalSurface, surface_from_part: pin.SE3, part: NominalSurface
+) -> MatingGap | None:
+    """The gap below the `part` at `surface_from_part`, of a surface that was scanned and lies at base_from_surface
+    `pose`. None where nothing scanned lies below the part.
+    """
+    lines, rows = np.nonzero(cloud.valid)
+    local = (cloud.points[lines, rows] - pose.translation) @ pose.rotation
+    return _gap(local, lines, nominal, surface_from_part, part)
+
+
+def drawn_gap(nominal: NominalSurface, surface_from_part: pin.SE3, part: NominalSurface) -> MatingGap | None:
+    """The gap between the two as they are drawn."""
+    samples = _thinned(nominal.samples)
+    return _gap(samples, np.arange(len(samples)), nominal, surface_from_part, part)
+
+
+def _thinned(samples: Array) -> Array:
+    return samples[:: max(1, len(samples) // SAMPLES)]
+
+
+def _gap(
+    points: Array, lines: Indices, nominal: NominalSurface, surface_from_part: pin.SE3, part: NominalSurface
+) -> MatingGap | None:
+    """Of `points` (n, 3) m of the surface, surface frame, taken in the lines (n,)."""
+    # Where the drawn surface has its other side, or a wall, a part meets nothing.
+    index, feet = nominal.feet(points, REACH_M)
+    up = feet.normals @ surface_from_part.rotation[:, 2] > STEEPEST
+    index = index[feet.inner & up & (feet.heights > -DEEPEST_M)]
+    below = (points[index] - surface_from_part.translation) @ surface_from_part.rotation
+    over, feet = part.feet(below, REACH_M)
+    down = -feet.normals[:, 2]
+    mates = feet.inner & (down > STEEPEST)
+    if not mates.any():
+        return None
+    over, gaps = over[mates], feet.heights[mates] / down[mates]
+    medians, middle, noise = squares(_square(below[over]), gaps, lines[index[over]])
+    if not len(medians):
+        return None
+    face = _mating_face(nominal, surface_from_part, part)
+    seen = np.isin(face, np.unique(_square(below[over[medians]]))).mean() if len(face) else 0.0
+    return MatingGap(points[index[over[medians]]], middle, noise, float(seen))
+
+
+def _square(below: Array) -> Indices:
+    column, row = np.floor(below[:, :2] / SQUARE_M).astype(np.intp).T
+    return np.asarray(column * 2 * ROWS + row)
+
+
+def _mating_face(nominal: NominalSurface, surface_from_part: pin.SE3, part: NominalSurface) -> Indices:
+    """The squares of the part's underside that have the drawn surface below them."""
+    facing = part.normals[part.sample_triangles][:, 2] < -STEEPEST
+    under = _thinned(part.samples[facing])
+    found, feet = nominal.feet(under @ surface_from_part.rotation.T + surface_from_part.translation, REACH_M)
+    return np.unique(_square(under[found[feet.inner]]))

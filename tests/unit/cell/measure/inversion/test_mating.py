@@ -1,0 +1,130 @@
+"""The gap below a part as drawn: against rays, in the scan of a simulated cell, and what does not fit is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from cell.config.job import load_job
+from cell.measure.inversion import NominalSurface
+from cell.measure.inversion.mating import MatingGap, drawn_gap, scanned_gap
+from cell.measure.inversion.nominal import read_mesh
+from drivers.errors import RefusedError
+from lab.bench.job.whole_job import JobRecord
+from tests.support.part_meshes import body
+
+Floats = NDArray[np.float64]
+HERE = pin.SE3.Identity()
+TOLERANCE = 0.6e-3
+
+
+def moved(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> pin.SE3:
+    return pin.SE3(np.eye(3), np.array([x, y, z]))
+
+
+def stepped(corners: Floats) -> Floats:
+    """Half a millimetre lower on one side."""
+    return np.asarray(corners - np.where(corners[:, :1] > 0.01, [0.0, 0.0, 0.5e-3], 0.0))
+
+
+def drawn(name: str) -> tuple[NominalSurface, trimesh.Trimesh]:
+    job, mesh = load_job(name)
+    return NominalSurface.load(mesh, unit=job.surface.mesh_unit), body(*read_mesh(mesh, "m"), lambda corners: corners)
+
+
+def surface_of(part: trimesh.Trimesh) -> NominalSurface:
+    return NominalSurface(part.vertices, part.faces)
+
+
+POT, PART = drawn("pot")
+
+
+@pytest.mark.parametrize("name", ["pot", "seat", "panel"])
+def test_a_part_of_the_same_drawing_lies_on_the_surface(name: str) -> None:
+    nominal, part = drawn(name)
+    found = drawn_gap(nominal, HERE, surface_of(part))
+    assert found is not None
+    assert np.abs(found.gaps).max() < 1e-6 and found.seen > 0.95
+    assert found.problem(TOLERANCE) is None and found.notes == ()
+
+
+def test_the_gap_is_what_a_ray_measures() -> None:
+    """A part that is shifted and turned: rays from the surface along the part's z axis meet it so far off."""
+    lies = pin.SE3(pin.rpy.rpyToMatrix(0.004, -0.003, 0.01), np.array([0.4e-3, -0.2e-3, 0.3e-3]))
+    found = drawn_gap(POT, lies, surface_of(PART))
+    assert found is not None
+    inner = np.linalg.norm(found.places[:, :2] / [0.030, 0.015], axis=1) < 1.0
+    places, gaps = found.places[inner], found.gaps[inner]
+    below = (places - lies.translation) @ lies.rotation
+    # From well below, so that no ray begins inside the part.
+    starts = below - [0.0, 0.0, 0.004]
+    hits, rays, _ = PART.ray.intersects_location(starts, np.tile([0.0, 0.0, 1.0], (len(starts), 1)))
+    first = np.full(len(starts), np.inf)
+    np.minimum.at(first, rays, hits[:, 2] - below[rays, 2])
+    assert len(gaps) > 300 and np.isfinite(first).all()
+    # By the nearest point, not along the ray: on this surface they differ by less than this.
+    assert np.abs(gaps - first).max() < 0.01e-3
+
+
+@pytest.mark.parametrize(
+    ("height", "told"),
+    [(-0.5e-3, r"goes 0\.50 mm into the surface at .*Allowed are 0\.30 mm.*datum"), (0.5e-3, r"lies 0\.50 mm or more")],
+)
+def test_a_mesh_in_another_datum_is_refused_with_how_much_and_what_to_see_to(height: float, told: str) -> None:
+    found = drawn_gap(POT, moved(z=height), surface_of(PART))
+    assert found is not None
+    with pytest.raises(RefusedError, match=told) as refused:
+        found.require(TOLERANCE)
+    (number,) = refused.value.numbers
+    assert (number.most, number.value) == pytest.approx((0.3, -1e3 * height), abs=0.01)
+    found.require(4 * abs(height))
+
+
+def test_a_wrong_revision_is_refused_where_it_differs() -> None:
+    part = surface_of(body(POT.vertices, POT.triangles, stepped))
+    found = drawn_gap(POT, HERE, part)
+    assert found is not None
+    assert found.overlap == pytest.approx(0.5e-3, abs=2e-6)
+    assert found.places[np.argmin(found.gaps), 0] > 0.009
+    assert "goes 0.50 mm into the surface at (1" in str(found.problem(TOLERANCE))
+
+
+def test_one_square_of_noise_is_no_overlap() -> None:
+    gaps, noise = np.array([0.0, -0.5e-3]), np.array([1e-6, 0.3e-3])
+    found = MatingGap(np.zeros((2, 3)), gaps, noise, 1.0)
+    assert found.overlap == pytest.approx(0.2e-3)
+    assert found.problem(TOLERANCE) is None
+    assert replace(found, noise=1e-6 * np.ones(2)).problem(TOLERANCE) is not None
+
+
+def test_the_scanned_surface_tells_the_same(placed_pot: JobRecord) -> None:
+    cloud, pose = placed_pot.results["reconstruct"].cloud, placed_pot.results["invert_pose"].base_from_surface
+    fits = scanned_gap(cloud, pose, POT, HERE, surface_of(PART))
+    assert fits is not None
+    assert max(fits.overlap, np.abs(np.median(fits.gaps))) < 0.03e-3
+    assert fits.seen > 0.75 and fits.problem(TOLERANCE) is None
+    for height in (-0.5e-3, 0.5e-3):
+        found = scanned_gap(cloud, pose, POT, moved(z=height), surface_of(PART))
+        assert found is not None
+        assert np.median(found.gaps) == pytest.approx(height, abs=0.03e-3)
+        assert found.problem(TOLERANCE) is not None
+    half = replace(cloud, points=np.where(np.arange(cloud.shape[0])[:, None, None] < 30, cloud.points, np.nan))
+    part = scanned_gap(half, pose, POT, HERE, surface_of(PART))
+    assert part is not None and part.seen < 0.5
+    assert "lie over what was scanned" in part.notes[0] and "scan.length" in part.notes[0]
+
+
+def test_a_part_that_lies_elsewhere_has_nothing_below_it() -> None:
+    assert drawn_gap(POT, moved(x=0.2), surface_of(PART)) is None
+
+
+def test_figures_are_for_people_and_for_the_journal(tmp_path: Path) -> None:
+    found = MatingGap(np.zeros((3, 3)), np.array([-0.12e-3, 0.0, 0.3e-3]), np.zeros(3), 0.87)
+    assert found.words == "gap -0.12 to 0.30 mm, 0.00 mm in the middle; 87 % of it seen"
+    assert found.as_dict() == {"least_mm": -0.12, "median_mm": 0.0, "largest_mm": 0.3, "seen": 0.87}
