@@ -67,12 +67,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     step = asker.get("step", "Lines of the scan, how far apart", "0.5 mm", lambda t: parse_quantity(t, "mm", *STEP_MM))
 
     laid, proposal = _proposed(asker, laid, job, config, step=step)
-    heading = [
-        f"Place onto the surface of {mesh.name}. Written by `cell new-job`; change what is not as it is.",
-        f"Of the mesh, in {unit}, what the sweeps see is in {targets[1].name}: surface_from_mesh =",
-        "  " + pose_text(as_pose(laid.surface_from_mesh)),
-        *proposal.notes,
-    ]
+    heading = [*_origin(mesh, unit, targets[1], laid), *proposal.notes]
     with tempfile.TemporaryDirectory() as place:
         there = Path(place)
         written(proposal.surface, there / targets[1].name, f"{name}: what the sweeps see, mm, z up")
@@ -99,6 +94,15 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         for target in (*targets[:2], *([] if part is None or part.same else [part.target])):
             _copied(there / target.name, target).replace(target)
     return Made(targets[0], targets[1], targets[2], name=name, seen=proposal.share, place=found, notes=tuple(notes))
+
+
+def _origin(mesh: Path, unit: str, seen: Path, laid: Laid) -> tuple[str, ...]:
+    """For the head of the job's file: where its surface comes from."""
+    return (
+        f"Place onto the surface of {mesh.name}. Written by `cell new-job`; change what is not as it is.",
+        f"Of the mesh, in {unit}, what the sweeps see is in {seen.name}: surface_from_mesh =",
+        "  " + pose_text(as_pose(laid.surface_from_mesh)),
+    )
 
 
 def _proposed(asker: Asker, laid: Laid, job: Job, config: CellConfig, *, step: float) -> tuple[Laid, Proposal]:
