@@ -161,7 +161,7 @@ class StationDrawing:
 
     The place frame lies `height` m above the floor. `mesh` is the file of the surface, in `mesh_unit` "m" or "mm", or
     "" for the closed form `surface`, a name of `sim_backends.world.bodies.surfaces`. `part_size` (3,) in m, along its
-    axes.
+    axes. `part_mesh` is the file of the part, in the part frame; "" for a part that fits the surface exactly.
     """
 
     height: float
@@ -177,6 +177,8 @@ class StationDrawing:
     part_size: tuple[float, float, float]
     obstacles: dict[str, Box] = field(default_factory=dict)
     """In the place frame."""
+    part_mesh: str = ""
+    part_mesh_unit: str = "m"
 
 
 @dataclass(frozen=True, eq=False)

@@ -76,7 +76,7 @@ class World:
         self.part = PartContact(
             self.station.ground, scene.world_from_surface, scene.flange_from_part,
             world_from_table=scene.world_from_table, surface_from_part=station.surface_from_part,
-            table_height=station.height,
+            table_height=station.height, part=self.station.part,
         )  # fmt: skip
         self._solid = ArmPoints(scene.drawing)
         self.collisions = Collisions(scene, self.part, found)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +62,10 @@ class Described:
                 f"this cell cannot be simulated as it is described (job {self.job.job.name}):\n  "
                 + "\n  ".join(problems)
             )
-        return drawn.settled(Drawing(_cell(config), _station(self.job, self.mesh, config.vehicle.DRIVES)), STOCK)
+        station, part = _station(self.job, self.mesh, config.vehicle.DRIVES), self.job.part
+        if part is not None:
+            station = replace(station, part_mesh=part.mesh, part_mesh_unit=part.mesh_unit)
+        return drawn.settled(Drawing(_cell(config), station), STOCK)
 
 
 def _cell(config: CellConfig) -> drawn.CellDrawing:

@@ -6,13 +6,14 @@ not lie where its pose says, and nothing but its own underside can tell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
 
 from cell.measure.inversion.disagreement import ALLOWED, REACH_M, ROWS, SQUARE_M, STEEPEST, squares
 from cell.measure.inversion.nominal import Array, Indices, NominalSurface
+from cell.measure.inversion.place_pose import PlacePose
 from cell.measure.reconstruction.cloud import Cloud
 from drivers.errors import Measured, RefusedError
 
@@ -49,6 +50,18 @@ class MatingGap:
     def apart(self) -> float:
         """By how much, m, they are apart in the nearest square, beyond its noise."""
         return float(np.min(self.gaps - self.noise))
+
+    @property
+    def lift(self) -> float:
+        """How much higher, m, than its place the part comes to lie by this; below 0 where it lies deeper."""
+        return max(0.0, self.overlap) - max(0.0, self.apart)
+
+    def stated(self, pose: PlacePose, surface_from_part: pin.SE3) -> PlacePose:
+        """The pose with what the part is off its place by in its covariance, along its z axis."""
+        off = np.zeros(6)
+        off[:3] = self.lift * (pose.base_from_surface.rotation @ surface_from_part.rotation[:, 2])
+        more = np.outer(off, off)
+        return replace(pose, systematic=pose.systematic + more, covariance=pose.covariance + more)
 
     @property
     def words(self) -> str:

@@ -184,7 +184,7 @@ SPACING = 0.0004
 MOST_SAMPLES = 400_000
 WHOLE = (".stl", ".ply")
 """Files that refer to no others."""
-UNREADABLE = "nominal surface {} cannot be read as a mesh; give an STL or PLY"
+UNREADABLE = "mesh {} cannot be read as a mesh; give an STL or PLY"
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,19 +348,18 @@ def _read(file: _MeshFile, unit: str) -> tuple[Array, NDArray[np.int64]]:
         raise ConfigError(UNREADABLE.format(path)) from error
     if vertices.ndim != 2 or not len(faces) or not finite:
         raise ConfigError(
-            f"nominal surface {path} holds {len(faces)} triangles, or corners that are not numbers; give an STL or PLY "
-            "of the surface"
+            f"mesh {path} holds {len(faces)} triangles, or corners that are not numbers; give an STL or PLY"
         )
     vertices *= 1.0 if unit == "m" else 1e-3
     extent = float(np.ptp(vertices, axis=0).max())
     if not 0.001 < extent < 5.0:
         raise ConfigError(
-            f"nominal surface {path} measures {1e3 * extent:.3g} mm with mesh_unit = {unit!r} (allowed: 1 to 5000 mm); "
-            "check surface.mesh_unit in the job"
+            f"mesh {path} measures {1e3 * extent:.3g} mm with mesh_unit = {unit!r} (allowed: 1 to 5000 mm); "
+            "check surface.mesh_unit, or part.mesh_unit, in the job"
         )
     if not alike:
         raise ConfigError(
-            f"nominal surface {path}: neighbouring triangles face opposite ways, so nobody knows which side is up; "
+            f"mesh {path}: neighbouring triangles face opposite ways, so nobody knows which side is up; "
             "`cell new-job` turns them, or turn them in the drawing"
         )
     vertices.flags.writeable = faces.flags.writeable = False

@@ -229,6 +229,9 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
             swept = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
             pose = carried_on(here, *swept, look.creep)
         expected = expected_touch(here.job, here.nominal, pose, here.repeatability)
+        if mating is not None:
+            expected = replace(expected, height=expected.height + mating.lift)
+            pose = mating.stated(pose, here.job.place.surface_from_part.se3())
         context.safe_point()
         # Whoever has the run held may reach in, also in the middle of a look: then it is looked at again.
         if context.held_s == held:

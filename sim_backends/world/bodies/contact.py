@@ -1,7 +1,8 @@
 """The part and what it touches: held by the claw, pressed onto the surface, released and resting there.
 
-The part's underside is the nominal surface itself. Contact is a penalty: each sample point of the underside below
-the true surface pushes back along the surface's normal. Friction and the part's weight are left out.
+The part's underside is the nominal surface itself, or that of the part's own mesh. Contact is a penalty: each sample
+point of the underside below the true surface pushes back along the surface's normal. Friction and the part's weight are
+left out.
 """
 
 from __future__ import annotations
@@ -41,10 +42,11 @@ class PartContact:
     def __init__(
         self, surface: Surface, world_from_surface: Pose, flange_from_part: Pose, *,
         world_from_table: Pose | None = None, surface_from_part: Pose | None = None,
-        table_height: float = drawing.TABLE_HEIGHT,
+        table_height: float = drawing.TABLE_HEIGHT, part: Surface | None = None,
     ) -> None:  # fmt: skip
         """The table lies at the surface's origin, and the part's frame is the surface's when it is placed, unless
-        `world_from_table` and `surface_from_part` say so. Raises ValueError when there is no surface for the part."""
+        `world_from_table` and `surface_from_part` say so. `part` is the underside of a part that does not fit the
+        surface exactly, part frame, turned over. Raises ValueError when there is no surface for the part."""
         self._surface = surface
         self._surface_from_world = inverse(world_from_surface)
         self._world_from_surface = world_from_surface
@@ -56,19 +58,23 @@ class PartContact:
         self._world_from_part: Pose | None = None
         self._claw_closed = True
         self._lock = threading.Lock()
-        # A margin keeps the points off the border, where the height field falls to the table.
-        along = np.linspace(-0.98, 0.98, 25) * surface.half_x + surface.centre[0]
-        across = np.linspace(-0.97, 0.97, 13) * surface.half_y + surface.centre[1]
-        grid = np.meshgrid(along, across)
-        x, y = (axis.ravel() for axis in grid)
-        there = np.isfinite(surface.relief(x, y)[0]) & ~_beside_wall(surface, x, y)
+        surface_from_part = np.eye(4) if surface_from_part is None else surface_from_part
+        if part is None:
+            x, y = _grid(surface)
+            underside = np.stack([x, y, surface.height(x, y)], axis=-1)
+        else:
+            x, y = _grid(part)
+            underside = _moved(np.stack([x, y, -part.relief(x, y)[0]], axis=-1), surface_from_part)
+            underside = underside[np.isfinite(underside).all(axis=1)]
+            x, y = underside[:, 0], underside[:, 1]
+        inside = (np.abs(x - surface.centre[0]) <= surface.half_x) & (np.abs(y - surface.centre[1]) <= surface.half_y)
+        there = inside & np.isfinite(surface.relief(x, y)[0]) & ~_beside_wall(surface, x, y)
         if there.sum() < LEAST_TOUCHING:
             raise ValueError(
                 f"the surface {surface.name!r} lies below {there.sum()} of {len(there)} points of the part's underside "
                 f"(allowed: at least {LEAST_TOUCHING}); give a mesh that is seen from above, z up"
             )
-        underside = np.stack([x, y, surface.height(x, y)], axis=-1)[there]
-        self._underside = underside if surface_from_part is None else _moved(underside, inverse(surface_from_part))
+        self._underside = _moved(underside[there], inverse(surface_from_part))
         box = [[sx * surface.half_x, sy * surface.half_y, surface.top] for sx in (-1, 1) for sy in (-1, 1)]
         corners = _moved(np.array(box) + np.array([*surface.centre, 0.0]), world_from_surface)
         self._highest = max(float(corners[:, 2].max()), float(world_from_surface[2, 3])) + _LEAN
@@ -175,6 +181,15 @@ class PartContact:
         wrench[:3] = forces.sum(axis=0)
         wrench[3:] = np.cross(points - world_from_flange[:3, 3], forces).sum(axis=0)
         return wrench
+
+
+def _grid(field: Surface) -> tuple[Vector, Vector]:
+    """x and y (n,) at which an underside is tried over the footprint of `field`."""
+    # A margin keeps the points off the border, where the height field falls to the table.
+    along = np.linspace(-0.98, 0.98, 25) * field.half_x + field.centre[0]
+    across = np.linspace(-0.97, 0.97, 13) * field.half_y + field.centre[1]
+    x, y = np.meshgrid(along, across)
+    return x.ravel(), y.ravel()
 
 
 def _beside_wall(surface: Surface, x: Vector, y: Vector) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.mesh import Mesh
-from sim_backends.world.bodies.surfaces import OwnSurface, Surface, own_surface
+from sim_backends.world.bodies.surfaces import OwnSurface, Surface, own_surface, underside
 from sim_backends.world.bodies.surfaces import mesh as drawn_mesh
 from sim_backends.world.bodies.surfaces import surface as named_surface
 from sim_backends.world.drawing import StationDrawing, inverse
@@ -20,11 +20,15 @@ _KEPT = 4
 
 @dataclass(frozen=True, eq=False)
 class Station:
-    """`ground` is what a part meets, `seen` what cameras see, both in S; a ball about S of `radius`, m, holds it."""
+    """`ground` is what a part meets, `seen` what cameras see, both in S; a ball about S of `radius`, m, holds it.
+
+    `part` is the underside of the part, part frame, turned over; None for one that fits the ground exactly.
+    """
 
     ground: Surface
     seen: Mesh
     radius: float
+    part: Surface | None
 
     @classmethod
     def of(cls, drawn: StationDrawing) -> Station:
@@ -38,7 +42,8 @@ class Station:
         (x, y), low = ground.centre, min(0.0, float(seen.low[0, 2]))
         reach = np.hypot(abs(x) + ground.half_x, abs(y) + ground.half_y)
         room = max(0.015, ground.top, -low)
-        return cls(ground, seen, float(reach) + room)
+        part = underside(drawn.part_mesh, drawn.part_mesh_unit) if drawn.part_mesh else None
+        return cls(ground, seen, float(reach) + room, part)
 
 
 def _plane(surface_from_place: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -219,6 +219,12 @@ def own_surface(path: str, unit: str) -> OwnSurface:
     return _read(path, content, unit)
 
 
+def underside(path: str, unit: str) -> Surface:
+    """The lowest that the part in a mesh file has above each place of its frame, as heights turned over: z = -h."""
+    own = own_surface(path, unit)
+    return _ground(own.ground.name, own.vertices * [1.0, 1.0, -1.0], own.triangles)
+
+
 @lru_cache(maxsize=4)
 def _read(path: str, content: bytes, unit: str) -> OwnSurface:
     import trimesh

@@ -11,6 +11,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cell import Cell
+from cell.config.calibrations.store import save_calibration
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
@@ -24,10 +26,14 @@ from cell.procedures.arm import touch as touch_height
 from cell.procedures.arm.moves import PLACED, Mover, PartProgress, PartState
 from cell.procedures.arm.touch import TouchHeight
 from cell.procedures.drive.way import Whereabouts
+from cell.procedures.part_error import stated_bound
 from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.place import PlaceResult, Placing
 from cell.procedures.steps.workplace import Workplace
+from cell.run.record.replay import replay
+from cell.run.report.page.make import make_page
+from cell.run.report.report import place_error
 from cell.run.resumption import UnfinishedRun
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
@@ -338,6 +344,40 @@ def test_a_part_as_drawn_is_held_against_the_scanned_surface_before_it_goes_down
         assert found["largest_mm"] < 0.3
     else:
         assert done.at_end is not None and done.at_end["part"]["held"]
+
+
+def test_what_the_part_goes_into_the_surface_is_in_the_expected_touch_and_in_the_stated_bound(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    """Half of the underside .25 mm low, as drawn and in the simulated world: less than is allowed."""
+    low = job_with_part(tmp_path, "pot", lambda v: v - np.multiply.outer(v[:, 0] > 0.0, [0.0, 0.0, 0.25e-3]))
+    job, mesh = load_job(low)
+    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+    done = run_whole_job(CONFIG, job, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot)
+    assert (done.outcome, done.reason) == ("placed", "")
+    assert done.at_end is not None and done.placing is not None
+    placed, before = done.results["place"], placed_pot.results["place"]
+    assert placed.mating.lift == pytest.approx(0.25e-3, abs=0.03e-3)
+    assert placed.touch.expected.height - before.touch.expected.height == pytest.approx(0.25e-3, abs=0.03e-3)
+    assert abs(placed.touch.off) < 2.5 * placed.touch.sigma
+    error = place_error(job, nominal, done.at_end)["d_p95"]
+    assert isinstance(error, float) and error > 0.2
+    assert error < cast(float, stated_bound(job, nominal, placed.pose, done.placing)["d"])
+
+
+def test_a_run_of_a_job_with_a_part_mesh_tells_it_in_report_and_page_and_is_replayed(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert placed_pot.calibration is not None
+    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
+    with Cell.open(sim="all", seed=2, clock="virtual", job=job_with_part(tmp_path, "pot")) as cell:
+        done = cell.run(job=tmp_path / "pot.toml")
+    assert (done.outcome, done.report["part_mesh"]["file"]) == ("placed", str(tmp_path / "pot-part.ply"))
+    (row,) = [row for row in done.report["measured"] if row["name"] == "part into the surface"]
+    assert row["kept"] and row["value"] < 0.05
+    assert "part into the surface" in make_page(done.folder)
+    assert all(compared.same for compared in replay(done.folder))
 
 
 def test_placing_is_tried_once_whatever_becomes_of_it() -> None:

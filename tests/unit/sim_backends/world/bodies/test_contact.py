@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from sim_backends.world import drawing
 from sim_backends.world.bodies.contact import STIFFNESS, PartContact
-from sim_backends.world.bodies.surfaces import HALF_X, HALF_Y, Surface, surface
+from sim_backends.world.bodies.surfaces import HALF_X, HALF_Y, Surface, mesh, surface, underside
 from sim_backends.world.scene import rotation
+from tests.support.part_meshes import body
 
 Floats = NDArray[np.float64]
 
@@ -54,6 +57,37 @@ def raised(pose: np.ndarray, dx: float = 0.0, dz: float = 0.0) -> np.ndarray:
     made[0, 3] += dx
     made[2, 3] += dz
     return made
+
+
+@pytest.mark.parametrize("low", [0.0, 0.3e-3])
+def test_a_part_that_is_low_on_one_half_touches_as_much_earlier(tmp_path: Path, low: float) -> None:
+    """By its own mesh, drawn in the part frame, which is turned and shifted against the surface's."""
+    surface_from_part = turned((0.0, 0.0, 0.3), (0.004, -0.003, 0.002))
+    back, drawn = drawing.inverse(surface_from_part), mesh("pot", 20_000, walls=False)
+
+    def changed(corners: Floats) -> Floats:
+        lowered = corners - np.multiply.outer(corners[:, 0] > 0.0, [0.0, 0.0, low])
+        return np.asarray(lowered @ back[:3, :3].T + back[:3, 3])
+
+    made = body(drawn.vertices, np.asarray(drawn.triangles, dtype=np.int64), lambda corners: corners)
+    # The top goes with the underside into the part frame.
+    made.vertices = np.where(
+        np.arange(len(made.vertices))[:, None] < len(drawn.vertices),
+        changed(made.vertices), made.vertices @ back[:3, :3].T + back[:3, 3],
+    )  # fmt: skip
+    made.export(tmp_path / "part.stl")
+    part = PartContact(
+        surface("pot"), np.eye(4), drawing.FLANGE_FROM_PART, surface_from_part=surface_from_part,
+        part=underside(str(tmp_path / "part.stl"), "m"),
+    )  # fmt: skip
+    target = surface_from_part
+    assert not part.wrench(flange_for(raised(target, dz=low + 1e-4))).any()
+    wrench = part.wrench(flange_for(raised(target, dz=low - 1e-4)))
+    # All of it where nothing is low, else the half that is.
+    share = wrench[2] / (1e-4 * STIFFNESS)
+    assert (0.3 < share < 0.55) if low else (0.7 < share < 1.05)
+    part.set_claw(False, flange_for(raised(target, dz=0.02)))
+    assert part.part_pose(np.eye(4))[2, 3] == pytest.approx(0.002 + low, abs=3e-5)
 
 
 @pytest.mark.parametrize("name", ["pot", "seat", "panel"])
