@@ -132,10 +132,10 @@ def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: Boa
     try:
         return invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken=taken)
     except NotObservable as refused:
-        if not sweep.notes:
+        if not (notes := (*fix.notes, *sweep.notes)):
             raise
-        # What is known too little may be where the laser points, which no more scanning mends.
-        raise _told_before(refused, "; ".join(sweep.notes)) from refused
+        # What is known too little may be where the laser points, or how the vehicle rocks: no more scanning mends it.
+        raise _told_before(refused, "; ".join(notes)) from refused
 
 
 def _at(here: Workplace, context: StepContext) -> PlacePose:
