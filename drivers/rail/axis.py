@@ -135,7 +135,7 @@ class RailAxis(ABC):
             self._motion = RailMotion(
                 self.name,
                 self._clock,
-                arrived=self._watched(lambda: self._home_found(issued), length),
+                arrived=self._searched(issued, length),
                 halt=self._halt(issued),
                 duration=length / (0.5 * self._max_speed) + 0.1 * length / (0.1 * self._max_speed),
             )
@@ -306,6 +306,26 @@ class RailAxis(ABC):
             return arrived()
 
         return followed
+
+    def _searched(self, issued: int, length: float) -> Callable[[], bool]:
+        """Whether the search has ended. What is read once a stop was asked for tells neither zero nor fault."""
+        stops, watched = self._link.stops, self._watched(lambda: self._home_found(issued), length)
+
+        def ended() -> bool:
+            found = False
+            if stops.count == issued:
+                try:
+                    found = watched()
+                except CellError:
+                    if stops.count == issued:
+                        raise
+            if stops.count == issued:
+                return found
+            # A reading from before the stop may have come after it.
+            self._homing = False
+            return stops.end(self.name)
+
+        return ended
 
     @contextmanager
     def _halted_if_failed(self, issued: int) -> Iterator[None]:

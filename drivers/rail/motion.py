@@ -50,9 +50,6 @@ def patience(clock: Clock, seconds: float) -> float:
     return max(seconds, WALL_FLOOR_S * clock.rate)
 
 
-SEARCHING = "while it searched the reference switch"
-
-
 class Stops:
     """The stops of one link: how many were asked for, and what became of the last."""
 
@@ -72,18 +69,20 @@ class Stops:
         finally:
             self._given = False
 
-    def end(self, name: str, position: float, doing: str = "before its target") -> bool:
-        """How a motion ends that was stopped at `position`, m, `doing` this: not yet while the stop is given (False).
+    def end(self, name: str, position: float | None = None) -> bool:
+        """How a motion ends that was stopped at `position`, m, or None in a search: not yet while it is given (False).
 
         Raises `Aborted` once it was taken, `DeviceFault` where nobody knows that it was.
         """
         if self._given:
             return False
+        at = "" if position is None else f"at {shown(position, 'm')} "
         if self.failed:
-            text = f"was told to stop and has not confirmed it; at {shown(position, 'm')} it may go on"
+            text = f"was told to stop and has not confirmed it; {at}it may go on"
             hint = "Press the emergency stop, then see the line to the drive."
             raise DeviceFault(name, "rail.not_stopped", text, recoverable=False, hint=hint)
-        raise Aborted(f"{name}: stopped at {shown(position, 'm')} {doing}")
+        when = f"{at}before its target" if at else "while it searched the reference switch"
+        raise Aborted(f"{name}: stopped {when}")
 
 
 class RailMotion:

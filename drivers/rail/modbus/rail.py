@@ -8,12 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drivers.clock import Clock
-from drivers.errors import UNTOLD, ConfigError, DeviceFault, LimitError, shown
+from drivers.errors import UNTOLD, ConfigError, LimitError, shown
 from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.modbus.drive import DriveArrival, DriveZero, ModbusDrive
 from drivers.rail.modbus.link import ModbusLink, Number, Rate, RegisterMap
-from drivers.rail.motion import SEARCHING
 
 ROUNDING = 0.01
 """By what share a speed may be rounded to the drive's unit; an acceleration by five times that."""
@@ -156,17 +155,7 @@ class ModbusRail(RailAxis):
         self._zero.search(issued=issued)
 
     def _home_found(self, issued: int) -> bool:
-        stops, found = self._link.stops, False
-        if stops.count == issued:
-            try:
-                found = self._zero.found()
-            except DeviceFault:
-                # A search that is stopped looks like one that found nothing.
-                if stops.count == issued:
-                    raise
-        if stops.count != issued:
-            self._zero.forget()
-            return stops.end(self.name, self._position(), SEARCHING)
+        found = self._zero.found()
         self._homing = not found
         return found
 

@@ -12,7 +12,7 @@ from drivers.clock import Clock
 from drivers.errors import ConfigError
 from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
-from drivers.rail.motion import SEARCHING, RailMotion
+from drivers.rail.motion import RailMotion
 from drivers.rail.tmcl import module
 from drivers.rail.tmcl.link import NO_SUCH_TYPE, Axis, CommandRefused, ReferenceSearch, TmclLink
 from drivers.rail.tmcl.module import (
@@ -152,8 +152,6 @@ class TmclRail(RailAxis):
 
     def _home_found(self, issued: int) -> bool:
         searching = self._link.reference_search(ReferenceSearch.STATUS) != 0
-        if self._link.stops.count != issued:
-            return self._link.stops.end(self.name, self._position(), SEARCHING)
         self._homing = searching
         if not searching:
             self._zero.found(issued=issued)

@@ -114,6 +114,8 @@ def test_a_stopped_motion_ends_as_its_stop_did() -> None:
         assert not stops.end("rail", 0.005), "nobody knows yet"
     with pytest.raises(Aborted, match="stopped at 5 mm before its target"):
         stops.end("rail", 0.005)
+    with pytest.raises(Aborted, match="stopped while it searched the reference switch"):
+        stops.end("rail")
     with pytest.raises(DeadlineError), stops.one_more():
         raise DeadlineError("rail", "no answer")
     with pytest.raises(DeviceFault, match="has not confirmed it; at 5 mm it may go on") as told:
