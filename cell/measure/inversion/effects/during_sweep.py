@@ -38,6 +38,8 @@ LARGEST_OVERTONES = 0.05
 GATE_M = 0.5e-3
 EXPECTED_RAD = 1e-3
 """One standard deviation of each angle before the scan has told: as good as unknown."""
+LEAST_LEVER_M = 0.01
+"""A board that a roll hardly moves before the camera tells of none: what swings there is refused as a large one."""
 LARGEST_RAD = 0.4e-3
 """Beyond this the part cannot be put down well either."""
 
@@ -185,7 +187,7 @@ def roll_of(swung: float, base_from_board: pin.SE3, base_from_vehicle: pin.SE3) 
     """
     moved = np.cross(base_from_vehicle.rotation[:, 0], base_from_board.translation - base_from_vehicle.translation)
     seen = base_from_board.rotation[:, :2].T @ moved
-    return swung / float(np.linalg.norm(seen)) if swung else 0.0
+    return swung / max(float(np.linalg.norm(seen)), LEAST_LEVER_M) if swung else 0.0
 
 
 def require_firm(angle: float, moved: float, what: str, hz: float | None = None) -> None:
