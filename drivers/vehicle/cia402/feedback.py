@@ -18,7 +18,7 @@ from drivers.interfaces import LinkStatistics, VehicleState
 from drivers.vehicle.cia402.bus import command_lost, drive_error, wrong_units
 from drivers.vehicle.cia402.drive import OPERATIONAL, STATUS, DriveState, SideDrive, may_turn
 from drivers.vehicle.faults import disturbed, emergency_stop, no_feedback, two_vehicles
-from drivers.vehicle.feedback import Travel
+from drivers.vehicle.feedback import Travel, difference
 
 VelocityUnit = Literal["counts/s", "rpm", "0.1 rpm", "0.01 rpm", "0.001 rpm"]
 SIDES = ("left", "right")
@@ -121,7 +121,7 @@ class UnitCheck:
         if last is None:
             return 0.0
         took = now - last[0]
-        turned = ((position - last[1] + 2**31) % 2**32 - 2**31) * self._count
+        turned = difference(position, last[1]) * self._count
         stands = abs(velocity) * self._step < CREEPS and abs(turned) < CREEPS * took
         if stands or self._clock.wall(took) > GAP_WALL_S:
             self._begin()
@@ -234,7 +234,7 @@ class DriveFeedback:
     def _compare_rest(self) -> None:
         """How many pairs in a row the counts have stayed where they are."""
         counts = tuple(drive.position for drive in self.drives)
-        moved = [abs((a - b + 2**31) % 2**32 - 2**31) for a, b in zip(counts, self._rests_at, strict=False)]
+        moved = [abs(difference(now, then)) for now, then in zip(counts, self._rests_at, strict=False)]
         if not moved or max(moved) * self._wheels.count_length > CREPT_M:
             self._rests_at, self._rested = counts, 0
         self._rested += 1
