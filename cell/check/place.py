@@ -14,7 +14,7 @@ import pinocchio as pin
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.measure.geometry.poses import from_parts, transform
-from cell.measure.inversion.mating import NEXT_STEP, MatingGap, drawn_gap
+from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, drawn_gap
 from cell.measure.inversion.nominal import NominalSurface, read_mesh
 from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
@@ -99,7 +99,7 @@ def mating_problems(job: Job, mesh: Path) -> Iterator[str]:
     if job.part is None:
         return
     found = _drawn(job, mesh)
-    problem = f"nothing of surface.mesh lies below it. {NEXT_STEP}"
+    problem = f"{APART}. {NEXT_STEP}"
     if found is not None:
         problem = found.problem(job.place.tolerance) or ""
     if problem:

@@ -9,8 +9,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from cell.base.toml_file import read_toml
-from cell.config.job import Job, job_path, load_job
+from cell.config.job import job_path, load_job
 from cell.measure.inversion.nominal import read_mesh
 
 Floats = NDArray[np.float64]
@@ -39,5 +38,4 @@ def job_with_part(folder: Path, name: str, changed: Callable[[Floats], Floats] =
     text = job_path(name).read_text(encoding="utf-8")
     path = folder / f"{name}.toml"
     path.write_text(f'{text}\n[part]\nmesh = "{name}-part.ply"\nmesh_unit = "m"\n', encoding="utf-8")
-    Job.model_validate(read_toml(path, "job", "cell new-job"))
     return path

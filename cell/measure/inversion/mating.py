@@ -22,6 +22,7 @@ LEAST_SEEN = 0.5
 SAMPLES = 40_000
 DEEPEST_M = 1.5e-3
 """What was scanned farther below the drawn surface is not the surface: a table beside it, or a hole."""
+APART = "below the part as drawn there is nothing of the surface, or the triangles of part.mesh face inwards"
 NEXT_STEP = (
     "See that part.mesh is the drawing of this part, in the datum of grasp.flange_from_part and "
     "place.surface_from_part, and that part and surface are of one revision"

@@ -13,7 +13,7 @@ from cell.measure.geometry.poses import from_parts, from_ur, to_ur
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.disagreement import highest_standing, require_bare
 from cell.measure.inversion.effects.between_sweeps import Creep
-from cell.measure.inversion.mating import NEXT_STEP, MatingGap, scanned_gap
+from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, scanned_gap
 from cell.measure.reconstruction.cloud import Indices
 from cell.motion.collision import TOUCHES
 from cell.motion.kinematics import HOME
@@ -259,11 +259,12 @@ def _mated(here: Workplace, pose: PlacePose, context: StepContext) -> MatingGap 
         cloud = context.made(Reconstruction).cloud
     except LookupError:
         # A kind of job that measures in another way.
+        context.note(text="nothing was scanned: the part's underside was not held against the surface")
         return None
     lies = here.job.place.surface_from_part.se3()
     found = scanned_gap(cloud, pose.base_from_surface, here.nominal, lies, here.part_mesh)
     if found is None:
-        raise RefusedError(f"nothing of the scanned surface lies below the part as drawn. {NEXT_STEP}")
+        raise RefusedError(f"{APART}. {NEXT_STEP}")
     found.require(here.job.place.tolerance)
     return found
 

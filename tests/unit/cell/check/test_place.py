@@ -44,7 +44,7 @@ def test_the_drawing_of_the_part_is_held_against_that_of_the_surface(tmp_path: P
     assert re.search(r'part\.mesh "pot-part\.ply": the part as drawn goes 0\.40 mm into the surface at', told)
     aside, mesh = load_job(job_with_part(tmp_path, "pot", lambda corners: corners + np.array([0.2, 0.0, 0.0])))
     (told,) = mating_problems(aside, mesh)
-    assert "nothing of surface.mesh lies below it" in told
+    assert "nothing of the surface, or the triangles of part.mesh face inwards" in told
     with pytest.raises(ConfigError, match=r"does not fit this cell:\n.*part\.mesh"):
         require_fit(wrong, load_config(None), mesh)
 

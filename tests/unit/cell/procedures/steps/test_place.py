@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -29,7 +30,7 @@ from cell.procedures.drive.way import Whereabouts
 from cell.procedures.part_error import stated_bound
 from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
-from cell.procedures.steps.place import PlaceResult, Placing
+from cell.procedures.steps.place import PlaceResult, Placing, _mated
 from cell.procedures.steps.workplace import Workplace
 from cell.run.record.replay import replay
 from cell.run.report.page.make import make_page
@@ -44,6 +45,7 @@ from statemachine.journal import Journal
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure
 from tests.support.part_meshes import job_with_part
+from tests.support.report_runs import work_of
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")
@@ -344,6 +346,18 @@ def test_a_part_as_drawn_is_held_against_the_scanned_surface_before_it_goes_down
         assert found["largest_mm"] < 0.3
     else:
         assert done.at_end is not None and done.at_end["part"]["held"]
+
+
+def test_where_nothing_was_scanned_it_is_told_that_the_underside_was_not_looked_at(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    job, mesh = load_job(job_with_part(tmp_path, "pot"))
+    nominal, said = NominalSurface.load(mesh, unit=job.surface.mesh_unit), []
+    work = work_of(VirtualCell(CONFIG, 2, "nominal"), job, nominal, placed_pot, NoFrames(), tmp_path)
+    made = {name: result for name, result in placed_pot.results.items() if name != "reconstruct"}
+    context = StepContext(PLACE.policy().of("place"), 1, math.inf, made, work.devices.clock, said.append)
+    assert _mated(work, placed_pot.results["invert_pose"], context) is None
+    assert any("was not held against the surface" in str(event.data) for event in said)
 
 
 def test_what_the_part_goes_into_the_surface_is_in_the_expected_touch_and_in_the_stated_bound(

@@ -19,6 +19,7 @@ from cell.measure.inversion.effects.during_sweep import (
     find_rocking,
     rocking_covariance,
     rocking_motions,
+    roll_of,
 )
 from cell.measure.reconstruction.cloud import Cloud, merge
 from cell.procedures.arm.photograph import BoardFix
@@ -177,6 +178,12 @@ def test_a_roll_that_photographs_show_shifts_the_place_to_the_side_where_the_sca
     both = rocking_covariance(seen, VEHICLE, SURFACE.translation, 2e-4)
     pitch = rocking_covariance(seen, VEHICLE, SURFACE.translation)[4, 4]
     assert (both[3, 3], both[4, 4]) == pytest.approx((0.5 * 2e-4**2, pitch))
+
+
+def test_a_board_that_a_roll_does_not_move_tells_of_a_roll_that_is_refused() -> None:
+    beside = pin.SE3(np.eye(3), VEHICLE.translation + np.array([1.0, 0.0, 0.0]))
+    assert roll_of(0.0, beside, VEHICLE) == 0.0
+    assert roll_of(20e-6, beside, VEHICLE) > LARGEST_RAD
 
 
 def test_a_vehicle_that_rocks_too_much_is_waited_for() -> None:
