@@ -402,7 +402,7 @@ def diagram() -> str:
     lines = ["stateDiagram-v2", "    direction LR", "    state job {", "        direction LR"]
     lines += [*(f"        {edge}" for edge in inside), "    }", '    state "any state" as any_state']
     lines += ["    [*] --> idle", *(f"    {edge}" for edge in around)]
-    lines += [f"    {end} --> [*]" for end in ("placed", "refused", "faulted", "aborted")]
+    lines += [f"    {end} --> [*]" for end in ("placed", "refused", "misplaced", "faulted", "aborted")]
     return "\n".join(lines) + "\n"
 
 

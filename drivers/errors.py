@@ -153,6 +153,10 @@ class NotObservable(RefusedError):
     """A direction of the place pose is not known well enough; the text names it and its uncertainty."""
 
 
+class MisplacedError(RefusedError):
+    """The part was put down, looked at, and does not lie in its place; the text says how far off, and why."""
+
+
 class Aborted(CellError):
     """The operator, a script or a signal asked for the end of the run; the text says who."""
 

@@ -112,6 +112,7 @@ __all__ = ["Event", "FaultRecord", "RunResult", "Runner", "StepContext", "StepRe
 
 _END_TRIGGERS = {
     Outcome.REFUSED: JobTrigger.REFUSE,
+    Outcome.MISPLACED: JobTrigger.MISPLACE,
     Outcome.FAULTED: JobTrigger.FAULT,
     Outcome.ABORTED: JobTrigger.ABORT,
 }

@@ -24,6 +24,7 @@ class JobState(StrEnum):
     RECOVERING = "recovering"
     ABORTED = "aborted"
     REFUSED = "refused"
+    MISPLACED = "misplaced"
 
 
 class JobTrigger(Enum):
@@ -36,6 +37,7 @@ class JobTrigger(Enum):
     PAUSE = "pause"
     RESUME = "resume"
     REFUSE = "refuse"
+    MISPLACE = "misplace"
     FAULT = "fault"
     RECOVER = "recover"
     RECOVERED = "recovered"
@@ -82,6 +84,7 @@ def table(steps: tuple[str, ...], success: JobState) -> tuple[Transition, ...]:
     rows += [Transition(JobTrigger.PAUSE, step, JobState.PAUSED) for step in steps]
     rows += [Transition(JobTrigger.RESUME, JobState.PAUSED, step, TransitionGuard.INTERRUPTED) for step in steps]
     rows += [Transition(JobTrigger.REFUSE, step, JobState.REFUSED) for step in (JobState.IDLE, *steps)]
+    rows += [Transition(JobTrigger.MISPLACE, step, JobState.MISPLACED) for step in steps]
     rows += [Transition(JobTrigger.RECOVER, JobState.FAULTED, JobState.RECOVERING, TransitionGuard.RECOVERABLE)]
     rows += [Transition(JobTrigger.RECOVERED, JobState.RECOVERING, step, TransitionGuard.INTERRUPTED) for step in steps]
     rows += [Transition(JobTrigger.FAULT, state, JobState.FAULTED) for state in states]

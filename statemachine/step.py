@@ -17,11 +17,12 @@ from statemachine.watch import RunClock
 
 
 class Outcome(Enum):
-    """How a run ended: done where nothing is placed."""
+    """How a run ended: done where nothing is placed, misplaced where the placed part was looked at and is not in place."""
 
     PLACED = "placed"
     DONE = "done"
     REFUSED = "refused"
+    MISPLACED = "misplaced"
     FAULTED = "faulted"
     ABORTED = "aborted"
 

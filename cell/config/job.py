@@ -160,6 +160,7 @@ class PlaceSection(Table):
     contact_travel: Annotated[float, quantity("mm", 0.1, 10)]
     tolerance: Annotated[float, quantity("mm", 0.01, 10)]
     tolerance_angle: Annotated[float, quantity("mrad", 0.1, 100)]
+    verify: Literal["all", "seen", "none"] = "all"
 
     @model_validator(mode="after")
     def _descends(self) -> Self:

@@ -26,7 +26,7 @@ from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Pace
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
-from cell.procedures.steps.kinds import Kind, find_kind
+from cell.procedures.steps.kinds import Kind, kind_of
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep
 from cell.procedures.sweep.swath import SweepCollector, Sweeping
@@ -70,7 +70,7 @@ class ReadyJob:
         """
         job, mesh = load_job(file)
         require_fit(job, config, mesh, calibrates=calibrates)
-        kind = find_kind(job.job.kind).until(until)
+        kind = kind_of(job).until(until)
         kind.require_steps(script.after)
         nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
         info: dict[str, object] = dict(job_source(file))
@@ -89,8 +89,8 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended: `outcome` is placed (done, for a kind of job that places nothing), refused, faulted or aborted;
-    `report` is what report.json holds, `results` what each step made, by its name.
+    """How a run ended: `outcome` is placed (done, for a kind of job that places nothing), refused, misplaced, faulted
+    or aborted; `report` is what report.json holds, `results` what each step made, by its name.
 
     One that a signal reached too late to end it keeps its outcome, and is `interrupted` all the same. `wall_s` are the
     seconds that it took on the wall, which the report of a run on the virtual clock does not hold.

@@ -35,6 +35,7 @@ from drivers.errors import (
     DeviceFault,
     Interrupted,
     NotConnectedError,
+    MisplacedError,
     RefusedError,
 )
 from drivers.interfaces import Frame
@@ -79,6 +80,8 @@ def classify(error: BaseException, following: DeviceFollowing | None = None) -> 
 
 def _classify(error: BaseException) -> Failure:
     match error:
+        case MisplacedError():
+            return Failure(Outcome.MISPLACED, str(error), type(error).__name__, error=error)
         case RefusedError() | CalibrationStale() | ConfigError():
             return Failure(Outcome.REFUSED, str(error), type(error).__name__, error=error)
         case Aborted():

@@ -47,7 +47,7 @@ class UnfinishedRun:
                 "with `cell home`, then run the job anew"
             ) from error
         run = record.run
-        if run.outcome in ("placed", "done", "refused"):
+        if run.outcome in ("placed", "done", "refused", "misplaced"):
             raise ConfigError(
                 f"run {folder.name} has ended {run.outcome} ({run.reason}); only a run that was aborted, faulted or "
                 "cut short can be resumed. Run its job again"

@@ -85,17 +85,21 @@ class Cameras:
     def picture(
         self, camera: str, world_from_camera: Pose, world_from_base: Pose, laser: bool, exposure: float,
         warm: float = 0.0, t: float = 0.0, camera_from_flange: Pose | None = None,
+        world_from_part: Pose | None = None,
     ) -> Picture:  # fmt: skip
         """The picture (height, width) of `camera`, "scan" or "target", exposed for `exposure` s at these poses.
 
         `warm` is how far, of 0 to 1, laser and cameras have warmed up; `t` the world time, s, by which the sun moves.
-        With `camera_from_flange` the plate on the claw is shown where it comes into view.
+        With `camera_from_flange` the plate on the claw is shown where it comes into view, with `world_from_part` the
+        part, where the station has its shape.
         """
         optics = self._warmed(camera, warm)
         camera_from_world = inverse(world_from_camera)
         objects = self._objects(camera, camera_from_world, world_from_base)
         if camera == "scan" and camera_from_flange is not None:
             objects += self._witness(camera_from_flange)
+        if camera == "scan" and world_from_part is not None:
+            objects += self._part(camera_from_world @ world_from_part)
         with self._busy[camera]:
             lit = self.laser(warm) if laser and camera == "scan" else None
             return render(optics, objects, lit, exposure, self._rng[camera], light=self._sunny(camera_from_world, t))
@@ -108,6 +112,16 @@ class Cameras:
         corners, optics = _witness_corners(pose), self._cold["scan"]
         left = (-0.55 * optics.width / optics.fx) * corners[:, 2]
         return [PlaneInstance(pose, drawing.WITNESS_SIZE, WITNESS_ALBEDO)] if (corners[:, 0] > left).any() else []
+
+    def _part(self, pose: Pose) -> list[SceneObject]:
+        """The part, if it has a shape and the camera may see any of it."""
+        mesh, optics = self._shown[1].part_seen, self._cold["scan"]
+        if mesh is None:
+            return []
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        centre = pose[:3, :3] @ (0.5 * (low + high)) + pose[:3, 3]
+        near = in_view(optics, centre, 0.5 * float(np.linalg.norm(high - low)), far_of("scan", optics))
+        return [MeshInstance(pose, mesh, SURFACE_ALBEDO)] if near else []
 
     def lens(self, camera: str, warm: float) -> Lens:
         """The lens with the shift and zoom of what is `warm`, 0 to 1."""
@@ -163,7 +177,7 @@ class Cameras:
             shown = MeshInstance(camera_from_surface, station.seen, SURFACE_ALBEDO, self._grain)
             placed.append((shown, camera_from_surface, station.radius))
         optics = self._cold[camera]
-        far = max(_FAR[camera][0], _FAR[camera][1] * optics.focus_distance)
+        far = far_of(camera, optics)
         return [item for item, pose, radius in placed if in_view(optics, pose[:3, 3], radius, far)]
 
 
@@ -171,6 +185,12 @@ def _witness_corners(pose: Pose) -> Pose:
     half = np.array(drawing.WITNESS_SIZE) / 2.0
     corners = np.array([[x, y, 0.0] for x in (-half[0], half[0]) for y in (-half[1], half[1])])
     return corners @ pose[:3, :3].T + pose[:3, 3]
+
+
+def far_of(camera: str, optics: CameraOptics) -> float:
+    """Beyond this distance, m, the camera has nothing to see that matters."""
+    least, times = _FAR[camera]
+    return max(least, times * optics.focus_distance)
 
 
 def in_view(optics: CameraOptics, centre: NDArray[np.float64], radius: float, far: float) -> bool:

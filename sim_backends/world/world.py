@@ -149,7 +149,7 @@ class World:
         camera_from_flange = inverse(self.flange_from_camera(camera, t))
         return self._cameras.picture(
             camera, world_from_camera, world_from_base, laser=lit, exposure=exposure, warm=self.warmth(t), t=t,
-            camera_from_flange=camera_from_flange,
+            camera_from_flange=camera_from_flange, world_from_part=self.part.part_pose(world_from_flange),
         )  # fmt: skip
 
     def warmth(self, t: float) -> float:

@@ -1,4 +1,4 @@
-"""Parts whose underside is the surface that they are placed onto: a body of 20 mm above it, drawn in the part frame."""
+"""Parts whose underside is the surface that they are placed onto: a shell of 20 mm above it, drawn in the part frame."""
 
 from __future__ import annotations
 
@@ -16,9 +16,16 @@ Floats = NDArray[np.float64]
 HEIGHT = 0.020
 
 
-def body(vertices: Floats, faces: NDArray[np.int64], changed: Callable[[Floats], Floats]) -> trimesh.Trimesh:
-    """A closed body on the surface; `changed` gives the underside's corners (n, 3), m, as they are drawn instead."""
-    top = vertices * [1.0, 1.0, 0.0] + [0.0, 0.0, vertices[:, 2].max() + HEIGHT]
+def body(
+    vertices: Floats, faces: NDArray[np.int64], changed: Callable[[Floats], Floats], *, flat: bool = False
+) -> trimesh.Trimesh:
+    """A closed body on the surface; `changed` gives the underside's corners (n, 3), m, as they are drawn instead.
+
+    Its top is that of a shell, or `flat`.
+    """
+    top = vertices + [0.0, 0.0, HEIGHT]
+    if flat:
+        top[:, 2] = top[:, 2].max()
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     _, first, count = np.unique(np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True)
     a, b = edges[first[count == 1]].T
@@ -29,13 +36,27 @@ def body(vertices: Floats, faces: NDArray[np.int64], changed: Callable[[Floats],
     )
 
 
-def job_with_part(folder: Path, name: str, changed: Callable[[Floats], Floats] = lambda corners: corners) -> Path:
+def middle_of(
+    vertices: Floats, faces: NDArray[np.int64], half: tuple[float, float]
+) -> tuple[Floats, NDArray[np.int64]]:
+    """What of a surface lies within |x| and |y| ≤ `half`, m: the rest shows beside a part on it."""
+    inside = (np.abs(vertices[faces][..., :2]) <= half).all(axis=(1, 2))
+    used, again = np.unique(faces[inside], return_inverse=True)
+    return vertices[used], again.reshape(-1, 3)
+
+
+def job_with_part(
+    folder: Path, name: str, changed: Callable[[Floats], Floats] = lambda corners: corners, *,
+    verify: str = "none", half: tuple[float, float] = (1.0, 1.0), flat: bool = False,
+) -> Path:  # fmt: skip
     """A shipped job in `folder`, with a mesh of its part beside it: what `load_job` reads."""
     job, mesh = load_job(name)
     assert np.allclose(job.place.surface_from_part.se3().homogeneous, np.eye(4))
-    body(*read_mesh(mesh, job.surface.mesh_unit), changed).export(folder / f"{name}-part.ply")
+    surface = middle_of(*read_mesh(mesh, job.surface.mesh_unit), half)
+    body(*surface, changed, flat=flat).export(folder / f"{name}-part.ply")
     (folder / f"{name}.ply").write_bytes(mesh.read_bytes())
     text = job_path(name).read_text(encoding="utf-8")
     path = folder / f"{name}.toml"
+    text = text.replace("\n[place]\n", f'\n[place]\nverify = "{verify}"\n')
     path.write_text(f'{text}\n[part]\nmesh = "{name}-part.ply"\nmesh_unit = "m"\n', encoding="utf-8")
     return path

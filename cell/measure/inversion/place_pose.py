@@ -166,14 +166,15 @@ Resolve = Callable[[NDArray[np.intp], NDArray[np.intp]], Array]
 def invert_pose(
     cloud: Cloud, nominal: NominalSurface, prior: Prior, tolerance: Tolerance, *, systematic: Array | None = None,
     calibration: Resolve | None = None, sweeps: Resolve | None = None, start: pin.SE3 | None = None,
-    demands: Demands | None = None, most_points: int = 10_000,
+    demands: Demands | None = None, most_points: int = 10_000, partly: bool = False,
 ) -> PlacePose:  # fmt: skip
     """The pose of the nominal surface in the arm base, from a cloud in the arm base and the board's pose as prior.
 
     `systematic` (6×6, base axes) is what the place is off by whether scan or board decides it, such as the arm's error
     as it goes there; `calibration` says how the calibration's uncertainty moves each point, and is propagated through
     the registration; `sweeps` how each sweep's own uncertainty moves its points, which is taken out as far as the
-    sweeps tell it. `start` is where the search begins unless at the prior.
+    sweeps tell it. `start` is where the search begins unless at the prior. A motion that is not known well enough is
+    left to the verdict with `partly`.
 
     Raises `RefusedError` when the scan does not fit the surface, covers too little of it or contradicts the board, and
     `NotObservable` when three standard deviations exceed `tolerance` in some direction, which is named.
@@ -197,7 +198,8 @@ def invert_pose(
         disagreement = require_board(shared, prior, difference(pose, prior.base_from_surface))
         pose, random, verdict = inversion.settled(found, shared)
     with _shown(pose, *numbers):
-        verdict.require()
+        if not partly:
+            verdict.require()
     return PlacePose(
         base_from_surface=pose, random=np.asarray(random), systematic=np.asarray(shared),
         covariance=np.asarray(random + shared), verdict=verdict, rms=found.rms, chi2_per_dof=found.chi2_per_dof,

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import entry_points
 
-from cell.procedures.steps import board_photo, drive_to_target, invert_pose, laser_sweep, place, reconstruct
+from cell.config.job import Job
+from cell.procedures.steps import board_photo, drive_to_target, invert_pose, laser_sweep, place, reconstruct, verify
 from cell.procedures.steps.workplace import JobStep, Workplace
 from drivers.errors import ConfigError
 from statemachine.runner import StepContext
@@ -92,6 +93,16 @@ def _enter(here: Workplace, step: JobStep, context: StepContext) -> object:
 PLACE = Kind(
     "place", (drive_to_target.STEP, board_photo.STEP, laser_sweep.STEP, reconstruct.STEP, invert_pose.STEP, place.STEP)
 )
+
+
+VERIFIED = PLACE.with_step(verify.STEP, after=place.STEP.name, name=PLACE.name)
+"""The same for a job that names a mesh of its part: what was placed is looked at."""
+
+
+def kind_of(job: Job) -> Kind:
+    """The kind of this job; raises what `find_kind` raises."""
+    kind = find_kind(job.job.kind)
+    return VERIFIED if kind is PLACE and job.part is not None and job.place.verify != "none" else kind
 
 
 def find_kind(name: str) -> Kind:

@@ -42,7 +42,7 @@ UNCHECKED = (
 
 def laser_sweep(
     here: Workplace,
-    fix: BoardFix,
+    base_from_surface: pin.SE3,
     head: ScanCalibration,
     scan: ScanSection,
     *,
@@ -54,12 +54,10 @@ def laser_sweep(
 ) -> SweepRecord:
     """Sweep the scan head over every strip of `scan`, by the rail or by the arm as `scan.mode` says.
 
-    The board tells where the surface is; `sweeping` is told it beside who takes the frames. `check` raises when the run
-    is to end. Raises what `rail_sweep` and `arm_sweep` raise, and `DeviceFault` (rail.lost_steps).
+    `sweeping` is told where the surface is taken to be beside who takes the frames. `check` raises when the run is to
+    end. Raises what `rail_sweep` and `arm_sweep` raise, and `DeviceFault` (rail.lost_steps).
     """
     devices, config = here.devices, here.config
-    base_from_place = fix.base_from_board * here.job.place_from_board.inverse()
-    base_from_surface = base_from_place * here.job.surface.place_from_surface.se3()
     home_rail(devices, progress)
     plans = scan_plans(config, here.job.model_copy(update={"scan": scan}), base_from_surface, head)
     errors = SweepErrors(
@@ -140,8 +138,8 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     if pointing is not None:
         head = head.pointed(pointing, here.config.laser.exit_point)
     record = laser_sweep(
-        here, fix, head, unhurried(here.job.scan, context.attempt), check=context.check, progress=context.progress,
-        keep_frame=lambda frame: here.frames.keep("stripe", frame), sweeping=here.sweeping,
+        here, here.base_from_surface(fix), head, unhurried(here.job.scan, context.attempt), check=context.check,
+        progress=context.progress, keep_frame=lambda frame: here.frames.keep("stripe", frame), sweeping=here.sweeping,
     )  # fmt: skip
     rest = here.devices.interlocks.situation.last if here.job.scan.mode == "rail" else None
     doubts = (*record.doubts, *unwatched(head.witness), *doubts, *here.notes)
@@ -149,6 +147,12 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     for note in record.notes:
         context.note(text=note)
     return record
+
+
+def head_at(here: Workplace, sweep: SweepRecord) -> ScanCalibration:
+    """The scan head with the laser where it pointed before this sweep."""
+    head = here.calibration.scan
+    return head if sweep.pointing is None else head.pointed(sweep.pointing, here.config.laser.exit_point)
 
 
 def times_known(head: ScanCalibration, config: CellConfig) -> tuple[StampTiming | None, tuple[str, ...]]:

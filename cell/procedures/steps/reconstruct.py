@@ -18,6 +18,7 @@ from cell.measure.reconstruction import (
     write_cloud,
 )
 from cell.measure.reconstruction.cloud import Array, Indices, Motions
+from cell.procedures.steps.laser_sweep import head_at
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import RefusedError
@@ -70,11 +71,20 @@ def reconstructed(here: Workplace, sweep: SweepRecord) -> Reconstruction:
         write_cloud(path, built, simulated)
         refused.showing(seen={"cloud": built})
         raise
-    head = here.calibration.scan
-    if sweep.pointing is not None:
-        head = head.pointed(sweep.pointing, here.config.laser.exit_point)
+    by_calibration, by_poses = displacements(here, sweep, cloud)
+
+    def by_both(lines: Indices, rows: Indices) -> Array:
+        return np.concatenate([by_calibration(lines, rows), by_poses(lines, rows)], axis=2)
+
+    seams = tuple(find_seams(cloud, by_both))
+    write_cloud(path, cloud, simulated)
+    return Reconstruction(cloud, seams, by_calibration, by_poses)
+
+
+def displacements(here: Workplace, sweep: SweepRecord, cloud: Cloud) -> tuple[Motions, Motions]:
+    """How the points of a sweep's cloud move by what is not known of the calibration, and of the arm's poses."""
     # The same for all sweeps: what the calibration found, with the laser where it pointed before them.
-    geometry, variants = sweep.swaths[0].builder.geometry, head.variants()
+    geometry, variants = sweep.swaths[0].builder.geometry, head_at(here, sweep).variants()
     covariances = [swath.covariance for swath in sweep.swaths]
     # An arm that moves during the sweeps moves its base, too: the vehicle leans as the arm reaches out.
     vehicle, lean = here.config.arm.vehicle_from_base.se3().inverse(), here.config.vehicle.lean_sigma
@@ -86,12 +96,7 @@ def reconstructed(here: Workplace, sweep: SweepRecord) -> Reconstruction:
         leaning = lean_motions(cloud, lines, rows, vehicle, lean)
         return np.concatenate([flange_motions(cloud, lines, rows, covariances), leaning], axis=2)
 
-    def by_both(lines: Indices, rows: Indices) -> Array:
-        return np.concatenate([by_calibration(lines, rows), by_poses(lines, rows)], axis=2)
-
-    seams = tuple(find_seams(cloud, by_both))
-    write_cloud(path, cloud, simulated)
-    return Reconstruction(cloud, seams, by_calibration, by_poses)
+    return by_calibration, by_poses
 
 
 def _at(here: Workplace, context: StepContext) -> Reconstruction:

@@ -79,6 +79,10 @@ class Workplace:
         part = self.job.part
         return None if part is None else NominalSurface.load(Path(part.mesh), unit=part.mesh_unit)
 
+    def base_from_surface(self, fix: BoardFix) -> pin.SE3:
+        """Where the surface is by the board."""
+        return fix.base_from_board * self.job.place_from_board.inverse() * self.job.surface.place_from_surface.se3()
+
     @property
     def repeatability(self) -> Vector:
         """Covariance (6, 6) of base_from_flange each time the arm comes to rest, m² and rad²."""

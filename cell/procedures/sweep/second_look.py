@@ -18,7 +18,7 @@ from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.calibrate.reference_plate import configure_fast
 from cell.procedures.steps.board_photo import require_unmoved as require_board_unmoved
-from cell.procedures.steps.laser_sweep import laser_sweep
+from cell.procedures.steps.laser_sweep import head_at, laser_sweep
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
@@ -79,14 +79,11 @@ def _swept_again(
 ) -> tuple[SurfaceMotion, Creep | None]:
     # The arm is not moved from where it stands already.
     stood = sweep.rest is not None and sweep.rest is here.devices.interlocks.situation.last and len(sweep.swaths) == 1
-    head = here.calibration.scan
-    if sweep.pointing is not None:
-        head = head.pointed(sweep.pointing, here.config.laser.exit_point)
     few = sparse(here.job.scan, sweep.swaths[0])
     # A camera of a few frame rates takes all the lines.
     rate = configure_fast(here.devices, few.exposure, (few.frame_rate, here.job.scan.frame_rate))
     again = laser_sweep(
-        here, fix, head, few.model_copy(update={"frame_rate": rate}),
+        here, here.base_from_surface(fix), head_at(here, sweep), few.model_copy(update={"frame_rate": rate}),
         keep_frame=lambda frame: here.frames.keep("second-look", frame), check=context.check,
         progress=lambda share, text: context.progress(0.04 * share, f"whether the surface lies where it did: {text}"),
         most_lost=MOST_LOST,

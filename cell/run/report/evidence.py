@@ -17,6 +17,8 @@ from statemachine.runner import RunResult
 from statemachine.step import Outcome
 
 CLOUD = "cloud.ply"
+JUDGED = (Outcome.REFUSED, Outcome.MISPLACED)
+"""The ends that rest on figures."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +33,7 @@ class RefusalEvidence:
     def of(cls, result: RunResult) -> RefusalEvidence:
         """What the error behind the end of a run shows; nothing for other ends."""
         error = result.error
-        if result.outcome is Outcome.REFUSED and isinstance(error, RefusedError):
+        if result.outcome in JUDGED and isinstance(error, RefusedError):
             return cls(tuple(sorted(error.numbers, key=lambda number: number.kept)), error.seen)
         return cls((), {})
 
@@ -43,7 +45,7 @@ def ended_in(result: RunResult) -> str | None:
 
 def refusal(result: RunResult, folder: Path, frames: FrameStore) -> dict[str, object] | None:
     """The report's part of this name: why, in which step, on which numbers, and the files that show it."""
-    if result.outcome is not Outcome.REFUSED:
+    if result.outcome not in JUDGED:
         return None
     return {
         "step": ended_in(result),

@@ -25,7 +25,7 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.verification import Verification
 from cell.procedures.drive.way import Whereabouts
-from cell.procedures.steps.kinds import find_kind
+from cell.procedures.steps.kinds import kind_of
 from cell.run import calibration as sessions
 from cell.run.calibration import recorded_maintenance
 from cell.run.folder import find_run
@@ -308,7 +308,7 @@ class Cell:
         info: dict[str, object] = {}
         inline: tuple[Observer, ...] = ()
         if inject:
-            injector = Injector.scheduled(inject, find_kind(loaded.job.kind).names, self.simulated)
+            injector = Injector.scheduled(inject, kind_of(loaded).names, self.simulated)
             info["injected"] = [str(injection) for injection in injector.injections]
             inline = (injector,)
         return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)

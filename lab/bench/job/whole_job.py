@@ -25,7 +25,7 @@ from cell.procedures.calibrate.reference_plate import look_at_witness, with_edge
 from cell.procedures.calibrate.timing import look_at_shutter
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
-from cell.procedures.steps.kinds import PLACE
+from cell.procedures.steps.kinds import kind_of
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.calibration import arm_table
@@ -144,7 +144,7 @@ class _WholeJob:
             self.nominal,
             record.calibration,
             {**self.cell.facts, "mesh": mesh_source(self.nominal.source)},
-            PLACE,
+            kind_of(self.job),
             inline=(self._follow,),
             truth=self.cell.truth,
         )
@@ -175,7 +175,7 @@ class _WholeJob:
 
     def _follow(self, event: Event) -> None:
         """What the run comes to."""
-        names = PLACE.names
+        names = kind_of(self.job).names
         if event.kind == "step_started" and event.step in names:
             self.record.stage = str(event.step)
             self.tell(0.6 + 0.4 * names.index(str(event.step)) / len(names), str(event.step))

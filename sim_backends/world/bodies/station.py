@@ -22,13 +22,15 @@ _KEPT = 4
 class Station:
     """`ground` is what a part meets, `seen` what cameras see, both in S; a ball about S of `radius`, m, holds it.
 
-    `part` is the underside of the part, part frame, turned over; None for one that fits the ground exactly.
+    `part` is the underside of the part, part frame, turned over; None for one that fits the ground exactly. `part_seen`
+    is all of it as the scan camera sees it, part frame; None for one that no camera sees.
     """
 
     ground: Surface
     seen: Mesh
     radius: float
     part: Surface | None
+    part_seen: Mesh | None = None
 
     @classmethod
     def of(cls, drawn: StationDrawing) -> Station:
@@ -43,7 +45,8 @@ class Station:
         reach = np.hypot(abs(x) + ground.half_x, abs(y) + ground.half_y)
         room = max(0.015, ground.top, -low)
         part = underside(drawn.part_mesh, drawn.part_mesh_unit) if drawn.part_mesh else None
-        return cls(ground, seen, float(reach) + room, part)
+        whole = _whole(own_surface(drawn.part_mesh, drawn.part_mesh_unit)) if drawn.part_mesh else None
+        return cls(ground, seen, float(reach) + room, part, whole)
 
 
 def _plane(surface_from_place: NDArray[np.float64]) -> tuple[float, float, float]:
@@ -62,3 +65,8 @@ def _closed_form(name: str) -> Mesh:
 def _own(own: OwnSurface, table: tuple[float, float, float]) -> Mesh:
     made = own.walled(table)
     return Mesh(made.vertices, made.triangles)
+
+
+@lru_cache(maxsize=_KEPT)
+def _whole(own: OwnSurface) -> Mesh:
+    return Mesh(own.vertices, own.triangles)

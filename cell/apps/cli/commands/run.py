@@ -106,7 +106,7 @@ def dry_run(
     from cell.config.cell_config import find_config, load_config
     from cell.config.job import load_job
     from cell.devices.simulated.process import Injection
-    from cell.procedures.steps.kinds import find_kind
+    from cell.procedures.steps.kinds import kind_of
     from cell.run.session.supervisor import Cell
 
     loaded, mesh = load_job(job)
@@ -114,9 +114,9 @@ def dry_run(
     require_fit(loaded, described, mesh, calibrates=True)
     if clock is None and speed is None:
         clock = _clock(described)
-    find_kind(loaded.job.kind).until(until)
+    kind_of(loaded).until(until)
     for text in inject or ():
-        Injection.parse(text, find_kind(loaded.job.kind).names)
+        Injection.parse(text, kind_of(loaded).names)
     opened = partial(
         Cell.open, config, sim="all", seed=seed, level=level.value, speed=speed, job=job,
         confirm=None if confirm is None else confirm.value, clock=(clock or CellClock.wall).value,

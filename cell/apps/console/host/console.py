@@ -22,7 +22,7 @@ from cell.apps.console.host.link import Answer, AskCell, Beat, Do, Joined, Left,
 from cell.apps.console.host.observer import CellObserver
 from cell.apps.console.view.readings import cell_facts
 from cell.config.job import load_job
-from cell.procedures.steps.kinds import find_kind
+from cell.procedures.steps.kinds import kind_of
 from cell.run.job_run import RunOutcome
 from drivers.errors import CellError, ConfigError, InterlockError
 from statemachine.runner import Script
@@ -147,7 +147,7 @@ class Console:
                 self.desk.questions.hold(run)
             return self.seen
 
-        return self.desk.questions.script(find_kind(load_job(job)[0].job.kind).names, seen)
+        return self.desk.questions.script(kind_of(load_job(job)[0]).names, seen)
 
     @contextmanager
     def computing(self, job: str) -> Iterator[Callable[[RunOutcome], None]]:

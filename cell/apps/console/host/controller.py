@@ -21,7 +21,7 @@ from cell.config.job import load_job, require_job_name
 from cell.devices.diagnosis.diagnosis import ask
 from cell.devices.gate.gate import Gated
 from cell.procedures.calibrate.verification import Verification
-from cell.procedures.steps.kinds import find_kind
+from cell.procedures.steps.kinds import kind_of
 from cell.run.jogging import Jog
 from cell.run.runs import Run
 from drivers.errors import CellError, InterlockError
@@ -170,7 +170,7 @@ class ConsoleController:
         return self._soon(client, f"job {job}", begin)
 
     def _script(self, job: str) -> Script:
-        return self.questions.script(find_kind(load_job(job)[0].job.kind).names)
+        return self.questions.script(kind_of(load_job(job)[0]).names)
 
     def _require_nothing_starting(self) -> None:
         """Take `_beginning`, or raise `InterlockError` while something else has it."""

@@ -19,7 +19,7 @@ from cell.apps.console.view.scene import SceneNow
 from cell.base.lateness import busy_words
 from cell.config.job import load_job
 from cell.measure.geometry.poses import from_ur
-from cell.procedures.steps.kinds import find_kind
+from cell.procedures.steps.kinds import kind_of
 from cell.run.folder import list_runs, read_report
 from cell.run.runs import Run
 from drivers.errors import CellError
@@ -138,7 +138,7 @@ class CellObserver:
         steps: tuple[str, ...] = ()
         if run.kind == "job" and job is not None:
             with suppress(CellError):
-                steps = find_kind(load_job(job)[0].job.kind).names
+                steps = kind_of(load_job(job)[0]).names
         return RunView(run, steps, job, self._expected(job) if steps else {})
 
     def _expected(self, job: str | None) -> dict[str, float]:

@@ -132,7 +132,7 @@ def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, object]:
 
     tell(0.0, "loading the program")
     from cell.config.job import load_job
-    from cell.procedures.steps.kinds import find_kind
+    from cell.procedures.steps.kinds import kind_of
     from cell.run.session.supervisor import Cell
 
     tell(0.0, "simulating the cell")
@@ -140,7 +140,7 @@ def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, object]:
         Path(config) if config else None, sim="all", seed=seed, level=level, job=job, clock="virtual",
         confirm="simulated",
     ) as cell:  # fmt: skip
-        names = find_kind(load_job(job)[0].job.kind).names
+        names = kind_of(load_job(job)[0]).names
 
         def observe(event: Event) -> None:
             if event.step in names and event.kind in ("step_started", "progress"):

@@ -2,7 +2,7 @@
 
 import { byId, deg, el, figure, mm, remake, say, seconds, words } from './dom.js';
 
-const ENDS = { refused: 'REFUSED', faulted: 'FAULT', failed: 'FAULT', aborted: 'STOPPED' };
+const ENDS = { refused: 'REFUSED', misplaced: 'MISPLACED', faulted: 'FAULT', failed: 'FAULT', aborted: 'STOPPED' };
 
 // Word, kind (for its colour) and sentence of a state.
 export function mood({ run, question, last, starting, safety, devices, manual }) {

@@ -23,7 +23,7 @@ from cell.devices.gate.gate import Gated
 from cell.devices.gate.rules import RULES
 from cell.devices.simulated.process import is_whole
 from cell.motion.kinematics import arm_kinematics
-from cell.procedures.steps.kinds import find_kind
+from cell.procedures.steps.kinds import kind_of
 from cell.run.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM
 from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import ArmSafety, ArmState, Attended, RailState, VehicleState
@@ -201,7 +201,7 @@ def cell_facts(cell: Cell, job: str) -> dict[str, object]:
             "rail": [*config.rail.travel],
         },
         "jog": [entry for name in there for entry in _jogs(cell, name)],
-        "job": job, "jobs": jobs(job), "steps": list(find_kind(loaded.job.kind).names),
+        "job": job, "jobs": jobs(job), "steps": list(kind_of(loaded).names),
         "interlocks": [rule.name for rule in RULES if rule.check is not None and rule.liftable],
         "scene": scene(config, job, table, cell.folder / config.cell.meshes if config.cell.meshes else None),
     }  # fmt: skip

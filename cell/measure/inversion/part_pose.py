@@ -1,0 +1,121 @@
+"""Where a part lies on its surface, from one sweep of the part and of what shows of the surface beside it.
+
+What the arm's pose and the calibration are off by moves part and surface alike in one sweep, and cancels between them.
+Where too little of the surface shows, it is taken to lie where an earlier sweep found it, with what that is off by.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pinocchio as pin
+
+from cell.measure.geometry.poses import composition_jacobians
+from cell.measure.inversion.demands import Demands
+from cell.measure.inversion.nominal import Array, Indices, NominalSurface, Scan
+from cell.measure.inversion.observability import Tolerance
+from cell.measure.inversion.place_pose import PlacePose, invert_pose, shared_by_patches
+from cell.measure.inversion.registration import Prior, register
+from cell.measure.reconstruction.cloud import Cloud, Motions
+from drivers.errors import RefusedError
+
+FACING_UP = 0.3
+"""Cosine from the surface's z axis up to which a face of the part is one that the sweep sees."""
+SHIFTED = np.array([2e-3] * 3 + [2e-2] * 3)
+"""One standard deviation of where a part may lie that was put down wrongly, m and rad: it is found up to thrice that."""
+ABOUT_M = 4e-3
+"""So far around the part, where it belongs, its points are looked for."""
+BESIDE_M = 1.5e-3
+"""Nearer to the part, seen from above, nothing counts as the surface beside it."""
+LEAST_BESIDE = 500
+MOST_POINTS = 10_000
+DEMANDS = Demands(coverage=0.25)
+"""Less than of a surface: a sweep sees a strip of a part."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartPose:
+    """Where a part was seen: `surface_from_part`, and its `covariance` (6, 6), m² and rad², surface axes, about the
+    part's origin.
+
+    `fit` is how its faces lie in the scan; its verdict names the motions that these do not show. `beside` is the number
+    of points of the surface that showed beside the part; 0 where the earlier sweep tells where that lies.
+    """
+
+    surface_from_part: pin.SE3
+    covariance: Array
+    fit: PlacePose
+    beside: int
+
+
+def seen_from_above(part: NominalSurface, surface_from_part: pin.SE3) -> NominalSurface | None:
+    """The faces of a part that a sweep from above sees; None where it has none."""
+    up = part.normals @ surface_from_part.rotation.T[:, 2] > FACING_UP
+    return NominalSurface(part.vertices, part.triangles[up]) if up.any() else None
+
+
+def find_part(
+    cloud: Cloud, faces: NominalSurface, nominal: NominalSurface, surface: Prior, belongs: pin.SE3,
+    tolerance: Tolerance, moved: Motions,
+) -> PartPose:  # fmt: skip
+    """Where the part with these `faces`, which `belongs` at surface_from_part, lies in a sweep's cloud, arm base.
+
+    `surface` is where the earlier sweep found the surface, with its covariance. `moved` says how one standard deviation
+    of each independent parameter of this sweep displaces its points. Raises `RefusedError` where the part is not found.
+    """
+    on_part, around = _parted(cloud, faces, surface.base_from_surface * belongs)
+    there, unsure, follows = surface.base_from_surface, surface.covariance, np.zeros((6, 0))
+    beside = 0
+    if around.size >= LEAST_BESIDE:
+        try:
+            there, unsure, follows, beside = _surface_beside(around, nominal, surface, moved)
+        except RefusedError:
+            # A table, or whatever else lies there.
+            beside = 0
+
+    def against_surface(lines: Indices, rows: Indices) -> Array:
+        """How the points move beside the surface, which follows what moves them."""
+        own = moved(lines, rows)
+        if not beside:
+            return own
+        arms = cloud.points[lines, rows] - there.translation
+        with_it = follows[:3] + np.cross(follows[3:].T[None], arms[:, None]).transpose(0, 2, 1)
+        return np.asarray(own - with_it)
+
+    expected = there * belongs
+    carried = composition_jacobians(there, belongs)[0]
+    fit = invert_pose(
+        on_part, faces, Prior(expected, np.diag(SHIFTED**2)), tolerance, systematic=carried @ unsure @ carried.T,
+        calibration=against_surface, demands=DEMANDS, most_points=MOST_POINTS, partly=True,
+    )  # fmt: skip
+    turn = np.kron(np.eye(2), there.rotation.T)
+    return PartPose(there.inverse() * fit.base_from_surface, turn @ fit.covariance @ turn.T, fit, beside)
+
+
+def _parted(cloud: Cloud, faces: NominalSurface, base_from_part: pin.SE3) -> tuple[Cloud, Cloud]:
+    """The points about the part, where it is expected, and those beside it."""
+    low, high = faces.extent
+    local = (cloud.points - base_from_part.translation) @ base_from_part.rotation
+    # A comparison with what is no number is false: holes are of neither.
+    about = ((local > low - ABOUT_M) & (local < high + ABOUT_M)).all(axis=2)
+    clear = ((local < low - BESIDE_M) | (local > high + BESIDE_M))[..., :2].any(axis=2)
+    return _only(cloud, about), _only(cloud, clear)
+
+
+def _only(cloud: Cloud, kept: Array) -> Cloud:
+    return replace(cloud, points=np.where(kept[..., None], cloud.points, np.nan))
+
+
+def _surface_beside(
+    around: Cloud, nominal: NominalSurface, surface: Prior, moved: Motions
+) -> tuple[pin.SE3, Array, Array, int]:
+    """Where the surface lies by what shows of it, base_from_surface, its own covariance (6, 6), how it follows each
+    parameter (6, m), and of how many points."""
+    found = register(Scan.of(around, MOST_POINTS), nominal, surface)
+    if len(found.used) < LEAST_BESIDE:
+        raise RefusedError(f"{len(found.used)} points of the surface beside the part, at least {LEAST_BESIDE}")
+    lines, rows = around.subsample(MOST_POINTS)
+    along = np.einsum("ni,nim->nm", found.normals, moved(lines[found.used], rows[found.used]))
+    _, patches = shared_by_patches(found)
+    return found.base_from_surface, found.covariance + patches, found.follow @ along, len(found.used)

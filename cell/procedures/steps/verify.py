@@ -1,0 +1,231 @@
+"""Verify: the placed part and what shows of the surface around it are swept; it lies in its place, or the run fails."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config.job import Job, PlaceSection
+from cell.measure.geometry.poses import from_parts, transform
+from cell.measure.inversion import PlacePose, Prior, Tolerance
+from cell.measure.inversion.mating import MatingGap, scanned_gap
+from cell.measure.inversion.part_pose import PartPose, find_part, seen_from_above
+from cell.measure.reconstruction import Cloud, write_cloud
+from cell.measure.reconstruction.cloud import Indices
+from cell.motion.kinematics import HOME
+from cell.procedures.part_error import bound_of, draws, part_covariance, part_points, through
+from cell.procedures.steps.laser_sweep import head_at, laser_sweep
+from cell.procedures.steps.place import PlaceResult
+from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements
+from cell.procedures.steps.workplace import JobStep, Workplace
+from cell.procedures.sweep.stored_sweep import SweepRecord
+from drivers.errors import Measured, MisplacedError, RefusedError
+from drivers.interfaces import Vector
+from statemachine.runner import StepContext
+from statemachine.step import Step
+
+CLOUD = "placed.ply"
+NEXT_STEP = "See to it, take the part away, then run the job with the next part"
+LIKELY = {
+    "raised": "it lies on something, or is another part: look under it",
+    "deep": "the part or the surface is worn, or another one",
+    "shifted": "it slipped in the claw, or as the claw opened: look at the fingers",
+    "tilted": "it stands on something at one edge, or was held tilted: look under it",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedPart:
+    """Where the placed part was `seen`, beside where it `belongs` (surface_from_part).
+
+    `points` (45, 3) m, part frame, are those by which a placed part is judged. `covariance` (6, 6) is that of the seen
+    pose, surface axes, about the part's origin; along motions that its faces do not show, `unseen`, it is what was
+    stated before it was put down. `gap` is the gap below it, as it lies; None where nothing scanned lies below.
+    """
+
+    seen: PartPose
+    belongs: pin.SE3
+    points: Vector
+    covariance: Vector
+    unseen: tuple[str, ...] = ()
+    gap: MatingGap | None = None
+
+    @cached_property
+    def offsets(self) -> Vector:
+        """How far each point lies from where it belongs, (45, 3) m, surface axes."""
+        return transform(self.seen.surface_from_part, self.points) - transform(self.belongs, self.points)
+
+    @property
+    def turn(self) -> Vector:
+        """By how much the part is turned from where it belongs, (3,) rad, surface axes."""
+        return np.asarray(pin.log3(self.seen.surface_from_part.rotation @ self.belongs.rotation.T))
+
+    @cached_property
+    def _errors(self) -> Vector:
+        """What the points' places may be off by, (2000, 45, 3) m."""
+        arms = transform(self.seen.surface_from_part, self.points) - self.seen.surface_from_part.translation
+        return draws(through(arms, self.covariance))
+
+    @property
+    def off(self) -> float:
+        """How far its points lie from where they belong, on average, m."""
+        return float(np.linalg.norm(self.offsets, axis=1).mean())
+
+    @property
+    def unsure(self) -> float:
+        """What 95 % of the points are known to, m."""
+        return float(np.percentile(np.linalg.norm(self._errors, axis=-1), 95))
+
+    @property
+    def bound(self) -> dict[str, object]:
+        """Below what, mm, 95 % of the points lie from where they belong, by axis of the surface's frame and for D."""
+        return bound_of(self.offsets + self._errors)
+
+    @property
+    def turn_bound(self) -> float:
+        """By how much the part is turned at most, rad, at 95 %."""
+        turned = self.turn + draws(self.covariance[None, 3:, 3:])[:, 0]
+        return float(np.percentile(np.linalg.norm(turned, axis=-1), 95))
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        gap = "" if self.gap is None else f", {self.gap.words}"
+        where = "beside the surface in the same sweep" if self.seen.beside else "beside the surface as swept before"
+        return f"{1e3 * self.off:.2f} ± {1e3 * self.unsure:.2f} mm off its place, {where}{gap}"
+
+    @property
+    def likely(self) -> str:
+        """What has most likely happened to a part that does not lie in its place."""
+        x, y, z = self.offsets.mean(axis=0)
+        arm = float(np.sqrt(np.mean(np.sum((self.points - self.points.mean(axis=0)) ** 2, axis=1))))
+        sizes = {
+            "raised": z, "deep": -z, "shifted": float(np.hypot(np.hypot(x, y), arm * self.turn[2])),
+            "tilted": arm * float(np.hypot(*self.turn[:2])),
+        }  # fmt: skip
+        return LIKELY[max(sizes, key=lambda name: sizes[name])]
+
+    def measured(self, place: PlaceSection) -> tuple[Measured, Measured]:
+        """What it is judged by, beside the place's tolerances."""
+        return (
+            Measured("placed part off its place, 95 % bound", self.bound["d"], "mm", most=1e3 * place.tolerance),
+            Measured("placed part turned, 95 % bound", 1e3 * self.turn_bound, "mrad", most=1e3 * place.tolerance_angle),
+        )
+
+    def require(self, place: PlaceSection) -> None:
+        """Raise `MisplacedError` where the part is not known to lie within the place's tolerances."""
+        off, turned = self.measured(place)
+        if off.kept and turned.kept:
+            return
+        shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
+        turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
+        raise MisplacedError(
+            f"the placed part lies {self.words}: ({shift}) mm and ({turn}) mrad in the surface's axes. Allowed are "
+            f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad, held by {off.value:.2f} mm and "
+            f"{turned.value:.1f} mrad at 95 %. Most likely {self.likely}. {NEXT_STEP}",
+            off, turned,
+        )  # fmt: skip
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """For people: how it lies, and what was not seen."""
+        if not self.unseen:
+            return (f"the placed part lies {self.words}",)
+        return (f"the placed part lies {self.words}", f"not seen of the placed part: {', '.join(self.unseen)}")
+
+    def summary(self) -> dict[str, object]:
+        """Figures for journal and report."""
+        shift, turn = self.offsets.mean(axis=0), self.turn
+        sigma = np.sqrt(np.diag(self.covariance))
+        return {
+            "off_mm": round(1e3 * self.off, 4), "unsure_mm": round(1e3 * self.unsure, 4),
+            "shift_mm": [round(1e3 * float(v), 4) for v in shift],
+            "turn_mrad": [round(1e3 * float(v), 4) for v in turn],
+            "sigma_mm": [round(1e3 * float(v), 4) for v in sigma[:3]],
+            "sigma_mrad": [round(1e3 * float(v), 4) for v in sigma[3:]],
+            "points": self.seen.fit.n_points, "beside": self.seen.beside, "unseen": list(self.unseen),
+            "gap": None if self.gap is None else self.gap.as_dict(),
+        }  # fmt: skip
+
+
+def _at(here: Workplace, context: StepContext) -> PlacedPart:
+    sweep, scan, placed = context.made(SweepRecord), context.made(Reconstruction), context.made(PlaceResult)
+    pose = placed.pose or context.made(PlacePose)
+    cloud, record = _swept(here, sweep, pose, context)
+    context.progress(0.95, "folding the arm")
+    here.mover.to_joints(HOME)
+    by_calibration, by_poses = displacements(here, record, cloud)
+
+    def moved(lines: Indices, rows: Indices) -> Vector:
+        return np.concatenate([by_calibration(lines, rows), by_poses(lines, rows)], axis=2)
+
+    part = here.part_mesh
+    assert part is not None
+    place, belongs = here.job.place, here.job.place.surface_from_part.se3()
+    faces = seen_from_above(part, belongs)
+    assert faces is not None
+    tolerance = Tolerance(place.tolerance, place.tolerance_angle)
+    try:
+        seen = find_part(
+            cloud, faces, here.nominal, Prior(pose.base_from_surface, pose.covariance), belongs, tolerance, moved
+        )
+    except RefusedError as error:
+        raise MisplacedError(
+            f"the placed part is not where it was put down, or is not the part as drawn: {error}. {NEXT_STEP}",
+            *error.numbers,
+        ) from error
+    stated = part_covariance(here.job, pose, here.repeatability)
+    gap = scanned_gap(scan.cloud, pose.base_from_surface, here.nominal, seen.surface_from_part, part)
+    found = replace(judged(here.job, seen, part_points(here.nominal), stated), gap=gap)
+    for note in found.notes:
+        context.note(text=note)
+    found.require(place)
+    return found
+
+
+def _swept(
+    here: Workplace, sweep: SweepRecord, pose: PlacePose, context: StepContext
+) -> tuple[Cloud, SweepRecord]:
+    """Sweep the part, with the head as far above it as it was above the surface."""
+    part = here.part_mesh
+    if part is None:
+        raise RefusedError("the job has no mesh of its part ([part]): nothing tells what the placed part looks like")
+    middle = here.job.place.surface_from_part.se3() * (0.5 * sum(part.extent))
+    above = pose.base_from_surface * from_parts((0.0, 0.0, middle[2]))
+    again = laser_sweep(
+        here, above, head_at(here, sweep), here.job.scan, check=context.check,
+        keep_frame=lambda frame: here.frames.keep("verify", frame),
+        progress=lambda share, text: context.progress(0.9 * share, f"the placed part: {text}"),
+    )  # fmt: skip
+    cloud = build_cloud(again)
+    write_cloud(here.folder / CLOUD, cloud, here.config.cell.sim)
+    return cloud, again
+
+
+def judged(job: Job, seen: PartPose, points: Vector, stated: Vector) -> PlacedPart:
+    """The part as `seen`, with what is not seen of it as it was `stated`, (6, 6), surface axes.
+
+    Raises `MisplacedError` where something is not seen, and the job does not content itself with the rest.
+    """
+    unit = np.array([job.place.tolerance] * 3 + [job.place.tolerance_angle] * 3)
+    values, ways = np.linalg.eigh(seen.covariance / np.outer(unit, unit))
+    weak = ~(3.0 * np.sqrt(np.maximum(values, 0.0)) <= 1.0)
+    unseen = tuple(motion.words.partition(" is ")[0] for motion in seen.fit.verdict.weak) if weak.any() else ()
+    if unseen and job.place.verify == "all":
+        raise MisplacedError(
+            f"how the placed part lies is not seen in all: {'; '.join(m.words for m in seen.fit.verdict.weak)}. Sweep "
+            'more of it, or write place.verify = "seen"',
+            *(motion.measured() for motion in seen.fit.verdict.weak),
+        )
+    instead = np.einsum("in,ij,jn->n", ways, stated / np.outer(unit, unit), ways)
+    kept = (ways * np.where(weak, instead, values)) @ ways.T * np.outer(unit, unit)
+    return PlacedPart(seen, job.place.surface_from_part.se3(), points, kept, unseen)
+
+
+STEP = JobStep(
+    Step("verify", 180.0, 1, ("DeadlineError",)), _at, PlacedPart,
+    needs=(SweepRecord, Reconstruction, PlacePose, PlaceResult),
+)  # fmt: skip
