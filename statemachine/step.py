@@ -17,7 +17,7 @@ from statemachine.watch import RunClock
 
 
 class Outcome(Enum):
-    """How a run ended: done where nothing is placed, misplaced where the placed part was looked at and is not in place."""
+    """How a run ended: done where nothing is placed, misplaced where the placed part was seen out of its place."""
 
     PLACED = "placed"
     DONE = "done"

@@ -11,7 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from cell.check.place import contact_problems, mating_problems, mesh_box, place_problems, surface_problems, way_problems
+from cell.check.place import (
+    contact_problems,
+    mating_problems,
+    mesh_box,
+    place_problems,
+    surface_problems,
+    verify_problems,
+    way_problems,
+)
 from cell.check.reach import reach_problems
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
@@ -21,7 +29,8 @@ from cell.measure.vision import BoardSpec, parse_board
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
-from cell.procedures.steps.kinds import find_kind
+from cell.procedures.steps import verify
+from cell.procedures.steps.kinds import kind_of
 from drivers.errors import ConfigError
 from drivers.make import CameraConfig
 
@@ -52,16 +61,19 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
     # The arm's poses follow from the others: where these are wrong, it would only be told twice.
     problems = problems or list(reach_problems(job, config, extent, calibrates=calibrates))
     problems += contact_problems(job, config, mesh)
-    problems = problems or list(mating_problems(job, mesh))
+    problems = problems or [*mating_problems(job, mesh), *verify_problems(job)]
     if problems:
         raise ConfigError(f"job {job.job.name} does not fit this cell:\n  " + "\n  ".join(problems))
 
 
 def _kind(job: Job) -> Iterator[str]:
     try:
-        find_kind(job.job.kind)
+        kind = kind_of(job)
     except ConfigError as error:
         yield str(error)
+        return
+    if job.part is None and verify.STEP.name in kind.names:
+        yield f'job.kind "{kind.name}" looks at the placed part: give its mesh in [part]'
 
 
 def _speeds(job: Job, config: CellConfig) -> Iterator[str]:

@@ -16,6 +16,8 @@ from cell.config.job import Job
 from cell.measure.geometry.poses import from_parts, transform
 from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, drawn_gap
 from cell.measure.inversion.nominal import NominalSurface, read_mesh
+from cell.measure.inversion.observability import Tolerance
+from cell.measure.inversion.part_pose import seen_from_above, shown_by
 from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import Body, station_bodies, vehicle_bodies
@@ -106,6 +108,23 @@ def mating_problems(job: Job, mesh: Path) -> Iterator[str]:
         yield f'part.mesh "{Path(job.part.mesh).name}": {problem}'
 
 
+def verify_problems(job: Job) -> Iterator[str]:
+    """Whether a sweep can see how the part lies once it was placed; nothing where nobody looks."""
+    if job.part is None or job.place.verify == "none":
+        return
+    part = NominalSurface.load(Path(job.part.mesh), unit=job.part.mesh_unit)
+    faces, file = seen_from_above(part, job.place.surface_from_part.se3()), f'part.mesh "{Path(job.part.mesh).name}"'
+    if faces is None:
+        yield f"{file}: no face of it faces up where the part lies; nothing of it can be seen"
+    elif job.place.verify == "all":
+        tolerance = Tolerance(job.place.tolerance, job.place.tolerance_angle)
+        if unseen := shown_by(faces, tolerance):
+            yield (
+                f"{file}: the faces of the placed part do not show {', '.join(unseen)}. Write place.verify = "
+                '"seen" to have the rest looked at, or "none"'
+            )
+
+
 def _drawn(job: Job, mesh: Path) -> MatingGap | None:
     assert job.part is not None
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
@@ -121,7 +140,10 @@ def contact_notes(job: Job, mesh: Path) -> Iterator[str]:
         f"{1e3 * job.grasp.size[2]:g} mm, and {100 * over:.0f} % of its footprint lie over the surface"
     )
     if job.part is None:
-        yield "the job has no mesh of its part ([part]): whether its underside fits the surface is not looked at"
+        yield (
+            "the job has no mesh of its part ([part]): whether its underside fits the surface, and how it lies once it "
+            "was placed, is not looked at"
+        )
     elif (found := _drawn(job, mesh)) is not None:
         yield f"the part's mating face, as drawn: {found.words}"
 

@@ -54,12 +54,7 @@ def stated_bound(
         part = transform(pose.base_from_surface, job.place.surface_from_part.se3().translation[None])
         covariances = covariances + through(points - part, grasp)
     turn = pose.base_from_surface.rotation
-    return bound_of(draws(turn.T @ covariances @ turn))
-
-
-def bound_of(errors: Vector) -> dict[str, object]:
-    """Below what, mm, 95 % of errors (n, 45, 3) m, surface axes, lie, by axis and for D."""
-    errors = 1e3 * np.abs(errors)
+    errors = 1e3 * np.abs(draws(turn.T @ covariances @ turn))
     distance = np.linalg.norm(errors, axis=-1)
     by_axis = {name: float(np.percentile(errors[..., k], 95)) for k, name in enumerate("xyz")}
     return {"frame": "surface", "unit": "mm", **by_axis, "d": float(np.percentile(distance, 95))}

@@ -34,8 +34,8 @@ from drivers.errors import (
     DeviceError,
     DeviceFault,
     Interrupted,
-    NotConnectedError,
     MisplacedError,
+    NotConnectedError,
     RefusedError,
 )
 from drivers.interfaces import Frame

@@ -1,4 +1,4 @@
-"""Parts whose underside is the surface that they are placed onto: a shell of 20 mm above it, drawn in the part frame."""
+"""Parts whose underside is the surface that they are placed onto: shells of 20 mm above it, in the part frame."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def body(
 
     Its top is that of a shell, or `flat`.
     """
-    top = vertices + [0.0, 0.0, HEIGHT]
+    top = vertices + np.array([0.0, 0.0, HEIGHT])
     if flat:
         top[:, 2] = top[:, 2].max()
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

@@ -204,7 +204,14 @@ def _cut(text: str, width: int) -> str:
     return text if len(text) <= width else text[: width - 2].rstrip() + " …"
 
 
-COLOURS = {"placed": "green", "done": "green", "refused": "yellow", "misplaced": "red", "faulted": "red", "aborted": "magenta"}
+COLOURS = {
+    "placed": "green",
+    "done": "green",
+    "refused": "yellow",
+    "misplaced": "red",
+    "faulted": "red",
+    "aborted": "magenta",
+}
 
 
 def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False, whole: bool = False) -> None:

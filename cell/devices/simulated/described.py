@@ -110,8 +110,6 @@ def _station(job: Job, mesh: Path, drives: bool) -> drawn.StationDrawing:
         surface_from_part=_matrix(job.place.surface_from_part.se3()),
         part_size=job.grasp.size,
         obstacles=_boxes({o.name: (o.place_from_centre, o.size) for o in job.obstacle}),
-        part_mesh="" if job.part is None else str(Path(job.part.mesh).resolve()),
-        part_mesh_unit="m" if job.part is None else job.part.mesh_unit,
     )
 
 

@@ -14,7 +14,7 @@ import pinocchio as pin
 from cell.measure.geometry.poses import composition_jacobians
 from cell.measure.inversion.demands import Demands
 from cell.measure.inversion.nominal import Array, Indices, NominalSurface, Scan
-from cell.measure.inversion.observability import Tolerance
+from cell.measure.inversion.observability import Tolerance, determined, judge
 from cell.measure.inversion.place_pose import PlacePose, invert_pose, shared_by_patches
 from cell.measure.inversion.registration import Prior, register
 from cell.measure.reconstruction.cloud import Cloud, Motions
@@ -23,13 +23,15 @@ from drivers.errors import RefusedError
 FACING_UP = 0.3
 """Cosine from the surface's z axis up to which a face of the part is one that the sweep sees."""
 SHIFTED = np.array([2e-3] * 3 + [2e-2] * 3)
-"""One standard deviation of where a part may lie that was put down wrongly, m and rad: it is found up to thrice that."""
+"""One standard deviation of where a part put down wrongly may lie, m and rad: it is found up to thrice that."""
 ABOUT_M = 4e-3
 """So far around the part, where it belongs, its points are looked for."""
 BESIDE_M = 1.5e-3
 """Nearer to the part, seen from above, nothing counts as the surface beside it."""
 LEAST_BESIDE = 500
 MOST_POINTS = 10_000
+NOISE_M = 20e-6
+"""Of a point of a sweep, one standard deviation, roughly."""
 DEMANDS = Demands(coverage=0.25)
 """Less than of a surface: a sweep sees a strip of a part."""
 
@@ -53,6 +55,22 @@ def seen_from_above(part: NominalSurface, surface_from_part: pin.SE3) -> Nominal
     """The faces of a part that a sweep from above sees; None where it has none."""
     up = part.normals @ surface_from_part.rotation.T[:, 2] > FACING_UP
     return NominalSurface(part.vertices, part.triangles[up]) if up.any() else None
+
+
+def shown_by(faces: NominalSurface, tolerance: Tolerance) -> tuple[str, ...]:
+    """In words the motions of a part that its `faces` as drawn do not show within `tolerance`, part frame."""
+    points = faces.samples[:: max(1, len(faces.samples) // MOST_POINTS)]
+    normals = faces.normals[faces.sample_triangles[:: max(1, len(faces.samples) // MOST_POINTS)]]
+    rows = np.concatenate([normals, np.cross(points, normals)], axis=1) / NOISE_M
+    told, _ = determined(rows, faces.radius)
+    covariance = np.asarray(np.linalg.inv(told + np.diag(SHIFTED**-2.0)), dtype=np.float64)
+    verdict = judge(covariance, told, NOISE_M**2, points=len(points), radius=faces.radius, tolerance=tolerance)
+    return tuple(of_part(motion.words.partition(" is ")[0]) for motion in verdict.weak)
+
+
+def of_part(words: str) -> str:
+    """The name of a motion, which is that of a surface, for a part."""
+    return words.replace("surface frame", "part frame")
 
 
 def find_part(

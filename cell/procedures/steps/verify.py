@@ -12,11 +12,11 @@ from cell.config.job import Job, PlaceSection
 from cell.measure.geometry.poses import from_parts, transform
 from cell.measure.inversion import PlacePose, Prior, Tolerance
 from cell.measure.inversion.mating import MatingGap, scanned_gap
-from cell.measure.inversion.part_pose import PartPose, find_part, seen_from_above
+from cell.measure.inversion.part_pose import PartPose, find_part, of_part, seen_from_above
 from cell.measure.reconstruction import Cloud, write_cloud
 from cell.measure.reconstruction.cloud import Indices
 from cell.motion.kinematics import HOME
-from cell.procedures.part_error import bound_of, draws, part_covariance, part_points, through
+from cell.procedures.part_error import draws, part_covariance, part_points, through
 from cell.procedures.steps.laser_sweep import head_at, laser_sweep
 from cell.procedures.steps.place import PlaceResult
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements
@@ -28,6 +28,8 @@ from statemachine.runner import StepContext
 from statemachine.step import Step
 
 CLOUD = "placed.ply"
+CLEARLY = 3.0
+"""Standard deviations of the stated place beyond which a part has not come to lie so by chance."""
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 LIKELY = {
     "raised": "it lies on something, or is another part: look under it",
@@ -42,14 +44,16 @@ class PlacedPart:
     """Where the placed part was `seen`, beside where it `belongs` (surface_from_part).
 
     `points` (45, 3) m, part frame, are those by which a placed part is judged. `covariance` (6, 6) is that of the seen
-    pose, surface axes, about the part's origin; along motions that its faces do not show, `unseen`, it is what was
-    stated before it was put down. `gap` is the gap below it, as it lies; None where nothing scanned lies below.
+    pose, surface axes, about the part's origin; `stated` (6, 6) is that of the place before it was put down, which
+    stands for the motions that its faces do not show, `unseen`. `gap` is the gap below it, as it lies; None where
+    nothing scanned lies below.
     """
 
     seen: PartPose
     belongs: pin.SE3
     points: Vector
     covariance: Vector
+    stated: Vector
     unseen: tuple[str, ...] = ()
     gap: MatingGap | None = None
 
@@ -79,10 +83,15 @@ class PlacedPart:
         """What 95 % of the points are known to, m."""
         return float(np.percentile(np.linalg.norm(self._errors, axis=-1), 95))
 
-    @property
-    def bound(self) -> dict[str, object]:
-        """Below what, mm, 95 % of the points lie from where they belong, by axis of the surface's frame and for D."""
-        return bound_of(self.offsets + self._errors)
+    @cached_property
+    def bound(self) -> dict[str, float]:
+        """Below what, mm, 95 % of the points lie from where they belong, by axis of the surface's frame and for D.
+
+        Where they were seen counts, and at 95 % what that may be off by.
+        """
+        errors = 1e3 * np.abs(self.offsets + self._errors)
+        found = {name: errors[..., k] for k, name in enumerate("xyz")} | {"d": np.linalg.norm(errors, axis=-1)}
+        return {name: float(np.percentile(np.percentile(each, 95, axis=1), 95)) for name, each in found.items()}
 
     @property
     def turn_bound(self) -> float:
@@ -91,22 +100,36 @@ class PlacedPart:
         return float(np.percentile(np.linalg.norm(turned, axis=-1), 95))
 
     @property
+    def doubtful(self) -> str:
+        """What to do where the surface was not seen beside the part."""
+        return "" if self.seen.beside else ". Have more of the surface show beside the part: less would be left open"
+
+    @property
     def words(self) -> str:
         """For people."""
         gap = "" if self.gap is None else f", {self.gap.words}"
         where = "beside the surface in the same sweep" if self.seen.beside else "beside the surface as swept before"
         return f"{1e3 * self.off:.2f} ± {1e3 * self.unsure:.2f} mm off its place, {where}{gap}"
 
+    @cached_property
+    def _times(self) -> Vector:
+        """How far it is off its place, (6,), in standard deviations of the stated place: along x, y, z, and about them,
+        about its origin."""
+        off = np.concatenate([self.seen.surface_from_part.translation - self.belongs.translation, self.turn])
+        return np.asarray(off / np.sqrt(np.diag(self.stated)))
+
     @property
     def likely(self) -> str:
-        """What has most likely happened to a part that does not lie in its place."""
-        x, y, z = self.offsets.mean(axis=0)
-        arm = float(np.sqrt(np.mean(np.sum((self.points - self.points.mean(axis=0)) ** 2, axis=1))))
-        sizes = {
-            "raised": z, "deep": -z, "shifted": float(np.hypot(np.hypot(x, y), arm * self.turn[2])),
-            "tilted": arm * float(np.hypot(*self.turn[:2])),
-        }  # fmt: skip
-        return LIKELY[max(sizes, key=lambda name: sizes[name])]
+        """What has most likely happened to a part that does not lie in its place.
+
+        A part that slipped comes to lie on slopes and edges, so it is raised as well: what is to the side, or a tilt,
+        beyond what was stated says more.
+        """
+        x, y, z, about_x, about_y, about_z = np.abs(self._times)
+        slipped, tilted = max(x, y, about_z), max(about_x, about_y)
+        if max(slipped, tilted) < CLEARLY < z:
+            return LIKELY["raised" if self._times[2] > 0.0 else "deep"]
+        return LIKELY["shifted" if slipped > tilted else "tilted"]
 
     def measured(self, place: PlaceSection) -> tuple[Measured, Measured]:
         """What it is judged by, beside the place's tolerances."""
@@ -125,16 +148,19 @@ class PlacedPart:
         raise MisplacedError(
             f"the placed part lies {self.words}: ({shift}) mm and ({turn}) mrad in the surface's axes. Allowed are "
             f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad, held by {off.value:.2f} mm and "
-            f"{turned.value:.1f} mrad at 95 %. Most likely {self.likely}. {NEXT_STEP}",
+            f"{turned.value:.1f} mrad at 95 %. Most likely {self.likely}{self.doubtful}. {NEXT_STEP}",
             off, turned,
-        )  # fmt: skip
+        ).showing(seen={"placed": self})  # fmt: skip
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """For people: how it lies, and what was not seen."""
-        if not self.unseen:
-            return (f"the placed part lies {self.words}",)
-        return (f"the placed part lies {self.words}", f"not seen of the placed part: {', '.join(self.unseen)}")
+        """For people: how it lies, whether that is as usual, and what was not seen."""
+        more = f"that is farther off than was stated before it was put down: most likely {self.likely}"
+        return (
+            f"the placed part lies {self.words}",
+            *((more,) if np.abs(self._times).max() > CLEARLY else ()),
+            *(f"not seen of the placed part: {motion}" for motion in self.unseen),
+        )
 
     def summary(self) -> dict[str, object]:
         """Figures for journal and report."""
@@ -186,9 +212,7 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     return found
 
 
-def _swept(
-    here: Workplace, sweep: SweepRecord, pose: PlacePose, context: StepContext
-) -> tuple[Cloud, SweepRecord]:
+def _swept(here: Workplace, sweep: SweepRecord, pose: PlacePose, context: StepContext) -> tuple[Cloud, SweepRecord]:
     """Sweep the part, with the head as far above it as it was above the surface."""
     part = here.part_mesh
     if part is None:
@@ -213,16 +237,17 @@ def judged(job: Job, seen: PartPose, points: Vector, stated: Vector) -> PlacedPa
     unit = np.array([job.place.tolerance] * 3 + [job.place.tolerance_angle] * 3)
     values, ways = np.linalg.eigh(seen.covariance / np.outer(unit, unit))
     weak = ~(3.0 * np.sqrt(np.maximum(values, 0.0)) <= 1.0)
-    unseen = tuple(motion.words.partition(" is ")[0] for motion in seen.fit.verdict.weak) if weak.any() else ()
+    motions = seen.fit.verdict.weak
+    unseen = tuple(of_part(motion.words.partition(" is ")[0]) for motion in motions)
     if unseen and job.place.verify == "all":
         raise MisplacedError(
-            f"how the placed part lies is not seen in all: {'; '.join(m.words for m in seen.fit.verdict.weak)}. Sweep "
-            'more of it, or write place.verify = "seen"',
-            *(motion.measured() for motion in seen.fit.verdict.weak),
+            f"not all is seen of how the placed part lies: {'; '.join(of_part(m.words) for m in motions)}. Sweep more "
+            'of it, or write place.verify = "seen"',
+            *(motion.measured() for motion in motions),
         )
     instead = np.einsum("in,ij,jn->n", ways, stated / np.outer(unit, unit), ways)
     kept = (ways * np.where(weak, instead, values)) @ ways.T * np.outer(unit, unit)
-    return PlacedPart(seen, job.place.surface_from_part.se3(), points, kept, unseen)
+    return PlacedPart(seen, job.place.surface_from_part.se3(), points, kept, stated, unseen)
 
 
 STEP = JobStep(

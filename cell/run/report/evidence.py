@@ -11,7 +11,9 @@ from cell.config.job import Job
 from cell.measure.inversion import PlacePose, fit_figures
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
+from cell.procedures.steps import verify
 from cell.procedures.steps.place import PlaceResult
+from cell.procedures.steps.verify import PlacedPart
 from drivers.errors import Measured, MeasuredRow, RefusedError
 from statemachine.runner import RunResult
 from statemachine.step import Outcome
@@ -53,7 +55,14 @@ def refusal(result: RunResult, folder: Path, frames: FrameStore) -> dict[str, ob
         "numbers": [number.as_dict() for number in RefusalEvidence.of(result).numbers],
         "frames": last_frames(result, frames),
         "cloud": CLOUD if (folder / CLOUD).exists() else None,
+        **({} if (placed := seen_placed(result)) is None else {"placed": placed.summary()}),
     }
+
+
+def seen_placed(result: RunResult) -> PlacedPart | None:
+    """Where the placed part was seen, in its place or not; None where nobody looked, or it was not found."""
+    seen = result.results.get(verify.STEP.name) or RefusalEvidence.of(result).seen.get("placed")
+    return seen if isinstance(seen, PlacedPart) else None
 
 
 def last_frames(result: RunResult, frames: FrameStore) -> list[str]:
@@ -72,7 +81,9 @@ def measured(
     tolerance = 1e3 * job.place.tolerance
     if truth is not None:
         found.append(Measured("place error, largest of 45 points", truth["error_mm"]["d"]["max"], "mm", most=tolerance))
-    if bound is not None:
+    if (seen := seen_placed(result)) is not None:
+        found += seen.measured(job.place)
+    elif bound is not None:
         found.append(Measured("place error, stated 95 % bound", bound["d"], "mm", most=tolerance))
     if isinstance(placed, PlaceResult):
         travel = 1e3 * job.place.contact_travel

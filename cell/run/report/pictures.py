@@ -27,9 +27,10 @@ from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.steps.verify import PlacedPart
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.folder import Report
-from cell.run.report.evidence import RefusalEvidence, ended_in
+from cell.run.report.evidence import RefusalEvidence, ended_in, seen_placed
 from cell.run.report.figures import simulated_words, told
 from drivers.interfaces import Frame, Image, Vector
 from statemachine.runner import RunResult
@@ -175,8 +176,9 @@ def draw_stripe(axes: Axes, stripe: StripePanel) -> None:
 
 
 def draw_error(
-    axes: Axes, truth: Mapping[str, Any] | None, bound: Mapping[str, Any] | None, tolerance_mm: float
-) -> None:
+    axes: Axes, truth: Mapping[str, Any] | None, bound: Mapping[str, Any] | None, tolerance_mm: float,
+    seen: PlacedPart | None = None,
+) -> None:  # fmt: skip
     """Bars by axis and for D: the true error where it is known, and what the run itself states, up to the tolerance."""
     _title(axes, ["place error beside its tolerance" if truth else "stated place error beside its tolerance"])
     names = ["x", "y", "z", "d"]
@@ -184,6 +186,9 @@ def draw_error(
     if truth is not None:
         rows.append(("true, largest of 45 points", "tab:blue", [truth["error_mm"][name]["max"] for name in names]))
         rows.append(("true, mean", "lightsteelblue", [truth["error_mm"][name]["mean"] for name in names]))
+    if seen is not None:
+        off = 1e3 * np.column_stack([np.abs(seen.offsets), np.linalg.norm(seen.offsets, axis=1)]).mean(axis=0)
+        rows.append(("seen of the placed part, mean", "tab:green", off.tolist()))
     if bound is not None:
         rows.append(("stated: 95 % lie below", "tab:orange", [bound[name] for name in names]))
     thick = 0.8 / max(1, len(rows))
@@ -269,7 +274,8 @@ def draw_run(
     elif stripe is not None:
         draw_stripe(middle[0], stripe)
     if report["outcome"] == "placed":
-        draw_error(right, report["truth"], report["place_bound_95"], 1e3 * job.place.tolerance)
+        seen = seen_placed(result)
+        draw_error(right, report["truth"], report["place_bound_95"], 1e3 * job.place.tolerance, seen)
     else:
         draw_reason(right, report, ended_in(result))
     figure.savefig(path, pil_kwargs={"compress_level": COMPRESSION})

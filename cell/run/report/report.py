@@ -28,7 +28,7 @@ from cell.procedures.part_error import draws, part_points, placed_points, point_
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.folder import REPORT, release, timeless, when
-from cell.run.report.evidence import last_frames, measured, refusal
+from cell.run.report.evidence import last_frames, measured, refusal, seen_placed
 from drivers.interfaces import Vector
 from statemachine.runner import Event, RunResult
 from statemachine.step import summary_of
@@ -139,6 +139,10 @@ class FinishedJob:
         pose = getattr(self.result.results.get("place"), "pose", None) or pose
         report["place_pose"] = _pose(pose, self.job)
         report["place_sigma"] = _sigma(pose)
+        if (seen := seen_placed(self.result)) is not None:
+            # What was seen says more than what was stated before.
+            report["place_bound_95"] = {"frame": "surface", "unit": "mm", **seen.bound}
+            return
         covariance = self.job.grasp.covariance
         report["place_bound_95"] = stated_bound(self.job, self.nominal, pose, self.repeatability, covariance)
 
@@ -228,7 +232,7 @@ def _add_truth(
     if isinstance(pose, PlacePose) and witness.at_sweep is not None:
         report["pose_error"] = pose_error(pose, witness.at_sweep)
         report["pose_error_units"] = {"translation_mm": "mm", "rotation_mrad": "mrad"}
-    if report["outcome"] != "placed" or not isinstance(pose, PlacePose):
+    if report["outcome"] not in ("placed", "misplaced") or not isinstance(pose, PlacePose):
         return
     truth = place_error(job, nominal, now)
     assert isinstance(sweep, SweepRecord)
@@ -238,6 +242,12 @@ def _add_truth(
     if isinstance(made, Reconstruction) and witness.at_sweep is not None:
         truth["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)
     report["truth"] = truth
+    if (seen := seen_placed(result)) is not None:
+        error = difference(seen.seen.surface_from_part, pose_of(now, "surface_from_part"))
+        truth["seen_error"] = {
+            "translation_mm": [round(1e3 * float(v), 4) for v in error[:3]],
+            "rotation_mrad": [round(1e3 * float(v), 4) for v in error[3:]],
+        }
 
 
 def pose_of(truth: dict[str, Any], name: str) -> pin.SE3:

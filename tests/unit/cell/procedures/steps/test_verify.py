@@ -1,0 +1,250 @@
+"""The placed part as the scan head sees it: against where it truly lies, and against a fit that others wrote."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import scipy
+import trimesh
+
+from cell import Cell
+from cell.config.calibrations.store import save_calibration
+from cell.config.job import load_job
+from cell.devices.simulated.described import Described
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import difference, from_matrix, from_parts, transform
+from cell.measure.inversion import NominalSurface
+from cell.procedures.steps.kinds import PLACE, VERIFIED, kind_of
+from cell.procedures.steps.verify import CLOUD, LIKELY, PlacedPart
+from cell.run.report.page.make import make_page
+from drivers.errors import MisplacedError
+from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
+from sim_backends.world.bodies.contact import PartContact
+from statemachine.runner import StepContext
+from tests.support.part_meshes import job_with_part
+from tests.support.report_runs import CONFIG, at_station, work_of
+
+MIDDLE = (0.022, 1.0)
+"""A part that leaves 13 mm of the surface to be seen at both ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A cell of `record` at its station, with a part that lies `off` its place on the surface."""
+
+    record: JobRecord
+    folder: Path
+    half: tuple[float, float] = MIDDLE
+    verify: str = "all"
+    flat: bool = False
+
+    def looked(self, off: pin.SE3, notes: list[str] | None = None) -> PlacedPart:
+        """What the step makes of it."""
+        file = job_with_part(self.folder, "pot", verify=self.verify, half=self.half, flat=self.flat)
+        job, mesh = load_job(file)
+        nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+        cell = VirtualCell(CONFIG, self.record.seed, self.record.level, Described(job, mesh))
+        at_station(cell, self.record)
+        cell.devices.vehicle.brake()
+        work = work_of(cell, job, nominal, self.record, NoFrames(), self.folder)
+        world = cell.world
+        cell.devices.claw.bare.release()
+        world.part._world_from_part = world.scene.world_from_surface @ off.homogeneous
+        said: list[str] = [] if notes is None else notes
+        context = StepContext(
+            VERIFIED.policy().of("verify"), 1, math.inf, dict(self.record.results), cell.clock,
+            lambda event: said.append(str(event.data.get("text"))),
+        )  # fmt: skip
+        found = VERIFIED.work(work)["verify"](context)
+        assert isinstance(found, PlacedPart)
+        return found
+
+
+def moved(
+    x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> pin.SE3:
+    return from_parts((x, y, z), pin.exp3(np.array(turn)))
+
+
+@pytest.mark.parametrize(
+    "off", [moved(), moved(0.2e-3, -0.3e-3, 0.1e-3), moved(turn=(0.002, -0.003, 0.004))], ids=["there", "off", "turned"]
+)
+def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(
+    placed_pot: JobRecord, tmp_path: Path, off: pin.SE3
+) -> None:
+    found = Site(placed_pot, tmp_path).looked(off)
+    error = difference(found.seen.surface_from_part, off)
+    assert found.seen.beside > 1000 and found.unseen == ()
+    assert np.linalg.norm(error[:3]) < 0.025e-3 and np.abs(error[3:]).max() < 0.25e-3
+    # Chi-squared of 6 at 0.999.
+    assert error @ np.linalg.solve(found.covariance, error) < 22.5
+    assert found.unsure < 0.03e-3
+    true = np.linalg.norm(transform(off, found.points) - found.points, axis=1)
+    assert 1e3 * np.percentile(true, 95) < found.bound["d"] < 1e3 * np.percentile(true, 95) + 0.04
+
+
+def test_a_fit_that_others_wrote_finds_the_part_in_the_same_place(placed_pot: JobRecord, tmp_path: Path) -> None:
+    """Samples of the meshes by trimesh, least squares by scipy, on the cloud and the meshes as files."""
+    found = Site(placed_pot, tmp_path).looked(moved(0.1e-3, 0.2e-3, 0.15e-3))
+    cloud = np.asarray(trimesh.load(tmp_path / CLOUD).vertices)
+    pose = placed_pot.results["invert_pose"].base_from_surface
+    local = (cloud - pose.translation) @ pose.rotation
+    high = local[:, 2] > 0.012
+    poses = []
+    for points, file in ((local[high], "pot-part.ply"), (local[~high], "pot.ply")):
+        mesh = trimesh.load(tmp_path / file)
+        chosen = points[np.random.default_rng(0).permutation(len(points))[:5000]]
+        poses.append(fitted(chosen, mesh))
+    apart = poses[1].inverse() * poses[0]
+    assert np.linalg.norm(apart.translation - found.seen.surface_from_part.translation) < 0.02e-3
+    assert np.linalg.norm(pin.log3(apart.rotation.T @ found.seen.surface_from_part.rotation)) < 0.3e-3
+
+
+def fitted(points: np.ndarray, mesh: trimesh.Trimesh) -> pin.SE3:
+    """Where the mesh lies by points on its faces that look up; those at a rim are left out."""
+    samples, faces = trimesh.sample.sample_surface(mesh, 400_000, seed=0)
+    up = mesh.face_normals[faces][:, 2] > 0.3
+    samples, normals = samples[up], mesh.face_normals[faces[up]]
+    tree, start, used = scipy.spatial.cKDTree(samples), pin.SE3.Identity(), points
+    for gate in (0.3e-3, 0.1e-3, 0.1e-3):
+        here = (points - start.translation) @ start.rotation
+        apart, nearest = tree.query(here)
+        rim = np.abs(np.abs(samples[nearest, 0]) - MIDDLE[0]) < 0.8e-3
+        high = np.abs(np.einsum("ni,ni->n", here - samples[nearest], normals[nearest]))
+        used = points[(apart < 1e-3) & (high < gate) & ~rim]
+
+        def left(v: np.ndarray, used: np.ndarray = used, start: pin.SE3 = start) -> np.ndarray:
+            pose = start * from_parts(v[:3], pin.exp3(v[3:]))
+            there = (used - pose.translation) @ pose.rotation
+            _, nearest = tree.query(there)
+            return np.asarray(np.einsum("ni,ni->n", there - samples[nearest], normals[nearest]))
+
+        found = scipy.optimize.least_squares(left, np.zeros(6), loss="soft_l1", f_scale=0.02e-3, x_scale=1e-4)
+        start = start * from_parts(found.x[:3], pin.exp3(found.x[3:]))
+    return start
+
+
+def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lies(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    found = Site(placed_pot, tmp_path, half=(1.0, 1.0)).looked(moved(0.2e-3))
+    error = difference(found.seen.surface_from_part, moved(0.2e-3))
+    assert found.seen.beside == 0 and "as swept before" in found.words
+    assert error @ np.linalg.solve(found.covariance, error) < 22.5
+    assert 0.1e-3 < found.unsure < 0.25e-3
+
+
+@pytest.mark.parametrize(
+    ("off", "likely"),
+    [
+        (moved(0.1e-3, 0.8e-3, 0.3e-3), "shifted"),
+        (moved(z=0.7e-3), "raised"),
+        (moved(z=-0.7e-3), "deep"),
+        (moved(z=0.1e-3, turn=(0.0, 0.008, 0.0)), "tilted"),
+        (moved(turn=(0.0, 0.0, 0.009)), "shifted"),
+    ],
+)
+def test_a_part_out_of_its_place_is_told_with_where_it_lies_and_why(
+    placed_pot: JobRecord, tmp_path: Path, off: pin.SE3, likely: str
+) -> None:
+    with pytest.raises(MisplacedError, match=r"lies \d\.\d\d ± 0\.0\d mm off its place") as told:
+        Site(placed_pot, tmp_path).looked(off)
+    assert LIKELY[likely] in str(told.value) and "Allowed are 0.6 mm and 6 mrad" in str(told.value)
+    assert not all(number.kept for number in told.value.numbers)
+    found = told.value.seen["placed"]
+    assert isinstance(found, PlacedPart)
+    assert np.abs(difference(found.seen.surface_from_part, off))[:3].max() < 0.03e-3
+
+
+def test_another_part_or_none_is_not_found(placed_pot: JobRecord, tmp_path: Path) -> None:
+    with pytest.raises(MisplacedError, match="is not where it was put down, or is not the part as drawn"):
+        Site(placed_pot, tmp_path).looked(moved(0.05, 0.03, 0.02))
+
+
+def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(placed_pot: JobRecord, tmp_path: Path) -> None:
+    with pytest.raises(
+        MisplacedError, match=r'not all is seen .*translation along .*part frame.*place.verify = "seen"'
+    ):
+        Site(placed_pot, tmp_path, flat=True).looked(moved())
+    notes: list[str] = []
+    found = Site(placed_pot, tmp_path, flat=True, verify="seen").looked(moved(0.2e-3, z=0.1e-3), notes)
+    assert any("not seen of the placed part: translation" in note for note in notes)
+    error = difference(found.seen.surface_from_part, moved(0.2e-3, z=0.1e-3))
+    assert abs(error[2]) < 0.02e-3, "what shows is seen"
+    # What does not is as it was stated before, and so is the bound.
+    assert 0.05e-3 < math.sqrt(found.covariance[0, 0]) < 0.3e-3
+    assert found.bound["d"] > 0.2
+
+
+def test_a_part_farther_off_than_was_stated_is_noted_though_it_keeps_its_tolerance(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    notes: list[str] = []
+    Site(placed_pot, tmp_path).looked(moved(z=0.45e-3), notes)
+    assert any(f"most likely {LIKELY['raised']}" in note for note in notes)
+    usual: list[str] = []
+    Site(placed_pot, tmp_path).looked(moved(0.05e-3), usual)
+    assert not any("most likely" in note for note in usual)
+
+
+def test_a_job_looks_at_its_part_where_it_names_one_and_does_not_say_no(tmp_path: Path) -> None:
+    job, _ = load_job("pot")
+    assert kind_of(job) is PLACE
+    for verify, kind in (("all", VERIFIED), ("seen", VERIFIED), ("none", PLACE)):
+        job, _ = load_job(job_with_part(tmp_path, "pot", verify=verify))
+        assert kind_of(job) is kind
+    assert VERIFIED.names == (*PLACE.names, "verify") and VERIFIED.name == PLACE.name
+
+
+def test_a_run_tells_how_its_part_lies_in_report_page_and_picture(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert placed_pot.calibration is not None
+    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
+    job = job_with_part(tmp_path, "pot", verify="all", half=MIDDLE)
+    with Cell.open(sim="all", seed=2, clock="virtual", job=job) as cell:
+        done = cell.run(job=job)
+    assert (done.outcome, done.exit_code) == ("placed", 0)
+    report = json.loads((done.folder / "report.json").read_text(encoding="utf-8"))
+    told = report["steps"][-1]
+    assert (told["name"], told["result"]["unseen"]) == ("verify", [])
+    assert report["place_bound_95"]["d"] < 0.15
+    assert max(map(abs, report["truth"]["seen_error"]["translation_mm"])) < 0.03
+    assert report["truth"]["d_p95"] < report["place_bound_95"]["d"]
+    rows = {row["name"]: row for row in report["measured"]}
+    assert rows["placed part off its place, 95 % bound"]["kept"]
+    assert "place error, stated 95 % bound" not in rows
+    assert "placed part off its place" in make_page(done.folder)
+    assert (done.folder / CLOUD).stat().st_size > 100_000
+    assert (done.folder / "picture.png").is_file()
+
+
+def test_a_part_that_slips_as_the_claw_opens_ends_the_run_as_misplaced(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rest = PartContact._rest
+    slipped = moved(y=0.9e-3, turn=(0.0, 0.0, 0.004)).homogeneous
+    monkeypatch.setattr(PartContact, "_rest", lambda self, pose: rest(self, pose @ slipped))
+    job, mesh = load_job(job_with_part(tmp_path, "pot", verify="all", half=MIDDLE))
+    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+    done = run_whole_job(
+        CONFIG, job, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot, runs=tmp_path / "runs"
+    )
+    assert (done.outcome, done.stage) == ("misplaced", "verify")
+    assert "the part is already down" in done.reason and LIKELY["shifted"] in done.reason
+    assert done.folder is not None
+    report = json.loads((done.folder / "report.json").read_text(encoding="utf-8"))
+    assert (report["outcome"], report["code"], report["part"]) == ("misplaced", "MisplacedError", "released")
+    assert report["refusal"]["step"] == "verify" and report["refusal"]["placed"]["off_mm"] > 0.6
+    assert report["truth"]["d_p95"] < report["place_bound_95"]["d"], "where it lies is stated all the same"
+    assert done.at_end is not None
+    true = from_matrix(done.at_end["poses"]["surface_from_part"])
+    assert np.allclose(report["refusal"]["placed"]["shift_mm"][1], 1e3 * true.translation[1], atol=0.2)
+    assert (done.folder / "picture.png").is_file()
