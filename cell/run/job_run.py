@@ -26,6 +26,7 @@ from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Pace
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
+from cell.procedures.steps import verify
 from cell.procedures.steps.kinds import Kind, kind_of
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep
@@ -35,6 +36,7 @@ from cell.run.folder import new_run, read_report, run_log
 from cell.run.record.recorder import Recorder, recorded
 from cell.run.record.replay import save as save_perception
 from cell.run.recorded_work import classify, clear, outcome_of
+from cell.run.report.evidence import seen_words
 from cell.run.report.figures import following_words, told
 from cell.run.report.report import FinishedJob, TruthRecorder
 from cell.run.resumption import UnfinishedRun, job_source
@@ -185,6 +187,8 @@ class JobRun:
             self._open_again()
         if result.outcome is not Outcome.PLACED:
             result = replace(result, reason=here.part.told(result.reason))
+        elif self.job.part is not None:
+            result = replace(result, reason=seen_words(result))
         finished = FinishedJob(
             folder, self.config, self.job, nominal=self.nominal, repeatability=here.repeatability, result=result,
             info=self._facts_after(begun, here), started=started, witness=witness, frames=frames,
@@ -199,6 +203,7 @@ class JobRun:
         return Workplace(
             self.config, self.job, self.nominal, calibration=self.calibration, devices=self.devices, frames=frames,
             folder=folder, whereabouts=whereabouts, earlier=self.earlier, needs_part=self.kind.places,
+            looks_after=verify.STEP.name in self.kind.names,
             sweeping=self._sweeping, registered=self._registered, pace=self.pace,
         )  # fmt: skip
 

@@ -67,8 +67,14 @@ class MatingGap:
     @property
     def words(self) -> str:
         """For people."""
-        least, middle, most = self._figures(2)
-        return f"gap {least:.2f} to {most:.2f} mm, {middle:.2f} mm in the middle; {100 * self.seen:.0f} % of it seen"
+        _, middle, _ = self._figures(2)
+        return f"gap {self.span}, {middle:.2f} mm in the middle; {100 * self.seen:.0f} % of it seen"
+
+    @property
+    def span(self) -> str:
+        """The least and the largest gap, for people."""
+        least, _, most = self._figures(2)
+        return f"{least:.2f} to {most:.2f} mm"
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -51,11 +51,14 @@ def laser_sweep(
     progress: Callable[[float, str], None],
     sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None,
     most_lost: float = MAX_LOST_FRACTION,
+    counted: bool = True,
 ) -> SweepRecord:
     """Sweep the scan head over every strip of `scan`, by the rail or by the arm as `scan.mode` says.
 
     `sweeping` is told where the surface is taken to be beside who takes the frames. `check` raises when the run is to
-    end. Raises what `rail_sweep` and `arm_sweep` raise, and `DeviceFault` (rail.lost_steps).
+    end. Whether the rail has lost steps is looked at unless `counted` is False: whoever says so does it.
+
+    Raises what `rail_sweep` and `arm_sweep` raise, and `DeviceFault` (rail.lost_steps).
     """
     devices, config = here.devices, here.config
     home_rail(devices, progress)
@@ -80,7 +83,8 @@ def laser_sweep(
         collector = SweepCollector(geometry, scan, keep_frame, tell)
         sweeping(collector, base_from_surface)
         swaths.append(sweep(plan, here.mover, devices, errors, collector))
-    return SweepRecord(tuple(swaths), doubts=() if scan.mode == "arm" else _counted(devices, progress))
+    looked = counted and scan.mode == "rail"
+    return SweepRecord(tuple(swaths), doubts=_counted(devices, progress) if looked else ())
 
 
 def _counted(devices: Devices, progress: Callable[[float, str], None]) -> tuple[str, ...]:

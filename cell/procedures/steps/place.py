@@ -97,8 +97,8 @@ class Placing:
     progress: Callable[[float, str], None]
     note: Callable[[PartProgress], None]
 
-    def put_down(self) -> PlaceResult:
-        """Put the part onto the surface, and fold the arm.
+    def put_down(self, fold: bool = True) -> PlaceResult:
+        """Put the part onto the surface, and fold the arm unless somebody looks at the part from where it stands then.
 
         Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes
         by `contact_force`. Raises `RefusedError` before anything moves when the part is not held any more. It does so
@@ -114,7 +114,7 @@ class Placing:
         self._require_contact(contact, off)
         touch = self._require_expected(states, off)
         self._release(reached)
-        self._retreat()
+        self._retreat(fold)
         return PlaceResult(reached, contact, off, touch)
 
     @property
@@ -205,11 +205,12 @@ class Placing:
         self.note(part)
         self.mover.leave_part(part.where)
 
-    def _retreat(self) -> None:
+    def _retreat(self, fold: bool) -> None:
         self.progress(0.9, "retreating")
         self._lift()
-        self.progress(0.95, "folding the arm")
-        self.mover.to_joints(HOME)
+        if fold:
+            self.progress(0.95, "folding the arm")
+            self.mover.to_joints(HOME)
         self.part.left = True
 
 
@@ -241,7 +242,7 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         part=here.part, check=context.check, progress=context.progress,
         note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
     )  # fmt: skip
-    done = replace(placing.put_down(), look=look, pose=pose, mating=mating)
+    done = replace(placing.put_down(not here.looks_after), look=look, pose=pose, mating=mating)
     for note in done.notes:
         context.note(text=note)
     return done

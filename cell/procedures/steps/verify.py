@@ -107,9 +107,9 @@ class PlacedPart:
     @property
     def words(self) -> str:
         """For people."""
-        gap = "" if self.gap is None else f", {self.gap.words}"
-        where = "beside the surface in the same sweep" if self.seen.beside else "beside the surface as swept before"
-        return f"{1e3 * self.off:.2f} ± {1e3 * self.unsure:.2f} mm off its place, {where}{gap}"
+        gap = "" if self.gap is None else f", gap {self.gap.span}"
+        where = "" if self.seen.beside else ", against the surface as swept before"
+        return f"{1e3 * self.off:.2f} ± {1e3 * self.unsure:.2f} mm off{where}{gap}"
 
     @cached_property
     def _times(self) -> Vector:
@@ -146,7 +146,7 @@ class PlacedPart:
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
         raise MisplacedError(
-            f"the placed part lies {self.words}: ({shift}) mm and ({turn}) mrad in the surface's axes. Allowed are "
+            f"the placed part lies {self.words}, by ({shift}) mm and ({turn}) mrad in the surface's axes. Allowed are "
             f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad, held by {off.value:.2f} mm and "
             f"{turned.value:.1f} mrad at 95 %. Most likely {self.likely}{self.doubtful}. {NEXT_STEP}",
             off, turned,
@@ -181,8 +181,11 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     sweep, scan, placed = context.made(SweepRecord), context.made(Reconstruction), context.made(PlaceResult)
     pose = placed.pose or context.made(PlacePose)
     cloud, record = _swept(here, sweep, pose, context)
-    context.progress(0.95, "folding the arm")
+    context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
+    looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
     here.mover.to_joints(HOME)
+    if looking is not None:
+        looking.wait(30.0)
     by_calibration, by_poses = displacements(here, record, cloud)
 
     def moved(lines: Indices, rows: Indices) -> Vector:
@@ -221,8 +224,8 @@ def _swept(here: Workplace, sweep: SweepRecord, pose: PlacePose, context: StepCo
     above = pose.base_from_surface * from_parts((0.0, 0.0, middle[2]))
     again = laser_sweep(
         here, above, head_at(here, sweep), here.job.scan, check=context.check,
-        keep_frame=lambda frame: here.frames.keep("verify", frame),
-        progress=lambda share, text: context.progress(0.9 * share, f"the placed part: {text}"),
+        keep_frame=lambda frame: here.frames.keep("verify", frame), counted=False,
+        progress=lambda share, text: context.progress(0.85 * share, f"the placed part: {text}"),
     )  # fmt: skip
     cloud = build_cloud(again)
     write_cloud(here.folder / CLOUD, cloud, here.config.cell.sim)

@@ -40,10 +40,11 @@ PHOTO_RATE_HZ = 10.0
 class Workplace:
     """What every step of a job may use. `earlier` is the sweep of a run that this one resumes.
 
-    `needs_part` is False for a run that ends before anything is placed: the claw may be empty then. `whereabouts` is
-    kept over retries and runs: the vehicle may stand anywhere when a step is done again. `sweeping` is told who takes
-    the frames of each sweep, before it begins, and where the surface is by the board (base_from_surface),
-    `registered` where it was found. `pace` says how fast arm and vehicle go, of what is planned.
+    `needs_part` is False for a run that ends before anything is placed: the claw may be empty then. `looks_after` is
+    True for one that looks at the placed part. `whereabouts` is kept over retries and runs: the vehicle may stand
+    anywhere when a step is done again. `sweeping` is told who takes the frames of each sweep, before it begins, and
+    where the surface is by the board (base_from_surface), `registered` where it was found. `pace` says how fast arm and
+    vehicle go, of what is planned.
     """
 
     config: CellConfig
@@ -56,6 +57,7 @@ class Workplace:
     whereabouts: Whereabouts
     earlier: StoredSweep | None = None
     needs_part: bool = True
+    looks_after: bool = False
     sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None
     registered: Callable[[pin.SE3], None] = lambda base_from_surface: None
     part: PartProgress = field(default_factory=PartProgress)

@@ -65,6 +65,13 @@ def seen_placed(result: RunResult) -> PlacedPart | None:
     return seen if isinstance(seen, PlacedPart) else None
 
 
+def seen_words(result: RunResult) -> str:
+    """Why a run of a job that names its part's mesh has placed it."""
+    if (seen := seen_placed(result)) is not None:
+        return f"in place: {seen.words}"
+    return f'{result.reason}; nobody looked at the placed part, place.verify = "none"'
+
+
 def last_frames(result: RunResult, frames: FrameStore) -> list[str]:
     """Files of the frames that the step looked at in which a run ended, the newest last; none when it placed."""
     if result.outcome is Outcome.PLACED:
