@@ -18,7 +18,7 @@ import typer
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from cell.procedures.steps.kinds import PLACE
+from cell.procedures.steps.kinds import VERIFIED
 from drivers.common.units import parse_quantity
 from statemachine.sequence import JobTrigger
 
@@ -383,8 +383,8 @@ def sequence_page() -> str:
 
 
 def diagram() -> str:
-    """The sequence of a job that places, for Mermaid; what all steps or all states share is one arrow."""
-    sequence = PLACE.sequence()
+    """The sequence of a job that looks at what it placed, for Mermaid; what all steps or all states share is one arrow."""
+    sequence = VERIFIED.sequence()
     steps, states = set(sequence.steps), {str(row.source) for row in sequence.table}
     inside: dict[str, None] = {}
     around: dict[str, None] = {}

@@ -74,6 +74,7 @@ GROUPS = (
         "unit/cell/procedures/steps/test_invert_pose.py",
         "unit/cell/procedures/steps/test_place.py",
         "unit/cell/procedures/steps/test_verify.py",
+        "unit/cell/procedures/steps/test_correction.py",
         "unit/cell/procedures/sweep/test_second_look.py",
         "unit/cell/measure/inversion/effects/test_between_sweeps.py",
         "unit/cell/measure/inversion/effects/test_causes.py",

@@ -22,6 +22,7 @@ from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import Body, station_bodies, vehicle_bodies
 from cell.procedures.drive.way import MAX_HEADING, Planar, wrap
+from drivers.errors import ConfigError
 from drivers.interfaces import Vector
 from drivers.make import MOST_PAYLOAD
 
@@ -113,16 +114,17 @@ def verify_problems(job: Job) -> Iterator[str]:
     if job.part is None or job.place.verify == "none":
         return
     part = NominalSurface.load(Path(job.part.mesh), unit=job.part.mesh_unit)
-    faces, file = seen_from_above(part, job.place.surface_from_part.se3()), f'part.mesh "{Path(job.part.mesh).name}"'
-    if faces is None:
-        yield f"{file}: no face of it faces up where the part lies; nothing of it can be seen"
-    elif job.place.verify == "all":
-        tolerance = Tolerance(job.place.tolerance, job.place.tolerance_angle)
-        if unseen := shown_by(faces, tolerance):
-            yield (
-                f"{file}: the faces of the placed part do not show {', '.join(unseen)}. Write place.verify = "
-                '"seen" to have the rest looked at, or "none"'
-            )
+    try:
+        faces = seen_from_above(part, job.place.surface_from_part.se3())
+    except ConfigError as error:
+        yield str(error)
+        return
+    tolerance = Tolerance(job.place.tolerance, job.place.tolerance_angle)
+    if job.place.verify == "all" and (unseen := shown_by(faces, tolerance)):
+        yield (
+            f'part.mesh "{Path(job.part.mesh).name}": the faces of the placed part do not show {", ".join(unseen)}. '
+            'Write place.verify = "seen" to have the rest looked at, or "none"'
+        )
 
 
 def _drawn(job: Job, mesh: Path) -> MatingGap | None:

@@ -161,6 +161,8 @@ class PlaceSection(Table):
     tolerance: Annotated[float, quantity("mm", 0.01, 10)]
     tolerance_angle: Annotated[float, quantity("mrad", 0.1, 100)]
     verify: Literal["all", "seen", "none"] = "all"
+    corrections: Annotated[int, Field(ge=0, le=5)] = 1
+    accept: Annotated[float, quantity("mm", 0.01, 10)] | None = None
 
     @model_validator(mode="after")
     def _descends(self) -> Self:

@@ -47,9 +47,9 @@ def middle_of(
 
 def job_with_part(
     folder: Path, name: str, changed: Callable[[Floats], Floats] = lambda corners: corners, *,
-    verify: str = "none", half: tuple[float, float] = (1.0, 1.0), flat: bool = False,
+    verify: str = "none", half: tuple[float, float] = (1.0, 1.0), flat: bool = False, also: str = "corrections = 0",
 ) -> Path:  # fmt: skip
-    """A shipped job in `folder`, with a mesh of its part beside it: what `load_job` reads."""
+    """A shipped job in `folder`, with a mesh of its part beside it: what `load_job` reads. `also` is of its [place]."""
     job, mesh = load_job(name)
     assert np.allclose(job.place.surface_from_part.se3().homogeneous, np.eye(4))
     surface = middle_of(*read_mesh(mesh, job.surface.mesh_unit), half)
@@ -57,6 +57,6 @@ def job_with_part(
     (folder / f"{name}.ply").write_bytes(mesh.read_bytes())
     text = job_path(name).read_text(encoding="utf-8")
     path = folder / f"{name}.toml"
-    text = text.replace("\n[place]\n", f'\n[place]\nverify = "{verify}"\n')
+    text = text.replace("\n[place]\n", f'\n[place]\nverify = "{verify}"\n{also}\n')
     path.write_text(f'{text}\n[part]\nmesh = "{name}-part.ply"\nmesh_unit = "m"\n', encoding="utf-8")
     return path

@@ -18,7 +18,7 @@ from cell.measure.inversion.observability import Tolerance, determined, judge
 from cell.measure.inversion.place_pose import PlacePose, invert_pose, shared_by_patches
 from cell.measure.inversion.registration import Prior, register
 from cell.measure.reconstruction.cloud import Cloud, Motions
-from drivers.errors import RefusedError
+from drivers.errors import ConfigError, RefusedError
 
 FACING_UP = 0.3
 """Cosine from the surface's z axis up to which a face of the part is one that the sweep sees."""
@@ -51,10 +51,12 @@ class PartPose:
     beside: int
 
 
-def seen_from_above(part: NominalSurface, surface_from_part: pin.SE3) -> NominalSurface | None:
-    """The faces of a part that a sweep from above sees; None where it has none."""
+def seen_from_above(part: NominalSurface, surface_from_part: pin.SE3) -> NominalSurface:
+    """The faces of a part that a sweep from above sees. Raises `ConfigError` where it has none."""
     up = part.normals @ surface_from_part.rotation.T[:, 2] > FACING_UP
-    return NominalSurface(part.vertices, part.triangles[up]) if up.any() else None
+    if not up.any():
+        raise ConfigError("no face of part.mesh faces up where the part lies: nothing of the placed part can be seen")
+    return NominalSurface(part.vertices, part.triangles[up])
 
 
 def shown_by(faces: NominalSurface, tolerance: Tolerance) -> tuple[str, ...]:

@@ -129,6 +129,18 @@ class Mover:
             ]
         )
 
+    def meet_part(self) -> None:
+        """From now on the part that was put down may be met: the empty claw goes to take it."""
+        self._stand_before([body for body in self._station if body.name != PLACED])
+
+    def take_part(self, flange_from_part: pin.SE3, size: Sequence[float]) -> None:
+        """From now on the claw holds a part of this size, m, there."""
+        part = [body for body in tool_bodies(size, flange_from_part) if body.name == "part"]
+        self._moving = [*self._moving, *part]
+        if self._interlocks is not None:
+            self._interlocks.carry(part)
+        self._stand_before(self._station)
+
     def solids(self) -> list[Body]:
         """All that goes with the vehicle, where it is with the arm as it stands now, fixed to the base."""
         station = {body.name for body in self._station}

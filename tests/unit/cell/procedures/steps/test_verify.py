@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,60 +16,17 @@ import trimesh
 from cell import Cell
 from cell.config.calibrations.store import save_calibration
 from cell.config.job import load_job
-from cell.devices.simulated.described import Described
-from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, from_parts, transform
 from cell.measure.inversion import NominalSurface
 from cell.procedures.steps.kinds import PLACE, VERIFIED, kind_of
 from cell.procedures.steps.verify import CLOUD, LIKELY, PlacedPart
 from cell.run.report.page.make import make_page
 from drivers.errors import MisplacedError
-from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
+from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world.bodies.contact import PartContact
-from statemachine.runner import StepContext
+from tests.support.lying_part import MIDDLE, LyingPart, moved
 from tests.support.part_meshes import job_with_part
-from tests.support.report_runs import CONFIG, at_station, work_of
-
-MIDDLE = (0.022, 1.0)
-"""A part that leaves 13 mm of the surface to be seen at both ends."""
-
-
-@dataclass(frozen=True, eq=False)
-class Site:
-    """A cell of `record` at its station, with a part that lies `off` its place on the surface."""
-
-    record: JobRecord
-    folder: Path
-    half: tuple[float, float] = MIDDLE
-    verify: str = "all"
-    flat: bool = False
-
-    def looked(self, off: pin.SE3, notes: list[str] | None = None) -> PlacedPart:
-        """What the step makes of it."""
-        file = job_with_part(self.folder, "pot", verify=self.verify, half=self.half, flat=self.flat)
-        job, mesh = load_job(file)
-        nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
-        cell = VirtualCell(CONFIG, self.record.seed, self.record.level, Described(job, mesh))
-        at_station(cell, self.record)
-        cell.devices.vehicle.brake()
-        work = work_of(cell, job, nominal, self.record, NoFrames(), self.folder)
-        world = cell.world
-        cell.devices.claw.bare.release()
-        world.part._world_from_part = world.scene.world_from_surface @ off.homogeneous
-        said: list[str] = [] if notes is None else notes
-        context = StepContext(
-            VERIFIED.policy().of("verify"), 1, math.inf, dict(self.record.results), cell.clock,
-            lambda event: said.append(str(event.data.get("text"))),
-        )  # fmt: skip
-        found = VERIFIED.work(work)["verify"](context)
-        assert isinstance(found, PlacedPart)
-        return found
-
-
-def moved(
-    x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
-) -> pin.SE3:
-    return from_parts((x, y, z), pin.exp3(np.array(turn)))
+from tests.support.report_runs import CONFIG
 
 
 @pytest.mark.parametrize(
@@ -79,7 +35,7 @@ def moved(
 def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(
     placed_pot: JobRecord, tmp_path: Path, off: pin.SE3
 ) -> None:
-    found = Site(placed_pot, tmp_path).looked(off)
+    found = LyingPart(placed_pot, tmp_path).looked(off)
     error = difference(found.seen.surface_from_part, off)
     assert found.seen.beside > 1000 and found.unseen == ()
     assert np.linalg.norm(error[:3]) < 0.025e-3 and np.abs(error[3:]).max() < 0.25e-3
@@ -92,7 +48,7 @@ def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(
 
 def test_a_fit_that_others_wrote_finds_the_part_in_the_same_place(placed_pot: JobRecord, tmp_path: Path) -> None:
     """Samples of the meshes by trimesh, least squares by scipy, on the cloud and the meshes as files."""
-    found = Site(placed_pot, tmp_path).looked(moved(0.1e-3, 0.2e-3, 0.15e-3))
+    found = LyingPart(placed_pot, tmp_path).looked(moved(0.1e-3, 0.2e-3, 0.15e-3))
     cloud = np.asarray(trimesh.load(tmp_path / CLOUD).vertices)
     pose = placed_pot.results["invert_pose"].base_from_surface
     local = (cloud - pose.translation) @ pose.rotation
@@ -134,7 +90,7 @@ def fitted(points: np.ndarray, mesh: trimesh.Trimesh) -> pin.SE3:
 def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lies(
     placed_pot: JobRecord, tmp_path: Path
 ) -> None:
-    found = Site(placed_pot, tmp_path, half=(1.0, 1.0)).looked(moved(0.2e-3))
+    found = LyingPart(placed_pot, tmp_path, half=(1.0, 1.0)).looked(moved(0.2e-3))
     error = difference(found.seen.surface_from_part, moved(0.2e-3))
     assert found.seen.beside == 0 and "against the surface as swept before" in found.words
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
@@ -155,7 +111,7 @@ def test_a_part_out_of_its_place_is_told_with_where_it_lies_and_why(
     placed_pot: JobRecord, tmp_path: Path, off: pin.SE3, likely: str
 ) -> None:
     with pytest.raises(MisplacedError, match=r"lies \d\.\d\d ± 0\.0\d mm off") as told:
-        Site(placed_pot, tmp_path).looked(off)
+        LyingPart(placed_pot, tmp_path).looked(off)
     assert LIKELY[likely] in str(told.value) and "Allowed are 0.6 mm and 6 mrad" in str(told.value)
     assert not all(number.kept for number in told.value.numbers)
     found = told.value.seen["placed"]
@@ -165,17 +121,17 @@ def test_a_part_out_of_its_place_is_told_with_where_it_lies_and_why(
 
 def test_another_part_or_none_is_not_found(placed_pot: JobRecord, tmp_path: Path) -> None:
     with pytest.raises(MisplacedError, match="is not where it was put down, or is not the part as drawn"):
-        Site(placed_pot, tmp_path).looked(moved(0.05, 0.03, 0.02))
+        LyingPart(placed_pot, tmp_path).looked(moved(0.05, 0.03, 0.02))
 
 
 def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(placed_pot: JobRecord, tmp_path: Path) -> None:
     with pytest.raises(
         MisplacedError, match=r'not all is seen .*translation along .*part frame.*place.verify = "seen"'
     ):
-        Site(placed_pot, tmp_path, flat=True).looked(moved())
-    notes: list[str] = []
-    found = Site(placed_pot, tmp_path, flat=True, verify="seen").looked(moved(0.2e-3, z=0.1e-3), notes)
-    assert any("not seen of the placed part: translation" in note for note in notes)
+        LyingPart(placed_pot, tmp_path, flat=True).looked(moved())
+    site = LyingPart(placed_pot, tmp_path, flat=True, verify="seen")
+    found = site.looked(moved(0.2e-3, z=0.1e-3))
+    assert any("not seen of the placed part: translation" in note for note in site.notes)
     error = difference(found.seen.surface_from_part, moved(0.2e-3, z=0.1e-3))
     assert abs(error[2]) < 0.02e-3, "what shows is seen"
     # What does not is as it was stated before, and so is the bound.
@@ -186,12 +142,11 @@ def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(placed_pot: JobRe
 def test_a_part_farther_off_than_was_stated_is_noted_though_it_keeps_its_tolerance(
     placed_pot: JobRecord, tmp_path: Path
 ) -> None:
-    notes: list[str] = []
-    Site(placed_pot, tmp_path).looked(moved(z=0.45e-3), notes)
-    assert any(f"most likely {LIKELY['raised']}" in note for note in notes)
-    usual: list[str] = []
-    Site(placed_pot, tmp_path).looked(moved(0.05e-3), usual)
-    assert not any("most likely" in note for note in usual)
+    raised, usual = LyingPart(placed_pot, tmp_path), LyingPart(placed_pot, tmp_path)
+    raised.looked(moved(z=0.45e-3))
+    assert any(f"most likely {LIKELY['raised']}" in note for note in raised.notes)
+    usual.looked(moved(0.05e-3))
+    assert not any("most likely" in note for note in usual.notes)
 
 
 def test_a_job_looks_at_its_part_where_it_names_one_and_does_not_say_no(tmp_path: Path) -> None:

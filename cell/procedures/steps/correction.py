@@ -1,0 +1,127 @@
+"""Correction: a part that was placed and seen is gripped again where it lies, and placed anew by what was seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config.job import GraspSection, Job
+from cell.measure.geometry.poses import from_parts, to_ur, transform
+from cell.measure.inversion import PlacePose
+from cell.measure.inversion.mating import scanned_gap
+from cell.motion.collision import TOUCHES
+from cell.procedures.arm.moves import PartProgress, PartState
+from cell.procedures.arm.touch import expected_touch
+from cell.procedures.part_error import draws, part_points, through
+from cell.procedures.steps.place import PlaceResult, Placing
+from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.steps.workplace import Workplace
+from drivers.errors import RefusedError
+from drivers.interfaces import Vector
+from drivers.make import Mounting
+from statemachine.runner import StepContext
+
+GRIPPED = np.diag([20e-6**2] * 3 + [0.2e-3**2] * 3)
+"""Covariance of how a claw that closes on a part where it let it go moves it, m² and rad²: stated, as the grasp is."""
+
+
+SLIPS = 2.0
+"""A part slips as the claw opens where it moves so many times as far as a correction leaves it off, on average."""
+
+
+def hoped(here: Workplace, pose: PlacePose, points: Vector, seen: Vector) -> float:
+    """How far, m, the part's `points` (n, 3), part frame, lie from where they belong after a correction, on average: by
+    what the arm repeats to, and by what was not known of the part where it was `seen`, (6, 6), surface axes."""
+    base_from_part = pose.base_from_surface * here.job.place.surface_from_part.se3()
+    there = transform(base_from_part, points)
+    flange = base_from_part * here.job.grasp.flange_from_part.se3().inverse()
+    turn = np.kron(np.eye(2), pose.base_from_surface.rotation)
+    unsure = turn @ (seen + GRIPPED) @ turn.T
+    # It comes to rest twice: where it grips, and where it lets go.
+    spread = through(there - flange.translation, 2.0 * here.repeatability) + through(
+        there - base_from_part.translation, unsure
+    )
+    return float(np.linalg.norm(draws(spread), axis=-1).mean())
+
+
+def correct(
+    here: Workplace, placed: PlaceResult, pose: PlacePose, *, held: pin.SE3, slip: pin.SE3, seen: Vector,
+    context: StepContext,
+) -> PlaceResult:  # fmt: skip
+    """Grip the part, with the flange where it was let go, and place it anew; the arm stays above.
+
+    The claw then has it at `held`, flange_from_part, known to `seen` (6, 6). `slip` is how it moves as the claw opens,
+    part frame before from part frame after.
+
+    Raises what `Placing.put_down` raises, and `RefusedError` where something is met on the way to the part.
+    """
+    belongs, points = here.job.place.surface_from_part.se3(), part_points(here.nominal)
+    far = float(np.linalg.norm(transform(slip, points) - points, axis=1).mean())
+    if far < SLIPS * hoped(here, pose, points, seen):
+        # As little comes of the arm.
+        slip = pin.SE3.Identity()
+    job = held_so(here.job, held * slip, seen)
+    _take(here, job, placed.base_from_flange, context)
+    expected = expected_touch(job, here.nominal, pose, here.repeatability)
+    part = here.part_mesh
+    assert part is not None
+    cloud = context.made(Reconstruction).cloud
+    # Aimed beside its place, it touches slopes of the surface higher up.
+    gap = scanned_gap(cloud, pose.base_from_surface, here.nominal, belongs * slip.inverse(), part)
+    if gap is not None:
+        expected = replace(expected, height=expected.height + gap.lift)
+    placing = Placing(
+        job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
+        part=here.part, check=context.check, progress=lambda share, text: context.progress(0.5, f"again: {text}"),
+        note=lambda part: _note(context, part, to_ur(part.where).tolist()),
+    )  # fmt: skip
+    return replace(placing.put_down(fold=False), look=placed.look, pose=pose, mating=gap)
+
+
+def held_so(job: Job, flange_from_part: pin.SE3, seen: Vector) -> Job:
+    """The job with its part held at `flange_from_part`, known to `seen` (6, 6)."""
+    roll, pitch, yaw = pin.rpy.matrixToRpy(flange_from_part.rotation)
+    x, y, z = flange_from_part.translation
+    sigmas = np.sqrt(np.diag(seen + GRIPPED))
+    held = Mounting.model_construct(translation=(x, y, z), rotation=(roll, pitch, yaw))
+    grasp = GraspSection.model_construct(
+        flange_from_part=held, size=job.grasp.size, sigma=float(sigmas[:3].max()), sigma_angle=float(sigmas[3:].max())
+    )
+    return job.model_copy(update={"grasp": grasp})
+
+
+def along_surface(motion: pin.SE3) -> pin.SE3:
+    """What of a part's motion, its own frame, is along the surface: a part is pressed on, and comes up as it is let go,
+    and what it lies on tells how high and how tilted."""
+    x, y, _ = motion.translation
+    return from_parts((x, y, 0.0), pin.exp3(np.array([0.0, 0.0, pin.log3(motion.rotation)[2]])))
+
+
+def _take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext) -> None:
+    """Grip the part with the flange at `grip`, base_from_flange, and lift it."""
+    plan, mover, part = job.place, here.mover, here.part
+    normal = job.grasp.flange_from_part.se3().rotation[:, 2]
+    above = grip * from_parts(plan.approach * normal)
+    context.progress(0.5, "gripping the part again")
+    mover.follow(mover.plan_to(above, "above the placed part"))
+    mover.meet_part()
+    here.devices.arm.zero_force()
+    if mover.line(grip, plan.speed, TOUCHES, force_limit=plan.contact_force):
+        mover.line(above, plan.speed, TOUCHES)
+        raise RefusedError(
+            "the claw touched something as it went to grip the placed part again; it went back up, the part lies where "
+            "it was put down. Look what stands there"
+        )
+    part.state = PartState.UNKNOWN
+    _note(context, part, to_ur(part.where).tolist())
+    here.devices.claw.grip()
+    part.state, part.where, part.left = PartState.HELD, None, False
+    _note(context, part, None)
+    mover.take_part(job.grasp.flange_from_part.se3(), job.grasp.size)
+    mover.line(above, plan.speed, TOUCHES)
+
+
+def _note(context: StepContext, part: PartProgress, where: list[float] | None) -> None:
+    context.note(part=part.state.value, **({} if where is None else {"base_from_part": where}))

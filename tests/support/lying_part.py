@@ -1,0 +1,93 @@
+"""A part that lies somewhere on its surface, in a cell that stands before it: what `verify` makes of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config.job import load_job
+from cell.devices.simulated.described import Described
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_matrix, from_parts
+from cell.measure.inversion import NominalSurface
+from cell.procedures.arm.moves import PartState
+from cell.procedures.steps.kinds import VERIFIED
+from cell.procedures.steps.verify import PlacedPart
+from lab.bench.job.whole_job import JobRecord, NoFrames
+from sim_backends.world.drawing import inverse
+from statemachine.runner import StepContext
+from tests.support.part_meshes import job_with_part
+from tests.support.report_runs import CONFIG, at_station, work_of
+
+MIDDLE = (0.022, 1.0)
+"""A part that leaves 13 mm of the surface to be seen at both ends."""
+
+
+@dataclass(eq=False)
+class LyingPart:
+    """A cell of `record` at its station, whose part was put down; `also` is of the job's [place].
+
+    `changed` changes its world before anybody looks. `cell` is the one that looked last, `notes` are its texts and
+    `parts` what it noted of the part.
+    """
+
+    record: JobRecord
+    folder: Path
+    half: tuple[float, float] = MIDDLE
+    verify: str = "all"
+    flat: bool = False
+    also: str = "corrections = 0"
+    attempt: int = 1
+    state: PartState = PartState.RELEASED
+    changed: Callable[[VirtualCell], None] = lambda cell: None
+    cell: VirtualCell = field(init=False)
+    notes: list[str] = field(default_factory=list, init=False)
+    parts: list[str] = field(default_factory=list, init=False)
+
+    def looked(self, off: pin.SE3) -> PlacedPart:
+        """What the step makes of a part that lies `off` its place."""
+        file = job_with_part(self.folder, "pot", verify=self.verify, half=self.half, flat=self.flat, also=self.also)
+        job, mesh = load_job(file)
+        nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+        self.cell = cell = VirtualCell(CONFIG, self.record.seed, self.record.level, Described(job, mesh))
+        at_station(cell, self.record)
+        cell.devices.vehicle.brake()
+        work = work_of(cell, job, nominal, self.record, frames=NoFrames(), folder=self.folder)
+        cell.devices.claw.bare.release()
+        scene, now = cell.world.scene, cell.clock.now()
+        cell.world.part._world_from_part = scene.world_from_surface @ off.homogeneous
+        self.changed(cell)
+        work.part.state = self.state
+        work.part.where = from_matrix(inverse(cell.world.world_from_base(now)) @ scene.world_from_surface) * off
+        work.mover.leave_part(work.part.where)
+        context = StepContext(
+            VERIFIED.policy().of("verify"), self.attempt, math.inf, dict(self.record.results), clock=cell.clock,
+            tell=lambda event: self._told(event.data),
+        )  # fmt: skip
+        found = VERIFIED.work(work)["verify"](context)
+        assert isinstance(found, PlacedPart)
+        return found
+
+    def _told(self, data: dict[str, object]) -> None:
+        if "part" in data:
+            self.parts.append(str(data["part"]))
+        if "text" in data:
+            self.notes.append(str(data["text"]))
+
+    def lies(self) -> pin.SE3:
+        """surface_from_part, as it is in the world."""
+        scene, world = self.cell.world.scene, self.cell.world
+        flange = world.world_from_base(self.cell.clock.now()) @ world.arm.base_from_flange(self.cell.clock.now())
+        return from_matrix(inverse(scene.world_from_surface) @ world.part.part_pose(flange))
+
+
+def moved(
+    x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> pin.SE3:
+    """A motion by these, m and rad."""
+    return from_parts((x, y, z), pin.exp3(np.array(turn)))

@@ -1,0 +1,108 @@
+"""A part out of its place is gripped again and placed by what was seen, where that helps, and only there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.devices.simulated.direct import VirtualCell
+from cell.procedures.arm.moves import PartState
+from cell.procedures.steps.correction import along_surface, held_so
+from drivers.errors import MisplacedError, RefusedError
+from lab.bench.job.whole_job import JobRecord
+from sim_backends.world.bodies.contact import PartContact
+from tests.support.lying_part import LyingPart, moved
+from tests.support.report_runs import pot
+
+
+def test_a_part_that_lies_aside_is_gripped_and_placed_where_it_belongs(placed_pot: JobRecord, tmp_path: Path) -> None:
+    site = LyingPart(placed_pot, tmp_path, also="corrections = 1")
+    found = site.looked(moved(0.2e-3, 0.8e-3, 0.35e-3, turn=(0.0, 0.0, 0.007)))
+    (before,) = found.before
+    assert before > 0.7e-3 and found.off < 0.15e-3
+    assert found.summary()["before_mm"] == [pytest.approx(1e3 * before, abs=1e-3)]
+    assert site.parts == ["unknown", "held", "unknown", "released"], "whoever finds the run cut short knows"
+    assert not site.cell.world.part.held and site.cell.world.collisions.found == ()
+    true = site.lies()
+    assert np.linalg.norm(true.translation) < 0.2e-3 and np.abs(pin.log3(true.rotation)).max() < 1e-3
+    assert any("it is gripped and placed again" in note for note in site.notes)
+
+
+def test_what_is_accepted_is_not_touched_and_what_is_not_is_corrected(placed_pot: JobRecord, tmp_path: Path) -> None:
+    off = moved(0.2e-3, z=0.1e-3)
+    assert LyingPart(placed_pot, tmp_path, also="corrections = 1").looked(off).before == ()
+    nearer = LyingPart(placed_pot, tmp_path, also='corrections = 1\naccept = "0.1 mm"').looked(off)
+    assert len(nearer.before) == 1 and nearer.off < nearer.before[0]
+
+
+def test_a_part_that_lies_on_something_is_left_there(placed_pot: JobRecord, tmp_path: Path) -> None:
+    """Placed again it would lie as high."""
+    site = LyingPart(placed_pot, tmp_path, also="corrections = 3")
+    with pytest.raises(MisplacedError, match="it lies on something"):
+        site.looked(moved(z=0.8e-3))
+    assert site.parts == []
+    assert any(note.startswith("no correction of the placed part") for note in site.notes)
+
+
+def test_how_a_part_slips_each_time_the_claw_opens_is_seen_and_allowed_for(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rest, slips = PartContact._rest, moved(0.5e-3, turn=(0.0, 0.0, 0.003)).homogeneous
+    monkeypatch.setattr(PartContact, "_rest", lambda self, pose: rest(self, pose @ slips))
+    found = LyingPart(placed_pot, tmp_path, also='corrections = 2\naccept = "0.1 mm"').looked(moved(0.5e-3, z=0.2e-3))
+    assert [round(1e3 * off, 1) for off in found.before] == [pytest.approx(0.5, abs=0.15)] * 2, "as far off again"
+    assert found.off < 0.2e-3
+
+
+def test_what_is_in_the_way_to_the_part_ends_the_run_with_the_part_where_it_lay(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    """A force on the fingers from 10 mm above it on, as of a bolt that stands beside the part."""
+
+    def bolt(cell: VirtualCell) -> None:
+        touch, low = cell.world.arm.contact, float(placed_pot.results["place"].base_from_flange.translation[2]) + 0.010
+        assert touch is not None
+
+        def met(base_from_flange: Any) -> Any:
+            wrench = touch(base_from_flange)
+            wrench[2] += 20.0 * (base_from_flange[2, 3] < low)
+            return wrench
+
+        cell.world.arm.contact = met
+
+    site = LyingPart(placed_pot, tmp_path, also="corrections = 1", changed=bolt)
+    off = moved(y=0.8e-3, z=0.35e-3)
+    with pytest.raises(RefusedError, match="the claw touched something as it went to grip the placed part"):
+        site.looked(off)
+    assert site.parts == []
+    assert np.allclose(site.lies().homogeneous, off.homogeneous, atol=1e-9)
+
+
+def test_after_a_fault_nothing_is_gripped_and_a_part_in_the_claw_is_not_placed(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    again = LyingPart(placed_pot, tmp_path, also="corrections = 1", attempt=2)
+    with pytest.raises(MisplacedError):
+        again.looked(moved(y=0.8e-3, z=0.35e-3))
+    assert again.parts == []
+    with pytest.raises(RefusedError, match="the part is in the claw again"):
+        LyingPart(placed_pot, tmp_path, state=PartState.HELD).looked(moved())
+
+
+def test_the_grasp_that_was_seen_takes_the_place_of_the_stated_one() -> None:
+    job, _ = pot()
+    flange_from_part = job.grasp.flange_from_part.se3() * moved(1e-3, -2e-3, 0.5e-3, turn=(0.01, 0.02, -0.03))
+    held = held_so(job, flange_from_part, np.diag([9e-12] * 3 + [1e-10] * 3)).grasp
+    assert np.allclose(held.flange_from_part.se3().homogeneous, flange_from_part.homogeneous, atol=1e-12)
+    assert held.size == job.grasp.size
+    assert (held.sigma, held.sigma_angle) == (pytest.approx(20e-6, rel=0.02), pytest.approx(0.2e-3, rel=0.02))
+
+
+def test_of_a_slip_only_what_is_along_the_surface_counts() -> None:
+    found = along_surface(moved(0.3e-3, -0.2e-3, 0.4e-3, turn=(0.005, -0.004, 0.006)))
+    assert np.allclose(found.translation, [0.3e-3, -0.2e-3, 0.0])
+    assert np.allclose(pin.log3(found.rotation), [0.0, 0.0, 0.006], atol=1e-6)
