@@ -11,15 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cell.check.place import (
-    contact_problems,
-    mating_problems,
-    mesh_box,
-    place_problems,
-    surface_problems,
-    verify_problems,
-    way_problems,
-)
+from cell.check.place import contact_problems, mating_problems, mesh_box, place_problems, surface_problems, way_problems
+from cell.check.placed_part import verify_problems
 from cell.check.reach import reach_problems
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
@@ -61,7 +54,7 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
     # The arm's poses follow from the others: where these are wrong, it would only be told twice.
     problems = problems or list(reach_problems(job, config, extent, calibrates=calibrates))
     problems += contact_problems(job, config, mesh)
-    problems = problems or [*mating_problems(job, mesh), *verify_problems(job)]
+    problems = problems or [*mating_problems(job, mesh), *verify_problems(job, config)]
     if problems:
         raise ConfigError(f"job {job.job.name} does not fit this cell:\n  " + "\n  ".join(problems))
 

@@ -16,13 +16,10 @@ from cell.config.job import Job
 from cell.measure.geometry.poses import from_parts, transform
 from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, drawn_gap
 from cell.measure.inversion.nominal import NominalSurface, read_mesh
-from cell.measure.inversion.observability import Tolerance
-from cell.measure.inversion.part_pose import seen_from_above, shown_by
 from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import Body, station_bodies, vehicle_bodies
 from cell.procedures.drive.way import MAX_HEADING, Planar, wrap
-from drivers.errors import ConfigError
 from drivers.interfaces import Vector
 from drivers.make import MOST_PAYLOAD
 
@@ -107,24 +104,6 @@ def mating_problems(job: Job, mesh: Path) -> Iterator[str]:
         problem = found.problem(job.place.tolerance) or ""
     if problem:
         yield f'part.mesh "{Path(job.part.mesh).name}": {problem}'
-
-
-def verify_problems(job: Job) -> Iterator[str]:
-    """Whether a sweep can see how the part lies once it was placed; nothing where nobody looks."""
-    if job.part is None or job.place.verify == "none":
-        return
-    part = NominalSurface.load(Path(job.part.mesh), unit=job.part.mesh_unit)
-    try:
-        faces = seen_from_above(part, job.place.surface_from_part.se3())
-    except ConfigError as error:
-        yield str(error)
-        return
-    tolerance = Tolerance(job.place.tolerance, job.place.tolerance_angle)
-    if job.place.verify == "all" and (unseen := shown_by(faces, tolerance)):
-        yield (
-            f'part.mesh "{Path(job.part.mesh).name}": the faces of the placed part do not show {", ".join(unseen)}. '
-            'Write place.verify = "seen" to have the rest looked at, or "none"'
-        )
 
 
 def _drawn(job: Job, mesh: Path) -> MatingGap | None:

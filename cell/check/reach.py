@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -14,6 +15,8 @@ from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.solve.results import PARAMETERS, Quality
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts
+from cell.measure.inversion import NominalSurface
+from cell.measure.inversion.part_pose import seen_from_above
 from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import (
@@ -37,7 +40,9 @@ from cell.procedures.arm.photograph import (
     scan_plans,
     target_calibration_views,
 )
+from cell.procedures.steps.verify import surface_from_faces
 from cell.procedures.sweep.sweeping import RUN_UP_S
+from drivers.errors import ConfigError
 from drivers.interfaces import Vector
 
 Goal = tuple[str, pin.SE3, tuple[Pair, ...]]
@@ -125,15 +130,33 @@ def _goals(job: Job, config: CellConfig) -> Iterator[Goal]:
         ("the place pose (place, surface)", -job.place.contact_travel, TOUCHES),
     ):
         yield what, part * from_parts((0.0, 0.0, height)) * part_from_flange, touching
+    try:
+        faces = seen_faces(job)
+    except ConfigError:
+        # Told with what else is wrong with the part.
+        return
+    if faces is not None:
+        yield from _sweeps(job, config, surface * surface_from_faces(job, faces), over="the placed part")
 
 
-def _sweeps(job: Job, config: CellConfig, base_from_surface: pin.SE3) -> Iterator[Goal]:
+def seen_faces(job: Job) -> NominalSurface | None:
+    """The faces of the part that are looked at once it was placed; None where nobody looks.
+
+    Raises `ConfigError` where it has none, or its mesh is none.
+    """
+    if job.part is None or job.place.verify == "none":
+        return None
+    part = NominalSurface.load(Path(job.part.mesh), unit=job.part.mesh_unit)
+    return seen_from_above(part, job.place.surface_from_part.se3())
+
+
+def _sweeps(job: Job, config: CellConfig, base_from_surface: pin.SE3, over: str = "scan, surface") -> Iterator[Goal]:
     """Where each sweep begins and ends, run-ups included."""
     for k, plan in enumerate(scan_plans(config, job, base_from_surface, nominal_scan(config))):
         way = plan.base_from_flange_end.translation - plan.base_from_flange.translation
         run_up = RUN_UP_S * job.scan.speed * way / max(float(np.linalg.norm(way)), 1e-9)
-        yield f"the begin of sweep {k + 1} (scan, surface)", from_parts(-run_up) * plan.base_from_flange, ()
-        yield f"the end of sweep {k + 1} (scan, surface)", from_parts(run_up) * plan.base_from_flange_end, ()
+        yield f"the begin of sweep {k + 1} ({over})", from_parts(-run_up) * plan.base_from_flange, ()
+        yield f"the end of sweep {k + 1} ({over})", from_parts(run_up) * plan.base_from_flange_end, ()
 
 
 def _unreached(planner: Planner, goals: Iterator[Goal]) -> Iterator[str]:

@@ -238,7 +238,9 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     sweep, scan, part = context.made(SweepRecord), context.made(Reconstruction), here.part_mesh
     if part is None:
         raise RefusedError("the job has no mesh of its part ([part]): nothing tells what the placed part looks like")
-    cloud, record = _swept(here, sweep, pose, part, context)
+    place, belongs = here.job.place, here.job.place.surface_from_part.se3()
+    faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
+    cloud, record = _swept(here, sweep, pose, faces, context)
     context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
     looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
     here.mover.to_joints(HOME)
@@ -249,21 +251,15 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     def moved(lines: Indices, rows: Indices) -> Vector:
         return np.concatenate([by_calibration(lines, rows), by_poses(lines, rows)], axis=2)
 
-    place, belongs = here.job.place, here.job.place.surface_from_part.se3()
-    faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
     try:
         seen = find_part(
-            cloud,
-            faces,
-            here.nominal,
-            surface=Prior(pose.base_from_surface, pose.covariance),
-            belongs=belongs,
-            tolerance=tolerance,
-            moved=moved,
-        )
+            cloud, faces, here.nominal, surface=Prior(pose.base_from_surface, pose.covariance), belongs=belongs,
+            tolerance=tolerance, moved=moved,
+        )  # fmt: skip
     except RefusedError as error:
+        why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")
         raise MisplacedError(
-            f"the placed part is not where it was put down, or is not the part as drawn: {error}. {NEXT_STEP}",
+            f"the placed part is not where it was put down, or is not the part as drawn: {why}. {NEXT_STEP}",
             *error.numbers,
         ) from error
     stated = part_covariance(here.job, pose, here.repeatability)
@@ -272,19 +268,23 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
 
 
 def _swept(
-    here: Workplace, sweep: SweepRecord, pose: PlacePose, part: NominalSurface, context: StepContext
+    here: Workplace, sweep: SweepRecord, pose: PlacePose, faces: NominalSurface, context: StepContext
 ) -> tuple[Cloud, SweepRecord]:
-    """Sweep the part, with the head as far above it as it was above the surface."""
-    middle = here.job.place.surface_from_part.se3() * (0.5 * sum(part.extent))
-    above = pose.base_from_surface * from_parts((0.0, 0.0, middle[2]))
+    """Sweep the part, with the head as far above its faces as it was above the surface."""
     again = laser_sweep(
-        here, above, head_at(here, sweep), here.job.scan, check=context.check,
-        keep_frame=lambda frame: here.frames.keep("verify", frame), counted=False,
+        here, pose.base_from_surface * surface_from_faces(here.job, faces), head_at(here, sweep), here.job.scan,
+        check=context.check, keep_frame=lambda frame: here.frames.keep("verify", frame), counted=False,
         progress=lambda share, text: context.progress(0.85 * share, f"the placed part: {text}"),
     )  # fmt: skip
     cloud = build_cloud(again)
     write_cloud(here.folder / CLOUD, cloud, here.config.cell.sim)
     return cloud, again
+
+
+def surface_from_faces(job: Job, faces: NominalSurface) -> pin.SE3:
+    """The surface's frame, moved up to half the height of the placed part's faces: what the sweep of these is over."""
+    middle = job.place.surface_from_part.se3() * (0.5 * sum(faces.extent))
+    return from_parts((0.0, 0.0, middle[2]))
 
 
 def judged(job: Job, seen: PartPose, points: Vector, stated: Vector) -> PlacedPart:
