@@ -56,7 +56,9 @@ def seen_from_above(part: NominalSurface, surface_from_part: pin.SE3) -> Nominal
     up = part.normals @ surface_from_part.rotation.T[:, 2] > FACING_UP
     if not up.any():
         raise ConfigError("no face of part.mesh faces up where the part lies: nothing of the placed part can be seen")
-    return NominalSurface(part.vertices, part.triangles[up])
+    # Of its own corners alone: their box is that of the faces.
+    corners, triangles = np.unique(part.triangles[up], return_inverse=True)
+    return NominalSurface(part.vertices[corners], triangles.reshape(-1, 3))
 
 
 def shown_by(faces: NominalSurface, tolerance: Tolerance) -> tuple[str, ...]:

@@ -30,8 +30,8 @@ def of(mesh: trimesh.Trimesh) -> NominalSurface:
 
 def test_what_faces_up_is_seen_and_nothing_else() -> None:
     faces = seen_from_above(part(), HERE)
-    low, high = faces.samples[:, 2].min(), faces.samples[:, 2].max()
-    assert low > HEIGHT - 0.01 and high < HEIGHT + 0.012
+    low, high = faces.extent
+    assert low[2] > HEIGHT - 0.01 and high[2] < HEIGHT + 0.012
     over = seen_from_above(part(), pin.SE3(pin.rpy.rpyToMatrix(np.pi, 0.0, 0.0), np.zeros(3)))
     assert over.samples[:, 2].max() < HEIGHT, "turned over, its underside is seen"
     below = NominalSurface(faces.vertices, faces.triangles[:, ::-1])
