@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from cell.procedures.steps.kinds import PLACE, Kind
     from cell.procedures.steps.place import PlaceResult
     from cell.procedures.steps.reconstruct import Reconstruction
+    from cell.procedures.steps.verify import PlacedPart
     from cell.procedures.steps.workplace import JobStep
     from cell.procedures.sweep.stored_sweep import SweepRecord
     from cell.run.events import (
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
         InterlockError,
         Interrupted,
         LimitError,
+        MisplacedError,
         NotConnectedError,
         NotObservable,
         RefusedError,
@@ -85,6 +87,7 @@ _PLACES = {
     "cell.procedures.steps.reconstruct": ("Reconstruction",),
     "cell.measure.inversion.place_pose": ("PlacePose",),
     "cell.procedures.steps.place": ("PlaceResult",),
+    "cell.procedures.steps.verify": ("PlacedPart",),
     "cell.procedures.steps.drive_to_target": ("VehicleArrival",),
     "drivers.arm.make": ("ArmOutputClawConfig",),
     "drivers.make": (
@@ -94,7 +97,8 @@ _PLACES = {
     "drivers.common.units": ("quantity", "whole"),
     "drivers.errors": (
         "Aborted", "CalibrationStale", "CellError", "ConfigError", "DeadlineError", "DeviceError", "DeviceFault",
-        "InterlockError", "Interrupted", "LimitError", "NotConnectedError", "NotObservable", "RefusedError",
+        "InterlockError", "Interrupted", "LimitError", "MisplacedError", "NotConnectedError", "NotObservable",
+        "RefusedError",
     ),
 }  # fmt: skip
 
@@ -102,7 +106,8 @@ __all__ = [
     "PLACE", "Aborted", "Again", "ArmConfig", "ArmOutputClawConfig", "BoardFix", "CalibrationStale", "CameraConfig",
     "Cell", "CellError", "ClawConfig", "ConfigError", "ConfirmNeeded", "Confirmed", "DeadlineError", "DeviceError",
     "DeviceFault", "FaultMet", "GoesOn", "Held", "InterlockError", "Interrupted", "JobStep", "Kind", "LaserConfig",
-    "LimitError", "Make", "NotConnectedError", "NotObservable", "Noted", "OnArm", "PlacePose", "PlaceResult",
+    "LimitError", "Make", "MisplacedError", "NotConnectedError", "NotObservable", "Noted", "OnArm", "PlacePose",
+    "PlaceResult", "PlacedPart",
     "RailConfig", "Reconstruction", "RefusedError", "Run", "RunEnded", "RunEvent", "RunOutcome", "SafeStopped",
     "Script", "StateChanged", "Step", "StepDone", "StepFailed", "StepProgress", "StepStarted", "Surroundings",
     "SweepRecord", "VehicleArrival", "VehicleConfig", "quantity", "whole",

@@ -149,6 +149,40 @@ def inversion(
 
 
 @bench.command()
+def placed(
+    effect: Annotated[
+        list[str] | None, typer.Option("--effect", help="Just this one; may be repeated. All of them without.")
+    ] = None,
+    seeds: WorldsOption = 5,
+    level: LevelOption = Level.nominal,
+    job: JobOption = "pot",
+    corrections: Annotated[int, typer.Option(min=0, max=5, help="place.corrections of the job.")] = 0,
+    accept: Annotated[str | None, typer.Option(help='place.accept of the job, such as "0.05 mm".')] = None,
+    whole: Annotated[bool, typer.Option("--whole", help="The part covers its surface, and hides all of it.")] = False,
+    workers: WorkersOption = 0,
+    json: JsonOption = False,
+) -> None:
+    """Put effects between surface and part that nobody sees before it is placed, and hold what is seen then against
+    the truth.
+
+    Exit code 1 when a part was placed whose true error exceeds the stated bound.
+    """
+    from lab.bench.job.part_effects import EFFECTS
+    from lab.bench.job.placed_part import campaign
+
+    chosen = list(dict.fromkeys(effect or EFFECTS))
+    place = f"corrections = {corrections}" + ("" if accept is None else f'\naccept = "{accept}"')
+    with bar() as told:
+        result = campaign(
+            range(1, seeds + 1), level.value, job, chosen, place=place,
+            done=counted(told, len(chosen) * seeds), whole=whole, workers=workers,
+        )  # fmt: skip
+    show(result, json, without=("runs",))
+    if result["outside_bound"]:
+        raise typer.Exit(1)
+
+
+@bench.command()
 def realism(
     effect: Annotated[
         list[str] | None,

@@ -101,6 +101,12 @@ class World:
         self._set_up(self.collisions.found)
         self._cameras.show(scene, ready)
 
+    def remake(self, scene: Scene, station: Station) -> None:
+        """As if this scene had been drawn, and the part were in its claw; devices stay as they are."""
+        self.scene, self.station = scene, station
+        self._set_up(self.collisions.found)
+        self._cameras.show(scene, station)
+
     # --- where things are ---
 
     def world_from_base(self, t: float) -> Pose:

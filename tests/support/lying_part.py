@@ -18,14 +18,11 @@ from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import PartState
 from cell.procedures.steps.kinds import VERIFIED
 from cell.procedures.steps.verify import PlacedPart
+from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord, NoFrames
 from sim_backends.world.drawing import inverse
 from statemachine.runner import StepContext
-from tests.support.part_meshes import job_with_part
 from tests.support.report_runs import CONFIG, at_station, work_of
-
-MIDDLE = (0.022, 1.0)
-"""A part that leaves 13 mm of the surface to be seen at both ends."""
 
 
 @dataclass(eq=False)

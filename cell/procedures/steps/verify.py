@@ -86,8 +86,9 @@ class PlacedPart:
 
     @property
     def aside(self) -> float:
-        """The same without what raises all of it: how high it lies is told by what it lies on."""
-        return float(np.linalg.norm(self.offsets - [0.0, 0.0, self.offsets[:, 2].mean()], axis=1).mean())
+        """The same along the surface alone: how high and how tilted a part lies, what it lies on tells."""
+        motion = along_surface(self.belongs.inverse() * self.seen.surface_from_part)
+        return float(np.linalg.norm(transform(motion, self.points) - self.points, axis=1).mean())
 
     @property
     def unsure(self) -> float:

@@ -86,14 +86,16 @@ class JobRecord:
 def run_whole_job(
     config: CellConfig, job: Job, nominal: NominalSurface, seed: int, level: str, progress: Progress | None = None,
     calibrated: JobRecord | None = None, stood: float = 0.0, runs: Path | None = None,
+    changed: Callable[[VirtualCell], None] = lambda cell: None,
 ) -> JobRecord:  # fmt: skip
     """Calibrate the cell of `seed` and `level`, then do the job; raises nothing that the product names.
 
     `calibrated` is a record of the same cell, whose calibration is used again. The cell stands idle for `stood` s
-    before the job. With `runs` its run's folder is kept there.
+    before the job. With `runs` its run's folder is kept there. `changed` changes the cell before anything is done.
     """
     assert nominal.source is not None
     cell = VirtualCell(config, seed, level, Described(job, nominal.source))
+    changed(cell)
     record = JobRecord(seed, level)
     whole = _WholeJob(cell, config, job, nominal, record, progress or (lambda fraction, text: None))
     try:

@@ -1,8 +1,8 @@
 """The part and what it touches: held by the claw, pressed onto the surface, released and resting there.
 
 The part's underside is the nominal surface itself, or that of the part's own mesh. Contact is a penalty: each sample
-point of the underside below the true surface pushes back along the surface's normal. Friction and the part's weight are
-left out.
+point of the underside below the true surface pushes back along the surface's normal. A part with a mesh of its own
+settles once it is let go: its weight turns it until it rests on three points. Friction is left out.
 """
 
 from __future__ import annotations
@@ -10,11 +10,13 @@ from __future__ import annotations
 import threading
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from sim_backends.world import drawing
 from sim_backends.world.bodies.surfaces import Surface
 from sim_backends.world.drawing import inverse
+from sim_backends.world.scene import rotation
 
 Pose = NDArray[np.float64]
 Vector = NDArray[np.float64]
@@ -29,6 +31,8 @@ LEAST_TOUCHING = 40
 """Of the points of a part's underside that are tried so many have to have a surface below them."""
 CLEARANCE, CLEARANCE_STEP, WALL = 3e-4, 1e-4, 2.5
 """Room that a part has beside walls, m, the step in which they are looked for, m, and how steep, m/m, a wall is."""
+SETTLING, TIPS = 20, 5e-3
+"""Steps in which a part settles, and how far it tilts in one, rad: the ground below it is another one then."""
 _LEAN = 0.015
 """How much higher than drawn, m, a point of a leaning table's surface may be."""
 
@@ -57,7 +61,10 @@ class PartContact:
         self._fingertips = np.array([[x, y, 0.0] for x in (-0.02, 0.02) for y in (-0.01, 0.01)]) + fingers
         self._world_from_part: Pose | None = None
         self._claw_closed = True
+        self.opening = np.eye(4)
+        """How the part moves, in its own frame, as the claw opens, part before from part after; (4, 4)."""
         self._lock = threading.Lock()
+        self._own = part is not None
         surface_from_part = np.eye(4) if surface_from_part is None else surface_from_part
         if part is None:
             x, y = _grid(surface)
@@ -105,7 +112,8 @@ class PartContact:
             if closed:
                 self._grip(world_from_flange)
             elif self._world_from_part is None:
-                self._world_from_part = self._rest(self._pose(world_from_flange))
+                let_go = self._settle if self._own else self._rest
+                self._world_from_part = let_go(self._pose(world_from_flange) @ self.opening)
 
     def _grip(self, world_from_flange: Pose) -> None:
         if self._world_from_part is None:
@@ -127,6 +135,31 @@ class PartContact:
             if abs(step) < 1e-8:
                 break
         return rest
+
+    def _settle(self, world_from_part: Pose) -> Pose:
+        """The part as it comes to rest under its weight: as low as it gets, turned about its middle, in no contact.
+
+        Each step is a linear program: how far to come down and to tilt so that no point of the underside is below the
+        ground, with the ground as it is below the part now.
+        """
+        rest = self._rest(world_from_part)
+        for _ in range(SETTLING):
+            points = _moved(self._underside, rest)
+            depth, _ = self._below(points)
+            middle = points.mean(axis=0)
+            x, y, _ = (points - middle).T
+            over = -np.stack([np.ones(len(x)), y, -x], axis=1)
+            room = [(-np.inf, np.inf), (-TIPS, TIPS), (-TIPS, TIPS)]
+            made = scipy.optimize.linprog([1.0, 0.0, 0.0], over, -depth, bounds=room)
+            if not made.success:
+                break
+            down, about_x, about_y = (float(v) for v in np.asarray(made.x))
+            turn = rotation(np.array([about_x, about_y, 0.0]))
+            rest[:3, :3] = turn @ rest[:3, :3]
+            rest[:3, 3] = turn @ (rest[:3, 3] - middle) + middle + [0.0, 0.0, down]
+            if abs(down) + abs(about_x) + abs(about_y) < 1e-7:
+                break
+        return self._rest(rest)
 
     def _box(self, held: bool) -> tuple[list[float], list[float]]:
         """Lowest and highest corner of what may touch the ground, in the flange: fingertips, and the part when held."""

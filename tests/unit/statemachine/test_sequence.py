@@ -28,6 +28,8 @@ def at(state: str) -> Sequence:
     if state is JobState.RECOVERING:
         sequence.facts.recoverable, sequence.facts.retries_left = True, 1
         sequence.fire(JobTrigger.RECOVER)
+    if state is JobState.MISPLACED:
+        sequence.fire(JobTrigger.MISPLACE)
     while sequence.state != state and sequence.state in STEPS:
         sequence.facts.done.add(sequence.state)
         sequence.fire(JobTrigger.NEXT)

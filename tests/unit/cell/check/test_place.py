@@ -15,7 +15,7 @@ from cell.check.place import contact_notes, contact_problems, mating_problems, m
 from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import Job, load_job, shipped_jobs
 from drivers.errors import ConfigError
-from tests.support.part_meshes import job_with_part
+from lab.bench.job.part_jobs import job_with_part
 
 POT = load_job("pot")[1].with_suffix(".toml")
 

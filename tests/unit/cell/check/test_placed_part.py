@@ -15,7 +15,7 @@ from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.measure.inversion.nominal import read_mesh
 from drivers.errors import ConfigError
-from tests.support.part_meshes import body, job_with_part
+from lab.bench.job.part_jobs import body, job_with_part
 
 CONFIG = load_config(None)
 

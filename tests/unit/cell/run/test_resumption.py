@@ -18,8 +18,8 @@ from cell.procedures.sweep.stored_sweep import FILE
 from cell.run.folder import is_going, run_row
 from cell.run.resumption import UnfinishedRun, job_hash, job_source
 from drivers.errors import ConfigError
+from lab.bench.job.part_jobs import job_with_part
 from statemachine.journal import FILE_NAME, Journal
-from tests.support.part_meshes import job_with_part
 from tests.unit.cell.config.calibrations.test_store import made
 from tests.unit.cell.procedures.sweep.test_sweeping import CONFIG
 

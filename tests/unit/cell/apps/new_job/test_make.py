@@ -14,7 +14,7 @@ from cell.config.job import load_job
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion.nominal import read_mesh
 from drivers.errors import ConfigError
-from tests.support.part_meshes import body
+from lab.bench.job.part_jobs import body
 from tests.unit.cell.apps.new_job.meshes import from_options, relief
 
 

@@ -16,8 +16,8 @@ from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.mating import MatingGap, drawn_gap, scanned_gap
 from cell.measure.inversion.nominal import read_mesh
 from drivers.errors import RefusedError
+from lab.bench.job.part_jobs import body
 from lab.bench.job.whole_job import JobRecord
-from tests.support.part_meshes import body
 
 Floats = NDArray[np.float64]
 HERE = pin.SE3.Identity()
@@ -35,7 +35,7 @@ def stepped(corners: Floats) -> Floats:
 
 def drawn(name: str) -> tuple[NominalSurface, trimesh.Trimesh]:
     job, mesh = load_job(name)
-    return NominalSurface.load(mesh, unit=job.surface.mesh_unit), body(*read_mesh(mesh, "m"), lambda corners: corners)
+    return NominalSurface.load(mesh, unit=job.surface.mesh_unit), body(*read_mesh(mesh, "m"))
 
 
 def surface_of(part: trimesh.Trimesh) -> NominalSurface:

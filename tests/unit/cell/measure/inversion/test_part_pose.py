@@ -12,7 +12,7 @@ from cell.measure.inversion import NominalSurface, Tolerance
 from cell.measure.inversion.nominal import read_mesh
 from cell.measure.inversion.part_pose import seen_from_above, shown_by
 from drivers.errors import ConfigError
-from tests.support.part_meshes import HEIGHT, body
+from lab.bench.job.part_jobs import HEIGHT, body
 
 HERE = pin.SE3.Identity()
 TOLERANCE = Tolerance(0.6e-3, 6e-3)
@@ -20,7 +20,7 @@ JOB, MESH = load_job("pot")
 
 
 def part(*, flat: bool = False) -> NominalSurface:
-    made = body(*read_mesh(MESH, "m"), lambda corners: corners, flat=flat)
+    made = body(*read_mesh(MESH, "m"), flat=flat)
     return NominalSurface(made.vertices, made.faces)
 
 

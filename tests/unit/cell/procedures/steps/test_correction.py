@@ -13,8 +13,8 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.procedures.arm.moves import PartState
 from cell.procedures.steps.correction import along_surface, held_so
 from drivers.errors import MisplacedError, RefusedError
+from lab.bench.job.part_effects import motion, opened
 from lab.bench.job.whole_job import JobRecord
-from sim_backends.world.bodies.contact import PartContact
 from tests.support.lying_part import LyingPart, moved
 from tests.support.report_runs import pot
 
@@ -49,11 +49,13 @@ def test_a_part_that_lies_on_something_is_left_there(placed_pot: JobRecord, tmp_
 
 
 def test_how_a_part_slips_each_time_the_claw_opens_is_seen_and_allowed_for(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, tmp_path: Path
 ) -> None:
-    rest, slips = PartContact._rest, moved(0.5e-3, turn=(0.0, 0.0, 0.003)).homogeneous
-    monkeypatch.setattr(PartContact, "_rest", lambda self, pose: rest(self, pose @ slips))
-    found = LyingPart(placed_pot, tmp_path, also='corrections = 2\naccept = "0.1 mm"').looked(moved(0.5e-3, z=0.2e-3))
+    slips = opened(motion(0.5, turn=(0, 0, 3)))
+    site = LyingPart(
+        placed_pot, tmp_path, also='corrections = 2\naccept = "0.1 mm"', changed=lambda cell: slips(cell.world)
+    )
+    found = site.looked(moved(0.5e-3, z=0.2e-3))
     assert [round(1e3 * off, 1) for off in found.before] == [pytest.approx(0.5, abs=0.15)] * 2, "as far off again"
     assert found.off < 0.2e-3
 

@@ -46,8 +46,8 @@ def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
     few = sparse(site.job.scan, placed_pot.results["laser_sweep"].swaths[0])
     with pytest.raises(DeviceFault, match="lost steps") if fault else nullcontext() as met:
         swept = laser_sweep(
-            site.work, site.made["board_photo"], site.work.calibration.scan, few, keep_frame=lambda frame: None,
-            check=lambda: None, progress=lambda share, text: told.append(text),
+            site.work, site.work.base_from_surface(site.made["board_photo"]), site.work.calibration.scan, few,
+            keep_frame=lambda frame: None, check=lambda: None, progress=lambda share, text: told.append(text),
         )  # fmt: skip
         assert swept.doubts == ((UNCHECKED,) if mode == 1 else ())
     if fault:

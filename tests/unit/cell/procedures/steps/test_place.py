@@ -39,12 +39,12 @@ from cell.run.resumption import UnfinishedRun
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
+from lab.bench.job.part_jobs import job_with_part
 from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
 from sim_backends.world.drawing import inverse
 from statemachine.journal import Journal
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure
-from tests.support.part_meshes import job_with_part
 from tests.support.report_runs import work_of
 
 CONFIG = load_config(None)

@@ -22,10 +22,10 @@ from cell.procedures.steps.kinds import PLACE, VERIFIED, kind_of
 from cell.procedures.steps.verify import CLOUD, LIKELY, PlacedPart
 from cell.run.report.page.make import make_page
 from drivers.errors import MisplacedError
+from lab.bench.job.part_effects import motion, opened
+from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord, run_whole_job
-from sim_backends.world.bodies.contact import PartContact
-from tests.support.lying_part import MIDDLE, LyingPart, moved
-from tests.support.part_meshes import job_with_part
+from tests.support.lying_part import LyingPart, moved
 from tests.support.report_runs import CONFIG
 
 
@@ -183,16 +183,19 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture(
     assert (done.folder / "picture.png").is_file()
 
 
-def test_a_part_that_slips_as_the_claw_opens_ends_the_run_as_misplaced(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rest = PartContact._rest
-    slipped = moved(y=0.9e-3, turn=(0.0, 0.0, 0.004)).homogeneous
-    monkeypatch.setattr(PartContact, "_rest", lambda self, pose: rest(self, pose @ slipped))
+def test_a_part_that_slips_as_the_claw_opens_ends_the_run_as_misplaced(placed_pot: JobRecord, tmp_path: Path) -> None:
     job, mesh = load_job(job_with_part(tmp_path, "pot", verify="all", half=MIDDLE))
+    slips = opened(motion(y=0.9, turn=(0, 0, 4)))
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
     done = run_whole_job(
-        CONFIG, job, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot, runs=tmp_path / "runs"
+        CONFIG,
+        job,
+        nominal,
+        placed_pot.seed,
+        placed_pot.level,
+        calibrated=placed_pot,
+        runs=tmp_path / "runs",
+        changed=lambda cell: slips(cell.world),
     )
     assert (done.outcome, done.stage) == ("misplaced", "verify")
     assert "the part is already down" in done.reason and LIKELY["shifted"] in done.reason

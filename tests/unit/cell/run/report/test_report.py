@@ -90,6 +90,11 @@ def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(
         "injected", "not_injected", "not_injected[].fault", "not_injected[].why", "until", "scripted", "resumed_from",
         "frames_missing", "truth_missing", "picture_missing", "part_mesh.file", "part_mesh.sha256",
         "place.mating.least_mm", "place.mating.median_mm", "place.mating.largest_mm", "place.mating.seen",
+        "refusal.placed", "truth.seen_error.translation_mm", "truth.seen_error.rotation_mrad",
+        *(f"verify.{key}" for key in (
+            "off_mm", "unsure_mm", "shift_mm", "turn_mrad", "sigma_mm", "sigma_mrad", "points", "beside", "unseen",
+            "before_mm", "gap", "gap.least_mm", "gap.median_mm", "gap.largest_mm", "gap.seen",
+        )),
     }  # fmt: skip
     assert found - documented() == set()
     # What only devices that are simulated beside real ones have is compared where there are some.

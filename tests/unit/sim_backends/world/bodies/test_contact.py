@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from lab.bench.job.part_jobs import body
 from sim_backends.world import drawing
 from sim_backends.world.bodies.contact import STIFFNESS, PartContact
 from sim_backends.world.bodies.surfaces import HALF_X, HALF_Y, Surface, mesh, surface, underside
 from sim_backends.world.scene import rotation
-from tests.support.part_meshes import body
 
 Floats = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lab.bench.job.part_jobs import job_with_part
 from sim_backends.world.bodies.station import Station
 from sim_backends.world.bodies.surfaces import surface
 from sim_backends.world.drawing import STOCK
-from tests.support.part_meshes import job_with_part
 
 
 def test_the_underside_of_a_part_is_that_of_its_mesh(tmp_path: Path) -> None:

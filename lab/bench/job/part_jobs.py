@@ -1,4 +1,4 @@
-"""Parts whose underside is the surface that they are placed onto: shells of 20 mm above it, in the part frame."""
+"""Jobs whose part is drawn on the surface that it is placed onto: a shell of 20 mm above it, in the part frame."""
 
 from __future__ import annotations
 
@@ -13,11 +13,15 @@ from cell.config.job import job_path, load_job
 from cell.measure.inversion.nominal import read_mesh
 
 Floats = NDArray[np.float64]
+Faces = NDArray[np.int64]
 HEIGHT = 0.020
+ALL = (1.0, 1.0)
+MIDDLE = (0.022, 1.0)
+"""Half the sides, m, of a part that leaves 13 mm of the surface of `pot` to be seen at both ends."""
 
 
 def body(
-    vertices: Floats, faces: NDArray[np.int64], changed: Callable[[Floats], Floats], *, flat: bool = False
+    vertices: Floats, faces: Faces, changed: Callable[[Floats], Floats] = lambda corners: corners, *, flat: bool = False
 ) -> trimesh.Trimesh:
     """A closed body on the surface; `changed` gives the underside's corners (n, 3), m, as they are drawn instead.
 
@@ -36,9 +40,7 @@ def body(
     )
 
 
-def middle_of(
-    vertices: Floats, faces: NDArray[np.int64], half: tuple[float, float]
-) -> tuple[Floats, NDArray[np.int64]]:
+def within(vertices: Floats, faces: Faces, half: tuple[float, float]) -> tuple[Floats, Faces]:
     """What of a surface lies within |x| and |y| ≤ `half`, m: the rest shows beside a part on it."""
     inside = (np.abs(vertices[faces][..., :2]) <= half).all(axis=(1, 2))
     used, again = np.unique(faces[inside], return_inverse=True)
@@ -46,13 +48,16 @@ def middle_of(
 
 
 def job_with_part(
-    folder: Path, name: str, changed: Callable[[Floats], Floats] = lambda corners: corners, *,
-    verify: str = "none", half: tuple[float, float] = (1.0, 1.0), flat: bool = False, also: str = "corrections = 0",
+    folder: Path, name: str, changed: Callable[[Floats], Floats] = lambda corners: corners, *, verify: str = "none",
+    half: tuple[float, float] = ALL, flat: bool = False, also: str = "corrections = 0",
 ) -> Path:  # fmt: skip
-    """A shipped job in `folder`, with a mesh of its part beside it: what `load_job` reads. `also` is of its [place]."""
+    """A shipped job in `folder`, with a mesh of its part beside it: what `load_job` reads. `also` is of its [place].
+
+    Raises `ConfigError` for a name that does not ship.
+    """
     job, mesh = load_job(name)
     assert np.allclose(job.place.surface_from_part.se3().homogeneous, np.eye(4))
-    surface = middle_of(*read_mesh(mesh, job.surface.mesh_unit), half)
+    surface = within(*read_mesh(mesh, job.surface.mesh_unit), half)
     body(*surface, changed, flat=flat).export(folder / f"{name}-part.ply")
     (folder / f"{name}.ply").write_bytes(mesh.read_bytes())
     text = job_path(name).read_text(encoding="utf-8")
