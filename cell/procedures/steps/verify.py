@@ -134,14 +134,14 @@ class PlacedPart:
     def likely(self) -> str:
         """What has most likely happened to a part that does not lie in its place.
 
-        A part that slipped comes to lie on slopes and edges, so it is raised as well: what is to the side, or a tilt,
-        beyond what was stated says more.
+        A part that slipped comes to lie on slopes and edges, so it is tilted and raised as well; one that stands on
+        something at an edge is raised as well. So the first of them that is clear counts.
         """
         x, y, z, about_x, about_y, about_z = np.abs(self._times)
-        slipped, tilted = max(x, y, about_z), max(about_x, about_y)
-        if max(slipped, tilted) < CLEARLY < z:
-            return LIKELY["raised" if self._times[2] > 0.0 else "deep"]
-        return LIKELY["shifted" if slipped > tilted else "tilted"]
+        times = {"shifted": max(x, y, about_z), "tilted": max(about_x, about_y)}
+        times["raised" if self._times[2] > 0.0 else "deep"] = z
+        clear = (name for name, size in times.items() if size > CLEARLY)
+        return LIKELY[next(clear, max(times, key=lambda name: times[name]))]
 
     def measured(self, place: PlaceSection) -> tuple[Measured, Measured]:
         """What it is judged by, beside the place's tolerances."""
