@@ -16,12 +16,13 @@ import trimesh
 from cell import Cell
 from cell.config.calibrations.store import save_calibration
 from cell.config.job import load_job
+from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, from_parts, transform
 from cell.measure.inversion import NominalSurface
 from cell.procedures.steps.kinds import PLACE, VERIFIED, kind_of
 from cell.procedures.steps.verify import CLOUD, LIKELY, PlacedPart
 from cell.run.report.page.make import make_page
-from drivers.errors import MisplacedError
+from drivers.errors import DeviceFault, MisplacedError
 from lab.bench.job.part_effects import motion, opened
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord, run_whole_job
@@ -147,6 +148,15 @@ def test_a_part_farther_off_than_was_stated_is_noted_though_it_keeps_its_toleran
     assert any(f"most likely {LIKELY['raised']}" in note for note in raised.notes)
     usual.looked(moved(0.05e-3))
     assert not any("most likely" in note for note in usual.notes)
+
+
+def test_steps_that_the_rail_lost_over_the_placed_part_are_found(placed_pot: JobRecord, tmp_path: Path) -> None:
+    def lost(cell: VirtualCell) -> None:
+        cell.devices.rail.home().wait(60.0)
+        cell.fault("rail.lost_steps")
+
+    with pytest.raises(DeviceFault, match="lost steps"):
+        LyingPart(placed_pot, tmp_path, changed=lost).looked(moved())
 
 
 def test_a_job_looks_at_its_part_where_it_names_one_and_does_not_say_no(tmp_path: Path) -> None:
