@@ -97,6 +97,14 @@ def through(arms: Vector, covariance: Vector) -> Vector:
     return np.asarray(jacobians @ covariance @ jacobians.transpose(0, 2, 1), dtype=np.float64)
 
 
+def draws_of(covariance: Vector) -> Vector:
+    """Motions (2000, 6) drawn with a pose's covariance (6, 6), always the same ones."""
+    values, ways = np.linalg.eigh(covariance)
+    return np.asarray(
+        np.random.default_rng(0).standard_normal((DRAWS, 6)) @ (ways * np.sqrt(np.maximum(values, 0.0))).T
+    )
+
+
 def draws(covariances: Vector) -> Vector:
     """Errors (2000, n, 3) drawn with covariances (n, 3, 3), always the same ones."""
     values, vectors = np.linalg.eigh(covariances)

@@ -128,8 +128,14 @@ def _part(record: JournalRecord) -> object:
 def _require_held(folder: Path, record: JournalRecord) -> None:
     """`ConfigError` when the part is not in the claw any more, or may not be."""
     match _part(record):
-        case PartState.HELD.value:
+        case PartState.HELD.value if not any("part" in event.data for event in record.events):
             return
+        case PartState.HELD.value:
+            raise ConfigError(
+                f"run {folder.name} had put its part down and gripped it again to correct it: how the claw holds it is "
+                "not known, and the run is not resumed. Take the part out by hand, fold the arm with `cell home`, then "
+                "run the job with a part in the claw"
+            )
         case PartState.RELEASED.value:
             step = next(event.step for event in reversed(record.events) if "part" in event.data)
             failed = "what came after that" if step in record.done else "only the retreat"
@@ -140,7 +146,7 @@ def _require_held(folder: Path, record: JournalRecord) -> None:
         case state:
             how = f"tells of its part {str(state)[:40]!r}, which is neither held nor released"
             if state == PartState.UNKNOWN.value:
-                how = "ended while the claw was releasing its part"
+                how = "ended while the claw was releasing or gripping its part"
             raise ConfigError(
                 f"run {folder.name} {how}: whether the claw still has it is not known, and the run is not resumed. "
                 "Look what has become of the part, fold the arm with `cell home`, then run the job with a part in the "

@@ -39,8 +39,6 @@ class LyingPart:
     verify: str = "all"
     flat: bool = False
     also: str = "corrections = 0"
-    attempt: int = 1
-    state: PartState = PartState.RELEASED
     changed: Callable[[VirtualCell], None] = lambda cell: None
     cell: VirtualCell = field(init=False)
     notes: list[str] = field(default_factory=list, init=False)
@@ -55,15 +53,15 @@ class LyingPart:
         at_station(cell, self.record)
         cell.devices.vehicle.brake()
         work = work_of(cell, job, nominal, self.record, frames=NoFrames(), folder=self.folder)
+        self.changed(cell)
         cell.devices.claw.bare.release()
         scene, now = cell.world.scene, cell.clock.now()
         cell.world.part._world_from_part = scene.world_from_surface @ off.homogeneous
-        self.changed(cell)
-        work.part.state = self.state
+        work.part.state = PartState.RELEASED
         work.part.where = from_matrix(inverse(cell.world.world_from_base(now)) @ scene.world_from_surface) * off
         work.mover.leave_part(work.part.where)
         context = StepContext(
-            VERIFIED.policy().of("verify"), self.attempt, math.inf, dict(self.record.results), clock=cell.clock,
+            VERIFIED.policy().of("verify"), 1, math.inf, dict(self.record.results), clock=cell.clock,
             tell=lambda event: self._told(event.data),
         )  # fmt: skip
         found = VERIFIED.work(work)["verify"](context)
@@ -75,6 +73,10 @@ class LyingPart:
             self.parts.append(str(data["part"]))
         if "text" in data:
             self.notes.append(str(data["text"]))
+
+    def stands(self) -> set[str]:
+        """What stands about, as the interlocks know it."""
+        return {body.name for body in self.cell.devices.interlocks.situation.station}
 
     def lies(self) -> pin.SE3:
         """surface_from_part, as it is in the world."""

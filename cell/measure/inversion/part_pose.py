@@ -13,9 +13,10 @@ import pinocchio as pin
 
 from cell.measure.geometry.poses import composition_jacobians
 from cell.measure.inversion.demands import Demands
+from cell.measure.inversion.effects.during_sweep import find_rocking, rocking_motions
 from cell.measure.inversion.nominal import Array, Indices, NominalSurface, Scan
 from cell.measure.inversion.observability import Tolerance, determined, judge
-from cell.measure.inversion.place_pose import PlacePose, invert_pose, shared_by_patches
+from cell.measure.inversion.place_pose import PlacePose, balance, invert_pose, shared_by_patches
 from cell.measure.inversion.registration import Prior, register
 from cell.measure.reconstruction.cloud import Cloud, Motions
 from drivers.errors import ConfigError, RefusedError
@@ -79,40 +80,88 @@ def of_part(words: str) -> str:
 
 def find_part(
     cloud: Cloud, faces: NominalSurface, nominal: NominalSurface, surface: Prior, belongs: pin.SE3,
-    tolerance: Tolerance, moved: Motions,
+    tolerance: Tolerance, moved: Motions, *, times: Array, base_from_vehicle: pin.SE3,
 ) -> PartPose:  # fmt: skip
     """Where the part with these `faces`, which `belongs` at surface_from_part, lies in a sweep's cloud, arm base.
 
     `surface` is where the earlier sweep found the surface, with its covariance. `moved` says how one standard deviation
-    of each independent parameter of this sweep displaces its points. Raises `RefusedError` where the part is not found.
+    of each independent parameter of this sweep displaces its points; `times` (lines,) s is when its lines were taken: a
+    vehicle that rocks is seen in them. Raises `RefusedError` where the part is not found.
     """
     on_part, around = _parted(cloud, faces, surface.base_from_surface * belongs)
-    there, unsure, follows = surface.base_from_surface, surface.covariance, np.zeros((6, 0))
-    beside = 0
-    if around.size >= LEAST_BESIDE:
-        try:
-            there, unsure, follows, beside = _surface_beside(around, nominal, surface, moved)
-        except RefusedError:
-            # A table, or whatever else lies there.
-            beside = 0
 
-    def against_surface(lines: Indices, rows: Indices) -> Array:
+    def found(rocked: Motions | None) -> PartPose:
+        beside = _surface_beside(around, nominal, surface, moved, rocked)
+        return _against(beside, on_part, faces, belongs, tolerance=tolerance, moved=moved, rocked=rocked)
+
+    still = found(None)
+    rocking = find_rocking(on_part, faces, still.fit.base_from_surface, times)
+    if rocking is None:
+        return still
+    return found(
+        lambda lines, rows: rocking_motions(
+            cloud, lines, rows, base_from_vehicle=base_from_vehicle, times=times, hz=rocking.hz
+        )
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _SurfaceSeen:
+    """Where the surface lies by what shows of it beside the part: `base_from_surface`, its own covariance `unsure`
+    (6, 6), base axes, how it `follows` each parameter (6, m), and the number of its `points`."""
+
+    base_from_surface: pin.SE3
+    unsure: Array
+    follows: Array
+    points: int
+
+
+def _surface_beside(
+    around: Cloud, nominal: NominalSurface, surface: Prior, moved: Motions, rocked: Motions | None
+) -> _SurfaceSeen:
+    """From the points `around` the part; where too few of these are of the surface, as the earlier sweep has it."""
+    known = _SurfaceSeen(surface.base_from_surface, surface.covariance, np.zeros((6, 0)), 0)
+    if around.size < LEAST_BESIDE:
+        return known
+    try:
+        found = register(Scan.of(around, MOST_POINTS), nominal, surface)
+    except RefusedError:
+        # A table, or whatever else lies there.
+        return known
+    if len(found.used) < LEAST_BESIDE or not found.share >= DEMANDS.share:
+        return known
+    lines, rows = around.subsample(MOST_POINTS)
+    if rocked is not None:
+        found = balance(found, Scan.of(around, MOST_POINTS), rocked(lines[found.used], rows[found.used]), surface)
+    along = np.einsum("ni,nim->nm", found.normals, moved(lines[found.used], rows[found.used]))
+    _, patches = shared_by_patches(found)
+    return _SurfaceSeen(found.base_from_surface, found.covariance + patches, found.follow @ along, len(found.used))
+
+
+def _against(
+    beside: _SurfaceSeen, on_part: Cloud, faces: NominalSurface, belongs: pin.SE3, *, tolerance: Tolerance, moved: Motions,
+    rocked: Motions | None,
+) -> PartPose:  # fmt: skip
+    """The part in its points, against the surface."""
+    there = beside.base_from_surface
+
+    def differently(lines: Indices, rows: Indices) -> Array:
         """How the points move beside the surface, which follows what moves them."""
         own = moved(lines, rows)
-        if not beside:
+        if not beside.points:
             return own
-        arms = cloud.points[lines, rows] - there.translation
-        with_it = follows[:3] + np.cross(follows[3:].T[None], arms[:, None]).transpose(0, 2, 1)
+        arms = on_part.points[lines, rows] - there.translation
+        with_it = beside.follows[:3] + np.cross(beside.follows[3:].T[None], arms[:, None]).transpose(0, 2, 1)
         return np.asarray(own - with_it)
 
-    expected = there * belongs
     carried = composition_jacobians(there, belongs)[0]
     fit = invert_pose(
-        on_part, faces, Prior(expected, np.diag(SHIFTED**2)), tolerance, systematic=carried @ unsure @ carried.T,
-        calibration=against_surface, demands=DEMANDS, most_points=MOST_POINTS, partly=True,
+        on_part, faces, Prior(there * belongs, np.diag(SHIFTED**2)), tolerance,
+        systematic=carried @ beside.unsure @ carried.T, calibration=differently, sweeps=rocked, demands=DEMANDS,
+        most_points=MOST_POINTS, partly=True,
     )  # fmt: skip
     turn = np.kron(np.eye(2), there.rotation.T)
-    return PartPose(there.inverse() * fit.base_from_surface, turn @ fit.covariance @ turn.T, fit, beside)
+    return PartPose(there.inverse() * fit.base_from_surface, turn @ fit.covariance @ turn.T, fit, beside.points)
 
 
 def _parted(cloud: Cloud, faces: NominalSurface, base_from_part: pin.SE3) -> tuple[Cloud, Cloud]:
@@ -127,17 +176,3 @@ def _parted(cloud: Cloud, faces: NominalSurface, base_from_part: pin.SE3) -> tup
 
 def _only(cloud: Cloud, kept: Array) -> Cloud:
     return replace(cloud, points=np.where(kept[..., None], cloud.points, np.nan))
-
-
-def _surface_beside(
-    around: Cloud, nominal: NominalSurface, surface: Prior, moved: Motions
-) -> tuple[pin.SE3, Array, Array, int]:
-    """Where the surface lies by what shows of it, base_from_surface, its own covariance (6, 6), how it follows each
-    parameter (6, m), and of how many points."""
-    found = register(Scan.of(around, MOST_POINTS), nominal, surface)
-    if len(found.used) < LEAST_BESIDE:
-        raise RefusedError(f"{len(found.used)} points of the surface beside the part, at least {LEAST_BESIDE}")
-    lines, rows = around.subsample(MOST_POINTS)
-    along = np.einsum("ni,nim->nm", found.normals, moved(lines[found.used], rows[found.used]))
-    _, patches = shared_by_patches(found)
-    return found.base_from_surface, found.covariance + patches, found.follow @ along, len(found.used)

@@ -91,6 +91,7 @@ class Mover:
         self._tool_speed = config.arm.max_tool_speed
         self._obstacles = vehicle_obstacles(config.obstacle)
         self._station: list[Body] = []
+        self._met: list[Body] = []
         self.kinematics = arm_kinematics(config.arm.model, arm.link_table(), _joint_limits(config.arm))
         grasp = None if job is None else job.grasp
         self._interlocks = interlocks
@@ -131,7 +132,12 @@ class Mover:
 
     def meet_part(self) -> None:
         """From now on the part that was put down may be met: the empty claw goes to take it."""
+        self._met = [body for body in self._station if body.name == PLACED]
         self._stand_before([body for body in self._station if body.name != PLACED])
+
+    def spare_part(self) -> None:
+        """From now on that part is not to be met again: it was not taken."""
+        self._stand_before([*self._station, *self._met])
 
     def take_part(self, flange_from_part: pin.SE3, size: Sequence[float]) -> None:
         """From now on the claw holds a part of this size, m, there."""

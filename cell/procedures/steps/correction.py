@@ -15,7 +15,7 @@ from cell.motion.collision import TOUCHES
 from cell.procedures.arm.moves import PartProgress, PartState
 from cell.procedures.arm.touch import expected_touch
 from cell.procedures.part_error import draws, part_points, through
-from cell.procedures.steps.place import PlaceResult, Placing
+from cell.procedures.steps.place import FAST_FORCE, PlaceResult, Placing
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import Workplace
 from drivers.errors import RefusedError
@@ -63,7 +63,6 @@ def correct(
         # As little comes of the arm.
         slip = pin.SE3.Identity()
     job = held_so(here.job, held * slip, seen)
-    _take(here, job, placed.base_from_flange, context)
     expected = expected_touch(job, here.nominal, pose, here.repeatability)
     part = here.part_mesh
     assert part is not None
@@ -71,7 +70,9 @@ def correct(
     # Aimed beside its place, it touches slopes of the surface higher up.
     gap = scanned_gap(cloud, pose.base_from_surface, here.nominal, belongs * slip.inverse(), part)
     if gap is not None:
+        gap.require(here.job.place.tolerance)
         expected = replace(expected, height=expected.height + gap.lift)
+    _take(here, job, placed.base_from_flange, context)
     placing = Placing(
         job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
         part=here.part, check=context.check, progress=lambda share, text: context.progress(0.5, f"again: {text}"),
@@ -105,15 +106,20 @@ def _take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext) -> Non
     normal = job.grasp.flange_from_part.se3().rotation[:, 2]
     above = grip * from_parts(plan.approach * normal)
     context.progress(0.5, "gripping the part again")
+    context.check()
     mover.follow(mover.plan_to(above, "above the placed part"))
     mover.meet_part()
+    part.left = False
     here.devices.arm.zero_force()
-    if mover.line(grip, plan.speed, TOUCHES, force_limit=plan.contact_force):
+    if not _reached(here, grip, normal):
         mover.line(above, plan.speed, TOUCHES)
+        mover.spare_part()
+        part.left = True
         raise RefusedError(
             "the claw touched something as it went to grip the placed part again; it went back up, the part lies where "
             "it was put down. Look what stands there"
         )
+    context.check()
     part.state = PartState.UNKNOWN
     _note(context, part, to_ur(part.where).tolist())
     here.devices.claw.grip()
@@ -121,6 +127,18 @@ def _take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext) -> Non
     _note(context, part, None)
     mover.take_part(job.grasp.flange_from_part.se3(), job.grasp.size)
     mover.line(above, plan.speed, TOUCHES)
+
+
+def _reached(here: Workplace, grip: pin.SE3, normal: Vector) -> bool:
+    """Whether the open claw came down to `grip` along `normal`, (3,) on the flange, without touching anything."""
+    plan, mover = here.job.place, here.mover
+    slow = grip * from_parts(plan.contact_travel * normal)
+    if mover.line(slow, plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force):
+        return False
+    # What presses already would be taken as zero.
+    if not np.linalg.norm(here.devices.arm.state().wrench[:3]) <= plan.contact_force:
+        return False
+    return not mover.line(grip, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
 
 
 def _note(context: StepContext, part: PartProgress, where: list[float] | None) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.config.job import Job, PlaceSection
-from cell.measure.geometry.poses import from_parts, transform
+from cell.measure.geometry.poses import difference, from_parts, perturbed, transform
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion.mating import MatingGap, scanned_gap
 from cell.measure.inversion.part_pose import PartPose, find_part, of_part, seen_from_above
@@ -17,7 +17,7 @@ from cell.measure.reconstruction import Cloud, write_cloud
 from cell.measure.reconstruction.cloud import Indices
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import PartState
-from cell.procedures.part_error import draws, part_covariance, part_points, through
+from cell.procedures.part_error import draws_of, part_covariance, part_points
 from cell.procedures.steps.correction import along_surface, correct, hoped
 from cell.procedures.steps.laser_sweep import head_at, laser_sweep
 from cell.procedures.steps.place import PlaceResult
@@ -27,11 +27,14 @@ from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import Measured, MisplacedError, RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext
-from statemachine.step import Step
+from statemachine.step import OnFailure, Step
 
 CLOUD = "placed.ply"
+UNCLEAR = "nothing moved it: it is farther off than a place is known to, or not seen well enough"
 CLEARLY = 3.0
 """Standard deviations of the stated place beyond which a part has not come to lie so by chance."""
+FARTHEST_M = 2e-3
+"""A part that lies farther aside is not gripped: the fingers may not find it as it lies."""
 WORTH = 0.75
 """A part is corrected where it lies so many times as far off as it would after it, on average: every second part then
 comes to lie nearer, as what is configured of the arm is what it keeps to and a little more."""
@@ -77,7 +80,8 @@ class PlacedPart:
     def _errors(self) -> Vector:
         """What the points' places may be off by, (2000, 45, 3) m."""
         arms = transform(self.seen.surface_from_part, self.points) - self.seen.surface_from_part.translation
-        return draws(through(arms, self.covariance))
+        drawn = draws_of(self.covariance)
+        return np.asarray(drawn[:, None, :3] + np.cross(drawn[:, None, 3:], arms))
 
     @property
     def off(self) -> float:
@@ -108,7 +112,7 @@ class PlacedPart:
     @property
     def turn_bound(self) -> float:
         """By how much the part is turned at most, rad, at 95 %."""
-        turned = self.turn + draws(self.covariance[None, 3:, 3:])[:, 0]
+        turned = self.turn + draws_of(self.covariance)[:, 3:]
         return float(np.percentile(np.linalg.norm(turned, axis=-1), 95))
 
     @property
@@ -141,7 +145,7 @@ class PlacedPart:
         times = {"shifted": max(x, y, about_z), "tilted": max(about_x, about_y)}
         times["raised" if self._times[2] > 0.0 else "deep"] = z
         clear = (name for name, size in times.items() if size > CLEARLY)
-        return LIKELY[next(clear, max(times, key=lambda name: times[name]))]
+        return next((LIKELY[name] for name in clear), UNCLEAR)
 
     def measured(self, place: PlaceSection) -> tuple[Measured, Measured]:
         """What it is judged by, beside the place's tolerances."""
@@ -154,17 +158,16 @@ class PlacedPart:
         """Whether it is known to lie within the place's tolerances."""
         return all(number.kept for number in self.measured(place))
 
-    def require(self, place: PlaceSection) -> None:
-        """Raise `MisplacedError` where the part is not known to lie within the place's tolerances."""
-        if self.kept(place):
-            return
+    def misplaced(self, place: PlaceSection, more: str = "") -> MisplacedError:
+        """The error of a part that is not known to lie within the place's tolerances."""
         off, turned = self.measured(place)
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
-        raise MisplacedError(
+        return MisplacedError(
             f"the placed part lies {self.words}, by ({shift}) mm and ({turn}) mrad in the surface's axes. Allowed are "
-            f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad, held by {off.value:.2f} mm and "
-            f"{turned.value:.1f} mrad at 95 %. Most likely {self.likely}{self.doubtful}. {NEXT_STEP}",
+            f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad; at 95 % it may be "
+            f"{off.value:.2f} mm and {turned.value:.1f} mrad. Most likely {self.likely}{self.doubtful}. "
+            f"{more}{more and '. '}{NEXT_STEP}",
             off, turned,
         ).showing(seen={"placed": self})  # fmt: skip
 
@@ -197,16 +200,19 @@ class PlacedPart:
 def _at(here: Workplace, context: StepContext) -> PlacedPart:
     placed = context.made(PlaceResult)
     pose, plan = placed.pose or context.made(PlacePose), here.job.place
-    if here.part.state is PartState.HELD:
-        raise RefusedError("the part is in the claw again: it was gripped to be corrected, and is not placed by itself")
     found, slip = _looked(here, pose, context), pin.SE3.Identity()
-    # Done again after a fault, it only looks: where the claw let go last is not known then.
-    for _ in range(plan.corrections if context.attempt == 1 else 0):
+    for _ in range(plan.corrections):
         if not _worth_correcting(here, pose, found, context):
             break
         context.note(text=f"the placed part lies {found.words}: it is gripped and placed again")
         held = placed.base_from_flange.inverse() * pose.base_from_surface * found.seen.surface_from_part
-        placed = correct(here, placed, pose, held=held, slip=slip, seen=found.covariance, context=context)
+        try:
+            placed = correct(here, placed, pose, held=held, slip=slip, seen=found.covariance, context=context)
+        except RefusedError as error:
+            if here.part.state is not PartState.RELEASED:
+                raise
+            here.mover.to_joints(HOME)
+            raise found.misplaced(plan, f"It was not corrected: {error}") from error
         for note in placed.notes:
             context.note(text=note)
         found = replace(_looked(here, pose, context), before=(*found.before, found.off))
@@ -215,7 +221,8 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
         slip = along_surface(let_go.inverse() * pose.base_from_surface * found.seen.surface_from_part)
     for note in found.notes:
         context.note(text=note)
-    found.require(plan)
+    if not found.kept(plan):
+        raise found.misplaced(plan)
     return found
 
 
@@ -225,11 +232,11 @@ def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, conte
     if found.off <= (plan.tolerance if plan.accept is None else plan.accept) and found.kept(plan):
         return False
     hope = hoped(here, pose, found.points, found.covariance)
-    if found.aside > WORTH * hope:
+    if WORTH * hope < found.aside < FARTHEST_M:
         return True
     context.note(
         text=f"no correction of the placed part, {found.words}: to the side it is {1e3 * found.aside:.2f} mm off, and "
-        f"would be {1e3 * hope:.2f} mm"
+        f"would be {1e3 * hope:.2f} mm (farthest: {1e3 * FARTHEST_M:g} mm)"
     )
     return False
 
@@ -241,12 +248,18 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         raise RefusedError("the job has no mesh of its part ([part]): nothing tells what the placed part looks like")
     place, belongs = here.job.place, here.job.place.surface_from_part.se3()
     faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
-    cloud, record = _swept(here, sweep, pose, faces, context)
-    context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
-    looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
-    here.mover.to_joints(HOME)
-    if looking is not None:
-        looking.wait(30.0)
+    while True:
+        held = context.held_s
+        cloud, record = _swept(here, sweep, pose, faces, context)
+        context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
+        looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
+        here.mover.to_joints(HOME)
+        if looking is not None:
+            looking.wait(30.0)
+        context.safe_point()
+        # Whoever has the run held may reach in, and move the part.
+        if context.held_s == held:
+            break
     by_calibration, by_poses = displacements(here, record, cloud)
 
     def moved(lines: Indices, rows: Indices) -> Vector:
@@ -255,7 +268,8 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     try:
         seen = find_part(
             cloud, faces, here.nominal, surface=Prior(pose.base_from_surface, pose.covariance), belongs=belongs,
-            tolerance=tolerance, moved=moved,
+            tolerance=tolerance, moved=moved, times=record.times,
+            base_from_vehicle=here.config.arm.vehicle_from_base.se3().inverse(),
         )  # fmt: skip
     except RefusedError as error:
         why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")
@@ -307,10 +321,16 @@ def judged(job: Job, seen: PartPose, points: Vector, stated: Vector) -> PlacedPa
     instead = np.einsum("in,ij,jn->n", ways, stated / np.outer(unit, unit), ways)
     kept = (ways * np.where(weak, instead, values)) @ ways.T * np.outer(unit, unit)
     belongs = job.place.surface_from_part.se3()
-    return PlacedPart(seen, belongs, points, covariance=kept, stated=stated, unseen=unseen)
+    # Along what is not seen the part is taken to lie where it belongs: what the fit has there is noise.
+    off = ways.T @ (difference(seen.surface_from_part, belongs) / unit)
+    there = perturbed(belongs, unit * (ways @ np.where(weak, 0.0, off)))
+    return PlacedPart(
+        replace(seen, surface_from_part=there), belongs, points, covariance=kept, stated=stated, unseen=unseen
+    )
 
 
+# What was interrupted with the part between the fingers is left to a person. A correction takes up to 300 s.
 STEP = JobStep(
-    Step("verify", 600.0, 1, ("DeadlineError",)), _at, PlacedPart,
+    Step("verify", 1800.0, on_failure=OnFailure.STOP), _at, PlacedPart,
     needs=(SweepRecord, Reconstruction, PlacePose, PlaceResult),
 )  # fmt: skip

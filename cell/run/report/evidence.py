@@ -69,7 +69,7 @@ def seen_words(result: RunResult) -> str:
     """Why a run of a job that names its part's mesh has placed it."""
     if (seen := seen_placed(result)) is not None:
         return f"in place: {seen.words}"
-    return f'{result.reason}; nobody looked at the placed part, place.verify = "none"'
+    return f"{result.reason}; nobody looked at the placed part (place.verify)"
 
 
 def last_frames(result: RunResult, frames: FrameStore) -> list[str]:

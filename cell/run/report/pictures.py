@@ -202,7 +202,8 @@ def draw_error(
     axes.invert_yaxis()
     axes.set_xlim(0, 1.15 * max([tolerance_mm, *(value for _, _, values in rows for value in values)]))
     axes.set_xlabel("mm, axes of the surface; D: length of all three")
-    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=2)
+    small = {"fontsize": 8} if seen is None else {"fontsize": 7, "labelspacing": 0.2}
+    axes.legend(**small, loc="upper center", bbox_to_anchor=(0.5, -0.11), ncols=2)
 
 
 def draw_reason(axes: Axes, report: Report, step: str | None) -> None:

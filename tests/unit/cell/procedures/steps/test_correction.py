@@ -10,11 +10,13 @@ import pinocchio as pin
 import pytest
 
 from cell.devices.simulated.direct import VirtualCell
-from cell.procedures.arm.moves import PartState
+from cell.motion.collision import PLACED
 from cell.procedures.steps.correction import along_surface, held_so
+from cell.procedures.steps.kinds import VERIFIED
 from drivers.errors import MisplacedError, RefusedError
 from lab.bench.job.part_effects import motion, opened
 from lab.bench.job.whole_job import JobRecord
+from statemachine.step import OnFailure
 from tests.support.lying_part import LyingPart, moved
 from tests.support.report_runs import pot
 
@@ -81,18 +83,21 @@ def test_what_is_in_the_way_to_the_part_ends_the_run_with_the_part_where_it_lay(
     with pytest.raises(RefusedError, match="the claw touched something as it went to grip the placed part"):
         site.looked(off)
     assert site.parts == []
+    assert PLACED in site.stands(), "whoever moves next keeps clear of it"
     assert np.allclose(site.lies().homogeneous, off.homogeneous, atol=1e-9)
 
 
-def test_after_a_fault_nothing_is_gripped_and_a_part_in_the_claw_is_not_placed(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
-    again = LyingPart(placed_pot, tmp_path, also="corrections = 1", attempt=2)
+def test_what_is_interrupted_is_left_to_a_person() -> None:
+    """The part may be between the fingers then."""
+    step = VERIFIED.policy().of("verify")
+    assert (step.max_retries, step.retry_on, step.on_failure) == (0, (), OnFailure.STOP)
+
+
+def test_a_part_that_lies_too_far_aside_is_not_gripped(placed_pot: JobRecord, tmp_path: Path) -> None:
+    site = LyingPart(placed_pot, tmp_path, also="corrections = 1")
     with pytest.raises(MisplacedError):
-        again.looked(moved(y=0.8e-3, z=0.35e-3))
-    assert again.parts == []
-    with pytest.raises(RefusedError, match="the part is in the claw again"):
-        LyingPart(placed_pot, tmp_path, state=PartState.HELD).looked(moved())
+        site.looked(moved(3e-3, z=1e-3))
+    assert site.parts == [] and any("farthest: 2 mm" in note for note in site.notes)
 
 
 def test_the_grasp_that_was_seen_takes_the_place_of_the_stated_one() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,20 @@ def fitted(points: np.ndarray, mesh: trimesh.Trimesh) -> pin.SE3:
         found = scipy.optimize.least_squares(left, np.zeros(6), loss="soft_l1", f_scale=0.02e-3, x_scale=1e-4)
         start = start * from_parts(found.x[:3], pin.exp3(found.x[3:]))
     return start
+
+
+def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    def rocks(cell: VirtualCell) -> None:
+        scene = cell.world.scene
+        rocking = replace(scene.workshop, rocking=np.array([4e-5, 8e-5]), rocking_hz=3.9, rocking_phase=np.zeros(2))
+        cell.world.remake(replace(scene, workshop=rocking), cell.world.station)
+
+    found = LyingPart(placed_pot, tmp_path, changed=rocks).looked(moved(0.1e-3, z=0.05e-3))
+    error = difference(found.seen.surface_from_part, moved(0.1e-3, z=0.05e-3))
+    assert np.linalg.norm(error[:3]) < 0.03e-3 and np.abs(error[3:]).max() < 0.3e-3
+    assert error @ np.linalg.solve(found.covariance, error) < 22.5
 
 
 def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lies(
