@@ -139,8 +139,8 @@ def _surface_beside(
 
 
 def _against(
-    beside: _SurfaceSeen, on_part: Cloud, faces: NominalSurface, belongs: pin.SE3, *, tolerance: Tolerance, moved: Motions,
-    rocked: Motions | None,
+    beside: _SurfaceSeen, on_part: Cloud, faces: NominalSurface, belongs: pin.SE3, *, tolerance: Tolerance,
+    moved: Motions, rocked: Motions | None,
 ) -> PartPose:  # fmt: skip
     """The part in its points, against the surface."""
     there = beside.base_from_surface
