@@ -171,6 +171,11 @@ class PlaceSection(Table):
                 f"approach {1e3 * self.approach:g} mm is not above contact_travel {1e3 * self.contact_travel:g} mm, "
                 "where contact is looked for; raise approach"
             )
+        if self.accept is not None and self.accept > self.tolerance:
+            raise ValueError(
+                f"accept {1e3 * self.accept:g} mm is more than tolerance {1e3 * self.tolerance:g} mm; a part is corrected to "
+                "lie nearer than that"
+            )
         if self.contact_speed > self.speed:
             raise ValueError(
                 f"contact_speed {1e3 * self.contact_speed:g} mm/s exceeds speed {1e3 * self.speed:g} mm/s; the part is "

@@ -23,7 +23,7 @@ from cell.measure.inversion import NominalSurface
 from cell.procedures.steps.kinds import PLACE, VERIFIED, kind_of
 from cell.procedures.steps.verify import CLOUD, LIKELY, PlacedPart
 from cell.run.report.page.make import make_page
-from drivers.errors import DeviceFault, MisplacedError
+from drivers.errors import ConfigError, DeviceFault, MisplacedError
 from lab.bench.job.part_effects import motion, opened
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord, run_whole_job
@@ -181,6 +181,11 @@ def test_a_job_looks_at_its_part_where_it_names_one_and_does_not_say_no(tmp_path
         job, _ = load_job(job_with_part(tmp_path, "pot", verify=verify))
         assert kind_of(job) is kind
     assert VERIFIED.names == (*PLACE.names, "verify") and VERIFIED.name == PLACE.name
+
+
+def test_what_is_accepted_is_no_farther_off_than_is_allowed(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"accept 0\.7 mm is more than tolerance 0\.6 mm"):
+        load_job(job_with_part(tmp_path, "pot", verify="all", also='accept = "0.7 mm"'))
 
 
 def test_a_run_tells_how_its_part_lies_in_report_page_and_picture(
