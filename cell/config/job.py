@@ -173,8 +173,7 @@ class PlaceSection(Table):
             )
         if self.accept is not None and self.accept > self.tolerance:
             raise ValueError(
-                f"accept {1e3 * self.accept:g} mm is more than tolerance {1e3 * self.tolerance:g} mm; a part is corrected to "
-                "lie nearer than that"
+                f"accept {1e3 * self.accept:g} mm is more than tolerance {1e3 * self.tolerance:g} mm; lower accept"
             )
         if self.contact_speed > self.speed:
             raise ValueError(
