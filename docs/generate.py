@@ -383,7 +383,7 @@ def sequence_page() -> str:
 
 
 def diagram() -> str:
-    """The sequence of a job that looks at what it placed, for Mermaid; what all steps or all states share is one arrow."""
+    """The sequence of a job that looks at its placed part, for Mermaid; what all steps or states share is one arrow."""
     sequence = VERIFIED.sequence()
     steps, states = set(sequence.steps), {str(row.source) for row in sequence.table}
     inside: dict[str, None] = {}
