@@ -93,11 +93,12 @@ def test_what_a_run_waits_for_is_read_from_its_journal(tmp_path: Path) -> None:
 def test_of_two_that_go_on_one_has_to_be_named(tmp_path: Path) -> None:
     root = tmp_path / "runs"
     two = [new_run(root), new_run(root)]
-    for folder in two:
-        Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()})
+    # Held, or they are closed as soon as they are collected.
+    journals = [Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()}) for folder in two]
     with pytest.raises(ConfigError, match="more than one is going on"):
         find_going(root, None)
     assert find_going(root, two[0].name) == two[0]
+    assert len(journals) == 2
 
 
 def test_a_time_of_maintenance_takes_no_requests_and_keeps_no_run_from_being_asked(tmp_path: Path) -> None:
