@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from cell.measure.inversion.place_pose import PlacePose
     from cell.procedures.arm.photograph import BoardFix
+    from cell.procedures.placed_part import PlacedPart
     from cell.procedures.steps.drive_to_target import VehicleArrival
     from cell.procedures.steps.kinds import PLACE, Kind
     from cell.procedures.steps.place import PlaceResult
     from cell.procedures.steps.reconstruct import Reconstruction
-    from cell.procedures.steps.verify import PlacedPart
     from cell.procedures.steps.workplace import JobStep
     from cell.procedures.sweep.stored_sweep import SweepRecord
     from cell.run.events import (
@@ -87,7 +87,7 @@ _PLACES = {
     "cell.procedures.steps.reconstruct": ("Reconstruction",),
     "cell.measure.inversion.place_pose": ("PlacePose",),
     "cell.procedures.steps.place": ("PlaceResult",),
-    "cell.procedures.steps.verify": ("PlacedPart",),
+    "cell.procedures.placed_part": ("PlacedPart",),
     "cell.procedures.steps.drive_to_target": ("VehicleArrival",),
     "drivers.arm.make": ("ArmOutputClawConfig",),
     "drivers.make": (

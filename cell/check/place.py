@@ -20,6 +20,8 @@ from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import Body, station_bodies, vehicle_bodies
 from cell.procedures.drive.way import MAX_HEADING, Planar, wrap
+from cell.procedures.steps import verify
+from cell.procedures.steps.kinds import kind_of
 from drivers.interfaces import Vector
 from drivers.make import MOST_PAYLOAD
 
@@ -125,8 +127,11 @@ def contact_notes(job: Job, mesh: Path) -> Iterator[str]:
             "the job has no mesh of its part ([part]): whether its underside fits the surface, and how it lies once it "
             "was placed, is not looked at"
         )
-    elif (found := _drawn(job, mesh)) is not None:
+        return
+    if (found := _drawn(job, mesh)) is not None:
         yield f"the part's mating face, as drawn: {found.words}"
+    if verify.STEP.name not in kind_of(job).names:
+        yield "nobody looks how the part lies once it was placed: place.verify says so, or job.kind has no such step"
 
 
 def under_part(job: Job, mesh: Path) -> tuple[float, float]:

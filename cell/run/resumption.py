@@ -14,7 +14,7 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, job_path, load_job
 from cell.procedures.arm.moves import PartState
-from cell.procedures.steps import laser_sweep
+from cell.procedures.steps import laser_sweep, verify
 from cell.procedures.sweep.stored_sweep import FILE, StoredSweep
 from cell.run.folder import list_runs
 from drivers.errors import ConfigError, RefusedError
@@ -138,7 +138,8 @@ def _require_held(folder: Path, record: JournalRecord) -> None:
             )
         case PartState.RELEASED.value:
             step = next(event.step for event in reversed(record.events) if "part" in event.data)
-            failed = "what came after that" if step in record.done else "only the retreat"
+            after = step in record.done or step == verify.STEP.name
+            failed = "what came after that" if after else "only the retreat"
             raise ConfigError(
                 f"run {folder.name} had put its part down already, {failed} failed: there is nothing to resume. Look "
                 "at the part, fold the arm with `cell home`, then run the job with the next part"

@@ -16,8 +16,8 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix, from_parts
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import PartState
+from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps.kinds import VERIFIED
-from cell.procedures.steps.verify import PlacedPart
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord, NoFrames
 from sim_backends.world.drawing import inverse

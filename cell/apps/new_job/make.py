@@ -27,8 +27,9 @@ from cell.check.reach import sweep_problems
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, PartSection, load_job
 from cell.devices.simulated.described import Described
-from cell.measure.inversion import NominalSurface, PlacePose
+from cell.measure.inversion import NominalSurface, PlacePose, Tolerance
 from cell.measure.inversion.nominal import read_mesh
+from cell.measure.inversion.part_pose import seen_from_above, shown_by
 from drivers.common.units import parse_quantity
 from drivers.errors import CellError, ConfigError, NotObservable, RefusedError
 
@@ -63,7 +64,8 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     _require_room(asker, targets if part is None or part.same else (*targets, part.target), overwrite)
     like = template(asker)
     job = station(asker, like, name, targets[1].name, laid)
-    job = job.model_copy(update={"part": None if part is None else part.section})
+    if part is not None:
+        job = _looked_at(asker, job.model_copy(update={"part": part.section}), part)
     step = asker.get("step", "Lines of the scan, how far apart", "0.5 mm", lambda t: parse_quantity(t, "mm", *STEP_MM))
 
     laid, proposal = _proposed(asker, laid, job, config, step=step)
@@ -149,6 +151,17 @@ def _part(asker: Asker, folder: Path, name: str) -> _PartFile | None:
     given = asker.get("part", "The mesh of the part (STL, PLY)", None, lambda text: _readable(text, unit))
     target = folder / f"{name}-part{given.suffix.lower()}"
     return _PartFile(given, target, PartSection.model_validate({"mesh": target.name, "mesh_unit": unit}))
+
+
+def _looked_at(asker: Asker, job: Job, part: _PartFile) -> Job:
+    """The job, which looks at what shows of its part once it was placed; what does not is told."""
+    mesh = NominalSurface.load(part.given, part.section.mesh_unit)
+    tolerance = Tolerance(job.place.tolerance, job.place.tolerance_angle)
+    unseen = shown_by(seen_from_above(mesh, job.place.surface_from_part.se3()), tolerance)
+    if not unseen or job.place.verify != "all":
+        return job
+    asker.tell(f'the part\'s faces do not show {", ".join(unseen)}: verify = "seen", the rest is looked at')
+    return job.model_copy(update={"place": job.place.model_copy(update={"verify": "seen"})})
 
 
 def _readable(text: str, unit: str) -> Path:

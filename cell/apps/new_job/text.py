@@ -51,10 +51,28 @@ def job_text(job: Job, heading: Sequence[str]) -> str:
     lines += ["", *_station_lines(job), "", *_scan_lines(job), "", *_part_lines(job)]
     if job.part is not None:
         about = "  # beside this file, in the part's own frame: its underside is held against the scanned surface"
-        lines += ["", "[part]", f'mesh = "{job.part.mesh}"{about}', f'mesh_unit = "{job.part.mesh_unit}"']
+        lines += [
+            *_look_lines(job),
+            "",
+            "[part]",
+            f'mesh = "{job.part.mesh}"{about}',
+            f'mesh_unit = "{job.part.mesh_unit}"',
+        ]
     for obstacle in job.obstacle:
         lines += ["", "[[obstacle]]", *_obstacle(obstacle)]
     return "\n".join(lines) + "\n"
+
+
+def _look_lines(job: Job) -> list[str]:
+    """How the placed part is looked at: the end of [place]."""
+    place = job.place
+    lines = [
+        f'verify = "{place.verify}"         # of the placed part: all has to be seen, or what shows, or none',
+        f"corrections = {place.corrections}         # how often at most it is gripped and placed again, 0 to 5",
+    ]
+    if place.accept is not None:
+        lines.append(f"accept = {mm(place.accept)}                   # farther off, on average, it is corrected")
+    return lines
 
 
 def _station_lines(job: Job) -> list[str]:

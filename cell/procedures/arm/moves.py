@@ -236,7 +236,7 @@ class PartState(Enum):
 class PartProgress:
     """What has become of the part, kept beside the step: a run may be ended by others while the part is on its way.
 
-    `where` is base_from_part at the release; `left` tells whether the arm has gone from there and folded.
+    `where` is base_from_part at the release; `left` tells whether the arm has gone up from there.
     """
 
     state: PartState = PartState.HELD
@@ -252,4 +252,4 @@ class PartProgress:
         if self.state is PartState.RELEASED:
             failed = "" if self.left else ", only the retreat failed"
             return f"the part is already down {at} and is not to be placed again{failed}: {reason}"
-        return f"the claw was told to release the part {at}, look whether it did: {reason}"
+        return f"the claw was told to open or close on the part {at}, look whether it did: {reason}"

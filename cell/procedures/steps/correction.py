@@ -25,15 +25,14 @@ from statemachine.runner import StepContext
 
 GRIPPED = np.diag([20e-6**2] * 3 + [0.2e-3**2] * 3)
 """Covariance of how a claw that closes on a part where it let it go moves it, m² and rad²: stated, as the grasp is."""
-
-
 SLIPS = 2.0
 """A part slips as the claw opens where it moves so many times as far as a correction leaves it off, on average."""
 
 
 def hoped(here: Workplace, pose: PlacePose, points: Vector, seen: Vector) -> float:
-    """How far, m, the part's `points` (n, 3), part frame, lie from where they belong after a correction, on average: by
-    what the arm repeats to, and by what was not known of the part where it was `seen`, (6, 6), surface axes."""
+    """How far along the surface, m, the part's `points` (n, 3), part frame, lie from where they belong after a
+    correction, on average: by what the arm repeats to, and by what is not known of the part where it was `seen`,
+    (6, 6), surface axes."""
     base_from_part = pose.base_from_surface * here.job.place.surface_from_part.se3()
     there = transform(base_from_part, points)
     flange = base_from_part * here.job.grasp.flange_from_part.se3().inverse()
@@ -43,7 +42,8 @@ def hoped(here: Workplace, pose: PlacePose, points: Vector, seen: Vector) -> flo
     spread = through(there - flange.translation, 2.0 * here.repeatability) + through(
         there - base_from_part.translation, unsure
     )
-    return float(np.linalg.norm(draws(spread), axis=-1).mean())
+    across = pose.base_from_surface.rotation
+    return float(np.linalg.norm(draws(across.T @ spread @ across)[..., :2], axis=-1).mean())
 
 
 def correct(
@@ -91,13 +91,6 @@ def held_so(job: Job, flange_from_part: pin.SE3, seen: Vector) -> Job:
         flange_from_part=held, size=job.grasp.size, sigma=float(sigmas[:3].max()), sigma_angle=float(sigmas[3:].max())
     )
     return job.model_copy(update={"grasp": grasp})
-
-
-def along_surface(motion: pin.SE3) -> pin.SE3:
-    """What of a part's motion, its own frame, is along the surface: a part is pressed on, and comes up as it is let go,
-    and what it lies on tells how high and how tilted."""
-    x, y, _ = motion.translation
-    return from_parts((x, y, 0.0), pin.exp3(np.array([0.0, 0.0, pin.log3(motion.rotation)[2]])))
 
 
 def _take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext) -> None:

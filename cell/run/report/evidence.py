@@ -11,9 +11,9 @@ from cell.config.job import Job
 from cell.measure.inversion import PlacePose, fit_figures
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
+from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps import verify
 from cell.procedures.steps.place import PlaceResult
-from cell.procedures.steps.verify import PlacedPart
 from drivers.errors import Measured, MeasuredRow, RefusedError
 from statemachine.runner import RunResult
 from statemachine.step import Outcome
@@ -68,7 +68,7 @@ def seen_placed(result: RunResult) -> PlacedPart | None:
 def seen_words(result: RunResult) -> str:
     """Why a run of a job that names its part's mesh has placed it."""
     if (seen := seen_placed(result)) is not None:
-        return f"in place: {seen.words}"
+        return f"in place{', as far as it shows' if seen.unseen else ''}: {seen.words}"
     return f"{result.reason}; nobody looked at the placed part (place.verify)"
 
 

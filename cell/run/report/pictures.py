@@ -25,9 +25,9 @@ from cell.measure.reconstruction import Cloud
 from cell.measure.vision import BoardView
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
+from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.reconstruct import Reconstruction
-from cell.procedures.steps.verify import PlacedPart
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.folder import Report
 from cell.run.report.evidence import RefusalEvidence, ended_in, seen_placed

@@ -13,16 +13,18 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
+from scipy.stats import chi2
 
 from cell.config.cell_config import load_config
 from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import NominalSurface
-from cell.procedures.steps.verify import LIKELY, PlacedPart
+from cell.procedures.placed_part import LIKELY, PlacedPart
 from cell.run.report.report import place_error, pose_of
 from drivers.errors import ConfigError
 from lab.bench.job.part_effects import EFFECTS, PartEffect
 from lab.bench.job.part_jobs import ALL, MIDDLE, job_with_part
+from lab.bench.job.scan_errors import COVERED
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from lab.bench.over_cores import over_cores
 
@@ -91,23 +93,19 @@ def figures(record: JobRecord, nominal: NominalSurface, job: Job, effect: PartEf
     said = record.reason
     if isinstance(found, PlacedPart):
         true = pose_of(record.at_end, "surface_from_part")
-        error, place = difference(found.seen.surface_from_part, true), _lies(job, nominal, record.at_end)
+        error = difference(found.seen.surface_from_part, true)
+        place: Row = place_error(job, nominal, record.at_end)
         said = "; ".join(found.notes)
         made |= {
             "true_mean": place["error_mm"]["d"]["mean"], "true_p95": place["d_p95"], "bound": found.bound["d"],
             "outside": place["d_p95"] > found.bound["d"], "before": [1e3 * off for off in found.before],
             "seen_off_by": 1e3 * float(np.linalg.norm(error[:3])),
             "seen_tilted_by": 1e3 * float(np.hypot(error[3], error[4])),
-            "covered": bool(error @ np.linalg.solve(found.covariance, error) <= 12.59),
+            "covered": bool(error @ np.linalg.solve(found.covariance, error) <= chi2.ppf(COVERED, 6)),
             "turned": 1e3 * float(np.linalg.norm(pin.log3(true.rotation))),
         }  # fmt: skip
     made["named"] = any(LIKELY[cause] in said for cause in effect.causes)
     return made
-
-
-def _lies(job: Job, nominal: NominalSurface, at_end: Row) -> Row:
-    """How far the part's points lie from where they belong, as the report tells it."""
-    return place_error(job, nominal, at_end)
 
 
 def _effect(runs: Sequence[Row]) -> Row:

@@ -55,6 +55,11 @@ def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(tmp
     job, surface = load_job(made.job)
     assert job.part is not None and job.part.mesh == str(tmp_path / "lid-part.ply")
     require_fit(job, load_config(None), surface, calibrates=True)
+    assert job.place.verify == "all"
+    # A flat cover does not show how it lies along itself: the rest of it is looked at.
+    body(transform(lies, vertices), faces, flat=True).export(tmp_path / "drawings" / "cover.ply")
+    cover = from_options(tmp_path, True, **{**given, "name": "cover", "part": str(tmp_path / "drawings" / "cover.ply")})
+    assert load_job(cover.job)[0].place.verify == "seen"
     with pytest.raises(ConfigError, match=r"lid-part\.ply: there already"):
         from_options(tmp_path, part=str(tmp_path / "drawings" / "lid.ply"), **given)
     with pytest.raises(ConfigError, match=r"--part: .*none\.ply cannot be read as a mesh"):

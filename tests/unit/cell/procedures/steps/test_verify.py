@@ -20,8 +20,9 @@ from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, from_parts, transform
 from cell.measure.inversion import NominalSurface
+from cell.procedures.placed_part import LIKELY, PlacedPart
 from cell.procedures.steps.kinds import PLACE, VERIFIED, kind_of
-from cell.procedures.steps.verify import CLOUD, LIKELY, PlacedPart
+from cell.procedures.steps.verify import CLOUD
 from cell.run.report.page.make import make_page
 from drivers.errors import ConfigError, DeviceFault, MisplacedError
 from lab.bench.job.part_effects import motion, opened

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cell.procedures.steps.verify import LIKELY
+from cell.procedures.placed_part import LIKELY
 from drivers.errors import ConfigError
 from lab.bench.job.part_effects import EFFECTS
 from lab.bench.job.placed_part import _effect, _named, _placed, _seen, campaign

@@ -1,0 +1,212 @@
+"""Where a placed part was seen, whether it lies in its place, and what most likely happened to one that does not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config.job import Job, PlaceSection
+from cell.measure.geometry.poses import difference, from_parts, perturbed, transform
+from cell.measure.inversion.mating import MatingGap
+from cell.measure.inversion.part_pose import PartPose, of_part
+from cell.procedures.part_error import draws_of
+from drivers.errors import Measured, MisplacedError
+from drivers.interfaces import Vector
+
+UNCLEAR = "chance: by no motion is it farther off than was stated before it was put down"
+CLEARLY = 3.0
+"""Standard deviations of the stated place beyond which a part has not come to lie so by chance."""
+NEXT_STEP = "See to it, take the part away, then run the job with the next part"
+LIKELY = {
+    "raised": "it lies on something, or is another part: look under it",
+    "deep": "the part or the surface is worn, or another one",
+    "shifted": "it slipped in the claw, or as the claw opened: look at the fingers",
+    "tilted": "it stands on something at one edge, or was held tilted: look under it",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedPart:
+    """Where the placed part was `seen`, beside where it `belongs` (surface_from_part).
+
+    `points` (45, 3) m, part frame, are those by which a placed part is judged. `covariance` (6, 6) is that of the seen
+    pose, surface axes, about the part's origin; `stated` (6, 6) is that of the place before it was put down, which
+    stands for the motions that its faces do not show, `unseen`. `gap` is the gap below it, as it lies; None where
+    nothing scanned lies below. `before` is how far off, m, it lay before each correction.
+    """
+
+    seen: PartPose
+    belongs: pin.SE3
+    points: Vector
+    covariance: Vector
+    stated: Vector
+    unseen: tuple[str, ...] = ()
+    gap: MatingGap | None = None
+    before: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, job: Job, seen: PartPose, points: Vector, stated: Vector) -> PlacedPart:
+        """The part as `seen`, with what is not seen of it as it was `stated`, (6, 6), surface axes.
+
+        Raises `MisplacedError` where something is not seen, and the job does not content itself with the rest.
+        """
+        unit = np.array([job.place.tolerance] * 3 + [job.place.tolerance_angle] * 3)
+        values, ways = np.linalg.eigh(seen.covariance / np.outer(unit, unit))
+        weak = ~(3.0 * np.sqrt(np.maximum(values, 0.0)) <= 1.0)
+        motions = seen.fit.verdict.weak
+        unseen = tuple(of_part(motion.words.partition(" is ")[0]) for motion in motions)
+        if unseen and job.place.verify == "all":
+            raise MisplacedError(
+                f"not all is seen of how the placed part lies: {'; '.join(of_part(m.words) for m in motions)}. Sweep "
+                'more of it, or write place.verify = "seen"',
+                *(motion.measured() for motion in motions),
+            )
+        instead = np.einsum("in,ij,jn->n", ways, stated / np.outer(unit, unit), ways)
+        kept = (ways * np.where(weak, instead, values)) @ ways.T * np.outer(unit, unit)
+        belongs = job.place.surface_from_part.se3()
+        # Along what is not seen the part is taken to lie where it belongs: what the fit has there is noise.
+        off = ways.T @ (difference(seen.surface_from_part, belongs) / unit)
+        there = perturbed(belongs, unit * (ways @ np.where(weak, 0.0, off)))
+        return cls(
+            replace(seen, surface_from_part=there), belongs, points, covariance=kept, stated=stated, unseen=unseen
+        )
+
+    @cached_property
+    def offsets(self) -> Vector:
+        """How far each point lies from where it belongs, (45, 3) m, surface axes."""
+        return transform(self.seen.surface_from_part, self.points) - transform(self.belongs, self.points)
+
+    @property
+    def turn(self) -> Vector:
+        """By how much the part is turned from where it belongs, (3,) rad, surface axes."""
+        return np.asarray(pin.log3(self.seen.surface_from_part.rotation @ self.belongs.rotation.T))
+
+    @cached_property
+    def _errors(self) -> Vector:
+        """What the points' places may be off by, (2000, 45, 3) m."""
+        arms = transform(self.seen.surface_from_part, self.points) - self.seen.surface_from_part.translation
+        drawn = draws_of(self.covariance)
+        return np.asarray(drawn[:, None, :3] + np.cross(drawn[:, None, 3:], arms))
+
+    @property
+    def off(self) -> float:
+        """How far its points lie from where they belong, on average, m."""
+        return float(np.linalg.norm(self.offsets, axis=1).mean())
+
+    @property
+    def aside(self) -> float:
+        """The same along the surface alone: how high and how tilted a part lies, what it lies on tells."""
+        motion = along_surface(self.belongs.inverse() * self.seen.surface_from_part)
+        return float(np.linalg.norm(transform(motion, self.points) - self.points, axis=1).mean())
+
+    @property
+    def unsure(self) -> float:
+        """What 95 % of the points are known to, m."""
+        return float(np.percentile(np.linalg.norm(self._errors, axis=-1), 95))
+
+    @cached_property
+    def bound(self) -> dict[str, float]:
+        """Below what, mm, 95 % of the points lie from where they belong, by axis of the surface's frame and for D.
+
+        Where they were seen counts, and at 95 % what that may be off by.
+        """
+        errors = 1e3 * np.abs(self.offsets + self._errors)
+        found = {name: errors[..., k] for k, name in enumerate("xyz")} | {"d": np.linalg.norm(errors, axis=-1)}
+        return {name: float(np.percentile(np.percentile(each, 95, axis=1), 95)) for name, each in found.items()}
+
+    @property
+    def turn_bound(self) -> float:
+        """By how much the part is turned at most, rad, at 95 %."""
+        turned = self.turn + draws_of(self.covariance)[:, 3:]
+        return float(np.percentile(np.linalg.norm(turned, axis=-1), 95))
+
+    @property
+    def advice(self) -> str:
+        """What brings a narrower bound, where the surface was not seen beside the part."""
+        return "" if self.seen.beside else ". Leave 10 mm of the surface free beside the part: less is left open then"
+
+    @property
+    def words(self) -> str:
+        """For people."""
+        gap = "" if self.gap is None else f", gap {self.gap.span}"
+        where = "" if self.seen.beside else ", against the surface as swept before"
+        return f"{1e3 * self.off:.2f} ± {1e3 * self.unsure:.2f} mm off{where}{gap}"
+
+    @cached_property
+    def _times(self) -> Vector:
+        """How far it is off its place, (6,), in standard deviations of the stated place: along x, y, z, and about them,
+        about its origin."""
+        off = np.concatenate([self.seen.surface_from_part.translation - self.belongs.translation, self.turn])
+        return np.asarray(off / np.sqrt(np.diag(self.stated)))
+
+    @property
+    def likely(self) -> str:
+        """What has most likely happened to a part that does not lie in its place.
+
+        A part that slipped comes to lie on slopes and edges, so it is tilted and raised as well; one that stands on
+        something at an edge is raised as well. So the first of them that is clear counts.
+        """
+        x, y, z, about_x, about_y, about_z = np.abs(self._times)
+        times = {"shifted": max(x, y, about_z), "tilted": max(about_x, about_y)}
+        times["raised" if self._times[2] > 0.0 else "deep"] = z
+        clear = (name for name, size in times.items() if size > CLEARLY)
+        return next((LIKELY[name] for name in clear), UNCLEAR)
+
+    def measured(self, place: PlaceSection) -> tuple[Measured, Measured]:
+        """What it is judged by, beside the place's tolerances."""
+        return (
+            Measured("placed part off its place, 95 % bound", self.bound["d"], "mm", most=1e3 * place.tolerance),
+            Measured("placed part turned, 95 % bound", 1e3 * self.turn_bound, "mrad", most=1e3 * place.tolerance_angle),
+        )
+
+    def kept(self, place: PlaceSection) -> bool:
+        """Whether it is known to lie within the place's tolerances."""
+        return all(number.kept for number in self.measured(place))
+
+    def misplaced(self, place: PlaceSection, more: str = "") -> MisplacedError:
+        """The error of a part that is not known to lie within the place's tolerances."""
+        off, turned = self.measured(place)
+        shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
+        turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
+        return MisplacedError(
+            f"the placed part lies {self.words}, by ({shift}) mm and ({turn}) mrad in the surface's axes. Allowed are "
+            f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad; at 95 % it may be "
+            f"{off.value:.2f} mm and {turned.value:.1f} mrad. Most likely {self.likely}{self.advice}. "
+            f"{more}{more and '. '}{NEXT_STEP}",
+            off, turned,
+        ).showing(seen={"placed": self})  # fmt: skip
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """For people: how it lies, whether that is as usual, and what was not seen."""
+        more = f"that is farther off than was stated before it was put down: most likely {self.likely}"
+        return (
+            f"the placed part lies {self.words}",
+            *((more,) if np.abs(self._times).max() > CLEARLY else ()),
+            *(f"not seen of the placed part: {motion}" for motion in self.unseen),
+        )
+
+    def summary(self) -> dict[str, object]:
+        """Figures for journal and report."""
+        shift, turn = self.offsets.mean(axis=0), self.turn
+        sigma = np.sqrt(np.diag(self.covariance))
+        return {
+            "off_mm": round(1e3 * self.off, 4), "unsure_mm": round(1e3 * self.unsure, 4),
+            "shift_mm": [round(1e3 * float(v), 4) for v in shift],
+            "turn_mrad": [round(1e3 * float(v), 4) for v in turn],
+            "sigma_mm": [round(1e3 * float(v), 4) for v in sigma[:3]],
+            "sigma_mrad": [round(1e3 * float(v), 4) for v in sigma[3:]],
+            "points": self.seen.fit.n_points, "beside": self.seen.beside, "unseen": list(self.unseen),
+            "gap": None if self.gap is None else self.gap.as_dict(),
+            "before_mm": [round(1e3 * off, 4) for off in self.before],
+        }  # fmt: skip
+
+
+def along_surface(motion: pin.SE3) -> pin.SE3:
+    """What of a part's motion, its own frame, is along the surface: a part is pressed on, and comes up as it is let go,
+    and what it lies on tells how high and how tilted."""
+    x, y, _ = motion.translation
+    return from_parts((x, y, 0.0), pin.exp3(np.array([0.0, 0.0, pin.log3(motion.rotation)[2]])))

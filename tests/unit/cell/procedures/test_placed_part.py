@@ -1,0 +1,108 @@
+"""A placed part's figures against closed forms; where it is seen is tested at `verify`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import scipy
+
+from cell.config.job import load_job
+from cell.measure.geometry.poses import from_parts
+from cell.measure.inversion import PlacePose
+from cell.measure.inversion.observability import SmallMotion
+from cell.measure.inversion.part_pose import PartPose
+from cell.procedures.placed_part import LIKELY, UNCLEAR, PlacedPart, along_surface
+from drivers.errors import MisplacedError
+from tests.support.lying_part import moved
+
+JOB, _ = load_job("pot")
+PLACE = JOB.place
+STATED = np.diag([0.1e-3**2] * 3 + [1e-3**2] * 3)
+POINTS = np.array([[x, y, 0.0] for x in (-0.02, 0.0, 0.02) for y in (-0.01, 0.01)])
+
+
+class Shows:
+    """A fit of which the verdict names these motions."""
+
+    def __init__(self, *weak: str) -> None:
+        self.verdict = self
+        self.n_points = 1000
+        self.weak = [
+            SmallMotion(np.zeros(3), np.zeros(3), 2.0, f"{words} is not determined: 3σ 6 mm") for words in weak
+        ]
+
+
+def part(off: pin.SE3, sigma: float = 10e-6, *, beside: int = 900, weak: tuple[str, ...] = ()) -> PlacedPart:
+    """One that was seen `off` its place, known to `sigma` m, and to `sigma` over 20 mm."""
+    covariance = np.diag([sigma**2] * 3 + [(sigma / 0.02) ** 2] * 3)
+    if weak:
+        covariance[0, 0] = 2e-3**2
+    seen = PartPose(off, covariance, cast(PlacePose, Shows(*weak)), beside)
+    job = JOB.model_copy(update={"place": PLACE.model_copy(update={"verify": "seen" if weak else "all"})})
+    return PlacedPart.of(job, seen, POINTS, STATED)
+
+
+def test_a_shift_is_what_every_point_is_off_by_and_the_bound_what_chance_adds() -> None:
+    found = part(moved(0.3e-3), sigma=1e-9)
+    assert found.off == pytest.approx(0.3e-3) and found.bound["d"] == pytest.approx(0.3, abs=1e-4)
+    assert found.bound["x"] == pytest.approx(0.3, abs=1e-4) and found.bound["z"] < 1e-3
+    still = replace(part(moved(), sigma=10e-6), covariance=np.diag([10e-6**2] * 3 + [1e-18] * 3))
+    # All points move alike: each draw's distance is a Maxwell variable, of which 95 % lie below 2.795 sigma.
+    assert still.bound["d"] == pytest.approx(1e3 * 10e-6 * scipy.stats.maxwell.ppf(0.95), rel=0.05)
+
+
+def test_a_turn_moves_the_points_as_one_body() -> None:
+    """Known about y alone: opposite ends go opposite ways, and what lies on the axis stays."""
+    sure = np.full(6, 1e-12)
+    sure[4] = 1e-3
+    found = replace(part(moved()), covariance=np.diag(sure**2))
+    middle = np.abs(found.points[:, 0]) < 1e-9
+    left, right = found._errors[:, found.points[:, 0] < -0.01], found._errors[:, found.points[:, 0] > 0.01]
+    assert np.allclose(left[..., 2], -right[..., 2], atol=1e-9) and np.abs(found._errors[:, middle]).max() < 1e-9
+    assert found.turn_bound == pytest.approx(1e-3 * scipy.stats.norm.ppf(0.975), rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("off", "likely"),
+    [
+        (moved(0.5e-3, z=0.5e-3, turn=(0.0, 0.006, 0.0)), LIKELY["shifted"]),
+        (moved(turn=(0.0, 0.0, 0.004)), LIKELY["shifted"]),
+        (moved(z=0.5e-3, turn=(0.0, 0.006, 0.0)), LIKELY["tilted"]),
+        (moved(z=0.5e-3), LIKELY["raised"]),
+        (moved(z=-0.5e-3), LIKELY["deep"]),
+        (moved(0.2e-3, z=0.2e-3), UNCLEAR),
+    ],
+)
+def test_the_first_motion_that_chance_does_not_bring_is_the_cause(off: pin.SE3, likely: str) -> None:
+    assert part(off).likely == likely
+
+
+def test_a_part_is_kept_only_where_its_bound_is_inside_both_tolerances() -> None:
+    assert part(moved(0.5e-3)).kept(PLACE)
+    assert not part(moved(0.5e-3), sigma=0.1e-3).kept(PLACE), "it may lie farther"
+    assert not part(moved(turn=(0.0, 0.0, 0.007))).kept(PLACE)
+    told = str(part(moved(0.7e-3), beside=0).misplaced(PLACE, "It was not corrected: why"))
+    assert "against the surface as swept before" in told and "Leave 10 mm of the surface free" in told
+    assert "It was not corrected: why. See to it" in told
+
+
+def test_what_is_not_seen_moves_nothing_and_is_known_as_stated() -> None:
+    found = part(moved(1.5e-3, z=0.2e-3), weak=("translation along the x axis of the surface frame",))
+    assert found.unseen == ("translation along the x axis of the part frame",)
+    assert np.allclose(found.seen.surface_from_part.translation, [0.0, 0.0, 0.2e-3], atol=1e-9)
+    assert np.sqrt(found.covariance[0, 0]) == pytest.approx(0.1e-3) and np.sqrt(found.covariance[2, 2]) < 20e-6
+    seen = replace(found.seen, covariance=np.diag([2e-3**2] + [1e-10] * 5))
+    with pytest.raises(MisplacedError, match=r"not all is seen .*part frame.*place\.verify"):
+        PlacedPart.of(JOB, seen, POINTS, STATED)
+
+
+def test_of_a_motion_only_what_is_along_the_surface_counts_as_aside() -> None:
+    found = along_surface(moved(0.3e-3, -0.2e-3, 0.4e-3, turn=(0.005, -0.004, 0.006)))
+    assert np.allclose(found.translation, [0.3e-3, -0.2e-3, 0.0])
+    assert np.allclose(pin.log3(found.rotation), [0.0, 0.0, 0.006], atol=1e-6)
+    assert part(moved(z=0.4e-3, turn=(0.0, 0.005, 0.0))).aside < 1e-6
+    assert part(from_parts((0.3e-3, 0.4e-3, 0.2e-3))).aside == pytest.approx(0.5e-3)
