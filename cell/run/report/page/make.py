@@ -271,11 +271,16 @@ def _part_rows(report: Report) -> Iterator[Row]:
     if bound is None:
         return
     tolerance = (report.get("tolerance") or {}).get("translation_mm")
-    for name in (*AXES, "d"):
-        off = "not measured" if truth is None else f"{truth['error_mm'][name]['max']:.3f} mm"
-        of = "part's points, largest D" if name == "d" else f"part's points, largest along {name}"
+    seen = _result(report, "verify") or (report.get("refusal") or {}).get("placed")
+    for k, name in enumerate((*AXES, "d")):
+        off, which = "", "largest"
+        if truth is not None:
+            off = f"{truth['error_mm'][name]['max']:.3f} mm"
+        elif seen is not None:
+            off, which = f"{seen['off_mm'] if name == 'd' else abs(seen['shift_mm'][k]):.3f} mm", "as seen, mean"
+        of = f"part's points, {which} D" if name == "d" else f"part's points, {which} along {name}"
         allowed = f"at most {tolerance:g} mm" if name == "d" and tolerance is not None else ""
-        yield of, "0 mm", off, "" if truth is None else off, allowed, f"{bound[name]:.3f} mm"
+        yield of, "0 mm", off or "not measured", off, allowed, f"{bound[name]:.3f} mm"
 
 
 def _touch_rows(report: Report) -> Iterator[Row]:

@@ -196,3 +196,12 @@ def test_a_calibration_is_told_with_its_age(tmp_path: Path, seconds: float | Non
     report = {"started": "2026-09-21T14:13:20+00:00", "calibration_hash": "abc", "calibration_date": "2026-01-01"}
     told = dict(row.cells for row in identities(tmp_path, report))["calibration"]
     assert told.startswith("hash abc, made 2026-01-01") and age in told
+
+
+def test_where_nobody_knows_the_truth_the_part_is_where_it_was_seen() -> None:
+    """Of a run that placed and of one that ended misplaced."""
+    seen = {"off_mm": 0.08, "shift_mm": [0.05, -0.06, 0.01]}
+    for more in ({"steps": [{"name": "verify", "result": seen}]}, {"refusal": {"placed": seen}}):
+        rows = {row.cells[0]: row.cells for row in compared({**TOLERANCE, **BOUND, **more})}
+        assert rows["part's points, as seen, mean along y"][2] == "0.060 mm"
+        assert rows["part's points, as seen, mean D"][1:5] == ("0 mm", "0.080 mm", "0.080 mm", "at most 0.6 mm")
