@@ -119,9 +119,9 @@ class Cameras:
         if mesh is None:
             return []
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        centre = pose[:3, :3] @ (0.5 * (low + high)) + pose[:3, 3]
-        near = in_view(optics, centre, 0.5 * float(np.linalg.norm(high - low)), far_of("scan", optics))
-        return [MeshInstance(pose, mesh, SURFACE_ALBEDO)] if near else []
+        corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+        seen = in_picture(optics, corners @ pose[:3, :3].T + pose[:3, 3])
+        return [MeshInstance(pose, mesh, SURFACE_ALBEDO)] if seen else []
 
     def lens(self, camera: str, warm: float) -> Lens:
         """The lens with the shift and zoom of what is `warm`, 0 to 1."""
@@ -177,7 +177,7 @@ class Cameras:
             shown = MeshInstance(camera_from_surface, station.seen, SURFACE_ALBEDO, self._grain)
             placed.append((shown, camera_from_surface, station.radius))
         optics = self._cold[camera]
-        far = far_of(camera, optics)
+        far = max(_FAR[camera][0], _FAR[camera][1] * optics.focus_distance)
         return [item for item, pose, radius in placed if in_view(optics, pose[:3, 3], radius, far)]
 
 
@@ -185,12 +185,6 @@ def _witness_corners(pose: Pose) -> Pose:
     half = np.array(drawing.WITNESS_SIZE) / 2.0
     corners = np.array([[x, y, 0.0] for x in (-half[0], half[0]) for y in (-half[1], half[1])])
     return corners @ pose[:3, :3].T + pose[:3, 3]
-
-
-def far_of(camera: str, optics: CameraOptics) -> float:
-    """Beyond this distance, m, the camera has nothing to see that matters."""
-    least, times = _FAR[camera]
-    return max(least, times * optics.focus_distance)
 
 
 def in_view(optics: CameraOptics, centre: NDArray[np.float64], radius: float, far: float) -> bool:
@@ -201,6 +195,14 @@ def in_view(optics: CameraOptics, centre: NDArray[np.float64], radius: float, fa
     half = 1.2 * np.hypot(optics.width / optics.fx, optics.height / optics.fy) / 2
     # Distance of the ball's centre from the cone that encloses the picture.
     return float(np.hypot(x, y) * np.cos(np.arctan(half)) - z * np.sin(np.arctan(half))) <= radius
+
+
+def in_picture(optics: CameraOptics, corners: NDArray[np.float64]) -> bool:
+    """Whether anything between `corners` (n, 3), camera frame, m, may be in the picture."""
+    x, y, z = corners.T
+    half_x, half_y = 0.6 * optics.width / optics.fx * z, 0.6 * optics.height / optics.fy * z
+    # All beyond one side of the picture, with a fifth of it to spare: nothing between them is in it.
+    return not ((x > half_x).all() or (x < -half_x).all() or (y > half_y).all() or (y < -half_y).all() or (z < 0).all())
 
 
 def _optics(scene: Scene, lens: Lens, drawn: CameraDrawing, transmission: float) -> CameraOptics:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.mesh import Mesh
-from sim_backends.world.bodies.surfaces import OwnSurface, Surface, own_surface, underside
+from sim_backends.world.bodies.surfaces import OwnSurface, Surface, SurfaceMesh, own_surface, part_mesh, underside
 from sim_backends.world.bodies.surfaces import mesh as drawn_mesh
 from sim_backends.world.bodies.surfaces import surface as named_surface
 from sim_backends.world.drawing import StationDrawing, inverse
@@ -45,7 +45,7 @@ class Station:
         reach = np.hypot(abs(x) + ground.half_x, abs(y) + ground.half_y)
         room = max(0.015, ground.top, -low)
         part = underside(drawn.part_mesh, drawn.part_mesh_unit) if drawn.part_mesh else None
-        whole = _whole(own_surface(drawn.part_mesh, drawn.part_mesh_unit)) if drawn.part_mesh else None
+        whole = _whole(part_mesh(drawn.part_mesh, drawn.part_mesh_unit)) if drawn.part_mesh else None
         return cls(ground, seen, float(reach) + room, part, whole)
 
 
@@ -68,5 +68,5 @@ def _own(own: OwnSurface, table: tuple[float, float, float]) -> Mesh:
 
 
 @lru_cache(maxsize=_KEPT)
-def _whole(own: OwnSurface) -> Mesh:
-    return Mesh(own.vertices, own.triangles)
+def _whole(part: SurfaceMesh) -> Mesh:
+    return Mesh(part.vertices, part.triangles)

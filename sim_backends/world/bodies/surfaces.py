@@ -28,7 +28,7 @@ HALF_Y = 0.018
 """Half the pot's footprint along y_S, the direction of the stripe, m."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SurfaceMesh:
     """Triangles of a surface: vertices (n, 3), m, frame S; triangles (m, 3), counter-clockwise from outside."""
 
@@ -212,11 +212,19 @@ class OwnSurface:
 
 def own_surface(path: str, unit: str) -> OwnSurface:
     """The surface in a mesh file; the last few are kept. Raises ValueError when there is no mesh in it."""
+    return _read(path, _content(path), unit)
+
+
+def part_mesh(path: str, unit: str) -> SurfaceMesh:
+    """The part in a mesh file as a camera above it sees it: walls are as drawn, they only hide what is behind them."""
+    return _part(path, _content(path), unit)
+
+
+def _content(path: str) -> bytes:
     try:
-        content = sha256(Path(path).read_bytes()).digest()
+        return sha256(Path(path).read_bytes()).digest()
     except OSError as error:
-        raise ValueError(f"the surface's mesh {path} cannot be read: {error.strerror}") from error
-    return _read(path, content, unit)
+        raise ValueError(f"the mesh {path} cannot be read: {error.strerror}") from error
 
 
 def underside(path: str, unit: str) -> Surface:
@@ -228,7 +236,28 @@ def underside(path: str, unit: str) -> Surface:
 @lru_cache(maxsize=4)
 def _read(path: str, content: bytes, unit: str) -> OwnSurface:
     import trimesh
-    from trimesh.remesh import subdivide_to_size
+
+    merged = trimesh.Trimesh(*_divided(*_loaded(path, unit)), process=True)
+    vertices, faces = np.asarray(merged.vertices, dtype=np.float64), np.asarray(merged.faces, dtype=np.int64)
+    return OwnSurface(_ground(Path(path).stem, vertices, faces), vertices, faces)
+
+
+@lru_cache(maxsize=4)
+def _part(path: str, content: bytes, unit: str) -> SurfaceMesh:
+    vertices, faces = _loaded(path, unit)
+    a, b, c = np.moveaxis(vertices[faces], 1, 0)
+    up = np.cross(b - a, c - a)[:, 2] > 0.0
+    if not up.any():
+        return SurfaceMesh(vertices, faces.astype(np.int32))
+    above, shown = _divided(vertices, faces[up])
+    return SurfaceMesh(
+        np.concatenate([above, vertices]), np.concatenate([shown, faces[~up] + len(above)]).astype(np.int32)
+    )
+
+
+def _loaded(path: str, unit: str) -> tuple[Floats, Faces]:
+    """Vertices (n, 3), m, and triangles (m, 3) of a mesh file."""
+    import trimesh
 
     try:
         mesh = trimesh.load_mesh(path, process=True)
@@ -237,13 +266,18 @@ def _read(path: str, content: bytes, unit: str) -> OwnSurface:
         if not len(faces) or not np.isfinite(vertices).all():
             raise ValueError(f"{len(faces)} triangles, or corners that are not numbers")
     except Exception as error:  # every reader of trimesh raises its own
-        raise ValueError(f"the surface's mesh {path} cannot be read: {error}") from error
+        raise ValueError(f"the mesh {path} cannot be read: {error}") from error
+    return vertices, faces
+
+
+def _divided(vertices: Floats, faces: Faces) -> tuple[Floats, Faces]:
+    """The same with no side longer than `COARSEST`, or a hundredth of the mesh."""
+    from trimesh.remesh import subdivide_to_size
+
     longest = max(COARSEST, float(np.ptp(vertices, axis=0).max()) / 100.0)
     divide: Any = subdivide_to_size
-    vertices, faces = divide(vertices, faces, longest, max_iter=20)
-    merged = trimesh.Trimesh(vertices, faces, process=True)
-    vertices, faces = np.asarray(merged.vertices, dtype=np.float64), np.asarray(merged.faces, dtype=np.int64)
-    return OwnSurface(_ground(Path(path).stem, vertices, faces), vertices, faces)
+    made: tuple[Floats, Faces] = divide(vertices, faces, longest, max_iter=20)
+    return made
 
 
 def _ground(name: str, vertices: Floats, faces: Faces) -> Surface:
