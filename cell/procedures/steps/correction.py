@@ -8,13 +8,13 @@ import numpy as np
 import pinocchio as pin
 
 from cell.config.job import GraspSection, Job
-from cell.measure.geometry.poses import from_parts, to_ur, transform
+from cell.measure.geometry.poses import composition_jacobians, from_parts, to_ur, transform
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.mating import scanned_gap
 from cell.motion.collision import TOUCHES
 from cell.procedures.arm.moves import PartProgress, PartState
 from cell.procedures.arm.touch import expected_touch
-from cell.procedures.part_error import draws, part_points, through
+from cell.procedures.part_error import draws_of, part_points
 from cell.procedures.steps.place import FAST_FORCE, PlaceResult, Placing
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import Workplace
@@ -30,21 +30,19 @@ SLIPS = 2.0
 
 
 def hoped(here: Workplace, pose: PlacePose, points: Vector, seen: Vector) -> float:
-    """How far along the surface, m, the part's `points` (n, 3), part frame, lie from where they belong after a
-    correction, on average over them: one correction in two leaves them nearer. By what the arm repeats to, and by what is not known of the part where it was `seen`,
+    """How far along the surface, m, the part's `points` (n, 3), part frame, lie from where they belong after one
+    correction in two, on average: by what the arm repeats to, and by what is not known of the part where it was `seen`,
     (6, 6), surface axes."""
-    base_from_part = pose.base_from_surface * here.job.place.surface_from_part.se3()
-    there = transform(base_from_part, points)
+    belongs = here.job.place.surface_from_part.se3()
+    base_from_part = pose.base_from_surface * belongs
     flange = base_from_part * here.job.grasp.flange_from_part.se3().inverse()
-    turn = np.kron(np.eye(2), pose.base_from_surface.rotation)
-    unsure = turn @ (seen + GRIPPED) @ turn.T
+    carried = composition_jacobians(flange, flange.inverse() * base_from_part)[0]
+    turn = np.kron(np.eye(2), pose.base_from_surface.rotation.T)
     # It comes to rest twice: where it grips, and where it lets go.
-    spread = through(there - flange.translation, 2.0 * here.repeatability) + through(
-        there - base_from_part.translation, unsure
-    )
-    across = pose.base_from_surface.rotation
-    apart = np.linalg.norm(draws(across.T @ spread @ across)[..., :2], axis=-1)
-    return float(np.median(apart.mean(axis=1)))
+    rests = turn @ carried @ (2.0 * here.repeatability) @ carried.T @ turn.T
+    drawn = draws_of(rests + seen + GRIPPED)
+    apart = drawn[:, None, :3] + np.cross(drawn[:, None, 3:], points @ belongs.rotation.T)
+    return float(np.median(np.linalg.norm(apart[..., :2], axis=-1).mean(axis=1)))
 
 
 def correct(
