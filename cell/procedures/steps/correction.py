@@ -29,10 +29,10 @@ SLIPS = 2.0
 """A part slips as the claw opens where it moves so many times as far as a correction leaves it off, on average."""
 
 
-def hoped(here: Workplace, pose: PlacePose, points: Vector, seen: Vector) -> float:
-    """How far along the surface, m, the part's `points` (n, 3), part frame, lie from where they belong after one
-    correction in two, on average: by what the arm repeats to, and by what is not known of the part where it was `seen`,
-    (6, 6), surface axes."""
+def brought(here: Workplace, pose: PlacePose, points: Vector, seen: Vector) -> Vector:
+    """How far along the surface the part's `points` (n, 3), part frame, lie from where they belong after a correction,
+    on average: drawn (2000,), m, from what the arm repeats to, and from what is not known of the part where it was
+    `seen`, (6, 6), surface axes."""
     belongs = here.job.place.surface_from_part.se3()
     base_from_part = pose.base_from_surface * belongs
     flange = base_from_part * here.job.grasp.flange_from_part.se3().inverse()
@@ -42,7 +42,16 @@ def hoped(here: Workplace, pose: PlacePose, points: Vector, seen: Vector) -> flo
     rests = turn @ carried @ (2.0 * here.repeatability) @ carried.T @ turn.T
     drawn = draws_of(rests + seen + GRIPPED)
     apart = drawn[:, None, :3] + np.cross(drawn[:, None, 3:], points @ belongs.rotation.T)
-    return float(np.median(np.linalg.norm(apart[..., :2], axis=-1).mean(axis=1)))
+    return np.asarray(np.linalg.norm(apart[..., :2], axis=-1).mean(axis=1))
+
+
+def hoped(drawn: Vector, corrections: int) -> float:
+    """How far off a part is on average after up to `corrections`, of which each leaves it as far off as one of `drawn`
+    (n,), and which end as soon as those left promise no more: the optimal stopping of a search without recall."""
+    hope = float(drawn.mean())
+    for _ in range(corrections - 1):
+        hope = float(np.minimum(drawn, hope).mean())
+    return hope
 
 
 def correct(
@@ -58,7 +67,7 @@ def correct(
     """
     belongs, points = here.job.place.surface_from_part.se3(), part_points(here.nominal)
     far = float(np.linalg.norm(transform(slip, points) - points, axis=1).mean())
-    if far < SLIPS * hoped(here, pose, points, seen):
+    if far < SLIPS * hoped(brought(here, pose, points, seen), 1):
         # As little comes of the arm.
         slip = pin.SE3.Identity()
     job = held_so(here.job, held * slip, seen)

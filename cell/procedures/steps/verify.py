@@ -18,7 +18,7 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import PartState
 from cell.procedures.part_error import part_covariance, part_points
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart, along_surface
-from cell.procedures.steps.correction import correct, hoped
+from cell.procedures.steps.correction import brought, correct, hoped
 from cell.procedures.steps.laser_sweep import head_at, laser_sweep
 from cell.procedures.steps.place import PlaceResult
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements
@@ -38,8 +38,8 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     placed = context.made(PlaceResult)
     pose, plan = placed.pose or context.made(PlacePose), here.job.place
     found, slip = _looked(here, pose, context), pin.SE3.Identity()
-    for _ in range(plan.corrections):
-        if not _worth_correcting(here, pose, found, context):
+    for left in range(plan.corrections, 0, -1):
+        if not _worth_correcting(here, pose, found, left, context):
             break
         context.note(text=f"the placed part lies {found.words}: it is gripped and placed again")
         held = placed.base_from_flange.inverse() * pose.base_from_surface * found.seen.surface_from_part
@@ -63,12 +63,12 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     return found
 
 
-def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, context: StepContext) -> bool:
-    """Whether the part lies farther off than is accepted, and a correction would bring it nearer."""
+def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left: int, context: StepContext) -> bool:
+    """Whether the part lies farther off than is accepted, and the corrections that are `left` would bring it nearer."""
     plan = here.job.place
     if found.off <= (plan.tolerance if plan.accept is None else plan.accept) and found.kept(plan):
         return False
-    hope = hoped(here, pose, found.points, found.covariance)
+    hope = hoped(brought(here, pose, found.points, found.covariance), left)
     if hope < found.aside < FARTHEST_M:
         return True
     why = f"placed again it would be {1e3 * hope:.2f} mm off"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 
 from cell.devices.simulated.direct import VirtualCell
 from cell.motion.collision import PLACED
-from cell.procedures.steps.correction import held_so
+from cell.procedures.steps.correction import held_so, hoped
 from cell.procedures.steps.kinds import VERIFIED
 from drivers.errors import MisplacedError, RefusedError
 from lab.bench.job.part_effects import motion, opened
@@ -107,3 +108,13 @@ def test_the_grasp_that_was_seen_takes_the_place_of_the_stated_one() -> None:
     assert np.allclose(held.flange_from_part.se3().homogeneous, flange_from_part.homogeneous, atol=1e-12)
     assert held.size == job.grasp.size
     assert (held.sigma, held.sigma_angle) == (pytest.approx(20e-6, rel=0.02), pytest.approx(0.2e-3, rel=0.02))
+
+
+def test_the_more_corrections_are_left_the_less_is_one_content_with() -> None:
+    """Closed forms of a Rayleigh distribution: its mean, and the mean of the lesser of a draw and that."""
+    sigma = 40e-6
+    drawn = np.random.default_rng(7).rayleigh(sigma, 400_000)
+    mean = sigma * math.sqrt(math.pi / 2)
+    assert hoped(drawn, 1) == pytest.approx(mean, rel=5e-3)
+    assert hoped(drawn, 2) == pytest.approx(mean * math.erf(mean / (sigma * math.sqrt(2))), rel=5e-3)
+    assert hoped(drawn, 3) < hoped(drawn, 2) - 4e-6
