@@ -274,7 +274,12 @@ def shipped_mesh(mesh: Path) -> str | None:
     """The name of the shipped surface that this file is a copy of, byte for byte; None for one's own."""
     for name in shipped_jobs():
         shipped = _job_folder() / f"{name}.ply"
-        if mesh.stat().st_size == shipped.stat().st_size and mesh.read_bytes() == shipped.read_bytes():
+        # A job may be for the surface of another.
+        if (
+            shipped.is_file()
+            and mesh.stat().st_size == shipped.stat().st_size
+            and mesh.read_bytes() == shipped.read_bytes()
+        ):
             return name
     return None
 

@@ -33,6 +33,9 @@ LEAST_BESIDE = 500
 MOST_POINTS = 10_000
 NOISE_M = 20e-6
 """Of a point of a sweep, one standard deviation, roughly."""
+FORM_M = 1e-6
+"""What neighbouring points of part or surface are off by together, unless they show more: their distances tell it so
+finely. A scan's own bound allows for more, which would hide here what is to be seen."""
 DEMANDS = Demands(coverage=0.25)
 """Less than of a surface: a sweep sees a strip of a part."""
 
@@ -134,7 +137,7 @@ def _surface_beside(
     if rocked is not None:
         found = balance(found, Scan.of(around, MOST_POINTS), rocked(lines[found.used], rows[found.used]), surface)
     along = np.einsum("ni,nim->nm", found.normals, moved(lines[found.used], rows[found.used]))
-    _, patches = shared_by_patches(found)
+    _, patches = shared_by_patches(found, FORM_M)
     return _SurfaceSeen(found.base_from_surface, found.covariance + patches, found.follow @ along, len(found.used))
 
 
@@ -158,7 +161,7 @@ def _against(
     fit = invert_pose(
         on_part, faces, Prior(there * belongs, np.diag(SHIFTED**2)), tolerance,
         systematic=carried @ beside.unsure @ carried.T, calibration=differently, sweeps=rocked, demands=DEMANDS,
-        most_points=MOST_POINTS, partly=True,
+        most_points=MOST_POINTS, partly=True, least_shared=FORM_M,
     )  # fmt: skip
     turn = np.kron(np.eye(2), there.rotation.T)
     return PartPose(there.inverse() * fit.base_from_surface, turn @ fit.covariance @ turn.T, fit, beside.points)

@@ -46,24 +46,27 @@ FAR = 3.5
 """Robust deviations beyond which a patch is a foreign body, not one of many."""
 
 
-def shared_by_patches(found: Registration) -> tuple[float, Array]:
-    """One standard deviation, m, of what a patch's points share, and the pose's covariance (6, 6) because of it."""
+def shared_by_patches(found: Registration, least: float = SIGMA_FLOOR) -> tuple[float, Array]:
+    """One standard deviation, m, of what a patch's points share, and the pose's covariance (6, 6) because of it.
+
+    It is `least`, m, where the patches show no more than that.
+    """
     patch, count = _patches(found)
     weights = 1.0 / found.sigmas**2
     total = np.bincount(patch, weights)
     means, by_noise = np.bincount(patch, weights * found.heights) / total, 1.0 / total
     many = count >= LEAST_POINTS
-    sigma = _beyond_noise(means[many], by_noise[many])
+    sigma = _beyond_noise(means[many], by_noise[many], least)
     follow = np.stack([np.bincount(patch, along) for along in found.follow])
     return sigma, np.asarray(sigma**2 * follow @ follow.T)
 
 
-def _beyond_noise(means: Array, by_noise: Array) -> float:
+def _beyond_noise(means: Array, by_noise: Array, least: float) -> float:
     """What patches with these mean distances, m, deviate by beyond the variances, m², of their points' noise."""
     if not len(means):
         return SIGMA_FLOOR
     near = np.abs(means) <= FAR * 1.4826 * np.median(np.abs(means))
-    return float(np.sqrt(max(SIGMA_FLOOR**2, np.mean(means[near] ** 2 - by_noise[near]))))
+    return float(np.sqrt(max(least**2, np.mean(means[near] ** 2 - by_noise[near]))))
 
 
 def _patches(found: Registration) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -166,7 +169,7 @@ Resolve = Callable[[NDArray[np.intp], NDArray[np.intp]], Array]
 def invert_pose(
     cloud: Cloud, nominal: NominalSurface, prior: Prior, tolerance: Tolerance, *, systematic: Array | None = None,
     calibration: Resolve | None = None, sweeps: Resolve | None = None, start: pin.SE3 | None = None,
-    demands: Demands | None = None, most_points: int = 10_000, partly: bool = False,
+    demands: Demands | None = None, most_points: int = 10_000, partly: bool = False, least_shared: float = SIGMA_FLOOR,
 ) -> PlacePose:  # fmt: skip
     """The pose of the nominal surface in the arm base, from a cloud in the arm base and the board's pose as prior.
 
@@ -174,7 +177,7 @@ def invert_pose(
     as it goes there; `calibration` says how the calibration's uncertainty moves each point, and is propagated through
     the registration; `sweeps` how each sweep's own uncertainty moves its points, which is taken out as far as the
     sweeps tell it. `start` is where the search begins unless at the prior. A motion that is not known well enough is
-    left to the verdict with `partly`.
+    left to the verdict with `partly`. Neighbouring points are off by `least_shared`, m, together, or by what they show.
 
     Raises `RefusedError` when the scan does not fit the surface, covers too little of it or contradicts the board, and
     `NotObservable` when three standard deviations exceed `tolerance` in some direction, which is named.
@@ -190,7 +193,7 @@ def invert_pose(
     with _shown(pose, *numbers):
         parts = dissent(inversion.scan, pose, nominal, tolerance, explained)
         parts_differ = require_agreement(parts, tolerance, inversion.demands)
-    shared = _shared(found, displaced, systematic)
+    shared = _shared(found, displaced, systematic, least_shared)
     if len(cloud.each_sweep()) == 1:
         # What several sweeps differ by is told apart from the pose already.
         shared = shared + parts.covariance(tolerance)
@@ -254,9 +257,9 @@ class _Inversion:
         return pose, random, verdict
 
 
-def _shared(found: Registration, displaced: list[Array], systematic: Array | None) -> Array:
+def _shared(found: Registration, displaced: list[Array], systematic: Array | None, least: float) -> Array:
     """Covariance (6, 6) of what all points share: `systematic`, what displaces them together, and the patches."""
-    _, by_patches = shared_by_patches(found)
+    _, by_patches = shared_by_patches(found, least)
     shared = np.zeros((6, 6)) if systematic is None else systematic
     for moved in displaced:
         by_parameter = found.follow @ np.einsum("ni,nim->nm", found.normals, moved[found.used])

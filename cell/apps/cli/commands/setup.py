@@ -35,9 +35,9 @@ def init(
     from cell.config.job import job_path, load_job
     from drivers.errors import ConfigError
 
-    _, mesh = load_job(job)
-    source = job_path(job)
-    targets = {folder / "cell.toml": None, folder / source.name: source, folder / mesh.name: mesh}
+    source, (loaded, mesh) = job_path(job), load_job(job)
+    meshes = [mesh] if loaded.part is None else [mesh, Path(loaded.part.mesh)]
+    targets = {folder / "cell.toml": None, folder / source.name: source, **{folder / one.name: one for one in meshes}}
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder} is no folder; name another one")
     for target in targets:
