@@ -10,6 +10,7 @@ import pinocchio as pin
 
 from cell.config.job import Job, PlaceSection
 from cell.measure.geometry.poses import difference, from_parts, perturbed, transform
+from cell.measure.inversion.flush import Flush
 from cell.measure.inversion.mating import MatingGap
 from cell.measure.inversion.part_pose import PartPose, of_part
 from cell.procedures.part_error import draws_of
@@ -19,6 +20,7 @@ from drivers.interfaces import Vector
 UNCLEAR = "chance: by no motion is it farther off than was stated before it was put down"
 CLEARLY = 3.0
 """Standard deviations of the stated place beyond which a part has not come to lie so by chance."""
+BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 LIKELY = {
     "raised": "it lies on something, or is another part: look under it",
@@ -35,7 +37,8 @@ class PlacedPart:
     `points` (45, 3) m, part frame, are those by which a placed part is judged. `covariance` (6, 6) is that of the seen
     pose, surface axes, about the part's origin; `stated` (6, 6) is that of the place before it was put down, which
     stands for the motions that its faces do not show, `unseen`. `gap` is the gap below it, as it lies; None where
-    nothing scanned lies below. `before` is how far off, m, it lay before each correction.
+    nothing scanned lies below. `flush` is how its edge stands over the surface; None where nothing of that shows beside
+    it. `before` is how far off, m, it lay before each correction.
     """
 
     seen: PartPose
@@ -45,6 +48,7 @@ class PlacedPart:
     stated: Vector
     unseen: tuple[str, ...] = ()
     gap: MatingGap | None = None
+    flush: Flush | None = None
     before: tuple[float, ...] = ()
 
     @classmethod
@@ -132,6 +136,7 @@ class PlacedPart:
     def words(self) -> str:
         """For people."""
         gap = "" if self.gap is None else f", gap {self.gap.span}"
+        gap += "" if self.flush is None else f", flush {self.flush.span}"
         where = "" if self.seen.beside else ", against the surface as swept before"
         return f"{1e3 * self.off:.2f} ± {1e3 * self.unsure:.2f} mm off{where}{gap}"
 
@@ -155,11 +160,14 @@ class PlacedPart:
         clear = (name for name, size in times.items() if size > CLEARLY)
         return next((LIKELY[name] for name in clear), UNCLEAR)
 
-    def measured(self, place: PlaceSection) -> tuple[Measured, Measured]:
-        """What it is judged by, beside the place's tolerances."""
+    def measured(self, place: PlaceSection) -> tuple[Measured, ...]:
+        """What it is judged by, beside the place's tolerances: as a whole, and along its edge where that shows."""
+        most = 1e3 * place.tolerance
+        flush = () if self.flush is None else (Measured("flush, beyond its noise", self.flush.beyond, "mm", most=most),)
         return (
-            Measured("placed part off its place, 95 % bound", self.bound["d"], "mm", most=1e3 * place.tolerance),
+            Measured("placed part off its place, 95 % bound", self.bound["d"], "mm", most=most),
             Measured("placed part turned, 95 % bound", 1e3 * self.turn_bound, "mrad", most=1e3 * place.tolerance_angle),
+            *flush,
         )
 
     def kept(self, place: PlaceSection) -> bool:
@@ -168,15 +176,16 @@ class PlacedPart:
 
     def misplaced(self, place: PlaceSection, more: str = "") -> MisplacedError:
         """The error of a part that is not known to lie within the place's tolerances."""
-        off, turned = self.measured(place)
+        measured = off, turned, *_ = self.measured(place)
+        likely = BENT if off.kept and turned.kept else self.likely
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
         return MisplacedError(
             f"the placed part lies {self.words}, by ({shift}) mm and ({turn}) mrad in the surface's axes. Allowed are "
             f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad; at 95 % it may be "
-            f"{off.value:.2f} mm and {turned.value:.1f} mrad. Most likely {self.likely}{self.advice}. "
+            f"{off.value:.2f} mm and {turned.value:.1f} mrad. Most likely {likely}{self.advice}. "
             f"{more}{more and '. '}{NEXT_STEP}",
-            off, turned,
+            *measured,
         ).showing(seen={"placed": self})  # fmt: skip
 
     @property
@@ -201,6 +210,7 @@ class PlacedPart:
             "sigma_mrad": [round(1e3 * float(v), 4) for v in sigma[3:]],
             "points": self.seen.fit.n_points, "beside": self.seen.beside, "unseen": list(self.unseen),
             "gap": None if self.gap is None else self.gap.as_dict(),
+            "flush": None if self.flush is None else self.flush.as_dict(),
             "before_mm": [round(1e3 * off, 4) for off in self.before],
         }  # fmt: skip
 

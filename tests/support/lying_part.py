@@ -29,8 +29,8 @@ from tests.support.report_runs import CONFIG, at_station, work_of
 class LyingPart:
     """A cell of `record` at its station, whose part was put down; `also` is of the job's [place].
 
-    `changed` changes its world before anybody looks. `cell` is the one that looked last, `notes` are its texts and
-    `parts` what it noted of the part.
+    `changed` changes its world before anybody looks. `cell` is the one that looked last, `notes` are its texts,
+    `parts` what it noted of the part, and `carried` how many bodies the interlocks had in the claw then.
     """
 
     record: JobRecord
@@ -43,6 +43,7 @@ class LyingPart:
     cell: VirtualCell = field(init=False)
     notes: list[str] = field(default_factory=list, init=False)
     parts: list[str] = field(default_factory=list, init=False)
+    carried: list[int] = field(default_factory=list, init=False)
 
     def looked(self, off: pin.SE3) -> PlacedPart:
         """What the step makes of a part that lies `off` its place."""
@@ -54,6 +55,7 @@ class LyingPart:
         cell.devices.vehicle.brake()
         work = work_of(cell, job, nominal, self.record, frames=NoFrames(), folder=self.folder)
         self.changed(cell)
+        cell.devices.interlocks.carry(())
         cell.devices.claw.bare.release()
         scene, now = cell.world.scene, cell.clock.now()
         cell.world.part._world_from_part = scene.world_from_surface @ off.homogeneous
@@ -71,6 +73,7 @@ class LyingPart:
     def _told(self, data: dict[str, object]) -> None:
         if "part" in data:
             self.parts.append(str(data["part"]))
+            self.carried.append(len(self.cell.devices.interlocks.situation.part))
         if "text" in data:
             self.notes.append(str(data["text"]))
 

@@ -46,9 +46,11 @@ class PartPose:
     part's origin.
 
     `fit` is how its faces lie in the scan; its verdict names the motions that these do not show. `beside` is the number
-    of points of the surface that showed beside the part; 0 where the earlier sweep tells where that lies.
+    of points of the surface that showed beside the part; 0 where the earlier sweep tells where that lies, which is at
+    `base_from_surface`.
     """
 
+    base_from_surface: pin.SE3
     surface_from_part: pin.SE3
     covariance: Array
     fit: PlacePose
@@ -164,7 +166,7 @@ def _against(
         most_points=MOST_POINTS, partly=True, least_shared=FORM_M,
     )  # fmt: skip
     turn = np.kron(np.eye(2), there.rotation.T)
-    return PartPose(there.inverse() * fit.base_from_surface, turn @ fit.covariance @ turn.T, fit, beside.points)
+    return PartPose(there, there.inverse() * fit.base_from_surface, turn @ fit.covariance @ turn.T, fit, beside.points)
 
 
 def _parted(cloud: Cloud, faces: NominalSurface, base_from_part: pin.SE3) -> tuple[Cloud, Cloud]:

@@ -10,6 +10,7 @@ import pinocchio as pin
 from cell.config.job import Job
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
+from cell.measure.inversion.flush import flush_along_edge
 from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, seen_from_above
 from cell.measure.reconstruction import Cloud, write_cloud
@@ -119,7 +120,8 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         ) from error
     stated = part_covariance(here.job, pose, here.repeatability)
     gap = scanned_gap(scan.cloud, pose.base_from_surface, here.nominal, seen.surface_from_part, part)
-    return replace(PlacedPart.of(here.job, seen, part_points(here.nominal), stated), gap=gap)
+    flush = flush_along_edge(cloud, seen.base_from_surface, here.nominal, faces, belongs) if seen.beside else None
+    return replace(PlacedPart.of(here.job, seen, part_points(here.nominal), stated), gap=gap, flush=flush)
 
 
 def _swept(

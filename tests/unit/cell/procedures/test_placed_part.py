@@ -13,9 +13,10 @@ import scipy
 from cell.config.job import load_job
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import PlacePose
+from cell.measure.inversion.flush import Flush
 from cell.measure.inversion.observability import SmallMotion
 from cell.measure.inversion.part_pose import PartPose
-from cell.procedures.placed_part import LIKELY, UNCLEAR, PlacedPart, along_surface
+from cell.procedures.placed_part import BENT, LIKELY, UNCLEAR, PlacedPart, along_surface
 from drivers.errors import MisplacedError
 from tests.support.lying_part import moved
 
@@ -41,7 +42,7 @@ def part(off: pin.SE3, sigma: float = 10e-6, *, beside: int = 900, weak: tuple[s
     covariance = np.diag([sigma**2] * 3 + [(sigma / 0.02) ** 2] * 3)
     if weak:
         covariance[0, 0] = 2e-3**2
-    seen = PartPose(off, covariance, cast(PlacePose, Shows(*weak)), beside)
+    seen = PartPose(pin.SE3.Identity(), off, covariance, cast(PlacePose, Shows(*weak)), beside)
     job = JOB.model_copy(update={"place": PLACE.model_copy(update={"verify": "seen" if weak else "all"})})
     return PlacedPart.of(job, seen, POINTS, STATED)
 
@@ -106,3 +107,16 @@ def test_of_a_motion_only_what_is_along_the_surface_counts_as_aside() -> None:
     assert np.allclose(pin.log3(found.rotation), [0.0, 0.0, 0.006], atol=1e-6)
     assert part(moved(z=0.4e-3, turn=(0.0, 0.005, 0.0))).aside < 1e-6
     assert part(from_parts((0.3e-3, 0.4e-3, 0.2e-3))).aside == pytest.approx(0.5e-3)
+
+
+def test_an_edge_that_stands_too_high_is_no_part_in_its_place() -> None:
+    """It lies as it should, and is bent."""
+    noise = np.full(3, 0.05e-3)
+    along = [Flush(np.zeros((3, 3)), np.array([0.0, 0.1e-3, top]), noise) for top in (0.64e-3, 0.66e-3, -0.66e-3)]
+    kept, high, low = (replace(part(moved(0.1e-3)), flush=flush) for flush in along)
+    assert kept.kept(PLACE) and "flush +0.00 to +0.64 mm" in kept.words
+    assert not high.kept(PLACE) and not low.kept(PLACE)
+    refused = high.misplaced(PLACE)
+    assert BENT in str(refused) and [number.kept for number in refused.numbers] == [True, True, False]
+    assert BENT not in str(replace(high, seen=part(moved(0.9e-3)).seen).misplaced(PLACE)), "it also lies aside"
+    assert high.summary()["flush"] == high.flush.as_dict() if high.flush else None

@@ -66,6 +66,27 @@ def test_a_fit_that_others_wrote_finds_the_part_in_the_same_place(placed_pot: Jo
     assert np.linalg.norm(pin.log3(apart.rotation.T @ found.seen.surface_from_part.rotation)) < 0.3e-3
 
 
+def test_the_flush_along_its_edge_is_what_rays_onto_its_mesh_have(placed_pot: JobRecord, tmp_path: Path) -> None:
+    """Rays by trimesh, down onto the part as drawn, and onto the part where it lies."""
+    off = moved(0.1e-3, -0.1e-3, 0.2e-3, turn=(0.002, 0.003, 0.0))
+    flush = LyingPart(placed_pot, tmp_path).looked(off).flush
+    assert flush is not None and len(flush.higher) > 40
+    drawn = trimesh.load(tmp_path / "pot-part.ply")
+    tops = [heights(mesh, flush.places) for mesh in (drawn.copy().apply_transform(off.homogeneous), drawn)]
+    error = flush.higher - (tops[0] - tops[1])
+    assert np.sqrt(np.mean(error**2)) < 0.012e-3 and abs(error.mean()) < 0.005e-3
+    assert (np.abs(error) < flush.noise).all()
+
+
+def heights(mesh: trimesh.Trimesh, places: np.ndarray) -> np.ndarray:
+    """How high (n,) m the mesh is at the x and y of `places` (n, 3)."""
+    above = np.column_stack([places[:, :2], np.full(len(places), 0.2)])
+    hits, ray, _ = mesh.ray.intersects_location(above, np.tile([0.0, 0.0, -1.0], (len(places), 1)))
+    found = np.full(len(places), -np.inf)
+    np.maximum.at(found, ray, hits[:, 2])
+    return found
+
+
 def fitted(points: np.ndarray, mesh: trimesh.Trimesh) -> pin.SE3:
     """Where the mesh lies by points on its faces that look up; those at a rim are left out."""
     samples, faces = trimesh.sample.sample_surface(mesh, 400_000, seed=0)
