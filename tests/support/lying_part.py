@@ -15,7 +15,7 @@ from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix, from_parts
 from cell.measure.inversion import NominalSurface
-from cell.procedures.arm.moves import PartState
+from cell.procedures.arm.moves import Mover, PartState
 from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps.kinds import VERIFIED
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
@@ -30,7 +30,7 @@ class LyingPart:
     """A cell of `record` at its station, whose part was put down; `also` is of the job's [place].
 
     `changed` changes its world before anybody looks. `cell` is the one that looked last, `notes` are its texts,
-    `parts` what it noted of the part, and `carried` how many bodies the interlocks had in the claw then.
+    `parts` what it noted of the part, and `carried` whether its moves reckoned with a part in the claw then.
     """
 
     record: JobRecord
@@ -41,9 +41,10 @@ class LyingPart:
     also: str = "corrections = 0"
     changed: Callable[[VirtualCell], None] = lambda cell: None
     cell: VirtualCell = field(init=False)
+    _mover: Mover = field(init=False)
     notes: list[str] = field(default_factory=list, init=False)
     parts: list[str] = field(default_factory=list, init=False)
-    carried: list[int] = field(default_factory=list, init=False)
+    carried: list[bool] = field(default_factory=list, init=False)
 
     def looked(self, off: pin.SE3) -> PlacedPart:
         """What the step makes of a part that lies `off` its place."""
@@ -55,10 +56,10 @@ class LyingPart:
         cell.devices.vehicle.brake()
         work = work_of(cell, job, nominal, self.record, frames=NoFrames(), folder=self.folder)
         self.changed(cell)
-        cell.devices.interlocks.carry(())
         cell.devices.claw.bare.release()
         scene, now = cell.world.scene, cell.clock.now()
         cell.world.part._world_from_part = scene.world_from_surface @ off.homogeneous
+        self._mover = work.mover
         work.part.state = PartState.RELEASED
         work.part.where = from_matrix(inverse(cell.world.world_from_base(now)) @ scene.world_from_surface) * off
         work.mover.leave_part(work.part.where)
@@ -73,7 +74,7 @@ class LyingPart:
     def _told(self, data: dict[str, object]) -> None:
         if "part" in data:
             self.parts.append(str(data["part"]))
-            self.carried.append(len(self.cell.devices.interlocks.situation.part))
+            self.carried.append(any(body.name == "part" for body in self._mover.solids()))
         if "text" in data:
             self.notes.append(str(data["text"]))
 

@@ -29,7 +29,9 @@ def test_a_part_that_lies_aside_is_gripped_and_placed_where_it_belongs(placed_po
     assert before > 0.7e-3 and found.off < 0.15e-3
     assert found.summary()["before_mm"] == [pytest.approx(1e3 * before, abs=1e-3)]
     assert site.parts == ["unknown", "held", "unknown", "released"], "whoever finds the run cut short knows"
-    assert site.carried == [0, 0, 1, 1], "whoever moves with the part in the claw knows how far it reaches"
+    assert site.carried == [False, False, True, True], (
+        "whoever moves with the part in the claw knows how far it reaches"
+    )
     assert not site.cell.world.part.held and site.cell.world.collisions.found == ()
     true = site.lies()
     assert np.linalg.norm(true.translation) < 0.2e-3 and np.abs(pin.log3(true.rotation)).max() < 1e-3
