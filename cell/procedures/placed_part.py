@@ -135,10 +135,9 @@ class PlacedPart:
     @property
     def words(self) -> str:
         """For people."""
-        gap = "" if self.gap is None else f", gap {self.gap.span}"
-        gap += "" if self.flush is None else f", flush {self.flush.span}"
+        spans = [f", {name} {found.span}" for name, found in (("gap", self.gap), ("flush", self.flush)) if found]
         where = "" if self.seen.beside else ", against the surface as swept before"
-        return f"{1e3 * self.off:.2f} ± {1e3 * self.unsure:.2f} mm off{where}{gap}"
+        return f"{1e3 * self.off:.2f} ± {1e3 * self.unsure:.2f} mm off{where}{''.join(spans)}{' mm' if spans else ''}"
 
     @cached_property
     def _times(self) -> Vector:

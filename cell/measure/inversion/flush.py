@@ -35,9 +35,9 @@ class Flush:
 
     @property
     def span(self) -> str:
-        """The least and the largest, for people."""
+        """The least and the largest, mm, for people."""
         least, _, most = self._figures(2)
-        return f"{least:+.2f} to {most:+.2f} mm"
+        return f"{least:+.2f} to {most:+.2f}"
 
     @property
     def beyond(self) -> float:

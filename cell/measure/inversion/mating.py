@@ -68,13 +68,13 @@ class MatingGap:
     def words(self) -> str:
         """For people."""
         _, middle, _ = self._figures(2)
-        return f"gap {self.span}, {middle:.2f} mm in the middle; {100 * self.seen:.0f} % of it seen"
+        return f"gap {self.span} mm, {middle:.2f} mm in the middle; {100 * self.seen:.0f} % of it seen"
 
     @property
     def span(self) -> str:
-        """The least and the largest gap, for people."""
+        """The least and the largest gap, mm, for people."""
         least, _, most = self._figures(2)
-        return f"{least:.2f} to {most:.2f} mm"
+        return f"{least:.2f} to {most:.2f}"
 
     @property
     def notes(self) -> tuple[str, ...]:

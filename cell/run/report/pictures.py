@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from matplotlib.figure import Figure
 from cell.config.job import Job
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion import NominalSurface, PlacePose
+from cell.measure.inversion.flush import Flush
 from cell.measure.reconstruction import Cloud
 from cell.measure.vision import BoardView
 from cell.procedures.arm.photograph import BoardFix
@@ -62,12 +63,14 @@ class BoardPanel:
 class SurfacePanel:
     """Points (n, 3) in m in the surface's frame and their deviations (n,) in m, NaN beside the surface.
 
-    `deviation` is None when no pose of the surface was found; `believed` is False for a pose that was refused.
+    `deviation` is None when no pose of the surface was found; `believed` is False for a pose that was refused. `flush`
+    is that of the placed part, where it was seen.
     """
 
     points: Vector
     deviation: Vector | None
     believed: bool
+    flush: Flush | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +122,15 @@ def draw_surface(
     figure.colorbar(shown, ax=axes, label="deviation from the drawn surface in mm", shrink=0.8, pad=0.07, extend="both")
     said = "deviation from the drawn surface" if surface.believed else "deviation at the place that was refused"
     rms = float(np.sqrt(np.mean(deviation[on] ** 2))) if on.any() else float("nan")
-    _title(axes, [f"{said}: {rms:.3f} mm RMS" + ("" if on.all() else "; dark: beside it"), *map(seam_words, seams)])
+    title = [f"{said}: {rms:.3f} mm RMS" + ("" if on.all() else "; dark: beside it"), *map(seam_words, seams)]
+    if surface.flush is not None:
+        x, y, _ = 1e3 * surface.flush.places.T
+        axes.scatter(
+            x, y, s=22.0, c=1e3 * surface.flush.higher, marker="s", cmap="RdBu_r", vmin=-span_mm, vmax=span_mm,
+            edgecolors="black", linewidths=0.7,
+        )  # fmt: skip
+        title.append("framed: flush along the edge of the placed part")
+    _title(axes, title)
 
 
 def frame_map(axes: Axes, points: Vector) -> None:
@@ -260,11 +271,14 @@ def draw_run(
     surface = _surface(job, nominal, result, evidence)
     scanned = surface is not None or stripe is not None
     seams = (report["scan"] or {}).get("seams", ())
+    seen = seen_placed(result)
+    if surface is not None and seen is not None:
+        surface = replace(surface, flush=seen.flush)
     left, *middle, right = figure.subplots(
         1,
         2 + scanned,
         width_ratios=[1.0, 1.3, 1.0] if scanned else [1.5, 1.0],
-        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * len(seams)},
+        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * (len(seams) + (seen is not None))},
     )
     if board is None:
         empty(left, "the board", "not photographed")
@@ -275,7 +289,6 @@ def draw_run(
     elif stripe is not None:
         draw_stripe(middle[0], stripe)
     if report["outcome"] == "placed":
-        seen = seen_placed(result)
         draw_error(right, report["truth"], report["place_bound_95"], 1e3 * job.place.tolerance, seen)
     else:
         draw_reason(right, report, ended_in(result))

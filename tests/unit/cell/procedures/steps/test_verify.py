@@ -220,7 +220,9 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture(
     with Cell.open(sim="all", seed=2, clock="virtual", job=job) as cell:
         done = cell.run(job=job)
     assert (done.outcome, done.exit_code) == ("placed", 0)
-    assert re.fullmatch(r"in place: 0\.\d\d ± 0\.0\d mm off, gap .* mm", done.reason)
+    assert re.fullmatch(
+        r"in place: 0\.\d\d ± 0\.0\d mm off, gap [0-9.-]+ to [0-9.]+, flush [0-9.+-]+ to [0-9.+-]+ mm", done.reason
+    )
     report = json.loads((done.folder / "report.json").read_text(encoding="utf-8"))
     told = report["steps"][-1]
     assert (told["name"], told["result"]["unseen"]) == ("verify", [])

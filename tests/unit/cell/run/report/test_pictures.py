@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from cell.measure.inversion.flush import Flush
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.run.report.pictures import SurfacePanel, draw_surface
 from lab.bench.job.whole_job import JobRecord
@@ -37,3 +38,13 @@ def test_a_surface_that_was_not_found_is_shown_by_its_height() -> None:
     assert colours.get_ylabel() == "height in mm"
     assert "not found" in axes.get_title()
     surface_axes(SurfacePanel(points[:0], points[:0, 0], believed=True), [])
+
+
+def test_the_flush_of_a_placed_part_has_the_colours_of_the_map() -> None:
+    points = np.column_stack([*np.random.default_rng(1).uniform(-0.02, 0.02, (2, 400)), np.zeros(400)])
+    flush = Flush(points[:3], np.array([-0.1e-3, 0.0, 0.3e-3]), np.full(3, 0.05e-3))
+    axes, _ = surface_axes(SurfacePanel(points, np.zeros(400), believed=True, flush=flush), [])
+    pieces = axes.collections[-1]
+    assert pieces.get_clim() == (-0.2, 0.2) and np.allclose(pieces.get_array(), [-0.1, 0.0, 0.3])
+    assert np.allclose(pieces.get_offsets(), 1e3 * points[:3, :2])
+    assert "framed: flush" in axes.get_title()
