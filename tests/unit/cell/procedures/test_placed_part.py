@@ -120,3 +120,37 @@ def test_an_edge_that_stands_too_high_is_no_part_in_its_place() -> None:
     assert BENT in str(refused) and [number.kept for number in refused.numbers] == [True, True, False]
     assert BENT not in str(replace(high, seen=part(moved(0.9e-3)).seen).misplaced(PLACE)), "it also lies aside"
     assert high.summary()["flush"] == high.flush.as_dict() if high.flush else None
+
+
+def test_its_figures_are_those_of_its_points() -> None:
+    off = moved(0.2e-3, -0.1e-3, 0.4e-3, turn=(0.001, -0.002, 0.003))
+    found = replace(part(off, sigma=20e-6), before=(0.9e-3, 0.7e-3))
+    apart = POINTS @ off.rotation.T + off.translation - POINTS
+    mean = float(np.linalg.norm(apart, axis=1).mean())
+    aside = np.array([0.2e-3, -0.1e-3, 0.0]) + np.cross([0.0, 0.0, 0.003], POINTS)
+    assert found.off == pytest.approx(mean) and found.off < 0.95 * np.linalg.norm(apart, axis=1).max()
+    assert found.aside == pytest.approx(float(np.linalg.norm(aside, axis=1).mean()), rel=0.02)
+    assert found.summary() == {
+        "off_mm": pytest.approx(1e3 * mean, abs=1e-4), "unsure_mm": round(1e3 * found.unsure, 4),
+        "shift_mm": pytest.approx((1e3 * apart.mean(axis=0)).tolist(), abs=1e-4),
+        "turn_mrad": pytest.approx([1.0, -2.0, 3.0], abs=1e-4), "sigma_mm": [0.02] * 3, "sigma_mrad": [1.0] * 3,
+        "points": 1000, "beside": 900, "unseen": [], "gap": None, "flush": None, "before_mm": [0.9, 0.7],
+    }  # fmt: skip
+    assert found.words == f"{1e3 * mean:.2f} ± {1e3 * found.unsure:.2f} mm off"
+    x, y, z = 1e3 * apart.mean(axis=0)
+    told = str(found.misplaced(PLACE))
+    assert f"by ({x:+.2f}, {y:+.2f}, {z:+.2f}) mm and (+1.0, -2.0, +3.0) mrad in the surface's axes" in told
+    most = f"{found.bound['d']:.2f} mm and {1e3 * found.turn_bound:.1f} mrad"
+    assert f"Allowed are 0.6 mm and 6 mrad; at 95 % it may be {most}" in told
+
+
+def test_what_95_percent_of_its_points_are_known_to() -> None:
+    """A shift along one axis alone: of its normal deviate 95 % lie below 1.96 sigma."""
+    sure = np.full(6, 1e-12)
+    sure[1] = 20e-6
+    found = replace(part(moved()), covariance=np.diag(sure**2))
+    assert found.unsure == pytest.approx(20e-6 * scipy.stats.norm.ppf(0.975), rel=0.05)
+    turned = np.diag([1e-24] * 3 + [1e-3**2] * 3)
+    assert replace(part(moved()), covariance=turned).turn_bound == pytest.approx(
+        1e-3 * scipy.stats.maxwell.ppf(0.95), rel=0.05
+    )

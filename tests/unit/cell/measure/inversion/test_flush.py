@@ -82,6 +82,23 @@ def test_without_the_surface_beside_the_part_there_is_no_flush() -> None:
         "no point beside its edge lies on the surface"
     )
     assert flush_along_edge(cloud, TRUE * from_parts((0.0, 0.0, 0.05)), SURFACE, TOP, BELONGS) is None
+    assert flush_along_edge(cloud, TRUE, plate(0.25 * HALF, 0.018), TOP, BELONGS) is None, (
+        "nothing of the surface shows"
+    )
+
+
+def test_on_a_slope_it_is_still_the_step_along_the_surface_s_z_axis() -> None:
+    """A roof of 0.5 m/m stands .4 mm too high: across the roof that is .36 mm."""
+    slope = 0.5
+    turn = pin.rpy.rpyToMatrix(0.0, -np.arctan(slope), 0.0)
+    roof = plate(HALF * np.hypot(1.0, slope), 0.018)
+    roof = NominalSurface(roof.vertices @ turn.T, roof.triangles)
+
+    def height(x: Array, y: Array) -> Array:
+        return np.where(np.abs(x) < HALF, THICK + slope * x + 0.4e-3, 0.0 * y)
+
+    found = flush_along_edge(scanned(height, 5), TRUE, SURFACE, roof, BELONGS)
+    assert found is not None and np.median(found.higher) == pytest.approx(0.4e-3, abs=0.01e-3)
 
 
 def test_a_piece_whose_points_disagree_says_nothing() -> None:
