@@ -1,1 +1,1 @@
-"""What is done with devices: the six steps, and drives, sweeps and calibrations that they are made of."""
+"""What is done with devices: the steps of a job, and drives, sweeps and calibrations that they are made of."""

@@ -107,6 +107,13 @@ class PlacedPart:
         return float(np.linalg.norm(transform(motion, self.points) - self.points, axis=1).mean())
 
     @property
+    def not_aside(self) -> PlacedPart:
+        """The same part, moved along the surface to where it belongs."""
+        motion = self.belongs.inverse() * self.seen.surface_from_part
+        there = self.belongs * along_surface(motion).inverse() * motion
+        return replace(self, seen=replace(self.seen, surface_from_part=there))
+
+    @property
     def unsure(self) -> float:
         """What 95 % of the points are known to, m."""
         return float(np.percentile(np.linalg.norm(self._errors, axis=-1), 95))
@@ -159,6 +166,11 @@ class PlacedPart:
         clear = (name for name, size in times.items() if size > CLEARLY)
         return next((LIKELY[name] for name in clear), UNCLEAR)
 
+    @property
+    def slipped(self) -> bool:
+        """Whether it went to the side farther than chance brings: on a slope that has tilted and raised it as well."""
+        return self.likely == LIKELY["shifted"]
+
     def measured(self, place: PlaceSection) -> tuple[Measured, ...]:
         """What it is judged by, beside the place's tolerances: as a whole, and along its edge where that shows."""
         most = 1e3 * place.tolerance
@@ -170,13 +182,14 @@ class PlacedPart:
         )
 
     def kept(self, place: PlaceSection) -> bool:
-        """Whether it is known to lie within the place's tolerances."""
+        """Whether it is known to lie within the place's tolerances, with no piece of its edge clearly out of them."""
         return all(number.kept for number in self.measured(place))
 
     def misplaced(self, place: PlaceSection, more: str = "") -> MisplacedError:
         """The error of a part that is not known to lie within the place's tolerances."""
-        measured = off, turned, *_ = self.measured(place)
-        likely = BENT if off.kept and turned.kept else self.likely
+        measured = off, turned, *flush = self.measured(place)
+        bent = off.kept and turned.kept and not all(number.kept for number in flush)
+        likely = BENT if bent else self.likely
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
         return MisplacedError(
@@ -193,6 +206,7 @@ class PlacedPart:
         more = f"that is farther off than was stated before it was put down: most likely {self.likely}"
         return (
             f"the placed part lies {self.words}",
+            *(() if self.flush is None else self.flush.notes),
             *((more,) if np.abs(self._times).max() > CLEARLY else ()),
             *(f"not seen of the placed part: {motion}" for motion in self.unseen),
         )

@@ -63,9 +63,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     part = _part(asker, folder, name)
     _require_room(asker, targets if part is None or part.same else (*targets, part.target), overwrite)
     like = template(asker)
-    job = station(asker, like, name, targets[1].name, laid)
-    if part is not None:
-        job = _looked_at(asker, job.model_copy(update={"part": part.section}), part)
+    job = _with_part(asker, station(asker, like, name, targets[1].name, laid), part)
     step = asker.get("step", "Lines of the scan, how far apart", "0.5 mm", lambda t: parse_quantity(t, "mm", *STEP_MM))
 
     laid, proposal = _proposed(asker, laid, job, config, step=step)
@@ -153,8 +151,13 @@ def _part(asker: Asker, folder: Path, name: str) -> _PartFile | None:
     return _PartFile(given, target, PartSection.model_validate({"mesh": target.name, "mesh_unit": unit}))
 
 
-def _looked_at(asker: Asker, job: Job, part: _PartFile) -> Job:
-    """The job, which looks at what shows of its part once it was placed; what does not is told."""
+def _with_part(asker: Asker, job: Job, part: _PartFile | None) -> Job:
+    """The job with this part in place of that of the job that it is like. It looks at what shows of it once it was
+    placed; what does not show is told."""
+    given = {"part": None if part is None else part.section, "place": job.place.model_copy(update={"accept": None})}
+    job = job.model_copy(update=given)
+    if part is None:
+        return job
     mesh = NominalSurface.load(part.given, part.section.mesh_unit)
     tolerance = Tolerance(job.place.tolerance, job.place.tolerance_angle)
     unseen = shown_by(seen_from_above(mesh, job.place.surface_from_part.se3()), tolerance)

@@ -12,26 +12,33 @@ import numpy as np
 import pinocchio as pin
 import scipy
 
+from cell.measure.geometry.poses import transform
 from cell.measure.inversion.disagreement import ROWS, SQUARE_M, STEEPEST, squares
 from cell.measure.inversion.nominal import Array, Indices, NominalSurface
 from cell.measure.reconstruction.cloud import Cloud
 
-REACH_M = 3e-3
+REACH_M = 6e-3
 """Farther from what is drawn a point belongs to something else."""
-NOISY_M = 0.4e-3
-"""A piece whose noise is more shows a wall, or several things."""
 BESIDE_M = 6e-3
 """A piece of the edge is held against what lies nearer than this."""
+NOISY = 0.5
+"""A piece whose noise is more than this share of the tolerance shows a wall, or several things: it says nothing."""
+LEAST_SEEN = 0.5
+"""Share of the pieces below which little is known of the edge."""
 
 
 @dataclass(frozen=True, eq=False)
 class Flush:
     """Pieces of 2 mm along a part's edge: their middles `places` (n, 3) m, surface frame, how much `higher` (n,) m than
-    drawn each stands over the surface beside it, along the surface's z axis, and four standard deviations, `noise`."""
+    drawn each stands over the surface beside it, along the surface's z axis, and four standard deviations, `noise`.
+
+    `seen` is the share of the pieces that say so, of those that have the surface beside them.
+    """
 
     places: Array
     higher: Array
     noise: Array
+    seen: float = 1.0
 
     @property
     def span(self) -> str:
@@ -44,50 +51,64 @@ class Flush:
         """How far the worst piece is off what is drawn, up or down, beyond its noise, mm; below 0 within it."""
         return 1e3 * float(np.max(np.abs(self.higher) - self.noise))
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """For people, what was not looked at."""
+        if self.seen >= LEAST_SEEN:
+            return ()
+        return (
+            f"of the edge of the placed part {100 * self.seen:.0f} % say how flush it is: look along the rest of it",
+        )
+
     def as_dict(self) -> dict[str, float]:
         """For the journal."""
         least, middle, most = self._figures(4)
-        return {"least_mm": least, "median_mm": middle, "largest_mm": most, "pieces": len(self.higher)}
+        return {"least_mm": least, "median_mm": middle, "largest_mm": most, "seen": round(self.seen, 3)}
 
     def _figures(self, digits: int) -> tuple[float, ...]:
         return tuple(round(1e3 * float(v), digits) + 0.0 for v in np.percentile(self.higher, [0, 50, 100]))
 
 
 def flush_along_edge(
-    cloud: Cloud, base_from_surface: pin.SE3, nominal: NominalSurface, faces: NominalSurface, belongs: pin.SE3
-) -> Flush | None:
-    """The flush of a part with these `faces`, which `belongs` at surface_from_part, in a sweep over it and beside it.
+    part: Cloud, beside: Cloud, base_from_surface: pin.SE3, *, nominal: NominalSurface, faces: NominalSurface,
+    belongs: pin.SE3, lies: pin.SE3, tolerance: float, rocks: float = 0.0,
+) -> Flush | None:  # fmt: skip
+    """The flush of a part with these `faces`, which `belongs` at one surface_from_part, and `lies` at another.
 
-    `cloud` is in the arm base, where the same sweep shows the surface at `base_from_surface`. None where no piece of
-    the edge has some of the surface beside it.
+    `part` and `beside` are what one sweep shows of the part and of what lies beside it, arm base; there the surface is
+    at `base_from_surface`. Pieces are noisy by the place's `tolerance`, m. The vehicle `rocks` by so much, m, up and
+    down: a piece and what is beside it may be swept at opposite ends of that. None where none says anything.
     """
-    lines, rows = np.nonzero(cloud.valid)
-    local = (cloud.points[lines, rows] - base_from_surface.translation) @ base_from_surface.rotation
-    part = _standing((local - belongs.translation) @ belongs.rotation, local, lines, faces)
-    beside = _standing(local, local, lines, nominal)
-    if part is None or beside is None:
+    own = _standing(part, base_from_surface, lies, faces)
+    other = _standing(beside, base_from_surface, pin.SE3.Identity(), nominal)
+    if own is None or other is None:
         return None
-    nearest, other = map(np.asarray, scipy.spatial.cKDTree(beside.places[:, :2]).query(part.places[:, :2]))
+    nearest, which = map(np.asarray, scipy.spatial.cKDTree(other.places[:, :2]).query(own.places[:, :2]))
     edge = nearest <= BESIDE_M
-    if not edge.any():
+    noise = np.hypot(own.noise, other.noise[which]) + 2.0 * rocks
+    clear = edge & (noise <= NOISY * tolerance)
+    if not clear.any():
         return None
-    higher, noise = beside.higher[other[edge]], beside.noise[other[edge]]
-    return Flush(part.places[edge], part.higher[edge] - higher, np.hypot(part.noise[edge], noise))
+    # What a part moved to the side has higher on a slope is no step: as a whole it is higher by how its pose lifts it.
+    places = own.places[clear]
+    lifted = (places - transform(belongs * lies.inverse(), places))[:, 2]
+    higher = own.higher[clear] + lifted - other.higher[which[clear]]
+    return Flush(places, higher, noise[clear], float(clear.sum() / edge.sum()))
 
 
-def _standing(points: Array, places: Array, lines: Indices, drawn: NominalSurface) -> Flush | None:
-    """How much higher than `drawn` its points stand, in squares of 2 mm; None where no square has points enough.
-
-    `points` (n, 3) are in the frame of what is drawn, `places` (n, 3) the same in the surface's.
-    """
-    index, feet = drawn.feet(points, REACH_M)
-    up = feet.normals[:, 2]
+def _standing(
+    cloud: Cloud, base_from_surface: pin.SE3, surface_from_it: pin.SE3, drawn: NominalSurface
+) -> Flush | None:
+    """How much higher than `drawn` its points in the cloud stand, in squares of 2 mm of the surface; None for none."""
+    lines, rows = np.nonzero(cloud.valid)
+    places = (cloud.points[lines, rows] - base_from_surface.translation) @ base_from_surface.rotation
+    index, feet = drawn.feet((places - surface_from_it.translation) @ surface_from_it.rotation, REACH_M)
+    up = feet.normals @ surface_from_it.rotation[2]
     kept = feet.inner & (up > STEEPEST)
     if not kept.any():
         return None
     index = index[kept]
     column, row = np.floor(places[index, :2] / SQUARE_M).astype(np.intp).T
-    square = np.asarray(column * 2 * ROWS + row)
+    square: Indices = np.asarray(column * 2 * ROWS + row)
     medians, higher, noise = squares(square, feet.heights[kept] / up[kept], lines[index])
-    clear = noise <= NOISY_M
-    return Flush(places[index[medians[clear]]], higher[clear], noise[clear]) if clear.any() else None
+    return Flush(places[index[medians]], higher, noise) if len(medians) else None

@@ -47,7 +47,7 @@ class PartPose:
 
     `fit` is how its faces lie in the scan; its verdict names the motions that these do not show. `beside` is the number
     of points of the surface that showed beside the part; 0 where the earlier sweep tells where that lies, which is at
-    `base_from_surface`.
+    `base_from_surface`. The vehicle rocked by `rocked`, m, up and down, as far as the sweep shows it.
     """
 
     base_from_surface: pin.SE3
@@ -55,6 +55,7 @@ class PartPose:
     covariance: Array
     fit: PlacePose
     beside: int
+    rocked: float = 0.0
 
 
 def seen_from_above(part: NominalSurface, surface_from_part: pin.SE3) -> NominalSurface:
@@ -93,7 +94,7 @@ def find_part(
     of each independent parameter of this sweep displaces its points; `times` (lines,) s is when its lines were taken: a
     vehicle that rocks is seen in them. Raises `RefusedError` where the part is not found.
     """
-    on_part, around = _parted(cloud, faces, surface.base_from_surface * belongs)
+    on_part, around = parted(cloud, faces, surface.base_from_surface * belongs)
 
     def found(rocked: Motions | None) -> PartPose:
         beside = _surface_beside(around, nominal, surface, moved, rocked)
@@ -103,11 +104,12 @@ def find_part(
     rocking = find_rocking(on_part, faces, still.fit.base_from_surface, times)
     if rocking is None:
         return still
-    return found(
+    steady = found(
         lambda lines, rows: rocking_motions(
             cloud, lines, rows, base_from_vehicle=base_from_vehicle, times=times, hz=rocking.hz
         )
     )
+    return replace(steady, rocked=rocking.height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,8 +171,8 @@ def _against(
     return PartPose(there, there.inverse() * fit.base_from_surface, turn @ fit.covariance @ turn.T, fit, beside.points)
 
 
-def _parted(cloud: Cloud, faces: NominalSurface, base_from_part: pin.SE3) -> tuple[Cloud, Cloud]:
-    """The points about the part, where it is expected, and those beside it."""
+def parted(cloud: Cloud, faces: NominalSurface, base_from_part: pin.SE3) -> tuple[Cloud, Cloud]:
+    """The points of a cloud, arm base, about the part with these `faces`, where it is expected, and those beside it."""
     low, high = faces.extent
     local = (cloud.points - base_from_part.translation) @ base_from_part.rotation
     # A comparison with what is no number is false: holes are of neither.

@@ -1,1 +1,1 @@
-"""The six steps of a job, a file each, and what they share."""
+"""The steps of a job, a file each, and what they share."""

@@ -12,7 +12,7 @@ from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion.flush import flush_along_edge
 from cell.measure.inversion.mating import scanned_gap
-from cell.measure.inversion.part_pose import find_part, seen_from_above
+from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
 from cell.measure.reconstruction import Cloud, write_cloud
 from cell.measure.reconstruction.cloud import Indices
 from cell.motion.kinematics import HOME
@@ -50,7 +50,10 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
             if here.part.state is not PartState.RELEASED:
                 raise
             here.mover.to_joints(HOME)
-            raise found.misplaced(plan, f"It was not corrected: {error}") from error
+            if not found.kept(plan):
+                raise found.misplaced(plan, f"It was not corrected: {error}") from error
+            context.note(text=f"it was not corrected: {error}")
+            break
         for note in placed.notes:
             context.note(text=note)
         found = replace(_looked(here, pose, context), before=(*found.before, found.off))
@@ -70,11 +73,13 @@ def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left:
     if found.off <= (plan.tolerance if plan.accept is None else plan.accept) and found.kept(plan):
         return False
     hope = hoped(brought(here, pose, found.points, found.covariance), left)
-    if hope < found.aside < FARTHEST_M:
-        return True
     why = f"placed again it would be {1e3 * hope:.2f} mm off"
     if found.aside >= FARTHEST_M:
         why = f"farther than {1e3 * FARTHEST_M:g} mm the claw may not find it"
+    elif not found.kept(plan) and not found.slipped and not found.not_aside.kept(plan):
+        why = "its height, tilt or edge is what the part lies on, or is, and comes again"
+    elif hope < found.aside:
+        return True
     context.note(
         text=f"no correction of the placed part, {found.words}: along the surface it is {1e3 * found.aside:.2f} mm "
         f"off; {why}"
@@ -120,7 +125,11 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         ) from error
     stated = part_covariance(here.job, pose, here.repeatability)
     gap = scanned_gap(scan.cloud, pose.base_from_surface, here.nominal, seen.surface_from_part, part)
-    flush = flush_along_edge(cloud, seen.base_from_surface, here.nominal, faces, belongs) if seen.beside else None
+    on_part, around = parted(cloud, faces, seen.base_from_surface * belongs)
+    flush = None if not seen.beside else flush_along_edge(
+        on_part, around, seen.base_from_surface, nominal=here.nominal, faces=faces, belongs=belongs,
+        lies=seen.surface_from_part, tolerance=place.tolerance, rocks=seen.rocked,
+    )  # fmt: skip
     return replace(PlacedPart.of(here.job, seen, part_points(here.nominal), stated), gap=gap, flush=flush)
 
 

@@ -274,11 +274,12 @@ def draw_run(
     seen = seen_placed(result)
     if surface is not None and seen is not None:
         surface = replace(surface, flush=seen.flush)
+    flush = surface is not None and surface.flush is not None
     left, *middle, right = figure.subplots(
         1,
         2 + scanned,
         width_ratios=[1.0, 1.3, 1.0] if scanned else [1.5, 1.0],
-        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * (len(seams) + (seen is not None))},
+        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * (len(seams) + flush)},
     )
     if board is None:
         empty(left, "the board", "not photographed")

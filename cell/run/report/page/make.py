@@ -276,7 +276,7 @@ def _part_rows(report: Report) -> Iterator[Row]:
         off, which = "", "largest"
         if truth is not None:
             off = f"{truth['error_mm'][name]['max']:.3f} mm"
-        elif seen is not None:
+        elif seen is not None and not seen.get("unseen"):
             off, which = f"{seen['off_mm'] if name == 'd' else abs(seen['shift_mm'][k]):.3f} mm", "as seen, mean"
         of = f"part's points, {which} D" if name == "d" else f"part's points, {which} along {name}"
         allowed = f"at most {tolerance:g} mm" if name == "d" and tolerance is not None else ""

@@ -119,7 +119,16 @@ def test_an_edge_that_stands_too_high_is_no_part_in_its_place() -> None:
     refused = high.misplaced(PLACE)
     assert BENT in str(refused) and [number.kept for number in refused.numbers] == [True, True, False]
     assert BENT not in str(replace(high, seen=part(moved(0.9e-3)).seen).misplaced(PLACE)), "it also lies aside"
-    assert high.summary()["flush"] == high.flush.as_dict() if high.flush else None
+    assert high.summary()["flush"] == along[1].as_dict()
+    told = str(part(moved(0.1e-3)).misplaced(PLACE, "It was not corrected: why"))
+    assert BENT not in told, "nothing says so where its edge was not looked at"
+    assert any("look along the rest" in note for note in replace(kept, flush=replace(along[0], seen=0.2)).notes)
+
+
+def test_moved_to_where_it_belongs_along_the_surface_it_is_as_high_and_as_tilted() -> None:
+    found = part(moved(0.5e-3, -0.3e-3, 0.2e-3, turn=(0.003, 0.0, 0.004))).not_aside
+    assert found.aside < 2e-6 and found.offsets[:, 2].mean() == pytest.approx(0.2e-3, abs=0.02e-3)
+    assert np.allclose(found.turn, [0.003, 0.0, 0.0], atol=2e-5)
 
 
 def test_its_figures_are_those_of_its_points() -> None:

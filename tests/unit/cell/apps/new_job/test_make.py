@@ -40,7 +40,8 @@ def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(tmp
         tmp_path / "m.ply", lambda x, y: 8 + 3 * np.sin(x / 9 + 0.3) * np.cos(y / 11 - 0.5) + np.sin((x + 2 * y) / 16),
         half=14.0,
     )  # fmt: skip
-    job, surface = load_job(from_options(tmp_path, mesh=str(mesh), name="lid").job)
+    job, surface = load_job(from_options(tmp_path, mesh=str(mesh), name="lid", like="shell").job)
+    assert job.part is None and job.place.accept is None, "that of `shell` is another part"
     vertices, faces = read_mesh(surface, "mm")
     lies = job.place.surface_from_part.se3().inverse()
     (tmp_path / "drawings").mkdir()

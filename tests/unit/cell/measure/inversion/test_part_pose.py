@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pinocchio as pin
 import pytest
 import trimesh
+from numpy.typing import NDArray
 
 from cell.config.job import load_job
-from cell.measure.inversion import NominalSurface, Tolerance
+from cell.measure.inversion import NominalSurface, Prior, Tolerance
 from cell.measure.inversion.nominal import read_mesh
-from cell.measure.inversion.part_pose import seen_from_above, shown_by
+from cell.measure.inversion.part_pose import PartPose, find_part, seen_from_above, shown_by
 from drivers.errors import ConfigError
 from lab.bench.job.part_jobs import HEIGHT, body
+from tests.unit.cell.measure.inversion.test_registration import BOARD, TRUE, freeform, nominal, scanned
 
+Array = NDArray[np.float64]
 HERE = pin.SE3.Identity()
 TOLERANCE = Tolerance(0.6e-3, 6e-3)
 JOB, MESH = load_job("pot")
@@ -53,3 +58,38 @@ def test_the_motions_that_the_faces_do_not_show_are_named(made: NominalSurface, 
     found = shown_by(seen_from_above(made, HERE), TOLERANCE)
     assert len(found) == len(unseen)
     assert all(any(name.startswith(one) and name.endswith("part frame") for name in found) for one in unseen)
+
+
+def shell(x: Array, y: Array) -> Array:
+    return 0.010 + freeform(x, y)
+
+
+def found(moved: Callable[[Array], Array]) -> PartPose:
+    """A part 30 mm long on the middle of a surface; `moved` tells how points (n, 3) m, arm base, are displaced."""
+    cloud = scanned(lambda x, y: np.where(np.abs(x) < 0.015, shell(x, y), freeform(x, y)), 6)
+    return find_part(
+        cloud, nominal(shell, 0.015), nominal(freeform), surface=Prior(TRUE, BOARD), belongs=HERE, tolerance=TOLERANCE,
+        moved=lambda lines, rows: moved(cloud.points[lines, rows]), times=np.linspace(0.0, 5.0, cloud.shape[0]),
+        base_from_vehicle=HERE,
+    )  # fmt: skip
+
+
+def test_what_moves_part_and_surface_alike_leaves_nothing_open_and_what_moves_one_does() -> None:
+    def nothing(points: Array) -> Array:
+        return np.zeros((len(points), 3, 1))
+
+    def alike(points: Array) -> Array:
+        """Six motions of a rigid body, .2 mm, and .5 mrad about the arm's foot, 0.75 m away."""
+        turned = 0.5e-3 * np.cross(np.eye(3)[None], points[:, None]).transpose(0, 2, 1)
+        return np.concatenate([np.broadcast_to(0.2e-3 * np.eye(3), (len(points), 3, 3)), turned], axis=2)
+
+    def apart(points: Array) -> Array:
+        high = ((points - TRUE.translation) @ TRUE.rotation)[:, 2] > 0.0135
+        return 0.2e-3 * high[:, None, None] * TRUE.rotation[:, :1]
+
+    sure, same, own = (np.sqrt(np.diag(found(moved).covariance)) for moved in (nothing, alike, apart))
+    assert sure[:3].max() < 0.02e-3 and np.allclose(same, sure, rtol=0.2)
+    assert own[0] == pytest.approx(0.2e-3, rel=0.15)
+    seen = found(alike)
+    assert np.abs(seen.surface_from_part.translation).max() < 0.04e-3 and seen.beside > 1000
+    assert np.linalg.norm(seen.base_from_surface.translation - TRUE.translation) < 0.04e-3

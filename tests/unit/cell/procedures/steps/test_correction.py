@@ -48,9 +48,11 @@ def test_what_is_accepted_is_not_touched_and_what_is_not_is_corrected(placed_pot
 def test_a_part_that_lies_on_something_is_left_there(placed_pot: JobRecord, tmp_path: Path) -> None:
     """Placed again it would lie as high."""
     site = LyingPart(placed_pot, tmp_path, also="corrections = 3")
+    # Moved to its place along the surface it would be as high.
     with pytest.raises(MisplacedError, match="it lies on something"):
-        site.looked(moved(z=0.8e-3))
+        site.looked(moved(0.15e-3, z=0.8e-3))
     assert site.parts == []
+    assert any("what the part lies on, or is, and comes again" in note for note in site.notes)
     assert any(note.startswith("no correction of the placed part") for note in site.notes)
 
 
@@ -84,6 +86,10 @@ def test_what_is_in_the_way_to_the_part_ends_the_run_with_the_part_where_it_lay(
 
     site = LyingPart(placed_pot, tmp_path, also="corrections = 1", changed=bolt)
     off = moved(y=0.8e-3, z=0.35e-3)
+    # One that lies in its place, and might lie better, stays where it is.
+    near = LyingPart(placed_pot, tmp_path, also='corrections = 1\naccept = "0.1 mm"', changed=bolt)
+    assert near.looked(moved(y=0.2e-3, z=0.1e-3)).kept(pot()[0].place) and near.parts == []
+    assert any("it was not corrected: the claw touched something" in note for note in near.notes)
     with pytest.raises(RefusedError, match="the claw touched something as it went to grip the placed part"):
         site.looked(off)
     assert site.parts == []

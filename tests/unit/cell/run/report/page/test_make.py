@@ -205,3 +205,6 @@ def test_where_nobody_knows_the_truth_the_part_is_where_it_was_seen() -> None:
         rows = {row.cells[0]: row.cells for row in compared({**TOLERANCE, **BOUND, **more})}
         assert rows["part's points, as seen, mean along y"][2] == "0.060 mm"
         assert rows["part's points, as seen, mean D"][1:5] == ("0 mm", "0.080 mm", "0.080 mm", "at most 0.6 mm")
+    partly = {"steps": [{"name": "verify", "result": {**seen, "unseen": ["translation along the x axis"]}}]}
+    rows = {row.cells[0]: row.cells for row in compared({**TOLERANCE, **BOUND, **partly})}
+    assert rows["part's points, largest D"][2] == "not measured", "where it lies along x is as stated, not as seen"
