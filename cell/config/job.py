@@ -274,7 +274,7 @@ def shipped_mesh(mesh: Path) -> str | None:
     """The name of the shipped surface that this file is a copy of, byte for byte; None for one's own."""
     for name in shipped_jobs():
         shipped = _job_folder() / f"{name}.ply"
-        # A job may be for the surface of another.
+        # Only what the simulated world has in closed form is named as its job.
         if (
             shipped.is_file()
             and mesh.stat().st_size == shipped.stat().st_size

@@ -25,12 +25,15 @@ from cell.procedures.steps.place import PlaceResult
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
-from drivers.errors import MisplacedError, RefusedError
+from cell.procedures.sweep.swath import FRAMES_LOST
+from drivers.errors import DeviceFault, MisplacedError, RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
 
 CLOUD = "placed.ply"
+SWEEPS = 3
+"""How often at most the part is swept until no frames are lost."""
 FARTHEST_M = 2e-3
 """A part that lies farther aside is not gripped: the fingers may not find it as it lies."""
 
@@ -136,12 +139,22 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
 def _swept(
     here: Workplace, sweep: SweepRecord, pose: PlacePose, faces: NominalSurface, context: StepContext
 ) -> tuple[Cloud, SweepRecord]:
-    """Sweep the part, with the head as far above its faces as it was above the surface."""
-    again = laser_sweep(
-        here, pose.base_from_surface * surface_from_faces(here.job, faces), head_at(here, sweep), here.job.scan,
-        check=context.check, keep_frame=lambda frame: here.frames.keep("verify", frame), counted=False,
-        progress=lambda share, text: context.progress(0.85 * share, f"the placed part: {text}"),
-    )  # fmt: skip
+    """Sweep the part, with the head as far above its faces as it was above the surface. Lost frames are swept again:
+    nothing of the part is moved by that."""
+    over = pose.base_from_surface * surface_from_faces(here.job, faces)
+    for left in reversed(range(SWEEPS)):
+        try:
+            again = laser_sweep(
+                here, over, head_at(here, sweep), here.job.scan, check=context.check, counted=False,
+                keep_frame=lambda frame: here.frames.keep("verify", frame),
+                progress=lambda share, text: context.progress(0.85 * share, f"the placed part: {text}"),
+            )  # fmt: skip
+        except DeviceFault as fault:
+            if fault.code != FRAMES_LOST or not left:
+                raise
+            context.note(text=f"the placed part is swept again: {fault}")
+        else:
+            break
     cloud = build_cloud(again)
     write_cloud(here.folder / CLOUD, cloud, here.config.cell.sim)
     return cloud, again

@@ -64,6 +64,7 @@ def _steps(values: Vector, window: int, of: Callable[..., Vector]) -> Vector:
     return np.asarray(told[window:] - told[:-window])
 
 
+FRAMES_LOST = "camera.frames_lost"
 MAX_LOST_FRACTION = 0.05
 STEP_SHARE = 0.5
 """Of what a sweep may lie off as a whole, by which its lines may lie apart."""
@@ -250,7 +251,7 @@ class SweepCollector:
         """The middle frame and profile; raises `DeviceFault` without a line or with a larger share of frames lost."""
         if not len(lines) or self.middle is None or self.lost > most_lost * self.expected:
             raise DeviceFault(
-                camera, "camera.frames_lost",
+                camera, FRAMES_LOST,
                 f"{len(lines)} frames came from the sweep and {self.lost} were lost, of about {self.expected:.0f}",
                 recoverable=True, hint="Lower scan.frame_rate or look at the camera's link.",
             )  # fmt: skip

@@ -179,8 +179,9 @@ Faces = NDArray[np.int64]
 
 FINEST, MOST_POINTS = 1e-4, 1200
 """Raster of the height field: its step, m, at least, and points along the longer side at most."""
-COARSEST = 1e-3
-"""Triangles are divided until no side is longer, m, or than a hundredth of the mesh: ambient light is drawn by them."""
+COARSEST, COARSEST_PART = 1e-3, 4e-3
+"""Triangles are divided until no side is longer, m, or than a hundredth of the mesh: ambient light is drawn by them. It
+is drawn more coarsely on a part, which is in most pictures."""
 UNITS = {"m": 1.0, "mm": 1e-3}
 
 
@@ -237,7 +238,7 @@ def underside(path: str, unit: str) -> Surface:
 def _read(path: str, content: bytes, unit: str) -> OwnSurface:
     import trimesh
 
-    merged = trimesh.Trimesh(*_divided(*_loaded(path, unit)), process=True)
+    merged = trimesh.Trimesh(*_divided(*_loaded(path, unit), COARSEST), process=True)
     vertices, faces = np.asarray(merged.vertices, dtype=np.float64), np.asarray(merged.faces, dtype=np.int64)
     return OwnSurface(_ground(Path(path).stem, vertices, faces), vertices, faces)
 
@@ -249,7 +250,7 @@ def _part(path: str, content: bytes, unit: str) -> SurfaceMesh:
     up = np.cross(b - a, c - a)[:, 2] > 0.0
     if not up.any():
         return SurfaceMesh(vertices, faces.astype(np.int32))
-    above, shown = _divided(vertices, faces[up])
+    above, shown = _divided(vertices, faces[up], COARSEST_PART)
     return SurfaceMesh(
         np.concatenate([above, vertices]), np.concatenate([shown, faces[~up] + len(above)]).astype(np.int32)
     )
@@ -270,11 +271,11 @@ def _loaded(path: str, unit: str) -> tuple[Floats, Faces]:
     return vertices, faces
 
 
-def _divided(vertices: Floats, faces: Faces) -> tuple[Floats, Faces]:
-    """The same with no side longer than `COARSEST`, or a hundredth of the mesh."""
+def _divided(vertices: Floats, faces: Faces, coarsest: float) -> tuple[Floats, Faces]:
+    """The same with no side longer than `coarsest`, m, or a hundredth of the mesh."""
     from trimesh.remesh import subdivide_to_size
 
-    longest = max(COARSEST, float(np.ptp(vertices, axis=0).max()) / 100.0)
+    longest = max(coarsest, float(np.ptp(vertices, axis=0).max()) / 100.0)
     divide: Any = subdivide_to_size
     made: tuple[Floats, Faces] = divide(vertices, faces, longest, max_iter=20)
     return made

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
 
+from cell.config.job import load_job
+from cell.measure.inversion import NominalSurface, Tolerance
+from cell.measure.inversion.mating import drawn_gap
+from cell.measure.inversion.part_pose import seen_from_above, shown_by
 from sim_backends.world.bodies.surfaces import surface
 from tests.support.job_meshes import FOLDER, TRIANGLES
 
@@ -14,8 +20,18 @@ POINTS = 400_000
 
 def test_all_meshes_together_take_no_more_than_300_kb() -> None:
     meshes = [path for path in FOLDER.iterdir() if path.suffix != ".toml"]
-    assert sorted(path.stem for path in meshes) == sorted(TRIANGLES)
+    assert sorted(path.stem for path in meshes) == sorted([*TRIANGLES, "facets", "shell-part"])
     assert sum(path.stat().st_size for path in meshes) <= 300_000
+
+
+def test_the_part_that_ships_fits_its_surface_and_shows_how_it_lies() -> None:
+    job, mesh = load_job("shell")
+    assert job.part is not None
+    part, belongs = NominalSurface.load(Path(job.part.mesh)), job.place.surface_from_part.se3()
+    gap = drawn_gap(NominalSurface.load(mesh), belongs, part)
+    assert gap is not None and np.abs(gap.gaps).max() < 1e-6 and gap.seen == 1.0
+    assert shown_by(seen_from_above(part, belongs), Tolerance(job.place.tolerance, job.place.tolerance_angle)) == ()
+    assert trimesh.load_mesh(job.part.mesh).is_watertight
 
 
 @pytest.mark.parametrize("name", TRIANGLES)
