@@ -29,8 +29,9 @@ from tests.support.report_runs import CONFIG, at_station, work_of
 class LyingPart:
     """A cell of `record` at its station, whose part was put down; `also` is of the job's [place].
 
-    `changed` changes its world before anybody looks. `cell` is the one that looked last, `notes` are its texts,
-    `parts` what it noted of the part, and `carried` whether its moves reckoned with a part in the claw then.
+    `changed` changes its world before anybody looks, `heard` is called with each text that is told. `cell` is the one
+    that looked last, `notes` are its texts, `parts` what it noted of the part, and `carried` whether its moves reckoned
+    with a part in the claw then.
     """
 
     record: JobRecord
@@ -40,6 +41,7 @@ class LyingPart:
     flat: bool = False
     also: str = "corrections = 0"
     changed: Callable[[VirtualCell], None] = lambda cell: None
+    heard: Callable[[VirtualCell, str], None] = lambda cell, text: None
     cell: VirtualCell = field(init=False)
     _mover: Mover = field(init=False)
     notes: list[str] = field(default_factory=list, init=False)
@@ -77,6 +79,7 @@ class LyingPart:
             self.carried.append(any(body.name == "part" for body in self._mover.solids()))
         if "text" in data:
             self.notes.append(str(data["text"]))
+            self.heard(self.cell, self.notes[-1])
 
     def stands(self) -> set[str]:
         """What stands about, as the interlocks know it."""

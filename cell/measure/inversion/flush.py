@@ -7,6 +7,7 @@ part or a surface that is bent shows, too.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -96,9 +97,17 @@ def flush_along_edge(
     return Flush(places, higher, noise[clear], float(clear.sum() / edge.sum()))
 
 
+class _Squares(NamedTuple):
+    """By how much the squares at `places` (n, 3) m, surface frame, stand `higher` (n,) m than drawn, with `noise`."""
+
+    places: Array
+    higher: Array
+    noise: Array
+
+
 def _standing(
     cloud: Cloud, base_from_surface: pin.SE3, surface_from_it: pin.SE3, drawn: NominalSurface
-) -> Flush | None:
+) -> _Squares | None:
     """How much higher than `drawn` its points in the cloud stand, in squares of 2 mm of the surface; None for none."""
     lines, rows = np.nonzero(cloud.valid)
     places = (cloud.points[lines, rows] - base_from_surface.translation) @ base_from_surface.rotation
@@ -111,4 +120,4 @@ def _standing(
     column, row = np.floor(places[index, :2] / SQUARE_M).astype(np.intp).T
     square: Indices = np.asarray(column * 2 * ROWS + row)
     medians, higher, noise = squares(square, feet.heights[kept] / up[kept], lines[index])
-    return Flush(places[index[medians]], higher, noise) if len(medians) else None
+    return _Squares(places[index[medians]], higher, noise) if len(medians) else None

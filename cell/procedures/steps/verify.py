@@ -56,6 +56,8 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
             if not found.kept(plan):
                 raise found.misplaced(plan, f"It was not corrected: {error}") from error
             context.note(text=f"it was not corrected: {error}")
+            # The claw was near it, and may have moved it.
+            found = replace(_looked(here, pose, context), before=found.before)
             break
         for note in placed.notes:
             context.note(text=note)
