@@ -18,6 +18,8 @@ from drivers.errors import Measured, MisplacedError
 from drivers.interfaces import Vector
 
 UNCLEAR = "chance: by no motion is it farther off than was stated before it was put down"
+SURE = 99.9
+"""In so many of 100 parts the stated bound holds: one that is let go counts as in its place by it."""
 CLEARLY = 3.0
 """Standard deviations of the stated place beyond which a part has not come to lie so by chance."""
 BENT = "the part, or the surface beside it, is bent: look along its edge"
@@ -122,17 +124,17 @@ class PlacedPart:
     def bound(self) -> dict[str, float]:
         """Below what, mm, 95 % of the points lie from where they belong, by axis of the surface's frame and for D.
 
-        Where they were seen counts, and at 95 % what that may be off by.
+        Where they were seen counts, and what that may be off by, `SURE`.
         """
         errors = 1e3 * np.abs(self.offsets + self._errors)
         found = {name: errors[..., k] for k, name in enumerate("xyz")} | {"d": np.linalg.norm(errors, axis=-1)}
-        return {name: float(np.percentile(np.percentile(each, 95, axis=1), 95)) for name, each in found.items()}
+        return {name: float(np.percentile(np.percentile(each, 95, axis=1), SURE)) for name, each in found.items()}
 
     @property
     def turn_bound(self) -> float:
-        """By how much the part is turned at most, rad, at 95 %."""
+        """By how much the part is turned at most, rad, `SURE`."""
         turned = self.turn + draws_of(self.covariance)[:, 3:]
-        return float(np.percentile(np.linalg.norm(turned, axis=-1), 95))
+        return float(np.percentile(np.linalg.norm(turned, axis=-1), SURE))
 
     @property
     def advice(self) -> str:
@@ -194,7 +196,7 @@ class PlacedPart:
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
         return MisplacedError(
             f"the placed part lies {self.words}, by ({shift}) mm and ({turn}) mrad in the surface's axes. Allowed are "
-            f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad; at 95 % it may be "
+            f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad; it may be as much as "
             f"{off.value:.2f} mm and {turned.value:.1f} mrad. Most likely {likely}{self.advice}. "
             f"{more}{more and '. '}{NEXT_STEP}",
             *measured,
