@@ -61,6 +61,8 @@ class CalibrationConfig(Table):
     max_age: Annotated[float, quantity("day", 0.01, 3650)]
     stripe_exposure: PhotoExposure
     rail_sigma: Scatter
+    each_job: bool = True
+    """Whether every job looks at the fine board before it moves its part."""
 
 
 def checked_board(text: str) -> str:

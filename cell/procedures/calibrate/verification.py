@@ -228,7 +228,7 @@ def _photographs(
     made = []
     for end, side in zip(ends, "ab", strict=True):
         devices.rail.move_to(end).wait(30.0)
-        seen = _found(devices.scan_camera, board, "fine", keep, what + side)
+        seen = find_fine_board(devices.scan_camera, board, keep, what + side)
         flange = from_ur(devices.arm.state().flange)
         made.append(ScanObservation(seen, None, flange, devices.rail.state().position))
     return made
@@ -255,6 +255,11 @@ def _sweep(
     ]
 
 
+def find_fine_board(camera: Camera, board: BoardSpec, keep: Keep, what: str) -> BoardView:
+    """The fine board in a new picture, which goes to `keep`; `RefusedError` when it is not seen."""
+    return _found(camera, board, "fine", keep, what)
+
+
 def _found(camera: Camera, board: BoardSpec, name: str, keep: Keep, what: str) -> BoardView:
     refusals = Counter[str]()
     seen = look_for(camera, board, refusals, keep, what)
@@ -279,7 +284,7 @@ SHARE = 0.3
 that falls a little short."""
 SURE = 0.95
 """How sure a change's effect is below what is stated as the most."""
-_DRAWS = 100
+DRAWS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,7 +316,7 @@ class Verification:
         verdict = verify(scan, calibration.target, seen)
 
         def at_most(suspect: Suspect) -> float:
-            drawn = np.random.default_rng(0).normal(size=(_DRAWS, suspect.spread.shape[1])) @ suspect.spread.T
+            drawn = np.random.default_rng(0).normal(size=(DRAWS, suspect.spread.shape[1])) @ suspect.spread.T
             return float(np.quantile([effect(suspect.chain, suspect.change + step) for step in drawn], SURE))
 
         unseen = [effect(d.change.chain, d.step) if np.isfinite(d.size) else np.inf for d in verdict.detectable]

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pinocchio as pin
 
 from cell.config.job import Job
-from cell.motion.collision import Body
-from cell.motion.kinematics import HOME
+from cell.motion.collision import Body, CollisionError
+from cell.motion.kinematics import HOME, Unreachable
 from cell.procedures.arm.moves import Pace
 from cell.procedures.arm.photograph import BoardFix, look_pose
+from cell.procedures.calibrate.interim import InterimCheck, interim_check
 from cell.procedures.drive.way import BACK_UP, Planar, Way, Whereabouts, drive_line, next_step, turn_to, wrap
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
 from drivers.clock import Clock
-from drivers.errors import Measured, RefusedError
+from drivers.errors import CalibrationStale, Measured, RefusedError
 from drivers.interfaces import Vehicle
 from statemachine.runner import StepContext
 from statemachine.step import Step
@@ -35,7 +36,8 @@ late let it drive on, which the later ones tell."""
 class VehicleArrival:
     """Where the vehicle came to stand, and the last photograph that shows it. Errors in m and rad.
 
-    `driven` is false for an arm on a fixed frame, which was only looked at.
+    `driven` is false for an arm on a fixed frame, which was only looked at. `head` is what the look at the fine board
+    before says of the scan head, None where nobody looked.
     """
 
     base_from_place: pin.SE3
@@ -45,6 +47,7 @@ class VehicleArrival:
     error_yaw: float
     photographs: int
     driven: bool = True
+    head: InterimCheck | None = None
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -54,6 +57,7 @@ class VehicleArrival:
             "error_yaw_deg": round(math.degrees(self.error_yaw), 3),
             "photographs": self.photographs,
             **({} if self.driven else {"driven": False}),
+            **({} if self.head is None else {"interim": self.head.summary()}),
         }
 
     def told(self) -> str:
@@ -256,6 +260,7 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
     vehicle.recover()
     if not here.whereabouts.anchored:
         here.mover.to_joints(HOME)
+    head = _checked(here, context)
     here.whereabouts.enter(here.job)
     camera = here.calibration.target.flange_from_camera
     look = look_pose(here.config, here.job, here.board, camera)
@@ -267,7 +272,7 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         context.progress(0.3, "nothing to drive: looking whether the station stands where the job has it")
         arrival = stand_at_target(here.job, stand, vehicle, here.whereabouts, here.photograph)
         context.note(text=arrival.told())
-        return arrival
+        return replace(arrival, head=head)
     vehicle.enable()
     drive = TargetDrive(
         here.job, here.config.arm.vehicle_from_base.se3(), vehicle, whereabouts=here.whereabouts,
@@ -275,7 +280,28 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         note=lambda text: context.note(text=text), hold=context.safe_point, carried=here.mover.solids(),
         pace=here.mover.pace,
     )  # fmt: skip
-    return drive.to_target()
+    return replace(drive.to_target(), head=head)
+
+
+def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
+    """Whether the scan head is where its calibration has it; None, with a note, where that cannot be seen.
+
+    Raises `RefusedError` where the head has moved too far for this job, or the board is not seen.
+    """
+    if not here.config.calibration.each_job:
+        return None
+    try:
+        found = interim_check(
+            here.config, here.devices, here.mover, here.calibration, here.job, check=context.check,
+            progress=lambda text: context.progress(0.0, text), keep=here.frames.keep,
+        )  # fmt: skip
+    except (CalibrationStale, Unreachable, CollisionError) as error:
+        context.note(text=f"whether the scan head has moved since the calibration is not seen: {error}")
+        return None
+    for note in found.notes:
+        context.note(text=note)
+    found.require()
+    return found
 
 
 STEP = JobStep(Step("drive_to_target", 180.0, 1, ("DeadlineError",)), _at, VehicleArrival)

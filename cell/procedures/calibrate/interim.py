@@ -1,0 +1,145 @@
+"""The interim check: before each job moves its part, the scan camera looks at the fine board on the deck.
+
+The view is one of the calibration's own, so that the arm's kinematic error is the same. What a turned mount, a joint
+with a new zero or a bumped board does, shows alike: the board is not where the calibration has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import CellConfig
+from cell.config.job import Job
+from cell.devices.devices import Devices
+from cell.measure.calibration import ScanObservation
+from cell.measure.calibration.drift.decision import WORST_FIT
+from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
+from cell.measure.calibration.drift.interim import HeadShift
+from cell.measure.calibration.solve.normal import AdjustmentState
+from cell.measure.geometry.poses import from_ur
+from cell.measure.vision import parse_board
+from cell.motion.kinematics import HOME
+from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.photograph import references, verification_views
+from cell.procedures.calibrate.boards import PHOTO_RATE, Keep
+from cell.procedures.calibrate.verification import DRAWS, SHARE, SURE, at_place, find_fine_board
+from cell.procedures.sweep.sweeping import home_rail
+from drivers.errors import Measured, RefusedError
+
+LOOKS = 4
+"""So often the arm comes to rest at most. More would not be sharper: the calibration's own error remains."""
+CAUSES = "the scan head on the flange, a joint's zero, or the fine board on the deck"
+
+
+@dataclass(frozen=True, eq=False)
+class InterimCheck:
+    """What the look at the board says of the `head`, and what that does at the place of a job, m.
+
+    `effect` is what the change found does there, `at_most` what it does in `SURE` of cases. `tolerance` is the place's.
+    """
+
+    head: HeadShift
+    effect: float
+    at_most: float
+    tolerance: float
+
+    @classmethod
+    def of(cls, calibration: CellCalibration, job: Job, looks: Sequence[ScanObservation]) -> InterimCheck:
+        """From photographs of the fine board, each from a rest of its own; raises what `references` raises."""
+        scan = calibration.scan
+        near, _ = references(scan, calibration.target)
+        state = AdjustmentState(
+            scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, near.base_from_board
+        )
+        seen = [PictureMeasurements(dots_of(look), k, k) for k, look in enumerate(looks)]
+        head, does = HeadShift.of(state, near, seen), at_place(calibration, job)
+        effects = [does("scan", change) for change in head.drawn(DRAWS)]
+        mean = does("scan", head.likely)
+        return cls(head, mean, float(np.quantile(effects, SURE)), job.place.tolerance)
+
+    @property
+    def matters(self) -> bool:
+        """Whether what has changed may move the place by a `SHARE` of its tolerance."""
+        return self.head.changed and self.at_most >= SHARE * self.tolerance
+
+    def require(self) -> None:
+        """Raise `RefusedError` where the head has moved so far that it matters, or the pictures do not fit."""
+        if not self.head.fits:
+            raise RefusedError(
+                f"the fine board on the deck fits its picture {self.head.dots:.1f} times worse than at the "
+                f"calibration, allowed {WORST_FIT:g} times: see whether board and lens are clean, the board flat and the lens in "
+                "focus, then run `cell calibrate verify`",
+                Measured("fine board's misfit over the calibration's", self.head.dots, most=WORST_FIT),
+            )
+        if self.matters:
+            raise RefusedError(
+                f"{self.told}; allowed are {1e3 * SHARE * self.tolerance:.2f} mm. See what is loose or was bumped, "
+                "then run `cell calibrate`",
+                Measured("place off by the moved scan head, at most", 1e3 * self.at_most, "mm",
+                         most=1e3 * SHARE * self.tolerance),
+            )  # fmt: skip
+
+    @property
+    def told(self) -> str:
+        """What has moved, for people."""
+        x, y, z, *turns = 1e3 * self.head.change
+        turned = ", ".join(f"{turn:+.2f}" for turn in turns)
+        return (
+            f"since the calibration {CAUSES} has moved: by ({x:+.2f}, {y:+.2f}, {z:+.2f}) mm and ({turned}) mrad in "
+            f"the flange's axes. That puts the place {1e3 * self.effect:.2f} mm off, at most "
+            f"{1e3 * self.at_most:.2f} mm"
+        )
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """For people: a change that matters too little to end the job."""
+        if not self.head.changed:
+            return ()
+        return (f"{self.told}: the job goes on. Run `cell calibrate` when there is time",)
+
+    def summary(self) -> dict[str, object]:
+        """Figures for journal and report."""
+        change, sigma = 1e3 * self.head.change, 1e3 * np.sqrt(np.diag(self.head.covariance))
+        return {
+            "shift_mm": [round(float(v), 4) for v in change[:3]],
+            "turn_mrad": [round(float(v), 4) for v in change[3:]],
+            "sigma_mm": [round(float(v), 4) for v in sigma[:3]], "sigma_mrad": [round(float(v), 4) for v in sigma[3:]],
+            "place_mm": round(1e3 * self.effect, 4), "place_at_most_mm": round(1e3 * self.at_most, 4),
+            "dots": round(self.head.dots, 3), "chance": self.head.chance, "looks": self.head.looks,
+            "changed": self.head.changed,
+        }  # fmt: skip
+
+
+def interim_check(
+    config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, job: Job, *,
+    check: Callable[[], None], progress: Callable[[str], None], keep: Keep,
+) -> InterimCheck:  # fmt: skip
+    """Look at the fine board; again, from afar, for as long as what it shows may be chance or a change.
+
+    Raises `CalibrationStale` for a calibration without its reference, `RefusedError` when the board is not seen, and
+    what `Mover.to` raises where its view is out of reach.
+    """
+    fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
+    view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)
+    home_rail(devices, lambda share, text: progress(text))
+    devices.scan_camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
+    looks: list[ScanObservation] = []
+    while True:
+        check()
+        progress("looking at the fine board" + (", again" if looks else ""))
+        mover.hold()
+        travel = devices.rail.move_to(view.rail_position)
+        mover.to(view.base_from_flange, "the view of the fine board")
+        travel.wait(30.0)
+        seen = find_fine_board(devices.scan_camera, fine, keep, f"interim-{len(looks) + 1}")
+        flange = from_ur(devices.arm.state().flange)
+        looks.append(ScanObservation(seen, None, flange, devices.rail.state().position))
+        found = InterimCheck.of(calibration, job, looks)
+        if len(looks) == LOOKS or found.head.changed or not found.head.suspicious:
+            return found
+        # From afar: over a short way friction brings the arm back to the very place that it just had.
+        mover.to_joints(HOME)
