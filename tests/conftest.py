@@ -66,6 +66,7 @@ GROUPS = (
         "integration/virtual/test_verify_job.py",
         "unit/cell/procedures/arm/test_touch.py",
         "unit/cell/procedures/calibrate/test_verification.py",
+        "unit/cell/procedures/calibrate/test_interim.py",
         "unit/cell/procedures/test_part_error.py",
         "unit/cell/procedures/calibrate/test_timing.py",
         "unit/cell/procedures/steps/test_board_photo.py",

@@ -62,7 +62,6 @@ class CalibrationConfig(Table):
     stripe_exposure: PhotoExposure
     rail_sigma: Scatter
     each_job: bool = True
-    """Whether every job looks at the fine board before it moves its part."""
 
 
 def checked_board(text: str) -> str:

@@ -290,6 +290,30 @@ def stripe(
 
 
 @bench.command()
+def interim(
+    seeds: WorldsOption = 20,
+    level: LevelOption = Level.nominal,
+    checks: Annotated[int, typer.Option("--checks", min=1, max=1000, help="Of each cell that nobody touched.")] = 10,
+    workers: WorkersOption = 0,
+    json: JsonOption = False,
+) -> None:
+    """Plant twelve shifts in many calibrated cells, and look at the fine board as a job does before it begins.
+
+    Exit code 1 when a cell that nobody touched is called changed.
+    """
+    from lab.bench.calibration.interim import UNTOUCHED, campaign
+
+    with bar() as told:
+        told(0, "the first cells are on their way")
+        found = campaign(
+            range(1, seeds + 1), level.value, checks, lambda done, total: told(done, "cells", total), workers
+        )
+    show(found, json, without=("runs",))
+    if found["shifts"][UNTOUCHED]["found"]:
+        raise typer.Exit(1)
+
+
+@bench.command()
 def verify(
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="How many worlds.")] = 20,
     level: LevelOption = Level.nominal,

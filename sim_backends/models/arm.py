@@ -11,7 +11,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
 from typing import Any
 
@@ -142,6 +142,15 @@ class ArmModel:
         self._truth.update(self.time, 0.0, self.drive.q, moving=False)
 
     # --- the world's side ---
+
+    def shift_zero(self, joint: int, angle: float) -> None:
+        """As if the zero of `joint`, 0 to 5, had moved by `angle`, rad, and the controller did not know."""
+        with self._lock:
+            error = self.params.dh_error.copy()
+            error[joint, 3] += angle
+            self.params = replace(self.params, dh_error=error)
+            self._truth = self._true_pose(self.params.dh)
+            self._truth.update(self.time, 0.0, self.drive.q, moving=False)
 
     def tick(self, t: float) -> None:
         """Advance the arm to world time `t`; a time that is not later than the last one changes nothing."""

@@ -50,7 +50,18 @@ class Cameras:
     """The scan camera with its laser and the target camera of one scene; safe between threads."""
 
     def __init__(self, scene: Scene, station: Station) -> None:
-        cell, effects = scene.drawing.cell, scene.effects
+        cell = scene.drawing.cell
+        gx, gy = (float(v) for v in scene.light_gradient)
+        self._light = Light(level=scene.light_level, gradient=(gx, gy))
+        self._witness_pose = cell.witness
+        self._deck = (Board.parse(cell.deck_board), Board.parse(cell.fine_board))
+        self.show(scene, station)
+        self._rng = {name: stream(scene.seed, f"{name}_camera.noise") for name in self._cold}
+        self._busy = {name: threading.Lock() for name in self._cold}
+
+    def show(self, scene: Scene, station: Station) -> None:
+        """From now on the cameras see this station, in this scene, of the same drawing and clocks."""
+        effects, cell = scene.effects, scene.drawing.cell
         self._lens = {"scan": scene.scan_lens, "target": scene.target_lens}
         self._cold = {
             "scan": _optics(scene, scene.scan_lens, cell.scan, SCAN_TRANSMISSION),
@@ -64,17 +75,7 @@ class Cameras:
             bow=scene.workshop.sheet_bow * BOW_AT[0] / BOW_AT[1] ** 2, end=effects.sheet_ends,
             shadows=((-0.06, 0.004, 0.7), (0.035, 0.002, 0.9)) if effects.dust else (),
         )  # fmt: skip
-        gx, gy = (float(v) for v in scene.light_gradient)
-        self._light = Light(level=scene.light_level, gradient=(gx, gy))
-        self._witness_pose = cell.witness
-        self._deck = (Board.parse(cell.deck_board), Board.parse(cell.fine_board))
-        self.show(scene, station)
-        self._rng = {name: stream(scene.seed, f"{name}_camera.noise") for name in self._cold}
-        self._busy = {name: threading.Lock() for name in self._cold}
-
-    def show(self, scene: Scene, station: Station) -> None:
-        """From now on the cameras see this station, in a scene of the same cell."""
-        effects, (x, y, radius) = scene.effects, (float(v) for v in scene.workshop.oil)
+        x, y, radius = (float(v) for v in scene.workshop.oil)
         ground, oil = station.ground, None
         if effects.oil:
             at = (ground.centre[0] + x * ground.half_x, ground.centre[1] + y * ground.half_y)

@@ -90,7 +90,7 @@ def _cell(
 
 for command in (
     run.run, run.dry_run, run.resume,
-    runs.abort, runs.pause, runs.go_on, runs.confirm, runs.runs, runs.report, runs.export, runs.replay,
+    runs.abort, runs.pause, runs.go_on, runs.confirm, runs.runs, runs.health, runs.report, runs.export, runs.replay,
     devices.jog, devices.home, devices.recover, devices.diag, devices.find, devices.devices, devices.doctor,
     setup.init, setup.check, setup.new_job, commission.commission, console.console,
 ):  # fmt: skip

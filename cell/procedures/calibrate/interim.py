@@ -1,7 +1,8 @@
 """The interim check: before each job moves its part, the scan camera looks at the fine board on the deck.
 
-The view is one of the calibration's own, so that the arm's kinematic error is the same. What a turned mount, a joint
-with a new zero or a bumped board does, shows alike: the board is not where the calibration has it.
+The view is one of the calibration's own, with the same joints, so that the arm's kinematic error is the same. What a
+turned mount, a joint with a new zero or a bumped board does, shows alike: the board is not where the calibration has
+it.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
@@ -29,9 +31,11 @@ from cell.procedures.calibrate.boards import PHOTO_RATE, Keep
 from cell.procedures.calibrate.verification import DRAWS, SHARE, SURE, at_place, find_fine_board
 from cell.procedures.sweep.sweeping import home_rail
 from drivers.errors import Measured, RefusedError
+from drivers.interfaces import Vector
 
 LOOKS = 4
 """So often the arm comes to rest at most. More would not be sharper: the calibration's own error remains."""
+MOVED = "place off by what moved, at most"
 CAUSES = "the scan head on the flange, a joint's zero, or the fine board on the deck"
 
 
@@ -40,12 +44,16 @@ class InterimCheck:
     """What the look at the board says of the `head`, and what that does at the place of a job, m.
 
     `effect` is what the change found does there, `at_most` what it does in `SURE` of cases. `tolerance` is the place's.
+    `off` (3,) is by how much, and `sigma` (3,) one standard deviation of it, a point in the middle of a sweep is moved,
+    along the flange's axes.
     """
 
     head: HeadShift
     effect: float
     at_most: float
     tolerance: float
+    off: Vector
+    sigma: Vector
 
     @classmethod
     def of(cls, calibration: CellCalibration, job: Job, looks: Sequence[ScanObservation]) -> InterimCheck:
@@ -58,30 +66,38 @@ class InterimCheck:
         seen = [PictureMeasurements(dots_of(look), k, k) for k, look in enumerate(looks)]
         head, does = HeadShift.of(state, near, seen), at_place(calibration, job)
         effects = [does("scan", change) for change in head.drawn(DRAWS)]
-        mean = does("scan", head.likely)
-        return cls(head, mean, float(np.quantile(effects, SURE)), job.place.tolerance)
+        ahead = scan.flange_from_camera.rotation @ np.array([0.0, 0.0, job.scan.stand_off])
+        moves = np.hstack([np.eye(3), -pin.skew(ahead)])
+        sigma = np.sqrt(np.diag(moves @ head.covariance @ moves.T))
+        return cls(
+            head, does("scan", head.likely), float(np.quantile(effects, SURE)), job.place.tolerance,
+            off=moves @ head.change, sigma=sigma,
+        )  # fmt: skip
+
+    @property
+    def allowed(self) -> float:
+        """What a moved head may do at the place at most, m: a `SHARE` of its tolerance."""
+        return SHARE * self.tolerance
 
     @property
     def matters(self) -> bool:
-        """Whether what has changed may move the place by a `SHARE` of its tolerance."""
-        return self.head.changed and self.at_most >= SHARE * self.tolerance
+        """Whether what has changed may move the place by more than is allowed."""
+        return self.head.changed and self.at_most >= self.allowed
 
     def require(self) -> None:
         """Raise `RefusedError` where the head has moved so far that it matters, or the pictures do not fit."""
+        dots, allowed = self.head.dots, 1e3 * self.allowed
         if not self.head.fits:
             raise RefusedError(
-                f"the fine board on the deck fits its picture {self.head.dots:.1f} times worse than at the "
-                f"calibration, allowed {WORST_FIT:g} times: see whether board and lens are clean, the board flat and the lens in "
-                "focus, then run `cell calibrate verify`",
-                Measured("fine board's misfit over the calibration's", self.head.dots, most=WORST_FIT),
+                f"the fine board on the deck fits its picture {dots:.1f} times worse than at the calibration, allowed "
+                f"{WORST_FIT:g} times: see whether board and lens are clean, the board flat and the lens in focus, "
+                "then run `cell calibrate verify`",
+                Measured("fine board's misfit, over the calibration's", dots, most=WORST_FIT),
             )
         if self.matters:
-            raise RefusedError(
-                f"{self.told}; allowed are {1e3 * SHARE * self.tolerance:.2f} mm. See what is loose or was bumped, "
-                "then run `cell calibrate`",
-                Measured("place off by the moved scan head, at most", 1e3 * self.at_most, "mm",
-                         most=1e3 * SHARE * self.tolerance),
-            )  # fmt: skip
+            at_most = Measured(MOVED, 1e3 * self.at_most, "mm", most=allowed)
+            text = f"{self.told}; allowed are {allowed:.2f} mm. See what is loose or was bumped"
+            raise RefusedError(f"{text}, then run `cell calibrate`", at_most)
 
     @property
     def told(self) -> str:
@@ -97,7 +113,7 @@ class InterimCheck:
     @property
     def notes(self) -> tuple[str, ...]:
         """For people: a change that matters too little to end the job."""
-        if not self.head.changed:
+        if not self.head.changed or self.matters:
             return ()
         return (f"{self.told}: the job goes on. Run `cell calibrate` when there is time",)
 
@@ -109,6 +125,9 @@ class InterimCheck:
             "turn_mrad": [round(float(v), 4) for v in change[3:]],
             "sigma_mm": [round(float(v), 4) for v in sigma[:3]], "sigma_mrad": [round(float(v), 4) for v in sigma[3:]],
             "place_mm": round(1e3 * self.effect, 4), "place_at_most_mm": round(1e3 * self.at_most, 4),
+            "place_allowed_mm": round(1e3 * self.allowed, 4),
+            "off_mm": [round(1e3 * float(v), 4) for v in self.off],
+            "off_sigma_mm": [round(1e3 * float(v), 4) for v in self.sigma],
             "dots": round(self.head.dots, 3), "chance": self.head.chance, "looks": self.head.looks,
             "changed": self.head.changed,
         }  # fmt: skip
@@ -133,7 +152,7 @@ def interim_check(
         progress("looking at the fine board" + (", again" if looks else ""))
         mover.hold()
         travel = devices.rail.move_to(view.rail_position)
-        mover.to(view.base_from_flange, "the view of the fine board")
+        mover.to_as_from(HOME, view.base_from_flange, "the view of the fine board")
         travel.wait(30.0)
         seen = find_fine_board(devices.scan_camera, fine, keep, f"interim-{len(looks) + 1}")
         flange = from_ur(devices.arm.state().flange)

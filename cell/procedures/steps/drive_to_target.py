@@ -298,9 +298,9 @@ def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
     except (CalibrationStale, Unreachable, CollisionError) as error:
         context.note(text=f"whether the scan head has moved since the calibration is not seen: {error}")
         return None
+    found.require()
     for note in found.notes:
         context.note(text=note)
-    found.require()
     return found
 
 

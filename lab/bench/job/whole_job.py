@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -39,6 +39,7 @@ from sim_backends.direct.camera import Shot
 from statemachine.step import Event
 
 Progress = Callable[[float, str], None]
+Result = TypeVar("Result")
 
 
 class NoFrames(FrameStore):
@@ -108,6 +109,28 @@ def run_whole_job(
     before = [] if calibrated is None or calibrated.rests is None else list(calibrated.rests)
     record.rests = np.array([*before, *cell.arm.rests])
     return record
+
+
+def on_calibrated(
+    config: CellConfig, job: Job, nominal: NominalSurface, seed: int, level: str,
+    work: Callable[[VirtualCell, CellCalibration, Hands], Result],
+) -> Result:  # fmt: skip
+    """Calibrate the cell of `seed` and `level`, and do `work` on it as recorded work; raises what that raises."""
+    assert nominal.source is not None
+    cell = VirtualCell(config, seed, level, Described(job, nominal.source))
+    whole = _WholeJob(cell, config, job, nominal, JobRecord(seed, level), lambda fraction, text: None)
+
+    def done(hands: Hands) -> Result:
+        calibration = whole._calibrate(hands)
+        cell.devices.interlocks.work_with(calibration.configuration)
+        return work(cell, calibration, hands)
+
+    with tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
+
+        def perform(run: Run[Result]) -> Result:
+            return RecordedWork(run, "calibration", cell.devices, Path(folder), cell.facts).perform(done)
+
+        return Run("calibration", perform).result()
 
 
 @dataclass(frozen=True, eq=False)

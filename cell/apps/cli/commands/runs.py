@@ -138,6 +138,28 @@ def runs(config: ConfigOption = None, json: JsonOption = False) -> None:
         print_runs(rows)
 
 
+def health(config: ConfigOption = None, json: JsonOption = False) -> None:
+    """How good the cell is today: what its jobs have seen of each part since the calibration, and when one is due.
+
+    Exit code 1 when it is due now.
+    """
+    import datetime as dt
+
+    from cell.apps.cli.display import print_health
+    from cell.config.cell_config import load_config
+    from cell.config.files import find_config
+    from cell.run.health import health as found
+
+    loaded = load_config(find_config(config, simulated=True))
+    told = found(folder_of_runs(config), loaded.calibration.max_age, dt.datetime.now().astimezone())
+    if json:
+        print_json(told.as_dict())
+    else:
+        print_health(told.as_dict())
+    if told.calibrated and told.days_left == 0.0:
+        raise typer.Exit(1)
+
+
 def report(
     name: RunArgument = None,
     config: ConfigOption = None,

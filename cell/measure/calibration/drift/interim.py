@@ -30,7 +30,7 @@ class HeadShift:
 
     `change` (6,) is flange_from_camera's: m along the flange's axes, then rad about them. `covariance` (6, 6) holds
     noise, the arm's rests and the calibration's own. `dots` is the RMS of the dots' whitened residuals, 1 as
-    calibrated. `chance` is the probability of so much without any change; `looks` says how often the arm came to rest for it.
+    calibrated. `chance` is the probability of so much without any change, `looks` how often the arm came to rest.
     """
 
     change: Array

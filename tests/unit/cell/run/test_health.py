@@ -1,0 +1,144 @@
+"""How good the cell is today: series of figures of jobs' reports, their trends against closed forms, and what is due."""
+
+from __future__ import annotations
+
+import datetime as dt
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from cell.base.storage import write_json
+from cell.procedures.calibrate.interim import MOVED
+from cell.run.folder import new_run
+from cell.run.health import DriftSeries, health
+
+MADE = dt.datetime(2026, 11, 1, 8, 0, 0).astimezone()
+CALIBRATED = MADE.strftime("%Y-%m-%d %H:%M:%S")
+DAY_S = 86_400.0
+MAX_AGE_S = 30 * DAY_S
+
+
+def job(root: Path, day: float, off: list[float] | None = None, **more: Any) -> str:
+    """A job's report of this day, whose look at the board saw the head `off`, mm."""
+    folder = new_run(root)
+    started = (MADE + dt.timedelta(days=day)).strftime("%Y-%m-%dT%H:%M:%S%z")
+    arrival: dict[str, Any] = {"photographs": 2}
+    if off is not None:
+        arrival["interim"] = {"off_mm": off, "place_allowed_mm": 0.18}
+    sweep = {"head_slipped_um": [30.0, -40.0], "laser_turned_mrad": 0.05}
+    steps = [{"name": "drive_to_target", "result": arrival}, {"name": "laser_sweep", "result": sweep}]
+    report = {
+        "run": folder.name, "kind": "job", "outcome": "placed", "reason": "", "code": None, "started": started,
+        "calibration_date": CALIBRATED, "steps": steps,
+    } | more  # fmt: skip
+    write_json(folder / "report.json", report)
+    return folder.name
+
+
+def series(values: list[list[float]], limit: float | None = 0.18) -> DriftSeries:
+    return DriftSeries("head", "mm", np.arange(float(len(values))), np.array(values), limit)
+
+
+def test_what_scatters_does_not_creep_and_its_mean_counts() -> None:
+    rng = np.random.default_rng(4)
+    creeping = 0
+    for _ in range(200):
+        found = series((0.03 * rng.normal(size=(12, 3)) + [0.05, 0.0, 0.0]).tolist())
+        creeping += found.creeps
+        assert found.now < 0.1
+    assert creeping <= 2
+
+
+def test_what_creeps_is_told_with_the_day_on_which_the_limit_is_reached() -> None:
+    """0.01 mm a day from nothing, over nine days: 0.18 mm nine days later."""
+    rng = np.random.default_rng(5)
+    along = np.array([0.6, 0.8, 0.0])
+    found = series([(0.01 * day * along + 1e-4 * rng.normal(size=3)).tolist() for day in range(10)])
+    assert found.creeps and found.a_day == pytest.approx(0.01, rel=0.02)
+    assert found.now == pytest.approx(0.09, abs=0.001)
+    assert found.days_left == pytest.approx(9.0, rel=0.05)
+    assert series([[0.2, 0.0, 0.0]] * 6).days_left == 0.0
+    assert series([[0.1, 0.0, 0.0]] * 6).days_left is None
+    assert series([[0.2, 0.0, 0.0]] * 6, limit=None).days_left is None
+
+
+def test_one_that_comes_back_reaches_the_limit_on_its_other_side() -> None:
+    found = series([[0.10 - 0.01 * day] for day in range(8)])
+    assert found.now == pytest.approx(0.03, abs=1e-6) and found.days_left == pytest.approx(21.0, rel=1e-6)
+
+
+def test_four_jobs_make_no_trend() -> None:
+    found = series([[0.01 * day, 0.0, 0.0] for day in range(4)])
+    assert not found.creeps and found.a_day == 0.0 and found.now == pytest.approx(0.015) and found.last == 0.03
+
+
+def test_the_jobs_since_the_newest_calibration_count(tmp_path: Path) -> None:
+    job(tmp_path, -3.0, [9.0, 9.0, 9.0], calibration_date="2026-10-01 00:00:00")
+    names = [job(tmp_path, day, [0.03, 0.04, 0.0]) for day in range(6)]
+    job(tmp_path, 6.0)
+    found = health(tmp_path, MAX_AGE_S, MADE + dt.timedelta(days=7))
+    head, rail, laser = found.series
+    assert (found.calibrated, found.jobs, found.unlooked, len(head.days)) == (CALIBRATED, 7, 1, 6)
+    assert head.days.tolist() == pytest.approx([0, 1, 2, 3, 4, 5]) and head.now == pytest.approx(0.05)
+    assert (head.limit, laser.limit) == (0.18, None) and rail.limit == pytest.approx(0.15)
+    assert rail.values[0].tolist() == pytest.approx([0.03, -0.04]) and rail.last == pytest.approx(0.05)
+    assert laser.now == pytest.approx(0.05) and len(names) == 6
+    assert found.days_left == pytest.approx(23.0) and found.due == "a calibration is due in 23.0 days, by its age"
+
+
+def test_a_creeping_head_is_due_before_its_calibration_is_old(tmp_path: Path) -> None:
+    for day in range(10):
+        job(tmp_path, day, [0.01 * day, 0.0, 0.0])
+    found = health(tmp_path, MAX_AGE_S, MADE + dt.timedelta(days=9))
+    assert found.due == "a calibration is due in 9.0 days: scan head on the flange, at the place creeps 0.010 mm a day"
+
+
+def test_what_was_refused_because_it_moved_is_due_now(tmp_path: Path) -> None:
+    job(tmp_path, 0.0, [0.0, 0.0, 0.0])
+    refusal = {"numbers": [{"name": MOVED, "value": 0.4}]}
+    refused = job(tmp_path, 1.0, outcome="refused", refusal=refusal, steps=[])
+    found = health(tmp_path, MAX_AGE_S, MADE + dt.timedelta(days=2))
+    assert (found.moved, found.days_left) == (refused, 0.0)
+    assert found.due == f"a calibration is due now: run {refused} was refused, for something has moved"
+
+
+def test_what_is_beyond_its_limit_is_due_now_and_so_is_what_is_old(tmp_path: Path) -> None:
+    job(tmp_path, 0.0, [0.3, 0.0, 0.0])
+    assert health(tmp_path, MAX_AGE_S, MADE).due == (
+        "a calibration is due now: scan head on the flange, at the place is beyond its limit"
+    )
+    old = health(tmp_path / "none", MAX_AGE_S, MADE)
+    assert (old.calibrated, old.due) == ("", "no job has run yet: nothing is known")
+    other = tmp_path / "other"
+    job(other, 0.0, [0.0, 0.0, 0.0])
+    aged = health(other, MAX_AGE_S, MADE + dt.timedelta(days=31))
+    assert aged.days_left == 0.0 and aged.due == "a calibration is due in 0.0 days, by its age"
+
+
+def test_a_protective_stop_since_is_named_and_what_is_no_job_is_left_out(tmp_path: Path) -> None:
+    name = job(tmp_path, 0.0, [0.0, 0.0, 0.0], outcome="faulted", code="arm.protective_stop", reason="arm: stopped")
+    job(tmp_path, 1.0, [5.0, 5.0, 5.0], kind="verification")
+    write_json(new_run(tmp_path) / "report.json", {"spoilt": True})
+    found = health(tmp_path, MAX_AGE_S, MADE)
+    assert found.shocks == ((name, "arm: stopped"),) and found.jobs == 1
+    told = json.loads(json.dumps(found.as_dict()))
+    assert told["shocks"] == [{"run": name, "reason": "arm: stopped"}]
+    assert told["parts"][0]["values"] == [0.0] and told["parts"][0]["days_left"] is None
+
+
+def test_the_command_shows_it_and_ends_with_1_when_a_calibration_is_due(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: Callable[..., tuple[int, str, str]]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, out, _ = typed("health")
+    assert (code, "no job has run yet" in out) == (0, True)
+    job(tmp_path / "runs", 0.0, [0.3, 0.0, 0.0], outcome="faulted", code="arm.protective_stop", reason="arm: stopped")
+    code, out, _ = typed("health")
+    assert code == 1 and "parts may sit elsewhere: arm: stopped" in out and "is due now" in out
+    assert "█" in out and "0.300" in out and "0.18" in out
+    code, out, _ = typed("health", "--json")
+    assert (code, json.loads(out)["days_left"]) == (1, 0.0)
