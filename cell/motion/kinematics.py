@@ -152,7 +152,7 @@ class ArmKinematics:
         found: list[Joints] = []
         for start in [np.asarray(seed, dtype=np.float64), *self._branches(base_from_flange, seed)]:
             joints, error = self.refine(base_from_flange, start)
-            joints = self._unwound(joints, seed)
+            joints = self.unwound(joints, seed)
             if (
                 error < 1e-7
                 and self.limits.inside(joints)
@@ -193,7 +193,8 @@ class ArmKinematics:
         """Smallest singular value of the Jacobian, with 1 m taken as 1 rad; 0 in a singularity."""
         return float(np.linalg.svd(self.jacobian(joints), compute_uv=False)[-1])
 
-    def _unwound(self, joints: Joints, seed: Joints) -> Joints:
+    def unwound(self, joints: Joints, seed: Joints) -> Joints:
+        """The same posture with each joint as few turns from `seed` as its limits allow."""
         lower, upper = np.array(self.limits.lower), np.array(self.limits.upper)
         near = joints + TURN * np.round((np.asarray(seed) - joints) / TURN)
         near = np.where(near > upper, near - TURN, near)

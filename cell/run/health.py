@@ -7,6 +7,8 @@ its rail. So each part has a series of figures, and a series shows what creeps.
 from __future__ import annotations
 
 import datetime as dt
+import json
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.measure.calibration.drift.reference_plate import LARGEST_RAD
 from cell.measure.calibration.drift.slip import LARGEST_M
 from cell.procedures.calibrate.interim import MOVED
 from cell.run.folder import list_runs, read_report
@@ -38,14 +41,14 @@ class DriftSeries:
     """What jobs have seen of one part since the calibration, oldest first.
 
     `days` (n,) since the first of them; `values` (n, k) in `unit`, as far as the part is from where it was calibrated;
-    `limit` is what their length may reach, None where every job states what it sees as uncertainty.
+    `limit` is what their length may reach: beyond it a job is refused.
     """
 
     part: str
     unit: str
     days: Array
     values: Array
-    limit: float | None
+    limit: float
 
     @cached_property
     def _line(self) -> tuple[Array, Array, float]:
@@ -84,8 +87,6 @@ class DriftSeries:
     @property
     def days_left(self) -> float | None:
         """In how many days the limit is reached, 0 where it is; None where that is not in sight."""
-        if self.limit is None:
-            return None
         if self.now >= self.limit:
             return 0.0
         if not self.creeps:
@@ -168,16 +169,17 @@ def _slipped(step: Step) -> tuple[list[float], float] | None:
     return None if found is None else ([1e-3 * value for value in found], 1e3 * LARGEST_M)
 
 
-def _turned(step: Step) -> tuple[list[float], None] | None:
+def _turned(step: Step) -> tuple[list[float], float] | None:
     found = step.get("laser_turned_mrad")
-    return None if found is None else ([found], None)
+    # What a verification has seen of it counts no more.
+    return None if found is None else ([found - step.get("laser_confirmed_mrad", 0.0)], 1e3 * LARGEST_RAD)
 
 
-HEAD = "scan head on the flange, at the place"
-WATCHED: tuple[tuple[str, str, str, Callable[[Step], tuple[list[float], float | None] | None]], ...] = (
+HEAD = "head on the flange"
+WATCHED: tuple[tuple[str, str, str, Callable[[Step], tuple[list[float], float] | None]], ...] = (
     (HEAD, "mm", "drive_to_target", _interim),
-    ("scan head on its rail", "mm", "laser_sweep", _slipped),
-    ("laser's light plane", "mrad", "laser_sweep", _turned),
+    ("head on its rail", "mm", "laser_sweep", _slipped),
+    ("light plane", "mrad", "laser_sweep", _turned),
 )
 """Each part with its unit, the step that looks at it, and what of that step's result it is, with its limit."""
 
@@ -231,7 +233,7 @@ def _steps(report: Mapping[str, Any]) -> dict[str, Step]:
 
 def _series(
     reports: Sequence[Mapping[str, Any]], part: str, unit: str, step: str,
-    seen: Callable[[Step], tuple[list[float], float | None] | None],
+    seen: Callable[[Step], tuple[list[float], float] | None],
 ) -> DriftSeries | None:  # fmt: skip
     """What these reports tell of a part; None where no job has looked at it."""
     times, values, limits = [], [], []
@@ -245,3 +247,7 @@ def _series(
         return None
     days = (np.array(times) - times[0]) / DAY_S
     return DriftSeries(part, unit, days, np.array(values, dtype=np.float64), limits[-1])
+
+
+if __name__ == "__main__":
+    print(json.dumps(health(Path(sys.argv[1]), float(sys.argv[2]), dt.datetime.now().astimezone()).as_dict()))

@@ -15,7 +15,7 @@ import pinocchio as pin
 from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import parse_board
-from cell.procedures.arm.photograph import look_pose
+from cell.procedures.arm.photograph import drawn_interim_view, look_pose
 from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, turn_to
 from cell.run.recorded_work import Hands
 from drivers.common.units import parse_quantity
@@ -109,10 +109,11 @@ def moved(cell: Cell, wish: Jog, job: Job, hands: Hands, begun: list[Begun] | No
 
 
 def _name_look(cell: Cell, job: Job) -> None:
-    """Where a run of `job` has the arm while it drives, by the camera's mounting as configured."""
+    """Where a run of `job` has the arm while it drives, and leaves it, by the cameras' mountings as configured."""
     mounting = cell.config.target_camera.flange_from_camera.se3()
     look = look_pose(cell.config, job, parse_board(job.board.spec), mounting)
     cell.devices.interlocks.may_drive_with(f"the looking pose of job {job.job.name}", look)
+    cell.devices.interlocks.may_drive_with("over the fine board", drawn_interim_view(cell.config).base_from_flange)
 
 
 def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:

@@ -218,7 +218,7 @@ def blurred_board(record: JobRecord, root: Path) -> Ended:
 def few_points(record: JobRecord, root: Path) -> Ended:
     """The sweep brings hardly a point."""
     job, nominal = pot()
-    return tried(with_few_lines(record, 2), job, nominal, "reconstruct", root)
+    return tried(with_few_lines(record, 1), job, nominal, "reconstruct", root)
 
 
 def other_surface(record: JobRecord, root: Path) -> Ended:

@@ -263,24 +263,21 @@ def print_health(told: Mapping[str, Any]) -> None:
     """A row for each part that the jobs look at, and when a calibration is due."""
     console = Console(highlight=False)
     if told["parts"]:
-        columns = (
-            "part",
-            ">jobs",
-            ">last job",
-            ">by now",
-            ">limit",
-            "unit",
-            ">creeps a day",
-            ">limit in days",
-            "jobs, oldest first",
-        )
-        table = new_table(f"since the calibration of {told['calibrated']}", *columns)
+        columns = ("part", ">last", ">by now", ">limit", "unit", ">a day", ">days left", "each job")
+        table = new_table(f"{told['jobs']} jobs since the calibration of {told['calibrated']}", *columns)
         for part in told["parts"]:
-            limit = "" if part["limit"] is None else f"{part['limit']:.2f}"
             creeps = f"{part['a_day']:.3f}" if part["a_day"] else ""
             left = "" if part["days_left"] is None else f"{part['days_left']:.0f}"
-            seen = str(part["jobs"]), f"{part['last']:.3f}", f"{part['now']:.3f}"
-            table.add_row(part["part"], *seen, limit, part["unit"], creeps, left, sparks(part["values"], part["limit"]))
+            seen = f"{part['last']:.3f}", f"{part['now']:.3f}"
+            table.add_row(
+                part["part"],
+                *seen,
+                f"{part['limit']:.2f}",
+                part["unit"],
+                creeps,
+                left,
+                sparks(part["values"], part["limit"]),
+            )
         console.print(table)
     for shock in told["shocks"]:
         console.print(
@@ -292,13 +289,14 @@ def print_health(told: Mapping[str, Any]) -> None:
 
 
 SPARKS = "▁▂▃▄▅▆▇█"
-MOST_SPARKS = 24
+MOST_SPARKS = 10
 
 
-def sparks(values: Sequence[float], limit: float | None) -> str:
-    """The newest of these values as bars, of their limit or of the largest."""
-    top = limit or max(values) or 1.0
-    return "".join(SPARKS[min(len(SPARKS) - 1, int(len(SPARKS) * value / top))] for value in values[-MOST_SPARKS:])
+def sparks(values: Sequence[float], limit: float) -> str:
+    """The newest of these values as bars; a full one has reached the limit."""
+    return "".join(
+        SPARKS[min(len(SPARKS) - 1, int((len(SPARKS) - 1) * value / limit))] for value in values[-MOST_SPARKS:]
+    )
 
 
 def _simulated(row: Mapping[str, object]) -> str:

@@ -226,7 +226,7 @@ RULES = (
     Rule(
         "arm_stowed",
         ("vehicle.drive",),
-        "the arm is at rest in a transport pose: HOME, or the looking pose of the job that is run or named",
+        "the arm is at rest in a transport pose: HOME, over the fine board, or a job's looking pose",
         _stowed,
     ),
     Rule(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 
@@ -19,6 +20,7 @@ from cell.motion.collision import (
     BASE,
     PLACED,
     Body,
+    CollisionError,
     CollisionModel,
     Pair,
     arm_bodies,
@@ -27,7 +29,7 @@ from cell.motion.collision import (
     tool_bodies,
     vehicle_bodies,
 )
-from cell.motion.kinematics import JointLimits, Joints, arm_kinematics
+from cell.motion.kinematics import HOME, JointLimits, Joints, Unreachable, arm_kinematics
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
 from drivers.clock import Clock
@@ -84,6 +86,7 @@ class Mover:
         interlocks: Interlocks | None = None, pace: Pace | None = None,
     ) -> None:  # fmt: skip
         self.hold = hold
+        self.rests_at: pin.SE3 | None = None
         self.pace = pace or Pace()
         self._arm = arm
         self._clock = clock
@@ -186,13 +189,21 @@ class Mover:
 
         With other joints the arm's errors are others, by more than a tenth of a millimetre.
         """
-        self.to_joints(self._planner.reach(base_from_flange, near, what))
+        joints = self._planner.reach(base_from_flange, near, what)
+        self.to_joints(self.kinematics.unwound(joints, self.joints))
 
     def to_joints(self, joints: Joints) -> None:
         """Move freely to joint angles and settle."""
         self.hold()
         start = self.joints
         self.follow(self._planner.free(start, joints, self._leaving(start)).at_pace(self.pace.share))
+
+    def fold(self) -> None:
+        """Bring the arm to where it rests between jobs: to `rests_at` where it can, else HOME."""
+        if self.rests_at is not None:
+            with suppress(Unreachable, CollisionError):
+                return self.to_as_from(HOME, self.rests_at, "where the arm rests between jobs")
+        return self.to_joints(HOME)
 
     def line(
         self, base_from_flange: pin.SE3, speed: float, allowed: Sequence[Pair] = (), force_limit: float | None = None

@@ -21,11 +21,15 @@ from cell.measure.calibration import ScanCalibration, TargetCalibration
 from cell.measure.calibration.drift.evidence import Reference
 from cell.measure.geometry.poses import compose_covariance, from_parts, from_ur, mean, transform
 from cell.measure.inversion.effects.during_sweep import require_firm, roll_of
-from cell.measure.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board
+from cell.measure.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board, parse_board
 from cell.measure.vision.board.view import centre_of
 from drivers.errors import CalibrationStale, Measured, RefusedError
 from drivers.interfaces import Arm, Camera, Frame, Vector
 
+NO_REFERENCE = (
+    "the stored calibration holds no reference to verify against, it was made by an older program; run "
+    "`cell calibrate` once"
+)
 MOVED = 22.46
 """Squared Mahalanobis distance of two board poses above which the station has moved: χ² of 6 at 0.999."""
 
@@ -282,10 +286,7 @@ def target_calibration_views(config: CellConfig, board: BoardSpec) -> list[Calib
 def references(scan: ScanCalibration, target: TargetCalibration) -> tuple[Reference, Reference]:
     """What both cameras' calibrations are verified against. Raises `CalibrationStale` where that was not stored."""
     if scan.reference is None or target.reference is None:
-        raise CalibrationStale(
-            "the stored calibration holds no reference to verify against, it was made by an older program; run "
-            "`cell calibrate` once"
-        )
+        raise CalibrationStale(NO_REFERENCE)
     return scan.reference, target.reference
 
 
@@ -298,13 +299,34 @@ def verification_views(
     both ways. Raises `CalibrationStale` for a calibration that was stored without its reference.
     """
     near, far = references(scan, target)
-    rail = _scan_rail(config, SCAN_VERIFICATION)
-    base_from_scan = _looking(near.base_from_board, fine, _SCAN_VIEWS[SCAN_VERIFICATION])
     base_from_target = _looking(far.base_from_board, large, _TARGET_VIEWS[TARGET_VERIFICATION])
     return (
-        CalibrationView(base_from_scan * scan.flange_from_camera_at(rail).inverse(), rail),
+        _scan_view(config, fine, scan, near, SCAN_VERIFICATION),
         CalibrationView(base_from_target * target.flange_from_camera.inverse(), 0.0),
     )
+
+
+def interim_view(config: CellConfig, fine: BoardSpec, scan: ScanCalibration) -> CalibrationView:
+    """One of the scan camera's calibration views, aimed as those of `verification_views`, for the look of each job.
+
+    The rail stands near its zero, from which a sweep begins. Raises `CalibrationStale` as `verification_views`.
+    """
+    if scan.reference is None:
+        raise CalibrationStale(NO_REFERENCE)
+    return _scan_view(config, fine, scan, scan.reference, SCAN_INTERIM)
+
+
+def drawn_interim_view(config: CellConfig) -> CalibrationView:
+    """The same as drawn, for who has no calibration at hand."""
+    return scan_calibration_views(config, parse_board(config.calibration.fine.board))[SCAN_INTERIM]
+
+
+def _scan_view(
+    config: CellConfig, fine: BoardSpec, scan: ScanCalibration, near: Reference, k: int
+) -> CalibrationView:  # fmt: skip
+    rail = _scan_rail(config, k)
+    base_from_scan = _looking(near.base_from_board, fine, _SCAN_VIEWS[k])
+    return CalibrationView(base_from_scan * scan.flange_from_camera_at(rail).inverse(), rail)
 
 
 def rail_ends(
@@ -358,7 +380,7 @@ def _looking(base_from_board: pin.SE3, board: BoardSpec, drawn: Sequence[float])
     return centre * from_parts(np.zeros(3), rotation) * from_parts(1e-3 * np.array([along, across, -depth]))
 
 
-SCAN_VERIFICATION, TARGET_VERIFICATION = 6, 5
+SCAN_VERIFICATION, SCAN_INTERIM, TARGET_VERIFICATION = 6, 4, 5
 EDGE_PX, LEAST_DOTS, RAIL_STEP, LEAST_WAY = 12.0, 0.5, 1e-3, 0.02
 
 # Offset of the optical axis along and across the board in mm, depth in mm, tilts about x and y and turn about z in deg.

@@ -26,11 +26,10 @@ from cell.measure.geometry.poses import from_ur
 from cell.measure.vision import parse_board
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.photograph import references, verification_views
+from cell.procedures.arm.photograph import NO_REFERENCE, CalibrationView, interim_view
 from cell.procedures.calibrate.boards import PHOTO_RATE, Keep
 from cell.procedures.calibrate.verification import DRAWS, SHARE, SURE, at_place, find_fine_board
-from cell.procedures.sweep.sweeping import home_rail
-from drivers.errors import Measured, RefusedError
+from drivers.errors import CalibrationStale, Measured, RefusedError
 from drivers.interfaces import Vector
 
 LOOKS = 4
@@ -57,9 +56,11 @@ class InterimCheck:
 
     @classmethod
     def of(cls, calibration: CellCalibration, job: Job, looks: Sequence[ScanObservation]) -> InterimCheck:
-        """From photographs of the fine board, each from a rest of its own; raises what `references` raises."""
+        """From photographs of the fine board, each from a rest of its own; raises what `interim_view` raises."""
         scan = calibration.scan
-        near, _ = references(scan, calibration.target)
+        near = scan.reference
+        if near is None:
+            raise CalibrationStale(NO_REFERENCE)
         state = AdjustmentState(
             scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, near.base_from_board
         )
@@ -133,6 +134,11 @@ class InterimCheck:
         }  # fmt: skip
 
 
+def fine_board_view(config: CellConfig, calibration: CellCalibration) -> CalibrationView:
+    """From where the check looks; raises what `interim_view` raises."""
+    return interim_view(config, parse_board(config.calibration.fine.board), calibration.scan)
+
+
 def interim_check(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, job: Job, *,
     check: Callable[[], None], progress: Callable[[str], None], keep: Keep,
@@ -142,18 +148,17 @@ def interim_check(
     Raises `CalibrationStale` for a calibration without its reference, `RefusedError` when the board is not seen, and
     what `Mover.to` raises where its view is out of reach.
     """
-    fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
-    view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)
-    home_rail(devices, lambda share, text: progress(text))
+    fine, view = parse_board(config.calibration.fine.board), fine_board_view(config, calibration)
+    homing = None if devices.rail.state().homed_here else devices.rail.home()
     devices.scan_camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
     looks: list[ScanObservation] = []
     while True:
         check()
         progress("looking at the fine board" + (", again" if looks else ""))
-        mover.hold()
-        travel = devices.rail.move_to(view.rail_position)
         mover.to_as_from(HOME, view.base_from_flange, "the view of the fine board")
-        travel.wait(30.0)
+        if homing is not None:
+            homing.wait(60.0)
+        devices.rail.move_to(view.rail_position).wait(30.0)
         seen = find_fine_board(devices.scan_camera, fine, keep, f"interim-{len(looks) + 1}")
         flange = from_ur(devices.arm.state().flange)
         looks.append(ScanObservation(seen, None, flange, devices.rail.state().position))

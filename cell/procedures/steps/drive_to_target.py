@@ -258,13 +258,13 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
     if warnings := vehicle.state().warnings:
         context.note(text=f"the vehicle warns: {'; '.join(warnings)}")
     vehicle.recover()
-    if not here.whereabouts.anchored:
-        here.mover.to_joints(HOME)
     head = _checked(here, context)
+    if head is None and not here.whereabouts.anchored:
+        here.mover.to_joints(HOME)
     here.whereabouts.enter(here.job)
     camera = here.calibration.target.flange_from_camera
     look = look_pose(here.config, here.job, here.board, camera)
-    here.mover.to(look, "the looking pose")
+    here.mover.to_as_from(HOME, look, "the looking pose")
     here.devices.interlocks.may_drive_with(f"the looking pose of job {here.job.job.name}", look)
     here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
     if not here.config.vehicle.DRIVES:
@@ -299,6 +299,8 @@ def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
         context.note(text=f"whether the scan head has moved since the calibration is not seen: {error}")
         return None
     found.require()
+    # Whatever ends the step from here on, these pictures do not show it.
+    here.frames.begin()
     for note in found.notes:
         context.note(text=note)
     return found

@@ -16,7 +16,6 @@ from cell.measure.inversion.effects.between_sweeps import Creep
 from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, scanned_gap
 from cell.measure.reconstruction.cloud import Indices
 from cell.motion.collision import TOUCHES
-from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover, PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.arm.touch import FELT_M, REFUSED, TouchCheck, TouchHeight, expected_touch, felt_touch
@@ -210,7 +209,7 @@ class Placing:
         self._lift()
         if fold:
             self.progress(0.95, "folding the arm")
-            self.mover.to_joints(HOME)
+            self.mover.fold()
         self.part.left = True
 
 

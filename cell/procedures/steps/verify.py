@@ -15,7 +15,6 @@ from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
 from cell.measure.reconstruction import Cloud, write_cloud
 from cell.measure.reconstruction.cloud import Indices
-from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import PartState
 from cell.procedures.part_error import part_covariance, part_points
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart, along_surface
@@ -52,7 +51,7 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
         except RefusedError as error:
             if here.part.state is not PartState.RELEASED:
                 raise
-            here.mover.to_joints(HOME)
+            here.mover.fold()
             if not found.kept(plan):
                 raise found.misplaced(plan, f"It was not corrected: {error}") from error
             context.note(text=f"it was not corrected: {error}")
@@ -104,7 +103,7 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         cloud, record = _swept(here, sweep, pose, faces, context)
         context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
         looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
-        here.mover.to_joints(HOME)
+        here.mover.fold()
         if looking is not None:
             looking.wait(30.0)
         context.safe_point()

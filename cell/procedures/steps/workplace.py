@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,9 +20,11 @@ from cell.measure.inversion import NominalSurface
 from cell.measure.vision import BoardSpec, parse_board
 from cell.procedures.arm.moves import Mover, Pace, PartProgress
 from cell.procedures.arm.photograph import APART_S, BoardFix, photograph
+from cell.procedures.calibrate.interim import fine_board_view
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.sweep.swath import SweepCollector
+from drivers.errors import CalibrationStale
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 from statemachine.step import Step
@@ -66,9 +69,14 @@ class Workplace:
 
     @cached_property
     def mover(self) -> Mover:
-        """Planned moves of the arm with the job's part in the claw."""
+        """Planned moves of the arm with the job's part in the claw. It rests where the next job looks first."""
         devices = self.devices
-        return Mover(devices.arm, devices.clock, self.config, self.job, interlocks=devices.interlocks, pace=self.pace)
+        made = Mover(devices.arm, devices.clock, self.config, self.job, interlocks=devices.interlocks, pace=self.pace)
+        if self.config.calibration.each_job:
+            with suppress(CalibrationStale):
+                made.rests_at = fine_board_view(self.config, self.calibration).base_from_flange
+                devices.interlocks.may_drive_with("over the fine board", made.rests_at)
+        return made
 
     @cached_property
     def board(self) -> BoardSpec:

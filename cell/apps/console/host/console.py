@@ -115,7 +115,8 @@ class Console:
         self._server = ServerProcess(
             lambda fd: ServerSetup(
                 fd, self.port, address.hosts, lasting=token, cert=certificate, key=key,
-                runs=str(cell.runs_folder.resolve()), cell=facts
+                runs=str(cell.runs_folder.resolve()), cell=facts,
+                max_age_s=cell.config.calibration.max_age,
             ),
             bound, self._heard, self._stop, self._left_alone,
         )  # fmt: skip

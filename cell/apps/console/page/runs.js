@@ -1,6 +1,7 @@
 // Earlier runs: their list, the trend of the place error, one run's report and pictures, and the way to its replay.
 
 import { byId, el, figure, seconds, words } from './dom.js';
+import { health } from './health.js';
 import { trend } from './trend.js';
 
 export class Runs {
@@ -11,9 +12,20 @@ export class Runs {
   async load() {
     const [runs, points] = await Promise.all(['/api/runs', '/api/trend'].map(async (path) => (await this.link.get(path)).json()));
     byId('trend').replaceChildren(trend(points, (run) => this.open(run)));
+    this.health();
     const body = byId('runs').tBodies[0];
     body.replaceChildren(...runs.map((run) => this.row(run)));
     if (!runs.length) body.append(el('tr', {}, el('td', { colSpan: 5, textContent: 'No run yet.' })));
+  }
+
+  // Slow beside the lists: it comes when it comes.
+  async health() {
+    const box = byId('health');
+    try {
+      box.replaceChildren(...health(await (await this.link.get('/api/health')).json()));
+    } catch (problem) {
+      box.replaceChildren(el('p', { className: 'bad', textContent: problem.message }));
+    }
   }
 
   row(run) {

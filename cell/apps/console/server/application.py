@@ -142,6 +142,7 @@ class Application:
             Route("/api/cell", self._tell_cell, middleware=small),
             Route("/api/runs", self._runs, middleware=small),
             Route("/api/trend", self._trend, middleware=small),
+            Route("/api/health", self._health, middleware=small),
             Route("/api/runs/{run}", self._run, middleware=small),
             Route("/api/runs/{run}/replay", self._replay, middleware=small),
             Route("/api/runs/{run}/report.html", self._report),
@@ -180,6 +181,9 @@ class Application:
 
     async def _trend(self, request: Request) -> Response:
         return await self._from_archive(Archive.trend)
+
+    async def _health(self, request: Request) -> Response:
+        return _found(await run_in_threadpool(self._archive.health))
 
     async def _from_archive(self, what: Callable[[Archive], object]) -> Response:
         return _json(await run_in_threadpool(what, self._archive))

@@ -104,8 +104,8 @@ class Server:
         """Until the program at the other end is gone."""
         self._loop = asyncio.get_running_loop()
         application = Application(
-            self.access, self.pages, Archive(Path(self._setup.runs)), cell=self._setup.cell, do=self._do,
-            stop=self._stop, of_job=self._of_job,
+            self.access, self.pages, Archive(Path(self._setup.runs), self._setup.max_age_s),
+            cell=self._setup.cell, do=self._do, stop=self._stop, of_job=self._of_job,
         )  # fmt: skip
         config = uvicorn.Config(
             application.asgi() if self._setup.lasting is not None else _entering(application.asgi(), self._renew),

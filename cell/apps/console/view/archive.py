@@ -87,10 +87,10 @@ _DRAW += "write_page(Path(sys.argv[1]), Path(sys.argv[2]))"
 
 
 class Archive:
-    """Below the folder `root`. What is not there is None."""
+    """Below the folder `root`, of a cell whose calibration may be `max_age_s` old. What is not there is None."""
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    def __init__(self, root: Path, max_age_s: float = 30 * 86_400.0) -> None:
+        self._root, self._max_age_s = root, max_age_s
         self._rows: dict[Path, dict[str, Any]] = {}
         self._pages = tempfile.TemporaryDirectory(prefix="cell-console-")
         self._drawing = threading.Lock()
@@ -104,6 +104,11 @@ class Archive:
         """Jobs, oldest first."""
         keys = ("run", "started", "job", "outcome", "d_mean_mm", "expected_mm", "duration_s")
         return [{key: row[key] for key in keys} for row in reversed(self.runs()) if row["kind"] == "job"]
+
+    def health(self) -> dict[str, Any] | None:
+        """What `cell health` tells; found by a process of its own that gives way."""
+        told = self._printed("-m", "cell.run.health", str(self._root), str(self._max_age_s))
+        return None if told is None else dict(json.loads(told))
 
     def run(self, name: str) -> dict[str, object] | None:
         """One run's report and the names of its pictures."""

@@ -1,4 +1,4 @@
-"""A person slows the cell down: arm and vehicle go the same ways more slowly, from the next motion on."""
+"""The arm's moves: at a person's pace, with the same joints wherever it comes from, and to where it rests."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import LEAST, Mover, Pace
+from cell.procedures.arm.photograph import drawn_interim_view
 from cell.procedures.steps.drive_to_target import TargetDrive
 from drivers.errors import ConfigError
 from tests.unit.cell.procedures.drive.test_way import JOB, VEHICLE_FROM_BASE, Site
@@ -43,6 +44,44 @@ def test_the_arm_goes_the_same_way_at_a_share_of_its_speed_from_the_next_motion_
     assert speeds(lambda: mover.to_joints(HOME))[0] == pytest.approx(0.5 * whole, rel=0.08)
     assert np.abs(cell.devices.arm.state().joints - HOME).max() < 1e-3
     assert speeds(line)[1] == pytest.approx(0.5 * straight, rel=0.05)
+
+
+def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints() -> None:
+    """But for whole turns, of which it makes the fewest: the last joint's is spared from one turn further on."""
+    cell = VirtualCell(CONFIG, 2, "nominal")
+    cell.devices.vehicle.brake()
+    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None, interlocks=cell.devices.interlocks)
+    pose = drawn_interim_view(CONFIG).base_from_flange
+    expected = mover.kinematics.ik(pose, HOME)
+
+    def off() -> np.ndarray:
+        """From these joints, but for whole turns."""
+        return np.abs((mover.joints - expected + np.pi) % (2 * np.pi) - np.pi)
+
+    mover.to(pose, "the view")
+    assert off().max() > 0.5, "from where the world begins, other joints are nearer"
+    mover.to_as_from(HOME, pose, "the view")
+    assert off().max() < 1e-3
+    turned = expected + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 2 * np.pi])
+    mover.to_joints(turned)
+    mover.to_as_from(HOME, pose, "the view")
+    assert mover.joints == pytest.approx(turned, abs=1e-3)
+
+
+def test_between_jobs_the_arm_rests_where_the_next_looks_first_or_else_at_home() -> None:
+    cell = VirtualCell(CONFIG, 2, "nominal")
+    cell.devices.vehicle.brake()
+    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None, interlocks=cell.devices.interlocks)
+    mover.fold()
+    assert mover.joints == pytest.approx(HOME, abs=1e-3)
+    mover.rests_at = drawn_interim_view(CONFIG).base_from_flange
+    mover.fold()
+    apart = from_ur(cell.devices.arm.state().flange).actInv(mover.rests_at)
+    assert np.linalg.norm(apart.translation) < 1e-4
+    for unreachable in (from_parts((3.0, 0.0, 0.0)), from_parts((0.0, 0.0, -0.2)) * mover.rests_at):
+        mover.rests_at = unreachable
+        mover.fold()
+        assert mover.joints == pytest.approx(HOME, abs=1e-3)
 
 
 def test_the_vehicle_drives_at_a_share_of_the_jobs_speed() -> None:

@@ -15,7 +15,7 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration.drift.interim import HeadShift
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
-from cell.procedures.calibrate.interim import LOOKS, MOVED, InterimCheck, interim_check
+from cell.procedures.calibrate.interim import LOOKS, MOVED, InterimCheck, fine_board_view, interim_check
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.run.report.report import pose_of
 from drivers.errors import RefusedError
@@ -55,6 +55,10 @@ def test_a_cell_that_nobody_touched_passes_and_says_what_it_saw(placed_pot: JobR
     arrival = placed_pot.results["drive_to_target"]
     assert isinstance(arrival, VehicleArrival) and arrival.head is not None
     assert arrival.summary()["interim"] == arrival.head.summary()
+    # It rests where the next job looks first.
+    assert placed_pot.calibration is not None and placed_pot.at_end is not None
+    view = fine_board_view(CONFIG, placed_pot.calibration).base_from_flange
+    assert np.linalg.norm(view.actInv(pose_of(placed_pot.at_end, "base_from_flange")).translation) < 1e-3
 
 
 @pytest.mark.parametrize("name", ["last joint's zero, 4 mrad", "scan camera's middle, 1.5 px"])
@@ -73,6 +77,16 @@ def test_what_moves_the_place_too_far_refuses_with_the_number_and_the_next_step(
         assert (number.name, number.kept) == (MOVED, False)
         assert number.value == pytest.approx(1e3 * found.at_most)
         assert f"{1e3 * found.effect:.2f} mm off, at most {1e3 * found.at_most:.2f} mm" in str(met.value)
+
+
+def test_what_may_be_chance_is_looked_at_again_and_all_looks_count(placed_pot: JobRecord) -> None:
+    found = [looked(placed_pot, SHIFTS[f"scan head, .1 mm along {axis}"].put_in)[0].head for axis in "xyz"]
+    assert max(head.looks for head in found) > 1
+    assert all(head.changed or not head.suspicious or head.looks == LOOKS for head in found)
+    once = looked(placed_pot)[0].head
+    for head in found:
+        if head.looks > 1:
+            assert (np.diag(head.covariance)[:3] < 0.8 * np.diag(once.covariance)[:3]).all()
 
 
 def test_a_job_whose_head_has_moved_ends_before_the_vehicle_drives(placed_pot: JobRecord) -> None:

@@ -54,7 +54,7 @@ def test_a_sweep_is_kept_and_its_cloud_shown_also_where_it_is_refused(placed_pot
     assert placed_pot.folder is not None and (placed_pot.folder / FILE).is_file()
     here, told = at_work(placed_pot, tmp_path), []
     here.devices.gate.listener = cast(Any, SimpleNamespace(reading=lambda device, reading: told.append(device)))
-    few = with_few_lines(placed_pot, 2).results["laser_sweep"]
+    few = with_few_lines(placed_pot, 1).results["laser_sweep"]
     for sweep in (placed_pot.results["laser_sweep"], few):
         context = cast(Any, SimpleNamespace(made={SweepRecord: sweep}.get))
         if sweep is few:

@@ -93,7 +93,7 @@ def fitted(points: np.ndarray, mesh: trimesh.Trimesh) -> pin.SE3:
 def test_the_flush_along_its_edge_is_by_how_much_its_pose_lifts_it(placed_pot: JobRecord, tmp_path: Path) -> None:
     off = moved(0.2e-3, -0.1e-3, 0.2e-3, turn=(0.002, 0.003, 0.0))
     flush = LyingPart(placed_pot, tmp_path).looked(off).flush
-    assert flush is not None and len(flush.higher) > 15 and flush.seen > 0.9
+    assert flush is not None and len(flush.higher) > 15 and flush.seen > 0.8
     error = flush.higher - lifted(flush.places, off)
     # Where the surface is, beside the part, is known to about .005 mm.
     assert np.sqrt(np.mean(error**2)) < 0.025e-3 and abs(error.mean()) < 0.02e-3

@@ -45,6 +45,11 @@ def test_runs_of_the_archive_are_read_from_their_folders(tmp_path: Path) -> None
     assert archive.run(piped.name) is None and archive.run("20260103T000000-abcd") is None
 
 
+def test_the_cells_health_is_what_the_command_tells(tmp_path: Path) -> None:
+    told = Archive(tmp_path).health()
+    assert told is not None and (told["parts"], told["due"]) == ([], "no job has run yet: nothing is known")
+
+
 def test_a_run_that_no_console_has_seen_is_replayed_from_its_record(cell: Cell) -> None:
     cell.home()
     folder = list_runs(cell.runs_folder)[-1]

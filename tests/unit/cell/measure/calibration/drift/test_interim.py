@@ -15,7 +15,7 @@ from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
 from cell.measure.calibration.drift.interim import CHANCE, SUSPICIOUS, HeadShift
 from cell.measure.calibration.solve.normal import HAND, AdjustmentState
 from cell.measure.geometry.poses import from_matrix
-from cell.procedures.arm.photograph import verification_views
+from cell.procedures.arm.photograph import interim_view
 from lab.bench.calibration.observed_cell import ObservedCell, shifted
 from sim_backends.world.scene import draw, rotation
 
@@ -31,7 +31,7 @@ def calibrated() -> tuple[ObservedCell, CellCalibration]:
 def look(cell: ObservedCell, calibration: CellCalibration, rests: int) -> HeadShift:
     scan = calibration.scan
     assert scan.reference is not None
-    view, _ = verification_views(CONFIG, cell.fine, cell.large, scan, calibration.target)
+    view = interim_view(CONFIG, cell.fine, scan)
     seen = []
     for k in range(rests):
         rest = cell.move(view.base_from_flange.homogeneous)
