@@ -9,11 +9,10 @@ from __future__ import annotations
 import datetime as dt
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +20,10 @@ from numpy.typing import NDArray
 from cell.measure.calibration.drift.reference_plate import LARGEST_RAD
 from cell.measure.calibration.drift.slip import LARGEST_M
 from cell.procedures.calibrate.interim import MOVED
-from cell.run.folder import list_runs, read_report
+from cell.run.folder import Report, list_runs, read_report
 from drivers.errors import CellError
 
 Array = NDArray[np.float64]
-Step = Mapping[str, Any]
 
 FOR_A_TREND = 5
 """Jobs that a trend needs at least."""
@@ -159,24 +157,24 @@ class CellHealth:
         }  # fmt: skip
 
 
-def _interim(step: Step) -> tuple[list[float], float] | None:
+def _interim(step: Report) -> tuple[list[float], float] | None:
     found = step.get("interim")
     return None if found is None else (found["off_mm"], found["place_allowed_mm"])
 
 
-def _slipped(step: Step) -> tuple[list[float], float] | None:
+def _slipped(step: Report) -> tuple[list[float], float] | None:
     found = step.get("head_slipped_um")
     return None if found is None else ([1e-3 * value for value in found], 1e3 * LARGEST_M)
 
 
-def _turned(step: Step) -> tuple[list[float], float] | None:
+def _turned(step: Report) -> tuple[list[float], float] | None:
     found = step.get("laser_turned_mrad")
     # What a verification has seen of it counts no more.
     return None if found is None else ([found - step.get("laser_confirmed_mrad", 0.0)], 1e3 * LARGEST_RAD)
 
 
 HEAD = "head on the flange"
-WATCHED: tuple[tuple[str, str, str, Callable[[Step], tuple[list[float], float] | None]], ...] = (
+WATCHED: tuple[tuple[str, str, str, Callable[[Report], tuple[list[float], float] | None]], ...] = (
     (HEAD, "mm", "drive_to_target", _interim),
     ("head on its rail", "mm", "laser_sweep", _slipped),
     ("light plane", "mrad", "laser_sweep", _turned),
@@ -189,7 +187,7 @@ def health(root: Path, max_age_s: float, now: dt.datetime) -> CellHealth:
     reports = [report for folder in list_runs(root) if (report := _read(folder)) is not None]
     jobs = sorted((report for report in reports if report.get("calibration_date")), key=_begun)
     if not jobs:
-        return CellHealth("", 0, 0, (), (), "", age_days=0.0, max_age_days=max_age_s / DAY_S)
+        return CellHealth("", 0, 0, (), (), moved="", age_days=0.0, max_age_days=max_age_s / DAY_S)
     calibrated = str(jobs[-1]["calibration_date"])
     since = [report for report in jobs if report["calibration_date"] == calibrated]
     made = dt.datetime.strptime(calibrated, "%Y-%m-%d %H:%M:%S").astimezone()
@@ -203,12 +201,12 @@ def health(root: Path, max_age_s: float, now: dt.datetime) -> CellHealth:
     ]
     moved = [str(report["run"]) for report in since if _moved(report)]
     return CellHealth(
-        calibrated, len(since), len(ran) - looked, tuple(series), tuple(shocks), moved[-1] if moved else "",
+        calibrated, len(since), len(ran) - looked, tuple(series), tuple(shocks), moved=moved[-1] if moved else "",
         age_days=(now - made).total_seconds() / DAY_S, max_age_days=max_age_s / DAY_S,
     )  # fmt: skip
 
 
-def _read(folder: Path) -> dict[str, Any] | None:
+def _read(folder: Path) -> Report | None:
     try:
         report = read_report(folder)
     except (CellError, OSError):
@@ -216,24 +214,24 @@ def _read(folder: Path) -> dict[str, Any] | None:
     return report if report.get("kind", "job") == "job" else None
 
 
-def _begun(report: Mapping[str, Any]) -> float:
+def _begun(report: Report) -> float:
     """When it began, s since the epoch."""
     return dt.datetime.strptime(str(report["started"]), "%Y-%m-%dT%H:%M:%S%z").timestamp()
 
 
-def _moved(report: Mapping[str, Any]) -> bool:
+def _moved(report: Report) -> bool:
     """Whether the job was refused because the fine board is not where the calibration has it."""
     return any(number.get("name") == MOVED for number in (report.get("refusal") or {}).get("numbers", ()))
 
 
-def _steps(report: Mapping[str, Any]) -> dict[str, Step]:
+def _steps(report: Report) -> dict[str, Report]:
     """The results of the steps that were done, by name."""
     return {step["name"]: step["result"] for step in report.get("steps") or () if step.get("result")}
 
 
 def _series(
-    reports: Sequence[Mapping[str, Any]], part: str, unit: str, step: str,
-    seen: Callable[[Step], tuple[list[float], float] | None],
+    reports: Sequence[Report], part: str, unit: str, step: str,
+    seen: Callable[[Report], tuple[list[float], float] | None],
 ) -> DriftSeries | None:  # fmt: skip
     """What these reports tell of a part; None where no job has looked at it."""
     times, values, limits = [], [], []

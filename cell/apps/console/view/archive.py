@@ -105,7 +105,7 @@ class Archive:
         keys = ("run", "started", "job", "outcome", "d_mean_mm", "expected_mm", "duration_s")
         return [{key: row[key] for key in keys} for row in reversed(self.runs()) if row["kind"] == "job"]
 
-    def health(self) -> dict[str, Any] | None:
+    def health(self) -> dict[str, object] | None:
         """What `cell health` tells; found by a process of its own that gives way."""
         told = self._printed("-m", "cell.run.health", str(self._root), str(self._max_age_s))
         return None if told is None else dict(json.loads(told))
