@@ -98,9 +98,11 @@ def campaign(
     rows = [row for rows in run_all(partial(one_world, level, untouched), seeds, workers, done) for row in rows]
     names = [UNTOUCHED, *(each.name for each in planted())]
     creeping = [row for row in rows if row["shift"] == CREEPING]
+    shifts = {name: _tally([row for row in rows if row["shift"] == name]) for name in names}
+    shares = [shifts[each.name]["found"] / len(seeds) for each in planted()]
     return {
-        "level": level, "seeds": len(seeds),
-        "shifts": {name: _tally([row for row in rows if row["shift"] == name]) for name in names},
+        "level": level, "seeds": len(seeds), "shifts": shifts, "found": float(np.mean(shares)),
+        "least_found": min(shares),
         "creeping_found_at_mm": _found_at(creeping), "runs": rows,
     }  # fmt: skip
 
