@@ -380,7 +380,7 @@ def _looking(base_from_board: pin.SE3, board: BoardSpec, drawn: Sequence[float])
     return centre * from_parts(np.zeros(3), rotation) * from_parts(1e-3 * np.array([along, across, -depth]))
 
 
-SCAN_VERIFICATION, SCAN_INTERIM, TARGET_VERIFICATION = 6, 4, 5
+SCAN_VERIFICATION, SCAN_INTERIM, TARGET_VERIFICATION = 6, 16, 5
 EDGE_PX, LEAST_DOTS, RAIL_STEP, LEAST_WAY = 12.0, 0.5, 1e-3, 0.02
 
 # Offset of the optical axis along and across the board in mm, depth in mm, tilts about x and y and turn about z in deg.
