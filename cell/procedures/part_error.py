@@ -19,6 +19,7 @@ from drivers.interfaces import Vector
 
 SEGMENTS, POINTS_PER_SEGMENT = 5, 9
 DRAWS = 2000
+POSE_DRAWS = 20_000
 
 
 @lru_cache(maxsize=4)
@@ -98,10 +99,10 @@ def through(arms: Vector, covariance: Vector) -> Vector:
 
 
 def draws_of(covariance: Vector) -> Vector:
-    """Motions (2000, 6) drawn with a pose's covariance (6, 6), always the same ones."""
+    """Motions (20000, 6) drawn with a pose's covariance (6, 6), always the same ones."""
     values, ways = np.linalg.eigh(covariance)
     return np.asarray(
-        np.random.default_rng(0).standard_normal((DRAWS, 6)) @ (ways * np.sqrt(np.maximum(values, 0.0))).T
+        np.random.default_rng(0).standard_normal((POSE_DRAWS, 6)) @ (ways * np.sqrt(np.maximum(values, 0.0))).T
     )
 
 

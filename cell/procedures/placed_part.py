@@ -18,8 +18,8 @@ from drivers.errors import Measured, MisplacedError
 from drivers.interfaces import Vector
 
 UNCLEAR = "chance: by no motion is it farther off than was stated before it was put down"
-SURE = 99.9
-"""In so many of 100 parts the stated bound holds: one that is let go counts as in its place by it."""
+SURE_PERCENT = 99.9
+"""Of parts for which the stated bound holds: one that is let go counts as in its place by it."""
 CLEARLY = 3.0
 """Standard deviations of the stated place beyond which a part has not come to lie so by chance."""
 BENT = "the part, or the surface beside it, is bent: look along its edge"
@@ -124,17 +124,19 @@ class PlacedPart:
     def bound(self) -> dict[str, float]:
         """Below what, mm, 95 % of the points lie from where they belong, by axis of the surface's frame and for D.
 
-        Where they were seen counts, and what that may be off by, `SURE`.
+        Where they were seen counts, and what that may be off by, `SURE_PERCENT`.
         """
         errors = 1e3 * np.abs(self.offsets + self._errors)
         found = {name: errors[..., k] for k, name in enumerate("xyz")} | {"d": np.linalg.norm(errors, axis=-1)}
-        return {name: float(np.percentile(np.percentile(each, 95, axis=1), SURE)) for name, each in found.items()}
+        return {
+            name: float(np.percentile(np.percentile(each, 95, axis=1), SURE_PERCENT)) for name, each in found.items()
+        }
 
     @property
     def turn_bound(self) -> float:
-        """By how much the part is turned at most, rad, `SURE`."""
+        """By how much the part is turned at most, rad, `SURE_PERCENT`."""
         turned = self.turn + draws_of(self.covariance)[:, 3:]
-        return float(np.percentile(np.linalg.norm(turned, axis=-1), SURE))
+        return float(np.percentile(np.linalg.norm(turned, axis=-1), SURE_PERCENT))
 
     @property
     def advice(self) -> str:
@@ -178,8 +180,8 @@ class PlacedPart:
         most = 1e3 * place.tolerance
         flush = () if self.flush is None else (Measured("flush, beyond its noise", self.flush.beyond, "mm", most=most),)
         return (
-            Measured("placed part off its place, 95 % bound", self.bound["d"], "mm", most=most),
-            Measured("placed part turned, 95 % bound", 1e3 * self.turn_bound, "mrad", most=1e3 * place.tolerance_angle),
+            Measured("placed part off its place, at most", self.bound["d"], "mm", most=most),
+            Measured("placed part turned, at most", 1e3 * self.turn_bound, "mrad", most=1e3 * place.tolerance_angle),
             *flush,
         )
 

@@ -16,6 +16,7 @@ from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import parse_board
 from cell.procedures.arm.photograph import drawn_interim_view, look_pose
+from cell.procedures.calibrate.interim import resting_pose
 from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, turn_to
 from cell.run.recorded_work import Hands
 from drivers.common.units import parse_quantity
@@ -113,7 +114,7 @@ def _name_look(cell: Cell, job: Job) -> None:
     mounting = cell.config.target_camera.flange_from_camera.se3()
     look = look_pose(cell.config, job, parse_board(job.board.spec), mounting)
     cell.devices.interlocks.may_drive_with(f"the looking pose of job {job.job.name}", look)
-    cell.devices.interlocks.may_drive_with("over the fine board", drawn_interim_view(cell.config).base_from_flange)
+    cell.devices.interlocks.may_drive_with("over the fine board", resting_pose(drawn_interim_view(cell.config)))
 
 
 def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:

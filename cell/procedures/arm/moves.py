@@ -86,7 +86,7 @@ class Mover:
         interlocks: Interlocks | None = None, pace: Pace | None = None,
     ) -> None:  # fmt: skip
         self.hold = hold
-        self.rests_at: pin.SE3 | None = None
+        self._rests_at: pin.SE3 | None = None
         self.pace = pace or Pace()
         self._arm = arm
         self._clock = clock
@@ -198,11 +198,22 @@ class Mover:
         start = self.joints
         self.follow(self._planner.free(start, joints, self._leaving(start)).at_pace(self.pace.share))
 
+    def to_view(self, base_from_flange: pin.SE3) -> None:
+        """The same to a view of a calibration, and only with its joints, the nearest to HOME: `CollisionError` where
+        these are not free."""
+        self.to_joints(self.kinematics.unwound(self.kinematics.ik(base_from_flange, HOME), self.joints))
+
+    def rest_at(self, base_from_flange: pin.SE3) -> None:
+        """From now on the arm rests there between jobs, if it can with what is in the claw now."""
+        with suppress(Unreachable, CollisionError):
+            self._planner.reach(base_from_flange, HOME, "where the arm rests between jobs")
+            self._rests_at = base_from_flange
+
     def fold(self) -> None:
-        """Bring the arm to where it rests between jobs: to `rests_at` where it can, else HOME."""
-        if self.rests_at is not None:
+        """Bring the arm to where it rests between jobs: as `rest_at` has it, else HOME."""
+        if self._rests_at is not None:
             with suppress(Unreachable, CollisionError):
-                return self.to_as_from(HOME, self.rests_at, "where the arm rests between jobs")
+                return self.to_as_from(HOME, self._rests_at, "where the arm rests between jobs")
         return self.to_joints(HOME)
 
     def line(

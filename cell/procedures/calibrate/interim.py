@@ -7,6 +7,7 @@ it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -22,13 +23,14 @@ from cell.measure.calibration.drift.decision import WORST_FIT
 from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
 from cell.measure.calibration.drift.interim import HeadShift
 from cell.measure.calibration.solve.normal import AdjustmentState
-from cell.measure.geometry.poses import from_ur
+from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import parse_board
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import NO_REFERENCE, CalibrationView, interim_view
-from cell.procedures.calibrate.boards import PHOTO_RATE, Keep
-from cell.procedures.calibrate.verification import DRAWS, SHARE, SURE, at_place, find_fine_board
+from cell.procedures.calibrate.boards import PHOTO_RATE, Keep, look_for
+from cell.procedures.calibrate.verification import DRAWS, SHARE, SURE, at_place
+from cell.procedures.sweep.sweeping import home_rail
 from drivers.errors import CalibrationStale, Measured, RefusedError
 from drivers.interfaces import Vector
 
@@ -55,8 +57,13 @@ class InterimCheck:
     sigma: Vector
 
     @classmethod
-    def of(cls, calibration: CellCalibration, job: Job, looks: Sequence[ScanObservation]) -> InterimCheck:
-        """From photographs of the fine board, each from a rest of its own; raises what `interim_view` raises."""
+    def of(
+        cls, calibration: CellCalibration, job: Job, looks: Sequence[ScanObservation], middle: float
+    ) -> InterimCheck:  # fmt: skip
+        """From photographs of the fine board, each from a rest of its own; raises what `interim_view` raises.
+
+        `middle` is where the rail stands in the middle of a sweep, m: a head that turns takes its rail along.
+        """
         scan = calibration.scan
         near = scan.reference
         if near is None:
@@ -65,9 +72,10 @@ class InterimCheck:
             scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, near.base_from_board
         )
         seen = [PictureMeasurements(dots_of(look), k, k) for k, look in enumerate(looks)]
-        head, does = HeadShift.of(state, near, seen), at_place(calibration, job)
+        head, does = HeadShift.of(state, near, seen), at_place(calibration, job, middle)
         effects = [does("scan", change) for change in head.drawn(DRAWS)]
-        ahead = scan.flange_from_camera.rotation @ np.array([0.0, 0.0, job.scan.stand_off])
+        seen_at = middle * scan.rail_direction + np.array([0.0, 0.0, job.scan.stand_off])
+        ahead = scan.flange_from_camera.rotation @ seen_at
         moves = np.hstack([np.eye(3), -pin.skew(ahead)])
         sigma = np.sqrt(np.diag(moves @ head.covariance @ moves.T))
         return cls(
@@ -113,10 +121,15 @@ class InterimCheck:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """For people: a change that matters too little to end the job."""
-        if not self.head.changed or self.matters:
+        """For people: a change that matters too little to end the job, or what this look could not have shown."""
+        if self.head.changed:
+            return () if self.matters else (f"{self.told}: the job goes on. Run `cell calibrate` when there is time",)
+        if self.at_most < self.allowed:
             return ()
-        return (f"{self.told}: the job goes on. Run `cell calibrate` when there is time",)
+        return (
+            f"the look at the fine board is blunt here: what it leaves open may put the place {1e3 * self.at_most:.2f} "
+            f"mm off (allowed {1e3 * self.allowed:.2f} mm). `cell calibrate verify` looks more closely",
+        )
 
     def summary(self) -> dict[str, object]:
         """Figures for journal and report."""
@@ -139,6 +152,15 @@ def fine_board_view(config: CellConfig, calibration: CellCalibration) -> Calibra
     return interim_view(config, parse_board(config.calibration.fine.board), calibration.scan)
 
 
+OVER_M = 0.2
+"""So far above its view of the board the arm rests between jobs: there is room to put a part into the claw."""
+
+
+def resting_pose(view: CalibrationView) -> pin.SE3:
+    """base_from_flange for an arm that waits for its next job: over the board, at which that job looks first."""
+    return from_parts((0.0, 0.0, OVER_M)) * view.base_from_flange
+
+
 def interim_check(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, job: Job, *,
     check: Callable[[], None], progress: Callable[[str], None], keep: Keep,
@@ -146,23 +168,28 @@ def interim_check(
     """Look at the fine board; again, from afar, for as long as what it shows may be chance or a change.
 
     Raises `CalibrationStale` for a calibration without its reference, `RefusedError` when the board is not seen, and
-    what `Mover.to` raises where its view is out of reach.
+    what `Mover.to_view` raises where its view is out of reach.
     """
     fine, view = parse_board(config.calibration.fine.board), fine_board_view(config, calibration)
-    homing = None if devices.rail.state().homed_here else devices.rail.home()
+    home_rail(devices, lambda share, text: progress(text))
     devices.scan_camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
     looks: list[ScanObservation] = []
     while True:
         check()
         progress("looking at the fine board" + (", again" if looks else ""))
-        mover.to_as_from(HOME, view.base_from_flange, "the view of the fine board")
-        if homing is not None:
-            homing.wait(60.0)
+        mover.to_view(view.base_from_flange)
         devices.rail.move_to(view.rail_position).wait(30.0)
-        seen = find_fine_board(devices.scan_camera, fine, keep, f"interim-{len(looks) + 1}")
+        refusals = Counter[str]()
+        seen = look_for(devices.scan_camera, fine, refusals, keep, f"interim-{len(looks) + 1}")
+        if seen is None:
+            raise RefusedError(
+                f"the fine board on the deck is not seen where the calibration has it: {next(iter(refusals))}. Clean "
+                "it, see that nothing covers it and that light and lens are as they were, then run the job again; "
+                "where board, camera or arm were moved, run `cell calibrate` first"
+            )
         flange = from_ur(devices.arm.state().flange)
         looks.append(ScanObservation(seen, None, flange, devices.rail.state().position))
-        found = InterimCheck.of(calibration, job, looks)
+        found = InterimCheck.of(calibration, job, looks, 0.5 * sum(config.rail.travel))
         if len(looks) == LOOKS or found.head.changed or not found.head.suspicious:
             return found
         # From afar: over a short way friction brings the arm back to the very place that it just had.

@@ -228,7 +228,7 @@ def _photographs(
     made = []
     for end, side in zip(ends, "ab", strict=True):
         devices.rail.move_to(end).wait(30.0)
-        seen = find_fine_board(devices.scan_camera, board, keep, what + side)
+        seen = _found(devices.scan_camera, board, "fine", keep, what + side)
         flange = from_ur(devices.arm.state().flange)
         made.append(ScanObservation(seen, None, flange, devices.rail.state().position))
     return made
@@ -253,11 +253,6 @@ def _sweep(
         ScanObservation(None, profiles[line], swath.base_from_flange, float(position))
         for line, position in zip(swath.lines, swath.rail, strict=True)
     ]
-
-
-def find_fine_board(camera: Camera, board: BoardSpec, keep: Keep, what: str) -> BoardView:
-    """The fine board in a new picture, which goes to `keep`; `RefusedError` when it is not seen."""
-    return _found(camera, board, "fine", keep, what)
 
 
 def _found(camera: Camera, board: BoardSpec, name: str, keep: Keep, what: str) -> BoardView:
@@ -462,8 +457,11 @@ class Verification:
         }
 
 
-def at_place(calibration: CellCalibration, job: Job) -> Callable[[str, Array], float]:
-    """What a change (27,) of the "scan" or the "target" chain does at the place of a job, m."""
+def at_place(calibration: CellCalibration, job: Job, middle: float = 0.0) -> Callable[[str, Array], float]:
+    """What a change (27,) of the "scan" or the "target" chain does at the place of a job, m.
+
+    `middle` is where the rail stands in the middle of a sweep, for a change that turns the rail as well.
+    """
     board = parse_board(job.board.spec)
     camera_from_board = from_parts((0.0, 0.0, job.photo.stand_off)) * from_parts(-centre_of(board))
     place = (camera_from_board * job.place_from_board.inverse()).translation
@@ -473,7 +471,7 @@ def at_place(calibration: CellCalibration, job: Job) -> Callable[[str, Array], f
             return target_effect(calibration.target, change, place)
         # A sweep has the middle of the rail's travel in its middle; where that is, a direction's error is taken up.
         half = 0.5 * job.scan.length
-        return scan_effect(calibration.scan, change, job.scan.stand_off, (-half, half))
+        return scan_effect(calibration.scan, change, job.scan.stand_off, (middle - half, middle + half))
 
     return effect
 

@@ -246,7 +246,6 @@ def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, re
 
 def _at(here: Workplace, context: StepContext) -> VehicleArrival:
     """The arm to its looking pose first, with the vehicle braked."""
-    context.progress(0.0, "arm to the looking pose")
     if here.needs_part and not here.devices.claw.holding:
         raise RefusedError(
             f"the claw holds no part: put the part of job {here.job.job.name} into it, or see whether it was "
@@ -259,9 +258,10 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         context.note(text=f"the vehicle warns: {'; '.join(warnings)}")
     vehicle.recover()
     head = _checked(here, context)
-    if head is None and not here.whereabouts.anchored:
+    if head is None and not here.drove and not here.whereabouts.anchored:
         here.mover.to_joints(HOME)
     here.whereabouts.enter(here.job)
+    context.progress(0.0, "arm to the looking pose")
     camera = here.calibration.target.flange_from_camera
     look = look_pose(here.config, here.job, here.board, camera)
     here.mover.to_as_from(HOME, look, "the looking pose")
@@ -273,6 +273,7 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         arrival = stand_at_target(here.job, stand, vehicle, here.whereabouts, here.photograph)
         context.note(text=arrival.told())
         return replace(arrival, head=head)
+    here.drove = True
     vehicle.enable()
     drive = TargetDrive(
         here.job, here.config.arm.vehicle_from_base.se3(), vehicle, whereabouts=here.whereabouts,
@@ -284,21 +285,24 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
 
 
 def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
-    """Whether the scan head is where its calibration has it; None, with a note, where that cannot be seen.
+    """Whether the scan head is where its calibration has it; None where that is not wanted or, with a note, not seen.
 
+    Once in a run: the vehicle may stand before a station that the arm does not know yet.
     Raises `RefusedError` where the head has moved too far for this job, or the board is not seen.
     """
-    if not here.config.calibration.each_job:
-        return None
+    if here.drove or not here.config.calibration.each_job:
+        return here.interim
     try:
         found = interim_check(
             here.config, here.devices, here.mover, here.calibration, here.job, check=context.check,
             progress=lambda text: context.progress(0.0, text), keep=here.frames.keep,
         )  # fmt: skip
     except (CalibrationStale, Unreachable, CollisionError) as error:
-        context.note(text=f"whether the scan head has moved since the calibration is not seen: {error}")
+        text = f"whether the scan head has moved since the calibration is not seen: {error}"
+        context.note(text=f"{text}. Until it is, `cell calibrate verify` tells")
         return None
     found.require()
+    here.interim = found
     # Whatever ends the step from here on, these pictures do not show it.
     here.frames.begin()
     for note in found.notes:
@@ -306,4 +310,4 @@ def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
     return found
 
 
-STEP = JobStep(Step("drive_to_target", 180.0, 1, ("DeadlineError",)), _at, VehicleArrival)
+STEP = JobStep(Step("drive_to_target", 300.0, 1, ("DeadlineError",)), _at, VehicleArrival)

@@ -20,7 +20,7 @@ from cell.measure.inversion import NominalSurface
 from cell.measure.vision import BoardSpec, parse_board
 from cell.procedures.arm.moves import Mover, Pace, PartProgress
 from cell.procedures.arm.photograph import APART_S, BoardFix, photograph
-from cell.procedures.calibrate.interim import fine_board_view
+from cell.procedures.calibrate.interim import InterimCheck, fine_board_view, resting_pose
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.sweep.swath import SweepCollector
@@ -47,7 +47,8 @@ class Workplace:
     True for one that looks at the placed part. `whereabouts` is kept over retries and runs: the vehicle may stand
     anywhere when a step is done again. `sweeping` is told who takes the frames of each sweep, before it begins, and
     where the surface is by the board (base_from_surface), `registered` where it was found. `pace` says how fast arm and
-    vehicle go, of what is planned.
+    vehicle go, of what is planned. `interim` is what this run's look at the fine board said, `drove` whether the
+    vehicle has been told to drive in it.
     """
 
     config: CellConfig
@@ -65,6 +66,8 @@ class Workplace:
     registered: Callable[[pin.SE3], None] = lambda base_from_surface: None
     part: PartProgress = field(default_factory=PartProgress)
     pace: Pace = field(default_factory=Pace)
+    interim: InterimCheck | None = None
+    drove: bool = False
     _photographs: int = field(default=0, init=False)
 
     @cached_property
@@ -74,8 +77,9 @@ class Workplace:
         made = Mover(devices.arm, devices.clock, self.config, self.job, interlocks=devices.interlocks, pace=self.pace)
         if self.config.calibration.each_job:
             with suppress(CalibrationStale):
-                made.rests_at = fine_board_view(self.config, self.calibration).base_from_flange
-                devices.interlocks.may_drive_with("over the fine board", made.rests_at)
+                rest = resting_pose(fine_board_view(self.config, self.calibration))
+                made.rest_at(rest)
+                devices.interlocks.may_drive_with("over the fine board", rest)
         return made
 
     @cached_property

@@ -147,16 +147,18 @@ def health(config: ConfigOption = None, json: JsonOption = False) -> None:
 
     from cell.apps.cli.display import print_health
     from cell.config.cell_config import load_config
-    from cell.config.files import find_config
+    from cell.config.files import beside, find_config
     from cell.run.health import health as found
 
-    loaded = load_config(find_config(config, simulated=True))
-    told = found(folder_of_runs(config), loaded.calibration.max_age, dt.datetime.now().astimezone())
+    path = find_config(config, simulated=True)
+    loaded = load_config(path)
+    calibrations = beside(path) / loaded.cell.calibrations
+    told = found(folder_of_runs(config), calibrations, loaded.calibration.max_age, dt.datetime.now().astimezone())
     if json:
         print_json(told.as_dict())
     else:
         print_health(told.as_dict())
-    if told.calibrated and told.days_left == 0.0:
+    if told.due_now:
         raise typer.Exit(1)
 
 

@@ -116,7 +116,7 @@ class Console:
             lambda fd: ServerSetup(
                 fd, self.port, address.hosts, lasting=token, cert=certificate, key=key,
                 runs=str(cell.runs_folder.resolve()), cell=facts,
-                max_age_s=cell.config.calibration.max_age,
+                calibrations=str(cell.calibrations_folder.resolve()), max_age_s=cell.config.calibration.max_age,
             ),
             bound, self._heard, self._stop, self._left_alone,
         )  # fmt: skip

@@ -40,7 +40,7 @@ class ServerSetup:
     """How the server works; the first that it is told. `fd` is the socket that is bound for it already.
 
     `lasting` is the token of a file; `cert` and `key` are files for TLS. `cell` is what `/api/cell` answers.
-    `max_age_s` is how old a calibration may become.
+    `max_age_s` is how old a calibration in the folder `calibrations` may become.
     """
 
     fd: int
@@ -51,6 +51,7 @@ class ServerSetup:
     key: str | None
     runs: str
     cell: Mapping[str, object]
+    calibrations: str = ""
     max_age_s: float = 30 * 86_400.0
 
 

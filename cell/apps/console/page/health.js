@@ -5,10 +5,10 @@ import { el } from './dom.js';
 const NEWEST = 40;
 
 export function health(found) {
-  const due = el('p', { className: found.days_left > 0 || !found.calibrated ? 'quiet' : 'bad', textContent: found.due });
+  const due = el('p', { className: found.due_now ? 'bad' : 'quiet', textContent: found.due });
   const shocks = found.shocks.map((shock) => el('p', { className: 'bad', textContent: `After run ${shock.run} parts may sit elsewhere: ${shock.reason}` }));
   if (!found.parts.length) return [due, ...shocks];
-  const head = el('tr', {}, ...['Part', 'By now', 'Limit', 'Creeps a day', 'Each job'].map((text) => el('th', { textContent: text })));
+  const head = el('tr', {}, ...['Part', 'Last', 'By now', 'Limit', 'Creeps a day', 'Each job'].map((text) => el('th', { textContent: text })));
   return [el('table', {}, el('thead', {}, head), el('tbody', {}, ...found.parts.map(row))), due, ...shocks];
 }
 
@@ -21,6 +21,7 @@ function row(part) {
   });
   return el('tr', {},
     el('td', { textContent: part.part }),
+    el('td', { textContent: part.last.toFixed(3) }),
     el('td', { textContent: `${part.now.toFixed(3)} ${part.unit}` }),
     el('td', { textContent: `${part.limit.toFixed(2)} ${part.unit}` }),
     el('td', { textContent: creeps }),

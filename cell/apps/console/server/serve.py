@@ -104,7 +104,8 @@ class Server:
         """Until the program at the other end is gone."""
         self._loop = asyncio.get_running_loop()
         application = Application(
-            self.access, self.pages, Archive(Path(self._setup.runs), self._setup.max_age_s),
+            self.access, self.pages,
+            Archive(Path(self._setup.runs), Path(self._setup.calibrations), self._setup.max_age_s),
             cell=self._setup.cell, do=self._do, stop=self._stop, of_job=self._of_job,
         )  # fmt: skip
         config = uvicorn.Config(

@@ -87,10 +87,13 @@ _DRAW += "write_page(Path(sys.argv[1]), Path(sys.argv[2]))"
 
 
 class Archive:
-    """Below the folder `root`, of a cell whose calibration may be `max_age_s` old. What is not there is None."""
+    """Below the folder `root`, of a cell whose calibration, in `calibrations`, may be `max_age_s` old.
 
-    def __init__(self, root: Path, max_age_s: float = 30 * 86_400.0) -> None:
-        self._root, self._max_age_s = root, max_age_s
+    What is not there is None.
+    """
+
+    def __init__(self, root: Path, calibrations: Path = Path(), max_age_s: float = 30 * 86_400.0) -> None:
+        self._root, self._calibrated = root, (str(calibrations), str(max_age_s))
         self._rows: dict[Path, dict[str, Any]] = {}
         self._pages = tempfile.TemporaryDirectory(prefix="cell-console-")
         self._drawing = threading.Lock()
@@ -107,7 +110,7 @@ class Archive:
 
     def health(self) -> dict[str, object] | None:
         """What `cell health` tells; found by a process of its own that gives way."""
-        told = self._printed("-m", "cell.run.health", str(self._root), str(self._max_age_s))
+        told = self._printed("-m", "cell.run.health", str(self._root), *self._calibrated)
         return None if told is None else dict(json.loads(told))
 
     def run(self, name: str) -> dict[str, object] | None:

@@ -9,9 +9,11 @@ from cell import Cell
 from cell.config.cell_config import load_config
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur
+from cell.motion.collision import CollisionError
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import LEAST, Mover, Pace
 from cell.procedures.arm.photograph import drawn_interim_view
+from cell.procedures.calibrate.interim import resting_pose
 from cell.procedures.steps.drive_to_target import TargetDrive
 from drivers.errors import ConfigError
 from tests.unit.cell.procedures.drive.test_way import JOB, VEHICLE_FROM_BASE, Site
@@ -74,14 +76,42 @@ def test_between_jobs_the_arm_rests_where_the_next_looks_first_or_else_at_home()
     mover = Mover(cell.devices.arm, cell.clock, CONFIG, None, interlocks=cell.devices.interlocks)
     mover.fold()
     assert mover.joints == pytest.approx(HOME, abs=1e-3)
-    mover.rests_at = drawn_interim_view(CONFIG).base_from_flange
-    mover.fold()
-    apart = from_ur(cell.devices.arm.state().flange).actInv(mover.rests_at)
-    assert np.linalg.norm(apart.translation) < 1e-4
-    for unreachable in (from_parts((3.0, 0.0, 0.0)), from_parts((0.0, 0.0, -0.2)) * mover.rests_at):
-        mover.rests_at = unreachable
+    rest = resting_pose(drawn_interim_view(CONFIG))
+    for unreachable in (from_parts((3.0, 0.0, 0.0)), from_parts((0.0, 0.0, -0.5)) * rest):
+        mover.rest_at(unreachable)
         mover.fold()
         assert mover.joints == pytest.approx(HOME, abs=1e-3)
+    mover.rest_at(rest)
+    mover.fold()
+    assert np.linalg.norm(from_ur(cell.devices.arm.state().flange).actInv(rest).translation) < 1e-4
+
+
+WIDE = (0.6, 0.6, 0.02)
+
+
+def mover_with(size: tuple[float, float, float] | None) -> Mover:
+    """In a cell of its own, with a part of this size in the claw."""
+    cell = VirtualCell(CONFIG, 2, "nominal")
+    cell.devices.vehicle.brake()
+    job = None if size is None else JOB.model_copy(update={"grasp": JOB.grasp.model_copy(update={"size": size})})
+    return Mover(cell.devices.arm, cell.clock, CONFIG, job, interlocks=cell.devices.interlocks)
+
+
+def test_with_a_part_that_has_no_room_there_the_arm_rests_at_home() -> None:
+    view = drawn_interim_view(CONFIG).base_from_flange
+    for mover, rests in ((mover_with((0.07, 0.036, 0.02)), True), (mover_with(WIDE), False)):
+        mover.rest_at(view)
+        mover.fold()
+        assert (np.abs(mover.joints - HOME).max() > 0.5) == rests
+
+
+def test_a_view_is_taken_with_the_calibrations_joints_or_not_at_all() -> None:
+    view = drawn_interim_view(CONFIG).base_from_flange
+    mover = mover_with(None)
+    mover.to_view(view)
+    assert mover.joints == pytest.approx(mover.kinematics.ik(view, HOME), abs=1e-3)
+    with pytest.raises(CollisionError):
+        mover_with(WIDE).to_view(view)
 
 
 def test_the_vehicle_drives_at_a_share_of_the_jobs_speed() -> None:

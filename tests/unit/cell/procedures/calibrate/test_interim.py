@@ -15,12 +15,13 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration.drift.interim import HeadShift
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
-from cell.procedures.calibrate.interim import LOOKS, MOVED, InterimCheck, fine_board_view, interim_check
+from cell.procedures.calibrate.interim import LOOKS, MOVED, InterimCheck, fine_board_view, interim_check, resting_pose
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.run.report.report import pose_of
 from drivers.errors import RefusedError
-from lab.bench.calibration.interim import PlantedShift, planted
+from lab.bench.calibration.interim import planted
 from lab.bench.job.whole_job import JobRecord, run_whole_job
+from sim_backends.world.scene import rotation
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")
@@ -55,38 +56,34 @@ def test_a_cell_that_nobody_touched_passes_and_says_what_it_saw(placed_pot: JobR
     arrival = placed_pot.results["drive_to_target"]
     assert isinstance(arrival, VehicleArrival) and arrival.head is not None
     assert arrival.summary()["interim"] == arrival.head.summary()
-    # It rests where the next job looks first.
+    # It rests above where the next job looks first.
     assert placed_pot.calibration is not None and placed_pot.at_end is not None
-    view = fine_board_view(CONFIG, placed_pot.calibration).base_from_flange
-    assert np.linalg.norm(view.actInv(pose_of(placed_pot.at_end, "base_from_flange")).translation) < 1e-3
+    rest = resting_pose(fine_board_view(CONFIG, placed_pot.calibration))
+    assert np.linalg.norm(rest.actInv(pose_of(placed_pot.at_end, "base_from_flange")).translation) < 1e-3
 
 
-@pytest.mark.parametrize("name", ["last joint's zero, 4 mrad", "scan camera's middle, 1.5 px"])
-def test_what_moves_the_place_too_far_refuses_with_the_number_and_the_next_step(
-    placed_pot: JobRecord, name: str
-) -> None:
-    found, kept = looked(placed_pot, SHIFTS[name].put_in)
-    assert found.head.changed and len(kept) == found.head.looks == 1
-    if name.startswith("last joint"):
-        assert found.matters
-        with pytest.raises(
-            RefusedError, match=r"has moved: by .* allowed are 0\.18 mm.*then run `cell calibrate`"
-        ) as met:
-            found.require()
-        (number,) = met.value.numbers
-        assert (number.name, number.kept) == (MOVED, False)
-        assert number.value == pytest.approx(1e3 * found.at_most)
-        assert f"{1e3 * found.effect:.2f} mm off, at most {1e3 * found.at_most:.2f} mm" in str(met.value)
+def test_what_moves_the_place_too_far_refuses_with_the_number_and_the_next_step(placed_pot: JobRecord) -> None:
+    found, kept = looked(placed_pot, SHIFTS["last joint's zero, 4 mrad"].put_in)
+    assert found.head.changed and found.matters and len(kept) == found.head.looks == 1
+    with pytest.raises(RefusedError, match=r"has moved: by .* allowed are 0\.18 mm.*then run `cell calibrate`") as met:
+        found.require()
+    (number,) = met.value.numbers
+    assert (number.name, number.kept) == (MOVED, False)
+    assert number.value == pytest.approx(1e3 * found.at_most)
+    assert f"{1e3 * found.effect:.2f} mm off, at most {1e3 * found.at_most:.2f} mm" in str(met.value)
+
+
+def test_a_lens_that_moved_looks_like_a_head_that_moved(placed_pot: JobRecord) -> None:
+    found, _ = looked(placed_pot, SHIFTS["scan camera's middle, 1.5 px"].put_in)
+    assert found.head.changed
 
 
 def test_what_may_be_chance_is_looked_at_again_and_all_looks_count(placed_pot: JobRecord) -> None:
     found = [looked(placed_pot, SHIFTS[f"scan head, .1 mm along {axis}"].put_in)[0].head for axis in "xyz"]
-    assert max(head.looks for head in found) > 1
     assert all(head.changed or not head.suspicious or head.looks == LOOKS for head in found)
-    once = looked(placed_pot)[0].head
-    for head in found:
-        if head.looks > 1:
-            assert (np.diag(head.covariance)[:3] < 0.8 * np.diag(once.covariance)[:3]).all()
+    seen = [*found, looked(placed_pot)[0].head, looked(placed_pot, SHIFTS["fine board, .2 mm"].put_in)[0].head]
+    once, more = ([np.diag(head.covariance)[:3] for head in seen if (head.looks == 1) == one] for one in (True, False))
+    assert once and more and all((many < 0.8 * once[0]).all() for many in more)
 
 
 def test_a_job_whose_head_has_moved_ends_before_the_vehicle_drives(placed_pot: JobRecord) -> None:
@@ -139,6 +136,11 @@ def test_what_may_do_too_much_counts_and_only_if_it_is_no_chance() -> None:
     assert not seen(at_most=0.5e-3, head=replace(seen().head, chance=0.01)).matters
 
 
+def test_a_look_that_leaves_too_much_open_says_so() -> None:
+    (note,) = seen(at_most=0.25e-3, head=replace(seen().head, chance=0.5)).notes
+    assert "what it leaves open may put the place 0.25 mm off (allowed 0.18 mm). `cell calibrate verify`" in note
+
+
 def test_pictures_that_fit_badly_are_refused() -> None:
     with pytest.raises(
         RefusedError, match=r"fits its picture 1\.7 times worse .* allowed 1\.6 times.*calibrate verify"
@@ -154,18 +156,23 @@ def test_its_figures_are_those_of_the_head() -> None:
     }  # fmt: skip
 
 
-def test_a_turn_moves_the_place_by_its_distance(placed_pot: JobRecord) -> None:
-    """About the camera's x, 1 mrad at 130 mm: 0.13 mm, by the closed form and by the sweep's own points."""
-    turn = PlantedShift("turn", SHIFTS["scan head, 1 mrad about the camera's axis"].put_in)
-    found, _ = looked(placed_pot, turn.put_in)
-    ahead = found.off - found.head.change[:3]
-    assert placed_pot.calibration is not None
-    axis = placed_pot.calibration.scan.flange_from_camera.rotation[:, 2]
-    assert ahead == pytest.approx(np.cross(found.head.change[3:], JOB.scan.stand_off * axis))
-    assert found.head.change[5] == pytest.approx(1e-3, abs=0.5e-3)
+@pytest.mark.parametrize(("axis", "lever"), [(0, JOB.scan.stand_off), (2, 0.05)])
+def test_a_turn_moves_the_place_by_its_distance(placed_pot: JobRecord, axis: int, lever: float) -> None:
+    """Of 4 mrad about the camera's x, 130 mm; about its axis, the 50 mm that the rail stands out in mid-sweep."""
+    turn = 4e-3 * np.eye(3)[axis]
+
+    def put_in(cell: VirtualCell) -> None:
+        head = cell.world.scene.flange_from_scan_camera.copy()
+        head[:3, :3] = head[:3, :3] @ rotation(turn)
+        cell.world.remake(replace(cell.world.scene, flange_from_scan_camera=head), cell.world.station)
+
+    found, _ = looked(placed_pot, put_in)
+    assert np.linalg.norm(found.head.change[3:]) == pytest.approx(4e-3, abs=0.4e-3)
+    assert np.linalg.norm(found.off) == pytest.approx(4e-3 * lever, abs=0.12e-3)
+    assert found.effect == pytest.approx(4e-3 * lever, rel=0.5)
 
 
 @pytest.mark.campaign
 def test_every_planted_shift_is_found_in_a_cell(placed_pot: JobRecord) -> None:
     missed = [name for name, each in SHIFTS.items() if not looked(placed_pot, each.put_in)[0].head.changed]
-    assert len(missed) <= 2 and LOOKS == 4
+    assert len(missed) <= 2
