@@ -66,7 +66,7 @@ class DriftSeries:
         now = self.values.mean(axis=0) - slope * ago.mean()
         left = float(np.sum((self.values - now - ago[:, None] * slope) ** 2))
         explained, free = float(slope @ slope * (away @ away)), axes * (jobs - 2)
-        if explained / axes < scipy.special.fdtri(axes, free, 1.0 - CHANCE) * left / free or self._step < left:
+        if explained / axes <= scipy.special.fdtri(axes, free, 1.0 - CHANCE) * left / free or self._step < left:
             return None
         return now, slope
 

@@ -59,7 +59,7 @@ def test_a_fit_that_others_wrote_finds_the_part_in_the_same_place(placed_pot: Jo
     poses = []
     for points, file in ((local[high], "pot-part.ply"), (local[~high], "pot.ply")):
         mesh = trimesh.load(tmp_path / file)
-        chosen = points[np.random.default_rng(0).permutation(len(points))[:5000]]
+        chosen = points[np.random.default_rng(0).permutation(len(points))[:12_000]]
         poses.append(fitted(chosen, mesh))
     apart = poses[1].inverse() * poses[0]
     assert np.linalg.norm(apart.translation - found.seen.surface_from_part.translation) < 0.01e-3
@@ -240,7 +240,7 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture(
     report = json.loads((done.folder / "report.json").read_text(encoding="utf-8"))
     told = report["steps"][-1]
     assert (told["name"], told["result"]["unseen"]) == ("verify", [])
-    assert report["place_bound_95"]["d"] < 0.15
+    assert report["place_bound_95"]["d"] < 0.2
     assert max(map(abs, report["truth"]["seen_error"]["translation_mm"])) < 0.03
     assert report["truth"]["d_p95"] < report["place_bound_95"]["d"]
     rows = {row["name"]: row for row in report["measured"]}

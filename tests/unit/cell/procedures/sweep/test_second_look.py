@@ -21,6 +21,7 @@ from cell.measure.inversion import NominalSurface, PlacePose
 from cell.measure.inversion.effects.between_sweeps import Creep, SurfaceMotion, surface_motion
 from cell.measure.reconstruction import Cloud, flange_motions, merge
 from cell.measure.reconstruction.cloud import Filled
+from cell.motion.kinematics import HOME
 from cell.procedures.arm.touch import felt_touch
 from cell.procedures.steps import place as place_step
 from cell.procedures.steps.kinds import PLACE
@@ -69,6 +70,8 @@ class Site:
         cell.devices.vehicle.brake()
         self.work = work_of(cell, self.job, self.nominal, self.record, NoFrames(), self.folder)
         cell.devices.interlocks.work_with(self.work.calibration.configuration)
+        # With the joints of the run that swept before: with others the arm's errors are others.
+        self.work.mover.to_joints(HOME)
         self.made = {name: self.record.results[name] for name in NAMES[:-1]}
 
     def sweep_here(self) -> None:
