@@ -101,6 +101,8 @@ def test_with_a_part_that_has_no_room_there_the_arm_rests_at_home() -> None:
     view = drawn_interim_view(CONFIG).base_from_flange
     for mover, rests in ((mover_with((0.07, 0.036, 0.02)), True), (mover_with(WIDE), False)):
         mover.rest_at(view)
+        # The claw is empty then, but the next part has as little room.
+        mover.leave_part(from_parts((0.8, 0.0, 0.0)))
         mover.fold()
         assert (np.abs(mover.joints - HOME).max() > 0.5) == rests
 
