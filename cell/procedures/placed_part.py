@@ -180,8 +180,10 @@ class PlacedPart:
         most = 1e3 * place.tolerance
         flush = () if self.flush is None else (Measured("flush, beyond its noise", self.flush.beyond, "mm", most=most),)
         return (
-            Measured("placed part off its place, at most", self.bound["d"], "mm", most=most),
-            Measured("placed part turned, at most", 1e3 * self.turn_bound, "mrad", most=1e3 * place.tolerance_angle),
+            Measured("placed part off its place, stated bound", self.bound["d"], "mm", most=most),
+            Measured(
+                "placed part turned, stated bound", 1e3 * self.turn_bound, "mrad", most=1e3 * place.tolerance_angle
+            ),
             *flush,
         )
 

@@ -185,7 +185,7 @@ class Mover:
         self.follow(self.plan_to(base_from_flange, what))
 
     def to_as_from(self, near: Joints, base_from_flange: pin.SE3, what: str) -> None:
-        """The same, wherever the arm stands, with those in which it comes there from `near`.
+        """Move freely to a flange pose, wherever the arm stands, with the joints in which it comes there from `near`.
 
         With other joints the arm's errors are others, by more than a tenth of a millimetre.
         """
@@ -199,8 +199,10 @@ class Mover:
         self.follow(self._planner.free(start, joints, self._leaving(start)).at_pace(self.pace.share))
 
     def to_view(self, base_from_flange: pin.SE3) -> None:
-        """The same to a view of a calibration, and only with its joints, the nearest to HOME: `CollisionError` where
-        these are not free."""
+        """Move freely to a view of a calibration with the calibration's joints, those nearest to HOME.
+
+        Raises `Unreachable`, or `CollisionError` where these joints are not free.
+        """
         self.to_joints(self.kinematics.unwound(self.kinematics.ik(base_from_flange, HOME), self.joints))
 
     def rest_at(self, base_from_flange: pin.SE3) -> None:

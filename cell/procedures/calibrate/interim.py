@@ -36,7 +36,7 @@ from drivers.interfaces import Vector
 
 LOOKS = 4
 """So often the arm comes to rest at most. More would not be sharper: the calibration's own error remains."""
-MOVED = "place off by what moved, at most"
+MOVED = "place off by what has moved, bound"
 CAUSES = "the scan head on the flange, a joint's zero, or the fine board on the deck"
 
 

@@ -258,7 +258,7 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         context.note(text=f"the vehicle warns: {'; '.join(warnings)}")
     vehicle.recover()
     head = _checked(here, context)
-    if head is None and not here.drove and not here.whereabouts.anchored:
+    if head is None and not here.whereabouts.anchored:
         here.mover.to_joints(HOME)
     here.whereabouts.enter(here.job)
     context.progress(0.0, "arm to the looking pose")
@@ -273,7 +273,6 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         arrival = stand_at_target(here.job, stand, vehicle, here.whereabouts, here.photograph)
         context.note(text=arrival.told())
         return replace(arrival, head=head)
-    here.drove = True
     vehicle.enable()
     drive = TargetDrive(
         here.job, here.config.arm.vehicle_from_base.se3(), vehicle, whereabouts=here.whereabouts,
@@ -287,10 +286,10 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
 def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
     """Whether the scan head is where its calibration has it; None where that is not wanted or, with a note, not seen.
 
-    Once in a run: the vehicle may stand before a station that the arm does not know yet.
+    Once in a run: when the step is done again, the vehicle may stand before a station that the arm does not know yet.
     Raises `RefusedError` where the head has moved too far for this job, or the board is not seen.
     """
-    if here.drove or not here.config.calibration.each_job:
+    if here.looked or not here.config.calibration.each_job:
         return here.interim
     try:
         found = interim_check(
@@ -300,9 +299,10 @@ def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
     except (CalibrationStale, Unreachable, CollisionError) as error:
         text = f"whether the scan head has moved since the calibration is not seen: {error}"
         context.note(text=f"{text}. Until it is, `cell calibrate verify` tells")
+        here.looked = True
         return None
     found.require()
-    here.interim = found
+    here.interim, here.looked = found, True
     # Whatever ends the step from here on, these pictures do not show it.
     here.frames.begin()
     for note in found.notes:

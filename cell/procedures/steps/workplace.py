@@ -47,8 +47,8 @@ class Workplace:
     True for one that looks at the placed part. `whereabouts` is kept over retries and runs: the vehicle may stand
     anywhere when a step is done again. `sweeping` is told who takes the frames of each sweep, before it begins, and
     where the surface is by the board (base_from_surface), `registered` where it was found. `pace` says how fast arm and
-    vehicle go, of what is planned. `interim` is what this run's look at the fine board said, `drove` whether the
-    vehicle has been told to drive in it.
+    vehicle go, of what is planned. `looked` says whether this run has tried to look at the fine board,
+    `interim` what that said, None where nothing was to be seen.
     """
 
     config: CellConfig
@@ -67,7 +67,7 @@ class Workplace:
     part: PartProgress = field(default_factory=PartProgress)
     pace: Pace = field(default_factory=Pace)
     interim: InterimCheck | None = None
-    drove: bool = False
+    looked: bool = False
     _photographs: int = field(default=0, init=False)
 
     @cached_property

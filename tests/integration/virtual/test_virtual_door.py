@@ -171,6 +171,14 @@ def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe
     require_safe(dict(outcome.report))
 
 
+def test_a_drive_that_is_done_again_does_not_look_at_the_fine_board_again() -> None:
+    """The vehicle may stand before a station that the arm does not know yet."""
+    outcome = done(("target_camera.silent@drive_to_target",), confirm="simulated")
+    step = outcome.report["steps"][0]
+    assert (step["name"], step["state"], step["retries"]) == ("drive_to_target", "failed", 1)
+    assert len(list((outcome.folder / "frames").glob("interim-1-*.png"))) == 1
+
+
 def test_a_script_between_the_steps_may_move_what_the_run_may_and_a_stop_before_the_run_is_not_forgotten() -> None:
     with opened() as cell:
         rail, moved = cell.devices.rail, []

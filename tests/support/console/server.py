@@ -43,7 +43,7 @@ class Served:
         self.trouble: str | None = None
         facts = {"version": 1, "name": "test"}
         self.process = ServerProcess(
-            lambda fd: ServerSetup(fd, self.port, HOSTS, lasting, None, None, str(runs), facts),
+            lambda fd: ServerSetup(fd, self.port, HOSTS, lasting, None, None, str(runs), facts, str(runs), 86_400.0),
             bound, self._hear, self._stop, lambda: None,
         )  # fmt: skip
         self._cookie = self._key = ""

@@ -51,8 +51,8 @@ class ServerSetup:
     key: str | None
     runs: str
     cell: Mapping[str, object]
-    calibrations: str = ""
-    max_age_s: float = 30 * 86_400.0
+    calibrations: str
+    max_age_s: float
 
 
 # --- server to cell ---

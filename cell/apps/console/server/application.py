@@ -183,7 +183,8 @@ class Application:
         return await self._from_archive(Archive.trend)
 
     async def _health(self, request: Request) -> Response:
-        return _found(await run_in_threadpool(self._archive.health))
+        told = await run_in_threadpool(self._archive.health)
+        return _no("missing", "the reports could not be read: see `cell health`", 404) if told is None else _json(told)
 
     async def _from_archive(self, what: Callable[[Archive], object]) -> Response:
         return _json(await run_in_threadpool(what, self._archive))

@@ -92,7 +92,7 @@ class Archive:
     What is not there is None.
     """
 
-    def __init__(self, root: Path, calibrations: Path = Path(), max_age_s: float = 30 * 86_400.0) -> None:
+    def __init__(self, root: Path, calibrations: Path, max_age_s: float) -> None:
         self._root, self._calibrated = root, (str(calibrations), str(max_age_s))
         self._rows: dict[Path, dict[str, Any]] = {}
         self._pages = tempfile.TemporaryDirectory(prefix="cell-console-")

@@ -21,7 +21,7 @@ from cell.measure.geometry.poses import covariance_root
 SUSPICIOUS = 0.1
 """Looks that chance brings more seldom are repeated: one job in ten, of a head that nobody touched."""
 CHANCE = 1e-4
-"""What chance brings more seldom is a change: one job in 10,000, of a head that nobody touched."""
+"""What chance brings more seldom is a change. Jobs of one calibration share its error: false alarms come together."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from drivers.errors import RefusedError
 from lab.bench.calibration.interim import planted
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world.scene import rotation
+from statemachine.journal import read
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")
@@ -104,6 +106,21 @@ def test_a_cell_that_does_not_want_it_is_not_looked_at(placed_pot: JobRecord) ->
     ended = run_whole_job(config, JOB, nominal, placed_pot.seed, "nominal", calibrated=placed_pot)
     arrival = ended.results["drive_to_target"]
     assert arrival.head is None and "interim" not in arrival.summary()
+
+
+def test_a_calibration_of_an_older_program_is_not_looked_at_and_the_job_says_so(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    made = placed_pot.calibration
+    assert made is not None
+    old = replace(placed_pot, calibration=replace(made, scan=replace(made.scan, reference=None)))
+    nominal = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
+    ended = run_whole_job(CONFIG, JOB, nominal, old.seed, "nominal", calibrated=old, runs=tmp_path)
+    assert ended.results["drive_to_target"].head is None and ended.folder is not None
+    notes = [event.data["text"] for event in read(ended.folder).events if event.kind == "note" and "text" in event.data]
+    assert any(
+        "has moved since the calibration is not seen: the stored calibration holds no ref" in text for text in notes
+    )
 
 
 def test_a_board_that_is_covered_is_refused_with_what_to_do(placed_pot: JobRecord) -> None:

@@ -244,7 +244,7 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture(
     assert max(map(abs, report["truth"]["seen_error"]["translation_mm"])) < 0.03
     assert report["truth"]["d_p95"] < report["place_bound_95"]["d"]
     rows = {row["name"]: row for row in report["measured"]}
-    assert rows["placed part off its place, at most"]["kept"]
+    assert rows["placed part off its place, stated bound"]["kept"]
     assert "place error, stated 95 % bound" not in rows
     assert "placed part off its place" in make_page(done.folder)
     assert (done.folder / CLOUD).stat().st_size > 100_000

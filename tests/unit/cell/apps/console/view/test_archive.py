@@ -21,7 +21,7 @@ def test_runs_of_the_archive_are_read_from_their_folders(tmp_path: Path) -> None
         '{"outcome": "placed", "reason": "done", "job": "pot", "place_sigma": {"translation_mm": [0.03, 0.04, 0.0]}'
     )
     (folder / "report.json").write_text(report + ', "truth": {"error_mm": {"d": {"mean": 0.07}}}, "started": "2026"}')
-    archive = Archive(tmp_path)
+    archive = Archive(tmp_path, tmp_path, 86_400.0)
     (row,) = archive.runs()
     assert (row["d_mean_mm"], row["expected_mm"], row["outcome"]) == (0.07, 0.05, "placed")
     (point,) = archive.trend()
@@ -46,14 +46,14 @@ def test_runs_of_the_archive_are_read_from_their_folders(tmp_path: Path) -> None
 
 
 def test_the_cells_health_is_what_the_command_tells(tmp_path: Path) -> None:
-    told = Archive(tmp_path).health()
+    told = Archive(tmp_path, tmp_path, 86_400.0).health()
     assert told is not None and (told["parts"], told["due"]) == ([], "no job has run yet: nothing is known")
 
 
 def test_a_run_that_no_console_has_seen_is_replayed_from_its_record(cell: Cell) -> None:
     cell.home()
     folder = list_runs(cell.runs_folder)[-1]
-    archive = Archive(cell.runs_folder)
+    archive = Archive(cell.runs_folder, cell.runs_folder, 86_400.0)
     run, told = archive.run(folder.name), archive.replay(folder.name)
     assert run is not None and run["replay"]
     assert told is not None and told["times"][-1] > 1.0
@@ -62,7 +62,7 @@ def test_a_run_that_no_console_has_seen_is_replayed_from_its_record(cell: Cell) 
     # Where the record is cut off it is read as far as it goes; where it tells nothing, nothing is offered.
     record = folder / "record.mcap"
     record.write_bytes(record.read_bytes()[: record.stat().st_size // 2])
-    assert Archive(cell.runs_folder).replay(folder.name) is not None
+    assert Archive(cell.runs_folder, cell.runs_folder, 86_400.0).replay(folder.name) is not None
     record.write_bytes(record.read_bytes()[:60])
-    archive = Archive(cell.runs_folder)
+    archive = Archive(cell.runs_folder, cell.runs_folder, 86_400.0)
     assert not (archive.run(folder.name) or {"replay": True})["replay"] and archive.replay(folder.name) is None

@@ -80,6 +80,20 @@ def test_a_shift_and_a_turn_are_found_and_told_by_how_much(
         cell.truth = truth
 
 
+def test_a_board_that_was_bent_fits_badly_wherever_the_head_is(
+    calibrated: tuple[ObservedCell, CellCalibration],
+) -> None:
+    cell, calibration = calibrated
+    try:
+        found = []
+        for cell.bend in (0.0, 0.2e-3):
+            found.append(look(cell, calibration, 1))
+    finally:
+        cell.bend = 0.0
+    assert [one.fits for one in found] == [True, False]
+    assert 3.0 < found[1].dots < 5.5
+
+
 def test_more_rests_make_it_sharper_down_to_the_calibrations_own_error(
     calibrated: tuple[ObservedCell, CellCalibration],
 ) -> None:
