@@ -264,7 +264,7 @@ def print_health(told: Mapping[str, Any]) -> None:
     console = Console(highlight=False)
     if told["parts"]:
         columns = ("part", ">last", ">by now", ">limit", "unit", ">a day", ">days left", "each job")
-        table = new_table(f"{told['jobs']} jobs since the calibration of {told['calibrated']}", *columns)
+        table = new_table(f"since the calibration of {told['calibrated']}, jobs: {told['jobs']}", *columns)
         for part in told["parts"]:
             creeps = f"{part['a_day']:.3f}" if part["a_day"] else ""
             left = "" if part["days_left"] is None else f"{part['days_left']:.0f}"
