@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.config.cell_config import CellConfig
-from cell.config.job import Job
+from cell.config.job import Job, PartSection
 from cell.measure.geometry.poses import from_parts, transform
 from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, drawn_gap
 from cell.measure.inversion.nominal import NominalSurface, read_mesh
@@ -33,6 +33,8 @@ LEAST_OVER = 0.5
 GRID = 21
 """Rays to the side over the footprint."""
 FAR_M = 1.0
+BESIDE_PART_M = 2e-3
+"""A pin or a hole's rim may stand out of the mesh of a part so far."""
 
 
 def contact_problems(job: Job, config: CellConfig, mesh: Path) -> Iterator[str]:
@@ -106,6 +108,24 @@ def mating_problems(job: Job, mesh: Path) -> Iterator[str]:
         problem = found.problem(job.place.tolerance) or ""
     if problem:
         yield f'part.mesh "{Path(job.part.mesh).name}": {problem}'
+    yield from _feature_problems(job, job.part)
+
+
+def _feature_problems(job: Job, part: PartSection) -> Iterator[str]:
+    """Features lie on the part, and somebody looks at it."""
+    if part.feature and verify.STEP.name not in kind_of(job).names:
+        yield (
+            f"part.feature {part.feature[0].name}: nobody looks at the placed part. Write place.verify, a kind of job "
+            "with the step verify, or no feature"
+        )
+    low, high = NominalSurface.load(Path(part.mesh), unit=part.mesh_unit).extent
+    for feature in part.feature:
+        at = np.array(feature.at)
+        if (off := float(np.linalg.norm(at - np.clip(at, low, high)))) > BESIDE_PART_M:
+            yield (
+                f"part.feature {feature.name}: at lies {1e3 * off:.1f} mm beside the box of the part's mesh (allowed: "
+                f"at most {1e3 * BESIDE_PART_M:g} mm). Give it in the part's own frame"
+            )
 
 
 def _drawn(job: Job, mesh: Path) -> MatingGap | None:

@@ -13,7 +13,7 @@ import tomllib
 from collections.abc import Collection, Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, Protocol, Self
 
 import numpy as np
 import pinocchio as pin
@@ -95,11 +95,18 @@ class StationObstacle(Obstacle):
     place_from_centre: Pose
 
 
-def once_each(obstacles: Sequence[Obstacle]) -> None:
-    """Raise `ValueError` when two have one name."""
-    names = [obstacle.name for obstacle in obstacles]
+class Named(Protocol):
+    """A table that has a name."""
+
+    @property
+    def name(self) -> str: ...
+
+
+def once_each(what: str, tables: Sequence[Named]) -> None:
+    """Raise `ValueError` when two of these tables, `what` in words, have one name."""
+    names = [table.name for table in tables]
     if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"obstacle {', '.join(twice)} is there twice; give each a name of its own")
+        raise ValueError(f"{what} {', '.join(twice)} is there twice; give each a name of its own")
 
 
 def vehicle_obstacles(obstacles: Iterable[VehicleObstacle]) -> list[Body]:
@@ -175,7 +182,7 @@ class CellConfig(Table):
 
     @model_validator(mode="after")
     def _distinct_obstacles(self) -> Self:
-        once_each(self.obstacle)
+        once_each("obstacle", self.obstacle)
         return self
 
     @model_validator(mode="after")

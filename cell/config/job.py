@@ -20,7 +20,7 @@ from cell.config.cell_config import StationObstacle, checked_board, once_each
 from drivers.common.addresses import Name
 from drivers.common.units import number, quantity, shown, whole
 from drivers.errors import ConfigError
-from drivers.make import Exposure, Mounting, Pose, Table
+from drivers.make import Exposure, Mounting, Offset, Pose, Table
 
 LEAST_LINES, MOST_LINES = 10, 20_000
 """Lines of one sweep: fewer show no surface, more do not fit into memory."""
@@ -28,6 +28,8 @@ LONGEST_SWEEP_S = 100.0
 """The step of the laser sweep has 120 s."""
 
 Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
+Share = Annotated[float, number(-1, 1)]
+"""Of a direction, along one axis."""
 
 
 class JobSection(Table):
@@ -81,11 +83,34 @@ class SurfaceSection(Table):
     prior_sigma_angle: Annotated[float, quantity("deg", 0.01, 20)]
 
 
+class FeatureSection(Table):
+    """What people measure of a placed part, in the part's frame: a flat counts along its normal, an edge, a hole or a
+    pin across its direction. `axis` (3,), of any length, is that normal or direction."""
+
+    name: Annotated[str, Name]
+    kind: Literal["flat", "edge", "hole", "pin"]
+    at: tuple[Offset, Offset, Offset]
+    axis: tuple[Share, Share, Share]
+    tolerance: Annotated[float, quantity("mm", 0.01, 10)]
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> Self:
+        if not any(self.axis):
+            raise ValueError("axis (0, 0, 0) has no direction; give a flat's normal, else the feature's own direction")
+        return self
+
+
 class PartSection(Table):
     """The part as drawn, in its own frame; its underside is held against the scanned surface before the descent."""
 
     mesh: Annotated[str, AfterValidator(_checked_mesh_name)]
     mesh_unit: Literal["m", "mm"]
+    feature: tuple[FeatureSection, ...] = ()
+
+    @model_validator(mode="after")
+    def _distinct_features(self) -> Self:
+        once_each("feature", self.feature)
+        return self
 
 
 class SwathSection(Table):
@@ -199,7 +224,7 @@ class Job(Table):
 
     @model_validator(mode="after")
     def _distinct_obstacles(self) -> Self:
-        once_each(self.obstacle)
+        once_each("obstacle", self.obstacle)
         return self
 
     @property

@@ -8,12 +8,13 @@ from functools import cached_property
 import numpy as np
 import pinocchio as pin
 
-from cell.config.job import Job, PlaceSection
+from cell.config.job import FeatureSection, Job, PlaceSection
 from cell.measure.geometry.poses import difference, from_parts, perturbed, transform
 from cell.measure.inversion.flush import Flush
 from cell.measure.inversion.mating import MatingGap
 from cell.measure.inversion.part_pose import PartPose, of_part
 from cell.procedures.part_error import draws_of
+from cell.procedures.part_features import FeatureSeen
 from drivers.errors import Measured, MisplacedError
 from drivers.interfaces import Vector
 
@@ -22,6 +23,7 @@ SURE_PERCENT = 99.9
 """Of parts for which the stated bound holds: one that is let go counts as in its place by it."""
 CLEARLY = 3.0
 """Standard deviations of the stated place beyond which a part has not come to lie so by chance."""
+FLUSH = "flush, beyond its noise"
 BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 LIKELY = {
@@ -40,7 +42,7 @@ class PlacedPart:
     pose, surface axes, about the part's origin; `stated` (6, 6) is that of the place before it was put down, which
     stands for the motions that its faces do not show, `unseen`. `gap` is the gap below it, as it lies; None where
     nothing scanned lies below. `flush` is how its edge stands over the surface; None where nothing of that shows beside
-    it. `before` is how far off, m, it lay before each correction.
+    it. `before` is how far off, m, it lay before each correction. `named` are the features that the job names.
     """
 
     seen: PartPose
@@ -52,6 +54,7 @@ class PlacedPart:
     gap: MatingGap | None = None
     flush: Flush | None = None
     before: tuple[float, ...] = ()
+    named: tuple[FeatureSection, ...] = ()
 
     @classmethod
     def of(cls, job: Job, seen: PartPose, points: Vector, stated: Vector) -> PlacedPart:
@@ -77,8 +80,9 @@ class PlacedPart:
         off = ways.T @ (difference(seen.surface_from_part, belongs) / unit)
         there = perturbed(belongs, unit * (ways @ np.where(weak, 0.0, off)))
         return cls(
-            replace(seen, surface_from_part=there), belongs, points, covariance=kept, stated=stated, unseen=unseen
-        )
+            replace(seen, surface_from_part=there), belongs, points, covariance=kept, stated=stated, unseen=unseen,
+            named=() if job.part is None else job.part.feature,
+        )  # fmt: skip
 
     @cached_property
     def offsets(self) -> Vector:
@@ -138,6 +142,14 @@ class PlacedPart:
         turned = self.turn + draws_of(self.covariance)[:, 3:]
         return float(np.percentile(np.linalg.norm(turned, axis=-1), SURE_PERCENT))
 
+    @cached_property
+    def features(self) -> tuple[FeatureSeen, ...]:
+        """Where the features lie that the job names."""
+        motions, seen = draws_of(self.covariance), self.seen.surface_from_part
+        return tuple(
+            FeatureSeen.of(section, seen, self.belongs, motions=motions, percent=SURE_PERCENT) for section in self.named
+        )
+
     @property
     def advice(self) -> str:
         """What brings a narrower bound, where the surface was not seen beside the part."""
@@ -176,32 +188,34 @@ class PlacedPart:
         return self.likely == LIKELY["shifted"]
 
     def measured(self, place: PlaceSection) -> tuple[Measured, ...]:
-        """What it is judged by, beside the place's tolerances: as a whole, and along its edge where that shows."""
+        """What it is judged by, beside its limits: as a whole, along its edge where that shows, and each feature."""
         most = 1e3 * place.tolerance
-        flush = () if self.flush is None else (Measured("flush, beyond its noise", self.flush.beyond, "mm", most=most),)
+        flush = () if self.flush is None else (Measured(FLUSH, self.flush.beyond, "mm", most=most),)
         return (
             Measured("placed part off its place, stated bound", self.bound["d"], "mm", most=most),
             Measured(
                 "placed part turned, stated bound", 1e3 * self.turn_bound, "mrad", most=1e3 * place.tolerance_angle
             ),
             *flush,
+            *(feature.measured for feature in self.features),
         )
 
     def kept(self, place: PlaceSection) -> bool:
-        """Whether it is known to lie within the place's tolerances, with no piece of its edge clearly out of them."""
+        """Whether it is known to lie within all tolerances, with no piece of its edge clearly out of them."""
         return all(number.kept for number in self.measured(place))
 
     def misplaced(self, place: PlaceSection, more: str = "") -> MisplacedError:
         """The error of a part that is not known to lie within the place's tolerances."""
-        measured = off, turned, *flush = self.measured(place)
-        bent = off.kept and turned.kept and not all(number.kept for number in flush)
+        measured = off, turned, *_ = self.measured(place)
+        bent = off.kept and turned.kept and any(number.name == FLUSH and not number.kept for number in measured)
         likely = BENT if bent else self.likely
+        out = "".join(f". Out of tolerance: {each.words}" for each in self.features if not each.measured.kept)
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
         return MisplacedError(
             f"the placed part lies {self.words}, by ({shift}) mm and ({turn}) mrad in the surface's axes. Allowed are "
             f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad; it may be as much as "
-            f"{off.value:.2f} mm and {turned.value:.1f} mrad. Most likely {likely}{self.advice}. "
+            f"{off.value:.2f} mm and {turned.value:.1f} mrad{out}. Most likely {likely}{self.advice}. "
             f"{more}{more and '. '}{NEXT_STEP}",
             *measured,
         ).showing(seen={"placed": self})  # fmt: skip
@@ -230,6 +244,7 @@ class PlacedPart:
             "points": self.seen.fit.n_points, "beside": self.seen.beside, "unseen": list(self.unseen),
             "gap": None if self.gap is None else self.gap.as_dict(),
             "flush": None if self.flush is None else self.flush.as_dict(),
+            "features": [feature.as_dict() for feature in self.features],
             "before_mm": [round(1e3 * off, 4) for off in self.before],
         }  # fmt: skip
 

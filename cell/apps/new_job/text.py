@@ -57,6 +57,13 @@ def job_text(job: Job, heading: Sequence[str]) -> str:
             "[part]",
             f'mesh = "{job.part.mesh}"{about}',
             f'mesh_unit = "{job.part.mesh_unit}"',
+            "# What is measured of the placed part, each with its own tolerance, in the part's frame:",
+            "# [[part.feature]]",
+            '# name = "left edge"',
+            '# kind = "edge"                      # a flat counts along its axis; edge, hole and pin across it',
+            '# at = ["-22 mm", "0 mm", "5 mm"]',
+            "# axis = [0, 1, 0]",
+            '# tolerance = "0.4 mm"',
         ]
     for obstacle in job.obstacle:
         lines += ["", "[[obstacle]]", *_obstacle(obstacle)]

@@ -26,6 +26,7 @@ from cell.measure.reconstruction import Cloud
 from cell.measure.vision import BoardView
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
+from cell.procedures.part_features import FeatureSeen
 from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -64,13 +65,14 @@ class SurfacePanel:
     """Points (n, 3) in m in the surface's frame and their deviations (n,) in m, NaN beside the surface.
 
     `deviation` is None when no pose of the surface was found; `believed` is False for a pose that was refused. `flush`
-    is that of the placed part, where it was seen.
+    is that of the placed part, where it was seen, `features` what the job names of it.
     """
 
     points: Vector
     deviation: Vector | None
     believed: bool
     flush: Flush | None = None
+    features: tuple[FeatureSeen, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,6 +132,15 @@ def draw_surface(
             edgecolors="black", linewidths=0.7,
         )  # fmt: skip
         title.append("framed: flush along the edge of the placed part")
+    for feature in surface.features:
+        x, y = 1e3 * feature.belongs[:2]
+        axes.plot(x, y, "x", color="black", markersize=6)
+        axes.annotate(
+            f"{feature.section.name}: {1e3 * feature.off:.2f}", (x, y), xytext=(0, 5), textcoords="offset points",
+            fontsize=7, ha="center", bbox={"boxstyle": "round,pad=0.1", "facecolor": "white", "edgecolor": "none"},
+        )  # fmt: skip
+    if surface.features:
+        title.append("crosses: features of the placed part, mm off")
     _title(axes, title)
 
 
@@ -273,13 +284,13 @@ def draw_run(
     seams = (report["scan"] or {}).get("seams", ())
     seen = seen_placed(result)
     if surface is not None and seen is not None:
-        surface = replace(surface, flush=seen.flush)
-    flush = surface is not None and surface.flush is not None
+        surface = replace(surface, flush=seen.flush, features=seen.features)
+    more = 0 if surface is None else (surface.flush is not None) + bool(surface.features)
     left, *middle, right = figure.subplots(
         1,
         2 + scanned,
         width_ratios=[1.0, 1.3, 1.0] if scanned else [1.5, 1.0],
-        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * (len(seams) + flush)},
+        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * (len(seams) + more)},
     )
     if board is None:
         empty(left, "the board", "not photographed")

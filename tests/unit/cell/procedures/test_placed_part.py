@@ -10,7 +10,7 @@ import pinocchio as pin
 import pytest
 import scipy
 
-from cell.config.job import load_job
+from cell.config.job import FeatureSection, load_job
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.flush import Flush
@@ -125,6 +125,23 @@ def test_an_edge_that_stands_too_high_is_no_part_in_its_place() -> None:
     assert any("look along the rest" in note for note in replace(kept, flush=replace(along[0], seen=0.2)).notes)
 
 
+def test_a_feature_out_of_its_own_tolerance_is_no_part_in_its_place() -> None:
+    """As a whole the part keeps the place's tolerance of .6 mm."""
+    table = {"kind": "hole", "at": ["20 mm", "0 mm", "0 mm"], "axis": [0, 0, 1]}
+    named = tuple(
+        FeatureSection.model_validate({**table, "name": name, "tolerance": tolerance})
+        for name, tolerance in (("wide", "0.5 mm"), ("narrow", "0.2 mm"))
+    )
+    found = replace(part(moved(0.3e-3)), named=named)
+    assert part(moved(0.3e-3)).kept(PLACE) and not found.kept(PLACE)
+    assert replace(part(moved(0.1e-3)), named=named).kept(PLACE)
+    told = found.misplaced(PLACE)
+    assert "Out of tolerance: the hole narrow is 0.30 mm off" in str(told) and "hole wide" not in str(told)
+    assert [number.kept for number in told.numbers] == [True, True, True, False]
+    assert BENT not in str(told)
+    assert [each["name"] for each in found.summary()["features"]] == ["wide", "narrow"]  # type: ignore[index,attr-defined]
+
+
 def test_moved_to_where_it_belongs_along_the_surface_it_is_as_high_and_as_tilted() -> None:
     found = part(moved(0.5e-3, -0.3e-3, 0.2e-3, turn=(0.003, 0.0, 0.004))).not_aside
     assert found.aside < 2e-6 and found.offsets[:, 2].mean() == pytest.approx(0.2e-3, abs=0.02e-3)
@@ -143,7 +160,8 @@ def test_its_figures_are_those_of_its_points() -> None:
         "off_mm": pytest.approx(1e3 * mean, abs=1e-4), "unsure_mm": round(1e3 * found.unsure, 4),
         "shift_mm": pytest.approx((1e3 * apart.mean(axis=0)).tolist(), abs=1e-4),
         "turn_mrad": pytest.approx([1.0, -2.0, 3.0], abs=1e-4), "sigma_mm": [0.02] * 3, "sigma_mrad": [1.0] * 3,
-        "points": 1000, "beside": 900, "unseen": [], "gap": None, "flush": None, "before_mm": [0.9, 0.7],
+        "points": 1000, "beside": 900, "unseen": [], "gap": None, "flush": None, "features": [],
+            "before_mm": [0.9, 0.7],
     }  # fmt: skip
     assert found.words == f"{1e3 * mean:.2f} ± {1e3 * found.unsure:.2f} mm off"
     x, y, z = 1e3 * apart.mean(axis=0)

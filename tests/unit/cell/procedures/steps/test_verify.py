@@ -231,6 +231,11 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture(
     assert placed_pot.calibration is not None
     save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
     job = job_with_part(tmp_path, "pot", verify="all", half=MIDDLE)
+    with job.open("a", encoding="utf-8") as file:
+        file.write(
+            '[[part.feature]]\nname = "left"\nkind = "edge"\nat = ["-15 mm", "0 mm", "5 mm"]\naxis = [0, 1, 0]\n'
+            'tolerance = "0.4 mm"\n'
+        )
     with Cell.open(sim="all", seed=2, clock="virtual", job=job) as cell:
         done = cell.run(job=job)
     assert (done.outcome, done.exit_code) == ("placed", 0)
@@ -245,6 +250,9 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture(
     assert report["truth"]["d_p95"] < report["place_bound_95"]["d"]
     rows = {row["name"]: row for row in report["measured"]}
     assert rows["placed part off its place, stated bound"]["kept"]
+    (feature,) = told["result"]["features"]
+    assert feature["off_mm"] < feature["bound_mm"] < feature["tolerance_mm"]
+    assert rows["edge left, stated bound"]["value"] == pytest.approx(feature["bound_mm"], abs=1e-3)
     assert "place error, stated 95 % bound" not in rows
     assert "placed part off its place" in make_page(done.folder)
     assert (done.folder / CLOUD).stat().st_size > 100_000

@@ -1,0 +1,117 @@
+"""Named features of a placed part against closed forms."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import scipy
+from pydantic import ValidationError
+
+from cell.check.fit import require_fit
+from cell.config.cell_config import load_config
+from cell.config.job import FeatureSection, PartSection, load_job
+from cell.measure.geometry.poses import from_parts
+from cell.procedures.part_features import FeatureSeen, counting
+from drivers.errors import ConfigError
+from lab.bench.job.part_jobs import job_with_part
+
+PERCENT = 99.9
+
+
+def feature(kind: str, axis: tuple[float, ...], at: tuple[str, ...] = ("20 mm", "0 mm", "10 mm")) -> FeatureSection:
+    return FeatureSection.model_validate(
+        {"name": "rim", "kind": kind, "at": list(at), "axis": list(axis), "tolerance": "0.3 mm"}
+    )
+
+
+def sure(section: FeatureSection, seen: pin.SE3, belongs: pin.SE3 | None = None) -> FeatureSeen:
+    where = pin.SE3.Identity() if belongs is None else belongs
+    return FeatureSeen.of(section, seen, where, motions=np.zeros((10, 6)), percent=PERCENT)
+
+
+def test_a_flat_counts_along_its_normal_and_the_others_across_their_direction() -> None:
+    off = from_parts((0.3e-3, 0.4e-3, 1.2e-3))
+    assert sure(feature("flat", (0, 0, 1)), off).off == pytest.approx(1.2e-3)
+    assert sure(feature("flat", (0, 0, 0.5)), off).off == pytest.approx(1.2e-3), "of any length"
+    for kind in ("edge", "hole", "pin"):
+        assert sure(feature(kind, (0, 0, 1)), off).off == pytest.approx(0.5e-3)
+    assert sure(feature("edge", (1, 0, 0)), off).off == pytest.approx(np.hypot(0.4e-3, 1.2e-3))
+    assert sure(feature("flat", (0.6, 0.8, 0)), off).off == pytest.approx(0.5e-3)
+
+
+def test_a_turned_part_moves_a_feature_by_its_arm() -> None:
+    turned = from_parts((0.0, 0.0, 0.0), pin.exp3(np.array([0.0, 0.0, 2e-3])))
+    # 20 mm from the origin: 40 um to the side, and next to nothing along the arm.
+    assert sure(feature("flat", (0, 1, 0)), turned).off == pytest.approx(40e-6, rel=1e-3)
+    assert sure(feature("flat", (1, 0, 0)), turned).off < 1e-7
+
+
+def test_axes_are_the_parts_and_turn_with_its_place() -> None:
+    belongs = from_parts((0.01, 0.0, 0.0), pin.exp3(np.array([0.0, 0.0, np.pi / 2])))
+    seen = from_parts((0.01, 0.3e-3, 0.0), belongs.rotation)
+    # The part's x axis lies along the surface's y axis.
+    found = sure(feature("flat", (1, 0, 0)), seen, belongs)
+    assert found.off == pytest.approx(0.3e-3) and sure(feature("flat", (0, 1, 0)), seen, belongs).off < 1e-9
+    assert np.allclose(found.belongs, [0.01, 0.02, 0.01])
+    projection = counting(feature("hole", (0.3, -0.5, 0.8)), belongs.rotation)
+    assert np.allclose(projection @ projection, projection) and np.trace(projection) == pytest.approx(2.0)
+
+
+def test_the_bound_of_a_feature_is_what_chance_adds_at_its_arm() -> None:
+    rng = np.random.default_rng(3)
+    shifts = np.concatenate([20e-6 * rng.standard_normal((200_000, 3)), np.zeros((200_000, 3))], axis=1)
+    flat, hole = feature("flat", (0, 0, 1)), feature("hole", (0, 0, 1))
+    for section, expected in ((flat, scipy.stats.halfnorm.ppf(0.999)), (hole, scipy.stats.rayleigh.ppf(0.999))):
+        found = FeatureSeen.of(section, pin.SE3.Identity(), pin.SE3.Identity(), motions=shifts, percent=PERCENT)
+        assert found.off == 0.0 and found.bound == pytest.approx(20e-6 * expected, rel=0.03)
+    # Turns about y lift what lies 20 mm along x, and leave what lies on the axis.
+    turns = np.zeros((200_000, 6))
+    turns[:, 4] = 1e-3 * rng.standard_normal(len(turns))
+    lifted = FeatureSeen.of(flat, pin.SE3.Identity(), pin.SE3.Identity(), motions=turns, percent=PERCENT)
+    assert lifted.bound == pytest.approx(20e-6 * scipy.stats.halfnorm.ppf(0.999), rel=0.03)
+    assert lifted.measured.kept and lifted.measured.most == pytest.approx(0.3)
+    assert not replace(lifted, bound=0.31e-3).measured.kept
+    assert json.loads(json.dumps(lifted.as_dict()))["bound_mm"] == round(1e3 * lifted.bound, 4)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"axis": [0, 0, 0]}, "has no direction"),
+        ({"axis": [0, 0, 2]}, "-1 to 1"),
+        ({"kind": "corner"}, "flat"),
+        ({"tolerance": "0 mm"}, "0.01"),
+        ({"name": "a/b"}, "is no name"),
+    ],
+)
+def test_what_is_no_feature_is_told(change: dict[str, object], told: str) -> None:
+    table = {"name": "rim", "kind": "edge", "at": ["0 mm", "0 mm", "0 mm"], "axis": [1, 0, 0], "tolerance": "0.3 mm"}
+    with pytest.raises(ValidationError, match=told):
+        FeatureSection.model_validate(table | change)
+    with pytest.raises(ValidationError, match="feature rim is there twice"):
+        PartSection.model_validate({"mesh": "a.ply", "mesh_unit": "m", "feature": [table, table]})
+
+
+def test_features_beside_the_part_and_those_that_nobody_looks_at_are_told_before_anything_moves(tmp_path: Path) -> None:
+    job, mesh = load_job(job_with_part(tmp_path, "pot", verify="all"))
+    assert job.part is not None
+    on, off = (
+        feature("edge", (0, 1, 0), ("0 mm", "0 mm", "5 mm")),
+        feature("edge", (0, 1, 0), ("0 mm", "90 mm", "5 mm")),
+    )
+    config = load_config(None)
+    told = r"part\.feature rim: at lies \d\d\.\d mm beside the box .*at most 2 mm"
+    for section, verify, problem in ((on, "all", None), (off, "all", told), (on, "none", "nobody looks")):
+        place = job.place.model_copy(update={"verify": verify})
+        part = job.part.model_copy(update={"feature": (section,)})
+        named = job.model_copy(update={"part": part, "place": place})
+        if problem is None:
+            require_fit(named, config, mesh)
+            continue
+        with pytest.raises(ConfigError, match=problem):
+            require_fit(named, config, mesh)
