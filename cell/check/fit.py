@@ -24,6 +24,7 @@ from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.steps import verify
 from cell.procedures.steps.kinds import kind_of
+from cell.procedures.steps.sought_part import nominal_of, sought
 from drivers.errors import ConfigError
 from drivers.make import CameraConfig
 
@@ -52,7 +53,10 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
     extent = mesh_box(mesh, job.surface.mesh_unit)
     problems += [*surface_problems(job, extent, mesh), *_stripe(job, config, extent[0][2], extent[1][2])]
     # The arm's poses follow from the others: where these are wrong, it would only be told twice.
-    problems = problems or list(reach_problems(job, config, extent, calibrates=calibrates))
+    if not problems:
+        found, file = sought(job, mesh)
+        box = extent if found is job else nominal_of(found, file).extent
+        problems += reach_problems(found, config, box, calibrates=calibrates)
     problems += contact_problems(job, config, mesh)
     problems = problems or [*mating_problems(job, mesh), *verify_problems(job, config)]
     if problems:
@@ -65,6 +69,10 @@ def _kind(job: Job) -> Iterator[str]:
     except ConfigError as error:
         yield str(error)
         return
+    if kind.unloads and (job.part is None or job.nest is None):
+        yield f'job.kind "{kind.name}" finds the part by its mesh and takes it to the vehicle: give [part] and [nest]'
+    if not kind.unloads and job.nest is not None:
+        yield f'[nest]: job.kind "{kind.name}" sets no part down there; write kind = "unload", or no nest'
     if job.part is None and verify.STEP.name in kind.names:
         yield f'job.kind "{kind.name}" looks at the placed part: give its mesh in [part]'
 

@@ -130,6 +130,11 @@ def _goals(job: Job, config: CellConfig) -> Iterator[Goal]:
         ("the place pose (place, surface)", -job.place.contact_travel, TOUCHES),
     ):
         yield what, part * from_parts((0.0, 0.0, height)) * part_from_flange, touching
+    if job.nest is not None:
+        for what, height in (("above the nest", job.place.approach), ("in the nest", -job.place.contact_travel)):
+            nest = job.nest.base_from_part.se3() * from_parts((0.0, 0.0, height))
+            yield f"the pose {what} (nest.base_from_part)", nest * part_from_flange, ()
+        return
     try:
         faces = seen_faces(job)
     except ConfigError:

@@ -208,6 +208,16 @@ class PlaceSection(Table):
         return self
 
 
+class NestSection(Table):
+    """Where on the vehicle an unloaded part comes to lie, how exactly the arm finds that, and how exactly it lies."""
+
+    base_from_part: Mounting
+    sigma: Annotated[float, quantity("mm", 0.01, 5)] = 2e-4
+    sigma_angle: Annotated[float, quantity("mrad", 0.1, 50)] = 2e-3
+    tolerance: Annotated[float, quantity("mm", 0.05, 10)] = 1e-3
+    tolerance_angle: Annotated[float, quantity("mrad", 0.5, 100)] = 15e-3
+
+
 class Job(Table):
     """A job, as typed and checked records."""
 
@@ -220,6 +230,7 @@ class Job(Table):
     grasp: GraspSection
     place: PlaceSection
     part: PartSection | None = None
+    nest: NestSection | None = None
     obstacle: tuple[StationObstacle, ...] = ()
 
     @model_validator(mode="after")

@@ -23,11 +23,12 @@ from cell.devices.simulated.following import DeviceFollowing
 from cell.devices.simulated.mixed import beware
 from cell.devices.simulated.process import Injector, is_whole
 from cell.measure.inversion import NominalSurface
-from cell.procedures.arm.moves import Pace
+from cell.procedures.arm.moves import Pace, PartProgress, PartState
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps import verify
 from cell.procedures.steps.kinds import Kind, kind_of
+from cell.procedures.steps.sought_part import nominal_of, sought
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep
 from cell.procedures.sweep.swath import SweepCollector, Sweeping
@@ -74,7 +75,8 @@ class ReadyJob:
         require_fit(job, config, mesh, calibrates=calibrates)
         kind = kind_of(job).until(until)
         kind.require_steps(script.after)
-        nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+        job, mesh = sought(job, mesh)
+        nominal = nominal_of(job, mesh)
         info: dict[str, object] = dict(job_source(file))
         # A resumed run must end where this one was to end, and be looked at as this one was.
         if until is not None:
@@ -202,9 +204,10 @@ class JobRun:
     def _workplace(self, folder: Path, whereabouts: Whereabouts, frames: FrameStore) -> Workplace:
         return Workplace(
             self.config, self.job, self.nominal, calibration=self.calibration, devices=self.devices, frames=frames,
-            folder=folder, whereabouts=whereabouts, earlier=self.earlier, needs_part=self.kind.places,
-            looks_after=verify.STEP.name in self.kind.names,
+            folder=folder, whereabouts=whereabouts, earlier=self.earlier,
+            needs_part=self.kind.places and not self.kind.unloads, looks_after=verify.STEP.name in self.kind.names,
             sweeping=self._sweeping, registered=self._registered, pace=self.pace,
+            part=PartProgress(PartState.LIES if self.kind.unloads else PartState.HELD),
         )  # fmt: skip
 
     def _runner(self, here: Workplace, journal: Journal, observer: Observer) -> Runner:

@@ -15,6 +15,7 @@ from cell.config.cell_config import CellConfig
 from cell.config.job import Job, job_path, load_job
 from cell.procedures.arm.moves import PartState
 from cell.procedures.steps import laser_sweep, verify
+from cell.procedures.steps.sought_part import sought
 from cell.procedures.sweep.stored_sweep import FILE, StoredSweep
 from cell.run.folder import list_runs
 from drivers.errors import ConfigError, RefusedError
@@ -132,8 +133,8 @@ def _require_held(folder: Path, record: JournalRecord) -> None:
             return
         case PartState.HELD.value:
             raise ConfigError(
-                f"run {folder.name} had put its part down and gripped it again to correct it: how the claw holds it is "
-                "not known, and the run is not resumed. Take the part out by hand, fold the arm with `cell home`, then "
+                f"run {folder.name} had gripped a part that lay: how the claw holds it is not known, and the run is "
+                "not resumed. Take the part out by hand, fold the arm with `cell home`, then "
                 "run the job with a part in the claw"
             )
         case PartState.RELEASED.value:
@@ -168,7 +169,7 @@ def job_source(name: str | Path) -> dict[str, object]:
     path = str(job_path(name).resolve())
     job, mesh = load_job(path)
     part = {} if job.part is None else {"part_mesh": mesh_source(Path(job.part.mesh))}
-    return {"job_file": path, "job_hash": job_hash(path), "mesh": mesh_source(mesh), **part}
+    return {"job_file": path, "job_hash": job_hash(path), "mesh": mesh_source(sought(job, mesh)[1]), **part}
 
 
 def mesh_source(mesh: Path) -> dict[str, str]:

@@ -179,6 +179,8 @@ class StationDrawing:
     """In the place frame."""
     part_mesh: str = ""
     part_mesh_unit: str = "m"
+    nest: Pose | None = None
+    """base_from_part in a nest on the vehicle: the part lies on the surface at first, and the claw is empty."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,7 +12,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_backends.world.drawing import RAIL_DIRECTION, STOCK, CameraDrawing, CellDrawing, Drawing, inverse, pose
+from sim_backends.world.drawing import (
+    RAIL_DIRECTION,
+    STOCK,
+    CameraDrawing,
+    CellDrawing,
+    Drawing,
+    StationDrawing,
+    inverse,
+    pose,
+)
 from sim_backends.world.levels import CUT, WARMING_K, Deviations, Effects, deviations, effects_of, number_of
 
 Pose = NDArray[np.float64]
@@ -101,6 +110,8 @@ class Scene:
     flange_from_scan_camera: Pose
     flange_from_target_camera: Pose
     flange_from_part: Pose
+    surface_from_part: Pose
+    """Of a part that lies on the surface at first."""
     scan_lens: Lens
     target_lens: Lens
     light_plane_normal: Vector
@@ -191,6 +202,7 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
             "target_mount", cell.target.mounting, sigma.target_mount_translation, sigma.target_mount_rotation
         ),
         flange_from_part=d.moved(grasp, station.flange_from_part, sigma.grasp_translation, sigma.grasp_rotation),
+        surface_from_part=_lies(d, grasp.replace("grasp", "lies"), station),
         scan_lens=_lens(d, "scan_lens", sigma, cell.scan), target_lens=_lens(d, "target_lens", sigma, cell.target),
         light_plane_normal=normal, light_plane_distance=distance, laser_origin=origin,
         rail_direction=rotation(d.vector("rail_direction", sigma.rail_direction)) @ RAIL_DIRECTION,
@@ -205,6 +217,19 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
         light_gradient=d.vector("light_gradient", sigma.ambient, 2), scan_clock=_clock(d, "scan_clock", sigma, effects),
         target_clock=_clock(d, "target_clock", sigma, effects), workshop=_workshop(d, effects),
     )  # fmt: skip
+
+
+LIES = (0.5e-3, 4e-3)
+"""How a part lies beside its place, along the surface and about its normal, m and rad, one standard deviation."""
+
+
+def _lies(d: _Draws, name: str, station: StationDrawing) -> Pose:
+    """Where a part lies on the surface at first, S from part, before its weight settles it."""
+    aside = np.eye(4)
+    aside[:2, 3] = d.vector(f"{name}.translation", LIES[0], 2)
+    aside[:3, :3] = rotation(np.array([0.0, 0.0, d.scalar(f"{name}.rotation", LIES[1])]))
+    made: Pose = station.surface_from_part @ aside
+    return made
 
 
 def _start(d: _Draws, sigma: Deviations, drawing: Drawing, world_from_place: Pose) -> Pose:

@@ -24,7 +24,7 @@ from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.models.ramp import Screw
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.world.bodies.collisions import ArmPoints, Collision, Collisions
-from sim_backends.world.bodies.contact import PartContact
+from sim_backends.world.bodies.contact import Nest, PartContact
 from sim_backends.world.bodies.station import Station
 from sim_backends.world.cameras import Cameras
 from sim_backends.world.drawing import CAMERA_RATE, STOCK, Drawing, StationDrawing, inverse, pose
@@ -66,6 +66,8 @@ class World:
         self._cameras = Cameras(self.scene, self.station)
         self._stood = 0.0
         self._set_up()
+        if drawing.station.nest is not None:
+            self._close_claw(False)
         self.vehicle.sag = self._sag
         self.vehicle.blocked = lambda t, pose: self.collisions.blocks(t, pose)
         self.arm.contact = self._touch
@@ -76,28 +78,39 @@ class World:
         self.part = PartContact(
             self.station.ground, scene.world_from_surface, scene.flange_from_part,
             world_from_table=scene.world_from_table, surface_from_part=station.surface_from_part,
-            table_height=station.height, part=self.station.part,
+            table_height=station.height, part=self.station.part, nest=self._nest(),
         )  # fmt: skip
         self._solid = ArmPoints(scene.drawing)
         self.collisions = Collisions(scene, self.part, found)
         self._report_grip()
 
+    def _nest(self) -> Nest | None:
+        """The nest on the vehicle, where the job takes the part from the surface."""
+        station = self.scene.drawing.station
+        if station.nest is None:
+            return None
+        there = station.nest @ inverse(station.surface_from_part)
+        return Nest(there, lambda: self.world_from_base(self.clock.now()), self.scene.surface_from_part)
+
+    def _close_claw(self, closed: bool) -> None:
+        self.switches["claw"] = closed
+        if (output := self.scene.drawing.cell.claw_output) is not None:
+            self.arm.write_digital_outputs(1 << output, int(closed) << output)
+
     def make_ready(self, station: StationDrawing) -> None:
-        """As when a person makes all ready for a job: the station is set up, and its part is put into the claw.
+        """As when a person makes all ready for a job: the station is set up, and its part is put into the claw, or onto
+        the surface where the job takes it from there.
 
         What lay at the station is taken away. Vehicle, arm and rail stay as they stand. Where the station stands
         already, with its part in the claw, all stays as it is. Raises ValueError as `World`.
         """
         drawing = replace(self.scene.drawing, station=station)
-        if self.part.held and drawing.as_json() == self.scene.drawing.as_json():
+        if self.part.untouched and drawing.as_json() == self.scene.drawing.as_json():
             return
         ready = Station.of(station)
         scene = draw(self.scene.seed, self.scene.level, drawing, self.parts + 1)
         self.scene, self.station, self.parts = scene, ready, self.parts + 1
-        self.switches["claw"] = True
-        if drawing.cell.claw_output is not None:
-            closed = 1 << drawing.cell.claw_output
-            self.arm.write_digital_outputs(closed, closed)
+        self._close_claw(station.nest is None)
         self._set_up(self.collisions.found)
         self._cameras.show(scene, ready)
 

@@ -65,6 +65,8 @@ class Described:
         station, part = _station(self.job, self.mesh, config.vehicle.DRIVES), self.job.part
         if part is not None:
             station = replace(station, part_mesh=part.mesh, part_mesh_unit=part.mesh_unit)
+        if self.job.nest is not None:
+            station = replace(station, nest=_matrix(self.job.nest.base_from_part.se3()))
         return drawn.settled(Drawing(_cell(config), station), STOCK)
 
 

@@ -68,6 +68,15 @@ def seen_from_above(part: NominalSurface, surface_from_part: pin.SE3) -> Nominal
     return NominalSurface(part.vertices[corners], triangles.reshape(-1, 3))
 
 
+def seen_from_below(part: NominalSurface, surface_from_part: pin.SE3) -> NominalSurface:
+    """The faces of a part that face down where it lies, turned over: the ground that fits it. Raises `ConfigError`."""
+    turned = NominalSurface(part.vertices, part.triangles[:, ::-1])
+    try:
+        return seen_from_above(turned, surface_from_part)
+    except ConfigError as error:
+        raise ConfigError("no face of part.mesh faces down where the part lies: it has no underside") from error
+
+
 def shown_by(faces: NominalSurface, tolerance: Tolerance) -> tuple[str, ...]:
     """In words the motions of a part that its `faces` as drawn do not show within `tolerance`, part frame."""
     points = faces.samples[:: max(1, len(faces.samples) // MOST_POINTS)]

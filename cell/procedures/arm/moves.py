@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 
-import numpy as np
 import pinocchio as pin
 
 from cell.config.cell_config import ArmConfig, CellConfig, deck_plates, mounted, station_obstacles, vehicle_obstacles
@@ -118,20 +117,22 @@ class Mover:
         station = station_bodies(base_from_place, centre, on_place, (low, (x, y, z + ROOM_ABOVE)))
         self._stand_before([*station, *station_obstacles(job.obstacle, base_from_place)])
 
-    def leave_part(self, base_from_part: pin.SE3) -> None:
-        """From now on the claw is empty, and the part stands where it was put: it is not to be met again."""
+    def hold_nothing(self) -> list[Body]:
+        """From now on the claw is empty; what it held until now."""
         part = [body for body in self._moving if body.name == "part"]
         self._moving = [body for body in self._moving if body.name != "part"]
-        middle = (pin.SE3(np.eye(3), np.array([0.0, 0.0, 0.5 * body.size[2]])) for body in part)
-        self._stand_before(
-            [
-                *self._station,
-                *(
-                    box(PLACED, BASE, base_from_part * shift, body.size)
-                    for body, shift in zip(part, middle, strict=True)
-                ),
-            ]
-        )
+        self._stand_before(self._station)
+        return part
+
+    def leave_part(self, base_from_part: pin.SE3) -> None:
+        """From now on the claw is empty, and the part stands where it was put: it is not to be met again."""
+        for part in self.hold_nothing():
+            self.part_lies(base_from_part, part.size)
+
+    def part_lies(self, base_from_part: pin.SE3, size: Sequence[float]) -> None:
+        """From now on a part of this size, m, stands there and is not to be met."""
+        middle = from_parts((0.0, 0.0, 0.5 * size[2]))
+        self._stand_before([*self._station, box(PLACED, BASE, base_from_part * middle, size)])
 
     def meet_part(self) -> None:
         """From now on the part that was put down may be met: the empty claw goes to take it."""
@@ -258,6 +259,7 @@ def _joint_limits(config: ArmConfig) -> JointLimits:
 class PartState(Enum):
     """Where the part is, as far as the claw's commands and its feedback tell."""
 
+    LIES = "at the station"
     HELD = "held"
     UNKNOWN = "unknown"
     RELEASED = "released"

@@ -7,24 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pinocchio as pin
 
-from cell.config.job import GraspSection, Job
-from cell.measure.geometry.poses import composition_jacobians, from_parts, to_ur, transform
+from cell.measure.geometry.poses import composition_jacobians, transform
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.mating import scanned_gap
-from cell.motion.collision import TOUCHES
-from cell.procedures.arm.moves import PartProgress, PartState
 from cell.procedures.arm.touch import expected_touch
 from cell.procedures.part_error import draws_of, part_points
-from cell.procedures.steps.place import FAST_FORCE, PlaceResult, Placing
+from cell.procedures.steps.gripping import GRIPPED, held_so, note_part, take
+from cell.procedures.steps.place import PlaceResult, Placing
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import Workplace
-from drivers.errors import RefusedError
 from drivers.interfaces import Vector
-from drivers.make import Mounting
 from statemachine.runner import StepContext
 
-GRIPPED = np.diag([20e-6**2] * 3 + [0.2e-3**2] * 3)
-"""Covariance of how a claw that closes on a part where it let it go moves it, m² and rad²: stated, as the grasp is."""
 SLIPS = 2.0
 """A part slips as the claw opens where it moves so many times as far as a correction leaves it off, on average."""
 
@@ -80,67 +74,10 @@ def correct(
     if gap is not None:
         gap.require(here.job.place.tolerance)
         expected = replace(expected, height=expected.height + gap.lift)
-    _take(here, job, placed.base_from_flange, context)
+    take(here, job, placed.base_from_flange, context, what="the placed part")
     placing = Placing(
         job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
         part=here.part, check=context.check, progress=lambda share, text: context.progress(0.5, f"again: {text}"),
-        note=lambda part: _note(context, part, to_ur(part.where).tolist()),
+        note=lambda part: note_part(context, part),
     )  # fmt: skip
     return replace(placing.put_down(fold=False), look=placed.look, pose=pose, mating=gap)
-
-
-def held_so(job: Job, flange_from_part: pin.SE3, seen: Vector) -> Job:
-    """The job with its part held at `flange_from_part`, known to `seen` (6, 6)."""
-    roll, pitch, yaw = pin.rpy.matrixToRpy(flange_from_part.rotation)
-    x, y, z = flange_from_part.translation
-    sigmas = np.sqrt(np.diag(seen + GRIPPED))
-    held = Mounting.model_construct(translation=(x, y, z), rotation=(roll, pitch, yaw))
-    grasp = GraspSection.model_construct(
-        flange_from_part=held, size=job.grasp.size, sigma=float(sigmas[:3].max()), sigma_angle=float(sigmas[3:].max())
-    )
-    return job.model_copy(update={"grasp": grasp})
-
-
-def _take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext) -> None:
-    """Grip the part with the flange at `grip`, base_from_flange, and lift it."""
-    plan, mover, part = job.place, here.mover, here.part
-    normal = job.grasp.flange_from_part.se3().rotation[:, 2]
-    above = grip * from_parts(plan.approach * normal)
-    context.progress(0.5, "gripping the part again")
-    context.check()
-    mover.follow(mover.plan_to(above, "above the placed part"))
-    mover.meet_part()
-    part.left = False
-    here.devices.arm.zero_force()
-    if not _reached(here, grip, normal):
-        mover.line(above, plan.speed, TOUCHES)
-        mover.spare_part()
-        part.left = True
-        raise RefusedError(
-            "the claw touched something as it went to grip the placed part again; it went back up, the part lies where "
-            "it was put down. Look what stands there"
-        )
-    context.check()
-    part.state = PartState.UNKNOWN
-    _note(context, part, to_ur(part.where).tolist())
-    here.devices.claw.grip()
-    part.state, part.where, part.left = PartState.HELD, None, False
-    _note(context, part, None)
-    mover.take_part(job.grasp.flange_from_part.se3(), job.grasp.size)
-    mover.line(above, plan.speed, TOUCHES)
-
-
-def _reached(here: Workplace, grip: pin.SE3, normal: Vector) -> bool:
-    """Whether the open claw came down to `grip` along `normal`, (3,) on the flange, without touching anything."""
-    plan, mover = here.job.place, here.mover
-    slow = grip * from_parts(plan.contact_travel * normal)
-    if mover.line(slow, plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force):
-        return False
-    # What presses already would be taken as zero.
-    if not np.linalg.norm(here.devices.arm.state().wrench[:3]) <= plan.contact_force:
-        return False
-    return not mover.line(grip, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
-
-
-def _note(context: StepContext, part: PartProgress, where: list[float] | None) -> None:
-    context.note(part=part.state.value, **({} if where is None else {"base_from_part": where}))

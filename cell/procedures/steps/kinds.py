@@ -12,7 +12,20 @@ from functools import partial
 from importlib.metadata import entry_points
 
 from cell.config.job import Job
-from cell.procedures.steps import board_photo, drive_to_target, invert_pose, laser_sweep, place, reconstruct, verify
+from cell.procedures.placed_part import PlacedPart
+from cell.procedures.steps import (
+    board_photo,
+    drive_to_target,
+    invert_pose,
+    laser_sweep,
+    pick,
+    place,
+    reconstruct,
+    set_down,
+    sought_part,
+    verify,
+    verify_nest,
+)
 from cell.procedures.steps.workplace import JobStep, Workplace
 from drivers.errors import ConfigError
 from statemachine.runner import StepContext
@@ -44,8 +57,13 @@ class Kind:
 
     @property
     def places(self) -> bool:
-        """Whether one of its steps places a part."""
-        return any(issubclass(step.makes, place.PlaceResult) for step in self.steps)
+        """Whether one of its steps places a part, or sees one in its nest."""
+        return any(issubclass(step.makes, place.PlaceResult | PlacedPart) for step in self.steps)
+
+    @property
+    def unloads(self) -> bool:
+        """Whether it takes the part from the surface: the claw is empty at first."""
+        return any(step is pick.STEP for step in self.steps)
 
     def sequence(self) -> Sequence:
         """A sequence at its start; it ends placed only where a step places."""
@@ -99,6 +117,15 @@ VERIFIED = PLACE.with_step(verify.STEP, after=place.STEP.name, name=PLACE.name)
 """The same for a job that names a mesh of its part: what was placed is looked at."""
 
 
+UNLOAD = Kind(
+    sought_part.UNLOAD,
+    (drive_to_target.STEP, board_photo.STEP, laser_sweep.STEP, reconstruct.STEP, invert_pose.STEP, pick.STEP,
+     set_down.STEP, verify_nest.STEP),
+)  # fmt: skip
+"""Takes a part from its surface: the sweep looks for the part itself, which is gripped and set into a nest."""
+BUILT_IN = {kind.name: kind for kind in (PLACE, UNLOAD)}
+
+
 def kind_of(job: Job) -> Kind:
     """The kind of this job; raises what `find_kind` raises."""
     kind = find_kind(job.job.kind)
@@ -107,11 +134,11 @@ def kind_of(job: Job) -> Kind:
 
 def find_kind(name: str) -> Kind:
     """The kind of this name; `ConfigError` that lists what is installed, or says what is wrong with a foreign one."""
-    if name == PLACE.name:
-        return PLACE
-    found = {entry.name: entry for entry in entry_points(group=GROUP) if entry.name != PLACE.name}
+    if name in BUILT_IN:
+        return BUILT_IN[name]
+    found = {entry.name: entry for entry in entry_points(group=GROUP) if entry.name not in BUILT_IN}
     if name not in found:
-        known = ", ".join(sorted((PLACE.name, *found)))
+        known = ", ".join(sorted((*BUILT_IN, *found)))
         raise ConfigError(f'job.kind "{name}": there is no such kind of job; installed: {known}')
     try:
         kind = found[name].load()

@@ -100,7 +100,8 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
     while True:
         held = context.held_s
-        cloud, record = _swept(here, sweep, pose, faces, context)
+        over = pose.base_from_surface * surface_from_faces(here.job, faces)
+        cloud, record = swept_part(here, sweep, over, context)
         context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
         looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
         here.mover.fold()
@@ -137,12 +138,10 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     return replace(PlacedPart.of(here.job, seen, part_points(here.nominal), stated), gap=gap, flush=flush)
 
 
-def _swept(
-    here: Workplace, sweep: SweepRecord, pose: PlacePose, faces: NominalSurface, context: StepContext
-) -> tuple[Cloud, SweepRecord]:
-    """Sweep the part, with the head as far above its faces as it was above the surface. Lost frames are swept again:
-    nothing of the part is moved by that."""
-    over = pose.base_from_surface * surface_from_faces(here.job, faces)
+def swept_part(here: Workplace, sweep: SweepRecord, over: pin.SE3, context: StepContext) -> tuple[Cloud, SweepRecord]:
+    """Sweep the part `over` what is in the place of the surface, base from there, with the head as in the first sweep.
+
+    Lost frames are swept again: nothing of the part is moved by that."""
     for left in reversed(range(SWEEPS)):
         try:
             again = laser_sweep(

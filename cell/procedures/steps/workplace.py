@@ -18,7 +18,7 @@ from cell.config.job import Job
 from cell.devices.devices import Devices
 from cell.measure.inversion import NominalSurface
 from cell.measure.vision import BoardSpec, parse_board
-from cell.procedures.arm.moves import Mover, Pace, PartProgress
+from cell.procedures.arm.moves import Mover, Pace, PartProgress, PartState
 from cell.procedures.arm.photograph import APART_S, BoardFix, photograph
 from cell.procedures.calibrate.interim import InterimCheck, fine_board_view, resting_pose
 from cell.procedures.drive.way import Whereabouts
@@ -75,6 +75,8 @@ class Workplace:
         """Planned moves of the arm with the job's part in the claw. It rests where the next job looks first."""
         devices = self.devices
         made = Mover(devices.arm, devices.clock, self.config, self.job, interlocks=devices.interlocks, pace=self.pace)
+        if self.part.state is PartState.LIES:
+            made.hold_nothing()
         if self.config.calibration.each_job:
             with suppress(CalibrationStale):
                 rest = resting_pose(fine_board_view(self.config, self.calibration))

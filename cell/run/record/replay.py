@@ -34,6 +34,7 @@ from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.board_photo import settled
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction, reconstructed
+from cell.procedures.steps.sought_part import nominal_of
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep, SweepRecord
 from cell.run.record.file import FILE as RECORD
@@ -165,7 +166,7 @@ def _nominal(folder: Path, job: Job) -> NominalSurface:
         raise ConfigError(f"{folder.name} cannot be replayed: its journal does not name a surface ({error})") from error
     if sha256(path) != expected:
         raise ConfigError(f"{folder.name} cannot be replayed: its surface {path} is gone or was changed since")
-    return NominalSurface.load(path, unit=job.surface.mesh_unit)
+    return nominal_of(job, path)
 
 
 class _Kept:

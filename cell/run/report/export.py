@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from cell.config.job import load_job
 from cell.measure.geometry.poses import from_ur, transform
-from cell.measure.inversion import NominalSurface
 from cell.measure.reconstruction.ply import StoredCloud, deviation_colours, read_cloud, triangles, write_mesh, write_ply
+from cell.procedures.steps.sought_part import nominal_of, sought
 from cell.run.folder import Report, read_report
 from cell.run.report.figures import simulated_words
 from drivers.errors import ConfigError
@@ -73,10 +73,9 @@ def _deviations(cloud: StoredCloud, report: Report, name: str | None) -> NDArray
     if pose is None:
         return None
     try:
-        job, mesh = load_job(name or report["job"])
+        job, mesh = sought(*load_job(name or report["job"]))
     except ConfigError as error:
         raise ConfigError(f"{error}; name the run's job file with --job") from error
     values = np.array([*(1e-3 * v for v in pose["translation_mm"]), *pose["rotation_vector_rad"]])
     base_from_surface = from_ur(values) * job.place.surface_from_part.se3().inverse()
-    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
-    return nominal.deviations(transform(base_from_surface.inverse(), cloud.points))
+    return nominal_of(job, mesh).deviations(transform(base_from_surface.inverse(), cloud.points))

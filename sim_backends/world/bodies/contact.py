@@ -8,6 +8,8 @@ settles once it is let go: its weight turns it until it rests on three points. F
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import scipy
@@ -37,6 +39,16 @@ _LEAN = 0.015
 """How much higher than drawn, m, a point of a leaning table's surface may be."""
 
 
+@dataclass(frozen=True, eq=False)
+class Nest:
+    """A nest on the vehicle, which fits the part as the surface does: `base_from_surface` (4, 4) is where that would
+    be, and `world_from_base` tells where the vehicle has the arm's base. At first the part `lies` on the surface."""
+
+    base_from_surface: Pose
+    world_from_base: Callable[[], Pose]
+    lies: Pose
+
+
 class PartContact:
     """Where the part is and what forces act on it; safe between threads.
 
@@ -46,11 +58,12 @@ class PartContact:
     def __init__(
         self, surface: Surface, world_from_surface: Pose, flange_from_part: Pose, *,
         world_from_table: Pose | None = None, surface_from_part: Pose | None = None,
-        table_height: float = drawing.TABLE_HEIGHT, part: Surface | None = None,
+        table_height: float = drawing.TABLE_HEIGHT, part: Surface | None = None, nest: Nest | None = None,
     ) -> None:  # fmt: skip
         """The table lies at the surface's origin, and the part's frame is the surface's when it is placed, unless
         `world_from_table` and `surface_from_part` say so. `part` is the underside of a part that does not fit the
-        surface exactly, part frame, turned over. Raises ValueError when there is no surface for the part."""
+        surface exactly, part frame, turned over. With a `nest` the part lies on the surface, and the claw is open.
+        Raises ValueError when there is no surface for the part."""
         self._surface = surface
         self._surface_from_world = inverse(world_from_surface)
         self._world_from_surface = world_from_surface
@@ -65,6 +78,9 @@ class PartContact:
         """How the part moves, in its own frame, as the claw opens, part before from part after; (4, 4)."""
         self._lock = threading.Lock()
         self._own = part is not None
+        self._nest = nest
+        self._base_from_part: Pose | None = None
+        self._lying = False
         surface_from_part = np.eye(4) if surface_from_part is None else surface_from_part
         if part is None:
             x, y = _grid(surface)
@@ -87,11 +103,19 @@ class PartContact:
         self._highest = max(float(corners[:, 2].max()), float(world_from_surface[2, 3])) + _LEAN
         self._held_box = self._box(held=True)
         self._empty_box = self._box(held=False)
+        if nest is not None:
+            self._claw_closed, self._lying = False, True
+            self._world_from_part = (self._settle if self._own else self._rest)(world_from_surface @ nest.lies)
 
     @property
     def held(self) -> bool:
         """Whether the claw holds the part; the claw's grip feedback."""
         return self._world_from_part is None
+
+    @property
+    def untouched(self) -> bool:
+        """Whether the part is where it was at first: in the claw, or on the surface."""
+        return self.held if self._nest is None else self._lying
 
     def part_pose(self, world_from_flange: Pose) -> Pose:
         """World_from_part (4, 4) when the flange is at `world_from_flange`."""
@@ -101,6 +125,8 @@ class PartContact:
     def _pose(self, world_from_flange: Pose) -> Pose:
         if self._world_from_part is None:
             return world_from_flange @ self._flange_from_part
+        if self._base_from_part is not None and self._nest is not None:
+            return self._nest.world_from_base() @ self._base_from_part
         return self._world_from_part.copy()
 
     def set_claw(self, closed: bool, world_from_flange: Pose) -> None:
@@ -112,16 +138,33 @@ class PartContact:
             if closed:
                 self._grip(world_from_flange)
             elif self._world_from_part is None:
-                let_go = self._settle if self._own else self._rest
-                self._world_from_part = let_go(self._pose(world_from_flange) @ self.opening)
+                self._let_go(self._pose(world_from_flange) @ self.opening)
+
+    def _let_go(self, world_from_part: Pose) -> None:
+        """The part comes to rest where it is let go: in the nest, with which it rides, where that is below it."""
+        if (nested := self._in_nest(world_from_part)) is None or self._nest is None:
+            self._world_from_part = (self._settle if self._own else self._rest)(world_from_part)
+            return
+        # The nest has the surface's shape: where that is below the nest, the part rests in it as on the surface.
+        rest = (self._settle if self._own else self._rest)(nested @ world_from_part)
+        self._world_from_part = inverse(nested) @ rest
+        self._base_from_part = inverse(self._nest.world_from_base()) @ self._world_from_part
+
+    def _in_nest(self, at: Pose) -> Pose | None:
+        """What brings the nest to the surface, world from world, where `at` is nearer to the nest; else None."""
+        if self._nest is None:
+            return None
+        world_from_nest = self._nest.world_from_base() @ self._nest.base_from_surface
+        apart = [np.linalg.norm(at[:2, 3] - pose[:2, 3]) for pose in (world_from_nest, self._world_from_surface)]
+        return self._world_from_surface @ inverse(world_from_nest) if apart[0] < apart[1] else None
 
     def _grip(self, world_from_flange: Pose) -> None:
         if self._world_from_part is None:
             return
-        found = inverse(world_from_flange) @ self._world_from_part
+        found = inverse(world_from_flange) @ self._pose(world_from_flange)
         if np.linalg.norm(found[:3, 3] - self._flange_from_part[:3, 3]) <= GRIP_REACH:
-            self._flange_from_part = found
-            self._world_from_part = None
+            self._flange_from_part, self._lying = found, False
+            self._world_from_part = self._base_from_part = None
             self._held_box = self._box(held=True)
 
     def _rest(self, world_from_part: Pose) -> Pose:
@@ -195,6 +238,12 @@ class PartContact:
 
     def wrench(self, world_from_flange: Pose) -> Vector:
         """Force (N) and torque about the flange's origin (Nm), (6,), on the flange, in world axes."""
+        if (nested := self._in_nest(world_from_flange)) is not None:
+            felt = self._pushed(nested @ world_from_flange)
+            return np.concatenate([nested[:3, :3].T @ felt[:3], nested[:3, :3].T @ felt[3:]])
+        return self._pushed(world_from_flange)
+
+    def _pushed(self, world_from_flange: Pose) -> Vector:
         wrench = np.zeros(6)
         with self._lock:
             low, high = self._held_box if self._world_from_part is None else self._empty_box
@@ -204,7 +253,7 @@ class PartContact:
                 return wrench
             points = _moved(self._fingertips, world_from_flange)
             if self._world_from_part is None:
-                points = np.concatenate([points, _moved(self._underside, self._pose(world_from_flange))])
+                points = np.concatenate([points, _moved(self._underside, world_from_flange @ self._flange_from_part)])
         depth, normals = self._below(points)
         if depth.max() <= 0.0:
             return wrench

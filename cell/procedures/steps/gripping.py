@@ -1,0 +1,102 @@
+"""Gripping: the open claw goes down to a part that lies, closes on it and lifts it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config.job import GraspSection, Job
+from cell.measure.geometry.poses import from_parts, to_ur
+from cell.motion.collision import TOUCHES
+from cell.procedures.arm.moves import PartProgress, PartState
+from cell.procedures.steps.place import FAST_FORCE
+from cell.procedures.steps.workplace import Workplace
+from drivers.errors import Measured, RefusedError
+from drivers.interfaces import Vector
+from drivers.make import Mounting
+from statemachine.runner import StepContext
+
+GRIPPED = np.diag([20e-6**2] * 3 + [0.2e-3**2] * 3)
+"""Covariance of how a claw that closes on a part where it let it go moves it, m² and rad²: stated, as the grasp is."""
+
+
+def held_so(job: Job, flange_from_part: pin.SE3, seen: Vector) -> Job:
+    """The job with its part held at `flange_from_part`, known to `seen` (6, 6)."""
+    roll, pitch, yaw = pin.rpy.matrixToRpy(flange_from_part.rotation)
+    x, y, z = flange_from_part.translation
+    sigmas = np.sqrt(np.diag(seen + GRIPPED))
+    held = Mounting.model_construct(translation=(x, y, z), rotation=(roll, pitch, yaw))
+    grasp = GraspSection.model_construct(
+        flange_from_part=held, size=job.grasp.size, sigma=float(sigmas[:3].max()), sigma_angle=float(sigmas[3:].max())
+    )
+    return job.model_copy(update={"grasp": grasp})
+
+
+def take(
+    here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what: str, most_pull: float | None = None
+) -> None:
+    """Grip the part, `what` in words, with the flange at `grip`, base_from_flange, and lift it.
+
+    Raises `RefusedError` where the claw meets something on its way down, and, with `most_pull` in N, where the part
+    sticks: it is let go again then.
+    """
+    plan, mover, part = job.place, here.mover, here.part
+    normal = job.grasp.flange_from_part.se3().rotation[:, 2]
+    above = grip * from_parts(plan.approach * normal)
+    context.progress(0.5, f"gripping {what}")
+    context.check()
+    mover.follow(mover.plan_to(above, f"above {what}"))
+    mover.meet_part()
+    part.left = False
+    here.devices.arm.zero_force()
+    if not _reached(here, grip, normal):
+        mover.line(above, plan.speed, TOUCHES)
+        mover.spare_part()
+        part.left = True
+        raise RefusedError(
+            f"the claw touched something as it went to grip {what}; it went back up, the part lies where it was. Look "
+            "what stands there"
+        )
+    context.check()
+    before = part.state
+    part.state = PartState.UNKNOWN
+    note_part(context, part)
+    here.devices.claw.grip()
+    where, part.state, part.where, part.left = part.where, PartState.HELD, None, False
+    note_part(context, part)
+    mover.take_part(job.grasp.flange_from_part.se3(), job.grasp.size)
+    if most_pull is not None and mover.line(
+        grip * from_parts(plan.contact_travel * normal), plan.contact_speed, TOUCHES, force_limit=most_pull
+    ):
+        part.state, part.where = PartState.UNKNOWN, where
+        note_part(context, part)
+        here.devices.claw.release()
+        part.state, part.left = before, True
+        note_part(context, part)
+        mover.hold_nothing()
+        mover.spare_part()
+        mover.line(above, plan.speed, TOUCHES)
+        raise RefusedError(
+            f"{what} sticks: the claw pulled at it with more than {most_pull:.0f} N and let it go again, where it lay. "
+            "Look what holds it",
+            Measured("pull at the part", most_pull, "N", most=most_pull),
+        )
+    mover.line(above, plan.speed, TOUCHES)
+
+
+def _reached(here: Workplace, grip: pin.SE3, normal: Vector) -> bool:
+    """Whether the open claw came down to `grip` along `normal`, (3,) on the flange, without touching anything."""
+    plan, mover = here.job.place, here.mover
+    slow = grip * from_parts(plan.contact_travel * normal)
+    if mover.line(slow, plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force):
+        return False
+    # What presses already would be taken as zero.
+    if not np.linalg.norm(here.devices.arm.state().wrench[:3]) <= plan.contact_force:
+        return False
+    return not mover.line(grip, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
+
+
+def note_part(context: StepContext, part: PartProgress) -> None:
+    """Keep in the journal what has become of the part, and where it is, if that is known."""
+    where = {} if part.where is None else {"base_from_part": to_ur(part.where).tolist()}
+    context.note(part=part.state.value, **where)

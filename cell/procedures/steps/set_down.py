@@ -1,0 +1,57 @@
+"""Set down: the part that was taken from its surface goes into its nest on the vehicle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from cell.measure.inversion import PlacePose
+from cell.measure.inversion.part_pose import seen_from_below
+from cell.procedures.arm.touch import expected_touch
+from cell.procedures.steps.gripping import held_so, note_part
+from cell.procedures.steps.pick import HeldPart
+from cell.procedures.steps.place import PlaceResult, Placing
+from cell.procedures.steps.workplace import JobStep, Workplace
+from drivers.errors import RefusedError
+from statemachine.runner import StepContext
+from statemachine.step import OnFailure, Step
+
+
+@dataclass(frozen=True, eq=False)
+class SetDown:
+    """How the part was `put` into its nest. Nobody has looked at it there."""
+
+    put: PlaceResult
+
+    def summary(self) -> dict[str, object]:
+        """Figures for journal and report."""
+        told = self.put.summary()
+        return {name: told[name] for name in ("contact", "depth_error_mm", "touch", "base_from_flange")}
+
+
+def _at(here: Workplace, context: StepContext) -> SetDown:
+    nest, part, job = here.job.nest, here.part_mesh, here.job
+    assert nest is not None and part is not None
+    base_from_part = nest.base_from_part.se3()
+    known = np.diag([nest.sigma**2] * 3 + [nest.sigma_angle**2] * 3)
+    pose = replace(context.made(PlacePose), base_from_surface=base_from_part, covariance=known)
+    held = held_so(job, job.grasp.flange_from_part.se3(), context.made(HeldPart).covariance)
+    below = seen_from_below(part, job.place.surface_from_part.se3())
+    placing = Placing(
+        held, base_from_part, expected_touch(held, below, pose, here.repeatability), mover=here.mover,
+        arm=here.devices.arm, claw=here.devices.claw, part=here.part, check=context.check, progress=context.progress,
+        note=lambda part: note_part(context, part),
+    )  # fmt: skip
+    try:
+        done = placing.put_down()
+    except RefusedError as error:
+        raise RefusedError(f"at the nest: {error}", *error.numbers) from error
+    if done.touch is not None:
+        for note in done.touch.notes:
+            context.note(text=f"at the nest: {note}")
+    return SetDown(done)
+
+
+# A part that may have touched its nest is not set down a second time by itself.
+STEP = JobStep(Step("set_down", 180.0, on_failure=OnFailure.STOP), _at, SetDown, needs=(PlacePose, HeldPart))

@@ -1,0 +1,48 @@
+"""What the sweep of a job looks for: the surface, or, where a part is to be unloaded, that part as it lies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pinocchio as pin
+
+from cell.config.job import Job
+from cell.measure.inversion import NominalSurface
+from cell.measure.inversion.part_pose import seen_from_above
+from drivers.make import Pose
+
+UNLOAD = "unload"
+"""The kind of job that takes a part from its surface."""
+
+
+def sought(job: Job, mesh: Path) -> tuple[Job, Path]:
+    """The job with what its sweep looks for as its surface, and the file of that mesh.
+
+    To be unloaded, the part's upper side is the surface: it lies where `place.surface_from_part` has it, and is gripped
+    where it is found. The scan head keeps its distance from it. Other jobs stay as they are.
+    """
+    if job.job.kind != UNLOAD or job.part is None or job.surface.mesh == job.part.mesh:
+        return job, mesh
+    there = job.surface.place_from_surface.se3() * job.place.surface_from_part.se3()
+    surface = job.surface.model_copy(
+        update={"mesh": job.part.mesh, "mesh_unit": job.part.mesh_unit, "place_from_surface": pose_record(there)}
+    )
+    place = job.place.model_copy(update={"surface_from_part": pose_record(pin.SE3.Identity())})
+    found, file = job.model_copy(update={"surface": surface, "place": place}), Path(job.part.mesh)
+    low, high = nominal_of(found, file).extent
+    above = job.scan.stand_off + 0.5 * float(low[2] + high[2])
+    return found.model_copy(update={"scan": job.scan.model_copy(update={"stand_off": above})}), file
+
+
+def nominal_of(job: Job, mesh: Path) -> NominalSurface:
+    """The surface of a job as `sought` gives it, from its mesh's file. Raises `ConfigError`."""
+    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+    unloaded = job.job.kind == UNLOAD and job.part is not None
+    return seen_from_above(nominal, job.place.surface_from_part.se3()) if unloaded else nominal
+
+
+def pose_record(pose: pin.SE3) -> Pose:
+    """The pose as a job has it."""
+    x, y, z = (float(v) for v in pose.translation)
+    roll, pitch, yaw = (float(v) for v in pin.rpy.matrixToRpy(pose.rotation))
+    return Pose.model_construct(translation=(x, y, z), rotation=(roll, pitch, yaw))

@@ -1,0 +1,68 @@
+"""Verify, after unloading: the part is swept in its nest, and lies there as it should, or the run fails."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+
+from cell.config.job import Job
+from cell.measure.inversion import PlacePose, Prior, Tolerance
+from cell.measure.inversion import invert_pose as register
+from cell.measure.inversion.part_pose import DEMANDS, SHIFTED, PartPose, parted
+from cell.procedures.part_error import part_points
+from cell.procedures.placed_part import NEXT_STEP, PlacedPart
+from cell.procedures.steps.reconstruct import displacements
+from cell.procedures.steps.set_down import SetDown
+from cell.procedures.steps.sought_part import pose_record
+from cell.procedures.steps.verify import swept_part
+from cell.procedures.steps.workplace import JobStep, Workplace
+from cell.procedures.sweep.stored_sweep import SweepRecord
+from drivers.errors import MisplacedError, RefusedError
+from statemachine.runner import StepContext
+from statemachine.step import OnFailure, Step
+
+
+def _at(here: Workplace, context: StepContext) -> PlacedPart:
+    job, sweep = at_nest(here.job), context.made(SweepRecord)
+    belongs = job.place.surface_from_part.se3()
+    cloud, record = swept_part(here, sweep, belongs, context)
+    here.mover.fold()
+    by_calibration, by_poses = displacements(here, record, cloud)
+    on_part, _ = parted(cloud, here.nominal, belongs)
+    known = np.diag([job.place.tolerance**2] * 3 + [job.place.tolerance_angle**2] * 3)
+    try:
+        fit = register(
+            on_part, here.nominal, Prior(belongs, np.diag(SHIFTED**2)),
+            Tolerance(job.place.tolerance, job.place.tolerance_angle), systematic=here.kinematic,
+            calibration=by_calibration, sweeps=by_poses, demands=DEMANDS, partly=True,
+        )  # fmt: skip
+    except RefusedError as error:
+        why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")
+        raise MisplacedError(f"the part is not seen in its nest: {why}. {NEXT_STEP}", *error.numbers) from error
+    found = PlacedPart.of(job, _in_base(fit), part_points(here.nominal), known)
+    for note in found.notes:
+        context.note(text=f"in its nest: {note}")
+    if not found.kept(job.place):
+        raise found.misplaced(job.place, "That is in its nest, in axes of the arm base")
+    return found
+
+
+def _in_base(fit: PlacePose) -> PartPose:
+    """The part as seen against the arm's base, which takes the place of a surface here."""
+    return PartPose(pin.SE3.Identity(), fit.base_from_surface, fit.covariance, fit, beside=fit.n_points)
+
+
+def at_nest(job: Job) -> Job:
+    """The job with the nest as the place, in the arm base, and the nest's tolerances."""
+    nest = job.nest
+    assert nest is not None
+    place = job.place.model_copy(
+        update={
+            "surface_from_part": pose_record(nest.base_from_part.se3()), "tolerance": nest.tolerance,
+            "tolerance_angle": nest.tolerance_angle,
+        }
+    )  # fmt: skip
+    return job.model_copy(update={"place": place})
+
+
+STEP = JobStep(Step("verify", 600.0, on_failure=OnFailure.STOP), _at, PlacedPart, needs=(SweepRecord, SetDown))
