@@ -65,7 +65,7 @@ def seen_from_above(part: NominalSurface, surface_from_part: pin.SE3) -> Nominal
         raise ConfigError("no face of part.mesh faces up where the part lies: nothing of the placed part can be seen")
     # Of its own corners alone: their box is that of the faces.
     corners, triangles = np.unique(part.triangles[up], return_inverse=True)
-    return NominalSurface(part.vertices[corners], triangles.reshape(-1, 3))
+    return NominalSurface(part.vertices[corners], triangles.reshape(-1, 3), source=part.source)
 
 
 def seen_from_below(part: NominalSurface, surface_from_part: pin.SE3) -> NominalSurface:

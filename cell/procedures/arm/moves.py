@@ -278,7 +278,7 @@ class PartProgress:
 
     def told(self, reason: str) -> str:
         """A run's reason, not to be read without what has become of the part."""
-        if self.state is PartState.HELD or self.where is None:
+        if self.state in (PartState.HELD, PartState.LIES) or self.where is None:
             return reason
         x, y, z = 1e3 * self.where.translation
         at = f"at ({x:.1f}, {y:.1f}, {z:.1f}) mm in the arm base"

@@ -23,7 +23,7 @@ from statemachine.step import OnFailure, Step
 
 
 def _at(here: Workplace, context: StepContext) -> PlacedPart:
-    job, sweep = at_nest(here.job), context.made(SweepRecord)
+    job, sweep = where_seen(here.job), context.made(SweepRecord)
     belongs = job.place.surface_from_part.se3()
     cloud, record = swept_part(here, sweep, belongs, context)
     here.mover.fold()
@@ -52,17 +52,13 @@ def _in_base(fit: PlacePose) -> PartPose:
     return PartPose(pin.SE3.Identity(), fit.base_from_surface, fit.covariance, fit, beside=fit.n_points)
 
 
-def at_nest(job: Job) -> Job:
-    """The job with the nest as the place, in the arm base, and the nest's tolerances."""
-    nest = job.nest
-    assert nest is not None
-    place = job.place.model_copy(
-        update={
-            "surface_from_part": pose_record(nest.base_from_part.se3()), "tolerance": nest.tolerance,
-            "tolerance_angle": nest.tolerance_angle,
-        }
-    )  # fmt: skip
-    return job.model_copy(update={"place": place})
+def where_seen(job: Job) -> Job:
+    """The job with the place where its part is looked at: its own, or the nest in the arm base, with its tolerances."""
+    if (nest := job.nest) is None:
+        return job
+    lies = pose_record(nest.base_from_part.se3())
+    update = {"surface_from_part": lies, "tolerance": nest.tolerance, "tolerance_angle": nest.tolerance_angle}
+    return job.model_copy(update={"place": job.place.model_copy(update=update)})
 
 
 STEP = JobStep(Step("verify", 600.0, on_failure=OnFailure.STOP), _at, PlacedPart, needs=(SweepRecord, SetDown))

@@ -14,7 +14,7 @@ from cell.procedures.frame_store import FrameStore
 from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps import verify
 from cell.procedures.steps.place import PlaceResult
-from cell.procedures.steps.verify_nest import at_nest
+from cell.procedures.steps.verify_nest import where_seen
 from drivers.errors import Measured, MeasuredRow, RefusedError
 from statemachine.runner import RunResult
 from statemachine.step import Outcome
@@ -90,7 +90,7 @@ def measured(
     if truth is not None:
         found.append(Measured("place error, largest of 45 points", truth["error_mm"]["d"]["max"], "mm", most=tolerance))
     if (seen := seen_placed(result)) is not None:
-        found += seen.measured(job.place if job.nest is None else at_nest(job).place)
+        found += seen.measured(where_seen(job).place)
     elif bound is not None and job.nest is None:
         found.append(Measured("place error, stated 95 % bound", bound["d"], "mm", most=tolerance))
     if isinstance(placed, PlaceResult):

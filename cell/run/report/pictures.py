@@ -301,7 +301,7 @@ def draw_run(
     elif stripe is not None:
         draw_stripe(middle[0], stripe)
     if report["outcome"] == "placed":
-        draw_error(right, report["truth"], report["place_bound_95"], 1e3 * job.place.tolerance, seen)
+        draw_error(right, report["truth"], report["place_bound_95"], report["tolerance"]["translation_mm"], seen)
     else:
         draw_reason(right, report, ended_in(result))
     figure.savefig(path, pil_kwargs={"compress_level": COMPRESSION})

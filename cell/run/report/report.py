@@ -27,6 +27,7 @@ from cell.procedures.frame_store import FrameStore
 from cell.procedures.part_error import draws, part_points, placed_points, point_covariances, stated_bound, through
 from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.steps.verify_nest import where_seen
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.folder import REPORT, release, timeless, when
 from cell.run.report.evidence import last_frames, measured, refusal, seen_placed
@@ -109,7 +110,7 @@ class FinishedJob:
 
     def _of_the_run(self) -> dict[str, object]:
         """What every run has, in the order of the file; what is not known yet is None."""
-        ended, result, place = time.time(), self.result, self.job.place
+        ended, result, place = time.time(), self.result, where_seen(self.job).place
         made = result.results.get("reconstruct")
         return {
             "run": self.folder.name, "kind": "job", "version": release(),

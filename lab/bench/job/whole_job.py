@@ -26,6 +26,7 @@ from cell.procedures.calibrate.timing import look_at_shutter
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.kinds import kind_of
+from cell.procedures.steps.sought_part import nominal_of, sought
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.calibration import arm_table
@@ -97,6 +98,8 @@ def run_whole_job(
     assert nominal.source is not None
     cell = VirtualCell(config, seed, level, Described(job, nominal.source))
     changed(cell)
+    job, mesh = sought(job, nominal.source)
+    nominal = nominal if mesh == nominal.source else nominal_of(job, mesh)
     record = JobRecord(seed, level)
     whole = _WholeJob(cell, config, job, nominal, record, progress or (lambda fraction, text: None))
     try:

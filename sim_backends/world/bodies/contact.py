@@ -33,6 +33,8 @@ LEAST_TOUCHING = 40
 """Of the points of a part's underside that are tried so many have to have a surface below them."""
 CLEARANCE, CLEARANCE_STEP, WALL = 3e-4, 1e-4, 2.5
 """Room that a part has beside walls, m, the step in which they are looked for, m, and how steep, m/m, a wall is."""
+STICKY, STRETCH = 0.5e-3, 50e-6
+"""A part that sticks comes loose this far, m, from its surface; from the second on it holds with its whole force."""
 SETTLING, TIPS = 20, 5e-3
 """Steps in which a part settles, and how far it tilts in one, rad: the ground below it is another one then."""
 _LEAN = 0.015
@@ -76,6 +78,8 @@ class PartContact:
         self._claw_closed = True
         self.opening = np.eye(4)
         """How the part moves, in its own frame, as the claw opens, part before from part after; (4, 4)."""
+        self.sticks = 0.0
+        """With how much force, N, the surface holds a part that lies on it, until it is `STICKY` m away."""
         self._lock = threading.Lock()
         self._own = part is not None
         self._nest = nest
@@ -255,6 +259,9 @@ class PartContact:
             if self._world_from_part is None:
                 points = np.concatenate([points, _moved(self._underside, world_from_flange @ self._flange_from_part)])
         depth, normals = self._below(points)
+        if self.sticks and self.held and -STICKY < (deepest := float(depth.max())) <= 0.0:
+            wrench[2] = -self.sticks * min(1.0, -deepest / STRETCH)
+            wrench[3:] = np.cross(points.mean(axis=0) - world_from_flange[:3, 3], wrench[:3])
         if depth.max() <= 0.0:
             return wrench
         # The part of a vertical depth along the normal; the whole underside has STIFFNESS along z.

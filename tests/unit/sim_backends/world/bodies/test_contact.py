@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lab.bench.job.part_jobs import body
 from sim_backends.world import drawing
-from sim_backends.world.bodies.contact import STIFFNESS, PartContact
+from sim_backends.world.bodies.contact import STIFFNESS, Nest, PartContact
 from sim_backends.world.bodies.surfaces import HALF_X, HALF_Y, Surface, mesh, surface, underside
 from sim_backends.world.scene import rotation
 
@@ -170,3 +170,35 @@ def test_an_empty_claw_feels_the_table_with_its_fingers() -> None:
     tips_on_the_table[2, 3] = target[2, 3] + 0.155
     assert not part.wrench(raised(tips_on_the_table, dz=1e-4)).any()
     assert part.wrench(raised(tips_on_the_table, dz=-0.01))[2] > 0
+
+
+def test_a_part_lies_at_first_is_taken_into_its_nest_and_rides_with_the_vehicle() -> None:
+    base = [np.eye(4)]
+    nest = Nest(
+        turned((0.0, 0.0, 0.5), (-0.6, 0.1, 0.7)), lambda: base[0], turned((0.0, 0.0, 0.01), (0.4e-3, 0.0, 0.0))
+    )
+    world_from_surface = turned((0.0, 0.0, 0.0), (0.6, 0.0, 0.6))
+    part = PartContact(surface("pot"), world_from_surface, drawing.FLANGE_FROM_PART, nest=nest)
+    assert not part.held and part.untouched
+    lay = part.part_pose(np.eye(4))
+    aside = drawing.inverse(world_from_surface) @ lay
+    assert aside[0, 3] == pytest.approx(0.4e-3) and 0.0 < aside[2, 3] < 1e-3, "it lies aside, on slopes"
+    part.set_claw(True, flange_for(lay))
+    assert part.held and not part.untouched
+    # Pressed into the nest by .1 mm it is pushed back as by the surface, in the nest's own axes.
+    there = base[0] @ nest.base_from_surface
+    assert part.wrench(flange_for(raised(there, dz=-1e-4)))[2] == pytest.approx(0.1e-3 * STIFFNESS, rel=0.15)
+    assert not part.wrench(flange_for(raised(there, dz=1e-3))).any()
+    part.set_claw(False, flange_for(raised(there, dz=2e-4)))
+    np.testing.assert_allclose(part.part_pose(np.eye(4)), there, atol=1e-6)
+    base[0] = turned((0.0, 0.0, 0.3), (1.0, 2.0, 0.0))
+    np.testing.assert_allclose(part.part_pose(np.eye(4)), base[0] @ there, atol=1e-6)
+    part.set_claw(True, flange_for(base[0] @ there))
+    assert part.held, "it is taken from there as well"
+
+
+def test_a_part_that_sticks_holds_on_until_it_is_half_a_millimetre_away() -> None:
+    part, world_from_surface = contact(lean=(0.0, 0.0, 0.0))
+    part.sticks = 30.0
+    pulls = [-part.wrench(flange_for(raised(world_from_surface, dz=height)))[2] for height in (25e-6, 2e-4, 6e-4)]
+    assert pulls == pytest.approx([15.0, 30.0, 0.0], rel=0.1)

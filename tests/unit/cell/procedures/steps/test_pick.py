@@ -1,0 +1,85 @@
+"""A part is found by its own mesh, gripped where it lies, set into its nest and looked at there: whole virtual jobs."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cell import Cell
+from cell.config.calibrations.store import save_calibration
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import difference, from_matrix
+from cell.run.record.replay import replay
+from cell.run.report.page.make import make_page
+from drivers.errors import ConfigError
+from lab.bench.job.whole_job import JobRecord
+from tests.support.unloading import JOB, Change, unloaded
+
+
+def test_a_part_is_taken_from_its_surface_into_its_nest(placed_pot: JobRecord, tmp_path: Path) -> None:
+    def clings(cell: VirtualCell) -> None:
+        cell.world.part.sticks = 10.0
+
+    done = unloaded(placed_pot, clings, runs=tmp_path)
+    assert (done.outcome, done.reason) == ("placed", "") and done.at_sweep and done.at_end and done.folder and JOB.nest
+    lay, lies = (from_matrix(truth["poses"]["base_from_part"]) for truth in (done.at_sweep, done.at_end))
+    # Where the world has put it is drawn: some tenths of a millimetre from where the job expects it.
+    found = difference(done.results["invert_pose"].base_from_surface, lay)
+    assert np.linalg.norm(found[:3]) < 0.3e-3 and np.linalg.norm(found[3:]) < 1.5e-3
+    nest = difference(lies, JOB.nest.base_from_part.se3())
+    assert np.linalg.norm(nest[:3]) < 0.5e-3 and np.linalg.norm(nest[3:]) < 3e-3
+    seen = done.results["verify"]
+    error = difference(seen.seen.surface_from_part, lies)
+    assert error @ np.linalg.solve(seen.covariance, error) < 22.5, "of 1,000 by chance one"
+    assert not done.at_end["part"]["held"] and done.at_end["collisions"] == []
+    report = json.loads((done.folder / "report.json").read_text(encoding="utf-8"))
+    assert re.fullmatch(r"in place: 0\.\d\d ± 0\.\d\d mm off", report["reason"]) and report["part"] == "released"
+    told = (report["nest_error"]["translation_mm"], report["pose_error"]["translation_mm"])
+    assert np.allclose(told, [1e3 * error[:3], 1e3 * found[:3]], atol=1e-3)
+    assert report["tolerance"]["translation_mm"] == 1e3 * JOB.nest.tolerance
+    assert "placed part off its place" in make_page(done.folder)
+
+
+def take_away(cell: VirtualCell) -> None:
+    part = cell.world.part
+    assert part._world_from_part is not None
+    part._world_from_part[0, 3] += 0.2
+
+
+def hold(cell: VirtualCell) -> None:
+    cell.world.part._world_from_part = None
+
+
+@pytest.mark.parametrize(
+    ("change", "stage", "told"),
+    [
+        (take_away, "invert_pose", "surface"),
+        (hold, "drive_to_target", "the claw holds a part, and job unload takes one from its surface"),
+    ],
+)
+def test_where_there_is_no_part_or_the_claw_is_full_nothing_is_gripped(
+    placed_pot: JobRecord, change: Change, stage: str, told: str
+) -> None:
+    done = unloaded(placed_pot, change)
+    assert (done.outcome, done.stage) == ("refused", stage) and told in done.reason
+    assert "pick" not in done.results
+
+
+def test_through_the_public_door_it_is_replayed_and_not_resumed_once_it_was_gripped(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert placed_pot.calibration is not None
+    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
+    with Cell.open(sim="all", seed=placed_pot.seed, clock="virtual", job="unload") as cell:
+        done = cell.run(job="unload")
+        assert (done.outcome, done.exit_code) == ("placed", 0)
+        ended = cell.run(job="unload", inject=["arm.emergency_stop@set_down:40%"])
+        assert (ended.outcome, ended.report["part"]) == ("faulted", "held"), "the next part lay there, and was gripped"
+        with pytest.raises(ConfigError, match="had gripped a part that lay"):
+            cell.resume(ended.folder)
+    assert all(each.same for each in replay(done.folder))
