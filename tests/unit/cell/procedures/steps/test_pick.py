@@ -52,6 +52,8 @@ def take_away(cell: VirtualCell) -> None:
 
 def hold(cell: VirtualCell) -> None:
     cell.world.part._world_from_part = None
+    cell.world._close_claw(True)
+    cell.world._report_grip()
 
 
 @pytest.mark.parametrize(
