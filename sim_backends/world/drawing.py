@@ -179,6 +179,8 @@ class StationDrawing:
     """In the place frame."""
     part_mesh: str = ""
     part_mesh_unit: str = "m"
+    waviness: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Amplitude and wavelength, m, and direction from the surface's x, rad, of a sine that the job's mesh has not."""
 
 
 @dataclass(frozen=True, eq=False)
