@@ -104,7 +104,7 @@ def draw_board(axes: Axes, board: BoardPanel) -> None:
 
 def draw_surface(
     figure: Figure, axes: Axes, surface: SurfacePanel, span_mm: float, seams: Sequence[Mapping[str, object]],
-    waviness: str = "",
+    waviness: Sequence[str] = (),
 ) -> None:  # fmt: skip
     """A map of the scanned points from above, means over squares: their deviation from the drawn surface within
     ±`span_mm`, or their height where no place of the surface was found."""
@@ -124,7 +124,7 @@ def draw_surface(
     said = "deviation from the drawn surface" if surface.believed else "deviation at the place that was refused"
     rms = float(np.sqrt(np.mean(deviation[on] ** 2))) if on.any() else float("nan")
     title = [f"{said}: {rms:.3f} mm RMS" + ("" if on.all() else "; dark: beside it"), *map(seam_words, seams)]
-    title += textwrap.wrap(waviness, TITLE_COLUMNS)
+    title += waviness
     if surface.flush is not None:
         x, y, _ = 1e3 * surface.flush.places.T
         axes.scatter(
@@ -279,20 +279,19 @@ def draw_run(
     if surface is not None and seen is not None:
         surface = replace(surface, flush=seen.flush)
     flush = surface is not None and surface.flush is not None
-    waviness = texture_words(report)
-    above = len(seams) + flush + len(textwrap.wrap(waviness, TITLE_COLUMNS))
+    waviness = textwrap.wrap(texture_words(report), TITLE_COLUMNS)
     left, *middle, right = figure.subplots(
         1,
         2 + scanned,
         width_ratios=[1.0, 1.3, 1.0] if scanned else [1.5, 1.0],
-        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * above},
+        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * (len(seams) + flush + len(waviness))},
     )
     if board is None:
         empty(left, "the board", "not photographed")
     else:
         draw_board(left, board)
     if surface is not None:
-        draw_surface(figure, middle[0], surface, SCALE_SHARE * 1e3 * job.place.tolerance, seams, waviness)
+        draw_surface(figure, middle[0], surface, SCALE_SHARE * 1e3 * job.place.tolerance, seams, waviness=waviness)
     elif stripe is not None:
         draw_stripe(middle[0], stripe)
     if report["outcome"] == "placed":

@@ -22,7 +22,6 @@ from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.measure.geometry.poses import difference, from_matrix, to_ur, transform
 from cell.measure.inversion import NominalSurface, PlacePose
-from cell.measure.inversion.texture import Texture
 from cell.measure.reconstruction import Cloud
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.part_error import draws, part_points, placed_points, point_covariances, stated_bound, through
@@ -92,13 +91,14 @@ class FinishedJob:
             except Exception as error:
                 report["truth_missing"] = f"{type(error).__name__}: {error}"
         report["measured"] = measured(self.result, self.job, report["truth"], report["place_bound_95"])
-        texture, failed = self._texture()
-        if report["scan"] is not None:
-            report["scan"]["texture"] = None if texture is None else texture.as_dict()
+        texture = None
+        try:
+            texture = texture_of(self.result, self.nominal)
+        except Exception as error:
+            report["texture_missing"] = f"{type(error).__name__}: {error}"
         if texture is not None:
+            report["scan"]["texture"] = texture.as_dict()
             report["measured"] += [number.as_dict() for number in texture.measured()]
-        if failed:
-            report["texture_missing"] = failed
         picture = self.folder / "picture.png"
         try:
             # Drawing is the slowest thing to load, and a command that jogs or stops the cell does not draw.
@@ -134,16 +134,9 @@ class FinishedJob:
             "tolerance": {"translation_mm": 1e3 * place.tolerance, "rotation_mrad": 1e3 * place.tolerance_angle},
             "measured": [],
             "assumed_noise": {"level": self.info["level"], "sigmas": _configured_noise(self.config)},
-            "scan": made.summary() if isinstance(made, Reconstruction) else None,
+            "scan": {**made.summary(), "texture": None} if isinstance(made, Reconstruction) else None,
             "truth": None,
         }  # fmt: skip
-
-    def _texture(self) -> tuple[Texture | None, str]:
-        """The waviness of the scanned surface, None where its place is not known, and what went wrong with it."""
-        try:
-            return texture_of(self.result, self.nominal), ""
-        except Exception as error:
-            return None, f"{type(error).__name__}: {error}"
 
     def _add_place(self, report: dict[str, object]) -> None:
         """The place pose, where one was inverted."""

@@ -9,16 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.mesh import Mesh
-from sim_backends.world.bodies.surfaces import (
-    OwnSurface,
-    Surface,
-    SurfaceMesh,
-    own_surface,
-    part_mesh,
-    underside,
-    wave,
-    waved,
-)
+from sim_backends.world.bodies import surfaces
+from sim_backends.world.bodies.surfaces import OwnSurface, Surface, SurfaceMesh, own_surface, part_mesh, underside
 from sim_backends.world.bodies.surfaces import mesh as drawn_mesh
 from sim_backends.world.bodies.surfaces import surface as named_surface
 from sim_backends.world.drawing import StationDrawing, inverse
@@ -51,7 +43,7 @@ class Station:
             own = own_surface(drawn.mesh, drawn.mesh_unit)
             ground, seen = replace(own.ground, table=table), _own(own, table, drawn.waviness)
         if drawn.waviness[0]:
-            ground = waved(ground, drawn.waviness)
+            ground = surfaces.waved(ground, drawn.waviness)
         (x, y), low = ground.centre, min(0.0, float(seen.low[0, 2]))
         reach = np.hypot(abs(x) + ground.half_x, abs(y) + ground.half_y)
         room = max(0.015, ground.top, -low)
@@ -79,7 +71,7 @@ def _own(own: OwnSurface, table: tuple[float, float, float], waviness: tuple[flo
 def _waved(made: SurfaceMesh, waviness: tuple[float, float, float]) -> Mesh:
     """As seen, with its waviness; the feet of the sides move with it, below what is looked at."""
     vertices = made.vertices.copy()
-    vertices[:, 2] += wave(vertices[:, 0], vertices[:, 1], waviness)[0]
+    vertices[:, 2] += surfaces.wave(vertices[:, 0], vertices[:, 1], waviness)[0]
     return Mesh(vertices, made.triangles)
 
 

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import re
+from dataclasses import replace
 from pathlib import Path
+from typing import NoReturn
 
 import cv2
 import pytest
 
+from cell.devices.simulated.direct import VirtualCell
 from cell.measure.reconstruction.ply import read_cloud
+from cell.run.report.figures import texture_words
+from cell.run.report.page.make import make_page
 from drivers.errors import Measured, RefusedError
+from lab.bench.job.whole_job import JobRecord, run_whole_job
+from sim_backends.world.bodies.station import Station
 from tests.support import report_runs
-from tests.support.report_runs import Ended, Ends, Make, read_strictly
+from tests.support.report_runs import Ended, Ends, Make, pot, read_strictly
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +124,52 @@ def test_a_real_cell_has_its_own_figures(ends: Ends) -> None:
         "fit, χ²/dof",
         "surface covered",
     ]
+
+
+def test_a_surface_as_drawn_shows_no_waviness(placed: Ended) -> None:
+    texture = placed.report["scan"]["texture"]
+    assert (texture["sa_mm"], texture["sq_mm"], texture["sz_mm"]) == (None, None, None)
+    # Lines 1 mm apart.
+    assert texture["nesting_mm"] == 5.0 and 0.003 < texture["limit_mm"] < 0.01
+    assert texture["area_mm2"] == pytest.approx(63.0 * 32.0, rel=0.1)
+    row = placed.report["measured"][-1]
+    assert row["name"].endswith("is less than") and row["value"] == pytest.approx(texture["limit_mm"], abs=1e-5)
+    assert texture_words(placed.report) == f"no waviness told: {texture['reason']}"
+
+
+def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: Path) -> None:
+    amplitude, wavelength = 0.1e-3, 0.015
+
+    def waved(cell: VirtualCell) -> None:
+        scene = cell.world.scene
+        station = replace(scene.drawing.station, waviness=(amplitude, wavelength, 0.25 * math.pi))
+        drawing = replace(scene.drawing, station=station)
+        cell.world.remake(replace(scene, drawing=drawing), Station.of(station))
+
+    job, nominal = pot()
+    record = run_whole_job(
+        report_runs.CONFIG, job, nominal, 2, "nominal", calibrated=placed_pot, runs=tmp_path, changed=waved
+    )
+    assert record.folder is not None
+    report = read_strictly(record.folder / "report.json")
+    texture = report["scan"]["texture"]
+    through = 1e3 * amplitude * 2.0 ** -((1e-3 * texture["nesting_mm"] / wavelength) ** 2)
+    assert texture["sq_mm"] == pytest.approx(through / math.sqrt(2.0), rel=0.03)
+    assert texture["sa_mm"] == pytest.approx(2.0 * through / math.pi, rel=0.05)
+    # The form takes a part of so few waves, and noise adds to the highest and the lowest.
+    assert texture["sz_mm"] == pytest.approx(2.0 * through, rel=0.25)
+    assert report["measured"][-1]["name"] == "waviness of the surface, Sq"
+    assert texture_words(report).startswith(f"waviness over 5 mm: Sa {texture['sa_mm']:.4f} mm, Sq")
+    assert f"Waviness over 5 mm: Sa {texture['sa_mm']:.4f} mm" in make_page(record.folder)
+
+
+def test_a_waviness_that_cannot_be_told_does_not_cost_the_report(placed_pot: JobRecord, tmp_path: Path) -> None:
+    def fails(*given: object) -> NoReturn:
+        raise MemoryError("too many points")
+
+    broken = replace(placed_pot.results["reconstruct"], by_poses=fails)
+    record = replace(placed_pot, results={**placed_pot.results, "reconstruct": broken})
+    report = report_runs.placed(record, tmp_path / "runs").report
+    assert (report["outcome"], report["scan"]["texture"]) == ("placed", None)
+    assert report["texture_missing"] == "MemoryError: too many points"
+    assert texture_words(report) == ""

@@ -1,0 +1,158 @@
+"""Sa, Sq and Sz of sines are their closed forms, the filter is scipy's, and noise is never taken for a surface."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from cell.measure.inversion.nominal import SIGMA_FLOOR
+from cell.measure.inversion.texture import ALPHA, EDGE_WEIGHT, Heights, form_removed, gaussian, measure_texture
+
+LINES, ROWS = 121, 201
+PITCH, STEP = 0.5e-3, 0.18e-3
+INDEX = 2e-3
+"""Of the nesting indices the least that has three lines across."""
+WAVE = 0.006
+
+
+def scanned(heights: np.ndarray | float, unsure: float = 0.0, shaken: float = 0.0) -> Heights:
+    """A flat surface of 60 mm by 36 mm, its points high by `heights` (lines, rows), m."""
+    x, y = np.meshgrid(PITCH * np.arange(LINES), STEP * np.arange(ROWS), indexing="ij")
+    lines = np.repeat(np.arange(LINES), ROWS)
+    places = np.column_stack([x.ravel(), y.ravel()])
+    some = np.arange(0, len(lines), 7)
+    bow = unsure * np.sqrt(2.0) * np.sin(2.0 * np.pi * places[some, :1] / WAVE)
+    high = np.broadcast_to(heights, x.shape).ravel() * 1.0
+    return Heights(places, high, np.zeros((len(lines), 2)), lines, (PITCH, STEP), some, bow, shaken)
+
+
+def sine(amplitude: float, wavelength: float = WAVE) -> np.ndarray:
+    """Heights (lines, 1) of a wave along the sweep."""
+    return amplitude * np.cos(2.0 * np.pi * PITCH * np.arange(LINES)[:, None] / wavelength)
+
+
+def told(given: Heights) -> tuple[float, float, float]:
+    """Sa, Sq and Sz, all of which are there."""
+    made = measure_texture(given)
+    assert made.sa is not None and made.sq is not None and made.sz is not None, made.reason
+    return made.sa, made.sq, made.sz
+
+
+def test_the_filter_is_that_of_scipy_also_at_edges_and_holes() -> None:
+    rng = np.random.default_rng(1)
+    heights, weights = rng.normal(size=(90, 70)), np.ones((90, 70))
+    weights[40:43, 20:24] = weights[60:80, 40:60] = 0.0
+    sigma = ALPHA * 8.0 / np.sqrt(2.0 * np.pi)
+    over, under = (gaussian_filter(v, sigma, mode="constant", truncate=12.0) for v in (weights * heights, weights))
+    made = gaussian(heights, weights, 8.0, EDGE_WEIGHT)
+    known = np.isfinite(made)
+    np.testing.assert_allclose(made[known], (over / under)[known], atol=1e-12)
+    # A narrow hole is bridged, a wide one is not.
+    assert known[:55].all() and not known[65:75, 45:55].any()
+
+
+@pytest.mark.parametrize("wavelength", [0.5, 1.0, 2.0, 5.0])
+def test_half_of_a_wave_of_the_cutoffs_length_comes_through(wavelength: float) -> None:
+    cutoff, cells = 20.0, np.arange(401) - 200.0
+    wave = np.cos(2.0 * np.pi * cells / (wavelength * cutoff))[:, None] * np.ones((401, 60))
+    through = gaussian(wave, np.ones_like(wave), cutoff, EDGE_WEIGHT)[200, 30]
+    assert through == pytest.approx(2.0 ** -(wavelength**-2.0), abs=1e-6)
+
+
+def test_a_sine_has_the_parameters_of_its_closed_form() -> None:
+    for amplitude in (0.05e-3, 0.2e-3):
+        sa, sq, sz = told(scanned(sine(amplitude)))
+        through = amplitude * 2.0 ** -((INDEX / WAVE) ** 2)
+        assert sa == pytest.approx(2.0 * through / np.pi, rel=0.02)
+        assert sq == pytest.approx(through / np.sqrt(2.0), rel=0.01)
+        # A form of second order bends ten waves and a half a little.
+        assert sz == pytest.approx(2.0 * through, rel=0.05)
+
+
+def test_form_and_pose_are_no_waviness() -> None:
+    x, y = PITCH * np.arange(LINES)[:, None], STEP * np.arange(ROWS)
+    bowl = 1e-3 + 0.01 * x - 0.02 * y + 0.3 * x**2 - 0.2 * x * y + 0.5 * y**2
+    assert measure_texture(scanned(bowl)).sq is None
+    assert told(scanned(bowl + sine(0.1e-3)))[1] == pytest.approx(told(scanned(sine(0.1e-3)))[1], rel=1e-6)
+    # A curved surface that lies elsewhere seems high by its slopes.
+    slopes = np.column_stack([np.cos(500.0 * x + 0.0 * y).ravel(), np.sin(400.0 * y + 0.0 * x).ravel()]) * 0.3
+    places = scanned(0.0).places
+    turned = 0.2e-3 * slopes[:, 0] - 0.1e-3 * slopes[:, 1] + 2e-3 * (
+        places[:, 0] * slopes[:, 1] - places[:, 1] * slopes[:, 0]
+    )  # fmt: skip
+    assert np.ptp(turned) > 0.1e-3
+    assert np.abs(form_removed(places, slopes, turned)).max() < 1e-12
+    moved = replace(scanned(turned.reshape(LINES, ROWS)), slopes=slopes)
+    assert measure_texture(moved).sq is None
+    assert measure_texture(replace(moved, slopes=np.zeros_like(slopes))).sq is not None
+
+
+def noisy(seed: int, sigma: float = 12e-6, lines: float = 3e-6) -> np.ndarray:
+    """Noise (lines, rows) of each point by itself and of whole lines, m."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(0.0, sigma, (LINES, ROWS)) + rng.normal(0.0, lines, (LINES, 1))
+
+
+def test_noise_is_never_taken_for_a_surface() -> None:
+    for seed in range(24):
+        made = measure_texture(scanned(noisy(seed, sigma=60e-6, lines=20e-6)))
+        assert (made.sa, made.sq, made.sz) == (None, None, None)
+        assert made.limit is not None and made.noise is not None and made.limit > made.noise > SIGMA_FLOOR
+        assert f"below {1e3 * made.limit:.4f} mm cannot be told from the sensor" in made.reason
+
+
+def test_the_noise_is_taken_out_of_the_figures() -> None:
+    plain = told(scanned(sine(0.06e-3)))
+    off, raw = [], []
+    for seed in range(24):
+        made = measure_texture(scanned(sine(0.06e-3) + noisy(seed, sigma=60e-6, lines=0.0)))
+        assert made.sq is not None and made.noise is not None
+        off.append(made.sq / plain[1] - 1.0)
+        raw.append(np.hypot(made.sq, made.noise) / plain[1] - 1.0)
+    assert abs(np.mean(off)) < 0.01 < 0.05 < np.mean(raw)
+    assert np.abs(off).max() < 0.05
+
+
+def test_what_calibration_and_vehicle_leave_open_raises_the_limit() -> None:
+    plain, unsure, shaken = (
+        measure_texture(scanned(sine(0.03e-3), **more)) for more in ({}, {"unsure": 5e-6}, {"shaken": 0.03e-3})
+    )
+    assert plain.limit == pytest.approx(SIGMA_FLOOR, rel=0.3)
+    assert unsure.limit is not None and plain.limit is not None
+    assert np.sqrt(unsure.limit**2 - plain.limit**2) == pytest.approx(10e-6, rel=0.03)
+    assert unsure.sq == plain.sq is not None
+    assert shaken.sq is None and "cannot be told from a vehicle that rocks" in shaken.reason
+
+
+def without(given: Heights, gone: np.ndarray) -> Heights:
+    """The same with holes where `gone` (n,)."""
+    left = np.flatnonzero(~gone)
+    return replace(
+        given, places=given.places[left], heights=given.heights[left], slopes=given.slopes[left],
+        lines=given.lines[left], some=np.arange(len(left)), unsure=np.zeros((len(left), 1)),
+    )  # fmt: skip
+
+
+def test_holes_and_an_outline_that_is_no_rectangle_change_little() -> None:
+    whole = scanned(sine(0.1e-3) + noisy(1))
+    x, y = whole.places.T
+    holes = (np.abs(x - 0.02) < 0.001) & (np.abs(y - 0.01) < 0.001) | (np.hypot(x - 0.04, y - 0.02) < 0.005)
+    corner = x + y < 0.015
+    area = measure_texture(whole).area
+    assert area == pytest.approx(PITCH * (LINES - 1) * STEP * (ROWS - 1), rel=0.03)
+    made = measure_texture(without(whole, holes | corner))
+    assert made.sq == pytest.approx(told(whole)[1], rel=0.03)
+    assert made.area == pytest.approx(area - np.pi * 0.005**2 - 0.5 * 0.015**2, rel=0.03)
+
+
+def test_too_little_gives_no_figure_but_the_reason() -> None:
+    whole = scanned(sine(0.1e-3))
+    few = measure_texture(without(whole, np.arange(len(whole.lines)) >= 300))
+    assert few.reason == "300 points lie over the surface, at least 500 are needed"
+    narrow = measure_texture(without(whole, whole.places[:, 1] > 0.008))
+    assert "wide, at least 10.0 mm are needed with lines 0.50 mm apart" in narrow.reason
+    for made in (few, narrow, measure_texture(without(whole, np.ones(len(whole.lines), dtype=bool)))):
+        assert (made.sa, made.sq, made.sz, made.limit, made.measured()) == (None, None, None, None, ())
