@@ -71,8 +71,7 @@ class Surface:
 def wave(x: Floats, y: Floats, waviness: tuple[float, float, float]) -> tuple[Floats, Floats, Floats]:
     """Height, m, and slopes along x and y of a sine: amplitude and wavelength, m, and direction from x, rad."""
     amplitude, wavelength, direction = waviness
-    k = 2.0 * np.pi / wavelength if amplitude else 0.0
-    kx, ky = k * np.cos(direction), k * np.sin(direction)
+    kx, ky = (2.0 * np.pi / wavelength if amplitude else 0.0) * np.array([np.cos(direction), np.sin(direction)])
     rise = amplitude * np.cos(kx * x + ky * y)
     return amplitude * np.sin(kx * x + ky * y), rise * kx, rise * ky
 
