@@ -23,10 +23,8 @@ ALPHA = float(np.sqrt(np.log(2.0) / np.pi))
 """Of the Gaussian filter: it lets half of a wave of the cutoff's length through (ISO 16610-61)."""
 SERIES = tuple(1e-3 * v for v in (0.1, 0.2, 0.25, 0.5, 0.8, 1.0, 2.0, 2.5, 5.0, 8.0, 10.0, 20.0, 25.0, 50.0))
 """Nesting indices to choose from, m, as in ISO 25178-3."""
-LEAST_SAMPLES = 3
-"""Samples across a nesting index: what ISO 25178-3 asks of optical sensors."""
-CELLS, MOST_CELLS = 8, 1000
-"""Cells of the grid across a nesting index, and along a side of the area."""
+LEAST_SAMPLES, CELLS, MOST_CELLS = 3, 8, 1000
+"""Samples across a nesting index, as ISO 25178-3 asks of optical sensors; cells across it, and along the whole area."""
 EDGE_WEIGHT, INNER_WEIGHT = 0.4, 0.9
 """Of the filter's usual weight, from which on a cell counts, and counts for the noise: half is at a straight edge."""
 LEAST_POINTS, LEAST_WIDTH = 500, 5

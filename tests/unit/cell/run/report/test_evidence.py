@@ -6,7 +6,6 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn
 
 import cv2
 import pytest
@@ -129,7 +128,6 @@ def test_a_real_cell_has_its_own_figures(ends: Ends) -> None:
 def test_a_surface_as_drawn_shows_no_waviness(placed: Ended) -> None:
     texture, row = placed.report["scan"]["texture"], placed.report["measured"][-1]
     assert (texture["sa_mm"], texture["sq_mm"], texture["sz_mm"]) == (None, None, None)
-    # Lines 1 mm apart.
     assert texture["nesting_mm"] == 5.0 and 0.003 < texture["limit_mm"] < 0.01
     assert texture["area_mm2"] == pytest.approx(63.0 * 32.0, rel=0.1)
     assert row["name"].endswith("is less than") and row["value"] == pytest.approx(texture["limit_mm"], abs=1e-5)
@@ -148,19 +146,14 @@ def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: 
     report = read_strictly(folder / "report.json")
     texture, through = report["scan"]["texture"], 0.1 * 2.0 ** -((5.0 / 15.0) ** 2)
     assert texture["sq_mm"] == pytest.approx(through / math.sqrt(2.0), rel=0.03)
-    # The form takes a part of so few waves, and noise adds to the highest and the lowest.
-    assert texture["sz_mm"] == pytest.approx(2.0 * through, rel=0.25)
+    assert texture["sz_mm"] == pytest.approx(2.0 * through, rel=0.25)  # the form bends so few waves
     assert report["measured"][-1]["name"] == "waviness of the surface, Sq"
     assert f"Waviness over 5 mm: Sa {texture['sa_mm']:.4f} mm, Sq {texture['sq_mm']:.4f} mm" in make_page(folder)
 
 
 def test_a_waviness_that_cannot_be_told_does_not_cost_the_report(placed_pot: JobRecord, tmp_path: Path) -> None:
-    def fails(*given: object) -> NoReturn:
-        raise MemoryError("too many points")
-
-    broken = replace(placed_pot.results["reconstruct"], by_poses=fails)
+    broken = replace(placed_pot.results["reconstruct"], by_poses=None)
     record = replace(placed_pot, results={**placed_pot.results, "reconstruct": broken})
     report = report_runs.placed(record, tmp_path / "runs").report
     assert (report["outcome"], report["scan"]["texture"]) == ("placed", None)
-    assert report["texture_missing"] == "MemoryError: too many points"
-    assert texture_words(report) == ""
+    assert report["texture_missing"].startswith("TypeError: ") and texture_words(report) == ""
