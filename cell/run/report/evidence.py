@@ -7,14 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pinocchio as pin
+
 from cell.config.job import Job
-from cell.measure.inversion import PlacePose, fit_figures
+from cell.measure.inversion import NominalSurface, PlacePose, fit_figures
+from cell.measure.inversion.effects.during_sweep import find_rocking
+from cell.measure.inversion.texture import Texture, heights_over, measure_texture
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps import verify
 from cell.procedures.steps.place import PlaceResult
+from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.verify_nest import where_seen
+from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import Measured, MeasuredRow, RefusedError
 from statemachine.runner import RunResult
 from statemachine.step import Outcome
@@ -78,6 +85,17 @@ def last_frames(result: RunResult, frames: FrameStore) -> list[str]:
     if result.outcome is Outcome.PLACED:
         return []
     return [f"frames/{name}" for name in frames.recent]
+
+
+def texture_of(result: RunResult, nominal: NominalSurface) -> Texture | None:
+    """The waviness of the scanned surface, also at a place that was judged and not believed; None without a place."""
+    sweep, made, found = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
+    place = found.base_from_surface if isinstance(found, PlacePose) else RefusalEvidence.of(result).seen.get("pose")
+    if not (isinstance(sweep, SweepRecord) and isinstance(made, Reconstruction) and isinstance(place, pin.SE3)):
+        return None
+    rocking = find_rocking(made.cloud, nominal, place, sweep.times)
+    shaken = 0.0 if rocking is None else rocking.height / float(np.sqrt(2.0))
+    return measure_texture(heights_over(made.cloud, nominal, place, (made.by_calibration, made.by_poses), shaken))
 
 
 def measured(

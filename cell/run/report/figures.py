@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from cell.run.folder import Report
 from drivers.errors import MeasuredRow
 
 
@@ -31,6 +32,17 @@ def _digits(value: float | None) -> str:
     if value == int(value) and abs(value) < 1e6:
         return f"{value:.0f}"
     return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
+
+
+def texture_words(report: Report) -> str:
+    """The waviness of the scanned surface, as `scan.texture` of a report has it, for people; "" without it."""
+    texture = (report.get("scan") or {}).get("texture")
+    if not texture:
+        return ""
+    if texture["sq_mm"] is None:
+        return f"no waviness told: {texture['reason']}"
+    sizes = ", ".join(f"{name.capitalize()} {texture[f'{name}_mm']:.4f} mm" for name in ("sa", "sq", "sz"))
+    return f"waviness over {texture['nesting_mm']:g} mm: {sizes} (limit of Sq {texture['limit_mm']:.4f} mm)"
 
 
 SHOWN_UNITS = {"m": (1e3, "mm"), "rad": (1e3, "mrad"), "rad/m": (1e3, "mrad/m"), "s": (1e6, "us")}

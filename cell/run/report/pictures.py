@@ -33,7 +33,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.folder import Report
 from cell.run.report.evidence import RefusalEvidence, ended_in, seen_placed
-from cell.run.report.figures import simulated_words, told
+from cell.run.report.figures import simulated_words, texture_words, told
 from drivers.interfaces import Frame, Image, Vector
 from statemachine.runner import RunResult
 
@@ -105,8 +105,9 @@ def draw_board(axes: Axes, board: BoardPanel) -> None:
 
 
 def draw_surface(
-    figure: Figure, axes: Axes, surface: SurfacePanel, span_mm: float, seams: Sequence[Mapping[str, object]]
-) -> None:
+    figure: Figure, axes: Axes, surface: SurfacePanel, span_mm: float, seams: Sequence[Mapping[str, object]],
+    waviness: Sequence[str] = (),
+) -> None:  # fmt: skip
     """A map of the scanned points from above, means over squares: their deviation from the drawn surface within
     ±`span_mm`, or their height where no place of the surface was found."""
     points = 1e3 * surface.points
@@ -125,6 +126,7 @@ def draw_surface(
     said = "deviation from the drawn surface" if surface.believed else "deviation at the place that was refused"
     rms = float(np.sqrt(np.mean(deviation[on] ** 2))) if on.any() else float("nan")
     title = [f"{said}: {rms:.3f} mm RMS" + ("" if on.all() else "; dark: beside it"), *map(seam_words, seams)]
+    title += waviness
     if surface.flush is not None:
         x, y, _ = 1e3 * surface.flush.places.T
         axes.scatter(
@@ -266,6 +268,8 @@ COMPRESSION = 3
 """Of the picture's file, 0 to 9: the default, 6, takes twice as long for a file that is a fifth smaller."""
 TITLE_LINE = 0.17 / HEIGHT
 """Height of a line of a panel's title, which a seam needs each."""
+TITLE_COLUMNS = 84
+"""Of the map's title."""
 
 
 def draw_run(
@@ -286,18 +290,19 @@ def draw_run(
     if surface is not None and seen is not None and job.nest is None:
         surface = replace(surface, flush=seen.flush, features=seen.features)
     more = 0 if surface is None else (surface.flush is not None) + bool(surface.features)
+    waviness = textwrap.wrap(texture_words(report), TITLE_COLUMNS)
     left, *middle, right = figure.subplots(
         1,
         2 + scanned,
         width_ratios=[1.0, 1.3, 1.0] if scanned else [1.5, 1.0],
-        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * (len(seams) + more)},
+        gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * (len(seams) + more + len(waviness))},
     )
     if board is None:
         empty(left, "the board", "not photographed")
     else:
         draw_board(left, board)
     if surface is not None:
-        draw_surface(figure, middle[0], surface, SCALE_SHARE * 1e3 * job.place.tolerance, seams)
+        draw_surface(figure, middle[0], surface, SCALE_SHARE * 1e3 * job.place.tolerance, seams, waviness=waviness)
     elif stripe is not None:
         draw_stripe(middle[0], stripe)
     if report["outcome"] == "placed":

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.mesh import Mesh
+from sim_backends.world.bodies import surfaces
 from sim_backends.world.bodies.surfaces import OwnSurface, Surface, SurfaceMesh, own_surface, part_mesh, underside
 from sim_backends.world.bodies.surfaces import mesh as drawn_mesh
 from sim_backends.world.bodies.surfaces import surface as named_surface
@@ -36,11 +37,13 @@ class Station:
     def of(cls, drawn: StationDrawing) -> Station:
         """The station as drawn. Raises ValueError for an unknown surface or a file that is no mesh."""
         if not drawn.mesh:
-            ground, seen = named_surface(drawn.surface), _closed_form(drawn.surface)
+            ground, seen = named_surface(drawn.surface), _closed_form(drawn.surface, drawn.waviness)
         else:
             table = _plane(inverse(drawn.place_from_surface))
             own = own_surface(drawn.mesh, drawn.mesh_unit)
-            ground, seen = replace(own.ground, table=table), _own(own, table)
+            ground, seen = replace(own.ground, table=table), _own(own, table, drawn.waviness)
+        if drawn.waviness[0]:
+            ground = surfaces.waved(ground, drawn.waviness)
         (x, y), low = ground.centre, min(0.0, float(seen.low[0, 2]))
         reach = np.hypot(abs(x) + ground.half_x, abs(y) + ground.half_y)
         room = max(0.015, ground.top, -low)
@@ -56,15 +59,20 @@ def _plane(surface_from_place: NDArray[np.float64]) -> tuple[float, float, float
 
 
 @lru_cache(maxsize=_KEPT)
-def _closed_form(name: str) -> Mesh:
-    made = drawn_mesh(name)
-    return Mesh(made.vertices, made.triangles)
+def _closed_form(name: str, waviness: tuple[float, float, float]) -> Mesh:
+    return _waved(drawn_mesh(name), waviness)
 
 
 @lru_cache(maxsize=_KEPT)
-def _own(own: OwnSurface, table: tuple[float, float, float]) -> Mesh:
-    made = own.walled(table)
-    return Mesh(made.vertices, made.triangles)
+def _own(own: OwnSurface, table: tuple[float, float, float], waviness: tuple[float, float, float]) -> Mesh:
+    return _waved(own.walled(table), waviness)
+
+
+def _waved(made: SurfaceMesh, waviness: tuple[float, float, float]) -> Mesh:
+    """As seen, with its waviness; the feet of the sides move with it, below what is looked at."""
+    vertices = made.vertices.copy()
+    vertices[:, 2] += surfaces.wave(vertices[:, 0], vertices[:, 1], waviness)[0]
+    return Mesh(vertices, made.triangles)
 
 
 @lru_cache(maxsize=_KEPT)

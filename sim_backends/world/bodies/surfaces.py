@@ -9,7 +9,7 @@ is above each place, from a raster fine enough that what lies between its points
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from hashlib import sha256
 from pathlib import Path
@@ -66,6 +66,24 @@ class Surface:
     def height(self, x: Floats, y: Floats) -> Floats:
         """Height (n,), m, of the surface at x, y (n,) in S; outside the footprint that of the table, 0."""
         return self.sample(x, y)[0]
+
+
+def wave(x: Floats, y: Floats, waviness: tuple[float, float, float]) -> tuple[Floats, Floats, Floats]:
+    """Height, m, and slopes along x and y of a sine: amplitude and wavelength, m, and direction from x, rad."""
+    amplitude, wavelength, direction = waviness
+    kx, ky = (2.0 * np.pi / wavelength if amplitude else 0.0) * np.array([np.cos(direction), np.sin(direction)])
+    rise = amplitude * np.cos(kx * x + ky * y)
+    return amplitude * np.sin(kx * x + ky * y), rise * kx, rise * ky
+
+
+def waved(plain: Surface, waviness: tuple[float, float, float]) -> Surface:
+    """The height field with a sine on it, see `wave`."""
+
+    def relief(x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+        (h, gx, gy), (rise, by_x, by_y) = plain.relief(x, y), wave(x, y, waviness)
+        return h + rise, gx + by_x, gy + by_y
+
+    return replace(plain, relief=relief, top=plain.top + waviness[0])
 
 
 # Wave vectors (rad/m), phases (rad) and amplitudes (m) of the pot's relief; no two vectors are parallel, so that no

@@ -25,6 +25,7 @@ from cell.measure.reconstruction.ply import read_cloud
 from cell.procedures.steps.sought_part import UNLOAD
 from cell.run.folder import Report
 from cell.run.report.evidence import CLOUD
+from cell.run.report.figures import texture_words
 from cell.run.report.pictures import SCALE_SHARE, frame_map, square_means
 from drivers.errors import CellError
 from drivers.interfaces import Vector
@@ -59,7 +60,7 @@ class SurfaceView:
     """What a page shows of a cloud: the `map` as PNG, and `cloud`, the points of the 3-D view for `cloud.js`.
 
     `compared` tells whether it is coloured by deviations, ± `span_mm`; else it is by height, and `why` says why.
-    `stops` are the scale's colours for CSS.
+    `stops` are the scale's colours for CSS. `waviness` are words for what is told of it, "" without.
     """
 
     map: bytes
@@ -68,6 +69,7 @@ class SurfaceView:
     why: str
     span_mm: float
     stops: Sequence[str]
+    waviness: str
 
 
 def surface_view(folder: Path, report: Report) -> SurfaceView | None:
@@ -81,7 +83,7 @@ def surface_view(folder: Path, report: Report) -> SurfaceView | None:
     stops = [f"rgb({r},{g},{b})" for r, g, b in _palette(compared)[:SHADES:15]]
     return SurfaceView(
         map=map_picture(scan, span), cloud=view_data(scan, span), compared=compared, why=scan.why, span_mm=span,
-        stops=stops,
+        stops=stops, waviness=texture_words(report),
     )  # fmt: skip
 
 

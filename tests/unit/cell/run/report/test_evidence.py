@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import pytest
 
+from cell.devices.simulated.direct import VirtualCell
 from cell.measure.reconstruction.ply import read_cloud
+from cell.run.report.figures import texture_words
+from cell.run.report.page.make import make_page
 from drivers.errors import Measured, RefusedError
+from lab.bench.job.whole_job import JobRecord, run_whole_job
+from sim_backends.world.bodies.station import Station
 from tests.support import report_runs
-from tests.support.report_runs import Ended, Ends, Make, read_strictly
+from tests.support.report_runs import Ended, Ends, Make, pot, read_strictly
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +123,37 @@ def test_a_real_cell_has_its_own_figures(ends: Ends) -> None:
         "fit, χ²/dof",
         "surface covered",
     ]
+
+
+def test_a_surface_as_drawn_shows_no_waviness(placed: Ended) -> None:
+    texture, row = placed.report["scan"]["texture"], placed.report["measured"][-1]
+    assert (texture["sa_mm"], texture["sq_mm"], texture["sz_mm"]) == (None, None, None)
+    assert texture["nesting_mm"] == 5.0 and 0.003 < texture["limit_mm"] < 0.01
+    assert texture["area_mm2"] == pytest.approx(63.0 * 32.0, rel=0.1)
+    assert row["name"].endswith("is less than") and row["value"] == pytest.approx(texture["limit_mm"], abs=1e-5)
+    assert texture_words(placed.report) == f"no waviness told: {texture['reason']}"
+
+
+def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: Path) -> None:
+    def waved(cell: VirtualCell) -> None:
+        drawing = cell.world.scene.drawing
+        station = replace(drawing.station, waviness=(0.1e-3, 0.015, 0.25 * math.pi))
+        cell.world.remake(replace(cell.world.scene, drawing=replace(drawing, station=station)), Station.of(station))
+
+    given = (report_runs.CONFIG, *pot(), 2, "nominal")
+    folder = run_whole_job(*given, calibrated=placed_pot, runs=tmp_path, changed=waved).folder
+    assert folder is not None
+    report = read_strictly(folder / "report.json")
+    texture, through = report["scan"]["texture"], 0.1 * 2.0 ** -((5.0 / 15.0) ** 2)
+    assert texture["sq_mm"] == pytest.approx(through / math.sqrt(2.0), rel=0.03)
+    assert texture["sz_mm"] == pytest.approx(2.0 * through, rel=0.25)  # the form bends so few waves
+    assert report["measured"][-1]["name"] == "waviness of the surface, Sq"
+    assert f"Waviness over 5 mm: Sa {texture['sa_mm']:.4f} mm, Sq {texture['sq_mm']:.4f} mm" in make_page(folder)
+
+
+def test_a_waviness_that_cannot_be_told_does_not_cost_the_report(placed_pot: JobRecord, tmp_path: Path) -> None:
+    broken = replace(placed_pot.results["reconstruct"], by_poses=None)
+    record = replace(placed_pot, results={**placed_pot.results, "reconstruct": broken})
+    report = report_runs.placed(record, tmp_path / "runs").report
+    assert (report["outcome"], report["scan"]["texture"]) == ("placed", None)
+    assert report["texture_missing"].startswith("TypeError: ") and texture_words(report) == ""

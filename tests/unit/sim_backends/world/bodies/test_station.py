@@ -11,7 +11,7 @@ import pytest
 from lab.bench.job.part_jobs import job_with_part
 from sim_backends.world.bodies.station import Station
 from sim_backends.world.bodies.surfaces import surface
-from sim_backends.world.drawing import STOCK
+from sim_backends.world.drawing import STOCK, read, settled
 
 
 def test_the_underside_of_a_part_is_that_of_its_mesh(tmp_path: Path) -> None:
@@ -28,3 +28,19 @@ def test_the_underside_of_a_part_is_that_of_its_mesh(tmp_path: Path) -> None:
 def test_a_mesh_that_is_none_is_told_by_its_path(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"none\.stl cannot be read"):
         Station.of(replace(STOCK.station, part_mesh=str(tmp_path / "none.stl")))
+
+
+def test_a_wave_lies_on_what_is_felt_and_on_what_is_seen() -> None:
+    drawn = replace(STOCK, station=replace(STOCK.station, waviness=(0.1e-3, 0.012, 0.5)))
+    plain, waved = Station.of(STOCK.station), Station.of(read(settled(drawn, STOCK).as_json()).station)
+
+    def rise(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.asarray(0.1e-3 * np.sin(2.0 * np.pi / 0.012 * (np.cos(0.5) * x + np.sin(0.5) * y)))
+
+    x, y = np.random.default_rng(1).uniform(-0.015, 0.015, (2, 500))
+    height, *slopes = np.subtract(waved.ground.relief(x, y), plain.ground.relief(x, y))
+    np.testing.assert_allclose(height, rise(x, y), atol=1e-12)
+    expected = [rise(x + 1e-7, y) - rise(x, y), rise(x, y + 1e-7) - rise(x, y)]
+    np.testing.assert_allclose(slopes, np.array(expected) / 1e-7, atol=1e-4)
+    x, y, z = plain.seen.vertices.T
+    np.testing.assert_allclose(waved.seen.vertices[:, 2] - z, rise(x, y), atol=1e-12)
