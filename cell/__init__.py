@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from cell.procedures.steps.reconstruct import Reconstruction
     from cell.procedures.steps.workplace import JobStep
     from cell.procedures.sweep.stored_sweep import SweepRecord
+    from cell.run.batch import BatchOutcome, BatchPart, Distribution
     from cell.run.events import (
         Confirmed,
         ConfirmNeeded,
@@ -73,6 +74,7 @@ if TYPE_CHECKING:
 _PLACES = {
     "cell.run.session.supervisor": ("Cell",),
     "cell.run.job_run": ("RunOutcome",),
+    "cell.run.batch": ("BatchOutcome", "BatchPart", "Distribution"),
     "cell.run.runs": ("Run",),
     "cell.run.events": (
         "ConfirmNeeded", "Confirmed", "FaultMet", "GoesOn", "Held", "Noted", "RunEnded", "RunEvent", "SafeStopped",
@@ -103,8 +105,10 @@ _PLACES = {
 }  # fmt: skip
 
 __all__ = [
-    "PLACE", "Aborted", "Again", "ArmConfig", "ArmOutputClawConfig", "BoardFix", "CalibrationStale", "CameraConfig",
+    "PLACE", "Aborted", "Again", "ArmConfig", "ArmOutputClawConfig", "BatchOutcome", "BatchPart", "BoardFix",
+    "CalibrationStale", "CameraConfig",
     "Cell", "CellError", "ClawConfig", "ConfigError", "ConfirmNeeded", "Confirmed", "DeadlineError", "DeviceError",
+    "Distribution",
     "DeviceFault", "FaultMet", "GoesOn", "Held", "InterlockError", "Interrupted", "JobStep", "Kind", "LaserConfig",
     "LimitError", "Make", "MisplacedError", "NotConnectedError", "NotObservable", "Noted", "OnArm", "PlacePose",
     "PlaceResult", "PlacedPart",
