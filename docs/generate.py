@@ -183,7 +183,9 @@ def job_toml() -> str:
     pot = load_job("pot")[0]
     place = pot.place.model_copy(update={"accept": pot.place.tolerance})
     # What the shipped job leaves out is told in the job that `cell new-job` writes.
-    told = comments(job_text(pot.model_copy(update={"part": part, "place": place, "batch": BatchSection()}), []))
+    told = comments(
+        job_text(pot.model_copy(update={"part": part, "place": place, "batch": BatchSection(on_refusal="skip")}), [])
+    )
     told |= comments(job_path("pot").read_text(encoding="utf-8"))
     text, models = "# job.toml\n\n" + NOTE, list(records(Job))
     text += '`cell new-job` writes such a file for a mesh. Every quantity carries its unit, such as `"35 mm"`.\n\n'

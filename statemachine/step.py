@@ -206,10 +206,9 @@ class StepContext:
         self.check()
         self._tell(Event("progress", self.step.name, {"fraction": fraction, "text": text}))
 
-    def ask(self, what: str, code: str) -> str:
-        """Wait, however long, for a person's word about `what`; who gave it. Nothing may move. Raises like `check`."""
-        number = self._control.ask(what)
-        about = {"reason": what, "code": code, "number": number}
+    def ask(self, what: str) -> None:
+        """Wait, however long, for a person's word about `what`. Nothing may move meanwhile. Raises like `check`."""
+        about = {"reason": what, "code": self.step.name, "number": self._control.ask(what)}
         self._tell(Event("confirm_needed", self.step.name, about))
         try:
             while (by := self._control.answer()) is None:
@@ -219,7 +218,7 @@ class StepContext:
         finally:
             self._control.asked_no_more()
         self._tell(Event("confirmed", self.step.name, {"by": by, "reason": what}))
-        return by
+        self.safe_point()
 
     def note(self, **data: object) -> None:
         """Write something worth keeping to the journal and tell the observer."""

@@ -204,14 +204,14 @@ class Job(Table):
     grasp: GraspSection
     place: PlaceSection
     part: PartSection | None = None
-    batch: BatchSection | None = None
+    batch: BatchSection = BatchSection()
     obstacle: tuple[StationObstacle, ...] = ()
 
     @model_serializer(mode="wrap")
     def _written(self, written: SerializerFunctionWrapHandler) -> dict[str, object]:
-        """Without `batch` where nothing is said of it: what rests on a job's content stays as it was."""
+        """Without the default `batch`: what rests on a job's content stays as it was."""
         tables: dict[str, object] = written(self)
-        return {name: table for name, table in tables.items() if name != "batch" or table is not None}
+        return {name: table for name, table in tables.items() if name != "batch" or self.batch != BatchSection()}
 
     @model_validator(mode="after")
     def _distinct_obstacles(self) -> Self:

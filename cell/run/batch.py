@@ -8,60 +8,27 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean, stdev
+from typing import Self
 
 from cell.base.storage import sealed, write_json
-from cell.devices.devices import require_no_emergency_stop
+from cell.config.job import Job
 from cell.devices.simulated.process import is_whole
-from cell.run.folder import Report, when
-from cell.run.job_run import RunOutcome
-from cell.run.recorded_work import Hands, RecordedWork
-from cell.run.runs import Run
+from cell.run.folder import Report
+from cell.run.job_run import Observer, RunOutcome
+from cell.run.recorded_work import Hands
 from cell.run.session.session import Opened
 from drivers.errors import CellError, ConfigError, DeviceFault, Interrupted
-from drivers.interfaces import Claw
+from statemachine.step import Event
 
 MOST_PARTS = 1_000_000
 GOOD = ("placed", "done")
 """The ends of a part that was neither refused nor failed."""
 COUNTED = ("placed", "corrected", "refused", "misplaced", "faulted", "aborted")
-NEXT_PART = "batch.next_part"
-"""The code of the questions between two parts."""
-
-
-@dataclass(frozen=True)
-class BatchPart:
-    """A part of a batch, counted from 1: how the run of this name ended, and its figures by name, each with its unit.
-
-    `part` is what has become of it: held, released or unknown. `corrections` counts how often it was placed again.
-    """
-
-    number: int
-    outcome: str
-    reason: str
-    run: str
-    part: str
-    corrections: int
-    figures: Mapping[str, tuple[float, str]]
-
-    @classmethod
-    def of(cls, number: int, outcome: RunOutcome) -> BatchPart:
-        """As its run reports it."""
-        report = outcome.report
-        seen: Report = next((s["result"] for s in report.get("steps") or () if s["name"] == "verify"), None) or {}
-        found: dict[str, tuple[float, str]] = {"cycle time": (report["cell_s"], "s")}
-        if seen:
-            found["placed part off its place, as seen"] = (seen["off_mm"], "mm")
-            found["corrections"] = (len(seen["before_mm"]), "")
-        if seen.get("gap"):
-            found["gap, median"] = (seen["gap"]["median_mm"], "mm")
-        rows = (row for row in report.get("measured") or () if row["value"] is not None)
-        found |= {row["name"]: (row["value"], row["unit"]) for row in rows}
-        state, corrections = str(report.get("part", "unknown")), len(seen.get("before_mm", ()))
-        return cls(number, outcome.outcome, outcome.reason, outcome.folder.name, state, corrections, figures=found)
 
 
 @dataclass(frozen=True)
@@ -79,36 +46,34 @@ class Distribution:
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """What came of a batch of `count` parts: those that were tried, and why it ended. `file` has it as JSON.
+    """What came of a batch of `count` parts: the `runs` of those that were tried, and why it ended; `file` keeps it.
 
-    `interrupted` says that a signal has ended it. `ended` is None while it goes on.
+    `interrupted` says that a signal has ended it.
     """
 
     job: str
     count: int
     file: Path
-    started: str
-    ended: str | None
-    reason: str
-    interrupted: bool
-    parts: tuple[BatchPart, ...]
+    reason: str = "not ended, or its process died"
+    interrupted: bool = False
+    runs: tuple[RunOutcome, ...] = ()
 
     @property
     def counts(self) -> dict[str, int]:
         """How many parts ended how; one that was placed again before it was good counts as corrected, not as placed."""
         found = dict.fromkeys(COUNTED, 0)
-        for part in self.parts:
-            good = "corrected" if part.corrections else "placed"
-            found[good if part.outcome in GOOD else part.outcome] += 1
-        return {**found, "not tried": self.count - len(self.parts)}
+        for run in self.runs:
+            good = "corrected" if _seen(run.report).get("before_mm") else "placed"
+            found[good if run.outcome in GOOD else run.outcome] += 1
+        return {**found, "not tried": self.count - len(self.runs)}
 
     @property
     def figures(self) -> tuple[Distribution, ...]:
         """How each figure of the placed parts is distributed."""
         found: dict[tuple[str, str], list[float]] = {}
-        for part in self.parts:
-            for name, (value, unit) in part.figures.items() if part.outcome in GOOD else ():
-                found.setdefault((name, unit), []).append(value)
+        for run in self.runs:
+            for which, value in figures(run.report).items() if run.outcome in GOOD else ():
+                found.setdefault(which, []).append(value)
         return tuple(
             Distribution(*which, len(of), fmean(of), stdev(of) if len(of) > 1 else None, min=min(of), max=max(of))
             for which, of in found.items()
@@ -120,108 +85,96 @@ class BatchOutcome:
         return 130 if self.interrupted else int(self.counts["placed"] + self.counts["corrected"] < self.count)
 
     def as_dict(self) -> dict[str, object]:
-        """JSON-ready."""
-        figures = [asdict(figure) for figure in self.figures]
-        return {**asdict(self), "file": self.file.name, "counts": self.counts, "figures": figures}
+        """JSON-ready; the runs by their names."""
+        return {
+            "job": self.job, "count": self.count, "reason": self.reason, "interrupted": self.interrupted,
+            "counts": self.counts, "figures": [asdict(figure) for figure in self.figures],
+            "runs": [{"run": run.folder.name, "outcome": run.outcome, "reason": run.reason} for run in self.runs],
+        }  # fmt: skip
+
+    def kept(self) -> Self:
+        """Itself, also in its file."""
+        write_json(self.file, sealed(self.as_dict()))
+        return self
 
 
-@dataclass(eq=False)
-class BatchWork:
-    """A batch at work: `run(number)` does a part's run, `between(work)` what is done between two parts, and waits.
+def _seen(report: Report) -> Report:
+    """Where the placed part was seen; empty where nobody looked."""
+    return next((step["result"] or {} for step in report.get("steps") or () if step["name"] == "verify"), {})
 
-    `on_part` is told each part, with the batch so far. `on_refusal` is the job's.
+
+def figures(report: Report) -> dict[tuple[str, str], float]:
+    """What parts of one job are compared by, by name and unit."""
+    seen = _seen(report)
+    found = {("cycle time", "s"): report["cell_s"]}
+    if seen:
+        found[("placed part off its place, as seen", "mm")] = seen["off_mm"]
+        found[("corrections", "")] = len(seen["before_mm"])
+    if seen.get("gap"):
+        found[("gap, median", "mm")] = seen["gap"]["median_mm"]
+    return found | {(row["name"], row["unit"]): row["value"] for row in report["measured"] if row["value"] is not None}
+
+
+def require_count(count: int) -> None:
+    """`ConfigError` for a batch of so many parts."""
+    if not 1 <= count <= MOST_PARTS:
+        raise ConfigError(f"a batch of {count} parts is none (allowed: 1 to {MOST_PARTS}); give another count")
+
+
+def perform(
+    here: Opened, job: Job, count: int, run: Callable[[int], RunOutcome],
+    between: Callable[[Callable[[Hands], None]], None], observer: Observer | None,
+) -> BatchOutcome:  # fmt: skip
+    """Do a batch: `run(number)` a part, `between(work)` what a person is asked before the next one; both wait.
+
+    `observer` is told each part's end. Raises what keeps the first part from being begun, or is no error of the cell.
     """
-
-    here: Opened
-    job: str
-    count: int
-    on_refusal: str
-    run: Callable[[int], RunOutcome]
-    between: Callable[[Callable[[Run[None]], None]], None]
-    on_part: Callable[[BatchPart, BatchOutcome], None]
-    _parts: list[BatchPart] = field(default_factory=list)
-    _started: float = field(default_factory=time.time)
-    _id: str = field(default_factory=lambda: f"batch-{time.strftime('%Y%m%dT%H%M%S')}-{secrets.token_hex(2)}")
-
-    def perform(self) -> BatchOutcome:
-        """Do it. Raises what keeps the first part from being begun; later a signal or what `on_part` raises alone."""
-        if not 1 <= self.count <= MOST_PARTS:
-            raise ConfigError(f"a batch of {self.count} parts is none (allowed: 1 to {MOST_PARTS}); give another count")
-        why, interrupted = "", False
-        try:
-            while not why and len(self._parts) < self.count:
-                why, interrupted = self._part(len(self._parts) + 1)
-        except BaseException as error:
-            if not self._parts:
-                raise
-            signal = isinstance(error, Interrupted) or not isinstance(error, Exception)
-            outcome = self._kept(f"after part {len(self._parts)}: {str(error) or type(error).__name__}", signal)
-            if not isinstance(error, CellError):
-                raise
-            return outcome
-        return self._kept(why or "every part was tried", interrupted)
-
-    def _part(self, number: int) -> tuple[str, bool]:
-        """Do the next part: why the batch ends after it, or nothing, and whether a signal came."""
-        if number > 1:
-            self._ask(number)
-        outcome = self.run(number)
-        part = BatchPart.of(number, outcome)
-        self._parts.append(part)
-        self.on_part(part, self._kept(None))
-        # Nobody knows how a part lies that is down and was refused.
-        skipped = part.outcome == "refused" and part.part == "held" and self.on_refusal != "end"
-        if outcome.interrupted or outcome.stopped_after_end or not (part.outcome in GOOD or skipped):
-            return f"part {number} {part.outcome}: {part.reason}", outcome.interrupted
-        return "", False
-
-    def _kept(self, why: str | None, interrupted: bool = False) -> BatchOutcome:
-        """The batch so far, also in its file; with `why` it has ended."""
-        ended, reason = (None, "not ended, or its process died") if why is None else (when(time.time()), why)
-        outcome = BatchOutcome(
-            self.job, self.count, self.here.runs_folder / f"{self._id}.json", when(self._started), ended,
-            reason=reason, interrupted=interrupted, parts=tuple(self._parts),
-        )  # fmt: skip
-        write_json(outcome.file, sealed(outcome.as_dict()))
-        return outcome
-
-    def _ask(self, number: int) -> None:
-        """Ask a person, in a run of its own, whether to go on after a refusal, and at a real cell for the next part."""
-        here, last, simulated = self.here, self._parts[-1], self.here.simulated
-        refused = last.outcome == "refused" and self.on_refusal == "ask" and here.config.cell.confirm != "simulated"
-        by_hand = not is_whole(simulated)
-
-        def work(hands: Hands) -> None:
-            if refused:
-                hands.ask(f"part {last.number} was refused: {last.reason}. Go on with part {number}?", NEXT_PART)
-            if by_hand:
-                filled = simulated is not None and "claw" in simulated.simulated
-                load(hands, None if filled else here.devices.claw, f"part {number} of {self.count}")
-
-        def recorded(run: Run[None]) -> None:
-            facts = {**here.facts, "batch": self._id, "number": number}
-            # Who reaches into the cell opens its guard: only an emergency stop ends this.
-            health = require_no_emergency_stop
-            RecordedWork(run, "loading", here.devices, here.runs_folder, facts, health=health).perform(work)
-
-        if refused or by_hand:
-            self.between(recorded)
+    require_count(count)
+    name = f"batch-{time.strftime('%Y%m%dT%H%M%S')}-{secrets.token_hex(2)}.json"
+    batch, why, interrupted = BatchOutcome(job.job.name, count, here.runs_folder / name), "", False
+    try:
+        while not why and len(batch.runs) < count:
+            number, last = len(batch.runs) + 1, batch.runs[-1] if batch.runs else None
+            if last is not None and (work := _question(here, job, f"part {number} of {count}", last)) is not None:
+                between(work)
+            last = run(number)
+            # What its steps made is large, and in its folder.
+            batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).kept()
+            if observer is not None:
+                counts = ", ".join(f"{n} {name}" for name, n in batch.counts.items() if n)
+                line = f"part {number} of {count}  {last}; {last.report['cell_s']:.0f} s, {last.folder.name} · {counts}"
+                observer(Event("note", None, {"text": line}))
+            interrupted = last.interrupted
+            why = "" if _goes_on(job, last) else f"part {number} {last}"
+    except CellError as error:
+        if not batch.runs:
+            raise
+        why, interrupted = f"after part {len(batch.runs)}: {error}", isinstance(error, Interrupted)
+    return replace(batch, reason=why or "every part was tried", interrupted=interrupted).kept()
 
 
-def load(hands: Hands, claw: Claw | None, part: str) -> None:
-    """Have a person put `part` into the claw, which closes once that is confirmed, and then clear the arm's way.
+def _goes_on(job: Job, run: RunOutcome) -> bool:
+    """Whether the next part comes after this run. Nobody knows how a part lies that is down and was refused."""
+    skipped = run.outcome == "refused" and run.report.get("part") == "held" and job.batch.on_refusal != "end"
+    return (run.outcome in GOOD or skipped) and not run.interrupted and not run.stopped_after_end
 
-    Without a `claw` the simulated world fills it.
-    """
-    why = ""
-    while claw is not None and not claw.holding:
-        hands.ask(f"{why}Hold {part} between the claw's fingers: the claw closes on it", NEXT_PART)
-        try:
-            if not claw.holding:
-                claw.grip()
-        except DeviceFault as error:
+
+def _question(here: Opened, job: Job, part: str, last: RunOutcome) -> Callable[[Hands], None] | None:
+    """What asks a person whether to go on after a refusal, and at a cell with real devices for the next part."""
+    claw, simulated = here.devices.claw, here.simulated
+    by_hand, filled = not is_whole(simulated), simulated is not None and "claw" in simulated.simulated
+    refused = last.outcome == "refused" and job.batch.on_refusal == "ask" and here.config.cell.confirm != "simulated"
+
+    def work(hands: Hands) -> None:
+        if refused:
+            hands.ask(f"The last part was {last}. Go on with {part}?")
+        while by_hand and not (filled or claw.holding):
             claw.release()
-            why = f"{error} "
-    ready = "take away what was placed, prepare the next place, and step back: the arm moves next"
-    hands.ask(f"The claw holds {part}; {ready}", NEXT_PART)
-    hands.safe_point()
+            hands.ask(f"Hold {part} between the claw's fingers: the claw closes on it")
+            with suppress(DeviceFault):
+                claw.grip()
+        if by_hand:
+            ready = "take away what was placed, prepare the next place, and step back: the arm moves next"
+            hands.ask(f"The claw holds {part}; {ready}")
+
+    return work if refused or by_hand else None

@@ -121,15 +121,14 @@ log = logging.getLogger(__name__)
 class Hands:
     """What work is given to be held by: `check` raises once it is to end, `safe_point` also holds it when paused.
 
-    `keep(what, frame)` leaves a picture that the work looked at in the run's folder. `ask(what, code)` waits for a
-    person's word.
+    `keep(what, frame)` leaves a picture that the work looked at in the run's folder. `ask(what)` waits for a person.
     """
 
     check: Callable[[], None]
     safe_point: Callable[[], None]
     progress: Callable[[float, str], None]
     keep: Callable[[str, Frame], None]
-    ask: Callable[[str, str], str]
+    ask: Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)

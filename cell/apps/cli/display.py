@@ -16,6 +16,7 @@ from rich.console import Console
 
 from cell.apps.cli.options import new_table
 from cell.config.files import DEVICES
+from cell.run.batch import BatchOutcome
 from cell.run.folder import wall_seconds
 from cell.run.report.figures import following_words, noise_rows, shown_limit, shown_value, simulated_words
 from drivers.errors import MeasuredRow
@@ -238,6 +239,18 @@ def print_late(report: Mapping[str, object]) -> None:
     part = "the part had been placed" if report["outcome"] == "placed" else f"the run had ended {report['outcome']}"
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     console.print(f"interrupted after {part}", style="bold magenta", markup=False)
+
+
+def print_batch(batch: BatchOutcome) -> None:
+    """What came of a batch: each figure of the placed parts, how many parts ended how, and why it ended."""
+    console = Console(highlight=False)
+    table = new_table("placed parts", "figure", ">n", ">mean", ">sd", ">min", ">max", "unit")
+    for row in batch.figures:
+        numbers = ("" if value is None else f"{value:.4g}" for value in (row.mean, row.sd, row.min, row.max))
+        table.add_row(row.name, str(row.n), *numbers, row.unit)
+    console.print(table)
+    counts = ", ".join(f"{number} {name}" for name, number in batch.counts.items())
+    console.print(f"{counts}: {batch.reason}\nbatch     {_from_here(batch.file)}", markup=False, soft_wrap=True)
 
 
 def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:

@@ -26,8 +26,9 @@ from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.verification import Verification
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.steps.kinds import kind_of
+from cell.run import batch as batches
 from cell.run import calibration as sessions
-from cell.run.batch import BatchOutcome, BatchPart, BatchWork
+from cell.run.batch import BatchOutcome
 from cell.run.calibration import recorded_maintenance
 from cell.run.folder import find_run
 from cell.run.job_run import JobWork, Observer, ReadyJob, RunOutcome
@@ -316,28 +317,25 @@ class Cell:
 
     def run_batch(
         self, job: str | Path = "pot", count: int = 1, observer: Observer | None = None, inject: Sequence[str] = (), *,
-        at_start: bool = False, on_part: Callable[[BatchPart, BatchOutcome], None] = lambda part, batch: None,
+        at_start: bool = False,
     ) -> BatchOutcome:  # fmt: skip
         """`run` a job for `count` parts, 1 to 1000000, one after another, and wait for the end of the batch.
 
-        A simulated cell's claw is filled again for each part. At a real one the run before each further part waits for
-        a person's word that the claw is filled: an `observer` sees `confirm_needed`, and `Run.confirm` answers.
-        Only a refusal before the part is put down can be gone on after, as `batch.on_refusal` of the job says.
+        A simulated cell's claw is filled again for each part. At a real cell a person is asked for each further part:
+        the `observer` sees `confirm_needed`, and `current.confirm` or `cell confirm` answers.
 
         Args:
-            job, observer, inject: As in `start`, for every part.
+            job, observer, inject: As in `start`, for every part; the observer is also told each part's end, as a note.
             at_start: As in `start`, for the first part.
-            on_part: Called after each part with the batch so far; what it raises ends the batch.
 
         Raises:
             CellError: What keeps the first part from being begun.
         """
-        loaded, _ = load_job(job)
-        return BatchWork(
-            self._here, loaded.job.name, count, loaded.batch.on_refusal if loaded.batch else "end",
+        return batches.perform(
+            self._here, load_job(job)[0], count,
             run=lambda number: self.run(job, observer, inject, at_start=at_start and number == 1),
-            between=lambda work: self.begin("loading", work, observer).result(), on_part=on_part,
-        ).perform()  # fmt: skip
+            between=lambda work: self.perform("loading", work, observer), observer=observer,
+        )  # fmt: skip
 
     def resume(
         self, run: str | Path | None = None, observer: Observer | None = None, *, at_start: bool = False,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.config.job import job_path, load_job, shipped_jobs
+from cell.config.job import Job, job_path, load_job, shipped_jobs
 from drivers.errors import ConfigError
 
 
@@ -35,3 +35,15 @@ def test_the_job_of_the_present_folder_wins_over_the_one_that_ships(
     Path("pot.toml").write_text(shipped.read_text())
     assert job_path("pot") == Path("pot.toml")
     assert job_path(shipped) == shipped
+
+
+def test_a_job_that_says_nothing_of_batches_is_written_as_before(tmp_path: Path) -> None:
+    shipped, text = job_path("pot"), job_path("pot").read_text()
+    assert "batch" not in load_job("pot")[0].model_dump(mode="json")
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace("pot.ply", str(shipped.with_suffix(".ply"))) + '[batch]\non_refusal = "skip"\n')
+    job = load_job(path)[0]
+    assert Job.model_validate(job.model_dump(mode="json")) == job
+    path.write_text(path.read_text().replace("skip", "later"))
+    with pytest.raises(ConfigError, match=r"batch\.on_refusal.*'end', 'ask' or 'skip'"):
+        load_job(path)
