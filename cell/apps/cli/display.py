@@ -244,7 +244,8 @@ def print_late(report: Mapping[str, object]) -> None:
 def print_batch(batch: BatchOutcome) -> None:
     """What came of a batch: each figure of the placed parts, how many parts ended how, and why it ended."""
     console = Console(highlight=False)
-    table = new_table("placed parts", "figure", ">n", ">mean", ">sd", ">min", ">max", "unit")
+    columns = ("figure", ">n", ">mean", ">sd", ">min", ">max", "unit")
+    table = new_table("placed parts", *columns)
     for row in batch.figures:
         numbers = ("" if value is None else f"{value:.4g}" for value in (row.mean, row.sd, row.min, row.max))
         table.add_row(row.name, str(row.n), *numbers, row.unit)

@@ -132,8 +132,9 @@ class ProgressDisplay:
         elif step is None:
             return
         elif event.kind == "step_started":
+            if (before := self._tasks.pop(step, None)) is not None:
+                self._progress.remove_task(before)
             self._show(step, 0.0, "")
-            self._progress.reset(self._tasks[step])
         elif event.kind == "progress":
             fraction = event.data["fraction"]
             assert isinstance(fraction, float | int)
