@@ -177,15 +177,13 @@ def cell_toml() -> str:
 def job_toml() -> str:
     """The page of a job's file."""
     from cell.apps.new_job.text import job_text
-    from cell.config.job import BatchSection, Job, PartSection, job_path, load_job
+    from cell.config.job import Job, PartSection, job_path, load_job
 
     part = PartSection.model_validate({"mesh": "part.stl", "mesh_unit": "mm"})
     pot = load_job("pot")[0]
     place = pot.place.model_copy(update={"accept": pot.place.tolerance})
     # What the shipped job leaves out is told in the job that `cell new-job` writes.
-    told = comments(
-        job_text(pot.model_copy(update={"part": part, "place": place, "batch": BatchSection(on_refusal="skip")}), [])
-    )
+    told = comments(job_text(pot.model_copy(update={"part": part, "place": place}), []))
     told |= comments(job_path("pot").read_text(encoding="utf-8"))
     text, models = "# job.toml\n\n" + NOTE, list(records(Job))
     text += '`cell new-job` writes such a file for a mesh. Every quantity carries its unit, such as `"35 mm"`.\n\n'

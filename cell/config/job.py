@@ -13,7 +13,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, SerializerFunctionWrapHandler, model_serializer, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from cell.base.toml_file import below, read_toml, validate
 from cell.config.cell_config import StationObstacle, checked_board, once_each
@@ -184,9 +184,9 @@ class PlaceSection(Table):
 
 
 class BatchSection(Table):
-    """What a batch of this job does after a refusal: it ends, asks a person, or goes on with the next part.
+    """What a batch does after a refusal while the claw holds the part: it ends, asks a person, or tries the next part.
 
-    A part that is misplaced, a fault and an abort always end it.
+    A part that is misplaced, a fault and an abort always end it. Nothing that is made or measured rests on this.
     """
 
     on_refusal: Literal["end", "ask", "skip"] = "end"
@@ -204,14 +204,8 @@ class Job(Table):
     grasp: GraspSection
     place: PlaceSection
     part: PartSection | None = None
-    batch: BatchSection = BatchSection()
+    batch: BatchSection = Field(default=BatchSection(), exclude=True)
     obstacle: tuple[StationObstacle, ...] = ()
-
-    @model_serializer(mode="wrap")
-    def _written(self, written: SerializerFunctionWrapHandler) -> dict[str, object]:
-        """Without the default `batch`: what rests on a job's content stays as it was."""
-        tables: dict[str, object] = written(self)
-        return {name: table for name, table in tables.items() if name != "batch" or self.batch != BatchSection()}
 
     @model_validator(mode="after")
     def _distinct_obstacles(self) -> Self:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean, stdev
@@ -27,7 +26,6 @@ from statemachine.step import Event
 
 MOST_PARTS = 1_000_000
 GOOD = ("placed", "done")
-"""The ends of a part that was neither refused nor failed."""
 COUNTED = ("placed", "corrected", "refused", "misplaced", "faulted", "aborted")
 
 
@@ -79,6 +77,12 @@ class BatchOutcome:
             for which, of in found.items()
         )
 
+    def __str__(self) -> str:
+        """The newest part and the counters, in a line."""
+        last, counts = self.runs[-1], ", ".join(f"{n} {name}" for name, n in self.counts.items() if n)
+        ended = f"{last}; {last.report.get('cell_s')} s, {last.folder.name}"
+        return f"part {len(self.runs)} of {self.count}  {ended} · {counts}"
+
     @property
     def exit_code(self) -> int:
         """130 interrupted, else 0 when every part was placed, 1 otherwise."""
@@ -108,8 +112,10 @@ def figures(report: Report) -> dict[tuple[str, str], float]:
     seen = _seen(report)
     found = {("cycle time", "s"): report["cell_s"]}
     if seen:
-        found[("placed part off its place, as seen", "mm")] = seen["off_mm"]
-        found[("corrections", "")] = len(seen["before_mm"])
+        found |= {
+            ("placed part off its place, as seen", "mm"): seen["off_mm"],
+            ("corrections", ""): len(seen["before_mm"]),
+        }
     if seen.get("gap"):
         found[("gap, median", "mm")] = seen["gap"]["median_mm"]
     return found | {(row["name"], row["unit"]): row["value"] for row in report["measured"] if row["value"] is not None}
@@ -134,29 +140,24 @@ def perform(
     batch, why, interrupted = BatchOutcome(job.job.name, count, here.runs_folder / name), "", False
     try:
         while not why and len(batch.runs) < count:
-            number, last = len(batch.runs) + 1, batch.runs[-1] if batch.runs else None
-            if last is not None and (work := _question(here, job, f"part {number} of {count}", last)) is not None:
+            number = len(batch.runs) + 1
+            if number > 1 and (work := _question(here, job, f"part {number} of {count}", batch.runs[-1])):
                 between(work)
             last = run(number)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).kept()
             if observer is not None:
-                counts = ", ".join(f"{n} {name}" for name, n in batch.counts.items() if n)
-                line = f"part {number} of {count}  {last}; {last.report['cell_s']:.0f} s, {last.folder.name} · {counts}"
-                observer(Event("note", None, {"text": line}))
+                observer(Event("note", None, {"text": str(batch)}))
+            # Nobody knows how a part lies that is down and was refused.
+            skipped = last.outcome == "refused" and last.report.get("part") == "held" and job.batch.on_refusal != "end"
             interrupted = last.interrupted
-            why = "" if _goes_on(job, last) else f"part {number} {last}"
+            if interrupted or last.stopped_after_end or not (last.outcome in GOOD or skipped):
+                why = f"part {number} {last}"
     except CellError as error:
         if not batch.runs:
             raise
         why, interrupted = f"after part {len(batch.runs)}: {error}", isinstance(error, Interrupted)
     return replace(batch, reason=why or "every part was tried", interrupted=interrupted).kept()
-
-
-def _goes_on(job: Job, run: RunOutcome) -> bool:
-    """Whether the next part comes after this run. Nobody knows how a part lies that is down and was refused."""
-    skipped = run.outcome == "refused" and run.report.get("part") == "held" and job.batch.on_refusal != "end"
-    return (run.outcome in GOOD or skipped) and not run.interrupted and not run.stopped_after_end
 
 
 def _question(here: Opened, job: Job, part: str, last: RunOutcome) -> Callable[[Hands], None] | None:
@@ -169,10 +170,11 @@ def _question(here: Opened, job: Job, part: str, last: RunOutcome) -> Callable[[
         if refused:
             hands.ask(f"The last part was {last}. Go on with {part}?")
         while by_hand and not (filled or claw.holding):
-            claw.release()
             hands.ask(f"Hold {part} between the claw's fingers: the claw closes on it")
-            with suppress(DeviceFault):
+            try:
                 claw.grip()
+            except DeviceFault:
+                claw.release()
         if by_hand:
             ready = "take away what was placed, prepare the next place, and step back: the arm moves next"
             hands.ask(f"The claw holds {part}; {ready}")

@@ -58,8 +58,6 @@ def job_text(job: Job, heading: Sequence[str]) -> str:
             f'mesh = "{job.part.mesh}"{about}',
             f'mesh_unit = "{job.part.mesh_unit}"',
         ]
-    if job.batch.on_refusal != "end":
-        lines += ["", "[batch]", f'on_refusal = "{job.batch.on_refusal}"  # of a part that the claw still holds']
     for obstacle in job.obstacle:
         lines += ["", "[[obstacle]]", *_obstacle(obstacle)]
     return "\n".join(lines) + "\n"

@@ -319,14 +319,11 @@ class Cell:
         self, job: str | Path = "pot", count: int = 1, observer: Observer | None = None, inject: Sequence[str] = (), *,
         at_start: bool = False,
     ) -> BatchOutcome:  # fmt: skip
-        """`run` a job for `count` parts, 1 to 1000000, one after another, and wait for the end of the batch.
+        """`run` a job for `count` parts, 1 to 1000000, and wait for the end of the batch; arguments as in `start`.
 
         A simulated cell's claw is filled again for each part. At a real cell a person is asked for each further part:
-        the `observer` sees `confirm_needed`, and `current.confirm` or `cell confirm` answers.
-
-        Args:
-            job, observer, inject: As in `start`, for every part; the observer is also told each part's end, as a note.
-            at_start: As in `start`, for the first part.
+        the `observer` sees `confirm_needed`, and `current.confirm` or `cell confirm` answers. It is told each part's
+        end, as a note. `at_start` is said for the first part.
 
         Raises:
             CellError: What keeps the first part from being begun.

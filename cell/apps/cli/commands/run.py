@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -146,10 +147,7 @@ def _perform_batch(
     opened: Callable[[], Cell], batch: Callable[..., BatchOutcome], count: int, json: bool, *, partly: bool,
     elsewhere: bool = False, pace: float = 1.0,
 ) -> NoReturn:  # fmt: skip
-    """Do a batch on a cell, show what came of it, and exit with its code. A person is asked here, unless `elsewhere`.
-
-    Neither a job that is done only `partly` nor the console's page has batches.
-    """
+    """Do a batch on a cell, show what came of it, exit with its code. A person is asked here, unless `elsewhere`."""
     from cell.apps.cli.display import print_batch
     from cell.apps.cli.progress import ProgressDisplay, answer_here
     from cell.devices.simulated.process import is_whole
@@ -160,7 +158,8 @@ def _perform_batch(
     if partly:
         raise ConfigError("--count does whole jobs, shown here: leave out --until and --console, or leave out --count")
     with ProgressDisplay(compiles=True) as display, opened() as cell:
-        here = sys.stdin.isatty() and not elsewhere
+        # In the background nobody reads a terminal: who tries is stopped.
+        here = not elsewhere and sys.stdin.isatty() and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
         if not (here or elsewhere or is_whole(cell.simulated)):
             unasked = "there is no terminal to ask whether the next part is in the claw: run this in one, or with "
             raise ConfigError(f"{unasked}--ask-elsewhere, and answer with `cell confirm`")

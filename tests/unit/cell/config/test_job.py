@@ -6,9 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.base.storage import write_json
-from cell.base.toml_file import restored
-from cell.config.job import Job, job_path, load_job, shipped_jobs
+from cell.config.job import job_path, load_job, shipped_jobs
 from drivers.errors import ConfigError
 
 
@@ -39,14 +37,13 @@ def test_the_job_of_the_present_folder_wins_over_the_one_that_ships(
     assert job_path(shipped) == shipped
 
 
-def test_a_job_that_says_nothing_of_batches_is_written_as_before(tmp_path: Path) -> None:
-    shipped, text = job_path("pot"), job_path("pot").read_text()
-    assert "batch" not in load_job("pot")[0].model_dump(mode="json")
-    path = tmp_path / "mine.toml"
-    path.write_text(text.replace("pot.ply", str(shipped.with_suffix(".ply"))) + '[batch]\non_refusal = "skip"\n')
+def test_what_a_batch_does_is_checked_and_no_part_of_what_runs_rest_on(tmp_path: Path) -> None:
+    shipped, path = job_path("pot"), tmp_path / "mine.toml"
+    text = shipped.read_text().replace('"pot.ply"', f'"{shipped.with_suffix(".ply")}"')
+    path.write_text(f'{text}\n[batch]\non_refusal = "skip"\n')
     job = load_job(path)[0]
-    write_json(tmp_path / "job.json", job.model_dump(mode="json"))
-    assert restored(Job, tmp_path / "job.json") == job
+    assert (job.batch.on_refusal, load_job("pot")[0].batch.on_refusal) == ("skip", "end")
+    assert "batch" not in job.model_dump(mode="json")
     path.write_text(path.read_text().replace("skip", "later"))
     with pytest.raises(ConfigError, match=r'batch\.on_refusal.*"end", "ask" or "skip"'):
         load_job(path)
