@@ -10,16 +10,18 @@ import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from cell.apps.cli.options import new_table
 from cell.config.files import DEVICES
-from cell.run.batch import BatchOutcome
 from cell.run.folder import wall_seconds
 from cell.run.report.figures import following_words, noise_rows, shown_limit, shown_value, simulated_words
 from drivers.errors import MeasuredRow
+
+if TYPE_CHECKING:
+    from cell.run.batch import BatchOutcome
 
 WIDTH, HEIGHT = 80, 23
 """What a screen holds; its last line is left to the prompt."""
