@@ -15,6 +15,7 @@ from cell.base.storage import read_json
 from cell.config.calibrations.store import save_calibration
 from cell.config.job import load_job
 from cell.devices.simulated.described import Described
+from cell.devices.simulated.direct import VirtualCell
 from cell.run.batch import _question
 from cell.run.folder import read_report
 from cell.run.job_run import RunOutcome
@@ -142,8 +143,9 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
 
         def person(what: str) -> None:
             asked.append(what.split()[0])
-            assert claw.holding == (asked[-1] == "The")
-            if asked == ["Hold", "Hold"] and cell.simulated is not None:
+            assert isinstance(cell.simulated, VirtualCell)
+            assert claw.holding == cell.simulated.world.switched("claw") == (asked[-1] == "The")
+            if asked == ["Hold", "Hold"]:
                 cell.simulated.make_ready(Described.of("own.toml"))
 
         def work(hands: Hands) -> None:
