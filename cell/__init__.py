@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from cell.procedures.steps.reconstruct import Reconstruction
     from cell.procedures.steps.workplace import JobStep
     from cell.procedures.sweep.stored_sweep import SweepRecord
+    from cell.run.batch import BatchOutcome, Distribution
     from cell.run.events import (
         Confirmed,
         ConfirmNeeded,
@@ -73,6 +74,7 @@ if TYPE_CHECKING:
 _PLACES = {
     "cell.run.session.supervisor": ("Cell",),
     "cell.run.job_run": ("RunOutcome",),
+    "cell.run.batch": ("BatchOutcome", "Distribution"),
     "cell.run.runs": ("Run",),
     "cell.run.events": (
         "ConfirmNeeded", "Confirmed", "FaultMet", "GoesOn", "Held", "Noted", "RunEnded", "RunEvent", "SafeStopped",
@@ -103,14 +105,14 @@ _PLACES = {
 }  # fmt: skip
 
 __all__ = [
-    "PLACE", "Aborted", "Again", "ArmConfig", "ArmOutputClawConfig", "BoardFix", "CalibrationStale", "CameraConfig",
-    "Cell", "CellError", "ClawConfig", "ConfigError", "ConfirmNeeded", "Confirmed", "DeadlineError", "DeviceError",
-    "DeviceFault", "FaultMet", "GoesOn", "Held", "InterlockError", "Interrupted", "JobStep", "Kind", "LaserConfig",
-    "LimitError", "Make", "MisplacedError", "NotConnectedError", "NotObservable", "Noted", "OnArm", "PlacePose",
-    "PlaceResult", "PlacedPart",
-    "RailConfig", "Reconstruction", "RefusedError", "Run", "RunEnded", "RunEvent", "RunOutcome", "SafeStopped",
-    "Script", "StateChanged", "Step", "StepDone", "StepFailed", "StepProgress", "StepStarted", "Surroundings",
-    "SweepRecord", "VehicleArrival", "VehicleConfig", "quantity", "whole",
+    "PLACE", "Aborted", "Again", "ArmConfig", "ArmOutputClawConfig", "BatchOutcome", "BoardFix", "CalibrationStale",
+    "CameraConfig", "Cell", "CellError", "ClawConfig", "ConfigError", "ConfirmNeeded", "Confirmed", "DeadlineError",
+    "DeviceError", "DeviceFault", "Distribution", "FaultMet", "GoesOn", "Held", "InterlockError", "Interrupted",
+    "JobStep", "Kind", "LaserConfig", "LimitError", "Make", "MisplacedError", "NotConnectedError", "NotObservable",
+    "Noted", "OnArm", "PlacePose", "PlaceResult", "PlacedPart", "RailConfig", "Reconstruction", "RefusedError", "Run",
+    "RunEnded", "RunEvent", "RunOutcome", "SafeStopped", "Script", "StateChanged", "Step", "StepDone", "StepFailed",
+    "StepProgress", "StepStarted", "Surroundings", "SweepRecord", "VehicleArrival", "VehicleConfig", "quantity",
+    "whole",
 ]  # fmt: skip
 
 

@@ -206,6 +206,20 @@ class StepContext:
         self.check()
         self._tell(Event("progress", self.step.name, {"fraction": fraction, "text": text}))
 
+    def ask(self, what: str) -> None:
+        """Wait, however long, for a person's word about `what`. Nothing may move meanwhile. Raises like `check`."""
+        about = {"reason": what, "code": self.step.name, "number": self._control.ask(what)}
+        self._tell(Event("confirm_needed", self.step.name, about))
+        try:
+            while (by := self._control.answer()) is None:
+                self.token.event.wait(0.02)
+                self.check()
+                self._look()
+        finally:
+            self._control.asked_no_more()
+        self._tell(Event("confirmed", self.step.name, {"by": by, "reason": what}))
+        self.safe_point()
+
     def note(self, **data: object) -> None:
         """Write something worth keeping to the journal and tell the observer."""
         self._tell(Event("note", self.step.name, data))

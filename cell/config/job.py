@@ -218,6 +218,15 @@ class NestSection(Table):
     tolerance_angle: Annotated[float, quantity("mrad", 0.5, 100)] = 15e-3
 
 
+class BatchSection(Table):
+    """What a batch does after a refusal while the claw holds the part: it ends, asks a person, or tries the next part.
+
+    A part that is misplaced, a fault and an abort always end it. Nothing that is made or measured rests on this.
+    """
+
+    on_refusal: Literal["end", "ask", "skip"] = "end"
+
+
 class Job(Table):
     """A job, as typed and checked records."""
 
@@ -231,6 +240,7 @@ class Job(Table):
     place: PlaceSection
     part: PartSection | None = None
     nest: NestSection | None = None
+    batch: BatchSection = Field(default=BatchSection(), exclude=True)
     obstacle: tuple[StationObstacle, ...] = ()
 
     @model_validator(mode="after")

@@ -121,13 +121,14 @@ log = logging.getLogger(__name__)
 class Hands:
     """What work is given to be held by: `check` raises once it is to end, `safe_point` also holds it when paused.
 
-    `keep(what, frame)` leaves a picture that the work looked at in the run's folder.
+    `keep(what, frame)` leaves a picture that the work looked at in the run's folder. `ask(what)` waits for a person.
     """
 
     check: Callable[[], None]
     safe_point: Callable[[], None]
     progress: Callable[[float, str], None]
     keep: Callable[[str, Frame], None]
+    ask: Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +203,8 @@ class RecordedWork:
             nonlocal stops
             with devices.gate.entered(context.token):
                 context.check()
-                made = work(Hands(context.check, context.safe_point, context.progress, frames.keep))
+                hands = Hands(context.check, context.safe_point, context.progress, keep=frames.keep, ask=context.ask)
+                made = work(hands)
             # A stop that a person asks for from here on is not cleared.
             stops = devices.gate.stops
             return made

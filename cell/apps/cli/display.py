@@ -10,7 +10,7 @@ import shlex
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
@@ -19,6 +19,9 @@ from cell.config.files import DEVICES
 from cell.run.folder import wall_seconds
 from cell.run.report.figures import following_words, noise_rows, shown_limit, shown_value, simulated_words
 from drivers.errors import MeasuredRow
+
+if TYPE_CHECKING:
+    from cell.run.batch import BatchOutcome
 
 WIDTH, HEIGHT = 80, 23
 """What a screen holds; its last line is left to the prompt."""
@@ -238,6 +241,19 @@ def print_late(report: Mapping[str, object]) -> None:
     part = "the part had been placed" if report["outcome"] == "placed" else f"the run had ended {report['outcome']}"
     console = Console(stderr=True, soft_wrap=True, highlight=False)
     console.print(f"interrupted after {part}", style="bold magenta", markup=False)
+
+
+def print_batch(batch: BatchOutcome) -> None:
+    """What came of a batch: each figure of the placed parts, how many parts ended how, and why it ended."""
+    console = Console(highlight=False)
+    columns = ("figure", ">n", ">mean", ">sd", ">min", ">max", "unit")
+    table = new_table("placed parts", *columns)
+    for row in batch.figures:
+        numbers = ("" if value is None else f"{value:.4g}" for value in (row.mean, row.sd, row.min, row.max))
+        table.add_row(row.name, str(row.n), *numbers, row.unit)
+    console.print(table)
+    counts = ", ".join(f"{number} {name}" for name, number in batch.counts.items())
+    console.print(f"{counts}: {batch.reason}\nbatch     {_from_here(batch.file)}", markup=False, soft_wrap=True)
 
 
 def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:

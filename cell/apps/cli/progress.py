@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import getpass
 import os
+import select
 import sys
+import termios
 import threading
 import time
 from contextlib import suppress
@@ -15,6 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Column
 
+from statemachine.control import RunControl
 from statemachine.step import Event
 
 SAID = ("note", "paused", "going_on")
@@ -39,6 +43,19 @@ def tell_question(event: Event, console: Console | None = None) -> None:
         console.print(f"when that is done, in another shell here: {answer}", markup=False)
     elif event.kind == "confirmed":
         console.print(f"confirmed by {event.data['by']}", markup=False)
+
+
+def answer_here(control: RunControl, console: Console) -> None:
+    """Wait until the question that a run asks now is answered: at this terminal, or elsewhere."""
+    termios.tcflush(sys.stdin, termios.TCIFLUSH)  # what was typed before the question is no answer
+    asked = control.question
+    console.print('or type here: "ready" and Enter; "end" ends the batch', markup=False)
+    while asked is not None and control.question == asked and not (control.answer() or control.token.reason):
+        typed = os.read(sys.stdin.fileno(), 1000) if select.select([sys.stdin], [], [], 0.1)[0] else b"\n"
+        if typed.strip() == b"ready":
+            control.confirm(getpass.getuser(), asked[0])
+        elif typed.strip() == b"end" or not typed:
+            control.abort("ended at the terminal")
 
 
 def kept_loops() -> list[float]:
@@ -115,8 +132,9 @@ class ProgressDisplay:
         elif step is None:
             return
         elif event.kind == "step_started":
+            if (before := self._tasks.pop(step, None)) is not None:
+                self._progress.remove_task(before)
             self._show(step, 0.0, "")
-            self._progress.reset(self._tasks[step])
         elif event.kind == "progress":
             fraction = event.data["fraction"]
             assert isinstance(fraction, float | int)

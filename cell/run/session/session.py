@@ -102,9 +102,10 @@ class Opened:
         self, run: Run[object], kind: str, work: Callable[[Hands], Made], info: Mapping[str, object] | None = None
     ) -> Made:
         """Do work outside a job in a run that was begun, and record it; raises what `RecordedWork.perform` does."""
-        health = require_no_emergency_stop if kind in ("jog", "recovery") else require_healthy
-        facts = {**self.facts, **(info or {})}
-        recorded = RecordedWork(run, kind, self.devices, self.runs_folder, facts, health=health, config=self.config)
+        # Who puts a part into the claw opens the cell's guard, and takes as long as it takes.
+        health = require_no_emergency_stop if kind in ("jog", "recovery", "loading") else require_healthy
+        facts, told = {**self.facts, **(info or {})}, None if kind == "loading" else self.config
+        recorded = RecordedWork(run, kind, self.devices, self.runs_folder, facts, health=health, config=told)
         return recorded.perform(work)
 
 

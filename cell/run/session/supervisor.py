@@ -26,7 +26,9 @@ from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.verification import Verification
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.steps.kinds import kind_of
+from cell.run import batch as batches
 from cell.run import calibration as sessions
+from cell.run.batch import BatchOutcome
 from cell.run.calibration import recorded_maintenance
 from cell.run.folder import find_run
 from cell.run.job_run import JobWork, Observer, ReadyJob, RunOutcome
@@ -312,6 +314,25 @@ class Cell:
             info["injected"] = [str(injection) for injection in injector.injections]
             inline = (injector,)
         return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
+
+    def run_batch(
+        self, job: str | Path = "pot", count: int = 1, observer: Observer | None = None, inject: Sequence[str] = (), *,
+        at_start: bool = False,
+    ) -> BatchOutcome:  # fmt: skip
+        """`run` a job for `count` parts, 1 to 1000000, and wait for the end of the batch; arguments as in `start`.
+
+        A simulated cell's claw is filled again for each part. At a real cell a person is asked for each further part:
+        the `observer` sees `confirm_needed`, and `current.confirm` or `cell confirm` answers. It is told each part's
+        end, as a note. `at_start` is said for the first part.
+
+        Raises:
+            CellError: What keeps the first part from being begun.
+        """
+        return batches.perform(
+            self._here, load_job(job)[0], count,
+            run=lambda number: self.run(job, observer, inject, at_start=at_start and number == 1),
+            between=lambda work: self.perform("loading", work, observer), observer=observer,
+        )  # fmt: skip
 
     def resume(
         self, run: str | Path | None = None, observer: Observer | None = None, *, at_start: bool = False,

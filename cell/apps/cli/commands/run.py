@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -17,12 +18,15 @@ from sim_backends.faults import FAULT_NAMES
 
 if TYPE_CHECKING:
     from cell.config.cell_config import CellConfig
+    from cell.run.batch import BatchOutcome
     from cell.run.job_run import Observer, RunOutcome
     from cell.run.session.supervisor import Cell
+    from statemachine.step import Event
 
 UntilOption = Annotated[
     str | None, typer.Option(help="End the run, done, after the step of this name.", autocompletion=options.steps)
 ]
+CountOption = Annotated[int | None, typer.Option("--count", help="A batch: for so many parts, 1 to 1000000.")]
 AtStartOption = Annotated[
     bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
 ]
@@ -67,6 +71,8 @@ def run(
     ] = 1.0,
     json: JsonOption = False,
     noise: NoiseOption = False,
+    count: CountOption = None,
+    elsewhere: Annotated[bool, typer.Option("--ask-elsewhere", help="With --count: `cell confirm` answers.")] = False,
 ) -> None:
     """Run a job on the cell that the configuration describes.
 
@@ -81,6 +87,9 @@ def run(
 
     require_share(pace)
     opened = partial(Cell.open, config, sim=sim, seed=seed, level=level.value, job=job)
+    if count is not None:
+        batch = partial(Cell.run_batch, job=job, at_start=at_start)
+        _perform_batch(opened, batch, count, json, partly=until is not None, elsewhere=elsewhere, pace=pace)
     _perform(opened, perform, json, noise)
 
 
@@ -99,6 +108,7 @@ def dry_run(
     console: ConsoleOption = False,
     no_open: Annotated[bool, typer.Option("--no-open", help="With --console: print the page's link only.")] = False,
     port: Annotated[int, typer.Option("--port", min=0, max=65535, help="With --console: where the page is.")] = 0,
+    count: CountOption = None,
 ) -> None:
     """Run a job on a simulated cell, which is started and ended by itself. Calibrates it first if need be."""
     typer.echo(f"dry run of {job} in the simulated world {seed}: loading", err=True)
@@ -121,6 +131,9 @@ def dry_run(
         Cell.open, config, sim="all", seed=seed, level=level.value, speed=speed, job=job,
         confirm=None if confirm is None else confirm.value, clock=(clock or CellClock.wall).value,
     )  # fmt: skip
+    if count is not None:
+        batch = partial(Cell.run_batch, job=job, inject=inject or ())
+        _perform_batch(opened, batch, count, json, partly=console or until is not None)
     if console:
         from cell.apps.cli.commands.console import require_installed, run_shown
 
@@ -128,6 +141,39 @@ def dry_run(
         watched = partial(run_shown, job=job, inject=inject or (), until=until, port=port, open_page=not no_open)
         _perform(opened, watched, json, noise)
     _perform(opened, lambda cell, display: cell.run(job, display, inject or (), until=until), json, noise)
+
+
+def _perform_batch(
+    opened: Callable[[], Cell], batch: Callable[..., BatchOutcome], count: int, json: bool, *, partly: bool,
+    elsewhere: bool = False, pace: float = 1.0,
+) -> NoReturn:  # fmt: skip
+    """Do a batch on a cell, show what came of it, exit with its code. A person is asked here, unless `elsewhere`."""
+    from cell.apps.cli.display import print_batch
+    from cell.apps.cli.progress import ProgressDisplay, answer_here
+    from cell.devices.simulated.process import is_whole
+    from cell.run.batch import require_count
+    from drivers.errors import ConfigError
+
+    require_count(count)
+    if partly:
+        raise ConfigError("--count does whole jobs, shown here: leave out --until and --console, or leave out --count")
+    with ProgressDisplay(compiles=True) as display, opened() as cell:
+        # In the background nobody reads a terminal: who tries is stopped.
+        here = not elsewhere and sys.stdin.isatty() and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+        if not (here or elsewhere or is_whole(cell.simulated)):
+            unasked = "there is no terminal to ask whether the next part is in the claw: run this in one, or with "
+            raise ConfigError(f"{unasked}--ask-elsewhere, and answer with `cell confirm`")
+
+        def told(event: Event) -> None:
+            display(event)
+            if here and event.kind == "confirm_needed" and (run := cell.current) is not None and run.kind == "loading":
+                answer_here(run.control, display.console)
+
+        cell.pace = pace
+        outcome = batch(cell, count=count, observer=told)
+        display.end()
+        print_json(outcome.as_dict()) if json else print_batch(outcome)
+    raise typer.Exit(outcome.exit_code)
 
 
 def _clock(config: CellConfig) -> CellClock:

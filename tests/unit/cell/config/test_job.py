@@ -35,3 +35,15 @@ def test_the_job_of_the_present_folder_wins_over_the_one_that_ships(
     Path("pot.toml").write_text(shipped.read_text())
     assert job_path("pot") == Path("pot.toml")
     assert job_path(shipped) == shipped
+
+
+def test_what_a_batch_does_is_checked_and_no_part_of_what_runs_rest_on(tmp_path: Path) -> None:
+    shipped, path = job_path("pot"), tmp_path / "mine.toml"
+    text = shipped.read_text().replace('"pot.ply"', f'"{shipped.with_suffix(".ply")}"')
+    path.write_text(f'{text}\n[batch]\non_refusal = "skip"\n')
+    job = load_job(path)[0]
+    assert (job.batch.on_refusal, load_job("pot")[0].batch.on_refusal) == ("skip", "end")
+    assert "batch" not in job.model_dump(mode="json")
+    path.write_text(path.read_text().replace("skip", "later"))
+    with pytest.raises(ConfigError, match=r'batch\.on_refusal.*"end", "ask" or "skip"'):
+        load_job(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
@@ -9,8 +10,10 @@ import time
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
-from cell.apps.cli.progress import ProgressDisplay, kept_loops
+from cell.apps.cli.progress import ProgressDisplay, answer_here, kept_loops
+from statemachine.control import RunControl
 from statemachine.step import Event
 
 LONG = "arm: it stopped [C153] because points came 15 ms late: this computer is too busy"
@@ -85,3 +88,23 @@ main()
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.stdout.splitlines()[0] == "dry run of pot in the simulated world 1: loading True"
+
+
+@pytest.mark.parametrize(("typed", "by_whom", "ended"), [(b"go\nready\n", True, None), (b"end\n", False, "terminal")])
+def test_a_question_is_answered_at_the_terminal_by_what_is_typed_after_it(
+    monkeypatch: pytest.MonkeyPatch, typed: bytes, by_whom: bool, ended: str | None
+) -> None:
+    person, program = os.openpty()
+
+    class Screen(io.StringIO):
+        def write(self, text: str) -> int:
+            return os.write(person, typed) if "ready" in text else 0
+
+    os.write(person, b"end\n" if by_whom else b"ready\n")  # before the question
+    control = RunControl()
+    control.ask("Is the part in the claw?")
+    with os.fdopen(program) as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        answer_here(control, Console(file=Screen()))
+    os.close(person)
+    assert (control.answer() is not None, control.token.reason) == (by_whom, ended and f"ended at the {ended}")

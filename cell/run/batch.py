@@ -1,0 +1,184 @@
+"""A batch: one job for several parts, a run each, and what came of them as counts and distributions.
+
+Between two runs the next part comes into the claw. A simulated world puts it there by itself; at a real cell a person
+does, who is asked in a recorded run of its own: nothing moves before that is confirmed.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import fmean, stdev
+from typing import Self
+
+from cell.base.storage import sealed, write_json
+from cell.config.job import Job
+from cell.devices.simulated.process import is_whole
+from cell.run.folder import Report
+from cell.run.job_run import Observer, RunOutcome
+from cell.run.recorded_work import Hands
+from cell.run.session.session import Opened
+from drivers.errors import CellError, ConfigError, DeviceFault, Interrupted
+from statemachine.step import Event
+
+MOST_PARTS = 1_000_000
+GOOD = ("placed", "done")
+COUNTED = ("placed", "corrected", "refused", "misplaced", "faulted", "aborted")
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """A figure of `n` placed parts, in `unit`; `sd` has n - 1 degrees of freedom, and is None of one part."""
+
+    name: str
+    unit: str
+    n: int
+    mean: float
+    sd: float | None
+    min: float
+    max: float
+
+
+@dataclass(frozen=True)
+class BatchOutcome:
+    """What came of a batch of `count` parts: the `runs` of those that were tried, and why it ended; `file` keeps it.
+
+    `interrupted` says that a signal has ended it.
+    """
+
+    job: str
+    count: int
+    file: Path
+    reason: str = "not ended, or its process died"
+    interrupted: bool = False
+    runs: tuple[RunOutcome, ...] = ()
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many parts ended how; one that was placed again before it was good counts as corrected, not as placed."""
+        found = dict.fromkeys(COUNTED, 0)
+        for run in self.runs:
+            good = "corrected" if _seen(run.report).get("before_mm") else "placed"
+            found[good if run.outcome in GOOD else run.outcome] += 1
+        return {**found, "not tried": self.count - len(self.runs)}
+
+    @property
+    def figures(self) -> tuple[Distribution, ...]:
+        """How each figure of the placed parts is distributed."""
+        found: dict[tuple[str, str], list[float]] = {}
+        for run in self.runs:
+            for which, value in figures(run.report).items() if run.outcome in GOOD else ():
+                found.setdefault(which, []).append(value)
+        return tuple(
+            Distribution(*which, len(of), fmean(of), stdev(of) if len(of) > 1 else None, min=min(of), max=max(of))
+            for which, of in found.items()
+        )
+
+    def __str__(self) -> str:
+        """The newest part and the counters, in a line."""
+        last, counts = self.runs[-1], ", ".join(f"{n} {name}" for name, n in self.counts.items() if n)
+        ended = f"{last}; {last.report.get('cell_s')} s, {last.folder.name}"
+        return f"part {len(self.runs)} of {self.count}  {ended} · {counts}"
+
+    @property
+    def exit_code(self) -> int:
+        """130 interrupted, else 0 when every part was placed, 1 otherwise."""
+        return 130 if self.interrupted else int(self.counts["placed"] + self.counts["corrected"] < self.count)
+
+    def as_dict(self) -> dict[str, object]:
+        """JSON-ready; the runs by their names."""
+        return {
+            "job": self.job, "count": self.count, "reason": self.reason, "interrupted": self.interrupted,
+            "counts": self.counts, "figures": [asdict(figure) for figure in self.figures],
+            "runs": [{"run": run.folder.name, "outcome": run.outcome, "reason": run.reason} for run in self.runs],
+        }  # fmt: skip
+
+    def kept(self) -> Self:
+        """Itself, also in its file."""
+        write_json(self.file, sealed(self.as_dict()))
+        return self
+
+
+def _seen(report: Report) -> Report:
+    """Where the placed part was seen; empty where nobody looked."""
+    return next((step["result"] or {} for step in report.get("steps") or () if step["name"] == "verify"), {})
+
+
+def figures(report: Report) -> dict[tuple[str, str], float]:
+    """What parts of one job are compared by, by name and unit."""
+    seen = _seen(report)
+    found = {("cycle time", "s"): report["cell_s"]}
+    if seen:
+        found |= {
+            ("placed part off its place, as seen", "mm"): seen["off_mm"],
+            ("corrections", ""): len(seen["before_mm"]),
+        }
+    if seen.get("gap"):
+        found[("gap, median", "mm")] = seen["gap"]["median_mm"]
+    return found | {(row["name"], row["unit"]): row["value"] for row in report["measured"] if row["value"] is not None}
+
+
+def require_count(count: int) -> None:
+    """`ConfigError` for a batch of so many parts."""
+    if not 1 <= count <= MOST_PARTS:
+        raise ConfigError(f"a batch of {count} parts is none (allowed: 1 to {MOST_PARTS}); give another count")
+
+
+def perform(
+    here: Opened, job: Job, count: int, run: Callable[[int], RunOutcome],
+    between: Callable[[Callable[[Hands], None]], None], observer: Observer | None,
+) -> BatchOutcome:  # fmt: skip
+    """Do a batch: `run(number)` a part, `between(work)` what a person is asked before the next one; both wait.
+
+    `observer` is told each part's end. Raises what keeps the first part from being begun, or is no error of the cell.
+    """
+    require_count(count)
+    name = f"batch-{time.strftime('%Y%m%dT%H%M%S')}-{secrets.token_hex(2)}.json"
+    batch, why, interrupted = BatchOutcome(job.job.name, count, here.runs_folder / name), "", False
+    try:
+        while not why and len(batch.runs) < count:
+            number = len(batch.runs) + 1
+            if number > 1 and (work := _question(here, job, f"part {number} of {count}", batch.runs[-1])):
+                between(work)
+            last = run(number)
+            # What its steps made is large, and in its folder.
+            batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).kept()
+            if observer is not None:
+                observer(Event("note", None, {"text": str(batch)}))
+            # Nobody knows how a part lies that is down and was refused.
+            skipped = last.outcome == "refused" and last.report.get("part") == "held" and job.batch.on_refusal != "end"
+            interrupted = last.interrupted
+            if interrupted or last.stopped_after_end or not (last.outcome in GOOD or skipped):
+                why = f"part {number} {last}"
+    except CellError as error:
+        if not batch.runs:
+            raise
+        why, interrupted = f"after part {len(batch.runs)}: {error}", isinstance(error, Interrupted)
+    return replace(batch, reason=why or "every part was tried", interrupted=interrupted).kept()
+
+
+def _question(here: Opened, job: Job, part: str, last: RunOutcome) -> Callable[[Hands], None] | None:
+    """What asks a person whether to go on after a refusal, and at a cell with real devices for the next part."""
+    claw, simulated = here.devices.claw, here.simulated
+    by_hand, filled = not is_whole(simulated), simulated is not None and "claw" in simulated.simulated
+    refused = last.outcome == "refused" and job.batch.on_refusal == "ask" and here.config.cell.confirm != "simulated"
+
+    def work(hands: Hands) -> None:
+        if refused:
+            hands.ask(f"The last part was {last}. Go on with {part}?")
+        while by_hand and job.nest is None and not (filled or claw.holding):
+            hands.ask(f"Hold {part} between the claw's fingers: the claw closes on it")
+            try:
+                claw.grip()
+            except DeviceFault:
+                claw.release()
+        ready = "and step back: the arm moves next"
+        if by_hand and job.nest is not None:
+            hands.ask(f"Take the last part out of the nest, see that {part} lies on its surface, {ready}")
+        elif by_hand:
+            hands.ask(f"The claw holds {part}; take away what was placed, prepare the next place, {ready}")
+
+    return work if refused or by_hand else None

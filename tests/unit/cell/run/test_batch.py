@@ -1,0 +1,170 @@
+"""A batch on the virtual clock: its figures are those of its runs, and what ends it leaves what was done whole."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cell import BatchOutcome, Cell, ConfigError
+from cell.base.storage import read_json
+from cell.config.calibrations.store import save_calibration
+from cell.config.job import load_job
+from cell.devices.simulated.described import Described
+from cell.devices.simulated.direct import VirtualCell
+from cell.run.batch import _question
+from cell.run.folder import read_report
+from cell.run.job_run import RunOutcome
+from cell.run.recorded_work import Hands
+from lab.bench.job.whole_job import JobRecord
+from statemachine.step import Event
+from tests.support.described_cells import Changes, described, pose
+
+FAST: Changes = {"scan": {"speed": '"30 mm/s"'}}
+
+
+@pytest.fixture
+def opened(placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Cell]:
+    """Opens a calibrated cell with the job `own.toml` that has these rules; `moved`: its scan head was bumped since."""
+    assert placed_pot.calibration is not None
+    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
+    monkeypatch.chdir(tmp_path)
+
+    def make(on_refusal: str = "", moved: bool = False) -> Cell:
+        config, own = described(tmp_path, None, FAST)
+        if on_refusal:
+            own.write_text(f'{own.read_text()}\n[batch]\non_refusal = "{on_refusal}"\n')
+        head: Changes = {"scan_camera": {"flange_from_camera": pose((92, -50, 80), (0, 0, 90))}}
+        true = described(tmp_path / "true", head)[0] if moved else None
+        return Cell.open(config, sim="all", clock="virtual", seed=2, job=own, truth=true)
+
+    return make
+
+
+def kept(batch: BatchOutcome) -> dict[str, object]:
+    return read_json(batch.file).require()
+
+
+def test_the_figures_are_those_of_the_runs_and_each_part_is_gripped_otherwise(opened: Callable[..., Cell]) -> None:
+    lines: list[str] = []
+    with opened() as cell:
+        batch = cell.run_batch("own.toml", 3, lambda event: lines.append(str(event.data.get("text"))))
+    assert (batch.exit_code, batch.counts["placed"], batch.counts["not tried"]) == (0, 3, 0)
+    assert kept(batch) == json.loads(json.dumps(batch.as_dict()))
+    reports = [read_report(run.folder) for run in batch.runs]
+    assert len({json.dumps(report["truth"]["error_mm"]) for report in reports}) == 3
+    series = {"cycle time": [report["cell_s"] for report in reports]}
+    for row in reports[0]["measured"]:
+        series[row["name"]] = [next(r["value"] for r in x["measured"] if r["name"] == row["name"]) for x in reports]
+    assert [figure.name for figure in batch.figures] == list(series)
+    for figure in batch.figures:
+        values = np.array(series[figure.name])
+        expected = [values.mean(), values.std(ddof=1), values.min(), values.max()]
+        assert figure.n == 3
+        np.testing.assert_allclose([figure.mean, figure.sd, figure.min, figure.max], expected, rtol=1e-9, atol=1e-12)
+    assert [line for line in lines if line.startswith("part 3 of 3  placed: ") and line.endswith("3 placed")]
+
+
+@pytest.mark.parametrize(("rule", "refused"), [("", 1), ("end", 1), ("skip", 2)])
+def test_after_a_refusal_the_job_decides(opened: Callable[..., Cell], rule: str, refused: int) -> None:
+    with opened(rule, moved=True) as cell:
+        batch = cell.run_batch("own.toml", 2)
+    assert (batch.counts["refused"], batch.counts["not tried"], batch.exit_code) == (refused, 2 - refused, 1)
+    assert batch.figures == ()
+
+
+def test_where_the_job_asks_a_person_goes_on_or_ends_it(opened: Callable[..., Cell]) -> None:
+    """The second question is answered with the end; nothing is tried before the first is answered."""
+    asked: list[str] = []
+    with opened("ask", moved=True) as cell:
+
+        def answer(event: Event) -> None:
+            if event.kind == "confirm_needed" and cell.current is not None:
+                asked.append(str(event.data["reason"]))
+                assert len(list(cell.runs_folder.glob("*/journal.sqlite"))) == 2 * len(asked)
+                if len(asked) == 1:
+                    cell.current.confirm("Ann")
+                else:
+                    cell.current.abort("Ann ends it")
+
+        batch = cell.run_batch("own.toml", 3, answer)
+    assert (batch.counts["refused"], batch.counts["not tried"], batch.exit_code) == (2, 1, 1)
+    assert [text.rpartition(". ")[2] for text in asked] == ["Go on with part 2 of 3?", "Go on with part 3 of 3?"]
+    assert "after part 2: loading ended: Ann ends it" in batch.reason
+
+
+def test_a_fault_ends_it_whatever_the_job_says_of_refusals(opened: Callable[..., Cell]) -> None:
+    with opened("skip") as cell:
+        batch = cell.run_batch("own.toml", 2, inject=["arm.emergency_stop@drive_to_target:40%"])
+    assert (batch.counts["faulted"], batch.counts["not tried"], batch.exit_code) == (1, 1, 1)
+    assert batch.reason.startswith("part 1 faulted: ")
+
+
+def test_an_abort_in_the_second_part_leaves_the_first_whole_and_tells_what_was_not_tried(
+    opened: Callable[..., Cell],
+) -> None:
+    before: list[dict[str, object]] = []
+    with opened() as cell:
+
+        def end(event: Event) -> None:
+            files = list(cell.runs_folder.glob("batch-*.json"))
+            if files and event.kind == "step_started" and event.step == "board_photo" and cell.current is not None:
+                before.append(read_json(files[0]).require())
+                cell.current.abort("seen enough")
+
+        batch = cell.run_batch("own.toml", 3, end)
+    assert before[0]["reason"] == "not ended, or its process died"
+    assert before[0]["counts"] == dict(kept(batch)["counts"], aborted=0, **{"not tried": 2})  # type: ignore[call-overload]
+    assert [run.outcome for run in batch.runs] == ["placed", "aborted"]
+    assert (batch.reason, batch.counts["not tried"], batch.exit_code) == ("part 2 aborted: seen enough", 1, 1)
+    assert read_report(batch.runs[0].folder)["outcome"] == "placed"
+
+
+@pytest.mark.parametrize("count", [0, 1_000_001])
+def test_a_count_out_of_range_is_told_with_the_range(
+    opened: Callable[..., Cell], typed: Callable[..., tuple[int, str, str]], count: int
+) -> None:
+    with opened() as cell, pytest.raises(ConfigError, match="allowed: 1 to 1000000"):
+        cell.run_batch("own.toml", count)
+    code, _, error = typed("dry-run", "-j", "own.toml", "--count", str(count))
+    assert (code, "allowed: 1 to 1000000" in error) == (2, True), error
+
+
+def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callable[..., Cell], tmp_path: Path) -> None:
+    """As at a cell with real devices: the person holds a part between the fingers at the second question only."""
+    asked: list[str] = []
+    with opened() as cell:
+        job, last = load_job("own.toml")[0], RunOutcome("placed", "all steps done", tmp_path, {})
+        here, claw = replace(cell._here, simulated=None), cell.devices.claw
+
+        def person(what: str) -> None:
+            asked.append(what.split()[0])
+            assert isinstance(cell.simulated, VirtualCell)
+            assert claw.holding == cell.simulated.world.switched("claw") == (asked[-1] == "The")
+            if asked == ["Hold", "Hold"]:
+                cell.simulated.make_ready(Described.of("own.toml"))
+
+        def work(hands: Hands) -> None:
+            with cell.maintenance("the part is taken out", ["claw_at_contact"]):
+                claw.release()
+            question = _question(here, job, "part 2 of 2", last)
+            assert question is not None
+            question(replace(hands, ask=person))
+
+        cell.perform("loading", work)
+    assert asked == ["Hold", "Hold", "The"]
+    assert _question(cell._here, job, "part 2 of 2", last) is None
+
+
+def test_the_command_line_shows_what_came_of_it(
+    opened: Callable[..., Cell], typed: Callable[..., tuple[int, str, str]]
+) -> None:
+    opened().close()
+    words = ("dry-run", "-c", "cell.toml", "-j", "own.toml", "--clock", "virtual", "--seed", "2", "--count", "1")
+    code, out, error = typed(*words)
+    assert (code, "1 placed, 0 corrected" in out, "part 1 of 1  placed" in error) == (0, True, True), (out, error)
+    assert typed(*words, "--until", "board_photo")[0] == 2
