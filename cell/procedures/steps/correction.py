@@ -13,7 +13,7 @@ from cell.measure.inversion import PlacePose
 from cell.measure.inversion.mating import scanned_gap
 from cell.motion.collision import TOUCHES
 from cell.procedures.arm.moves import PartProgress, PartState
-from cell.procedures.arm.touch import expected_touch
+from cell.procedures.arm.touch import expected_contact, expected_touch
 from cell.procedures.part_error import draws_of, part_points
 from cell.procedures.steps.place import FAST_FORCE, PlaceResult, Placing
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -81,8 +81,9 @@ def correct(
         gap.require(here.job.place.tolerance)
         expected = replace(expected, height=expected.height + gap.lift)
     _take(here, job, placed.base_from_flange, context)
+    region = expected_contact(job, here.nominal, pose, here.repeatability, part=part, mating=gap)
     placing = Placing(
-        job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
+        job, pose.base_from_surface, expected, region, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
         part=here.part, check=context.check, progress=lambda share, text: context.progress(0.5, f"again: {text}"),
         note=lambda part: _note(context, part, to_ur(part.where).tolist()),
     )  # fmt: skip
