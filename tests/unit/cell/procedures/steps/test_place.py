@@ -253,9 +253,11 @@ def test_a_stiff_touch_as_soon_as_it_is_felt_for_is_refused_with_the_part_held(
 
 def pushed_at(site: Site, place: tuple[float, float], along: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> None:
     """Something springy pushes along this way, part axes, at this place of its underside, m, and nothing else does."""
-    belongs = site.base_from_surface * JOB.place.surface_from_part.se3()
+    belongs, follow = site.base_from_surface * JOB.place.surface_from_part.se3(), site.cell.world.arm.contact
+    assert follow is not None
 
     def wrench(base_from_flange: Any) -> Any:
+        follow(base_from_flange)
         flange = from_matrix(base_from_flange)
         depth = -float(belongs.actInv((flange * JOB.grasp.flange_from_part.se3()).translation)[2])
         force = 20e3 * max(0.0, depth) * belongs.rotation @ np.array(along)
