@@ -122,14 +122,14 @@ def expected_touch(job: Job, nominal: NominalSurface, pose: PlacePose, placing: 
 
 
 def expected_contact(
-    job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vector, *, part: NominalSurface | None = None,
-    mating: MatingGap | None = None,
+    job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vector,
+    own: tuple[NominalSurface | None, MatingGap | None] = (None, None),
 ) -> ContactRegion:  # fmt: skip
-    """Where the part can touch, with all that is stated as for `expected_touch`.
+    """Where the part can touch, with all that is stated as for `expected_touch`: anywhere on the nominal surface.
 
-    Without a mesh of the `part` its underside is the nominal surface, and touches anywhere. With one, where the gap to
-    the scanned surface, `mating`, lets it: also wherever nothing was scanned.
+    A part with a mesh of its `own` touches where its gap to the scanned surface lets it, or nothing was scanned.
     """
+    part, mating = own
     arms, slopes, clearances = _displaced(job, nominal, pose, placing)
     slack = np.full(len(arms), np.inf)
     if part is not None:

@@ -81,7 +81,7 @@ def correct(
         gap.require(here.job.place.tolerance)
         expected = replace(expected, height=expected.height + gap.lift)
     _take(here, job, placed.base_from_flange, context)
-    region = expected_contact(job, here.nominal, pose, here.repeatability, part=part, mating=gap)
+    region = expected_contact(job, here.nominal, pose, here.repeatability, (part, gap))
     placing = Placing(
         job, pose.base_from_surface, expected, region, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
         part=here.part, check=context.check, progress=lambda share, text: context.progress(0.5, f"again: {text}"),

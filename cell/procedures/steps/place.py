@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,17 +17,10 @@ from cell.measure.inversion.first_contact import ContactPoint, ContactRegion, co
 from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, scanned_gap
 from cell.measure.reconstruction.cloud import Indices
 from cell.motion.collision import TOUCHES
+from cell.procedures.arm import touch as felt
 from cell.procedures.arm.moves import Mover, PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.arm.touch import (
-    FELT_M,
-    REFUSED,
-    TouchCheck,
-    TouchHeight,
-    expected_contact,
-    expected_touch,
-    felt_touch,
-)
+from cell.procedures.arm.touch import TouchCheck, TouchHeight, expected_contact, expected_touch, felt_touch
 from cell.procedures.steps.board_photo import require_unmoved
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -44,7 +36,6 @@ APPROACH_S = 3.0
 """About what the arm takes from the scan pose to the approach pose."""
 FAST_FORCE = 3.0
 """Times the contact force at which the faster part of the descent ends: accelerating the part is felt as well."""
-UNKNOWN = "where the part touched is not known: the arm told too few forces at rest"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +62,7 @@ class PlaceResult:
         """What is not as usual, for people."""
         seen = () if self.look is None else self.look.notes
         seen += () if self.mating is None else self.mating.notes
-        seen += (UNKNOWN,) if self.at is None else self.at.notes
+        seen += ("the arm told too few forces to know where the part touched",) if self.at is None else self.at.notes
         if self.touch is None:
             return (*seen, "the first touch was not held against the scan: the arm told too little of the way down")
         return (*seen, *self.touch.notes)
@@ -168,10 +159,8 @@ class Placing:
         )
         # At rest a lighter touch is felt than on the way; taken as zero, it would be pressed on without an end.
         if stopped or not np.linalg.norm(self.arm.state().wrench[:3]) <= plan.contact_force:
-            height, where = self._depth(), ""
-            with suppress(RefusedError):
-                at = self._touched_at(bare)
-                where = "" if at is None else f", at {at.words}"
+            height, at = self._depth(), self._touched_at(bare)
+            where = "" if at is None else f", at {at.words}"
             self._lift()
             raise RefusedError(
                 f"the part touched something more than {1e3 * plan.contact_travel:.2f} mm above the place pose{where}; "
@@ -201,32 +190,25 @@ class Placing:
 
     def _touched_at(self, bare: Vector) -> ContactPoint | None:
         """Which place of the part is pressed now, by wrenches (n, 6) before and now; base axes, about the flange."""
-        grasp = self.job.grasp
-        turn = np.kron(np.eye(2), (from_ur(self.arm.state().flange) * grasp.flange_from_part.se3()).rotation)
-        origin = grasp.flange_from_part.se3().inverse().translation
-        return contact_point(
-            bare @ turn, self.mover.at_rest() @ turn, origin, self.region.level, grasp.covariance[:2, :2]
-        )
+        held, known = self.job.grasp.flange_from_part.se3(), self.job.grasp.covariance[:2, :2]
+        turn = np.kron(np.eye(2), from_ur(self.arm.state().flange).rotation @ held.rotation)
+        now = self.mover.at_rest() @ turn
+        return contact_point(bare @ turn, now, held.inverse().translation, self.region.level, known)
 
     def _require_expected(
         self, bare: Vector, states: Sequence[ArmState], off: float
     ) -> tuple[TouchCheck | None, ContactPoint | None]:
-        """How high and where the part touched first, beside what the scan says; None where the arm does not tell it.
-
-        The part is lifted before `RefusedError` is raised.
-        """
-        normal = self._base_from_part.rotation[:, 2]
-        touched = felt_touch(states, self._flange_at(0.0).translation, normal)
+        """How high and where the part touched first, beside what the scan says; None where the arm does not tell it."""
+        touched = felt_touch(states, self._flange_at(0.0).translation, self._base_from_part.rotation[:, 2])
+        at = self._touched_at(bare)
+        # It touched no lower than where it stands now.
+        touch = TouchCheck(touched or TouchHeight(off, felt.FELT_M), self.expected, at)
         try:
-            at = self._touched_at(bare)
-            # It touched no lower than where it stands now.
-            touch = TouchCheck(touched or TouchHeight(off, FELT_M), self.expected, at)
-            if told := touched is not None or touch.off > REFUSED * touch.sigma:
+            if told := touched is not None or touch.off > felt.REFUSED * touch.sigma:
                 touch.require()
             if at is not None:
-                at = self.region.judge(
-                    at, np.inf if touched is None else touched.height - off + REFUSED * touched.sigma
-                )
+                pressed = np.inf if touched is None else touched.height - off + felt.REFUSED * touched.sigma
+                at = self.region.judge(at, pressed)
                 at.require()
         except RefusedError:
             self._lift()
@@ -272,8 +254,7 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         if mating is not None:
             expected = replace(expected, height=expected.height + mating.lift)
             pose = mating.stated(pose, here.job.place.surface_from_part.se3())
-        lies = here.nominal, pose, here.repeatability
-        region = expected_contact(here.job, *lies, part=here.part_mesh, mating=mating)
+        region = expected_contact(here.job, here.nominal, pose, here.repeatability, (here.part_mesh, mating))
         context.safe_point()
         # Whoever has the run held may reach in, also in the middle of a look: then it is looked at again.
         if context.held_s == held:

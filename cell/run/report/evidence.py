@@ -97,8 +97,6 @@ def measured(
         found.append(Measured("contact depth", 1e3 * placed.depth_error, "mm", most=travel))
         if placed.touch is not None:
             found.append(placed.touch.measured)
-        if placed.at is not None and placed.at.judged:
-            found.append(placed.at.measured)
         if placed.mating is not None:
             found.append(placed.mating.measured(job.place.tolerance))
     if isinstance(pose, PlacePose):

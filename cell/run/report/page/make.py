@@ -284,11 +284,7 @@ def _part_rows(report: Report) -> Iterator[Row]:
 
 
 def _touch_rows(report: Report) -> Iterator[Row]:
-    placed = _result(report, "place") or {}
-    if (at := placed.get("touched_at")) is not None:
-        shown, unsure = f"x {at['x_mm']:+.1f}, y {at['y_mm']:+.1f} mm", f"± {K95 * at['sigma_mm']:.1f} mm"
-        yield "first touch, place on the part", "its face", shown, f"{at['beside_mm']:.1f} mm beside it", "", unsure
-    if (touch := placed.get("touch")) is None:
+    if (touch := (_result(report, "place") or {}).get("touch")) is None:
         return
     limit = next((row.cells[2] for row in judged(report) if row.cells[0].startswith("first touch")), "")
     expected, felt = (f"{touch[key]:.3f} mm" for key in ("expected_mm", "felt_mm"))

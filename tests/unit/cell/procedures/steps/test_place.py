@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -197,7 +196,7 @@ def test_what_the_force_sensor_showed_before_the_descent_is_no_touch() -> None:
 def test_a_surface_that_comes_early_is_refused_with_the_part_held_lifted_and_not_crushed(early: float) -> None:
     """Also one that is met just before the slow part of the descent, where the fast one does not feel it yet."""
     site = Site()
-    with pytest.raises(RefusedError, match=r"touched something more than 1\.00 mm above"):
+    with pytest.raises(RefusedError, match=r"touched something more than 1\.00 mm above the place pose, at x "):
         site.place(too_low=early)
     assert site.held
     assert site.part.state is PartState.HELD
@@ -211,7 +210,7 @@ def test_a_surface_that_comes_early_is_refused_with_the_part_held_lifted_and_not
 def test_a_touch_that_contradicts_the_scan_is_refused_with_the_part_held_and_lifted(too_low: float, side: str) -> None:
     """Within the way in which contact is looked for: only what is stated of the place tells that it is wrong."""
     site = Site()
-    with pytest.raises(RefusedError, match=rf"touched 0\.\d+ mm {side} than the scan says.*verify") as caught:
+    with pytest.raises(RefusedError, match=rf"touched 0\.\d+ mm {side} than the scan says, at x .*verify") as caught:
         site.place(too_low=too_low)
     (number,) = caught.value.numbers
     assert number.value == pytest.approx(1e3 * too_low, abs=0.03)
@@ -277,50 +276,15 @@ def test_where_the_part_is_pressed_is_told_in_its_own_frame() -> None:
     assert 1e-3 < at.sigma < 3e-3, "the sensor's cross-talk over 17 cm, and the grasp"
 
 
-@pytest.mark.parametrize(
-    ("place", "along", "told"),
-    [
-        (
-            (0.08, 0.0),
-            (0.0, 0.0, 1.0),
-            r"something pushes at x \+80, y [+-]0 mm .* 4\d mm beside where the part can touch",
-        ),
-        ((0.0, 0.0), (1.0, 0.0, 0.1), r"a force of \d+\.\d N pushes from the side"),
-    ],
-)
-def test_what_pushes_beside_the_part_is_refused_with_the_part_held_and_lifted(
-    place: tuple[float, float], along: tuple[float, float, float], told: str
-) -> None:
+def test_what_pushes_beside_the_part_is_refused_with_the_part_held_and_lifted() -> None:
     """A scan head that meets something at the height of the touch: the part would be let go of in the air."""
     site = Site()
-    pushed_at(site, place, along)
-    with pytest.raises(RefusedError, match=told):
+    pushed_at(site, (0.08, 0.0))
+    with pytest.raises(RefusedError, match=r"something pushes at x \+80, y [+-]0 mm .* 4\d mm beside where the part"):
         site.place()
     assert site.held
     assert site.noted == []
     assert site.height_above() > 0.5 * JOB.place.approach
-
-
-def test_a_contact_where_the_part_as_drawn_is_clear_of_the_ground_is_refused() -> None:
-    """One half of its underside stands 1.5 mm clear, by the scan: there it cannot touch."""
-    site = Site()
-    clear = np.where(REGION.crossings[:, 0] < 0.0, 1.5e-3, 0.0)
-    site.region = replace(REGION, clearances=REGION.clearances + clear, slack=np.full(len(clear), 0.05e-3))
-    pushed_at(site, (0.02, 0.0))
-    assert site.place().contact
-    other = Site()
-    other.region = site.region
-    pushed_at(other, (-0.03, 0.0))
-    with pytest.raises(RefusedError, match=r"something pushes at x -30, .* 2\d mm beside"):
-        other.place()
-    assert other.held
-
-
-def test_a_contact_too_high_is_told_with_its_place() -> None:
-    site = Site()
-    pushed_at(site, (0.03, 0.01))
-    with pytest.raises(RefusedError, match=r"than the scan says, at x \+30, y \+10 mm of the part's frame"):
-        site.place(too_low=0.4e-3)
 
 
 def test_nothing_is_held_between_the_last_look_and_the_release() -> None:
