@@ -268,6 +268,7 @@ def pushed_at(site: Site, place: tuple[float, float], along: tuple[float, float,
 
 def test_where_the_part_is_pressed_is_told_in_its_own_frame() -> None:
     site = Site()
+    site.base_from_surface = site.base_from_surface * pin.SE3(pin.utils.rotate("z", 0.4), np.zeros(3))
     pushed_at(site, (0.021, -0.011), (0.3, 0.2, 1.0))
     at = site.place().at
     assert at is not None
