@@ -23,8 +23,9 @@ from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.steps import verify
+from cell.procedures.steps.board_photo import around
 from cell.procedures.steps.kinds import kind_of
-from cell.procedures.steps.sought_part import nominal_of, sought
+from cell.procedures.steps.sought_part import ground_below, nominal_of, sought
 from drivers.errors import ConfigError
 from drivers.make import CameraConfig
 
@@ -55,7 +56,7 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
     # The arm's poses follow from the others: where these are wrong, it would only be told twice.
     if not problems:
         found, file = sought(job, mesh)
-        box = extent if found is job else nominal_of(found, file).extent
+        box = extent if found is job else around(nominal_of(found, file).extent, ground_below(job, extent))
         problems += reach_problems(found, config, box, calibrates=calibrates)
     problems += contact_problems(job, config, mesh)
     problems = problems or [*mating_problems(job, mesh), *verify_problems(job, config)]
@@ -71,6 +72,8 @@ def _kind(job: Job) -> Iterator[str]:
         return
     if kind.unloads and (job.part is None or job.nest is None):
         yield f'job.kind "{kind.name}" finds the part by its mesh and takes it to the vehicle: give [part] and [nest]'
+    if kind.unloads and job.place.verify == "none":
+        yield f'place.verify = "none": job.kind "{kind.name}" looks at the part in its nest; write "all" or "seen"'
     if not kind.unloads and job.nest is not None:
         yield f'[nest]: job.kind "{kind.name}" sets no part down there; write kind = "unload", or no nest'
     if job.part is None and verify.STEP.name in kind.names:

@@ -70,6 +70,11 @@ def contact_problems(job: Job, config: CellConfig, mesh: Path) -> Iterator[str]:
             f"place.contact_travel {1e3 * place.contact_travel:g} mm is less than three times grasp.sigma: the part "
             f"would often not touch within it (allowed: at least {3e3 * grasp.sigma:g} mm)"
         )
+    if job.nest is not None and place.contact_travel < 3 * job.nest.sigma:
+        yield (
+            f"place.contact_travel {1e3 * place.contact_travel:g} mm is less than three times nest.sigma: the part "
+            f"would often not touch within it (allowed: at least {3e3 * job.nest.sigma:g} mm)"
+        )
     if (blur := job.scan.exposure * job.scan.speed) > 0.5 * place.tolerance:
         yield (
             f"scan.exposure {1e3 * job.scan.exposure:g} ms at scan.speed {1e3 * job.scan.speed:g} mm/s smears a line "
@@ -118,6 +123,8 @@ def _feature_problems(job: Job, part: PartSection) -> Iterator[str]:
             f"part.feature {part.feature[0].name}: nobody looks at the placed part. Write place.verify, a kind of job "
             "with the step verify, or no feature"
         )
+    if not part.feature:
+        return
     low, high = NominalSurface.load(Path(part.mesh), unit=part.mesh_unit).extent
     for feature in part.feature:
         at = np.array(feature.at)

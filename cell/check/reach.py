@@ -134,6 +134,7 @@ def _goals(job: Job, config: CellConfig) -> Iterator[Goal]:
         for what, height in (("above the nest", job.place.approach), ("in the nest", -job.place.contact_travel)):
             nest = job.nest.base_from_part.se3() * from_parts((0.0, 0.0, height))
             yield f"the pose {what} (nest.base_from_part)", nest * part_from_flange, ()
+        yield from _sweeps(job, config, job.nest.base_from_part.se3(), over="the part in its nest")
         return
     try:
         faces = seen_faces(job)

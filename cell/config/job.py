@@ -85,7 +85,7 @@ class SurfaceSection(Table):
 
 class FeatureSection(Table):
     """What people measure of a placed part, in the part's frame: a flat counts along its normal, an edge, a hole or a
-    pin across its direction. `axis` (3,), of any length, is that normal or direction."""
+    pin across its direction. `axis` (3,) is that normal or direction; its length does not count."""
 
     name: Annotated[str, Name]
     kind: Literal["flat", "edge", "hole", "pin"]
@@ -95,8 +95,8 @@ class FeatureSection(Table):
 
     @model_validator(mode="after")
     def _has_direction(self) -> Self:
-        if not any(self.axis):
-            raise ValueError("axis (0, 0, 0) has no direction; give a flat's normal, else the feature's own direction")
+        if not max(map(abs, self.axis)) >= 1e-3:
+            raise ValueError(f"axis {self.axis} has no direction; give a flat's normal, else the feature's own")
         return self
 
 

@@ -17,14 +17,16 @@ from typing import Self
 from cell.base.storage import sealed, write_json
 from cell.config.job import Job
 from cell.devices.simulated.process import is_whole
+from cell.procedures.arm.moves import PartState
 from cell.run.folder import Report
 from cell.run.job_run import Observer, RunOutcome
 from cell.run.recorded_work import Hands
 from cell.run.session.session import Opened
 from drivers.errors import CellError, ConfigError, DeviceFault, Interrupted
 from statemachine.step import Event
+from statemachine.watch import SignalInterrupt
 
-MOST_PARTS = 1_000_000
+MOST_PARTS = 10_000
 GOOD = ("placed", "done")
 COUNTED = ("placed", "corrected", "refused", "misplaced", "faulted", "aborted")
 
@@ -149,14 +151,17 @@ def perform(
             if observer is not None:
                 observer(Event("note", None, {"text": str(batch)}))
             # Nobody knows how a part lies that is down and was refused.
-            skipped = last.outcome == "refused" and last.report.get("part") == "held" and job.batch.on_refusal != "end"
+            there = PartState.HELD if job.nest is None else PartState.LIES
+            skipped = last.outcome == "refused" and last.report.get("part") == there.value
+            skipped = skipped and job.batch.on_refusal != "end" and (job.nest is not None or here.devices.claw.holding)
             interrupted = last.interrupted
             if interrupted or last.stopped_after_end or not (last.outcome in GOOD or skipped):
                 why = f"part {number} {last}"
-    except CellError as error:
+    except (CellError, SignalInterrupt) as error:
         if not batch.runs:
             raise
-        why, interrupted = f"after part {len(batch.runs)}: {error}", isinstance(error, Interrupted)
+        why = f"after part {len(batch.runs)}: {error}"
+        interrupted = isinstance(error, Interrupted | SignalInterrupt)
     return replace(batch, reason=why or "every part was tried", interrupted=interrupted).kept()
 
 

@@ -15,6 +15,7 @@ import pinocchio as pin
 
 from cell.base.storage import table, write_json
 from cell.check.fit import require_fit
+from cell.check.place import mesh_box
 from cell.config.calibrations.store import CellCalibration, save_calibration
 from cell.config.cell_config import DEVICES, CellConfig
 from cell.config.job import Job, load_job
@@ -28,7 +29,7 @@ from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps import verify
 from cell.procedures.steps.kinds import Kind, kind_of
-from cell.procedures.steps.sought_part import nominal_of, sought
+from cell.procedures.steps.sought_part import ground_below, nominal_of, sought
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep
 from cell.procedures.sweep.swath import SweepCollector, Sweeping
@@ -44,6 +45,7 @@ from cell.run.resumption import UnfinishedRun, job_source
 from cell.run.runs import Run
 from cell.run.session.session import Opened
 from drivers.errors import CalibrationStale, CellError
+from drivers.interfaces import Vector
 from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
 from statemachine.runner import NO_SCRIPT, Event, Runner, Script
@@ -62,6 +64,7 @@ class ReadyJob:
     nominal: NominalSurface
     script: Script
     info: dict[str, object]
+    ground: tuple[Vector, Vector] | None = None
 
     @classmethod
     def read(
@@ -75,6 +78,7 @@ class ReadyJob:
         require_fit(job, config, mesh, calibrates=calibrates)
         kind = kind_of(job).until(until)
         kind.require_steps(script.after)
+        ground = None if job.nest is None else ground_below(job, mesh_box(mesh, job.surface.mesh_unit))
         job, mesh = sought(job, mesh)
         nominal = nominal_of(job, mesh)
         info: dict[str, object] = dict(job_source(file))
@@ -83,7 +87,7 @@ class ReadyJob:
             info["until"] = until
         if not script.idle:
             info["scripted"] = True
-        return cls(job, kind, nominal, script, info)
+        return cls(job, kind, nominal, script, info, ground)
 
 
 Observer = Callable[[Event], None]
@@ -156,6 +160,7 @@ class JobRun:
     earlier: StoredSweep | None = None
     truth: Callable[[], dict[str, object]] | None = None
     pace: Pace = field(default_factory=Pace)
+    ground: tuple[Vector, Vector] | None = None
 
     def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
         """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
@@ -205,9 +210,9 @@ class JobRun:
         return Workplace(
             self.config, self.job, self.nominal, calibration=self.calibration, devices=self.devices, frames=frames,
             folder=folder, whereabouts=whereabouts, earlier=self.earlier,
-            needs_part=self.kind.places and not self.kind.unloads, looks_after=verify.STEP.name in self.kind.names,
-            sweeping=self._sweeping, registered=self._registered, pace=self.pace,
-            part=PartProgress(PartState.LIES if self.kind.unloads else PartState.HELD),
+            needs_part=self.kind.places and self.job.nest is None, looks_after=verify.STEP.name in self.kind.names,
+            sweeping=self._sweeping, registered=self._registered, pace=self.pace, ground=self.ground,
+            part=PartProgress(PartState.HELD if self.job.nest is None else PartState.LIES),
         )  # fmt: skip
 
     def _runner(self, here: Workplace, journal: Journal, observer: Observer) -> Runner:
@@ -344,7 +349,7 @@ class JobWork:
         job_run = JobRun(
             run, cell.config, cell.devices, job=ready.job, nominal=ready.nominal, calibration=calibration,
             info=self.info, kind=ready.kind, script=ready.script, inline=self.inline, earlier=earlier, truth=cell.truth,
-            pace=cell.pace,
+            pace=cell.pace, ground=ready.ground,
         )  # fmt: skip
         try:
             return job_run.perform(cell.runs_folder, cell.whereabouts)

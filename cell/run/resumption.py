@@ -131,11 +131,13 @@ def _require_held(folder: Path, record: JournalRecord) -> None:
     match _part(record):
         case PartState.HELD.value if not any("part" in event.data for event in record.events):
             return
+        case PartState.LIES.value:
+            return
         case PartState.HELD.value:
             raise ConfigError(
                 f"run {folder.name} had gripped a part that lay: how the claw holds it is not known, and the run is "
                 "not resumed. Take the part out by hand, fold the arm with `cell home`, then "
-                "run the job with a part in the claw"
+                "run the job anew"
             )
         case PartState.RELEASED.value:
             step = next(event.step for event in reversed(record.events) if "part" in event.data)
@@ -151,8 +153,7 @@ def _require_held(folder: Path, record: JournalRecord) -> None:
                 how = "ended while the claw was releasing or gripping its part"
             raise ConfigError(
                 f"run {folder.name} {how}: whether the claw still has it is not known, and the run is not resumed. "
-                "Look what has become of the part, fold the arm with `cell home`, then run the job with a part in the "
-                "claw"
+                "Look what has become of the part, fold the arm with `cell home`, then run the job anew"
             )
 
 

@@ -17,6 +17,7 @@ from cell.procedures.arm.photograph import MOVED, BoardFix, photo_pose, swing_co
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
 from drivers.errors import Measured, RefusedError
+from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 from statemachine.step import Step
 
@@ -106,9 +107,14 @@ def require_unmoved(here: Workplace, fix: BoardFix, since: str, progress: Callab
     )
 
 
+def around(box: tuple[Vector, Vector], other: tuple[Vector, Vector] | None) -> tuple[Vector, Vector]:
+    """The box around both, as lowest and highest corner (3,)."""
+    return box if other is None else (np.minimum(box[0], other[0]), np.maximum(box[1], other[1]))
+
+
 def _at(here: Workplace, context: StepContext) -> BoardFix:
     arrival, job = context.made(VehicleArrival), here.job
-    here.mover.meet_station(arrival.base_from_place, job, here.board, here.nominal.extent)
+    here.mover.meet_station(arrival.base_from_place, job, here.board, around(here.nominal.extent, here.ground))
     goal = photo_pose(job, here.board, arrival.fix.base_from_board, here.calibration.target.flange_from_camera)
     fix = photographed(here, goal, context.progress)
     for note in fix.notes:

@@ -77,8 +77,9 @@ def take(
         mover.spare_part()
         mover.line(above, plan.speed, TOUCHES)
         raise RefusedError(
-            f"{what} sticks: the claw pulled at it with more than {most_pull:.0f} N and let it go again, where it lay. "
-            "Look what holds it",
+            f"{what} sticks, or is heavier than place.contact_force lets the claw lift: it pulled with more than "
+            f"{most_pull:.0f} N and let go, at most {1e3 * plan.contact_travel:g} mm above where the part lay. Look "
+            "what holds it, or raise place.contact_force",
             Measured("pull at the part", most_pull, "N", most=most_pull),
         )
     mover.line(above, plan.speed, TOUCHES)

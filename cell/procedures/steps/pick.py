@@ -12,9 +12,12 @@ from cell.measure.inversion import PlacePose
 from cell.measure.inversion.part_pose import seen_from_below
 from cell.procedures.arm.moves import PartState
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.steps.board_photo import require_unmoved
-from cell.procedures.steps.gripping import GRIPPED, take
+from cell.procedures.steps.gripping import GRIPPED, note_part, take
+from cell.procedures.steps.place import carried_on
+from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace
+from cell.procedures.sweep.second_look import require_in_place
+from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext
@@ -43,17 +46,30 @@ class HeldPart:
 
 
 def _at(here: Workplace, context: StepContext) -> HeldPart:
-    pose, fix, job = context.made(PlacePose), context.made(BoardFix), here.job
-    if here.part.state is not PartState.LIES:
-        raise RefusedError(f"the part is {here.part.state.value}: nothing is gripped a second time")
-    require_unmoved(here, fix, "before the part was measured", context.progress)
-    context.safe_point()
-    held = job.grasp.flange_from_part.se3()
-    grip = pose.base_from_surface * job.place.surface_from_part.se3() * held.inverse()
-    here.part.where = pose.base_from_surface
+    fix, job, part = context.made(BoardFix), here.job, here.part
+    if part.state is not PartState.LIES:
+        raise RefusedError(f"the part is {part.state.value}: nothing is gripped a second time")
+    while True:
+        before, pose = context.held_s, context.made(PlacePose)
+        sweep, scan = context.made(SweepRecord), context.made(Reconstruction)
+        look = require_in_place(here, fix, sweep, scan=scan, pose=pose, context=context)
+        if look.creep is not None:
+            pose = carried_on(here, sweep, scan, fix, look.creep)
+        context.safe_point()
+        # Whoever has the run held may reach in, and move the part.
+        if context.held_s == before:
+            break
+    for note in look.notes:
+        context.note(text=note)
+    grip = pose.base_from_surface * job.place.surface_from_part.se3() * job.grasp.flange_from_part.se3().inverse()
+    part.where = pose.base_from_surface
     _lies(here, fix, pose.base_from_surface)
+    # After a grip that found no part its fingers are closed.
+    here.devices.claw.release()
     take(here, job, grip, context, what="the part", most_pull=MOST_PULL * job.place.contact_force)
     if not here.devices.claw.holding:
+        part.state = PartState.UNKNOWN
+        note_part(context, part)
         raise RefusedError("the claw lost the part as it lifted it; look where it fell, and at the fingers")
     return HeldPart(grip, pose.covariance + here.repeatability + GRIPPED)
 
@@ -62,11 +78,14 @@ def _lies(here: Workplace, fix: BoardFix, base_from_part: pin.SE3) -> None:
     """From here on the arm avoids the part, and what lies below it, each by itself: one stays when the other goes."""
     part = here.part_mesh
     assert part is not None
-    below = seen_from_below(part, here.job.place.surface_from_part.se3())
+    below = seen_from_below(part, here.job.place.surface_from_part.se3()).extent if here.ground is None else here.ground
     base_from_place = fix.base_from_board * here.job.place_from_board.inverse()
-    here.mover.meet_station(base_from_place, here.job, here.board, below.extent)
+    here.mover.meet_station(base_from_place, here.job, here.board, below)
     here.mover.part_lies(base_from_part, here.job.grasp.size)
 
 
 # What was interrupted with the part between the fingers is left to a person.
-STEP = JobStep(Step("pick", 180.0, on_failure=OnFailure.STOP), _at, HeldPart, needs=(BoardFix, PlacePose))
+STEP = JobStep(
+    Step("pick", 300.0, on_failure=OnFailure.STOP), _at, HeldPart,
+    needs=(BoardFix, SweepRecord, Reconstruction, PlacePose),
+)  # fmt: skip

@@ -14,15 +14,18 @@ from cell.procedures.steps.pick import HeldPart
 from cell.procedures.steps.place import PlaceResult, Placing
 from cell.procedures.steps.workplace import JobStep, Workplace
 from drivers.errors import RefusedError
+from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
 
 
 @dataclass(frozen=True, eq=False)
 class SetDown:
-    """How the part was `put` into its nest. Nobody has looked at it there."""
+    """How the part was `put` into its nest, and `covariance` (6, 6), m² and rad², of where that is known to have put
+    it: of the nest, of how it was held, and of the arm. Nobody has looked at it there."""
 
     put: PlaceResult
+    covariance: Vector
 
     def summary(self) -> dict[str, object]:
         """Figures for journal and report."""
@@ -50,7 +53,7 @@ def _at(here: Workplace, context: StepContext) -> SetDown:
         raise RefusedError(f"at the nest: {error}", *error.numbers) from error
     for note in done.notes:
         context.note(text=f"at the nest: {note}")
-    return SetDown(done)
+    return SetDown(done, known + context.made(HeldPart).covariance + here.repeatability)
 
 
 # A part that may have touched its nest is not set down a second time by itself.

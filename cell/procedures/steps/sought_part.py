@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pinocchio as pin
 
 from cell.config.job import Job
+from cell.measure.geometry.poses import transform
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.part_pose import seen_from_above
+from drivers.interfaces import Vector
 from drivers.make import Pose
 
 UNLOAD = "unload"
@@ -21,7 +25,7 @@ def sought(job: Job, mesh: Path) -> tuple[Job, Path]:
     To be unloaded, the part's upper side is the surface: it lies where `place.surface_from_part` has it, and is gripped
     where it is found. The scan head keeps its distance from it. Other jobs stay as they are.
     """
-    if job.job.kind != UNLOAD or job.part is None or job.surface.mesh == job.part.mesh:
+    if job.nest is None or job.part is None or job.surface.mesh == job.part.mesh:
         return job, mesh
     there = job.surface.place_from_surface.se3() * job.place.surface_from_part.se3()
     surface = job.surface.model_copy(
@@ -37,8 +41,17 @@ def sought(job: Job, mesh: Path) -> tuple[Job, Path]:
 def nominal_of(job: Job, mesh: Path) -> NominalSurface:
     """The surface of a job as `sought` gives it, from its mesh's file. Raises `ConfigError`."""
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
-    unloaded = job.job.kind == UNLOAD and job.part is not None
-    return seen_from_above(nominal, job.place.surface_from_part.se3()) if unloaded else nominal
+    return nominal if job.nest is None else seen_from_above(nominal, job.place.surface_from_part.se3())
+
+
+def ground_below(job: Job, extent: tuple[Vector, Vector]) -> tuple[Vector, Vector]:
+    """The box around the surface that a sought part lies on, lowest and highest corner (3,), m, part frame.
+
+    `extent` is that of the surface in its own frame, of the job as it was read.
+    """
+    corners = np.array([[x, y, z] for x, y, z in product(*zip(*extent, strict=True))])
+    found = transform(job.place.surface_from_part.se3().inverse(), corners)
+    return found.min(axis=0), found.max(axis=0)
 
 
 def pose_record(pose: pin.SE3) -> Pose:

@@ -98,19 +98,8 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         raise RefusedError("the job has no mesh of its part ([part]): nothing tells what the placed part looks like")
     place, belongs = here.job.place, here.job.place.surface_from_part.se3()
     faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
-    while True:
-        held = context.held_s
-        over = pose.base_from_surface * surface_from_faces(here.job, faces)
-        cloud, record = swept_part(here, sweep, over, context)
-        context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
-        looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
-        here.mover.fold()
-        if looking is not None:
-            looking.wait(30.0)
-        context.safe_point()
-        # Whoever has the run held may reach in, and move the part.
-        if context.held_s == held:
-            break
+    over = pose.base_from_surface * surface_from_faces(here.job, faces)
+    cloud, record = swept_part(here, sweep, over, context)
     by_calibration, by_poses = displacements(here, record, cloud)
 
     def moved(lines: Indices, rows: Indices) -> Vector:
@@ -139,9 +128,24 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
 
 
 def swept_part(here: Workplace, sweep: SweepRecord, over: pin.SE3, context: StepContext) -> tuple[Cloud, SweepRecord]:
-    """Sweep the part `over` what is in the place of the surface, base from there, with the head as in the first sweep.
+    """Sweep the part `over` what is in the place of the surface, base from there, with the head as in the first sweep,
+    look whether the rail has lost steps meanwhile, and fold the arm."""
+    while True:
+        held = context.held_s
+        cloud, record = _swept(here, sweep, over, context)
+        context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
+        looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
+        here.mover.fold()
+        if looking is not None:
+            looking.wait(30.0)
+        context.safe_point()
+        # Whoever has the run held may reach in, and move the part.
+        if context.held_s == held:
+            return cloud, record
 
-    Lost frames are swept again: nothing of the part is moved by that."""
+
+def _swept(here: Workplace, sweep: SweepRecord, over: pin.SE3, context: StepContext) -> tuple[Cloud, SweepRecord]:
+    """One sweep of the part. Lost frames are swept again: nothing of the part is moved by that."""
     for left in reversed(range(SWEEPS)):
         try:
             again = laser_sweep(

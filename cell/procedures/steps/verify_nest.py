@@ -26,10 +26,8 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     job, sweep = where_seen(here.job), context.made(SweepRecord)
     belongs = job.place.surface_from_part.se3()
     cloud, record = swept_part(here, sweep, belongs, context)
-    here.mover.fold()
     by_calibration, by_poses = displacements(here, record, cloud)
     on_part, _ = parted(cloud, here.nominal, belongs)
-    known = np.diag([job.place.tolerance**2] * 3 + [job.place.tolerance_angle**2] * 3)
     try:
         fit = register(
             on_part, here.nominal, Prior(belongs, np.diag(SHIFTED**2)),
@@ -39,7 +37,7 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     except RefusedError as error:
         why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")
         raise MisplacedError(f"the part is not seen in its nest: {why}. {NEXT_STEP}", *error.numbers) from error
-    found = PlacedPart.of(job, _in_base(fit), part_points(here.nominal), known)
+    found = PlacedPart.of(job, _in_base(fit), part_points(here.nominal), context.made(SetDown).covariance)
     for note in found.notes:
         context.note(text=f"in its nest: {note}")
     if not found.kept(job.place):

@@ -43,12 +43,13 @@ PHOTO_RATE_HZ = 10.0
 class Workplace:
     """What every step of a job may use. `earlier` is the sweep of a run that this one resumes.
 
-    `needs_part` is False for a run that ends before anything is placed: the claw may be empty then. `looks_after` is
+    `needs_part` is False for a run that places nothing from the claw: it may be empty then. `looks_after` is
     True for one that looks at the placed part. `whereabouts` is kept over retries and runs: the vehicle may stand
     anywhere when a step is done again. `sweeping` is told who takes the frames of each sweep, before it begins, and
     where the surface is by the board (base_from_surface), `registered` where it was found. `pace` says how fast arm and
     vehicle go, of what is planned. `looked` says whether this run has tried to look at the fine board,
-    `interim` what that said, None where nothing was to be seen.
+    `interim` what that said, None where nothing was to be seen. `ground` is the box around the surface below a part
+    that is to be unloaded, its lowest and highest corner, m, part frame.
     """
 
     config: CellConfig
@@ -68,6 +69,7 @@ class Workplace:
     pace: Pace = field(default_factory=Pace)
     interim: InterimCheck | None = None
     looked: bool = False
+    ground: tuple[Vector, Vector] | None = None
     _photographs: int = field(default=0, init=False)
 
     @cached_property

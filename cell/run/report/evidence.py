@@ -20,6 +20,7 @@ from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps import verify
 from cell.procedures.steps.place import PlaceResult
 from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.steps.set_down import SetDown
 from cell.procedures.steps.verify_nest import where_seen
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import Measured, MeasuredRow, RefusedError
@@ -103,6 +104,8 @@ def measured(
 ) -> list[MeasuredRow]:
     """Every figure that the run was or can be judged by, beside its limit: what decided a refusal comes first."""
     fix, pose, placed = (result.results.get(name) for name in ("board_photo", "invert_pose", "place"))
+    if isinstance(down := result.results.get("set_down"), SetDown):
+        placed = down.put
     found = list(RefusalEvidence.of(result).numbers)
     tolerance = 1e3 * job.place.tolerance
     if truth is not None:

@@ -319,7 +319,7 @@ class Cell:
         self, job: str | Path = "pot", count: int = 1, observer: Observer | None = None, inject: Sequence[str] = (), *,
         at_start: bool = False,
     ) -> BatchOutcome:  # fmt: skip
-        """`run` a job for `count` parts, 1 to 1000000, and wait for the end of the batch; arguments as in `start`.
+        """`run` a job for `count` parts, 1 to 10000, and wait for the end of the batch; arguments as in `start`.
 
         A simulated cell's claw is filled again for each part. At a real cell a person is asked for each further part:
         the `observer` sees `confirm_needed`, and `current.confirm` or `cell confirm` answers. It is told each part's

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 UntilOption = Annotated[
     str | None, typer.Option(help="End the run, done, after the step of this name.", autocompletion=options.steps)
 ]
-CountOption = Annotated[int | None, typer.Option("--count", help="A batch: for so many parts, 1 to 1000000.")]
+CountOption = Annotated[int | None, typer.Option("--count", help="A batch: for so many parts, 1 to 10000.")]
 AtStartOption = Annotated[
     bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
 ]
@@ -87,6 +87,8 @@ def run(
 
     require_share(pace)
     opened = partial(Cell.open, config, sim=sim, seed=seed, level=level.value, job=job)
+    if elsewhere and count is None:
+        raise typer.BadParameter("--ask-elsewhere is for the questions of a batch: give --count too, or leave it out")
     if count is not None:
         batch = partial(Cell.run_batch, job=job, at_start=at_start)
         _perform_batch(opened, batch, count, json, partly=until is not None, elsewhere=elsewhere, pace=pace)

@@ -22,7 +22,6 @@ from cell.measure.geometry.poses import from_ur, transform
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.part_pose import seen_from_above
 from cell.measure.reconstruction.ply import read_cloud
-from cell.procedures.steps.sought_part import UNLOAD
 from cell.run.folder import Report
 from cell.run.report.evidence import CLOUD
 from cell.run.report.figures import texture_words
@@ -118,7 +117,7 @@ def _surface(folder: Path, report: Report) -> tuple[pin.SE3, NominalSurface]:
         if hashlib.sha256(file.read_bytes()).hexdigest() != told:
             raise _NotKnown(f"{file.name} was changed since the run: it is not the surface that was scanned for")
         nominal = NominalSurface.load(file, unit=unit)
-        if job["job"]["kind"] == UNLOAD:
+        if job.get("nest") is not None:
             nominal = seen_from_above(nominal, surface_from_part)
     except (OSError, ValueError, KeyError, TypeError, CellError) as error:
         raise _NotKnown(f"the drawn surface cannot be read any more: {error}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ def test_a_part_that_sticks_is_let_go_where_it_lies(placed_pot: JobRecord, tmp_p
 
     stuck = unloaded(placed_pot, sticks, runs=tmp_path)
     assert (stuck.outcome, stuck.stage) == ("refused", "pick")
-    assert "the part sticks: the claw pulled at it with more than 24 N and let it go again" in stuck.reason
+    assert re.search(r"the part sticks, or is heavier .* pulled with more than 24 N and let go", stuck.reason)
     assert stuck.at_end and stuck.at_sweep and not stuck.at_end["part"]["held"] and stuck.folder is not None
     moved = difference(*(from_matrix(truth["poses"]["surface_from_part"]) for truth in (stuck.at_end, stuck.at_sweep)))
     assert np.linalg.norm(moved[:3]) < 0.1e-3
