@@ -1,8 +1,8 @@
 """Waviness of the scanned surface: Sa, Sq and Sz of what is left of its heights over the nominal one.
 
-The S-F surface of ISO 25178-2: an F-operator, an areal Gaussian S-filter (ISO 16610-61), and no L-filter. The
-F-operator takes out the pose of the nominal surface and a surface of second order; it comes first, so that no slope
-meets the edge of the area. Lines of even and of odd number are filtered by themselves as well: what only one of both
+The S-F surface after ISO 25178-2, its two operations exchanged: an F-operator, an areal Gaussian S-filter (ISO 16610-61,
+weights normalised at edges and holes), and no L-filter. The F-operator takes out the pose of the nominal surface and a
+surface of second order; it comes first, so that no slope meets the edge of the area. Lines of even and of odd number are filtered by themselves as well: what only one of both
 shows is the sensor's noise (docs/explanation/theory.md, section 9).
 """
 
@@ -116,11 +116,17 @@ def measure_texture(given: Heights) -> Texture:
     noise, seen = (float(np.sqrt(np.mean(each**2))) for each in (apart, surface))
     unknown = form_removed(given.places[some], given.slopes[some], given.unsure)
     spread = float(np.sum(np.mean(unknown**2, axis=0)))
-    limit = float(np.sqrt(noise**2 + SURE**2 * spread + given.shaken**2 + SIGMA_FLOOR**2))
+    # Of a small area the noise itself is known roughly: its mean square scatters as that of so many independent squares.
+    squares = len(apart) * (index / CELLS * 2.0) ** 2 / (2.0 * ALPHA * index) ** 2
+    parts = {
+        "the sensor's noise": noise**2 * (1.0 + 3.0 * float(np.sqrt(2.0 / squares))),
+        "what is not known of calibration and poses": SURE**2 * spread, "a vehicle that rocks": given.shaken**2,
+    }  # fmt: skip
+    limit = float(np.sqrt(sum(parts.values()) + SIGMA_FLOOR**2))
     sq = float(np.sqrt(max(0.0, seen**2 - noise**2)))
     made = replace(made, limit=limit, noise=noise)
     if sq <= limit:
-        cause = "a vehicle that rocks" if given.shaken else "the sensor"
+        cause = max(parts, key=lambda name: parts[name])
         return replace(made, reason=f"an Sq below {1e3 * limit:.4f} mm cannot be told from {cause}")
     # What noise adds to Sa and Sz is taken out in the share that it has in Sq.
     sa, sz = (sq / seen * float(value) for value in (np.mean(np.abs(surface)), np.ptp(surface)))

@@ -7,7 +7,6 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 
-import numpy as np
 import pinocchio as pin
 
 from cell.config.cell_config import ArmConfig, CellConfig, deck_plates, mounted, station_obstacles, vehicle_obstacles
@@ -67,8 +66,6 @@ def require_share(share: object) -> float:
     return float(share)
 
 
-READINGS, READING_S = 100, 0.004
-"""How often, and how far apart, in s, the force of an arm at rest is read: some mm of the contact's place."""
 ROOM_ABOVE = 0.005
 """How much higher than drawn the surface is taken to be, m: where it stands is known roughly before it was scanned."""
 GRACE_WALL_S = 10.0
@@ -237,13 +234,6 @@ class Mover:
         way = self.plan_to(base_from_start, "the start of the line")
         limits = LineLimits(speed=min(speed, self._tool_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
         return way, self._planner.line(way.end, base_from_end, limits)
-
-    def at_rest(self) -> Vector:
-        """Wrenches (n, 6) at the flange, base axes, N and N·m, of an arm that stands meanwhile."""
-        with self._arm.record() as states:
-            for _ in range(READINGS):
-                self._clock.sleep(READING_S)
-        return np.array([state.wrench for state in states]).reshape(-1, 6)
 
     def begin(self, trajectory: Trajectory) -> tuple[ArmMotion, float]:
         """Have the arm begin a trajectory; the motion, and in how many seconds it must have ended."""

@@ -9,13 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from cell.config.job import Job
 from cell.measure.inversion import NominalSurface, PlacePose
-from cell.measure.inversion.disagreement import REACH_M
-from cell.measure.inversion.first_contact import FRICTION, ContactPoint, ContactRegion, repeats
-from cell.measure.inversion.mating import MatingGap
 from cell.procedures.part_error import part_covariance
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import ArmState, Vector
@@ -27,6 +23,8 @@ FELT_M = 30e-6
 LEAST_STATES = 20
 LEAST_FORCE_N = 0.01
 """No force is told finer."""
+LONGEST_FOLLOWS = 0.99
+"""Correlation of the errors of two readings, one after the other, at most."""
 STEEPEST = 0.3
 """Cosine of the slope beyond which a wall is no ground to touch."""
 GRID_M = 5e-6
@@ -35,8 +33,6 @@ MOST_STATES = 400
 DRAWS = 1000
 UNDERSIDE = 400
 """So many points of the underside are looked at for the first touch."""
-NEAR_M = 3e-3
-"""So far from the middle of a square of the scanned gap, 2 mm wide, that gap holds."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +45,10 @@ class TouchHeight:
 
 @dataclass(frozen=True)
 class TouchCheck:
-    """Where the part touched as `felt`, and where it was `expected` to; `at` which place of its underside."""
+    """Where the part touched as `felt`, and where it was `expected` to."""
 
     felt: TouchHeight
     expected: TouchHeight
-    at: ContactPoint | None = None
 
     @property
     def off(self) -> float:
@@ -102,10 +97,9 @@ class TouchCheck:
     @property
     def _words(self) -> str:
         side = "higher" if self.off > 0 else "lower"
-        at = "" if self.at is None else f", at {self.at.words}"
         return (
-            f"the part touched {1e3 * abs(self.off):.3f} mm {side} than the scan says{at}, where "
-            f"{1e3 * self.sigma:.3f} mm is one standard deviation"
+            f"the part touched {1e3 * abs(self.off):.3f} mm {side} than the scan says, where {1e3 * self.sigma:.3f} mm "
+            "is one standard deviation"
         )
 
 
@@ -116,51 +110,13 @@ def expected_touch(job: Job, nominal: NominalSurface, pose: PlacePose, placing: 
     A tilted part touches with an edge before it is down. Where its force then seems to begin lies between that touch,
     of stiff bodies, and the mean height of all its points, of soft ones: both are allowed for.
     """
-    _, _, gaps = _displaced(job, nominal, pose, placing)
-    heights = -np.concatenate([gaps.min(axis=1), gaps.mean(axis=1)])
-    return TouchHeight(float(heights.mean()), float(heights.std()))
-
-
-def expected_contact(
-    job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vector,
-    own: tuple[NominalSurface | None, MatingGap | None] = (None, None),
-) -> ContactRegion:  # fmt: skip
-    """Where the part can touch, with all that is stated as for `expected_touch`: anywhere on the nominal surface.
-
-    A part with a mesh of its `own` touches where its gap to the scanned surface lets it, or nothing was scanned.
-    """
-    part, mating = own
-    arms, slopes, clearances = _displaced(job, nominal, pose, placing)
-    slack = np.full(len(arms), np.inf)
-    if part is not None:
-        index, feet = part.feet(arms, REACH_M)
-        over = index[feet.inner & (feet.normals[:, 2] < -STEEPEST)]
-        if len(over):
-            arms, slopes, slack, clearances = arms[over], slopes[over], slack[over], clearances[:, over]
-    if mating is not None:
-        lies = job.place.surface_from_part.se3()
-        squares = (mating.places - lies.translation) @ lies.rotation
-        far, found = scipy.spatial.cKDTree(squares).query(arms)
-        seen, nearest = far <= NEAR_M, np.asarray(found)[far <= NEAR_M]
-        slack[seen] = mating.noise[nearest]
-        clearances[:, seen] += mating.gaps[nearest]
-    level = float(np.median(arms[:, 2]))
-    above = arms[:, 2] - level
-    crossings = arms[:, :2] - above[:, None] * slopes[:, :2]
-    spread = float(np.sqrt(np.prod(np.ptp(arms[:, :2], axis=0)) / len(arms)))
-    return ContactRegion(crossings, spread + FRICTION * np.abs(above), level, clearances, slack)
-
-
-def _displaced(job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vector) -> tuple[Vector, Vector, Vector]:
-    """Points (n, 3), m, of the nominal underside, the slopes n / n_z there (n, 3), part frame, and each point's way to
-    the ground (DRAWS, n), m, under draws of what is stated of the place."""
     values, vectors = np.linalg.eigh(part_covariance(job, pose, placing))
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     steps = np.random.default_rng(0).standard_normal((DRAWS, 6)) @ root.T
     every = max(1, len(nominal.samples) // UNDERSIDE)
     normals = nominal.normals[nominal.sample_triangles[::every]]
-    lies = job.place.surface_from_part.se3()
-    rise = normals @ lies.rotation[:, 2]
+    up = job.place.surface_from_part.se3().rotation[:, 2]
+    rise = normals @ up
     ground = rise > STEEPEST
     if not ground.any():
         raise RefusedError(
@@ -169,9 +125,10 @@ def _displaced(job: Job, nominal: NominalSurface, pose: PlacePose, placing: Vect
         )
     # Each point's way to the ground, down the part's axis, where the part is displaced by d: n·d / n·up.
     slopes = normals[ground] / rise[ground, None]
-    arms = nominal.samples[::every][ground] - lies.translation
+    arms = nominal.samples[::every][ground] - job.place.surface_from_part.se3().translation
     gaps = steps[:, :3] @ slopes.T + steps[:, 3:] @ np.cross(arms, slopes).T
-    return arms @ lies.rotation, slopes @ lies.rotation, gaps
+    heights = -np.concatenate([gaps.min(axis=1), gaps.mean(axis=1)])
+    return TouchHeight(float(heights.mean()), float(heights.std()))
 
 
 def felt_touch(states: Sequence[ArmState], origin: Vector, normal: Vector) -> TouchHeight | None:
@@ -192,13 +149,22 @@ def felt_touch(states: Sequence[ArmState], origin: Vector, normal: Vector) -> To
     left = np.array([np.sum(_left(heights, forces, touch) ** 2) for touch in tried])
     best = int(np.argmin(left))
     # How fast the squares grow away from the best tells how far off the touch may be.
-    noise = max(float(left[best]) / (len(heights) - 4), LEAST_FORCE_N**2) * repeats(
-        _left(heights, forces, float(tried[best])), fitted=4
+    noise = max(float(left[best]) / (len(heights) - 4), LEAST_FORCE_N**2) * _repeats(
+        _left(heights, forces, float(tried[best]))
     )
     weights = np.exp(-0.5 * (left - left[best]) / noise)
     mean = float(weights @ tried / weights.sum())
     spread = float(weights @ (tried - mean) ** 2 / weights.sum())
     return TouchHeight(mean, float(np.sqrt(spread + FELT_M**2)))
+
+
+def _repeats(left: Vector) -> float:
+    """So many readings one after the other say what one does: friction and a filtered sensor hold their errors on."""
+    scale = float(left @ left)
+    # What was fitted takes some of it out: four numbers, each of which looks like one swing the other way.
+    follows = float(left[1:] @ left[:-1]) / scale + 4 / len(left) if scale > 0 else 0.0
+    follows = min(max(follows, 0.0), LONGEST_FOLLOWS)
+    return (1 + follows) / (1 - follows)
 
 
 def _left(heights: Vector, forces: Vector, touch: float) -> Vector:

@@ -10,7 +10,7 @@ import pinocchio as pin
 from cell.measure.geometry.poses import composition_jacobians, transform
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.mating import scanned_gap
-from cell.procedures.arm.touch import expected_contact, expected_touch
+from cell.procedures.arm.touch import expected_touch
 from cell.procedures.part_error import draws_of, part_points
 from cell.procedures.steps.gripping import GRIPPED, held_so, note_part, take
 from cell.procedures.steps.place import PlaceResult, Placing
@@ -75,9 +75,8 @@ def correct(
         gap.require(here.job.place.tolerance)
         expected = replace(expected, height=expected.height + gap.lift)
     take(here, job, placed.base_from_flange, context, what="the placed part")
-    region = expected_contact(job, here.nominal, pose, here.repeatability, (part, gap))
     placing = Placing(
-        job, pose.base_from_surface, expected, region, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
+        job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
         part=here.part, check=context.check, progress=lambda share, text: context.progress(0.5, f"again: {text}"),
         note=lambda part: note_part(context, part),
     )  # fmt: skip

@@ -13,14 +13,12 @@ from cell.measure.geometry.poses import from_parts, from_ur, to_ur
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.disagreement import highest_standing, require_bare
 from cell.measure.inversion.effects.between_sweeps import Creep
-from cell.measure.inversion.first_contact import ContactPoint, ContactRegion, contact_point
 from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, scanned_gap
 from cell.measure.reconstruction.cloud import Indices
 from cell.motion.collision import TOUCHES
-from cell.procedures.arm import touch as felt
 from cell.procedures.arm.moves import Mover, PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.arm.touch import TouchCheck, TouchHeight, expected_contact, expected_touch, felt_touch
+from cell.procedures.arm.touch import FELT_M, REFUSED, TouchCheck, TouchHeight, expected_touch, felt_touch
 from cell.procedures.steps.board_photo import require_unmoved
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -42,17 +40,15 @@ FAST_FORCE = 3.0
 class PlaceResult:
     """Where the flange was when the part was let go, how far off in depth, m, and where the part touched first.
 
-    `at` is the place of the underside where it did; None from an arm that told too few forces. `look` is what was seen
-    of the surface between its sweep and the descent; None where it was measured without a sweep. `pose` is where it was
-    placed to: the inverted one, carried on where something creeps. `mating` is the gap below the part as drawn, where
-    the job has a mesh of it.
+    `look` is what was seen of the surface between its sweep and the descent; None where it was measured without a
+    sweep. `pose` is where it was placed to: the inverted one, carried on where something creeps. `mating` is the gap
+    below the part as drawn, where the job has a mesh of it.
     """
 
     base_from_flange: pin.SE3
     contact: bool
     depth_error: float
     touch: TouchCheck | None = None
-    at: ContactPoint | None = None
     look: SecondLook | None = None
     pose: PlacePose | None = None
     mating: MatingGap | None = None
@@ -62,7 +58,6 @@ class PlaceResult:
         """What is not as usual, for people."""
         seen = () if self.look is None else self.look.notes
         seen += () if self.mating is None else self.mating.notes
-        seen += ("the arm told too few forces to know where the part touched",) if self.at is None else self.at.notes
         if self.touch is None:
             return (*seen, "the first touch was not held against the scan: the arm told too little of the way down")
         return (*seen, *self.touch.notes)
@@ -74,7 +69,6 @@ class PlaceResult:
             "contact": self.contact,
             "depth_error_mm": round(1e3 * self.depth_error, 4),
             "touch": None if self.touch is None else self.touch.as_dict(),
-            "touched_at": None if self.at is None else self.at.as_dict(),
             "surface_moved": None if self.look is None else self.look.moved.as_dict(),
             "creep": None if self.look is None or self.look.creep is None else self.look.creep.as_dict(),
             "base_from_flange": [round(float(v), 6) for v in to_ur(self.base_from_flange)],
@@ -86,15 +80,14 @@ class PlaceResult:
 class Placing:
     """One part to be put onto the surface whose pose was measured: with what, and who is told and asked meanwhile.
 
-    `expected` is how high the part is to touch first, `region` where it can touch. `part` follows what becomes of the
-    part. `note` is called before the claw is told to release it, and again as soon as it has, before anything else is
-    done. `check` raises when the run is to end.
+    `expected` is where the part is to touch first. `part` follows what becomes of the part. `note` is called before the
+    claw is told to release it, and again as soon as it has, before anything else is done. `check` raises when the run
+    is to end.
     """
 
     job: Job
     base_from_surface: pin.SE3
     expected: TouchHeight
-    region: ContactRegion
     mover: Mover
     arm: Arm
     claw: Claw
@@ -108,20 +101,20 @@ class Placing:
 
         Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes
         by `contact_force`. Raises `RefusedError` before anything moves when the part is not held any more. It does so
-        with the part still held and lifted when contact comes too early, not at all, or where the part or the stated
-        uncertainty of its place do not allow it.
+        with the part still held and lifted when contact comes too early, not at all, or where the stated uncertainty of
+        the place does not allow it.
         """
         require_held(self.part)
         self._approach()
-        bare = self._descend()
+        self._descend()
         contact, states = self._feel()
         reached = from_ur(self.arm.state().flange)
         off = self._depth()
         self._require_contact(contact, off)
-        touch, at = self._require_expected(bare, states, off)
+        touch = self._require_expected(states, off)
         self._release(reached)
         self._retreat(fold)
-        return PlaceResult(reached, contact, off, touch, at)
+        return PlaceResult(reached, contact, off, touch)
 
     @property
     def _base_from_part(self) -> pin.SE3:
@@ -148,26 +141,23 @@ class Placing:
         if not self.claw.holding:
             raise RefusedError("the claw does not hold the part any more before the descent; look where it was lost")
 
-    def _descend(self) -> Vector:
-        """The fast part, to just above the place; the wrenches (n, 6) before it."""
+    def _descend(self) -> None:
+        """The fast part, to just above the place."""
         plan = self.job.place
         self.progress(0.4, "descending")
         self.arm.zero_force()
-        bare = self.mover.at_rest()
         stopped = self.mover.line(
             self._flange_at(plan.contact_travel), plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force
         )
         # At rest a lighter touch is felt than on the way; taken as zero, it would be pressed on without an end.
         if stopped or not np.linalg.norm(self.arm.state().wrench[:3]) <= plan.contact_force:
-            height, at = self._depth(), self._touched_at(bare)
-            where = "" if at is None else f", at {at.words}"
+            height = self._depth()
             self._lift()
             raise RefusedError(
-                f"the part touched something more than {1e3 * plan.contact_travel:.2f} mm above the place pose{where}; "
-                "it was lifted again, still held. Look what lies on the place",
+                f"the part touched something more than {1e3 * plan.contact_travel:.2f} mm above the place pose; it was "
+                "lifted again, still held. Look what lies on the place",
                 Measured("contact, above the place pose", 1e3 * height, "mm", most=1e3 * plan.contact_travel),
             )
-        return bare
 
     def _feel(self) -> tuple[bool, Sequence[ArmState]]:
         """The slow part: whether the part came into contact, and the arm's states on the way."""
@@ -188,32 +178,20 @@ class Placing:
                 Measured("reached without contact", 1e3 * off, "mm"),
             )
 
-    def _touched_at(self, bare: Vector) -> ContactPoint | None:
-        """Which place of the part is pressed now, by wrenches (n, 6) before and now; base axes, about the flange."""
-        held, known = self.job.grasp.flange_from_part.se3(), self.job.grasp.covariance[:2, :2]
-        turn = np.kron(np.eye(2), from_ur(self.arm.state().flange).rotation @ held.rotation)
-        now = self.mover.at_rest() @ turn
-        return contact_point(bare @ turn, now, held.inverse().translation, self.region.level, known)
-
-    def _require_expected(
-        self, bare: Vector, states: Sequence[ArmState], off: float
-    ) -> tuple[TouchCheck | None, ContactPoint | None]:
-        """How high and where the part touched first, beside what the scan says; None where the arm does not tell it."""
-        touched = felt_touch(states, self._flange_at(0.0).translation, self._base_from_part.rotation[:, 2])
-        at = self._touched_at(bare)
+    def _require_expected(self, states: Sequence[ArmState], off: float) -> TouchCheck | None:
+        """Where the part touched first, beside where the scan says; None where the states on the way do not tell it."""
+        at = self._flange_at(0.0).translation
+        touched = felt_touch(states, at, self._base_from_part.rotation[:, 2])
         # It touched no lower than where it stands now.
-        touch = TouchCheck(touched or TouchHeight(off, felt.FELT_M), self.expected, at)
+        touch = TouchCheck(touched or TouchHeight(off, FELT_M), self.expected)
+        if touched is None and touch.off <= REFUSED * touch.sigma:
+            return None
         try:
-            if told := touched is not None or touch.off > felt.REFUSED * touch.sigma:
-                touch.require()
-            if at is not None:
-                pressed = np.inf if touched is None else touched.height - off + felt.REFUSED * touched.sigma
-                at = self.region.judge(at, pressed)
-                at.require()
+            touch.require()
         except RefusedError:
             self._lift()
             raise
-        return touch if told else None, at
+        return touch
 
     def _release(self, reached: pin.SE3) -> None:
         self.progress(0.8, "releasing")
@@ -254,14 +232,13 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         if mating is not None:
             expected = replace(expected, height=expected.height + mating.lift)
             pose = mating.stated(pose, here.job.place.surface_from_part.se3())
-        region = expected_contact(here.job, here.nominal, pose, here.repeatability, (here.part_mesh, mating))
         context.safe_point()
         # Whoever has the run held may reach in, also in the middle of a look: then it is looked at again.
         if context.held_s == held:
             break
     placing = Placing(
-        here.job, pose.base_from_surface, expected, region, mover=here.mover, arm=here.devices.arm,
-        claw=here.devices.claw, part=here.part, check=context.check, progress=context.progress,
+        here.job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
+        part=here.part, check=context.check, progress=context.progress,
         note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
     )  # fmt: skip
     done = replace(placing.put_down(not here.looks_after), look=look, pose=pose, mating=mating)

@@ -8,7 +8,7 @@ import numpy as np
 
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.part_pose import seen_from_below
-from cell.procedures.arm.touch import expected_contact, expected_touch
+from cell.procedures.arm.touch import expected_touch
 from cell.procedures.steps.gripping import held_so, note_part
 from cell.procedures.steps.pick import HeldPart
 from cell.procedures.steps.place import PlaceResult, Placing
@@ -30,7 +30,7 @@ class SetDown:
     def summary(self) -> dict[str, object]:
         """Figures for journal and report."""
         told = self.put.summary()
-        return {name: told[name] for name in ("contact", "depth_error_mm", "touch", "touched_at", "base_from_flange")}
+        return {name: told[name] for name in ("contact", "depth_error_mm", "touch", "base_from_flange")}
 
 
 def _at(here: Workplace, context: StepContext) -> SetDown:
@@ -41,17 +41,16 @@ def _at(here: Workplace, context: StepContext) -> SetDown:
     pose = replace(context.made(PlacePose), base_from_surface=base_from_part, covariance=known)
     held = held_so(job, job.grasp.flange_from_part.se3(), context.made(HeldPart).covariance)
     below = seen_from_below(part, job.place.surface_from_part.se3())
-    place = (held, below, pose, here.repeatability)
     placing = Placing(
-        held, base_from_part, expected_touch(*place), expected_contact(*place, (part, None)), mover=here.mover,
+        held, base_from_part, expected_touch(held, below, pose, here.repeatability), mover=here.mover,
         arm=here.devices.arm, claw=here.devices.claw, part=here.part, check=context.check, progress=context.progress,
         note=lambda part: note_part(context, part),
     )  # fmt: skip
     try:
         done = placing.put_down()
     except RefusedError as error:
-        raise RefusedError(f"at the nest: {error}", *error.numbers) from error
-    for note in done.notes:
+        raise RefusedError(f"at the nest, where [nest] of the job has it: {error}", *error.numbers) from error
+    for note in () if done.touch is None else done.touch.notes:
         context.note(text=f"at the nest: {note}")
     return SetDown(done, known + context.made(HeldPart).covariance + here.repeatability)
 

@@ -39,11 +39,6 @@ def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound(placed: d
     assert placed["outcome"] == "placed"
     assert placed["truth"]["error_mm"]["d"]["mean"] <= 0.60
     assert placed["truth"]["sensor_mm"]["p85"] <= 0.15
-    (place,) = [step for step in placed["steps"] if step["name"] == "place"]
-    at = place["result"]["touched_at"]
-    assert at["judged"] and at["chance"] == 1.0
-    assert max(abs(at["x_mm"]), abs(at["y_mm"])) < 10.0, "the torque comes over the wires, about the flange"
-    assert at["sigma_mm"] < 4.0
 
 
 @pytest.mark.campaign

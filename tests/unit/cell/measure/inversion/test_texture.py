@@ -83,7 +83,7 @@ def noisy(seed: int, lines: float = 0.0) -> np.ndarray:
 def test_noise_is_never_taken_for_a_surface() -> None:
     for made in (measure_texture(scanned(noisy(seed, lines=20e-6))) for seed in range(24)):
         assert (made.sa, made.sq, made.sz) == (None, None, None) and made.limit is not None
-        assert f"below {1e3 * made.limit:.4f} mm cannot be told from the sensor" in made.reason
+        assert f"below {1e3 * made.limit:.4f} mm cannot be told from the sensor's noise" in made.reason
 
 
 def test_the_noise_is_taken_out_of_the_figures() -> None:
