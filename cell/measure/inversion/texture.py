@@ -1,9 +1,10 @@
 """Waviness of the scanned surface: Sa, Sq and Sz of what is left of its heights over the nominal one.
 
-The S-F surface after ISO 25178-2, its two operations exchanged: an F-operator, an areal Gaussian S-filter (ISO 16610-61,
-weights normalised at edges and holes), and no L-filter. The F-operator takes out the pose of the nominal surface and a
-surface of second order; it comes first, so that no slope meets the edge of the area. Lines of even and of odd number are filtered by themselves as well: what only one of both
-shows is the sensor's noise (docs/explanation/theory.md, section 9).
+The S-F surface after ISO 25178-2, its two operations exchanged: an F-operator, an areal Gaussian S-filter (ISO
+16610-61, weights normalised at edges and holes), and no L-filter. The F-operator takes out the pose of the nominal
+surface and a surface of second order; it comes first, so that no slope meets the edge of the area. Lines of even and of
+odd number are filtered by themselves as well: what only one of both shows is the sensor's noise
+(docs/explanation/theory.md, section 9).
 """
 
 from __future__ import annotations
@@ -116,7 +117,7 @@ def measure_texture(given: Heights) -> Texture:
     noise, seen = (float(np.sqrt(np.mean(each**2))) for each in (apart, surface))
     unknown = form_removed(given.places[some], given.slopes[some], given.unsure)
     spread = float(np.sum(np.mean(unknown**2, axis=0)))
-    # Of a small area the noise itself is known roughly: its mean square scatters as that of so many independent squares.
+    # Of a small area the noise itself is known roughly: as the mean square of so many independent numbers.
     squares = len(apart) * (index / CELLS * 2.0) ** 2 / (2.0 * ALPHA * index) ** 2
     parts = {
         "the sensor's noise": noise**2 * (1.0 + 3.0 * float(np.sqrt(2.0 / squares))),
