@@ -150,12 +150,8 @@ def perform(
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).kept()
             if observer is not None:
                 observer(Event("note", None, {"text": str(batch)}))
-            # Nobody knows how a part lies that is down and was refused.
-            there = PartState.HELD if job.nest is None else PartState.LIES
-            skipped = last.outcome == "refused" and last.report.get("part") == there.value
-            skipped = skipped and job.batch.on_refusal != "end" and (job.nest is not None or here.devices.claw.holding)
             interrupted = last.interrupted
-            if interrupted or last.stopped_after_end or not (last.outcome in GOOD or skipped):
+            if interrupted or last.stopped_after_end or not (last.outcome in GOOD or _skipped(here, job, last)):
                 why = f"part {number} {last}"
     except (CellError, SignalInterrupt) as error:
         if not batch.runs:
@@ -163,6 +159,13 @@ def perform(
         why = f"after part {len(batch.runs)}: {error}"
         interrupted = isinstance(error, Interrupted | SignalInterrupt)
     return replace(batch, reason=why or "every part was tried", interrupted=interrupted).kept()
+
+
+def _skipped(here: Opened, job: Job, last: RunOutcome) -> bool:
+    """Whether the batch goes on after this end: nobody knows how a part lies that is down and was refused."""
+    there = PartState.HELD if job.nest is None else PartState.LIES
+    untouched = last.report.get("part") == there.value and (job.nest is not None or here.devices.claw.holding)
+    return last.outcome == "refused" and untouched and job.batch.on_refusal != "end"
 
 
 def _question(here: Opened, job: Job, part: str, last: RunOutcome) -> Callable[[Hands], None] | None:

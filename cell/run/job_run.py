@@ -87,7 +87,7 @@ class ReadyJob:
             info["until"] = until
         if not script.idle:
             info["scripted"] = True
-        return cls(job, kind, nominal, script, info, ground)
+        return cls(job, kind, nominal, script, info, ground=ground)
 
 
 Observer = Callable[[Event], None]

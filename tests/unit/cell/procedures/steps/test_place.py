@@ -405,7 +405,7 @@ def test_placing_is_tried_once_whatever_becomes_of_it() -> None:
         (("unknown", "released"), False, "had put its part down already, only the retreat failed"),
         (("released",), True, "what came after that failed"),
         (("unknown",), False, "Look what has become of the part"),
-        (("unknown", "released", "unknown", "held"), True, "gripped it again to correct it"),
+        (("unknown", "released", "unknown", "held"), True, "had gripped a part that lay"),
         (("unknown", "released", "unknown"), True, "releasing or gripping its part"),
     ],
 )
