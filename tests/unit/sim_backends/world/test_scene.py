@@ -12,7 +12,7 @@ from sim_backends.world.scene import draw, stream
 def flat(value: object) -> np.ndarray:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return np.concatenate([flat(getattr(value, f.name)) for f in dataclasses.fields(value)])
-    if isinstance(value, str | dict):
+    if value is None or isinstance(value, str | dict):
         return np.zeros(0)
     return np.asarray(value, dtype=float).ravel()
 
