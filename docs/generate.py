@@ -184,7 +184,8 @@ def job_toml() -> str:
     place = pot.place.model_copy(update={"accept": pot.place.tolerance})
     # What the shipped job leaves out is told in the job that `cell new-job` writes.
     told = comments(job_text(pot.model_copy(update={"part": part, "place": place}), []))
-    told |= comments(job_path("pot").read_text(encoding="utf-8"))
+    for name in ("unload", "shell", "pot"):
+        told |= comments(job_path(name).read_text(encoding="utf-8"))
     text, models = "# job.toml\n\n" + NOTE, list(records(Job))
     text += '`cell new-job` writes such a file for a mesh. Every quantity carries its unit, such as `"35 mm"`.\n\n'
     for name, field in Job.model_fields.items():

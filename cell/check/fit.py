@@ -23,9 +23,8 @@ from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.steps import verify
-from cell.procedures.steps.board_photo import around
 from cell.procedures.steps.kinds import kind_of
-from cell.procedures.steps.sought_part import ground_below, nominal_of, sought
+from cell.procedures.steps.sought_part import around, ground_below, nominal_of, sought
 from drivers.errors import ConfigError
 from drivers.make import CameraConfig
 

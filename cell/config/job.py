@@ -219,7 +219,7 @@ class NestSection(Table):
 
 
 class BatchSection(Table):
-    """What a batch does after a refusal while the claw holds the part: it ends, asks a person, or tries the next part.
+    """What a batch does after a refusal that left its part untouched: it ends, asks a person, or tries the next part.
 
     A part that is misplaced, a fault and an abort always end it. Nothing that is made or measured rests on this.
     """

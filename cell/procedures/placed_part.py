@@ -42,7 +42,8 @@ class PlacedPart:
     pose, surface axes, about the part's origin; `stated` (6, 6) is that of the place before it was put down, which
     stands for the motions that its faces do not show, `unseen`. `gap` is the gap below it, as it lies; None where
     nothing scanned lies below. `flush` is how its edge stands over the surface; None where nothing of that shows beside
-    it. `before` is how far off, m, it lay before each correction. `named` are the features that the job names.
+    it. `before` is how far off, m, it lay before each correction.`named` are the features that the job names.
+    `axes` says, for people, whose axes the figures are in.
     """
 
     seen: PartPose
@@ -55,6 +56,7 @@ class PlacedPart:
     flush: Flush | None = None
     before: tuple[float, ...] = ()
     named: tuple[FeatureSection, ...] = ()
+    axes: str = "the surface's axes"
 
     @classmethod
     def of(cls, job: Job, seen: PartPose, points: Vector, stated: Vector) -> PlacedPart:
@@ -213,7 +215,7 @@ class PlacedPart:
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
         return MisplacedError(
-            f"the placed part lies {self.words}, by ({shift}) mm and ({turn}) mrad in the surface's axes. Allowed are "
+            f"the placed part lies {self.words}, by ({shift}) mm and ({turn}) mrad in {self.axes}. Allowed are "
             f"{1e3 * place.tolerance:g} mm and {1e3 * place.tolerance_angle:g} mrad; it may be as much as "
             f"{off.value:.2f} mm and {turned.value:.1f} mrad{out}. Most likely {likely}{self.advice}. "
             f"{more}{more and '. '}{NEXT_STEP}",

@@ -19,7 +19,7 @@ from cell.config.job import Job
 from cell.devices.simulated.process import is_whole
 from cell.procedures.arm.moves import PartState
 from cell.run.folder import Report
-from cell.run.job_run import Observer, RunOutcome
+from cell.run.job_run import Observer, RunOutcome, each_of
 from cell.run.recorded_work import Hands
 from cell.run.session.session import Opened
 from drivers.errors import CellError, ConfigError, DeviceFault, Interrupted
@@ -135,9 +135,11 @@ def perform(
 ) -> BatchOutcome:  # fmt: skip
     """Do a batch: `run(number)` a part, `between(work)` what a person is asked before the next one; both wait.
 
-    `observer` is told each part's end. Raises what keeps the first part from being begun, or is no error of the cell.
+    `observer` is told each part's end; one that fails is told nothing more. Raises what keeps the first part from being
+    begun, or is no error of the cell.
     """
     require_count(count)
+    tell = each_of(() if observer is None else (observer,))
     name = f"batch-{time.strftime('%Y%m%dT%H%M%S')}-{secrets.token_hex(2)}.json"
     batch, why, interrupted = BatchOutcome(job.job.name, count, here.runs_folder / name), "", False
     try:
@@ -148,8 +150,7 @@ def perform(
             last = run(number)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).kept()
-            if observer is not None:
-                observer(Event("note", None, {"text": str(batch)}))
+            tell(Event("note", None, {"text": str(batch)}))
             interrupted = last.interrupted
             if interrupted or last.stopped_after_end or not (last.outcome in GOOD or _skipped(here, job, last)):
                 why = f"part {number} {last}"

@@ -15,9 +15,9 @@ import pinocchio as pin
 from cell.measure.geometry.poses import difference
 from cell.procedures.arm.photograph import MOVED, BoardFix, photo_pose, swing_covariance
 from cell.procedures.steps.drive_to_target import VehicleArrival
+from cell.procedures.steps.sought_part import around
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
 from drivers.errors import Measured, RefusedError
-from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 from statemachine.step import Step
 
@@ -105,11 +105,6 @@ def require_unmoved(here: Workplace, fix: BoardFix, since: str, progress: Callab
         "station does not stand firm, or was bumped. See to it, then run the job again",
         Measured("board moved by", shift, "mm", most=shift * float(np.sqrt(MOVED / far))),
     )
-
-
-def around(box: tuple[Vector, Vector], other: tuple[Vector, Vector] | None) -> tuple[Vector, Vector]:
-    """The box around both, as lowest and highest corner (3,)."""
-    return box if other is None else (np.minimum(box[0], other[0]), np.maximum(box[1], other[1]))
 
 
 def _at(here: Workplace, context: StepContext) -> BoardFix:

@@ -54,6 +54,11 @@ def ground_below(job: Job, extent: tuple[Vector, Vector]) -> tuple[Vector, Vecto
     return found.min(axis=0), found.max(axis=0)
 
 
+def around(box: tuple[Vector, Vector], other: tuple[Vector, Vector] | None) -> tuple[Vector, Vector]:
+    """The box around both, as lowest and highest corner (3,)."""
+    return box if other is None else (np.minimum(box[0], other[0]), np.maximum(box[1], other[1]))
+
+
 def pose_record(pose: pin.SE3) -> Pose:
     """The pose as a job has it."""
     x, y, z = (float(v) for v in pose.translation)

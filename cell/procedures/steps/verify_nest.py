@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pinocchio as pin
 
@@ -37,11 +39,14 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     except RefusedError as error:
         why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")
         raise MisplacedError(f"the part is not seen in its nest: {why}. {NEXT_STEP}", *error.numbers) from error
-    found = PlacedPart.of(job, _in_base(fit), part_points(here.nominal), context.made(SetDown).covariance)
+    stated = context.made(SetDown).covariance
+    found = replace(
+        PlacedPart.of(job, _in_base(fit), part_points(here.nominal), stated), axes="axes of the arm base, in its nest"
+    )
     for note in found.notes:
         context.note(text=f"in its nest: {note}")
     if not found.kept(job.place):
-        raise found.misplaced(job.place, "That is in its nest, in axes of the arm base")
+        raise found.misplaced(job.place)
     return found
 
 

@@ -134,6 +134,12 @@ def dry_run(
         confirm=None if confirm is None else confirm.value, clock=(clock or CellClock.wall).value,
     )  # fmt: skip
     if count is not None:
+        asks = loaded.batch.on_refusal == "ask" and (confirm is None or confirm.value != "simulated")
+        if asks and not _at_terminal():
+            raise typer.BadParameter(
+                f'batch.on_refusal of job {job} is "ask", and there is no terminal to ask at: add --confirm simulated, '
+                'or write "end" or "skip"'
+            )
         batch = partial(Cell.run_batch, job=job, inject=inject or ())
         _perform_batch(opened, batch, count, json, partly=console or until is not None)
     if console:
@@ -161,7 +167,7 @@ def _perform_batch(
         raise ConfigError("--count does whole jobs, shown here: leave out --until and --console, or leave out --count")
     with ProgressDisplay(compiles=True) as display, opened() as cell:
         # In the background nobody reads a terminal: who tries is stopped.
-        here = not elsewhere and sys.stdin.isatty() and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+        here = not elsewhere and _at_terminal()
         if not (here or elsewhere or is_whole(cell.simulated)):
             unasked = "there is no terminal to ask whether the next part is in the claw: run this in one, or with "
             raise ConfigError(f"{unasked}--ask-elsewhere, and answer with `cell confirm`")
@@ -176,6 +182,14 @@ def _perform_batch(
         display.end()
         print_json(outcome.as_dict()) if json else print_batch(outcome)
     raise typer.Exit(outcome.exit_code)
+
+
+def _at_terminal() -> bool:
+    """Whether this program may read what is typed: it is at a terminal, and in its foreground."""
+    try:
+        return sys.stdin.isatty() and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp()
+    except OSError:
+        return False
 
 
 def _clock(config: CellConfig) -> CellClock:

@@ -139,7 +139,8 @@ def test_a_feature_out_of_its_own_tolerance_is_no_part_in_its_place() -> None:
     assert "Out of tolerance: the hole narrow is 0.30 mm off" in str(told) and "hole wide" not in str(told)
     assert [number.kept for number in told.numbers] == [True, True, True, False]
     assert BENT not in str(told)
-    assert [each["name"] for each in found.summary()["features"]] == ["wide", "narrow"]  # type: ignore[index,attr-defined]
+    features = cast(list[dict[str, object]], found.summary()["features"])
+    assert [each["name"] for each in features] == ["wide", "narrow"]
 
 
 def test_moved_to_where_it_belongs_along_the_surface_it_is_as_high_and_as_tilted() -> None:

@@ -13,7 +13,7 @@ import pytest
 from cell import BatchOutcome, Cell, ConfigError
 from cell.base.storage import read_json
 from cell.config.calibrations.store import save_calibration
-from cell.config.job import load_job
+from cell.config.job import job_path, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.run.batch import _question
@@ -168,3 +168,14 @@ def test_the_command_line_shows_what_came_of_it(
     code, out, error = typed(*words)
     assert (code, "1 placed, 0 corrected" in out, "part 1 of 1  placed" in error) == (0, True, True), (out, error)
     assert typed(*words, "--until", "board_photo")[0] == 2
+
+
+def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: Callable[..., tuple[int, str, str]]
+) -> None:
+    """No terminal is here: the batch would wait for ever."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pot.ply").write_bytes(job_path("pot").with_suffix(".ply").read_bytes())
+    (tmp_path / "asks.toml").write_text(f'{job_path("pot").read_text(encoding="utf-8")}\n[batch]\non_refusal = "ask"\n')
+    code, _, error = typed("dry-run", "-j", "asks", "--count", "2", "--clock", "virtual")
+    assert code == 2 and "there is no terminal to ask at" in " ".join(error.split())
