@@ -18,6 +18,7 @@ from sim_backends.faults import FAULT_NAMES
 
 if TYPE_CHECKING:
     from cell.config.cell_config import CellConfig
+    from cell.config.job import Job
     from cell.run.batch import BatchOutcome
     from cell.run.job_run import Observer, RunOutcome
     from cell.run.session.supervisor import Cell
@@ -134,12 +135,7 @@ def dry_run(
         confirm=None if confirm is None else confirm.value, clock=(clock or CellClock.wall).value,
     )  # fmt: skip
     if count is not None:
-        asks = loaded.batch.on_refusal == "ask" and (confirm is None or confirm.value != "simulated")
-        if asks and not _at_terminal():
-            raise typer.BadParameter(
-                f'batch.on_refusal of job {job} is "ask", and there is no terminal to ask at: add --confirm simulated, '
-                'or write "end" or "skip"'
-            )
+        _require_terminal(loaded, confirm)
         batch = partial(Cell.run_batch, job=job, inject=inject or ())
         _perform_batch(opened, batch, count, json, partly=console or until is not None)
     if console:
@@ -182,6 +178,15 @@ def _perform_batch(
         display.end()
         print_json(outcome.as_dict()) if json else print_batch(outcome)
     raise typer.Exit(outcome.exit_code)
+
+
+def _require_terminal(job: Job, confirm: Confirm | None) -> None:
+    """Refuse a batch that would ask a person, and wait for ever, where nobody is."""
+    if job.batch.on_refusal == "ask" and confirm is not Confirm.simulated and not _at_terminal():
+        raise typer.BadParameter(
+            f'batch.on_refusal of job {job.job.name} is "ask", and there is no terminal to ask at: add --confirm '
+            'simulated, or write "end" or "skip"'
+        )
 
 
 def _at_terminal() -> bool:
