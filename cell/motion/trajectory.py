@@ -45,7 +45,11 @@ class PointSpeed:
         """How fast the straight joint way from `start` to `end` (6,) may be driven at most, in ways per second."""
         way = end - start
         count = int(np.ceil(np.abs(way).max() / STEP)) + 1
-        fastest = max(self._fastest(start + part * way, way) for part in np.linspace(0.0, 1.0, count + 1))
+        twists = np.array(
+            [self._kinematics.jacobian(start + part * way) @ way for part in np.linspace(0.0, 1.0, count + 1)]
+        )
+        speeds = twists[:, None, :3] + np.cross(twists[:, None, 3:], self._points)
+        fastest = float(np.sqrt(np.max(np.sum(speeds**2, axis=2))))
         return self._limit / max(MARGIN * fastest, 1e-12)
 
     def excess(self, times: NDArray[np.float64], joints: NDArray[np.float64]) -> float:
@@ -53,12 +57,6 @@ class PointSpeed:
         placed = np.array([self._placed(row) for row in joints])
         ways = np.linalg.norm(np.diff(placed, axis=0), axis=2).max(axis=1)
         return float((ways / np.diff(times)).max() / self._limit)
-
-    def _fastest(self, joints: Joints, rates: Joints) -> float:
-        """Speed of the fastest point, m/s, when the joints turn at `rates` (6,) rad/s."""
-        twist = self._kinematics.jacobian(joints) @ rates
-        speeds = twist[:3] + np.cross(twist[3:], self._points)
-        return float(np.sqrt(np.max(np.sum(speeds**2, axis=1))))
 
     def _placed(self, joints: Joints) -> NDArray[np.float64]:
         flange = self._kinematics.fk(joints)

@@ -229,6 +229,8 @@ class World:
         self._report_grip()
         self._meet(t, world_from_base)
         wrench = self.part.wrench(world_from_flange)
+        if not wrench.any():
+            return wrench
         if np.linalg.norm(wrench[:3]) > self.arm.params.force_limit and self.arm.safety is Safety.NORMAL:
             self.collisions.note(t, "part" if self.part.held else "claw", "ground")
         base_from_world = world_from_base[:3, :3].T

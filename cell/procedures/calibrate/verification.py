@@ -466,12 +466,12 @@ def at_place(calibration: CellCalibration, job: Job, middle: float = 0.0) -> Cal
     camera_from_board = from_parts((0.0, 0.0, job.photo.stand_off)) * from_parts(-centre_of(board))
     place = (camera_from_board * job.place_from_board.inverse()).translation
 
+    # A sweep has the middle of the rail's travel in its middle; where that is, a direction's error is taken up.
+    half = 0.5 * job.scan.length
+    of_scan = scan_effect(calibration.scan, job.scan.stand_off, (middle - half, middle + half))
+
     def effect(chain: str, change: Array) -> float:
-        if chain == "target":
-            return target_effect(calibration.target, change, place)
-        # A sweep has the middle of the rail's travel in its middle; where that is, a direction's error is taken up.
-        half = 0.5 * job.scan.length
-        return scan_effect(calibration.scan, change, job.scan.stand_off, (middle - half, middle + half))
+        return target_effect(calibration.target, change, place) if chain == "target" else of_scan(change)
 
     return effect
 

@@ -7,6 +7,7 @@ settles once it is let go: its weight turns it until it rests on three points. F
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ SETTLING, TIPS = 20, 5e-3
 """Steps in which a part settles, and how far it tilts in one, rad: the ground below it is another one then."""
 _LEAN = 0.015
 """How much higher than drawn, m, a point of a leaning table's surface may be."""
+_BESIDE, _FLOOR = 1.5 * drawing.TABLE_HALF, 0.1
+"""Farther than that, m, from the table's middle the floor is the ground; and what is higher than that, m, is above it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +110,7 @@ class PartContact:
         self._highest = max(float(corners[:, 2].max()), float(world_from_surface[2, 3])) + _LEAN
         self._held_box = self._box(held=True)
         self._empty_box = self._box(held=False)
+        self._table_at = inverse(self._table_from_world)[:2, 3].tolist()
         if nest is not None:
             self._claw_closed, self._lying = False, True
             self._world_from_part = (self._settle if self._own else self._rest)(world_from_surface @ nest.lies)
@@ -251,9 +255,13 @@ class PartContact:
         wrench = np.zeros(6)
         with self._lock:
             low, high = self._held_box if self._world_from_part is None else self._empty_box
-            *along, height = world_from_flange[2].tolist()
-            # No corner of the box around the points is as low as that: most of the time the arm is far from everything.
-            if height + sum(min(k * a, k * b) for k, a, b in zip(along, low, high, strict=True)) > self._highest:
+            (*_, x), (*_, y), (*along, height), _ = world_from_flange.tolist()
+            # The lowest corner of the box around the points: most of the time the arm is far from everything.
+            lowest = height + sum(min(k * a, k * b) for k, a, b in zip(along, low, high, strict=True))
+            beside = math.hypot(x - self._table_at[0], y - self._table_at[1]) > _BESIDE + math.hypot(
+                *(max(-a, b) for a, b in zip(low, high, strict=True))
+            )
+            if lowest > self._highest or (beside and lowest > _FLOOR):
                 return wrench
             points = _moved(self._fingertips, world_from_flange)
             if self._world_from_part is None:

@@ -9,7 +9,7 @@ and the calibration's own covariance hide small changes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -220,16 +220,11 @@ DEPTHS = (-0.01, 0.0, 0.01)
 ROWS = 9
 
 
-def scan_effect(scan: ScanCalibration, change: Array, stand_off: float, rail: tuple[float, float]) -> float:
-    """RMS in m of how far a change (27,) of the calibration moves the points of a sweep, in the flange's frame.
+def scan_effect(scan: ScanCalibration, stand_off: float, rail: tuple[float, float]) -> Callable[[Array], float]:
+    """Gives of a change (27,) of the calibration the RMS in m of how far it moves a sweep's points in the flange's frame.
 
     Over the picture's rows, depths of ± 10 mm about `stand_off` m in front of the camera, and the rail from end to end.
     """
-    state = AdjustmentState(
-        scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.flange_from_camera
-    )  # fmt: skip
-    moved = state.moved(np.asarray(change, dtype=np.float64)[:SHARED])
-    assert moved.plane is not None
     n, d = scan.light_plane.n, scan.light_plane.distance
     pixels = []
     for depth in DEPTHS:
@@ -237,13 +232,19 @@ def scan_effect(scan: ScanCalibration, change: Array, stand_off: float, rail: tu
         y = np.linspace(-0.4, 0.4, ROWS) * scan.camera.height / scan.camera.fy * z
         x = (d - n[1] * y - n[2] * z) / n[0]
         pixels.append(scan.camera.project(np.column_stack([x, y, np.full(ROWS, z)])))
-    seen = np.concatenate(pixels)
-    after = ScanGeometry(moved.camera, moved.plane, moved.rail_direction, moved.flange_from_camera)
-    squares = [
-        np.sum((after.solve(seen, at)[0] - scan.geometry().solve(seen, at)[0]) ** 2, axis=1)
-        for at in (np.full(len(seen), position) for position in rail)
-    ]
-    return float(np.sqrt(np.nanmean(squares)))
+    seen, at = np.tile(np.concatenate(pixels), (len(rail), 1)), np.repeat(rail, len(DEPTHS) * ROWS)
+    before = scan.geometry().solve(seen, at)[0]
+    state = AdjustmentState(
+        scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.flange_from_camera
+    )  # fmt: skip
+
+    def effect(change: Array) -> float:
+        moved = state.moved(np.asarray(change, dtype=np.float64)[:SHARED])
+        assert moved.plane is not None
+        after = ScanGeometry(moved.camera, moved.plane, moved.rail_direction, moved.flange_from_camera)
+        return float(np.sqrt(np.nanmean(np.sum((after.solve(seen, at)[0] - before) ** 2, axis=1))))
+
+    return effect
 
 
 def target_effect(target: TargetCalibration, change: Array, camera_from_place: Array) -> float:
