@@ -42,7 +42,9 @@ class PlacedPart:
     pose, surface axes, about the part's origin; `stated` (6, 6) is that of the place before it was put down, which
     stands for the motions that its faces do not show, `unseen`. `gap` is the gap below it, as it lies; None where
     nothing scanned lies below. `flush` is how its edge stands over the surface; None where nothing of that shows beside
-    it. `before` is how far off, m, it lay before each correction.`named` are the features that the job names.
+    it. `before` is how far off, m, it lay before each correction. `came` is how it came to lie when it was first put
+    down, had nothing been allowed for, `slips` how it moved in each correction as the claw opened (`GraspSeries`).
+    `named` are the features that the job names.
     `axes` says, for people, whose axes the figures are in.
     """
 
@@ -55,6 +57,8 @@ class PlacedPart:
     gap: MatingGap | None = None
     flush: Flush | None = None
     before: tuple[float, ...] = ()
+    came: pin.SE3 | None = None
+    slips: tuple[pin.SE3, ...] = ()
     named: tuple[FeatureSection, ...] = ()
     axes: str = "the surface's axes"
 

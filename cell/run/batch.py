@@ -18,6 +18,8 @@ from cell.base.storage import sealed, write_json
 from cell.config.job import Job
 from cell.devices.simulated.process import is_whole
 from cell.procedures.arm.moves import PartState
+from cell.procedures.grasp import GraspSeries
+from cell.procedures.placed_part import PlacedPart
 from cell.run.folder import Report
 from cell.run.job_run import Observer, RunOutcome, each_of
 from cell.run.recorded_work import Hands
@@ -115,6 +117,7 @@ def figures(report: Report) -> dict[tuple[str, str], float]:
     found = {("cycle time", "s"): report["cell_s"]}
     if seen:
         found |= {
+            ("placed part off its place at first", "mm"): [*seen["before_mm"], seen["off_mm"]][0],
             ("placed part off its place, as seen", "mm"): seen["off_mm"],
             ("corrections", ""): len(seen["before_mm"]),
         }
@@ -130,10 +133,11 @@ def require_count(count: int) -> None:
 
 
 def perform(
-    here: Opened, job: Job, count: int, run: Callable[[int], RunOutcome],
+    here: Opened, job: Job, count: int, run: Callable[[int, GraspSeries], RunOutcome],
     between: Callable[[Callable[[Hands], None]], None], observer: Observer | None,
 ) -> BatchOutcome:  # fmt: skip
-    """Do a batch: `run(number)` a part, `between(work)` what a person is asked before the next one; both wait.
+    """Do a batch: `run(number, series)` a part, after those of the series; `between(work)` what a person is asked
+    before the next one; both wait.
 
     `observer` is told each part's end; one that fails is told nothing more. Raises what keeps the first part from being
     begun, or is no error of the cell.
@@ -142,12 +146,15 @@ def perform(
     tell = each_of(() if observer is None else (observer,))
     name = f"batch-{time.strftime('%Y%m%dT%H%M%S')}-{secrets.token_hex(2)}.json"
     batch, why, interrupted = BatchOutcome(job.job.name, count, here.runs_folder / name), "", False
+    series = GraspSeries()
     try:
         while not why and len(batch.runs) < count:
             number = len(batch.runs) + 1
             if number > 1 and (work := _question(here, job, f"part {number} of {count}", batch.runs[-1])):
                 between(work)
-            last = run(number)
+            last = run(number, series)
+            if isinstance(seen := last.results.get("verify"), PlacedPart) and seen.came is not None:
+                series = series.after(seen.came, seen.slips)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).kept()
             tell(Event("note", None, {"text": str(batch)}))

@@ -27,6 +27,7 @@ from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Pace, PartProgress, PartState
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
+from cell.procedures.grasp import GraspSeries
 from cell.procedures.steps import verify
 from cell.procedures.steps.kinds import Kind, kind_of
 from cell.procedures.steps.sought_part import ground_below, nominal_of, sought
@@ -144,7 +145,8 @@ class JobRun:
 
     `run` is the handle by which it is held. `inline` observers see each event before the run goes on: those that cause
     faults or look at the truth. `earlier` is the sweep of a run that this one resumes; `script` works between steps.
-    `truth` asks a simulated world. `pace` says how fast arm and vehicle go, of what is planned.
+    `truth` asks a simulated world. `pace` says how fast arm and vehicle go, of what is planned. `series` is how the
+    parts before this one of its batch came to lie.
     """
 
     run: Run[object]
@@ -161,6 +163,7 @@ class JobRun:
     truth: Callable[[], dict[str, object]] | None = None
     pace: Pace = field(default_factory=Pace)
     ground: tuple[Vector, Vector] | None = None
+    series: GraspSeries = field(default_factory=GraspSeries)
 
     def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
         """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
@@ -212,7 +215,7 @@ class JobRun:
             folder=folder, whereabouts=whereabouts, earlier=self.earlier,
             needs_part=self.kind.places and self.job.nest is None, looks_after=verify.STEP.name in self.kind.names,
             sweeping=self._sweeping, registered=self._registered, pace=self.pace, ground=self.ground,
-            part=PartProgress(PartState.HELD if self.job.nest is None else PartState.LIES),
+            series=self.series, part=PartProgress(PartState.HELD if self.job.nest is None else PartState.LIES),
         )  # fmt: skip
 
     def _runner(self, here: Workplace, journal: Journal, observer: Observer) -> Runner:
@@ -305,8 +308,8 @@ class JobWork:
     """A job, read as `ready` from `file`, for a run of this cell; `info` goes into the journal and the report.
 
     `stored` is its calibration, or why there is none: then it is calibrated first. `before` is the run that this one
-    resumes,
-    `at_start` somebody's word that the vehicle stands at the job's start pose, for this run alone.
+    resumes, `at_start` somebody's word that the vehicle stands at the job's start pose, for this run alone. `series` is
+    how the parts before this one of its batch came to lie.
     """
 
     cell: Opened
@@ -317,6 +320,7 @@ class JobWork:
     before: UnfinishedRun | None
     inline: tuple[Observer, ...]
     at_start: bool
+    series: GraspSeries
 
     def perform(self, run: Run[RunOutcome]) -> RunOutcome:
         """Do it; raises what `JobRun.perform` raises. Ended as any run where the calibration before it ends it."""
@@ -349,7 +353,7 @@ class JobWork:
         job_run = JobRun(
             run, cell.config, cell.devices, job=ready.job, nominal=ready.nominal, calibration=calibration,
             info=self.info, kind=ready.kind, script=ready.script, inline=self.inline, earlier=earlier, truth=cell.truth,
-            pace=cell.pace, ground=ready.ground,
+            pace=cell.pace, ground=ready.ground, series=self.series,
         )  # fmt: skip
         try:
             return job_run.perform(cell.runs_folder, cell.whereabouts)

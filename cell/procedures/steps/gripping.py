@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pinocchio as pin
 
-from cell.config.job import GraspSection, Job
+from cell.config.job import Job
 from cell.measure.geometry.poses import from_parts, to_ur
 from cell.motion.collision import TOUCHES
 from cell.procedures.arm.moves import PartProgress, PartState
@@ -13,23 +13,7 @@ from cell.procedures.steps.place import FAST_FORCE
 from cell.procedures.steps.workplace import Workplace
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vector
-from drivers.make import Mounting
 from statemachine.runner import StepContext
-
-GRIPPED = np.diag([20e-6**2] * 3 + [0.2e-3**2] * 3)
-"""Covariance of how a claw that closes on a part where it let it go moves it, m² and rad²: stated, as the grasp is."""
-
-
-def held_so(job: Job, flange_from_part: pin.SE3, seen: Vector) -> Job:
-    """The job with its part held at `flange_from_part`, known to `seen` (6, 6)."""
-    roll, pitch, yaw = pin.rpy.matrixToRpy(flange_from_part.rotation)
-    x, y, z = flange_from_part.translation
-    sigmas = np.sqrt(np.diag(seen + GRIPPED))
-    held = Mounting.model_construct(translation=(x, y, z), rotation=(roll, pitch, yaw))
-    grasp = GraspSection.model_construct(
-        flange_from_part=held, size=job.grasp.size, sigma=float(sigmas[:3].max()), sigma_angle=float(sigmas[3:].max())
-    )
-    return job.model_copy(update={"grasp": grasp})
 
 
 def take(

@@ -12,7 +12,8 @@ from cell.measure.inversion import PlacePose
 from cell.measure.inversion.part_pose import seen_from_below
 from cell.procedures.arm.moves import PartState
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.steps.gripping import GRIPPED, note_part, take
+from cell.procedures.grasp import GRIPPED
+from cell.procedures.steps.gripping import note_part, take
 from cell.procedures.steps.place import carried_on
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
@@ -19,6 +19,8 @@ from cell.motion.collision import TOUCHES
 from cell.procedures.arm.moves import Mover, PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.arm.touch import FELT_M, REFUSED, TouchCheck, TouchHeight, expected_touch, felt_touch
+from cell.procedures.grasp import brought, held_so, hoped, moved
+from cell.procedures.part_error import part_points
 from cell.procedures.steps.board_photo import require_unmoved
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -42,7 +44,8 @@ class PlaceResult:
 
     `look` is what was seen of the surface between its sweep and the descent; None where it was measured without a
     sweep. `pose` is where it was placed to: the inverted one, carried on where something creeps. `mating` is the gap
-    below the part as drawn, where the job has a mesh of it.
+    below the part as drawn, where the job has a mesh of it. `allowed` is how the part was taken to come to lie aside,
+    part frame: as the parts before it did, of which there were `parts`.
     """
 
     base_from_flange: pin.SE3
@@ -52,6 +55,8 @@ class PlaceResult:
     look: SecondLook | None = None
     pose: PlacePose | None = None
     mating: MatingGap | None = None
+    allowed: pin.SE3 = field(default_factory=pin.SE3.Identity)
+    parts: int = 0
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -64,8 +69,14 @@ class PlaceResult:
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
-        mating = {} if self.mating is None else {"mating": self.mating.as_dict()}
-        return mating | {
+        more: dict[str, object] = {} if self.mating is None else {"mating": self.mating.as_dict()}
+        if self.parts:
+            more["allowed_for"] = {
+                "shift_mm": [round(1e3 * float(v), 4) for v in self.allowed.translation[:2]],
+                "turn_mrad": round(1e3 * float(pin.log3(self.allowed.rotation)[2]), 4),
+                "parts": self.parts,
+            }
+        return more | {
             "contact": self.contact,
             "depth_error_mm": round(1e3 * self.depth_error, 4),
             "touch": None if self.touch is None else self.touch.as_dict(),
@@ -223,12 +234,13 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
     require_held(here.part)
     while True:
         held, pose = context.held_s, context.made(PlacePose)
-        mating = _mated(here, pose, context)
+        aim = Aim.of(here, pose)
+        mating = _mated(here, pose, aim.touching, context)
         look = _looked_again(here, pose, context)
         if look is not None and look.creep is not None:
             swept = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
             pose = carried_on(here, *swept, look.creep)
-        expected = expected_touch(here.job, here.nominal, pose, here.repeatability)
+        expected = expected_touch(aim.job, here.nominal, pose, here.repeatability)
         if mating is not None:
             expected = replace(expected, height=expected.height + mating.lift)
             pose = mating.stated(pose, here.job.place.surface_from_part.se3())
@@ -236,19 +248,54 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         # Whoever has the run held may reach in, also in the middle of a look: then it is looked at again.
         if context.held_s == held:
             break
+    if aim.allowed is not None:
+        context.note(text=aim.words(here))
     placing = Placing(
-        here.job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
+        aim.job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
         part=here.part, check=context.check, progress=context.progress,
         note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
     )  # fmt: skip
     done = replace(placing.put_down(not here.looks_after), look=look, pose=pose, mating=mating)
+    if aim.allowed is not None:
+        done = replace(done, allowed=aim.allowed, parts=len(here.series.aside))
     for note in done.notes:
         context.note(text=note)
     return done
 
 
-def _mated(here: Workplace, pose: PlacePose, context: StepContext) -> MatingGap | None:
-    """The gap between the part as drawn and the surface as scanned; None without a mesh of the part or a scan.
+@dataclass(frozen=True, eq=False)
+class Aim:
+    """Where the part is put down so that it comes to lie in its place: `job` has it held so. `allowed` is by how much
+    that is aside, None for nothing; `touching` is where on the surface it meets that, surface_from_part."""
+
+    job: Job
+    allowed: pin.SE3 | None
+    touching: pin.SE3
+
+    @classmethod
+    def of(cls, here: Workplace, pose: PlacePose) -> Aim:
+        """By the parts of the batch before; straight at the place where they do not tell."""
+        points, grasp, belongs = part_points(here.nominal), here.job.grasp, here.job.place.surface_from_part.se3()
+        unsure = np.diag([grasp.sigma**2] * 3 + [grasp.sigma_angle**2] * 3)
+        noise = hoped(brought(here.job, here.repeatability, pose, points, unsure), 1)
+        allowed = here.series.allowance(points, noise)
+        if allowed is None:
+            return cls(here.job, None, belongs)
+        job = held_so(here.job, grasp.flange_from_part.se3() * allowed, unsure)
+        return cls(job, allowed, belongs * here.series.slip(points, noise).inverse())
+
+    def words(self, here: Workplace) -> str:
+        """For people, what is allowed for."""
+        assert self.allowed is not None
+        return (
+            f"{len(here.series.aside)} parts came to lie {1e3 * moved(self.allowed, part_points(here.nominal)):.2f} mm "
+            "aside alike: this one is put down as far to the other side"
+        )
+
+
+def _mated(here: Workplace, pose: PlacePose, lies: pin.SE3, context: StepContext) -> MatingGap | None:
+    """The gap between the part as drawn, where it `lies` on the surface, and that as scanned; None without a mesh of
+    the part or a scan.
 
     Raises `RefusedError` where they do not fit.
     """
@@ -261,7 +308,6 @@ def _mated(here: Workplace, pose: PlacePose, context: StepContext) -> MatingGap 
         # A kind of job that measures in another way.
         context.note(text="nothing was scanned: the part's underside was not held against the surface")
         return None
-    lies = here.job.place.surface_from_part.se3()
     found = scanned_gap(cloud, pose.base_from_surface, here.nominal, lies, here.part_mesh)
     if found is None:
         raise RefusedError(f"{APART}. {NEXT_STEP}")

@@ -9,7 +9,8 @@ import numpy as np
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.part_pose import seen_from_below
 from cell.procedures.arm.touch import expected_touch
-from cell.procedures.steps.gripping import held_so, note_part
+from cell.procedures.grasp import held_so
+from cell.procedures.steps.gripping import note_part
 from cell.procedures.steps.pick import HeldPart
 from cell.procedures.steps.place import PlaceResult, Placing
 from cell.procedures.steps.workplace import JobStep, Workplace

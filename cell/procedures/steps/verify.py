@@ -16,9 +16,10 @@ from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
 from cell.measure.reconstruction import Cloud, write_cloud
 from cell.measure.reconstruction.cloud import Indices
 from cell.procedures.arm.moves import PartState
+from cell.procedures.grasp import brought, hoped
 from cell.procedures.part_error import part_covariance, part_points
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart, along_surface
-from cell.procedures.steps.correction import brought, correct, hoped
+from cell.procedures.steps.correction import correct
 from cell.procedures.steps.laser_sweep import head_at, laser_sweep
 from cell.procedures.steps.place import PlaceResult
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements
@@ -40,7 +41,10 @@ FARTHEST_M = 2e-3
 def _at(here: Workplace, context: StepContext) -> PlacedPart:
     placed = context.made(PlaceResult)
     pose, plan = placed.pose or context.made(PlacePose), here.job.place
-    found, slip = _looked(here, pose, context), pin.SE3.Identity()
+    found, slips = _looked(here, pose, context), list[pin.SE3]()
+    leaves = hoped(brought(here.job, here.repeatability, pose, found.points, found.covariance), 1)
+    slip = here.series.slip(found.points, leaves)
+    came = along_surface(placed.allowed * found.belongs.inverse() * found.seen.surface_from_part)
     for left in range(plan.corrections, 0, -1):
         if not _worth_correcting(here, pose, found, left, context):
             break
@@ -64,11 +68,12 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
         # How it was held was seen: what it is off by to the side now came as the claw opened, and comes again.
         let_go = placed.base_from_flange * held
         slip = along_surface(let_go.inverse() * pose.base_from_surface * found.seen.surface_from_part)
+        slips.append(slip)
     for note in found.notes:
         context.note(text=note)
     if not found.kept(plan):
         raise found.misplaced(plan)
-    return found
+    return replace(found, came=came, slips=tuple(slips))
 
 
 def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left: int, context: StepContext) -> bool:
@@ -76,7 +81,7 @@ def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left:
     plan = here.job.place
     if found.off <= (plan.tolerance if plan.accept is None else plan.accept) and found.kept(plan):
         return False
-    hope = hoped(brought(here, pose, found.points, found.covariance), left)
+    hope = hoped(brought(here.job, here.repeatability, pose, found.points, found.covariance), left)
     why = f"placed again it would be {1e3 * hope:.2f} mm off"
     if found.aside >= FARTHEST_M:
         why = f"farther than {1e3 * FARTHEST_M:g} mm the claw may not find it"

@@ -23,6 +23,7 @@ from cell.procedures.arm.photograph import APART_S, BoardFix, photograph
 from cell.procedures.calibrate.interim import InterimCheck, fine_board_view, resting_pose
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
+from cell.procedures.grasp import GraspSeries
 from cell.procedures.sweep.swath import SweepCollector
 from drivers.errors import CalibrationStale
 from drivers.interfaces import Vector
@@ -49,7 +50,8 @@ class Workplace:
     where the surface is by the board (base_from_surface), `registered` where it was found. `pace` says how fast arm and
     vehicle go, of what is planned. `looked` says whether this run has tried to look at the fine board,
     `interim` what that said, None where nothing was to be seen. `ground` is the box around the surface below a part
-    that is to be unloaded, its lowest and highest corner, m, part frame.
+    that is to be unloaded, its lowest and highest corner, m, part frame. `series` is how the parts before this one of
+    its batch came to lie.
     """
 
     config: CellConfig
@@ -70,6 +72,7 @@ class Workplace:
     interim: InterimCheck | None = None
     looked: bool = False
     ground: tuple[Vector, Vector] | None = None
+    series: GraspSeries = field(default_factory=GraspSeries)
     _photographs: int = field(default=0, init=False)
 
     @cached_property

@@ -25,6 +25,7 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.verification import Verification
 from cell.procedures.drive.way import Whereabouts
+from cell.procedures.grasp import GraspSeries
 from cell.procedures.steps.kinds import kind_of
 from cell.run import batch as batches
 from cell.run import calibration as sessions
@@ -306,14 +307,7 @@ class Cell:
             CalibrationStale: A cell with a real device has no calibration that holds.
             InterlockError: Another run is going on.
         """
-        loaded, _ = load_job(job)
-        info: dict[str, object] = {}
-        inline: tuple[Observer, ...] = ()
-        if inject:
-            injector = Injector.scheduled(inject, kind_of(loaded).names, self.simulated)
-            info["injected"] = [str(injection) for injection in injector.injections]
-            inline = (injector,)
-        return self._start(job, observer, info, None, inline, at_start=at_start, until=until, script=script)
+        return self._start(job, observer, {}, None, inject=inject, at_start=at_start, until=until, script=script)
 
     def run_batch(
         self, job: str | Path = "pot", count: int = 1, observer: Observer | None = None, inject: Sequence[str] = (), *,
@@ -330,7 +324,9 @@ class Cell:
         """
         return batches.perform(
             self._here, load_job(job)[0], count,
-            run=lambda number: self.run(job, observer, inject, at_start=at_start and number == 1),
+            run=lambda number, series: self._start(
+                job, observer, {}, None, inject=inject, at_start=at_start and number == 1, series=series
+            ).result(),
             between=lambda work: self.perform("loading", work, observer), observer=observer,
         )  # fmt: skip
 
@@ -360,8 +356,14 @@ class Cell:
 
     def _start(
         self, job: str | Path, observer: Observer | None, info: dict[str, object], before: UnfinishedRun | None,
-        inline: tuple[Observer, ...] = (), *, at_start: bool, until: str | None, script: Script,
+        inject: Sequence[str] = (), *, at_start: bool, until: str | None = None, script: Script = NO_SCRIPT,
+        series: GraspSeries | None = None,
     ) -> Run[RunOutcome]:  # fmt: skip
+        inline: tuple[Observer, ...] = ()
+        if inject:
+            injector = Injector.scheduled(inject, kind_of(load_job(job)[0]).names, self.simulated)
+            info["injected"] = [str(injection) for injection in injector.injections]
+            inline = (injector,)
         self._runs.require_free()
         self._runs.require_no_late_stop()
         stops = self.stops
@@ -379,7 +381,10 @@ class Cell:
                 raise
             stored = error
         info |= {**self._here.world, **ready.info}
-        work = JobWork(self._here, job, ready, info, stored=stored, before=before, inline=inline, at_start=at_start)
+        work = JobWork(
+            self._here, job, ready, info, stored=stored, before=before, inline=inline, at_start=at_start,
+            series=series or GraspSeries(),
+        )  # fmt: skip
         return self.begin("job", work.perform, observer, stops)
 
     def calibration(self) -> CellCalibration:

@@ -221,7 +221,7 @@ ROWS = 9
 
 
 def scan_effect(scan: ScanCalibration, stand_off: float, rail: tuple[float, float]) -> Callable[[Array], float]:
-    """Gives of a change (27,) of the calibration the RMS in m of how far it moves a sweep's points in the flange's frame.
+    """Gives of a change (27,) of the calibration the RMS in m of how far it moves a sweep's points, flange frame.
 
     Over the picture's rows, depths of ± 10 mm about `stand_off` m in front of the camera, and the rail from end to end.
     """

@@ -12,7 +12,7 @@ import pytest
 
 from cell.devices.simulated.direct import VirtualCell
 from cell.motion.collision import PLACED
-from cell.procedures.steps.correction import held_so, hoped
+from cell.procedures.grasp import held_so, hoped
 from cell.procedures.steps.kinds import VERIFIED
 from drivers.errors import MisplacedError, RefusedError
 from lab.bench.job.part_effects import motion, opened

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, from_parts
-from cell.procedures.steps.gripping import GRIPPED, held_so
+from cell.procedures.grasp import GRIPPED, held_so
 from lab.bench.job.whole_job import JobRecord
 from tests.support.unloading import JOB, unloaded
 
