@@ -241,7 +241,11 @@ class PlacedPart:
         """Figures for journal and report."""
         shift, turn = self.offsets.mean(axis=0), self.turn
         sigma = np.sqrt(np.diag(self.covariance))
-        return {
+        came = {} if self.came is None else {
+            "came_mm": [round(1e3 * float(v), 4) for v in self.came.translation[:2]],
+            "came_mrad": round(1e3 * float(pin.log3(self.came.rotation)[2]), 4),
+        }  # fmt: skip
+        return came | {
             "off_mm": round(1e3 * self.off, 4), "unsure_mm": round(1e3 * self.unsure, 4),
             "shift_mm": [round(1e3 * float(v), 4) for v in shift],
             "turn_mrad": [round(1e3 * float(v), 4) for v in turn],

@@ -16,6 +16,7 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix, from_parts
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover, PartState
+from cell.procedures.grasp import GraspSeries
 from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps.kinds import VERIFIED
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
@@ -29,9 +30,9 @@ from tests.support.report_runs import CONFIG, at_station, work_of
 class LyingPart:
     """A cell of `record` at its station, whose part was put down; `also` is of the job's [place].
 
-    `changed` changes its world before anybody looks, `heard` is called with each text that is told. `cell` is the one
-    that looked last, `notes` are its texts, `parts` what it noted of the part, and `carried` whether its moves reckoned
-    with a part in the claw then.
+    `changed` changes its world before anybody looks, `heard` is called with each text that is told, `series` tells of
+    parts before. `cell` is the one that looked last, `notes` are its texts, `parts` what it noted of the part, and
+    `carried` whether its moves reckoned with a part in the claw then.
     """
 
     record: JobRecord
@@ -42,6 +43,7 @@ class LyingPart:
     also: str = "corrections = 0"
     changed: Callable[[VirtualCell], None] = lambda cell: None
     heard: Callable[[VirtualCell, str], None] = lambda cell, text: None
+    series: GraspSeries = field(default_factory=GraspSeries)
     cell: VirtualCell = field(init=False)
     _mover: Mover = field(init=False)
     notes: list[str] = field(default_factory=list, init=False)
@@ -61,7 +63,7 @@ class LyingPart:
         cell.devices.claw.bare.release()
         scene, now = cell.world.scene, cell.clock.now()
         cell.world.part._world_from_part = scene.world_from_surface @ off.homogeneous
-        self._mover = work.mover
+        self._mover, work.series = work.mover, self.series
         work.part.state = PartState.RELEASED
         work.part.where = from_matrix(inverse(cell.world.world_from_base(now)) @ scene.world_from_surface) * off
         work.mover.leave_part(work.part.where)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,6 +21,8 @@ from cell.run.batch import _question
 from cell.run.folder import read_report
 from cell.run.job_run import RunOutcome
 from cell.run.recorded_work import Hands
+from lab.bench.job.part_effects import held, motion
+from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord
 from statemachine.step import Event
 from tests.support.described_cells import Changes, described, pose
@@ -49,15 +52,42 @@ def kept(batch: BatchOutcome) -> dict[str, object]:
     return read_json(batch.file).require()
 
 
-def test_the_figures_are_those_of_the_runs_and_each_part_is_gripped_otherwise(opened: Callable[..., Cell]) -> None:
+def test_the_figures_are_those_of_the_runs_and_what_the_parts_have_alike_is_allowed_for(
+    opened: Callable[..., Cell], tmp_path: Path
+) -> None:
+    """Each part is gripped otherwise, and lies .3 mm aside in the claw."""
     lines: list[str] = []
+    file = job_with_part(tmp_path, "pot", verify="all", half=MIDDLE)
+    file.write_text(re.sub(r'(?m)^speed = "15 mm/s"', 'speed = "30 mm/s"', file.read_text(), count=1))
+    aside = held(motion(0.0, 0.3))
     with opened() as cell:
-        batch = cell.run_batch("own.toml", 3, lambda event: lines.append(str(event.data.get("text"))))
+        assert isinstance(cell.simulated, VirtualCell)
+        world = cell.simulated.world
+
+        def observe(event: Event) -> None:
+            lines.append(str(event.data.get("text")))
+            if (event.kind, event.step) == ("step_started", "drive_to_target"):
+                aside(world)
+
+        batch = cell.run_batch("pot.toml", 3, observe)
+    steps = [{step["name"]: step["result"] for step in run.report["steps"]} for run in batch.runs]
+    assert ["allowed_for" in each["place"] for each in steps] == [False, False, True]
+    assert steps[2]["place"]["allowed_for"]["shift_mm"] == [pytest.approx(0.0, abs=0.15), pytest.approx(0.3, abs=0.15)]
+    for each in steps:
+        assert each["verify"]["came_mm"] == [pytest.approx(0.0, abs=0.15), pytest.approx(0.3, abs=0.15)]
     assert (batch.exit_code, batch.counts["placed"], batch.counts["not tried"]) == (0, 3, 0)
+    assert steps[2]["verify"]["off_mm"] < 0.5 * min(each["verify"]["off_mm"] for each in steps[:2])
     assert kept(batch) == json.loads(json.dumps(batch.as_dict()))
     reports = [read_report(run.folder) for run in batch.runs]
     assert len({json.dumps(report["truth"]["error_mm"]) for report in reports}) == 3
-    series = {"cycle time": [report["cell_s"] for report in reports]}
+    seen = [each["verify"] for each in steps]
+    series = {
+        "cycle time": [report["cell_s"] for report in reports],
+        "placed part off its place at first": [[*each["before_mm"], each["off_mm"]][0] for each in seen],
+        "placed part off its place, as seen": [each["off_mm"] for each in seen],
+        "corrections": [len(each["before_mm"]) for each in seen],
+        "gap, median": [each["gap"]["median_mm"] for each in seen],
+    }
     for row in reports[0]["measured"]:
         series[row["name"]] = [next(r["value"] for r in x["measured"] if r["name"] == row["name"]) for x in reports]
     assert [figure.name for figure in batch.figures] == list(series)

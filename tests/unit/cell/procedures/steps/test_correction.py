@@ -11,8 +11,9 @@ import pinocchio as pin
 import pytest
 
 from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_matrix
 from cell.motion.collision import PLACED
-from cell.procedures.grasp import held_so, hoped
+from cell.procedures.grasp import GraspSeries, held_so, hoped
 from cell.procedures.steps.kinds import VERIFIED
 from drivers.errors import MisplacedError, RefusedError
 from lab.bench.job.part_effects import motion, opened
@@ -66,6 +67,12 @@ def test_how_a_part_slips_each_time_the_claw_opens_is_seen_and_allowed_for(
     found = site.looked(moved(0.5e-3, z=0.2e-3))
     assert [round(1e3 * off, 1) for off in found.before] == [pytest.approx(0.5, abs=0.15)] * 2, "as far off again"
     assert found.off < 0.2e-3
+    # A part that comes after others that slipped so is placed well at once.
+    slip = from_matrix(motion(0.5, turn=(0, 0, 3)))
+    site.series = GraspSeries().after(slip, [slip, slip])
+    again = site.looked(moved(0.5e-3, z=0.2e-3))
+    assert len(again.before) == len(again.slips) == 1 and again.off < 0.2e-3
+    assert np.allclose(again.slips[0].translation, slip.translation, atol=0.15e-3)
 
 
 def test_what_is_in_the_way_to_the_part_ends_the_run_with_the_part_where_it_lay(

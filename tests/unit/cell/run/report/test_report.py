@@ -90,12 +90,14 @@ def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(
         "injected", "not_injected", "not_injected[].fault", "not_injected[].why", "until", "scripted", "resumed_from",
         "frames_missing", "truth_missing", "picture_missing", "texture_missing", "part_mesh.file", "part_mesh.sha256",
         "place.mating.least_mm", "place.mating.median_mm", "place.mating.largest_mm", "place.mating.seen",
+        "place.allowed_for.shift_mm", "place.allowed_for.turn_mrad", "place.allowed_for.parts",
         "pick.base_from_flange", "pick.sigma_mm", "pick.sigma_mrad", "set_down.contact", "set_down.depth_error_mm",
         "set_down.touch", "set_down.base_from_flange", "nest_error.translation_mm", "nest_error.rotation_mrad",
         "refusal.placed", "truth.seen_error.translation_mm", "truth.seen_error.rotation_mrad",
         *(f"verify.{key}" for key in (
             "off_mm", "unsure_mm", "shift_mm", "turn_mrad", "sigma_mm", "sigma_mrad", "points", "beside", "unseen",
-            "before_mm", "features", "gap", "gap.least_mm", "gap.median_mm", "gap.largest_mm", "gap.seen",
+            "before_mm", "came_mm", "came_mrad", "features",
+            "gap", "gap.least_mm", "gap.median_mm", "gap.largest_mm", "gap.seen",
             "flush", "flush.least_mm", "flush.median_mm", "flush.largest_mm", "flush.seen",
         )),
     }  # fmt: skip

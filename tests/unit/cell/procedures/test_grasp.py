@@ -1,0 +1,57 @@
+"""What the parts of a batch have alike is told from what they have by chance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from cell.procedures.grasp import NEWEST, GraspSeries
+from tests.support.lying_part import moved
+
+POINTS = np.array([[x, y, 0.0] for x in (-0.02, 0.02) for y in (-0.015, 0.015)])
+NOISE = 0.05e-3
+
+
+def series(*aside: tuple[float, float, float]) -> GraspSeries:
+    """Of parts that came to lie aside by these, mm and mrad, and were placed again with a slip of nothing."""
+    made = GraspSeries()
+    for x, y, turn in aside:
+        made = made.after(moved(1e-3 * x, 1e-3 * y, turn=(0.0, 0.0, 1e-3 * turn)), [pin.SE3.Identity()])
+    return made
+
+
+def test_two_parts_that_came_alike_are_allowed_for_in_the_next() -> None:
+    found = series((0.30, -0.10, 4.0), (0.34, -0.14, 5.0)).allowance(POINTS, NOISE)
+    assert found is not None
+    assert np.allclose(found.translation, [0.32e-3, -0.12e-3, 0.0])
+    assert pin.log3(found.rotation)[2] == pytest.approx(4.5e-3)
+
+
+def test_one_part_may_have_been_bumped() -> None:
+    assert series((0.4, 0.0, 0.0)).allowance(POINTS, NOISE) is None
+    assert series((0.0, 0.02, 0.0), (0.5, 0.0, 0.0)).allowance(POINTS, NOISE) is None
+    bumped = series((0.30, 0.0, 0.0), (0.0, 0.9, 0.0), (0.32, 0.0, 0.0)).allowance(POINTS, NOISE)
+    assert bumped is None or np.linalg.norm(bumped.translation[:2] - [0.3e-3, 0.0]) < 0.02e-3
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_what_the_arm_errs_by_is_not_allowed_for(seed: int) -> None:
+    """Each way as much as brings the points off by the noise on average."""
+    drawn = np.random.default_rng(seed).normal(size=(6, 3)) * [0.04, 0.04, 0.0]
+    assert series(*map(tuple, drawn.tolist())).allowance(POINTS, NOISE) is None
+
+
+def test_the_newest_parts_count() -> None:
+    """A finger that was mended brings the parts back to the middle."""
+    worn = [(0.4, 0.0, 0.0)] * NEWEST
+    found = series(*worn, *[(0.0, 0.01, 0.0)] * NEWEST)
+    assert found.aside.shape == (NEWEST, 3) and found.allowance(POINTS, NOISE) is None
+
+
+def test_how_a_part_slips_is_known_from_those_that_were_placed_again() -> None:
+    assert np.allclose(series((0.4, 0.0, 0.0), (0.4, 0.0, 0.0)).slip(POINTS, NOISE).translation, 0.0)
+    slips = [moved(0.5e-3), moved(0.46e-3)]
+    assert GraspSeries().after(moved(0.48e-3), slips[:1]).slip(POINTS, NOISE) == pin.SE3.Identity()
+    found = GraspSeries().after(moved(0.48e-3), slips).slip(POINTS, NOISE)
+    assert found.translation[0] == pytest.approx(0.48e-3)
