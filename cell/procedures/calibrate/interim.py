@@ -25,7 +25,6 @@ from cell.measure.calibration.drift.interim import HeadShift
 from cell.measure.calibration.solve.normal import AdjustmentState
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import parse_board
-from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import NO_REFERENCE, CalibrationView, interim_view
 from cell.procedures.calibrate.boards import PHOTO_RATE, Keep, look_for
@@ -165,7 +164,7 @@ def interim_check(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, job: Job, *,
     check: Callable[[], None], progress: Callable[[str], None], keep: Keep,
 ) -> InterimCheck:  # fmt: skip
-    """Look at the fine board; again, from afar, for as long as what it shows may be chance or a change.
+    """Look at the fine board; again, from where the arm rests, for as long as it may show chance or a change.
 
     Raises `CalibrationStale` for a calibration without its reference, `RefusedError` when the board is not seen, and
     what `Mover.to_view` raises where its view is out of reach.
@@ -177,8 +176,11 @@ def interim_check(
     while True:
         check()
         progress("looking at the fine board" + (", again" if looks else ""))
-        mover.to_view(view.base_from_flange)
-        devices.rail.move_to(view.rail_position).wait(30.0)
+        carriage = devices.rail.move_to(view.rail_position)
+        try:
+            mover.to_view(view.base_from_flange)
+        finally:
+            carriage.wait(30.0)
         refusals = Counter[str]()
         seen = look_for(devices.scan_camera, fine, refusals, keep, f"interim-{len(looks) + 1}")
         if seen is None:
@@ -192,5 +194,5 @@ def interim_check(
         found = InterimCheck.of(calibration, job, looks, 0.5 * sum(config.rail.travel))
         if len(looks) == LOOKS or found.head.changed or not found.head.suspicious:
             return found
-        # From afar: over a short way friction brings the arm back to the very place that it just had.
-        mover.to_joints(HOME)
+        # From where it rests: over a shorter way friction brings the arm back to the very place that it just had.
+        mover.fold()

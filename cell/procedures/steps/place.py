@@ -27,7 +27,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.second_look import SecondLook, require_in_place
 from cell.procedures.sweep.stored_sweep import SweepRecord
-from drivers.errors import Measured, NotObservable, RefusedError
+from drivers.errors import CellError, Measured, NotObservable, RefusedError
 from drivers.interfaces import Arm, ArmState, Claw, Vector
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
@@ -93,7 +93,7 @@ class Placing:
 
     `expected` is where the part is to touch first. `part` follows what becomes of the part. `note` is called before the
     claw is told to release it, and again as soon as it has, before anything else is done. `check` raises when the run
-    is to end.
+    is to end, `ready` where the part is not to touch the surface: it is asked once the part is just above.
     """
 
     job: Job
@@ -106,6 +106,7 @@ class Placing:
     check: Callable[[], None]
     progress: Callable[[float, str], None]
     note: Callable[[PartProgress], None]
+    ready: Callable[[], None] = lambda: None
 
     def put_down(self, fold: bool = True) -> PlaceResult:
         """Put the part onto the surface, and fold the arm unless somebody looks at the part from where it stands then.
@@ -118,6 +119,7 @@ class Placing:
         require_held(self.part)
         self._approach()
         self._descend()
+        self._require_ready()
         contact, states = self._feel()
         reached = from_ur(self.arm.state().flange)
         off = self._depth()
@@ -169,6 +171,13 @@ class Placing:
                 "lifted again, still held. Look what lies on the place",
                 Measured("contact, above the place pose", 1e3 * height, "mm", most=1e3 * plan.contact_travel),
             )
+
+    def _require_ready(self) -> None:
+        try:
+            self.ready()
+        except CellError:
+            self._lift()
+            raise
 
     def _feel(self) -> tuple[bool, Sequence[ArmState]]:
         """The slow part: whether the part came into contact, and the arm's states on the way."""
@@ -250,10 +259,13 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
             break
     if aim.allowed is not None:
         context.note(text=aim.words(here))
+    # While the arm comes down; the laser is off.
+    carriage = here.devices.rail.check_zero() if look is not None and here.job.scan.mode == "rail" else None
     placing = Placing(
         aim.job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
         part=here.part, check=context.check, progress=context.progress,
         note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
+        ready=lambda: None if carriage is None else carriage.wait(30.0),
     )  # fmt: skip
     done = replace(placing.put_down(not here.looks_after), look=look, pose=pose, mating=mating)
     if aim.allowed is not None:

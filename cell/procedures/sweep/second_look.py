@@ -62,6 +62,7 @@ def require_in_place(
 ) -> SecondLook:
     """Sweep the first strip again, in few lines, and compare; photograph the board if the lines leave much open.
 
+    Whoever goes on looks whether the rail has lost steps in it.
     Raises `RefusedError` when either has moved by more than chance brings, and what a sweep and a photograph raise.
     """
     place = here.job.place
@@ -86,7 +87,7 @@ def _swept_again(
         here, here.base_from_surface(fix), head_at(here, sweep), few.model_copy(update={"frame_rate": rate}),
         keep_frame=lambda frame: here.frames.keep("second-look", frame), check=context.check,
         progress=lambda share, text: context.progress(0.04 * share, f"whether the surface lies where it did: {text}"),
-        most_lost=MOST_LOST,
+        most_lost=MOST_LOST, counted=False,
     )  # fmt: skip
     # What lens and light plane are off by cancels in the same strip only.
     before, now = scan.cloud.of_sweep(0), require_points(build_cloud(again))
