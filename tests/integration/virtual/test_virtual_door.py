@@ -162,6 +162,7 @@ def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
         ("target_camera.silent@drive_to_target", "DeadlineError"),
         ("arm.protective_stop@place:40%", "arm.protective_stop"),
         ("vehicle.motor_fault@place:40%", "vehicle.error"),
+        ("rail.lost_steps@place:2%", "rail.lost_steps"),
     ],
 )
 def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe(inject: str, code: str) -> None:

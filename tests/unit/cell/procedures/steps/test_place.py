@@ -98,7 +98,7 @@ class Site:
         placing = Placing(
             JOB, self.base_from_surface * from_parts((0.0, 0.0, -too_low)), STATED, mover=self.mover, arm=self.arm,
             claw=given["claw"], part=self.part, check=lambda: None, progress=lambda share, text: None,
-            note=given["note"],
+            note=given["note"], ready=given.get("ready", lambda: None),
         )  # fmt: skip
         return placing.put_down()
 
@@ -252,6 +252,21 @@ def test_nothing_is_held_between_the_last_look_and_the_release() -> None:
     assert held == [False]
 
 
+def test_steps_that_the_rail_lost_before_are_found_with_the_part_held_and_lifted() -> None:
+    site = Site()
+    rail = site.cell.devices.rail
+    rail.home().wait(60.0)
+    site.cell.fault("rail.lost_steps")
+    rail.move_to(0.05).wait(30.0)
+    looking = rail.check_zero()
+    assert looking is not None
+    with pytest.raises(DeviceFault, match="lost steps"):
+        site.place(ready=lambda: looking.wait(30.0))
+    assert site.held and site.noted == []
+    assert site.height_above() > 0.5 * JOB.place.approach
+    assert max(site.forces) == 0.0
+
+
 def test_a_part_that_meets_nothing_is_not_released() -> None:
     site = Site()
     with pytest.raises(RefusedError, match=r"no contact within 1\.00 mm"):
@@ -356,7 +371,7 @@ def test_where_nothing_was_scanned_it_is_told_that_the_underside_was_not_looked_
     work = work_of(VirtualCell(CONFIG, 2, "nominal"), job, nominal, placed_pot, NoFrames(), tmp_path)
     made = {name: result for name, result in placed_pot.results.items() if name != "reconstruct"}
     context = StepContext(PLACE.policy().of("place"), 1, math.inf, made, work.devices.clock, said.append)
-    assert _mated(work, placed_pot.results["invert_pose"], context) is None
+    assert _mated(work, placed_pot.results["invert_pose"], pin.SE3.Identity(), context) is None
     assert any("was not held against the surface" in str(event.data) for event in said)
 
 

@@ -26,7 +26,15 @@ from cell.procedures.arm.touch import felt_touch
 from cell.procedures.steps import place as place_step
 from cell.procedures.steps.kinds import PLACE
 from cell.procedures.sweep import second_look
-from cell.procedures.sweep.second_look import LINES, SecondLook, by_times, require_in_place, require_points, sparse
+from cell.procedures.sweep.second_look import (
+    LINES,
+    SecondLook,
+    by_times,
+    require_in_place,
+    require_points,
+    require_unmoved,
+    sparse,
+)
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION
 from drivers.errors import CellError, DeviceFault, LimitError, NotObservable, RefusedError
 from lab.bench.job.scan_errors import own_base
@@ -249,6 +257,26 @@ def test_after_a_pause_it_is_looked_at_anew(
     with pytest.raises(RefusedError, match=r"the surface has moved by (0\.9|1\.0)"):
         PLACE.work(site.work)["place"](site.context)
     assert held == [True]
+
+
+def test_a_few_steps_that_the_rail_lost_are_found_before_the_part_touches(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As few do not show in the lines: the count is looked at while the arm comes down."""
+    heard: list[str] = []
+
+    def lost(moved: SurfaceMotion) -> None:
+        """After the sweep, where the rail stands."""
+        rail, now = site.cell.world.rail, site.cell.clock.now()
+        rail.set_position(now, rail.position(now) + round(0.09e-3 * 200 * 256 / 0.002))
+        require_unmoved(moved)
+
+    monkeypatch.setattr(second_look, "require_unmoved", lost)
+    site = Site(placed_pot, tmp_path, *pot(), tell=lambda event: heard.append(str(event.data.get("text"))))
+    with pytest.raises(DeviceFault, match="lost steps"):
+        PLACE.work(site.work)["place"](site.context)
+    assert "descending" in heard and "feeling for contact" not in heard
+    assert site.cell.world.part.held
 
 
 # --- two clouds, one beside the other ---
