@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +20,11 @@ from cell.procedures.steps.invert_pose import LineTimes, inverted
 from cell.procedures.steps.invert_pose import invert_pose as step
 from cell.procedures.steps.place import carried_on
 from cell.run.report.report import place_error
-from drivers.errors import NotObservable
+from drivers.errors import NotObservable, RefusedError
 from lab.bench.job.scan_errors import own_base, surface_at_middle
 from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
-from sim_backends.world import world
-from sim_backends.world.scene import Scene
-from tests.support.report_runs import CONFIG, at_work, pot, work_of
+from tests.support.at_station import AtStation
+from tests.support.report_runs import CONFIG, NAMES, at_work, pot, work_of
 
 
 def head_of(record: JobRecord, cloud: Cloud) -> Head:
@@ -91,38 +89,33 @@ def test_a_place_that_is_carried_on_for_a_creep_keeps_what_the_droop_adds(
     assert (found.sigma / good.sigma).max() > 3
 
 
-def rolling(record: JobRecord, monkeypatch: pytest.MonkeyPatch, angle: float) -> JobRecord:
-    """The record's job once more, in a world whose vehicle rolls by ±`angle` rad."""
+def rolling(record: JobRecord, folder: Path, angle: float) -> AtStation:
+    """Where the record placed, in a world whose vehicle rolls by ±`angle` rad."""
 
-    def drawn(*given: object) -> Scene:
-        scene = draw(*given)
-        return replace(scene, workshop=replace(scene.workshop, rocking=np.array([angle, 0.0]), rocking_hz=3.0))
+    def rolls(cell: VirtualCell) -> None:
+        scene = cell.world.scene
+        workshop = replace(scene.workshop, rocking=np.array([angle, 0.0]), rocking_hz=3.0)
+        cell.world.remake(replace(scene, workshop=workshop), cell.world.station)
 
-    draw = world.draw
-    monkeypatch.setattr(world, "draw", drawn)
-    return run_whole_job(CONFIG, *pot(), record.seed, record.level, calibrated=record)
+    return AtStation(record, folder, changed=rolls)
 
 
 def test_a_vehicle_that_rolls_is_in_the_stated_covariance_though_no_height_of_the_scan_shows_it(
-    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, tmp_path: Path
 ) -> None:
-    found = rolling(placed_pot, monkeypatch, 0.3e-3)
-    assert (found.outcome, found.reason) == ("placed", "")
-    job, nominal = pot()
+    site = rolling(placed_pot, tmp_path, 0.3e-3)
+    pose, found = site.do(*NAMES[1:]).pose, site.ended
     assert found.placing is not None and found.at_end is not None
-    pose = found.results["place"].pose
     # ±.3 mrad at .6 m above the ground, one standard deviation.
     assert pose.sigma[1] == pytest.approx(0.3e-3 * 0.6 / np.sqrt(2), rel=0.25)
-    error = place_error(job, nominal, found.at_end)["d_p95"]
-    assert error < stated_bound(job, nominal, pose, found.placing)["d"]
+    error = place_error(site.job, site.nominal, found.at_end)["d_p95"]
+    assert error < stated_bound(site.job, site.nominal, pose, found.placing)["d"]
 
 
-def test_a_vehicle_that_rolls_too_much_is_refused_by_the_photographs(
-    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = rolling(placed_pot, monkeypatch, 0.6e-3)
-    assert found.outcome == "refused"
-    assert re.search(r"the vehicle rocks by ±0\.[56]\d mrad, which moves the board by ±0\.[45]\d mm", found.reason)
+def test_a_vehicle_that_rolls_too_much_is_refused_by_the_photographs(placed_pot: JobRecord, tmp_path: Path) -> None:
+    told = r"the vehicle rocks by ±0\.[56]\d mrad, which moves the board by ±0\.[45]\d mm"
+    with pytest.raises(RefusedError, match=told):
+        rolling(placed_pot, tmp_path, 0.6e-3).do("board_photo")
 
 
 @pytest.mark.campaign
