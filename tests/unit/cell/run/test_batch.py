@@ -52,11 +52,11 @@ def kept(batch: BatchOutcome) -> dict[str, object]:
 def test_the_figures_are_those_of_the_runs_and_each_part_is_gripped_otherwise(opened: Callable[..., Cell]) -> None:
     lines: list[str] = []
     with opened() as cell:
-        batch = cell.run_batch("own.toml", 3, lambda event: lines.append(str(event.data.get("text"))))
-    assert (batch.exit_code, batch.counts["placed"], batch.counts["not tried"]) == (0, 3, 0)
+        batch = cell.run_batch("own.toml", 2, lambda event: lines.append(str(event.data.get("text"))))
+    assert (batch.exit_code, batch.counts["placed"], batch.counts["not tried"]) == (0, 2, 0)
     assert kept(batch) == json.loads(json.dumps(batch.as_dict()))
     reports = [read_report(run.folder) for run in batch.runs]
-    assert len({json.dumps(report["truth"]["error_mm"]) for report in reports}) == 3
+    assert len({json.dumps(report["truth"]["error_mm"]) for report in reports}) == 2
     series = {"cycle time": [report["cell_s"] for report in reports]}
     for row in reports[0]["measured"]:
         series[row["name"]] = [next(r["value"] for r in x["measured"] if r["name"] == row["name"]) for x in reports]
@@ -64,9 +64,9 @@ def test_the_figures_are_those_of_the_runs_and_each_part_is_gripped_otherwise(op
     for figure in batch.figures:
         values = np.array(series[figure.name])
         expected = [values.mean(), values.std(ddof=1), values.min(), values.max()]
-        assert figure.n == 3
+        assert figure.n == 2
         np.testing.assert_allclose([figure.mean, figure.sd, figure.min, figure.max], expected, rtol=1e-9, atol=1e-12)
-    assert [line for line in lines if line.startswith("part 3 of 3  placed: ") and line.endswith("3 placed")]
+    assert [line for line in lines if line.startswith("part 2 of 2  placed: ") and line.endswith("2 placed")]
 
 
 @pytest.mark.parametrize(("rule", "refused"), [("", 1), ("end", 1), ("skip", 2)])
@@ -164,9 +164,10 @@ def test_the_command_line_shows_what_came_of_it(
     opened: Callable[..., Cell], typed: Callable[..., tuple[int, str, str]]
 ) -> None:
     opened().close()
-    words = ("dry-run", "-c", "cell.toml", "-j", "own.toml", "--clock", "virtual", "--seed", "2", "--count", "1")
-    code, out, error = typed(*words)
-    assert (code, "1 placed, 0 corrected" in out, "part 1 of 1  placed" in error) == (0, True, True), (out, error)
+    words = ("dry-run", "-c", "cell.toml", "-j", "own.toml", "--clock", "virtual", "--seed", "2", "--count", "2")
+    code, out, error = typed(*words, "--inject", "arm.emergency_stop@drive_to_target:40%")
+    shown = ("0 placed, 0 corrected" in out, "1 faulted" in out, "part 1 of 2  faulted" in error)
+    assert (code, shown) == (1, (True, True, True)), (out, error)
     assert typed(*words, "--until", "board_photo")[0] == 2
 
 
