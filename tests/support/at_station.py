@@ -22,7 +22,7 @@ from statemachine.runner import Event, StepContext
 from tests.support.report_runs import CONFIG, at_station, pot, work_of
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class AtStation:
     """A cell of `record` where that placed, `further` metres on, its vehicle braked; `made` is what `record` made.
 

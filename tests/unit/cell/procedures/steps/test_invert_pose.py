@@ -22,9 +22,9 @@ from cell.procedures.steps.place import carried_on
 from cell.run.report.report import place_error
 from drivers.errors import NotObservable, RefusedError
 from lab.bench.job.scan_errors import own_base, surface_at_middle
-from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
+from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.support.at_station import AtStation
-from tests.support.report_runs import CONFIG, NAMES, at_work, pot, work_of
+from tests.support.report_runs import CONFIG, NAMES, changed, pot
 
 
 def head_of(record: JobRecord, cloud: Cloud) -> Head:
@@ -75,12 +75,11 @@ def test_without_a_droop_nothing_is_added_and_too_large_a_one_is_refused(placed_
 def test_a_place_that_is_carried_on_for_a_creep_keeps_what_the_droop_adds(
     placed_pot: JobRecord, tmp_path: Path
 ) -> None:
-    made, (job, nominal), cell = placed_pot.results, pot(), VirtualCell(CONFIG, 2, "nominal")
+    made, work = placed_pot.results, AtStation(placed_pot, tmp_path, folded=False).work
     good, sweep = made["invert_pose"], made["laser_sweep"]
     rate, origin = np.array([6e-6, 0, 0, 0, 3e-6, 0]), good.base_from_surface.translation
     creep = Creep(rate, np.diag(np.full(6, 0.1e-6**2)), origin, float(sweep.times.mean()))
     creeping = replace(creep, rate=-rate).undone(drooped(placed_pot, 0.1e-3), sweep.times)
-    work = work_of(cell, job, nominal, placed_pot, NoFrames(), tmp_path)
     scan = replace(made["reconstruct"], cloud=creeping)
     found = carried_on(work, sweep, scan, made["board_photo"], creep)
     (note,) = found.notes
@@ -149,7 +148,8 @@ def test_a_droop_since_the_calibration_is_in_the_stated_covariance_or_refused(na
 def test_where_the_place_is_known_too_little_what_was_noted_of_the_sweep_is_told(
     placed_pot: JobRecord, tmp_path: Path, doubts: tuple[str, ...]
 ) -> None:
-    here, made = at_work(placed_pot, tmp_path, tolerance=0.05e-3), placed_pot.results
+    job, made = changed(pot()[0], "place", tolerance=0.05e-3), placed_pot.results
+    here = AtStation(placed_pot, tmp_path, job, folded=False).work
     sweep = replace(made["laser_sweep"], doubts=doubts)
     with pytest.raises(NotObservable) as caught:
         inverted(here, sweep, made["reconstruct"], made["board_photo"])
