@@ -17,6 +17,7 @@ from cell.run.record.replay import replay
 from cell.run.report.page.make import make_page
 from drivers.errors import ConfigError
 from lab.bench.job.whole_job import JobRecord
+from statemachine.step import Event
 from tests.support.unloading import JOB, Change, unloaded
 
 
@@ -79,8 +80,13 @@ def test_through_the_public_door_it_is_not_resumed_once_it_was_gripped_and_the_n
     assert placed_pot.calibration is not None
     save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
     with Cell.open(sim="all", seed=placed_pot.seed, clock="virtual", job="unload") as cell:
-        ended = cell.run(job="unload", inject=["arm.emergency_stop@set_down:40%"])
-        assert (ended.outcome, ended.report["part"]) == ("faulted", "held")
+
+        def end(event: Event) -> None:
+            if event.kind == "step_started" and event.step == "set_down" and cell.current is not None:
+                cell.current.abort("seen enough")
+
+        ended = cell.run("unload", end)
+        assert (ended.outcome, ended.report["part"]) == ("aborted", "held")
         with pytest.raises(ConfigError, match="had gripped a part that lay"):
             cell.resume(ended.folder)
         again = cell.run(job="unload", until="drive_to_target")
