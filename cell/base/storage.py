@@ -13,7 +13,7 @@ import json
 import os
 import secrets
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -200,16 +200,3 @@ def require_date(name: str, seconds: float) -> None:
             f"{name} lies {ahead / 3600:.1f} hours in the future, so its age is not known (allowed: "
             f"{CLOCK_SLACK_S / 3600:g} h); set this machine's clock"
         )
-
-
-# A reason can be long, and the report has all of it.
-_TABLE = """<table><caption>{{ title | truncate(240, true, " …", 0) }}</caption>
-{%- for name, value in rows %}<tr><th style='text-align:left'>{{ name | truncate(240, true, " …", 0) }}</th>
-<td>{{ value | truncate(240, true, " …", 0) }}</td></tr>{% endfor %}</table>"""
-
-
-def table(title: str, rows: Iterable[tuple[str, str]]) -> str:
-    """An HTML table of names and values under a title; of each no more than 240 characters."""
-    from jinja2 import Environment  # only who shows a table waits for it
-
-    return Environment(autoescape=True).from_string(_TABLE).render(title=title, rows=rows)

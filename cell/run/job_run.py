@@ -13,7 +13,7 @@ from typing import Any
 
 import pinocchio as pin
 
-from cell.base.storage import table, write_json
+from cell.base.storage import write_json
 from cell.check.fit import require_fit
 from cell.check.place import mesh_box
 from cell.config.calibrations.store import CellCalibration, save_calibration
@@ -40,7 +40,7 @@ from cell.run.record.recorder import Recorder, recorded
 from cell.run.record.replay import save as save_perception
 from cell.run.recorded_work import classify, clear, outcome_of
 from cell.run.report.evidence import seen_words
-from cell.run.report.figures import following_words, told
+from cell.run.report.figures import following_words
 from cell.run.report.report import FinishedJob, TruthRecorder
 from cell.run.resumption import UnfinishedRun, job_source
 from cell.run.runs import Run
@@ -133,10 +133,6 @@ class RunOutcome:
 
     def __repr__(self) -> str:
         return f"<RunOutcome {self.outcome}, run {self.folder.name}>"
-
-    def _repr_html_(self) -> str:
-        measured = ((str(row["name"]), told(row)) for row in self.report.get("measured") or ())
-        return table(f"{self.outcome}: run {self.folder.name}", [("reason", self.reason), *measured])
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,27 +10,25 @@ import numpy as np
 import pinocchio as pin
 
 from cell.config.job import load_job
-from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix, from_parts
 from cell.measure.inversion import NominalSurface
-from cell.procedures.arm.moves import Mover, PartState
+from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import GraspSeries
 from cell.procedures.placed_part import PlacedPart
-from cell.procedures.steps.kinds import VERIFIED
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
-from lab.bench.job.whole_job import JobRecord, NoFrames
+from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
-from statemachine.runner import StepContext
-from tests.support.report_runs import CONFIG, at_station, work_of
+from tests.support.at_station import AtStation
+from tests.support.report_runs import changed
 
 
 @dataclass(eq=False)
 class LyingPart:
     """A cell of `record` at its station, whose part was put down; `also` is of the job's [place].
 
-    `changed` changes its world before anybody looks, `heard` is called with each text that is told, `series` tells of
-    parts before. `cell` is the one that looked last, `notes` are its texts, `parts` what it noted of the part, and
+    It is swept `faster` than shipped. `changed` changes its world before anybody looks, `heard` is called with each
+    text that is told, `series` tells of parts before. `notes` are the texts, `parts` what it noted of the part, and
     `carried` whether its moves reckoned with a part in the claw then.
     """
 
@@ -41,11 +38,11 @@ class LyingPart:
     verify: str = "all"
     flat: bool = False
     also: str = "corrections = 0"
+    faster: float = 2.0
     changed: Callable[[VirtualCell], None] = lambda cell: None
     heard: Callable[[VirtualCell, str], None] = lambda cell, text: None
     series: GraspSeries = field(default_factory=GraspSeries)
-    cell: VirtualCell = field(init=False)
-    _mover: Mover = field(init=False)
+    _site: AtStation = field(init=False)
     notes: list[str] = field(default_factory=list, init=False)
     parts: list[str] = field(default_factory=list, init=False)
     carried: list[bool] = field(default_factory=list, init=False)
@@ -54,31 +51,33 @@ class LyingPart:
         """What the step makes of a part that lies `off` its place."""
         file = job_with_part(self.folder, "pot", verify=self.verify, half=self.half, flat=self.flat, also=self.also)
         job, mesh = load_job(file)
+        quick = changed(job, "scan", speed=self.faster * job.scan.speed)
         nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
-        self.cell = cell = VirtualCell(CONFIG, self.record.seed, self.record.level, Described(job, mesh))
-        at_station(cell, self.record)
-        cell.devices.vehicle.brake()
-        work = work_of(cell, job, nominal, self.record, frames=NoFrames(), folder=self.folder)
-        self.changed(cell)
+        self._site = site = AtStation(
+            self.record, self.folder, quick, nominal, folded=False, changed=self.changed,
+            tell=lambda event: self._told(event.data),
+        )  # fmt: skip
+        cell, work = site.cell, site.work
         cell.devices.claw.bare.release()
         scene, now = cell.world.scene, cell.clock.now()
         cell.world.part._world_from_part = scene.world_from_surface @ off.homogeneous
-        self._mover, work.series = work.mover, self.series
+        work.series = self.series
         work.part.state = PartState.RELEASED
         work.part.where = from_matrix(inverse(cell.world.world_from_base(now)) @ scene.world_from_surface) * off
         work.mover.leave_part(work.part.where)
-        context = StepContext(
-            VERIFIED.policy().of("verify"), 1, math.inf, dict(self.record.results), clock=cell.clock,
-            tell=lambda event: self._told(event.data),
-        )  # fmt: skip
-        found = VERIFIED.work(work)["verify"](context)
+        found = site.do("verify")
         assert isinstance(found, PlacedPart)
         return found
+
+    @property
+    def cell(self) -> VirtualCell:
+        """The one that looked last."""
+        return self._site.cell
 
     def _told(self, data: dict[str, object]) -> None:
         if "part" in data:
             self.parts.append(str(data["part"]))
-            self.carried.append(any(body.name == "part" for body in self._mover.solids()))
+            self.carried.append(any(body.name == "part" for body in self._site.work.mover.solids()))
         if "text" in data:
             self.notes.append(str(data["text"]))
             self.heard(self.cell, self.notes[-1])

@@ -31,7 +31,7 @@ from cell.run.recorded_work import classify
 from cell.run.report.report import FinishedJob, TruthRecorder, pose_of
 from cell.run.resumption import job_source
 from drivers.errors import CellError
-from lab.bench.job.whole_job import JobRecord, NoFrames
+from lab.bench.job.whole_job import JobRecord
 from statemachine.runner import FaultRecord, RunResult, StepContext, StepRecord
 from statemachine.step import Failure, Outcome
 
@@ -70,13 +70,6 @@ def work_of(
     whereabouts = Whereabouts(cell.devices.vehicle)
     whereabouts.say_at_start()
     return Workplace(CONFIG, job, nominal, record.calibration, cell.devices, frames, folder, whereabouts)
-
-
-def at_work(record: JobRecord, folder: Path, **place: object) -> Workplace:
-    """Where `pot` is done, on the cell of `record` just started, with other values in its section `place`."""
-    job, nominal = pot()
-    cell = VirtualCell(CONFIG, record.seed, record.level)
-    return work_of(cell, changed(job, "place", **place), nominal, record, NoFrames(), folder)
 
 
 def at_station(cell: VirtualCell, record: JobRecord, further: float = 0.0) -> None:

@@ -9,15 +9,17 @@ from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.inversion import NominalSurface
 from lab.bench.job.whole_job import JobRecord, run_whole_job
-from tests.support.report_runs import CONFIG
+from tests.support.report_runs import CONFIG, changed
 
-JOB, MESH = load_job("unload")
+SHIPPED, MESH = load_job("unload")
+JOB = changed(SHIPPED, "scan", speed=2.0 * SHIPPED.scan.speed)
+"""Swept twice as fast as shipped."""
 Change = Callable[[VirtualCell], None]
 
 
-def unloaded(placed_pot: JobRecord, changed: Change = lambda cell: None, runs: Path | None = None) -> JobRecord:
-    """The job `unload` in the world of `placed_pot`, with its calibration; `changed` changes the cell before it."""
+def unloaded(placed_pot: JobRecord, change: Change = lambda cell: None, runs: Path | None = None) -> JobRecord:
+    """The job `unload` in the world of `placed_pot`, with its calibration; `change` changes the cell before it."""
     nominal = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
     return run_whole_job(
-        CONFIG, JOB, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot, runs=runs, changed=changed
+        CONFIG, JOB, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot, runs=runs, changed=change
     )

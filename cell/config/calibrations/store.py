@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.base.storage import read_json, require_date, sealed, table, write_json
+from cell.base.storage import read_json, require_date, sealed, write_json
 from cell.config.cell_config import CellConfig
 from cell.measure.calibration import Priors, ScanCalibration, ScanObservation, TargetCalibration, TargetObservation
 from cell.measure.calibration.archive import SUFFIX, Observations, write_archive
@@ -171,13 +171,6 @@ class CellCalibration:
 
     def __repr__(self) -> str:
         return f"<CellCalibration of {self.date}, hash {self.hash()}>"
-
-    def _repr_html_(self) -> str:
-        rows = [(device, serial) for device, serial in sorted(self.identities.items())]
-        for name, quality in (("scan head", self.scan.quality), ("target camera", self.target.quality)):
-            fit = f"χ²/dof {quality.chi2_per_dof:.3f}, {quality.views} views, dots {quality.dots_rms_px:.4f} px RMS"
-            rows.append((name, fit))
-        return table(f"calibration of {self.date}", [*rows, ("hash", self.hash())])
 
     @property
     def date(self) -> str:

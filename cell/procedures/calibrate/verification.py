@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.base.storage import table
 from cell.config.calibrations.store import CellCalibration, save_calibration
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, ScanSection
@@ -326,12 +325,6 @@ class Verification:
 
     def __repr__(self) -> str:
         return f"<Verification of the calibration of {self.date}: {self.word}>"
-
-    def _repr_html_(self) -> str:
-        allowed = f"{1e3 * self.tolerance:.2f} mm"
-        rows = [("reason", self.reason), ("allowed at the place", allowed)]
-        suspects = ", ".join(f"{s.part} ({s.probability:.0%})" for s in self.verdict.suspects) or "none"
-        return table(f"verification: {self.word}", [*rows, ("suspected", suspects)] if self.verdict.changed else rows)
 
     @property
     def hidden(self) -> float:

@@ -25,7 +25,6 @@ from cell.measure.inversion import NominalSurface, PlacePose
 from cell.measure.reconstruction import Cloud
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.part_error import draws, part_points, placed_points, point_covariances, stated_bound, through
-from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.verify_nest import where_seen
 from cell.procedures.sweep.stored_sweep import SweepRecord
@@ -241,14 +240,15 @@ def _add_truth(
     report["end_state"] = {key: now[key] for key in ("laser_on", "vehicle", "arm", "rail_moving", "part", "collisions")}
     sweep, made, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
     if isinstance(pose, PlacePose) and witness.at_sweep is not None:
+        # Arm base axes, at the sweep; also where the place was refused.
         sought = "base_from_part" if job.nest is not None else "base_from_surface"
-        report["pose_error"] = pose_error(pose, witness.at_sweep, sought)
+        report["pose_error"] = _apart(difference(pose.base_from_surface, pose_of(witness.at_sweep, sought)))
         report["pose_error_units"] = {"translation_mm": "mm", "rotation_mrad": "mrad"}
     if report["outcome"] not in ("placed", "misplaced") or not isinstance(pose, PlacePose):
         return
     if job.nest is not None:
         if (nested := seen_placed(result)) is not None:
-            report["nest_error"] = _seen_error(nested, pose_of(now, "base_from_part"))
+            report["nest_error"] = _apart(difference(nested.seen.surface_from_part, pose_of(now, "base_from_part")))
         return
     truth = place_error(job, nominal, now)
     assert isinstance(sweep, SweepRecord)
@@ -259,12 +259,11 @@ def _add_truth(
         truth["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)
     report["truth"] = truth
     if (seen := seen_placed(result)) is not None:
-        truth["seen_error"] = _seen_error(seen, pose_of(now, "surface_from_part"))
+        truth["seen_error"] = _apart(difference(seen.seen.surface_from_part, pose_of(now, "surface_from_part")))
 
 
-def _seen_error(seen: PlacedPart, there: pin.SE3) -> dict[str, list[float]]:
-    """How far from where the part is it was seen."""
-    error = difference(seen.seen.surface_from_part, there)
+def _apart(error: Vector) -> dict[str, list[float]]:
+    """A difference (6,) of two poses, m and rad, as the report has it."""
     return {
         "translation_mm": [round(1e3 * float(v), 4) for v in error[:3]],
         "rotation_mrad": [round(1e3 * float(v), 4) for v in error[3:]],
@@ -274,15 +273,6 @@ def _seen_error(seen: PlacedPart, there: pin.SE3) -> dict[str, list[float]]:
 def pose_of(truth: dict[str, Any], name: str) -> pin.SE3:
     """A pose of the truth by its name."""
     return from_matrix(truth["poses"][name])
-
-
-def pose_error(pose: PlacePose, truth: dict[str, object], name: str = "base_from_surface") -> dict[str, object]:
-    """How far the inverted pose is from the true one of this `name` at the sweep, arm base axes; also when refused."""
-    error = difference(pose.base_from_surface, pose_of(truth, name))
-    return {
-        "translation_mm": [round(1e3 * float(v), 4) for v in error[:3]],
-        "rotation_mrad": [round(1e3 * float(v), 4) for v in error[3:]],
-    }
 
 
 def sensor_error(cloud: Cloud, nominal: NominalSurface, truth: dict[str, object]) -> dict[str, float] | None:

@@ -194,9 +194,10 @@ def test_the_command_line_shows_what_came_of_it(
     opened: Callable[..., Cell], typed: Callable[..., tuple[int, str, str]]
 ) -> None:
     opened().close()
-    words = ("dry-run", "-c", "cell.toml", "-j", "own.toml", "--clock", "virtual", "--seed", "2", "--count", "1")
-    code, out, error = typed(*words)
-    assert (code, "1 placed, 0 corrected" in out, "part 1 of 1  placed" in error) == (0, True, True), (out, error)
+    words = ("dry-run", "-c", "cell.toml", "-j", "own.toml", "--clock", "virtual", "--seed", "2", "--count", "2")
+    code, out, error = typed(*words, "--inject", "arm.emergency_stop@drive_to_target:40%")
+    shown = ("0 placed, 0 corrected" in out, "1 faulted" in out, "part 1 of 2  faulted" in error)
+    assert (code, shown) == (1, (True, True, True)), (out, error)
     assert typed(*words, "--until", "board_photo")[0] == 2
 
 

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.config.cell_config import load_config
 from cell.config.job import Job, load_job
 from cell.measure.inversion import NominalSurface, PlacePose
 from cell.measure.inversion.observability import PoseVerdict, SmallMotion
 from cell.procedures.arm.touch import FELT_M, TouchCheck, TouchHeight, expected_touch, felt_touch
 from drivers.errors import RefusedError
 from drivers.interfaces import ArmSafety, ArmState
-from lab.bench.job.whole_job import JobRecord, run_whole_job
+from lab.bench.job.whole_job import JobRecord
 from sim_backends.world import levels
+from tests.support.at_station import AtStation
+from tests.support.report_runs import NAMES, changed
 
 JOB, MESH = load_job("pot")
 NOMINAL = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
@@ -99,21 +101,20 @@ def test_a_part_that_may_be_tilted_is_expected_to_touch_early(placed_pot: JobRec
 
 
 def test_a_laser_that_turned_unseen_is_caught_when_the_part_touches(
-    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One milliradian, no plate to see it on, and a job that knows its grasp as this level's claw holds it."""
     assert placed_pot.calibration is not None
     blind = replace(placed_pot.calibration, scan=replace(placed_pot.calibration.scan, witness=None))
     monkeypatch.setattr(levels, "ALONE", replace(levels.ALONE, laser_pointing=150e-6))
-    job, quick = replaced_grasp(0.02e-3, 0.1e-3), {"speed": 2 * JOB.scan.speed}
-    job = job.model_copy(update={"scan": JOB.scan.model_copy(update=quick)})
-    before = replace(placed_pot, calibration=blind)
-    level = "nominal+laser_pointing"
-    done = run_whole_job(load_config(None), job, NOMINAL, placed_pot.seed, level, calibrated=before, stood=3600.0)
-    assert done.outcome == "refused"
-    assert done.stage == "place"
-    assert "than the scan says" in done.reason
-    assert "still held" in done.reason
+    job = changed(replaced_grasp(0.02e-3, 0.1e-3), "scan", speed=2 * JOB.scan.speed)
+    site = AtStation(
+        replace(placed_pot, calibration=blind), tmp_path, job, level="nominal+laser_pointing",
+        changed=lambda cell: cell.world.stand(3600.0),
+    )  # fmt: skip
+    with pytest.raises(RefusedError, match="still held") as caught:
+        site.do(*NAMES[1:])
+    assert "than the scan says" in str(caught.value) and site.cell.world.part.held
 
 
 def replaced_grasp(sigma: float, angle: float) -> Job:

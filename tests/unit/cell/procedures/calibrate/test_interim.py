@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cell.config.cell_config import load_config
+from cell.config.calibrations.store import CellCalibration
+from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration.drift.interim import HeadShift
@@ -23,7 +23,7 @@ from drivers.errors import RefusedError
 from lab.bench.calibration.interim import planted
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world.scene import rotation
-from statemachine.journal import read
+from tests.support.at_station import AtStation
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")
@@ -90,8 +90,8 @@ def test_what_may_be_chance_is_looked_at_again_and_all_looks_count(placed_pot: J
 
 def test_a_job_whose_head_has_moved_ends_before_the_vehicle_drives(placed_pot: JobRecord) -> None:
     nominal = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
-    run = partial(run_whole_job, CONFIG, JOB, nominal, placed_pot.seed, "nominal", calibrated=placed_pot)
-    ended = run(changed=SHIFTS["last joint's zero, 4 mrad"].put_in)
+    moved = SHIFTS["last joint's zero, 4 mrad"].put_in
+    ended = run_whole_job(CONFIG, JOB, nominal, placed_pot.seed, "nominal", calibrated=placed_pot, changed=moved)
     assert (ended.outcome, ended.stage) == ("refused", "drive_to_target")
     assert "the scan head on the flange, a joint's zero, or the fine board" in ended.reason
     assert ended.at_end is not None and placed_pot.at_end is not None
@@ -99,12 +99,21 @@ def test_a_job_whose_head_has_moved_ends_before_the_vehicle_drives(placed_pot: J
     assert np.linalg.norm(here - there) > 1.0
 
 
-def test_a_cell_that_does_not_want_it_is_not_looked_at(placed_pot: JobRecord) -> None:
-    nominal = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
+def arrived(
+    record: JobRecord, folder: Path, calibration: CellCalibration, config: CellConfig = CONFIG
+) -> tuple[VehicleArrival, list[str]]:
+    """How a cell that stands at its target arrives there, and what is noted of it."""
+    notes: list[str] = []
+    site = AtStation(record, folder, tell=lambda event: notes.append(str(event.data.get("text"))))
+    site.work.config, site.work.calibration = config, calibration
+    return site.do("drive_to_target"), notes
+
+
+def test_a_cell_that_does_not_want_it_is_not_looked_at(placed_pot: JobRecord, tmp_path: Path) -> None:
     unlooked = CONFIG.calibration.model_copy(update={"each_job": False})
     config = CONFIG.model_copy(update={"calibration": unlooked})
-    ended = run_whole_job(config, JOB, nominal, placed_pot.seed, "nominal", calibrated=placed_pot)
-    arrival = ended.results["drive_to_target"]
+    assert placed_pot.calibration is not None
+    arrival, _ = arrived(placed_pot, tmp_path, placed_pot.calibration, config)
     assert arrival.head is None and "interim" not in arrival.summary()
 
 
@@ -113,11 +122,9 @@ def test_a_calibration_of_an_older_program_is_not_looked_at_and_the_job_says_so(
 ) -> None:
     made = placed_pot.calibration
     assert made is not None
-    old = replace(placed_pot, calibration=replace(made, scan=replace(made.scan, reference=None)))
-    nominal = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
-    ended = run_whole_job(CONFIG, JOB, nominal, old.seed, "nominal", calibrated=old, runs=tmp_path)
-    assert ended.results["drive_to_target"].head is None and ended.folder is not None
-    notes = [event.data["text"] for event in read(ended.folder).events if event.kind == "note" and "text" in event.data]
+    old = replace(made, scan=replace(made.scan, reference=None))
+    arrival, notes = arrived(placed_pot, tmp_path, old)
+    assert arrival.head is None
     assert any(
         "has moved since the calibration is not seen: the stored calibration holds no ref" in text for text in notes
     )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -18,13 +17,11 @@ from cell.measure.inversion import PlacePose
 from cell.measure.vision import BoardView, parse_board
 from cell.procedures.arm.photograph import APART_S, BoardFix, swing, swing_covariance
 from cell.procedures.steps.board_photo import WAIT_S, WAITS, photographed, require_unmoved, until_quiet
-from cell.procedures.steps.kinds import PLACE
-from cell.procedures.steps.place import STEP
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ
 from drivers.errors import RefusedError
-from lab.bench.job.whole_job import JobRecord, NoFrames
-from statemachine.runner import StepContext
-from tests.support.report_runs import CONFIG, at_station, at_work, pot, work_of
+from lab.bench.job.whole_job import JobRecord
+from tests.support.at_station import AtStation
+from tests.support.report_runs import CONFIG
 
 
 def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
@@ -36,7 +33,7 @@ def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
     def photograph(count: int = 1) -> None:
         raise Taken
 
-    here, fix, asked = at_work(placed_pot, tmp_path), placed_pot.results["board_photo"], []
+    here, fix, asked = AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["board_photo"], []
     monkeypatch.setattr(here, "photograph", photograph)
     monkeypatch.setattr(here, "mover", SimpleNamespace(to=lambda *given: None))
     monkeypatch.setattr(here.devices.target_camera, "configure", lambda *given: asked.append(given))
@@ -155,11 +152,7 @@ def test_the_simulated_cell_of_firm_tyres_is_quiet(placed_pot: JobRecord) -> Non
 
 def looked(record: JobRecord, further: float, folder: Path) -> str:
     """The refusal of a look at the board with the vehicle so many metres from where it stood; "" for none."""
-    job, nominal = pot()
-    cell = VirtualCell(CONFIG, record.seed, record.level)
-    at_station(cell, record, further)
-    cell.devices.vehicle.brake()
-    work = work_of(cell, job, nominal, record, NoFrames(), folder)
+    work = AtStation(record, folder, further=further, folded=False).work
     try:
         require_unmoved(work, record.results["board_photo"], "before the sweep", lambda share, text: None)
     except RefusedError as refused:
@@ -184,26 +177,19 @@ def test_where_the_board_alone_decides_it_is_looked_at_again_before_the_part_goe
     placed_pot: JobRecord, tmp_path: Path
 ) -> None:
     """The surface does not tell: round, it lies the same however it was turned, and where the board has gone."""
-    job, nominal = pot()
-    cell = VirtualCell(CONFIG, placed_pot.seed, placed_pot.level)
-    at_station(cell, placed_pot, 0.0)
-    cell.devices.vehicle.brake()
-    world = cell.world
-    pose = world.scene.world_from_board.copy()
-    pose[0, 3] += 1e-3
-    world.scene = replace(world.scene, world_from_board=pose)
-    world._cameras.show(world.scene, world.station)
-    work = work_of(cell, job, nominal, placed_pot, NoFrames(), tmp_path)
-    cell.devices.interlocks.work_with(work.calibration.configuration)
-    seen: PlacePose = placed_pot.results["invert_pose"]
-    turned = replace(seen, verdict=replace(seen.verdict, unseen=("rotation about the z axis",)))
-    results = {name: placed_pot.results[name] for name in ("board_photo", "laser_sweep", "reconstruct")}
-    context = StepContext(
-        PLACE.policy().of("place"), 1, math.inf, {**results, "invert_pose": turned}, cell.clock, lambda event: None
-    )
+
+    def moved(cell: VirtualCell) -> None:
+        world = cell.world
+        pose = world.scene.world_from_board.copy()
+        pose[0, 3] += 1e-3
+        world.remake(replace(world.scene, world_from_board=pose), world.station)
+
+    site = AtStation(placed_pot, tmp_path, changed=moved)
+    seen: PlacePose = site.made["invert_pose"]
+    site.made["invert_pose"] = replace(seen, verdict=replace(seen.verdict, unseen=("rotation about the z axis",)))
     with pytest.raises(RefusedError, match="the board has moved by"):
-        STEP.work(work, context)
-    assert cell.world.part.held
+        site.do("place")
+    assert site.cell.world.part.held
 
 
 def test_what_the_cameras_mounting_is_off_by_does_not_hide_it(placed_pot: JobRecord) -> None:

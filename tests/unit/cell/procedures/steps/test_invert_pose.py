@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,12 +20,11 @@ from cell.procedures.steps.invert_pose import LineTimes, inverted
 from cell.procedures.steps.invert_pose import invert_pose as step
 from cell.procedures.steps.place import carried_on
 from cell.run.report.report import place_error
-from drivers.errors import NotObservable
+from drivers.errors import NotObservable, RefusedError
 from lab.bench.job.scan_errors import own_base, surface_at_middle
-from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
-from sim_backends.world import world
-from sim_backends.world.scene import Scene
-from tests.support.report_runs import CONFIG, at_work, pot, work_of
+from lab.bench.job.whole_job import JobRecord, run_whole_job
+from tests.support.at_station import AtStation
+from tests.support.report_runs import CONFIG, NAMES, changed, pot
 
 
 def head_of(record: JobRecord, cloud: Cloud) -> Head:
@@ -77,12 +75,11 @@ def test_without_a_droop_nothing_is_added_and_too_large_a_one_is_refused(placed_
 def test_a_place_that_is_carried_on_for_a_creep_keeps_what_the_droop_adds(
     placed_pot: JobRecord, tmp_path: Path
 ) -> None:
-    made, (job, nominal), cell = placed_pot.results, pot(), VirtualCell(CONFIG, 2, "nominal")
+    made, work = placed_pot.results, AtStation(placed_pot, tmp_path, folded=False).work
     good, sweep = made["invert_pose"], made["laser_sweep"]
     rate, origin = np.array([6e-6, 0, 0, 0, 3e-6, 0]), good.base_from_surface.translation
     creep = Creep(rate, np.diag(np.full(6, 0.1e-6**2)), origin, float(sweep.times.mean()))
     creeping = replace(creep, rate=-rate).undone(drooped(placed_pot, 0.1e-3), sweep.times)
-    work = work_of(cell, job, nominal, placed_pot, NoFrames(), tmp_path)
     scan = replace(made["reconstruct"], cloud=creeping)
     found = carried_on(work, sweep, scan, made["board_photo"], creep)
     (note,) = found.notes
@@ -91,38 +88,33 @@ def test_a_place_that_is_carried_on_for_a_creep_keeps_what_the_droop_adds(
     assert (found.sigma / good.sigma).max() > 3
 
 
-def rolling(record: JobRecord, monkeypatch: pytest.MonkeyPatch, angle: float) -> JobRecord:
-    """The record's job once more, in a world whose vehicle rolls by ±`angle` rad."""
+def rolling(record: JobRecord, folder: Path, angle: float) -> AtStation:
+    """Where the record placed, in a world whose vehicle rolls by ±`angle` rad."""
 
-    def drawn(*given: object) -> Scene:
-        scene = draw(*given)
-        return replace(scene, workshop=replace(scene.workshop, rocking=np.array([angle, 0.0]), rocking_hz=3.0))
+    def rolls(cell: VirtualCell) -> None:
+        scene = cell.world.scene
+        workshop = replace(scene.workshop, rocking=np.array([angle, 0.0]), rocking_hz=3.0)
+        cell.world.remake(replace(scene, workshop=workshop), cell.world.station)
 
-    draw = world.draw
-    monkeypatch.setattr(world, "draw", drawn)
-    return run_whole_job(CONFIG, *pot(), record.seed, record.level, calibrated=record)
+    return AtStation(record, folder, changed=rolls)
 
 
 def test_a_vehicle_that_rolls_is_in_the_stated_covariance_though_no_height_of_the_scan_shows_it(
-    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, tmp_path: Path
 ) -> None:
-    found = rolling(placed_pot, monkeypatch, 0.3e-3)
-    assert (found.outcome, found.reason) == ("placed", "")
-    job, nominal = pot()
+    site = rolling(placed_pot, tmp_path, 0.3e-3)
+    pose, found = site.do(*NAMES[1:]).pose, site.ended
     assert found.placing is not None and found.at_end is not None
-    pose = found.results["place"].pose
     # ±.3 mrad at .6 m above the ground, one standard deviation.
     assert pose.sigma[1] == pytest.approx(0.3e-3 * 0.6 / np.sqrt(2), rel=0.25)
-    error = place_error(job, nominal, found.at_end)["d_p95"]
-    assert error < stated_bound(job, nominal, pose, found.placing)["d"]
+    error = place_error(site.job, site.nominal, found.at_end)["d_p95"]
+    assert error < stated_bound(site.job, site.nominal, pose, found.placing)["d"]
 
 
-def test_a_vehicle_that_rolls_too_much_is_refused_by_the_photographs(
-    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = rolling(placed_pot, monkeypatch, 0.6e-3)
-    assert found.outcome == "refused"
-    assert re.search(r"the vehicle rocks by ±0\.[56]\d mrad, which moves the board by ±0\.[45]\d mm", found.reason)
+def test_a_vehicle_that_rolls_too_much_is_refused_by_the_photographs(placed_pot: JobRecord, tmp_path: Path) -> None:
+    told = r"the vehicle rocks by ±0\.[56]\d mrad, which moves the board by ±0\.[45]\d mm"
+    with pytest.raises(RefusedError, match=told):
+        rolling(placed_pot, tmp_path, 0.6e-3).do("board_photo")
 
 
 @pytest.mark.campaign
@@ -156,7 +148,8 @@ def test_a_droop_since_the_calibration_is_in_the_stated_covariance_or_refused(na
 def test_where_the_place_is_known_too_little_what_was_noted_of_the_sweep_is_told(
     placed_pot: JobRecord, tmp_path: Path, doubts: tuple[str, ...]
 ) -> None:
-    here, made = at_work(placed_pot, tmp_path, tolerance=0.05e-3), placed_pot.results
+    job, made = changed(pot()[0], "place", tolerance=0.05e-3), placed_pot.results
+    here = AtStation(placed_pot, tmp_path, job, folded=False).work
     sweep = replace(made["laser_sweep"], doubts=doubts)
     with pytest.raises(NotObservable) as caught:
         inverted(here, sweep, made["reconstruct"], made["board_photo"])

@@ -12,8 +12,7 @@ from cell.procedures.steps.laser_sweep import UNCHECKED, laser_sweep, unhurried
 from cell.procedures.sweep.second_look import sparse
 from drivers.errors import DeviceFault
 from lab.bench.job.whole_job import JobRecord
-from tests.support.report_runs import pot
-from tests.unit.cell.procedures.sweep.test_second_look import Site
+from tests.support.at_station import AtStation
 
 
 @pytest.mark.parametrize(("attempt", "share"), [(1, 1.0), (2, 0.5), (3, 0.25)])
@@ -36,7 +35,7 @@ def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
     placed_pot: JobRecord, tmp_path: Path, fault: str, mode: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Lost steps refuse what was swept; a rail that does not show its switch leaves a doubt."""
-    site, told = Site(placed_pot, tmp_path, *pot()), []
+    site, told = AtStation(placed_pot, tmp_path), []
     rail = site.cell.devices.rail
     rail.home().wait(60.0)
     if fault:

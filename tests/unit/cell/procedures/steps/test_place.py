@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-import re
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -12,8 +11,6 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell import Cell
-from cell.config.calibrations.store import save_calibration
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
@@ -32,20 +29,18 @@ from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.place import PlaceResult, Placing, _mated
 from cell.procedures.steps.workplace import Workplace
-from cell.run.record.replay import replay
-from cell.run.report.page.make import make_page
 from cell.run.report.report import place_error
 from cell.run.resumption import UnfinishedRun
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceError, DeviceFault, RefusedError
 from drivers.switches import ArmSwitchedClaw
 from lab.bench.job.part_jobs import job_with_part
-from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
+from lab.bench.job.whole_job import JobRecord, NoFrames
 from sim_backends.world.drawing import inverse
 from statemachine.journal import Journal
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure
-from tests.support.report_runs import work_of
+from tests.support.at_station import AtStation
 
 CONFIG = load_config(None)
 JOB, MESH = load_job("pot")
@@ -339,39 +334,45 @@ def test_nothing_is_placed_twice_and_nothing_moves_for_it() -> None:
     assert "retreat" not in told
 
 
+def with_part(
+    record: JobRecord, folder: Path, changed: Callable[[np.ndarray], np.ndarray] = lambda corners: corners
+) -> AtStation:
+    """A cell where `record` placed, with a part whose underside's corners are `changed`, as drawn and in its world."""
+    job, mesh = load_job(job_with_part(folder, "pot", changed))
+    return AtStation(record, folder, job, NominalSurface.load(mesh, unit=job.surface.mesh_unit))
+
+
+def test_a_part_as_drawn_that_fits_the_scanned_surface_is_placed_and_its_gap_told(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    found = with_part(placed_pot, tmp_path).do("place").summary()["mating"]
+    assert found["seen"] > 0.75 and abs(found["median_mm"]) < 0.03
+    assert found["largest_mm"] < 0.3
+
+
 @pytest.mark.parametrize(
-    ("height", "outcome", "told"),
+    ("height", "told"),
     [
-        (0.0, "placed", ""),
-        (-0.5e-3, "refused", r"the part as drawn goes 0\.\d\d mm into the surface at .* half of the place's tolerance"),
-        (0.5e-3, "refused", r"the part as drawn lies 0\.\d\d mm or more above the surface"),
+        (-0.5e-3, r"the part as drawn goes 0\.\d\d mm into the surface at .* half of the place's tolerance"),
+        (0.5e-3, r"the part as drawn lies 0\.\d\d mm or more above the surface"),
     ],
 )
 def test_a_part_as_drawn_is_held_against_the_scanned_surface_before_it_goes_down(
-    placed_pot: JobRecord, tmp_path: Path, height: float, outcome: str, told: str
+    placed_pot: JobRecord, tmp_path: Path, height: float, told: str
 ) -> None:
-    job, mesh = load_job(job_with_part(tmp_path, "pot", lambda corners: corners + np.array([0.0, 0.0, height])))
-    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
-    done = run_whole_job(CONFIG, job, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot)
-    assert done.outcome == outcome
-    assert re.search(told, done.reason)
-    if outcome == "placed":
-        found = done.results["place"].summary()["mating"]
-        assert found["seen"] > 0.75 and abs(found["median_mm"]) < 0.03
-        assert found["largest_mm"] < 0.3
-    else:
-        assert done.at_end is not None and done.at_end["part"]["held"]
+    site = with_part(placed_pot, tmp_path, lambda corners: corners + np.array([0.0, 0.0, height]))
+    with pytest.raises(RefusedError, match=told):
+        site.do("place")
+    assert site.cell.world.part.held
 
 
 def test_where_nothing_was_scanned_it_is_told_that_the_underside_was_not_looked_at(
     placed_pot: JobRecord, tmp_path: Path
 ) -> None:
-    job, mesh = load_job(job_with_part(tmp_path, "pot"))
-    nominal, said = NominalSurface.load(mesh, unit=job.surface.mesh_unit), []
-    work = work_of(VirtualCell(CONFIG, 2, "nominal"), job, nominal, placed_pot, NoFrames(), tmp_path)
-    made = {name: result for name, result in placed_pot.results.items() if name != "reconstruct"}
-    context = StepContext(PLACE.policy().of("place"), 1, math.inf, made, work.devices.clock, said.append)
-    assert _mated(work, placed_pot.results["invert_pose"], pin.SE3.Identity(), context) is None
+    site, said = with_part(placed_pot, tmp_path), []
+    del site.made["reconstruct"]
+    site.tell = said.append
+    assert _mated(site.work, placed_pot.results["invert_pose"], pin.SE3.Identity(), site.context("place")) is None
     assert any("was not held against the surface" in str(event.data) for event in said)
 
 
@@ -379,11 +380,9 @@ def test_what_the_part_goes_into_the_surface_is_in_the_expected_touch_and_in_the
     placed_pot: JobRecord, tmp_path: Path
 ) -> None:
     """Half of the underside .25 mm low, as drawn and in the simulated world: less than is allowed."""
-    low = job_with_part(tmp_path, "pot", lambda v: v - np.multiply.outer(v[:, 0] > 0.0, [0.0, 0.0, 0.25e-3]))
-    job, mesh = load_job(low)
-    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
-    done = run_whole_job(CONFIG, job, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot)
-    assert (done.outcome, done.reason) == ("placed", "")
+    site = with_part(placed_pot, tmp_path, lambda v: v - np.multiply.outer(v[:, 0] > 0.0, [0.0, 0.0, 0.25e-3]))
+    site.do("place")
+    job, nominal, done = site.job, site.nominal, site.ended
     assert done.at_end is not None and done.placing is not None
     placed, before = done.results["place"], placed_pot.results["place"]
     assert placed.mating.lift == pytest.approx(0.25e-3, abs=0.03e-3)
@@ -392,21 +391,6 @@ def test_what_the_part_goes_into_the_surface_is_in_the_expected_touch_and_in_the
     error = place_error(job, nominal, done.at_end)["d_p95"]
     assert isinstance(error, float) and error > 0.2
     assert error < cast(float, stated_bound(job, nominal, placed.pose, done.placing)["d"])
-
-
-def test_a_run_of_a_job_with_a_part_mesh_tells_it_in_report_and_page_and_is_replayed(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert placed_pot.calibration is not None
-    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
-    with Cell.open(sim="all", seed=2, clock="virtual", job=job_with_part(tmp_path, "pot")) as cell:
-        done = cell.run(job=tmp_path / "pot.toml")
-    assert (done.outcome, done.report["part_mesh"]["file"]) == ("placed", str(tmp_path / "pot-part.ply"))
-    (row,) = [row for row in done.report["measured"] if row["name"] == "part into the surface"]
-    assert row["kept"] and row["value"] < 0.05
-    assert "part into the surface" in make_page(done.folder)
-    assert all(compared.same for compared in replay(done.folder))
 
 
 def test_placing_is_tried_once_whatever_becomes_of_it() -> None:

@@ -18,7 +18,8 @@ from cell.procedures.steps import reconstruct
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord
-from tests.support.report_runs import at_work, with_few_lines
+from tests.support.at_station import AtStation
+from tests.support.report_runs import with_few_lines
 
 CONFIG = load_config(None)
 
@@ -32,14 +33,14 @@ def test_the_cloud_of_an_earlier_sweep_is_gone_whatever_becomes_of_this_one(
     (tmp_path / "cloud.ply").write_text("of the sweep before")
     monkeypatch.setattr(reconstruct, "build_cloud", fails)
     with pytest.raises(MemoryError):
-        reconstruct.reconstructed(at_work(placed_pot, tmp_path), placed_pot.results["laser_sweep"])
+        reconstruct.reconstructed(AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["laser_sweep"])
     assert not (tmp_path / "cloud.ply").exists()
 
 
 def test_the_cloud_is_built_with_the_laser_where_it_pointed(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here, sweep, given = at_work(placed_pot, tmp_path), placed_pot.results["laser_sweep"], []
+    here, sweep, given = AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["laser_sweep"], []
     monkeypatch.setattr(ScanCalibration, "variants", lambda head: given.append(head) or ())
     turned, head = Pointing(1e-3, 1e-5, 0.0), here.calibration.scan
     for pointing in (None, turned):
@@ -52,7 +53,7 @@ def test_the_cloud_is_built_with_the_laser_where_it_pointed(
 
 def test_a_sweep_is_kept_and_its_cloud_shown_also_where_it_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
     assert placed_pot.folder is not None and (placed_pot.folder / FILE).is_file()
-    here, told = at_work(placed_pot, tmp_path), []
+    here, told = AtStation(placed_pot, tmp_path, folded=False).work, []
     here.devices.gate.listener = cast(Any, SimpleNamespace(reading=lambda device, reading: told.append(device)))
     few = with_few_lines(placed_pot, 1).results["laser_sweep"]
     for sweep in (placed_pot.results["laser_sweep"], few):

@@ -23,22 +23,27 @@ from cell.measure.inversion import NominalSurface
 from cell.procedures.placed_part import LIKELY, PlacedPart
 from cell.procedures.steps.kinds import PLACE, VERIFIED, kind_of
 from cell.procedures.steps.verify import CLOUD
+from cell.run.record.replay import replay
 from cell.run.report.page.make import make_page
 from drivers.errors import ConfigError, DeviceFault, MisplacedError
 from lab.bench.job.part_effects import motion, opened
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.support.lying_part import LyingPart, moved
-from tests.support.report_runs import CONFIG
+from tests.support.report_runs import CONFIG, changed
+
+OFF = moved(0.2e-3, -0.1e-3, 0.2e-3, turn=(0.002, -0.003, 0.003))
 
 
-@pytest.mark.parametrize(
-    "off", [moved(), moved(0.2e-3, -0.3e-3, 0.1e-3), moved(turn=(0.002, -0.003, 0.004))], ids=["there", "off", "turned"]
-)
-def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(
-    placed_pot: JobRecord, tmp_path: Path, off: pin.SE3
-) -> None:
-    found = LyingPart(placed_pot, tmp_path).looked(off)
+@pytest.fixture(scope="module")
+def lying(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> tuple[PlacedPart, Path]:
+    """A part that lies `OFF` its place, swept as finely as shipped, and the folder of its meshes and its cloud."""
+    folder = tmp_path_factory.mktemp("lying")
+    return LyingPart(placed_pot, folder, faster=1.0).looked(OFF), folder
+
+
+def require_seen(found: PlacedPart, off: pin.SE3) -> None:
+    """Seen to hundredths of a millimetre where it is `off` its place, within what is stated."""
     error = difference(found.seen.surface_from_part, off)
     assert found.seen.beside > 1000 and found.unseen == ()
     assert np.linalg.norm(error[:3]) < 0.025e-3 and np.abs(error[3:]).max() < 0.25e-3
@@ -49,17 +54,31 @@ def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(
     assert 1e3 * np.percentile(true, 95) < found.bound["d"] < 1e3 * np.percentile(true, 95) + 0.04
 
 
-def test_a_fit_that_others_wrote_finds_the_part_in_the_same_place(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(lying: tuple[PlacedPart, Path]) -> None:
+    require_seen(lying[0], OFF)
+
+
+def test_a_part_in_its_place_is_left_there_and_nothing_is_said_of_it(placed_pot: JobRecord, tmp_path: Path) -> None:
+    site = LyingPart(placed_pot, tmp_path, also="corrections = 1")
+    found = site.looked(moved())
+    require_seen(found, moved())
+    assert found.before == () and site.parts == []
+    assert not any("most likely" in note for note in site.notes)
+
+
+def test_a_fit_that_others_wrote_finds_the_part_in_the_same_place(
+    placed_pot: JobRecord, lying: tuple[PlacedPart, Path]
+) -> None:
     """Samples of the meshes by trimesh, least squares by scipy, on the cloud and the meshes as files."""
-    found = LyingPart(placed_pot, tmp_path).looked(moved(0.1e-3, 0.2e-3, 0.15e-3))
-    cloud = np.asarray(trimesh.load(tmp_path / CLOUD).vertices)
+    found, folder = lying
+    cloud = np.asarray(trimesh.load(folder / CLOUD).vertices)
     pose = placed_pot.results["invert_pose"].base_from_surface
     local = (cloud - pose.translation) @ pose.rotation
     high = local[:, 2] > 0.012
     poses = []
     for points, file in ((local[high], "pot-part.ply"), (local[~high], "pot.ply")):
-        mesh = trimesh.load(tmp_path / file)
-        chosen = points[np.random.default_rng(0).permutation(len(points))[:12_000]]
+        mesh = trimesh.load(folder / file)
+        chosen = points[np.random.default_rng(0).permutation(len(points))[:4_000]]
         poses.append(fitted(chosen, mesh))
     apart = poses[1].inverse() * poses[0]
     assert np.linalg.norm(apart.translation - found.seen.surface_from_part.translation) < 0.01e-3
@@ -68,7 +87,7 @@ def test_a_fit_that_others_wrote_finds_the_part_in_the_same_place(placed_pot: Jo
 
 def fitted(points: np.ndarray, mesh: trimesh.Trimesh) -> pin.SE3:
     """Where the mesh lies by points on its faces that look up; those at a rim are left out."""
-    samples, faces = trimesh.sample.sample_surface(mesh, 400_000, seed=0)
+    samples, faces = trimesh.sample.sample_surface(mesh, 200_000, seed=0)
     up = mesh.face_normals[faces][:, 2] > 0.3
     samples, normals = samples[up], mesh.face_normals[faces[up]]
     tree, start, used = scipy.spatial.cKDTree(samples), pin.SE3.Identity(), points
@@ -90,11 +109,10 @@ def fitted(points: np.ndarray, mesh: trimesh.Trimesh) -> pin.SE3:
     return start
 
 
-def test_the_flush_along_its_edge_is_by_how_much_its_pose_lifts_it(placed_pot: JobRecord, tmp_path: Path) -> None:
-    off = moved(0.2e-3, -0.1e-3, 0.2e-3, turn=(0.002, 0.003, 0.0))
-    flush = LyingPart(placed_pot, tmp_path).looked(off).flush
+def test_the_flush_along_its_edge_is_by_how_much_its_pose_lifts_it(lying: tuple[PlacedPart, Path]) -> None:
+    flush = lying[0].flush
     assert flush is not None and len(flush.higher) > 15 and flush.seen > 0.8
-    error = flush.higher - lifted(flush.places, off)
+    error = flush.higher - lifted(flush.places, OFF)
     # Where the surface is, beside the part, is known to about .005 mm.
     assert np.sqrt(np.mean(error**2)) < 0.025e-3 and abs(error.mean()) < 0.02e-3
     assert (np.abs(error) < flush.noise).all()
@@ -135,10 +153,8 @@ def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lie
     ("off", "likely"),
     [
         (moved(0.1e-3, 0.8e-3, 0.3e-3), "shifted"),
-        (moved(z=0.7e-3), "raised"),
         (moved(z=-0.7e-3), "deep"),
         (moved(z=0.1e-3, turn=(0.0, 0.008, 0.0)), "tilted"),
-        (moved(turn=(0.0, 0.0, 0.009)), "shifted"),
     ],
 )
 def test_a_part_out_of_its_place_is_told_with_where_it_lies_and_why(
@@ -159,10 +175,6 @@ def test_another_part_or_none_is_not_found(placed_pot: JobRecord, tmp_path: Path
 
 
 def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(placed_pot: JobRecord, tmp_path: Path) -> None:
-    with pytest.raises(
-        MisplacedError, match=r'not all is seen .*translation along .*part frame.*place.verify = "seen"'
-    ):
-        LyingPart(placed_pot, tmp_path, flat=True).looked(moved())
     site = LyingPart(placed_pot, tmp_path, flat=True, verify="seen")
     found = site.looked(moved(0.2e-3, z=0.1e-3))
     assert any("not seen of the placed part: translation" in note for note in site.notes)
@@ -171,16 +183,6 @@ def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(placed_pot: JobRe
     # What does not is as it was stated before, and so is the bound.
     assert 0.05e-3 < math.sqrt(found.covariance[0, 0]) < 0.3e-3
     assert found.bound["d"] > 0.2
-
-
-def test_a_part_farther_off_than_was_stated_is_noted_though_it_keeps_its_tolerance(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
-    raised, usual = LyingPart(placed_pot, tmp_path), LyingPart(placed_pot, tmp_path)
-    raised.looked(moved(z=0.45e-3))
-    assert any(f"most likely {LIKELY['raised']}" in note for note in raised.notes)
-    usual.looked(moved(0.05e-3))
-    assert not any("most likely" in note for note in usual.notes)
 
 
 def test_steps_that_the_rail_lost_over_the_placed_part_are_found(placed_pot: JobRecord, tmp_path: Path) -> None:
@@ -224,18 +226,19 @@ def test_what_is_accepted_is_no_farther_off_than_is_allowed(tmp_path: Path) -> N
         load_job(job_with_part(tmp_path, "pot", verify="all", also='accept = "0.7 mm"'))
 
 
-def test_a_run_tells_how_its_part_lies_in_report_page_and_picture(
+def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replayed(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert placed_pot.calibration is not None
     save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
     job = job_with_part(tmp_path, "pot", verify="all", half=MIDDLE)
-    with job.open("a", encoding="utf-8") as file:
-        file.write(
-            '[[part.feature]]\nname = "left"\nkind = "edge"\nat = ["-15 mm", "0 mm", "5 mm"]\naxis = [0, 1, 0]\n'
-            'tolerance = "0.4 mm"\n'
-        )
+    text = job.read_text(encoding="utf-8").replace('speed = "15 mm/s"', 'speed = "30 mm/s"')
+    job.write_text(
+        f'{text}[[part.feature]]\nname = "left"\nkind = "edge"\nat = ["-15 mm", "0 mm", "5 mm"]\naxis = [0, 1, 0]\n'
+        'tolerance = "0.4 mm"\n',
+        encoding="utf-8",
+    )
     with Cell.open(sim="all", seed=2, clock="virtual", job=job) as cell:
         done = cell.run(job=job)
     assert (done.outcome, done.exit_code) == ("placed", 0)
@@ -254,13 +257,18 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture(
     assert feature["off_mm"] < feature["bound_mm"] < feature["tolerance_mm"]
     assert rows["edge left, stated bound"]["value"] == pytest.approx(feature["bound_mm"], abs=1e-3)
     assert "place error, stated 95 % bound" not in rows
-    assert "placed part off its place" in make_page(done.folder)
+    assert report["part_mesh"]["file"] == str(tmp_path / "pot-part.ply")
+    assert rows["part into the surface"]["kept"] and rows["part into the surface"]["value"] < 0.05
+    page = make_page(done.folder)
+    assert "placed part off its place" in page and "part into the surface" in page
+    assert all(compared.same for compared in replay(done.folder))
     assert (done.folder / CLOUD).stat().st_size > 100_000
     assert (done.folder / "picture.png").is_file()
 
 
 def test_a_part_that_slips_as_the_claw_opens_ends_the_run_as_misplaced(placed_pot: JobRecord, tmp_path: Path) -> None:
     job, mesh = load_job(job_with_part(tmp_path, "pot", verify="all", half=MIDDLE))
+    job = changed(job, "scan", speed=0.030)
     slips = opened(motion(y=0.9, turn=(0, 0, 4)))
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
     done = run_whole_job(

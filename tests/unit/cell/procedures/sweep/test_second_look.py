@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,17 +13,14 @@ import pinocchio as pin
 import pytest
 from scipy.stats import chi2
 
-from cell.config.job import Job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference
-from cell.measure.inversion import NominalSurface, PlacePose
+from cell.measure.inversion import PlacePose
 from cell.measure.inversion.effects.between_sweeps import Creep, SurfaceMotion, surface_motion
 from cell.measure.reconstruction import Cloud, flange_motions, merge
 from cell.measure.reconstruction.cloud import Filled
-from cell.motion.kinematics import HOME
 from cell.procedures.arm.touch import felt_touch
 from cell.procedures.steps import place as place_step
-from cell.procedures.steps.kinds import PLACE
 from cell.procedures.sweep import second_look
 from cell.procedures.sweep.second_look import (
     LINES,
@@ -38,11 +34,11 @@ from cell.procedures.sweep.second_look import (
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION
 from drivers.errors import CellError, DeviceFault, LimitError, NotObservable, RefusedError
 from lab.bench.job.scan_errors import own_base
-from lab.bench.job.whole_job import JobRecord, NoFrames, run_whole_job
+from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.world import World
-from statemachine.control import RunControl
-from statemachine.runner import Event, StepContext
-from tests.support.report_runs import CONFIG, NAMES, at_station, changed, pot, work_of
+from statemachine.runner import Event
+from tests.support.at_station import AtStation
+from tests.support.report_runs import NAMES, changed, pot
 
 
 def slid(cell: VirtualCell, shift: tuple[float, float], turn: float = 0.0) -> None:
@@ -56,54 +52,18 @@ def slid(cell: VirtualCell, shift: tuple[float, float], turn: float = 0.0) -> No
     world._cameras.show(world.scene, world.station)
 
 
-@dataclass
-class Site:
-    """A cell that stands where `record` placed, `further` metres on, its vehicle braked, and what was made before.
-
-    `tell` hears what the steps tell.
-    """
-
-    record: JobRecord
-    folder: Path
-    job: Job
-    nominal: NominalSurface
-    further: float = 0.0
-    tell: Callable[[Event], None] = lambda event: None
-    control: RunControl = field(default_factory=RunControl)
-    look: Callable[[], None] = lambda: None
-
-    def __post_init__(self) -> None:
-        self.cell = cell = VirtualCell(CONFIG, self.record.seed, self.record.level)
-        at_station(cell, self.record, self.further)
-        cell.devices.vehicle.brake()
-        self.work = work_of(cell, self.job, self.nominal, self.record, NoFrames(), self.folder)
-        cell.devices.interlocks.work_with(self.work.calibration.configuration)
-        # With the joints of the run that swept before: with others the arm's errors are others.
-        self.work.mover.to_joints(HOME)
-        self.made = {name: self.record.results[name] for name in NAMES[:-1]}
-
-    def sweep_here(self) -> None:
-        """Photograph, sweep and find the surface anew: the arm stays where it swept."""
-        for name in NAMES[1:-1]:
-            self.made[name] = PLACE.work(self.work)[name](self.context)
-
-    @property
-    def context(self) -> StepContext:
-        step = PLACE.policy().of("place")
-        return StepContext(step, 1, math.inf, self.made, self.cell.clock, self.tell, self.control, self.look)
-
-    def look_again(self) -> SecondLook:
-        made = (self.made[name] for name in ("board_photo", "laser_sweep", "reconstruct", "invert_pose"))
-        return require_in_place(self.work, *made, self.context)
+def look_again(site: AtStation) -> SecondLook:
+    made = (site.made[name] for name in ("board_photo", "laser_sweep", "reconstruct", "invert_pose"))
+    return require_in_place(site.work, *made, site.context("place"))
 
 
 def looked(
     record: JobRecord, folder: Path, shift: tuple[float, float] = (0.0, 0.0), turn: float = 0.0, further: float = 0.0
 ) -> SecondLook:
     """A look at the surface of `record`, slid by so much, from a vehicle so many metres from where it stood."""
-    site = Site(record, folder, *pot(), further)
+    site = AtStation(record, folder, further=further)
     slid(site.cell, shift, turn)
-    return site.look_again()
+    return look_again(site)
 
 
 def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path: Path) -> None:
@@ -123,14 +83,8 @@ def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path: 
 
 @pytest.mark.parametrize(
     ("shift", "turn", "further"),
-    [
-        ((0.5e-3, 0.0), 0.0, 0.0),
-        ((0.0, -0.5e-3), 0.0, 0.0),
-        ((0.0, 0.0), 3e-3, 0.0),
-        ((0.0, 0.0), 0.0, 0.5e-3),
-        ((0.0, 4e-3), 0.0, 0.0),
-    ],
-    ids=["along", "across", "turned", "the vehicle was pushed", "far"],
+    [((0.5e-3, 0.0), 0.0, 0.0), ((0.0, 0.0), 3e-3, 0.0), ((0.0, 0.0), 0.0, 0.5e-3), ((0.0, 4e-3), 0.0, 0.0)],
+    ids=["along", "turned", "the vehicle was pushed", "far"],
 )
 def test_one_that_slid_over_its_table_is_refused(
     placed_pot: JobRecord, tmp_path: Path, shift: tuple[float, float], turn: float, further: float
@@ -163,7 +117,7 @@ def test_one_that_is_not_there_any_more_is_refused(placed_pot: JobRecord, tmp_pa
 def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: CellError
 ) -> None:
-    site = Site(placed_pot, tmp_path, *pot())
+    site = AtStation(placed_pot, tmp_path)
     camera, rates = site.cell.scan_camera, []
     usual = camera.configure
 
@@ -174,7 +128,7 @@ def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(
         usual(exposure, frame_rate)
 
     monkeypatch.setattr(camera, "configure", configure)
-    assert not site.look_again().moved.moved
+    assert not look_again(site).moved.moved
     assert set(rates) == {30.0}
 
 
@@ -198,30 +152,30 @@ def test_a_look_that_loses_frames_tells_as_much(placed_pot: JobRecord, tmp_path:
             site.cell.scan_camera.model.fault("camera.frame_loss", 4)
             lost.append(4)
 
-    site = Site(placed_pot, tmp_path, *pot(), tell=losing)
-    assert not site.look_again().moved.moved
+    site = AtStation(placed_pot, tmp_path, tell=losing)
+    assert not look_again(site).moved.moved
     assert sum(lost) > MAX_LOST_FRACTION * LINES
 
 
 def test_what_late_replies_and_the_lines_leave_open_is_known(placed_pot: JobRecord, tmp_path: Path) -> None:
     job, nominal = pot()
-    site = Site(placed_pot, tmp_path, changed(job, "place", tolerance=2e-3), nominal)
-    site.sweep_here()
+    site = AtStation(placed_pot, tmp_path, changed(job, "place", tolerance=2e-3), nominal)
+    site.do(*NAMES[1:-1])
     assert {"table", "board"} <= {body.name for body in site.work.mover._station}, "met as the board was seen"
     slid(site.cell, (0.25e-3, 0.0))
     with pytest.raises(RefusedError, match=r"has moved by 0\.2\d mm .* times as far as chance brings"):
-        site.look_again()
+        look_again(site)
     # Replies that came late may have shifted the sweep as far.
     sweep = site.made["laser_sweep"]
     (swath,) = sweep.swaths
     loose = replace(swath, shift=0.15e-3)
     site.made["laser_sweep"] = replace(sweep, swaths=(loose,), rest=site.cell.devices.interlocks.situation.last)
-    look = site.look_again()
+    look = look_again(site)
     assert not look.moved.moved and look.notes == ()
     # A place that is wanted more exactly than that is asked of the board, too.
     site.work.job = changed(job, "place", tolerance=0.2e-3)
     taken = len(site.cell.target_camera.shots)
-    (note,) = site.look_again().notes
+    (note,) = look_again(site).notes
     assert len(site.cell.target_camera.shots) > taken
     assert re.search(r"translation along the x axis of the surface frame shows from 0\.\d+ mm on.* nobody touch", note)
 
@@ -242,7 +196,7 @@ def test_after_a_pause_it_is_looked_at_anew(
     held: list[bool] = []
     if photographed:
         monkeypatch.setattr(SurfaceMotion, "hidden", lambda *_: ["(a motion that does not show)"])
-        monkeypatch.setattr(second_look, "require_board_unmoved", lambda *_: site.context.safe_point())
+        monkeypatch.setattr(second_look, "require_board_unmoved", lambda *_: site.context("place").safe_point())
 
     def tell(event: Event) -> None:
         if "9 profiles" in event.data.get("text", "") and not held:
@@ -253,9 +207,9 @@ def test_after_a_pause_it_is_looked_at_anew(
         slid(site.cell, (0.0, 1e-3))
         site.control.go_on()
 
-    site = Site(placed_pot, tmp_path, *pot(), tell=tell, look=reach_in)
+    site = AtStation(placed_pot, tmp_path, tell=tell, look=reach_in)
     with pytest.raises(RefusedError, match=r"the surface has moved by (0\.9|1\.0)"):
-        PLACE.work(site.work)["place"](site.context)
+        site.do("place")
     assert held == [True]
 
 
@@ -272,9 +226,9 @@ def test_a_few_steps_that_the_rail_lost_are_found_before_the_part_touches(
         require_unmoved(moved)
 
     monkeypatch.setattr(second_look, "require_unmoved", lost)
-    site = Site(placed_pot, tmp_path, *pot(), tell=lambda event: heard.append(str(event.data.get("text"))))
+    site = AtStation(placed_pot, tmp_path, tell=lambda event: heard.append(str(event.data.get("text"))))
     with pytest.raises(DeviceFault, match="lost steps"):
-        PLACE.work(site.work)["place"](site.context)
+        site.do("place")
     assert "descending" in heard and "feeling for contact" not in heard
     assert site.cell.world.part.held
 
@@ -325,25 +279,24 @@ def test_a_second_sweep_that_sees_nothing_says_so(placed_pot: JobRecord) -> None
 
 
 def test_a_vehicle_that_creeps_is_seen_and_the_place_carried_on(
-    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rate = np.array([2.2e-6, -6e-6, -4.8e-6, -3.8e-6, 2.8e-6, 1.8e-6])
-    worlds, touched, stands = [], [], World.world_from_base
+    touched, stands = [], World.world_from_base
 
     def creeping(world: World, t: float) -> np.ndarray:
-        worlds[:] = [world]
         return stands(world, t) @ pin.SE3(pin.exp3(rate[3:] * t), rate[:3] * t).homogeneous
 
     def felt(*given: object) -> object:
-        touched.append(worlds[0].clock.now())
+        touched.append(site.cell.clock.now())
         return felt_touch(*given)
 
     monkeypatch.setattr(World, "world_from_base", creeping)
     monkeypatch.setattr(place_step, "felt_touch", felt)
-    job, nominal = pot(speed=0.015)
-    record = run_whole_job(CONFIG, job, nominal, 2, "nominal", calibrated=placed_pot)
-    (world,), placing = worlds, record.results["place"]
-    assert record.outcome == "placed" and any("creeps against the arm by" in note for note in placing.notes)
+    site = AtStation(placed_pot, tmp_path, pot(speed=0.015)[0])
+    placing = site.do(*NAMES[1:])
+    world, record = site.cell.world, site.ended
+    assert any("creeps against the arm by" in note for note in placing.notes)
     # It is the station that moves, seen from the arm.
     assert placing.look.creep.rate[:3] == pytest.approx(-rate[:3], abs=5e-6)
     surface = np.linalg.inv(creeping(world, touched[-1])) @ world.scene.world_from_surface
@@ -359,7 +312,7 @@ def test_a_vehicle_that_creeps_is_seen_and_the_place_carried_on(
 def test_a_place_that_creeps_is_carried_on_to_the_time_of_the_contact(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    site, until = Site(placed_pot, tmp_path, *pot()), []
+    site, until = AtStation(placed_pot, tmp_path), []
     monkeypatch.setattr(Creep, "carried", lambda creep, pose, time: until.append(time) or pose)
     site.work.pace.share = 0.5
     made = (site.made[name] for name in ("laser_sweep", "reconstruct", "board_photo"))
@@ -370,7 +323,7 @@ def test_a_place_that_creeps_is_carried_on_to_the_time_of_the_contact(
 
 
 def test_a_place_that_creeps_and_is_not_known_any_more_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
-    site = Site(placed_pot, tmp_path, *pot())
+    site = AtStation(placed_pot, tmp_path)
     made = [site.made[name] for name in ("laser_sweep", "reconstruct", "board_photo")]
     unknown = Creep(np.zeros(6), np.diag([30e-6**2] * 3 + [1e-12] * 3), np.zeros(3), float(made[0].times.mean()))
     with pytest.raises(NotObservable, match=r"known to \d+\.\d+ tolerances"):

@@ -15,10 +15,11 @@ from cell.measure.reconstruction.ply import read_cloud
 from cell.run.report.figures import texture_words
 from cell.run.report.page.make import make_page
 from drivers.errors import Measured, RefusedError
-from lab.bench.job.whole_job import JobRecord, run_whole_job
+from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.bodies.station import Station
 from tests.support import report_runs
-from tests.support.report_runs import Ended, Ends, Make, pot, read_strictly
+from tests.support.at_station import AtStation
+from tests.support.report_runs import Ended, Ends, Make, read_strictly
 
 
 @pytest.fixture(scope="module")
@@ -140,15 +141,16 @@ def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: 
         station = replace(drawing.station, waviness=(0.1e-3, 0.015, 0.25 * math.pi))
         cell.world.remake(replace(cell.world.scene, drawing=replace(drawing, station=station)), Station.of(station))
 
-    given = (report_runs.CONFIG, *pot(), 2, "nominal")
-    folder = run_whole_job(*given, calibrated=placed_pot, runs=tmp_path, changed=waved).folder
-    assert folder is not None
-    report = read_strictly(folder / "report.json")
+    site = AtStation(placed_pot, tmp_path, changed=waved)
+    site.do("laser_sweep", "reconstruct", "invert_pose")
+    run = report_runs.placed(replace(placed_pot, results=site.made), tmp_path / "runs")
+    (tmp_path / "cloud.ply").rename(run.folder / "cloud.ply")
+    report = run.report
     texture, through = report["scan"]["texture"], 0.1 * 2.0 ** -((5.0 / 15.0) ** 2)
     assert texture["sq_mm"] == pytest.approx(through / math.sqrt(2.0), rel=0.03)
     assert texture["sz_mm"] == pytest.approx(2.0 * through, rel=0.25)  # the form bends so few waves
     assert report["measured"][-1]["name"] == "waviness of the surface, Sq"
-    assert f"Waviness over 5 mm: Sa {texture['sa_mm']:.4f} mm, Sq {texture['sq_mm']:.4f} mm" in make_page(folder)
+    assert f"Waviness over 5 mm: Sa {texture['sa_mm']:.4f} mm, Sq {texture['sq_mm']:.4f} mm" in make_page(run.folder)
 
 
 def test_a_waviness_that_cannot_be_told_does_not_cost_the_report(placed_pot: JobRecord, tmp_path: Path) -> None:

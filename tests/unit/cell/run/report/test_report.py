@@ -14,9 +14,10 @@ from cell.config.job import SwathSection
 from cell.run.folder import write_json
 from cell.run.report.report import strict
 from drivers.errors import CellError
-from lab.bench.job.whole_job import JobRecord, run_whole_job
+from lab.bench.job.whole_job import JobRecord
 from tests.support import ROOT, report_runs
-from tests.support.report_runs import CONFIG, Ended, Ends, pot, read_strictly
+from tests.support.at_station import AtStation
+from tests.support.report_runs import Ended, Ends, pot, read_strictly
 
 DOCUMENT = ROOT / "docs" / "reference" / "report.md"
 
@@ -73,10 +74,11 @@ def documented() -> set[str]:
 @pytest.fixture(scope="module")
 def two_sweeps(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> Ended:
     """The middle of the pot in two sweeps side by side."""
-    job, nominal = pot(length=0.036, swath=(SwathSection(across="-4 mm"), SwathSection(across="4 mm")))
-    record = run_whole_job(CONFIG, job, nominal, 2, "nominal", calibrated=placed_pot)
-    assert (record.outcome, record.reason) == ("placed", "")
-    return report_runs.placed(record, tmp_path_factory.mktemp("two") / "runs")
+    job, _ = pot(length=0.036, swath=(SwathSection(across="-4 mm"), SwathSection(across="4 mm")))
+    folder = tmp_path_factory.mktemp("two")
+    site = AtStation(placed_pot, folder, job)
+    site.do("laser_sweep", "reconstruct", "invert_pose", "place")
+    return report_runs.placed(site.ended, folder / "runs")
 
 
 def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(

@@ -1,0 +1,72 @@
+"""A cell that stands where a whole job placed: single steps are done there, without all that comes before them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cell.config.job import Job
+from cell.devices.simulated.described import Described
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.inversion import NominalSurface
+from cell.motion.kinematics import HOME
+from cell.procedures.steps.kinds import kind_of
+from lab.bench.job.whole_job import JobRecord, NoFrames
+from statemachine.control import RunControl
+from statemachine.runner import Event, StepContext
+from tests.support.report_runs import CONFIG, at_station, pot, work_of
+
+
+@dataclass(eq=False, repr=False)
+class AtStation:
+    """A cell of `record` where that placed, `further` metres on, its vehicle braked; `made` is what `record` made.
+
+    `job` and `nominal` are those of `pot()` if not told otherwise, the arm's joints those of the sweep if `folded`:
+    with others its errors are others. `changed` changes the cell before anything moves, `tell` hears what steps tell.
+    """
+
+    record: JobRecord
+    folder: Path
+    job: Job = field(default_factory=lambda: pot()[0])
+    nominal: NominalSurface = field(default_factory=lambda: pot()[1])
+    further: float = 0.0
+    level: str = ""
+    folded: bool = True
+    changed: Callable[[VirtualCell], None] = lambda cell: None
+    tell: Callable[[Event], None] = lambda event: None
+    look: Callable[[], None] = lambda: None
+
+    def __post_init__(self) -> None:
+        assert self.nominal.source is not None
+        described = Described(self.job, self.nominal.source)
+        self.cell = VirtualCell(CONFIG, self.record.seed, self.level or self.record.level, described)
+        at_station(self.cell, self.record, self.further)
+        self.cell.devices.vehicle.brake()
+        self.changed(self.cell)
+        self.kind, self.control = kind_of(self.job), RunControl()
+        self.work = work_of(self.cell, self.job, self.nominal, self.record, NoFrames(), self.folder)
+        self.made: dict[str, Any] = dict(self.record.results)
+        if self.folded:
+            self.cell.devices.interlocks.work_with(self.work.calibration.configuration)
+            self.work.mover.to_joints(HOME)
+
+    def context(self, name: str) -> StepContext:
+        """What this step of the job is given."""
+        step = self.kind.policy().of(name)
+        return StepContext(step, 1, math.inf, self.made, self.cell.clock, self.tell, self.control, self.look)
+
+    def do(self, *names: str) -> Any:
+        """Do these steps; gives the last one's result, which all later ones get instead of the record's."""
+        for name in names:
+            self.made[name] = self.kind.work(self.work)[name](self.context(name))
+        return self.made[names[-1]]
+
+    @property
+    def ended(self) -> JobRecord:
+        """The record of what was done here instead, with the world's truth now."""
+        return replace(self.record, results=self.made, rests=np.array(self.cell.arm.rests), at_end=self.cell.truth())
