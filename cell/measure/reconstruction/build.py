@@ -177,7 +177,7 @@ def flange_motions(
     `covariances`: for each sweep, the (6, 6) of base_from_flange (translation, rotation; base axes) that its lines have
     in common. The errors of different sweeps are independent: each moves the points of its own sweep only.
     """
-    sweeps = cloud.sweeps[lines] if len(cloud.sweeps) else np.zeros(len(lines), dtype=np.intp)
+    sweeps = cloud.sweep_of[lines]
     arms = cloud.points[lines, rows] - cloud.flanges[lines, :3, 3]
     motions = np.zeros((len(lines), 3, 6 * len(covariances)))
     for k, covariance in enumerate(covariances):

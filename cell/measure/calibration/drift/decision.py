@@ -225,10 +225,7 @@ def scan_effect(scan: ScanCalibration, change: Array, stand_off: float, rail: tu
 
     Over the picture's rows, depths of ± 10 mm about `stand_off` m in front of the camera, and the rail from end to end.
     """
-    state = AdjustmentState(
-        scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.flange_from_camera
-    )  # fmt: skip
-    moved = state.moved(np.asarray(change, dtype=np.float64)[:SHARED])
+    moved = scan.state(scan.flange_from_camera).moved(np.asarray(change, dtype=np.float64)[:SHARED])
     assert moved.plane is not None
     n, d = scan.light_plane.n, scan.light_plane.distance
     pixels = []
@@ -248,8 +245,7 @@ def scan_effect(scan: ScanCalibration, change: Array, stand_off: float, rail: tu
 
 def target_effect(target: TargetCalibration, change: Array, camera_from_place: Array) -> float:
     """How far in m a change (27,) of the calibration moves a place that lies at (3,) m in the target camera's frame."""
-    state = AdjustmentState(target.camera, None, np.zeros(3), target.flange_from_camera, target.flange_from_camera)
-    moved = state.moved(np.asarray(change, dtype=np.float64)[:SHARED])
+    moved = target.state(target.flange_from_camera).moved(np.asarray(change, dtype=np.float64)[:SHARED])
     before, after = target.camera, moved.camera
     # The same picture through the other lens: a shift of the principal point turns the rays, a focal length stretches
     # the distance.
@@ -297,11 +293,6 @@ class Detectable:
     change: Change
     size: float
     step: Array
-
-    @property
-    def enough(self) -> bool:
-        """Whether a change of the size that has to be found shows."""
-        return self.size <= self.change.wanted
 
     @property
     def words(self) -> str:

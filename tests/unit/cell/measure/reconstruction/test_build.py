@@ -1,4 +1,4 @@
-"""The cloud lies where an independent ray trace puts the surface, its noise is what it says, outliers are out."""
+"""The cloud lies where an independent ray trace puts the surface, and its noise is what it says."""
 
 from __future__ import annotations
 
@@ -20,7 +20,6 @@ from cell.measure.reconstruction import (
     deviation_colours,
     write_ply,
 )
-from cell.measure.reconstruction.outliers import find_outliers
 from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
 
@@ -159,50 +158,6 @@ def test_a_subsample_is_spread_over_all_lines_and_rows() -> None:
     assert np.histogram(rows, bins=10, range=(0, 480))[0].min() > 150
 
 
-# --- outliers ---
-
-
-def relief(name: str, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Depth (256, 480) of a curved surface with noise, m, as a sweep samples it, and the noise's σ."""
-    x, y = np.meshgrid((np.arange(256) - 128) * 0.25e-3, (np.arange(480) - 240) * 0.078e-3, indexing="ij")
-    depth = 0.0015 * np.sin(150 * x + 70 * y) + 0.0011 * np.sin(230 * y - 90 * x)
-    if name == "steps":
-        depth = 3 * x**2 + 6 * y**2 + 0.0012 * np.tanh((0.97 * x - 0.24 * y - 0.01) / 0.0008)
-    sigma = 25e-6 * rng.uniform(0.7, 1.5, x.shape)
-    return depth + sigma * rng.standard_normal(x.shape), sigma
-
-
-def spoil(depth: Array, kind: str, share: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-    bad = np.zeros(depth.shape, dtype=bool)
-    if kind == "streak":
-        # Streaks along a line, some lines apart so that each stands alone.
-        for line in rng.permutation(np.arange(3, 253, 7)):
-            if bad.mean() >= share:
-                break
-            first = rng.integers(5, 400)
-            bad[line, first : first + rng.integers(20, 70)] = True
-    else:
-        bad = rng.random(depth.shape) < share
-    low, high = (0.002, 0.008) if kind == "far" else (0.00028, 0.0008)
-    offset = rng.uniform(low, high, depth.shape) * np.where(kind == "streak", 1, rng.choice([-1, 1], depth.shape))
-    depth[bad] += offset[bad]
-    return bad
-
-
-@pytest.mark.parametrize("name", ["free-form", "steps"])
-@pytest.mark.parametrize("kind", ["far", "near", "streak"])
-@pytest.mark.parametrize("share", [0.01, 0.05])
-def test_outliers_are_found_and_little_else(name: str, kind: str, share: float) -> None:
-    rng = np.random.default_rng(4)
-    depth, sigma = relief(name, rng)
-    bad = spoil(depth, kind, share, rng)
-    depth[rng.random(depth.shape) < 0.02] = np.nan
-    bad &= np.isfinite(depth)
-    found = find_outliers(depth, sigma)
-    assert np.count_nonzero(found & bad) / np.count_nonzero(bad) >= 0.99
-    assert np.count_nonzero(found & bad) / np.count_nonzero(found) >= 0.90
-
-
 # --- PLY ---
 
 
@@ -215,8 +170,7 @@ def test_a_ply_is_read_back_by_another_library(tmp_path: Path) -> None:
     quality = points[:, :, 2] - TABLE
     colours = deviation_colours(quality, 1e-4)
     path = tmp_path / "cloud.ply"
-    normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    count = write_ply(path, points, normals=normals, quality=quality, colours=colours, comment="frame: arm base")
+    count = write_ply(path, points, quality=quality, colours=colours, comment="frame: arm base")
     kept = np.isfinite(points[:, :, 0])
     assert count == kept.sum()
     loaded = trimesh.load(path)
@@ -225,4 +179,4 @@ def test_a_ply_is_read_back_by_another_library(tmp_path: Path) -> None:
     header = path.read_bytes().split(b"end_header")[0].decode()
     for line in ("format binary_little_endian 1.0", "comment coordinates in metres", "comment frame: arm base"):
         assert line in header.splitlines()
-    assert path.stat().st_size == len(header) + len("end_header\n") + count * (7 * 4 + 3)
+    assert path.stat().st_size == len(header) + len("end_header\n") + count * (4 * 4 + 3)
