@@ -22,7 +22,6 @@ LINES, ROWS = 300, 480
 LINE_STEP, ROW_STEP = 0.25e-3, 0.078e-3
 SIGMA = 25e-6
 KINDS = ("far", "near", "streak along a line", "streak along a row")
-SURFACES = ("free-form", "steps")
 CAMERAS = ((640, 480), (2048, 1088))
 """Pictures in px whose sweeps are timed."""
 

@@ -368,7 +368,7 @@ def test_a_verdict_names_what_is_known_worst_with_three_of_its_deviations() -> N
 
 @pytest.mark.parametrize("case", ["bent 0.3 to 3 mm", "turned by 180°", "mirrored"])
 @pytest.mark.parametrize(
-    "seeds", [range(2), pytest.param(range(2, 8), marks=pytest.mark.campaign)], ids=["few", "more"]
+    "seeds", [range(1), pytest.param(range(1, 8), marks=pytest.mark.campaign)], ids=["few", "more"]
 )
 def test_no_surface_that_is_not_the_nominal_one_leads_outside_the_tolerance(case: str, seeds: range) -> None:
     ended = [judge_case(case, seed).ended for seed in seeds]
