@@ -22,6 +22,7 @@ from cell.measure.reconstruction import (
 )
 from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
+from lab.bench.reconstruction.scenes import swept
 
 Array = NDArray[np.float64]
 
@@ -64,11 +65,11 @@ def table_stripe(rail: float) -> Array:
 
 def built(noise: float = 0.0, lines: int = 60) -> Cloud:
     rng = np.random.default_rng(0)
-    builder = ProfileBuilder(GEOMETRY, expected_lines=16)
-    for rail in np.linspace(0.02, 0.08, lines):
-        centres = table_stripe(rail) + noise * rng.standard_normal(480)
-        assert builder.add(profile(centres, max(noise, 0.01)), rail, 1e-6) == 480
-    return builder.finish(BASE_FROM_FLANGE)
+    profiles = (
+        (profile(table_stripe(rail) + noise * rng.standard_normal(480), max(noise, 0.01)), rail)
+        for rail in np.linspace(0.02, 0.08, lines)
+    )
+    return swept(GEOMETRY, profiles, 1e-6, BASE_FROM_FLANGE)
 
 
 # --- triangulation and frames ---
@@ -102,12 +103,9 @@ def test_the_noise_of_the_points_is_what_the_cloud_says() -> None:
 
 
 def test_an_error_of_the_rail_moves_a_whole_line_as_its_spread_says() -> None:
-    clouds = []
-    for error in (0.0, 2e-5):
-        builder = ProfileBuilder(GEOMETRY)
-        for rail in np.linspace(0.04, 0.05, 10):
-            builder.add(profile(table_stripe(rail)), rail + error, 2e-5)
-        clouds.append(builder.finish(BASE_FROM_FLANGE))
+    seen = [(profile(table_stripe(rail)), rail) for rail in np.linspace(0.04, 0.05, 10)]
+    told = ([(one, rail + error) for one, rail in seen] for error in (0.0, 2e-5))
+    clouds = [swept(GEOMETRY, profiles, 2e-5, BASE_FROM_FLANGE) for profiles in told]
     moved = clouds[1].points - clouds[0].points
     assert np.abs(moved - clouds[0].rail_spread[:, None]).max() < 1e-12
     assert np.linalg.norm(clouds[0].rail_spread, axis=1) == pytest.approx(2e-5 * np.linalg.norm(RAIL))
@@ -118,21 +116,18 @@ def test_another_calibration_moves_the_points_as_foretold() -> None:
     other = ScanGeometry(CAMERA, LightPlane.of((1.0, 0.01, -1 / 3.501), -0.03512), RAIL * 1.0002, MOUNT)
     lines, rows = cloud.subsample(500)
     foretold = calibration_motions(cloud, lines, rows, BASE_FROM_FLANGE, GEOMETRY, [other])[:, :, 0]
-    builder = ProfileBuilder(other)
-    for rail in cloud.rail:
-        builder.add(profile(table_stripe(rail)), rail, 1e-6)
-    seen = builder.finish(BASE_FROM_FLANGE).points[lines, rows] - cloud.points[lines, rows]
+    moved = swept(other, ((profile(table_stripe(rail)), rail) for rail in cloud.rail), 1e-6, BASE_FROM_FLANGE)
+    seen = moved.points[lines, rows] - cloud.points[lines, rows]
     assert np.abs(foretold - seen).max() < 1e-9
     assert np.abs(foretold).max() > 1e-5
 
 
 def test_rows_without_a_stripe_are_holes_and_lines_are_sorted() -> None:
-    builder = ProfileBuilder(GEOMETRY)
-    for rail in (0.042, 0.040, 0.044, 0.041, 0.043):
-        centres = table_stripe(rail)
-        centres[100:200] = np.nan
-        builder.add(profile(centres), rail, 1e-5)
-    cloud = builder.finish(BASE_FROM_FLANGE)
+    rails = (0.042, 0.040, 0.044, 0.041, 0.043)
+    centres = [table_stripe(rail) for rail in rails]
+    for columns in centres:
+        columns[100:200] = np.nan
+    cloud = swept(GEOMETRY, zip(map(profile, centres), rails, strict=True), 1e-5, BASE_FROM_FLANGE)
     assert np.all(np.diff(cloud.rail) > 0)
     assert np.all(np.isnan(cloud.points[:, 100:200]))
     assert cloud.size == 5 * 380
@@ -140,14 +135,12 @@ def test_rows_without_a_stripe_are_holes_and_lines_are_sorted() -> None:
 
 def test_a_profile_of_another_camera_is_refused() -> None:
     with pytest.raises(ValueError, match="camera of 480 rows"):
-        ProfileBuilder(GEOMETRY).add(profile(np.full(1024, 300.0)), 0.0, 1e-5)
+        ProfileBuilder(GEOMETRY).see(profile(np.full(1024, 300.0)))
 
 
 def test_a_sweep_without_points_is_refused() -> None:
-    builder = ProfileBuilder(GEOMETRY)
-    builder.add(profile(np.full(480, np.nan)), 0.0, 1e-5)
     with pytest.raises(RefusedError, match="gave 0 points in 1 profiles"):
-        builder.finish(BASE_FROM_FLANGE)
+        swept(GEOMETRY, [(profile(np.full(480, np.nan)), 0.0)], 1e-5, BASE_FROM_FLANGE)
 
 
 def test_a_subsample_is_spread_over_all_lines_and_rows() -> None:
