@@ -20,6 +20,7 @@ from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_axes, from_parts, perturbed
 from cell.measure.reconstruction import ScanGeometry
 from cell.measure.vision import BoardView, parse_board
+from cell.measure.vision.board.view import centre_of
 from cell.measure.vision.stripe.extract import StripeProfile
 from lab.bench.calibration.world import Noise, centroids, circle
 from sim_backends.optics import Board, BoardInstance, CameraOptics, LaserOptics, Mesh, MeshInstance
@@ -157,7 +158,7 @@ def observe(spec: RigSpec, head: TrueHead, rng: np.random.Generator) -> list[Sca
         tilt = np.radians(rng.uniform(10, 40)) * np.array([np.cos(2.4 * k), np.sin(2.4 * k), 0.0])
         rotation = pin.exp3(tilt) @ pin.exp3(np.array([0.0, 0.0, rng.uniform(-0.4, 0.4)]))
         centre = np.array([*(rng.uniform(-0.1, 0.1, 2) * field), rng.uniform(*spec.depths)])
-        seen = from_parts(centre - rotation @ np.array(known.centre), rotation)
+        seen = from_parts(centre - rotation @ centre_of(known), rotation)
         reading = rng.uniform(0.0, spec.travel)
         flange = (
             base_from_board * (head.flange_from_camera * from_parts(reading * head.rail_direction) * seen).inverse()

@@ -15,8 +15,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import from_axes, perturbed, transform
-from cell.measure.reconstruction import Cloud, ProfileBuilder, ScanGeometry
+from cell.measure.reconstruction import Cloud, ScanGeometry
 from lab.bench.over_cores import Progress, run_all
+from lab.bench.reconstruction.scenes import swept
 from lab.paper.rig import (
     RigSpec,
     Solved,
@@ -262,10 +263,11 @@ def spoil(sweep: Sweep, spec: RigSpec, share: float, rng: np.random.Generator) -
 
 def reconstruct(sweep: Sweep, centres: Array, geometry: ScanGeometry, spec: RigSpec) -> Cloud:
     """The product's own reconstruction of the centres, in the frame of `geometry`, with its outlier filter."""
-    builder = ProfileBuilder(geometry, len(centres))
-    for columns, reading in zip(centres, sweep.readings, strict=True):
-        builder.add(profile_of(columns, spec.noise.stripe), float(reading), spec.noise.rail)
-    return builder.finish(pin.SE3.Identity())
+    profiles = (
+        (profile_of(columns, spec.noise.stripe), float(reading))
+        for columns, reading in zip(centres, sweep.readings, strict=True)
+    )
+    return swept(geometry, profiles, spec.noise.rail, pin.SE3.Identity())
 
 
 def found_outliers(cloud: Cloud, spoiled: Spoiled) -> dict[str, float | int]:

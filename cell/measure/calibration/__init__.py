@@ -2,14 +2,6 @@
 
 from cell.measure.calibration.archive import ScanObservation, TargetObservation
 from cell.measure.calibration.solve.adjustment import Priors
-from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration, calibrate_scan, calibrate_target
+from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
 
-__all__ = [
-    "Priors",
-    "ScanCalibration",
-    "ScanObservation",
-    "TargetCalibration",
-    "TargetObservation",
-    "calibrate_scan",
-    "calibrate_target",
-]
+__all__ = ["Priors", "ScanCalibration", "ScanObservation", "TargetCalibration", "TargetObservation"]

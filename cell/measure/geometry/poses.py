@@ -144,21 +144,6 @@ def composition_jacobians(a_from_b: pin.SE3, b_from_c: pin.SE3) -> tuple[Array, 
     return outer, inner
 
 
-def point_covariances(
-    a_from_b: pin.SE3, pose_covariance: ArrayLike, points: ArrayLike, covariances: ArrayLike
-) -> Array:
-    """Covariances (n, 3, 3) in a of points (n, 3) in b with covariances (n, 3, 3) in b, the pose's 6×6 included."""
-    r = a_from_b.rotation
-    arm = np.asarray(points, dtype=np.float64) @ r.T
-    j = np.zeros((len(arm), 3, 6))
-    j[:, :, :3] = np.eye(3)
-    j[:, 0, 4], j[:, 0, 5] = arm[:, 2], -arm[:, 1]
-    j[:, 1, 3], j[:, 1, 5] = -arm[:, 2], arm[:, 0]
-    j[:, 2, 3], j[:, 2, 4] = arm[:, 1], -arm[:, 0]
-    pose_part = j @ np.asarray(pose_covariance, dtype=np.float64) @ j.transpose(0, 2, 1)
-    return np.asarray(r @ np.asarray(covariances, dtype=np.float64) @ r.T + pose_part, dtype=np.float64)
-
-
 def angle_apart(a_flange: pin.SE3, a_board: pin.SE3, b_flange: pin.SE3, b_board: pin.SE3) -> float:
     """Difference in rad between the angles of the flange's and the board's turn."""
     hand = float(np.linalg.norm(pin.log3(a_flange.rotation.T @ b_flange.rotation)))

@@ -133,8 +133,8 @@ def _squares(scan: Scan, pose: pin.SE3, nominal: NominalSurface) -> Array:
     return np.array([np.median(group) for group in groups if len(group) >= SQUARE_POINTS])
 
 
-def require_board(shared: Array, prior: Prior, correction: Array) -> float:
-    """Refuse a pose that contradicts the board; else the squared Mahalanobis distance between the two.
+def require_board(shared: Array, prior: Prior, correction: Array) -> None:
+    """Refuse a pose that contradicts the board, by the squared Mahalanobis distance between the two.
 
     A direction that the scan does not determine stays where the board put it and adds nothing.
     """
@@ -149,4 +149,3 @@ def require_board(shared: Array, prior: Prior, correction: Array) -> float:
             Measured("and turned", float(np.degrees(np.linalg.norm(correction[3:]))), "deg"),
             Measured("squared distance in units of the prior", distance, most=BOARD_DISAGREES),
         )
-    return distance

@@ -196,9 +196,9 @@ def highest_standing(
     found = None
     # Squares that overlap by half: in some of them a small thing is in the middle.
     for shift in np.ndindex(2, 2):
-        column, row = np.floor(below[:, :2] / SQUARE_M + 0.5 * np.array(shift)).astype(np.intp).T
-        square = column * 2 * ROWS + row
-        if (highest := _highest(square, lift, line)) is not None and (found is None or highest[1] > found.height):
+        if (highest := _highest(square_of(below, shift), lift, line)) is not None and (
+            found is None or highest[1] > found.height
+        ):
             found = Standing(highest[1], places[highest[0]])
     return found
 
@@ -213,6 +213,26 @@ def _highest(square: Indices, lift: Array, line: Indices) -> tuple[int, float] |
         return None
     best = int(np.argmax(middle - noise))
     return int(medians[best]), float(middle[best] - noise[best])
+
+
+def square_of(places: Array, shift: tuple[int, ...] = (0, 0)) -> Indices:
+    """The number (n,) of the square of 2 mm, across x and y, in which each place (n, 3), m, lies.
+
+    The squares may be shifted by half a one.
+    """
+    column, row = np.floor(places[:, :2] / SQUARE_M + 0.5 * np.array(shift)).astype(np.intp).T
+    return np.asarray(column * 2 * ROWS + row)
+
+
+def spread_mm(values: Array, digits: int) -> tuple[float, ...]:
+    """The least, the middle and the largest of `values` (n,), m, in mm."""
+    return tuple(round(1e3 * float(v), digits) + 0.0 for v in np.percentile(values, [0, 50, 100]))
+
+
+def spread_for_journal(values: Array, seen: float) -> dict[str, float]:
+    """The same with the share that was `seen`."""
+    least, middle, most = spread_mm(values, 4)
+    return {"least_mm": least, "median_mm": middle, "largest_mm": most, "seen": round(seen, 3)}
 
 
 def squares(square: Indices, heights: Array, line: Indices) -> tuple[Indices, Array, Array]:

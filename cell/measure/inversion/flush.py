@@ -14,8 +14,8 @@ import pinocchio as pin
 import scipy
 
 from cell.measure.geometry.poses import transform
-from cell.measure.inversion.disagreement import ROWS, SQUARE_M, STEEPEST, squares
-from cell.measure.inversion.nominal import Array, Indices, NominalSurface
+from cell.measure.inversion.disagreement import STEEPEST, spread_for_journal, spread_mm, square_of, squares
+from cell.measure.inversion.nominal import Array, NominalSurface
 from cell.measure.reconstruction.cloud import Cloud
 
 REACH_M = 6e-3
@@ -44,7 +44,7 @@ class Flush:
     @property
     def span(self) -> str:
         """The least and the largest, mm, for people."""
-        least, _, most = self._figures(2)
+        least, _, most = spread_mm(self.higher, 2)
         return f"{least:+.2f} to {most:+.2f}"
 
     @property
@@ -63,11 +63,7 @@ class Flush:
 
     def as_dict(self) -> dict[str, float]:
         """For the journal."""
-        least, middle, most = self._figures(4)
-        return {"least_mm": least, "median_mm": middle, "largest_mm": most, "seen": round(self.seen, 3)}
-
-    def _figures(self, digits: int) -> tuple[float, ...]:
-        return tuple(round(1e3 * float(v), digits) + 0.0 for v in np.percentile(self.higher, [0, 50, 100]))
+        return spread_for_journal(self.higher, self.seen)
 
 
 def flush_along_edge(
@@ -117,7 +113,5 @@ def _standing(
     if not kept.any():
         return None
     index = index[kept]
-    column, row = np.floor(places[index, :2] / SQUARE_M).astype(np.intp).T
-    square: Indices = np.asarray(column * 2 * ROWS + row)
-    medians, higher, noise = squares(square, feet.heights[kept] / up[kept], lines[index])
+    medians, higher, noise = squares(square_of(places[index]), feet.heights[kept] / up[kept], lines[index])
     return _Squares(places[index[medians]], higher, noise) if len(medians) else None

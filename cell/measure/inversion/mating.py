@@ -11,7 +11,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from cell.measure.inversion.disagreement import ALLOWED, REACH_M, ROWS, SQUARE_M, STEEPEST, squares
+from cell.measure.inversion.disagreement import (
+    ALLOWED,
+    REACH_M,
+    STEEPEST,
+    spread_for_journal,
+    spread_mm,
+    square_of,
+    squares,
+)
 from cell.measure.inversion.nominal import Array, Indices, NominalSurface
 from cell.measure.inversion.place_pose import PlacePose
 from cell.measure.reconstruction.cloud import Cloud
@@ -67,13 +75,13 @@ class MatingGap:
     @property
     def words(self) -> str:
         """For people."""
-        _, middle, _ = self._figures(2)
+        _, middle, _ = spread_mm(self.gaps, 2)
         return f"gap {self.span} mm, {middle:.2f} mm in the middle; {100 * self.seen:.0f} % of it seen"
 
     @property
     def span(self) -> str:
         """The least and the largest gap, mm, for people."""
-        least, _, most = self._figures(2)
+        least, _, most = spread_mm(self.gaps, 2)
         return f"{least:.2f} to {most:.2f}"
 
     @property
@@ -88,12 +96,7 @@ class MatingGap:
 
     def as_dict(self) -> dict[str, float]:
         """For the journal."""
-        least, middle, most = self._figures(4)
-        return {"least_mm": least, "median_mm": middle, "largest_mm": most, "seen": round(self.seen, 3)}
-
-    def _figures(self, digits: int) -> tuple[float, ...]:
-        """The least, the middle and the largest gap, mm."""
-        return tuple(round(1e3 * float(v), digits) + 0.0 for v in np.percentile(self.gaps, [0, 50, 100]))
+        return spread_for_journal(self.gaps, self.seen)
 
     def measured(self, tolerance: float) -> Measured:
         """How far the part would interfere with the surface, beside what is allowed at this `tolerance`, m."""
@@ -157,17 +160,12 @@ def _gap(
     if not mates.any():
         return None
     over, gaps = over[mates], feet.heights[mates] / down[mates]
-    medians, middle, noise = squares(_square(below[over]), gaps, lines[index[over]])
+    medians, middle, noise = squares(square_of(below[over]), gaps, lines[index[over]])
     if not len(medians):
         return None
     face = _mating_face(nominal, surface_from_part, part)
-    seen = np.isin(face, np.unique(_square(below[over[medians]]))).mean() if len(face) else 0.0
+    seen = np.isin(face, np.unique(square_of(below[over[medians]]))).mean() if len(face) else 0.0
     return MatingGap(points[index[over[medians]]], middle, noise, float(seen))
-
-
-def _square(below: Array) -> Indices:
-    column, row = np.floor(below[:, :2] / SQUARE_M).astype(np.intp).T
-    return np.asarray(column * 2 * ROWS + row)
 
 
 def _mating_face(nominal: NominalSurface, surface_from_part: pin.SE3, part: NominalSurface) -> Indices:
@@ -175,4 +173,4 @@ def _mating_face(nominal: NominalSurface, surface_from_part: pin.SE3, part: Nomi
     facing = part.normals[part.sample_triangles][:, 2] < -STEEPEST
     under = _thinned(part.samples[facing])
     found, feet = nominal.feet(under @ surface_from_part.rotation.T + surface_from_part.translation, REACH_M)
-    return np.unique(_square(under[found[feet.inner]]))
+    return np.unique(square_of(under[found[feet.inner]]))

@@ -131,19 +131,12 @@ class PoseVerdict:
     """What is known of the pose.
 
     worst: the least certain motion, in units of the tolerance. weak: the motions beyond tolerance, worst first.
-    unseen: motions that the scan alone does not determine, so that the board decides them. spectrum: (6,) eigenvalues
-    of the scan's information per point, with the surface's rms radius as unit of length, rising.
+    unseen: motions that the scan alone does not determine, so that the board decides them.
     """
 
     worst: SmallMotion
     weak: tuple[SmallMotion, ...]
     unseen: tuple[str, ...]
-    spectrum: Array
-
-    @property
-    def observable(self) -> bool:
-        """True when every motion is known to within the tolerance at three standard deviations."""
-        return not self.weak
 
     def require(self) -> None:
         """Raise `NotObservable` that names every motion that is not known well enough."""
@@ -199,7 +192,7 @@ def judge(
     spectrum, ways = np.linalg.eigh(scan_information / np.outer(length, length) * (mean_variance / max(1, points)))
     free = ways[:, spectrum < FREE] / length[:, None]
     unseen = tuple(name(way, radius) for way in sorted_out(free, radius)) if free.size else ()
-    return PoseVerdict(worst, tuple(weak), unseen, np.asarray(spectrum))
+    return PoseVerdict(worst, tuple(weak), unseen)
 
 
 def _sized(way: Array, covariance: Array, tolerance: Tolerance, radius: float) -> SmallMotion:

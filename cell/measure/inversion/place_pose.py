@@ -123,8 +123,7 @@ class PlacePose:
     rms: of the accepted points' distances, m; chi2_per_dof: the same in units of their noise; n_points: accepted;
     share: accepted among those over the surface; coverage: share of the surface that was seen.
     parts_differ: how far from this place a quarter of the surface puts it, beyond three sigma, in tolerances.
-    correction: (6,) from the board's pose to this one, base axes, m and rad; disagreement: squared Mahalanobis distance
-    between the two. notes: for people, what is not as usual.
+    correction: (6,) from the board's pose to this one, base axes, m and rad. notes: for people, what is not as usual.
     """
 
     base_from_surface: pin.SE3
@@ -139,7 +138,6 @@ class PlacePose:
     coverage: float
     parts_differ: float
     correction: Array
-    disagreement: float
     notes: tuple[str, ...] = ()
 
     @property
@@ -168,22 +166,22 @@ Resolve = Callable[[NDArray[np.intp], NDArray[np.intp]], Array]
 
 def invert_pose(
     cloud: Cloud, nominal: NominalSurface, prior: Prior, tolerance: Tolerance, *, systematic: Array | None = None,
-    calibration: Resolve | None = None, sweeps: Resolve | None = None, start: pin.SE3 | None = None,
-    demands: Demands | None = None, most_points: int = 10_000, partly: bool = False, least_shared: float = SIGMA_FLOOR,
+    calibration: Resolve | None = None, sweeps: Resolve | None = None, demands: Demands | None = None,
+    most_points: int = 10_000, partly: bool = False, least_shared: float = SIGMA_FLOOR,
 ) -> PlacePose:  # fmt: skip
     """The pose of the nominal surface in the arm base, from a cloud in the arm base and the board's pose as prior.
 
     `systematic` (6×6, base axes) is what the place is off by whether scan or board decides it, such as the arm's error
     as it goes there; `calibration` says how the calibration's uncertainty moves each point, and is propagated through
     the registration; `sweeps` how each sweep's own uncertainty moves its points, which is taken out as far as the
-    sweeps tell it. `start` is where the search begins unless at the prior. A motion that is not known well enough is
-    left to the verdict with `partly`. Neighbouring points are off by `least_shared`, m, together, or by what they show.
+    sweeps tell it. A motion that is not known well enough is left to the verdict with `partly`. Neighbouring points are
+    off by `least_shared`, m, together, or by what they show.
 
     Raises `RefusedError` when the scan does not fit the surface, covers too little of it or contradicts the board, and
     `NotObservable` when three standard deviations exceed `tolerance` in some direction, which is named.
     """
     inversion = _Inversion(Scan.of(cloud, most_points), nominal, prior, tolerance, demands or Demands())
-    found, coverage, numbers = inversion.fitted(start)
+    found, coverage, numbers = inversion.fitted()
     lines, rows = cloud.subsample(most_points)
     displaced = [resolve(lines, rows) for resolve in (calibration, sweeps) if resolve is not None]
     if sweeps is not None:
@@ -198,7 +196,7 @@ def invert_pose(
         # What several sweeps differ by is told apart from the pose already.
         shared = shared + parts.covariance(tolerance)
     with _shown(pose, *numbers):
-        disagreement = require_board(shared, prior, difference(pose, prior.base_from_surface))
+        require_board(shared, prior, difference(pose, prior.base_from_surface))
         pose, random, verdict = inversion.settled(found, shared)
     with _shown(pose, *numbers):
         if not partly:
@@ -207,7 +205,7 @@ def invert_pose(
         base_from_surface=pose, random=np.asarray(random), systematic=np.asarray(shared),
         covariance=np.asarray(random + shared), verdict=verdict, rms=found.rms, chi2_per_dof=found.chi2_per_dof,
         n_points=len(found.used), share=found.share, coverage=coverage, parts_differ=parts_differ,
-        correction=difference(pose, prior.base_from_surface), disagreement=disagreement,
+        correction=difference(pose, prior.base_from_surface),
     )  # fmt: skip
 
 
@@ -221,9 +219,9 @@ class _Inversion:
     tolerance: Tolerance
     demands: Demands
 
-    def fitted(self, start: pin.SE3 | None) -> tuple[Registration, float, tuple[Measured, ...]]:
+    def fitted(self) -> tuple[Registration, float, tuple[Measured, ...]]:
         """The surface registered in the scan, how much of it is covered, and the figures that every refusal shows."""
-        found = register(self.scan, self.nominal, self.prior, start)
+        found = register(self.scan, self.nominal, self.prior)
         pose = found.base_from_surface
         local = (self.scan.points[found.used] - pose.translation) @ pose.rotation
         coverage = self.nominal.coverage(local, 0.0025)

@@ -181,12 +181,12 @@ class Registration:
         return float(np.sum((self.heights / self.sigmas) ** 2) / max(1, len(self.heights) - 6))
 
 
-def register(scan: Scan, nominal: NominalSurface, prior: Prior, start: pin.SE3 | None = None) -> Registration:
-    """Find base_from_surface from `start` (the prior's pose unless given) in the light of scan and prior.
+def register(scan: Scan, nominal: NominalSurface, prior: Prior) -> Registration:
+    """Find base_from_surface from the prior's pose on, in the light of scan and prior.
 
     Raises `RefusedError` when too few points lie over the surface.
     """
-    begin = prior.base_from_surface if start is None else start
+    begin = prior.base_from_surface
     pose, fit = _search(begin, scan, nominal, prior, begin)
     for other in _beside(begin, nominal, prior):
         if fit >= LIKELY:
@@ -205,7 +205,7 @@ def _search(
     thin, sparse = scan.thinned(COARSE_POINTS), scan.thinned(OTHER_POINTS)
     first = _first_gate(nominal, prior, begin)
     tried = [_tried(_coarse(attempt, sparse, nominal, prior, first), thin, nominal)]
-    spread = _prior_spread(nominal, prior, begin)
+    spread = _prior_spread(prior, begin)
     level = _levelled(attempt, sparse, nominal, first)
     for candidate in candidates(level, sparse.points, nominal, *spread, MOST_CANDIDATES):
         tried.append(_tried(_coarse(candidate, sparse, nominal, prior, SEARCH_GATE), thin, nominal))
@@ -218,7 +218,7 @@ def _search(
 def _beside(begin: pin.SE3, nominal: NominalSurface, prior: Prior) -> list[pin.SE3]:
     """Other starts: raised, lowered and tilted either way, where the prior leaves it open."""
     normal, sides = across(nominal)
-    shift, turn = _prior_spread(nominal, prior, begin)
+    shift, turn = _prior_spread(prior, begin)
     pivot = pin.SE3(np.eye(3), nominal.centre)
     ways = [pin.SE3(np.eye(3), sign * min(shift, OTHER_START[0]) * normal) for sign in (1.0, -1.0)]
     tilts = [sign * min(turn, OTHER_START[1]) * side for side in sides for sign in (1.0, -1.0)]
@@ -230,7 +230,7 @@ def _tried(pose: pin.SE3, scan: Scan, nominal: NominalSurface) -> tuple[pin.SE3,
     return pose, _fit(pose, scan, nominal)
 
 
-def _prior_spread(nominal: NominalSurface, prior: Prior, start: pin.SE3) -> tuple[float, float]:
+def _prior_spread(prior: Prior, start: pin.SE3) -> tuple[float, float]:
     """How far across the surface (m) and about its normal (rad) it may lie from the start: three σ of the prior."""
     sigma = np.sqrt(np.diag(prior.covariance))
     off = difference(start, prior.base_from_surface)
@@ -240,7 +240,7 @@ def _prior_spread(nominal: NominalSurface, prior: Prior, start: pin.SE3) -> tupl
 
 def _first_gate(nominal: NominalSurface, prior: Prior, start: pin.SE3) -> float:
     """How far points may lie from the surface at the start."""
-    shift, turn = _prior_spread(nominal, prior, start)
+    shift, turn = _prior_spread(prior, start)
     return float(np.clip(shift + nominal.radius * turn, 0.002, 0.5 * nominal.radius))
 
 

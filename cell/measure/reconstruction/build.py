@@ -55,7 +55,6 @@ class ProfileBuilder:
         self._points = np.full((room, self._rows, 3), np.nan)
         self._spread = np.zeros((room, self._rows, 3), dtype=np.float32)
         self._centres = np.full((room, self._rows), np.nan)
-        self._rail = np.zeros((room, 2))
 
     @property
     def lines(self) -> int:
@@ -80,24 +79,6 @@ class ProfileBuilder:
         self._centres[line, rows] = profile.centres[rows]
         self._lines += 1
         return int(np.count_nonzero(np.isfinite(points[:, 0])))
-
-    def add(self, profile: StripeProfile, rail_position: float, rail_sigma: float) -> int:
-        """`see` a profile whose rail position is known already, ± `rail_sigma` (m)."""
-        count = self.see(profile)
-        self._rail[self._lines - 1] = rail_position, rail_sigma
-        return count
-
-    def finish(self, base_from_flange: pin.SE3, least_points: int = 500) -> Cloud:
-        """The cloud of the profiles that were `add`ed, in the order of the rail; the flange stood still all along.
-
-        Raises `RefusedError` when fewer than `least_points` points are left.
-        """
-        n = self._lines
-        order = np.argsort(self._rail[:n, 0], kind="stable")
-        flanges = np.broadcast_to(base_from_flange.homogeneous, (n, 4, 4))
-        rail = self._rail[order]
-        spread = rail[:, 1:] * self.sweep_direction(base_from_flange)
-        return self.place(order, flanges, rail[:, 0], spread).require(least_points)
 
     def seen(self, since: int) -> Array:
         """The profiles from number `since` on, (lines, rows, 3) m in the camera's frame; NaN where no point is."""
@@ -146,7 +127,6 @@ class ProfileBuilder:
         self._points = np.concatenate([self._points, np.full((more, self._rows, 3), np.nan)])
         self._spread = np.concatenate([self._spread, np.zeros((more, self._rows, 3), dtype=np.float32)])
         self._centres = np.concatenate([self._centres, np.full((more, self._rows), np.nan)])
-        self._rail = np.concatenate([self._rail, np.zeros((more, 2))])
 
 
 def calibration_motions(
@@ -177,7 +157,7 @@ def flange_motions(
     `covariances`: for each sweep, the (6, 6) of base_from_flange (translation, rotation; base axes) that its lines have
     in common. The errors of different sweeps are independent: each moves the points of its own sweep only.
     """
-    sweeps = cloud.sweeps[lines] if len(cloud.sweeps) else np.zeros(len(lines), dtype=np.intp)
+    sweeps = cloud.sweep_of[lines]
     arms = cloud.points[lines, rows] - cloud.flanges[lines, :3, 3]
     motions = np.zeros((len(lines), 3, 6 * len(covariances)))
     for k, covariance in enumerate(covariances):

@@ -72,6 +72,11 @@ class Cloud:
         return np.isfinite(self.points[:, :, 0])
 
     @property
+    def sweep_of(self) -> Indices:
+        """(lines,) the number of the sweep that each line belongs to, 0 for a single one."""
+        return self.sweeps if len(self.sweeps) else np.zeros(self.shape[0], dtype=np.intp)
+
+    @property
     def size(self) -> int:
         """Number of measured points."""
         return int(np.count_nonzero(self.valid))

@@ -25,19 +25,16 @@ _KINDS = {
 
 
 def write_ply(
-    path: Path, points: ArrayLike, *, normals: ArrayLike | None = None, quality: ArrayLike | None = None,
-    colours: ArrayLike | None = None, scalars: Mapping[str, NDArray[np.generic]] | None = None, comment: str = "",
+    path: Path, points: ArrayLike, *, quality: ArrayLike | None = None, colours: ArrayLike | None = None,
+    scalars: Mapping[str, NDArray[np.generic]] | None = None, comment: str = "",
 ) -> int:  # fmt: skip
     """Write the finite points (…, 3), in m; their number. Rows with NaN are left out.
 
-    Optional, one per point: unit `normals` (…, 3), a scalar `quality` (such as the deviation in m), `colours` (…, 3)
-    uint8, and `scalars` by name, of type float32, uint8, uint16 or int32. Raises ValueError when the sizes differ.
+    Optional, one per point: a scalar `quality` (such as the deviation in m), `colours` (…, 3) uint8, and `scalars` by
+    name, of type float32, uint8, uint16 or int32. Raises ValueError when the sizes differ.
     """
     xyz = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     columns: list[tuple[str, str, NDArray[np.generic]]] = [(n, "<f4", xyz[:, i]) for i, n in enumerate("xyz")]
-    if normals is not None:
-        vectors = np.asarray(normals, dtype=np.float64).reshape(-1, 3)
-        columns += [(n, "<f4", vectors[:, i]) for i, n in enumerate(("nx", "ny", "nz"))]
     if colours is not None:
         rgb = np.asarray(colours, dtype=np.uint8).reshape(-1, 3)
         columns += [(n, "u1", rgb[:, i]) for i, n in enumerate(("red", "green", "blue"))]
@@ -82,7 +79,6 @@ def write_cloud(path: Path, cloud: Cloud, simulated: Sequence[str] = ()) -> int:
     most = 0.5 * (aa + bb) + np.sqrt(0.25 * (aa - bb) ** 2 + ab**2)
     most_filled = np.linalg.eigvalsh(filled.covariances)[:, 2] if len(filled.lines) else np.empty(0)
     line = np.concatenate([lines, filled.lines])
-    sweeps = cloud.sweeps if len(cloud.sweeps) else np.zeros(cloud.shape[0], dtype=np.intp)
     flag = np.zeros(len(line), dtype=np.uint8)
     flag[len(lines) :] = 1
     said = f"\nsimulated: {', '.join(simulated)}" if simulated else ""
@@ -93,7 +89,7 @@ def write_cloud(path: Path, cloud: Cloud, simulated: Sequence[str] = ()) -> int:
             "sigma": np.sqrt(np.concatenate([most, most_filled])).astype(np.float32),
             "line": line.astype(np.int32),
             "row": np.concatenate([rows, filled.rows]).astype(np.int32),
-            "sweep": sweeps[line].astype(np.uint8),
+            "sweep": cloud.sweep_of[line].astype(np.uint8),
             "interpolated": flag,
         },
         comment="frame: arm base\nsigma in metres; interpolated: 1 where the point was not measured" + said,

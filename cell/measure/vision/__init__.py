@@ -20,21 +20,20 @@ if TYPE_CHECKING:
         StripeSettings,
         StripeStream,
         extract,
-        read_stripe,
     )
     from cell.measure.vision.stripe.planes import read_colours
 
 __all__ = [
     "BoardPose", "BoardSpec", "BoardView", "LaserChannel", "Mark", "PictureRefused", "Reason", "StripeProfile",
     "StripeSettings", "StripeStream", "board_pose", "check_picture", "extract", "find_board", "parse_board",
-    "read_colours", "read_picture", "read_stripe",
+    "read_colours", "read_picture",
 ]  # fmt: skip
 
 _ROOMS = {
     "board.board": "BoardPose board_pose find_board",
     "board.view": "BoardSpec BoardView parse_board",
     "pictures": "PictureRefused Reason check_picture read_picture",
-    "stripe.extract": "LaserChannel Mark StripeProfile StripeSettings StripeStream extract read_stripe",
+    "stripe.extract": "LaserChannel Mark StripeProfile StripeSettings StripeStream extract",
     "stripe.planes": "read_colours",
 }
 

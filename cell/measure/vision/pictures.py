@@ -96,13 +96,8 @@ def _eight_bit(image: NDArray[np.generic], path: Path) -> Image:
     return np.asarray(np.asarray(image, dtype=np.uint16) >> (bits - 8), dtype=np.uint8)
 
 
-def check_picture(image: Image, size: tuple[int, int] | None = None) -> None:
-    """Refuse an image (h, w) that is black, blinded or not of `size` (width, height) in px."""
-    height, width = image.shape[:2]
-    if size is not None and (width, height) != size:
-        raise PictureRefused(
-            Reason.WRONG_SIZE, f"the picture is {width}×{height} px, expected {size[0]}×{size[1]} like the others"
-        )
+def check_picture(image: Image) -> None:
+    """Refuse an image (h, w) that is black or blinded."""
     # A thin laser line must not make a black picture pass, hence a high percentile and not the maximum.
     counts = counts_of(image)
     bright = percentile(counts, 95)

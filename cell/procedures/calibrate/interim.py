@@ -22,7 +22,6 @@ from cell.measure.calibration import ScanObservation
 from cell.measure.calibration.drift.decision import WORST_FIT
 from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
 from cell.measure.calibration.drift.interim import HeadShift
-from cell.measure.calibration.solve.normal import AdjustmentState
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import parse_board
 from cell.procedures.arm.moves import Mover
@@ -67,11 +66,8 @@ class InterimCheck:
         near = scan.reference
         if near is None:
             raise CalibrationStale(NO_REFERENCE)
-        state = AdjustmentState(
-            scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, near.base_from_board
-        )
         seen = [PictureMeasurements(dots_of(look), k, k) for k, look in enumerate(looks)]
-        head, does = HeadShift.of(state, near, seen), at_place(calibration, job, middle)
+        head, does = HeadShift.of(scan.state(near.base_from_board), near, seen), at_place(calibration, job, middle)
         effects = [does("scan", change) for change in head.drawn(DRAWS)]
         seen_at = middle * scan.rail_direction + np.array([0.0, 0.0, job.scan.stand_off])
         ahead = scan.flange_from_camera.rotation @ seen_at

@@ -31,7 +31,7 @@ from cell.measure.calibration.drift.decision import (
     target_effect,
     verdict,
 )
-from cell.measure.calibration.drift.evidence import PictureMeasurements, Reference, dots_of, evidence
+from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of, evidence
 from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointing, turn_seen
 from cell.measure.calibration.drift.slip import WitnessCheck
 from cell.measure.calibration.solve.joint import STRIPE_POINTS
@@ -90,8 +90,7 @@ def verify(scan: ScanCalibration, target: TargetCalibration, seen: CheckObservat
     does not show the board.
     """
     near, far = references(scan, target)
-    head = _state(scan, near)
-    eye = AdjustmentState(target.camera, None, np.zeros(3), target.flange_from_camera, far.base_from_board)
+    head, eye = scan.state(near.base_from_board), target.state(far.base_from_board)
     evidences = {
         "scan": evidence(head, near, scan_looks(head, seen)),
         "target": evidence(eye, far, target_looks(seen.target)),
@@ -103,15 +102,9 @@ def check_witness(scan: ScanCalibration, seen: CheckObservations) -> WitnessChec
     """What the board says to the laser's pointing by its witness; None without one. Raises what `verify` raises."""
     if seen.pointing is None or scan.reference is None:
         return None
-    state = _state(scan, scan.reference)
+    state = scan.state(scan.reference.base_from_board)
     weighed = evidence(state, scan.reference, scan_looks(state, seen))
     return WitnessCheck.of(seen.pointing, seen.exit_point, state, weighed)
-
-
-def _state(head: ScanCalibration, of: Reference) -> AdjustmentState:
-    return AdjustmentState(
-        head.camera, head.light_plane, head.rail_direction, head.flange_from_camera, of.base_from_board
-    )
 
 
 def scan_looks(state: AdjustmentState, seen: CheckObservations) -> list[PictureMeasurements]:

@@ -18,10 +18,11 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import from_axes, from_parts
-from cell.measure.reconstruction import Cloud, ProfileBuilder, ScanGeometry
+from cell.measure.reconstruction import Cloud, ScanGeometry
 from cell.measure.vision import StripeStream
 from drivers.errors import RefusedError
 from lab.bench.calibration.world import Noise
+from lab.bench.reconstruction.scenes import swept
 from lab.paper.rig import RigSpec, TrueHead, draw_head, in_scan_frame, observe, solve
 from sim_backends.optics import Mesh, MeshInstance, PlaneInstance, SceneObject, render
 from sim_backends.world.levels import deviations
@@ -130,7 +131,7 @@ def _scan(
     spec: RigSpec, head: TrueHead, geometry: ScanGeometry, objects: list[tuple[pin.SE3, Mesh | None]],
     readings: Array, rng: np.random.Generator,
 ) -> Cloud:  # fmt: skip
-    builder, stripes = ProfileBuilder(geometry, len(readings)), StripeStream()
+    profiles, stripes = [], StripeStream()
     for reading in readings:
         scene: list[SceneObject] = []
         for pose, mesh in objects:
@@ -139,8 +140,9 @@ def _scan(
             scene.append(PlaneInstance(seen, FLAT, ALBEDO) if mesh is None else MeshInstance(seen, mesh, ALBEDO))
         frame = render(head.optics, scene, head.laser, EXPOSURE, rng)
         measured = float(reading + spec.noise.rail * rng.standard_normal())
-        builder.add(stripes.extract(frame), measured, spec.noise.rail)
-    return builder.finish(from_axes((0, 0, 0), x=(1, 0, 0), z=(0, 0, 1)), least_points=100)
+        profiles.append((stripes.extract(frame), measured))
+    here = from_axes((0, 0, 0), x=(1, 0, 0), z=(0, 0, 1))
+    return swept(geometry, profiles, spec.noise.rail, here, least_points=100)
 
 
 CAP = float(np.radians(50.0))

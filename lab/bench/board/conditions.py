@@ -72,21 +72,21 @@ class View:
     pixels: Array
 
 
-def draw_spec(kind: Kind, rng: np.random.Generator, more: int = 0) -> BoardSpec:
-    """A board of a kind with columns and rows drawn at random, `more` than usual by that many."""
+def draw_spec(kind: Kind, rng: np.random.Generator) -> BoardSpec:
+    """A board of a kind with columns and rows drawn at random."""
     if kind == "asymmetric_dots":
-        return BoardSpec(kind, int(rng.integers(4, 6)) + more, int(rng.choice([7, 9, 11])) + 2 * more, PITCH)
+        return BoardSpec(kind, int(rng.integers(4, 6)), int(rng.choice([7, 9, 11])), PITCH)
     if kind == "charuco":
         dictionary = str(rng.choice(["DICT_5X5_100", "DICT_4X4_50", "DICT_6X6_250"]))
         cols, rows = int(rng.integers(6, 10)), int(rng.integers(5, 8))
-        return BoardSpec(kind, cols + more, rows + more, PITCH, 0.7 * PITCH, dictionary)
+        return BoardSpec(kind, cols, rows, PITCH, 0.7 * PITCH, dictionary)
     if kind == "aprilgrid":
         cols, rows = int(rng.integers(5, 8)), int(rng.integers(4, 7))
-        return BoardSpec(kind, cols + more, rows + more, PITCH, PITCH * MARKER_SHARE[kind], DEFAULT_DICTIONARY[kind])
+        return BoardSpec(kind, cols, rows, PITCH, PITCH * MARKER_SHARE[kind], DEFAULT_DICTIONARY[kind])
     cols, rows = int(rng.integers(7, 12)), int(rng.integers(5, 9))
     if kind == "chessboard" and (cols + rows) % 2 == 0 and rng.random() < 0.7:
         rows += 1
-    return BoardSpec(kind, cols + more, rows + more, PITCH)
+    return BoardSpec(kind, cols, rows, PITCH)
 
 
 def draw_pose(spec: BoardSpec, lens: Lens, tilt: float, rng: np.random.Generator, share: float) -> Array:

@@ -17,6 +17,7 @@ from cell.config.cell_config import CellConfig
 from cell.measure.calibration import ScanObservation, TargetObservation
 from cell.measure.geometry.poses import from_matrix
 from cell.measure.vision import BoardSpec, BoardView, parse_board
+from cell.measure.vision.board.view import centre_of
 from cell.measure.vision.stripe.extract import StripeProfile
 from cell.motion.kinematics import HOME, Joints, arm_kinematics
 from cell.procedures.arm.photograph import CalibrationView, scan_calibration_views, target_calibration_views
@@ -152,7 +153,7 @@ class ObservedCell:
         normal, at = seen[:3, 2], seen[:3, 3]
         along = np.cross(truth.plane_normal, normal)
         system = np.array([truth.plane_normal, normal, along / np.linalg.norm(along)])
-        middle = seen[:3, :3] @ np.array(self.fine.centre) + at
+        middle = seen[:3, :3] @ centre_of(self.fine) + at
         foot = np.linalg.solve(system, np.array([truth.plane_distance, normal @ at, system[2] @ middle]))
         line = foot + np.linspace(-0.04, 0.04, 801)[:, None] * system[2]
         local = (line - at) @ seen[:3, :3]
@@ -164,7 +165,7 @@ class ObservedCell:
                 away = normal - slope * truth.plane_normal
                 line = foot + np.linspace(-0.04, 0.04, 801)[:, None] * system[2] + sag[:, None] * away / (1 - slope**2)
                 local = (line - at) @ seen[:3, :3]
-        centre = np.array(self.fine.centre)[:2]
+        centre = centre_of(self.fine)[:2]
         on = (np.abs(local[:, :2] - centre) < size / 2).all(axis=1)
         columns = np.full(height, np.nan)
         if np.count_nonzero(on) > 10:
@@ -226,7 +227,7 @@ class ObservedCell:
 def bend_of(spec: BoardSpec, sagitta: float, local: Array) -> Array:
     """How far (n,) in m a board bent along x stands out of its plane at board coordinates (n, 3)."""
     half = 0.5 * float(np.ptp(spec.points()[:, 0]))
-    return np.asarray(sagitta * ((local[:, 0] - spec.centre[0]) / half) ** 2, dtype=np.float64)
+    return np.asarray(sagitta * ((local[:, 0] - centre_of(spec)[0]) / half) ** 2, dtype=np.float64)
 
 
 def shifted(translation: Array) -> Array:

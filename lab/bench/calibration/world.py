@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from cell.config.cell_config import load_config
 from cell.measure.calibration import Priors
-from cell.measure.vision.board.view import BoardSpec, parse_board
+from cell.measure.vision.board.view import BoardSpec, centre_of, parse_board
 from cell.procedures.arm.photograph import scan_calibration_views
 from sim_backends.optics.camera import project_points, undistort_pixels
 from sim_backends.world.levels import NOMINAL
@@ -129,7 +129,7 @@ class HeadWorld:
         if along[1] < 0:
             along = -along
         system = np.array([self.plane, normal, along])
-        middle = pose[:3, :3] @ np.array(self.spec.centre) + pose[:3, 3]
+        middle = pose[:3, :3] @ centre_of(self.spec) + pose[:3, 3]
         start = np.linalg.solve(system, np.array([1.0, normal @ pose[:3, 3], along @ middle]))
         place = np.zeros(len(rows))
         pixels = np.zeros((len(rows), 2))

@@ -37,7 +37,7 @@ BORE, SINK = 0.0030, 0.0055
 
 @dataclass(frozen=True)
 class Part:
-    """A part: `height(x, y)` in m, NaN where there is none; `free` motions of its pose, in the words of the verdict.
+    """A part: `height(x, y)` in m, NaN where there is none.
 
     symmetry: "axis" turns about its z axis, "centre" about `centre` (m, surface frame) onto itself.
     """
@@ -46,7 +46,6 @@ class Part:
     title: str
     height: Height
     symmetry: Symmetry = "none"
-    free: tuple[str, ...] = ()
     round: bool = False
     centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -97,18 +96,14 @@ def _cap(x: Array, y: Array) -> Array:
     return np.asarray(SPHERE * np.sqrt(np.maximum(1.0 - (x**2 + y**2) / SPHERE**2, 0.0)) - 0.032)
 
 
-def _flat(x: Array, y: Array) -> Array:
-    return np.asarray(0.004 + 0.0 * x * y)
-
-
 PARTS = {
     part.name: part
     for part in (
         Part("pot", "free-form pot", _pot),
-        Part("turned", "pot of revolution", _turned, "axis", ("rotation about the z axis",), round=True),
+        Part("turned", "pot of revolution", _turned, "axis", round=True),
         Part("seat", "curved seat with edges", _seat),
         Part("plate", "plane with two holes", _plate),
-        Part("cap", "sphere cap", _cap, "centre", ("rotation about the x axis",) * 3, True, (0.0, 0.0, -0.032)),
+        Part("cap", "sphere cap", _cap, "centre", True, (0.0, 0.0, -0.032)),
     )
 }
 

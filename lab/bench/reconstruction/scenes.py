@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import CameraModel
@@ -22,7 +23,6 @@ LINES, ROWS = 300, 480
 LINE_STEP, ROW_STEP = 0.25e-3, 0.078e-3
 SIGMA = 25e-6
 KINDS = ("far", "near", "streak along a line", "streak along a row")
-SURFACES = ("free-form", "steps")
 CAMERAS = ((640, 480), (2048, 1088))
 """Pictures in px whose sweeps are timed."""
 
@@ -145,3 +145,23 @@ def speed(seed: int, tell: Callable[[float, str], None]) -> dict[str, list[dict[
             }
         )
     return {"speed": rows}
+
+
+def swept(
+    geometry: ScanGeometry, profiles: Iterable[tuple[StripeProfile, float]], rail_sigma: float,
+    base_from_flange: pin.SE3, least_points: int = 500,
+) -> Cloud:  # fmt: skip
+    """The cloud of profiles, each with the rail's reading ± `rail_sigma`, m, in the rail's order; the flange stood
+    still all along.
+
+    Raises `RefusedError` when fewer than `least_points` points are left.
+    """
+    builder, readings = ProfileBuilder(geometry, 2), []
+    for profile, reading in profiles:
+        builder.see(profile)
+        readings.append(reading)
+    rail = np.array(readings, dtype=np.float64)
+    order = np.argsort(rail, kind="stable")
+    flanges = np.broadcast_to(base_from_flange.homogeneous, (len(rail), 4, 4))
+    spread = np.full((len(rail), 1), rail_sigma) * builder.sweep_direction(base_from_flange)
+    return builder.place(order, flanges, rail[order], spread).require(least_points)

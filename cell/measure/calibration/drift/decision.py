@@ -234,9 +234,7 @@ def scan_effect(scan: ScanCalibration, stand_off: float, rail: tuple[float, floa
         pixels.append(scan.camera.project(np.column_stack([x, y, np.full(ROWS, z)])))
     seen, at = np.tile(np.concatenate(pixels), (len(rail), 1)), np.repeat(rail, len(DEPTHS) * ROWS)
     before = scan.geometry().solve(seen, at)[0]
-    state = AdjustmentState(
-        scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.flange_from_camera
-    )  # fmt: skip
+    state = scan.state(scan.flange_from_camera)
 
     def effect(change: Array) -> float:
         moved = state.moved(np.asarray(change, dtype=np.float64)[:SHARED])
@@ -249,8 +247,7 @@ def scan_effect(scan: ScanCalibration, stand_off: float, rail: tuple[float, floa
 
 def target_effect(target: TargetCalibration, change: Array, camera_from_place: Array) -> float:
     """How far in m a change (27,) of the calibration moves a place that lies at (3,) m in the target camera's frame."""
-    state = AdjustmentState(target.camera, None, np.zeros(3), target.flange_from_camera, target.flange_from_camera)
-    moved = state.moved(np.asarray(change, dtype=np.float64)[:SHARED])
+    moved = target.state(target.flange_from_camera).moved(np.asarray(change, dtype=np.float64)[:SHARED])
     before, after = target.camera, moved.camera
     # The same picture through the other lens: a shift of the principal point turns the rays, a focal length stretches
     # the distance.
@@ -298,11 +295,6 @@ class Detectable:
     change: Change
     size: float
     step: Array
-
-    @property
-    def enough(self) -> bool:
-        """Whether a change of the size that has to be found shows."""
-        return self.size <= self.change.wanted
 
     @property
     def words(self) -> str:

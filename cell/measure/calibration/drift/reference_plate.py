@@ -59,12 +59,7 @@ class Roll:
 
 def rolled(plane: LightPlane, exit_point: Array, angle: float) -> LightPlane:
     """The light plane turned by `angle`, rad, about its beam's middle, through the laser's exit, camera frame."""
-    stripe = np.cross(plane.n, np.cross(plane.along, plane.n))
-    stripe /= np.linalg.norm(stripe)
-    normal = np.cos(angle) * plane.n + np.sin(angle) * stripe
-    # The exit is known as drawn; off the plane by what it is, it stays off by as much.
-    off = float(plane.n @ exit_point) - plane.distance
-    return LightPlane.of(normal, float(normal @ exit_point) - off).bowed(plane.bow)
+    return _leaning(plane, exit_point, angle, _stripe(plane))
 
 
 def roll_of(moved: Array, by_roll: Array) -> Roll:
@@ -293,13 +288,21 @@ def turn_seen(before: PlateLine, now: PlateLine, camera: CameraModel, plane: Lig
 
 def turned(plane: LightPlane, exit_point: Array, angle: float) -> LightPlane:
     """The light plane turned by `angle`, rad, about the stripe's direction through the laser's exit, camera frame."""
-    about = np.cross(plane.n, np.cross(plane.along, plane.n))
-    about /= np.linalg.norm(about)
-    normal = np.cos(angle) * plane.n + np.sin(angle) * np.cross(about, plane.n)
+    return _leaning(plane, exit_point, angle, np.cross(_stripe(plane), plane.n))
+
+
+def _stripe(plane: LightPlane) -> Array:
+    """The stripe's direction (3,)."""
+    stripe = np.cross(plane.n, np.cross(plane.along, plane.n))
+    return np.asarray(stripe / np.linalg.norm(stripe))
+
+
+def _leaning(plane: LightPlane, exit_point: Array, angle: float, towards: Array) -> LightPlane:
+    """With its normal turned by `angle`, rad, `towards` a direction in the plane (3,)."""
+    normal = np.cos(angle) * plane.n + np.sin(angle) * towards
     # The exit is known as drawn; off the plane by what it is, it stays off by as much.
     off = float(plane.n @ exit_point) - plane.distance
-    made = LightPlane.of(normal, float(normal @ exit_point) - off)
-    return made.bowed(plane.bow)
+    return LightPlane.of(normal, float(normal @ exit_point) - off).bowed(plane.bow)
 
 
 def _columns(camera: CameraModel, plane: LightPlane, points: Array) -> Array:

@@ -17,7 +17,7 @@ import pinocchio as pin
 
 from cell.measure.calibration.archive import ScanObservation
 from cell.measure.calibration.drift.evidence import dots_of
-from cell.measure.calibration.solve.normal import BOARD, POSITION, AdjustmentState, dots_block
+from cell.measure.calibration.solve.normal import BOARD, POSITION, dots_block
 from cell.measure.geometry.camera import Array
 from cell.measure.vision import BoardView
 from drivers.errors import CalibrationStale, Measured, RefusedError
@@ -251,9 +251,7 @@ def _displacements(
         raise CalibrationStale(
             "the stored calibration holds no reference, an older program made it; run `cell calibrate`"
         )
-    state = AdjustmentState(
-        scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.reference.base_from_board
-    )  # fmt: skip
+    state = scan.state(scan.reference.base_from_board)
     frames = [frame for sweep in sweeps for frame in sweep.frames]
     looks = [dots_of(ScanObservation(frame.view, None, base_from_flange, frame.rail)) for frame in frames]
     # The board's place as all of them see it: in the mean over to and fro.

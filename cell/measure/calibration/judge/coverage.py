@@ -22,7 +22,7 @@ from cell.measure.calibration.solve.results import KEPT, PARAMETERS
 from cell.measure.geometry.camera import Array, seen_centres
 from cell.measure.geometry.poses import from_parts, transform
 from cell.measure.reconstruction.build import ScanGeometry
-from cell.measure.vision.board.view import BoardSpec
+from cell.measure.vision.board.view import BoardSpec, centre_of
 
 GRID = (8, 6)
 """Cells of the picture, columns and rows."""
@@ -151,9 +151,7 @@ class Places:
 def derivatives(state: AdjustmentState, covariance: Array, places: Places) -> Array:
     """∂point/∂parameter (n, 3, 21) in the base, by differences of a tenth of each parameter's deviation."""
     made = np.zeros((len(places.pixels), 3, KEPT))
-    still = AdjustmentState(
-        state.camera, state.plane, state.rail_direction, state.flange_from_camera, state.base_from_board
-    )  # without the views' own
+    still = replace(state, flanges=[], rails=np.zeros(0))
     for k, sigma in enumerate(np.sqrt(np.maximum(np.diag(covariance)[:KEPT], 0.0))):
         if sigma == 0:
             continue
@@ -310,7 +308,7 @@ def _view(joint: Joint, board: BoardSpec, at: Array, turn: Array, rail: float) -
     """A view as it would be, the board's middle at `at` (3,) in m in the camera, turned by (rx, ry, rz) in rad."""
     state = joint.adjusted.state
     rotation = pin.rpy.rpyToMatrix(*turn)
-    camera_from_board = from_parts(at - rotation @ np.array(board.centre), rotation)
+    camera_from_board = from_parts(at - rotation @ centre_of(board), rotation)
     flange_from_camera = state.flange_from_camera * from_parts(rail * state.rail_direction)
     flange = state.base_from_board * (flange_from_camera * camera_from_board).inverse()
     radius = joint.views[0].dot_radius
@@ -339,7 +337,7 @@ def _stripe(state: AdjustmentState, board: BoardSpec, camera_from_board: pin.SE3
     """Pixels (n, 2), at most `count`, where light plane and board meet, in the picture and clear of the dots."""
     assert state.plane is not None
     normal = camera_from_board.rotation[:, 2]
-    middle = transform(camera_from_board, np.array(board.centre))
+    middle = transform(camera_from_board, centre_of(board))
     along = np.cross(state.plane.n, normal)
     along /= np.linalg.norm(along)
     system = np.array([state.plane.n, normal, along])

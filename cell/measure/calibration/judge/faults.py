@@ -17,7 +17,7 @@ import scipy
 from numpy.typing import NDArray
 
 from cell.measure.calibration.solve.adjustment import Adjusted
-from cell.measure.calibration.solve.intrinsics import Intrinsics, adjustment_of, surface_shapes
+from cell.measure.calibration.solve.intrinsics import Intrinsics, adjustment_of, data_of, surface_shapes
 from cell.measure.calibration.solve.normal import CAMERA, FLANGE, SHARED, ViewData, dots_block
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.poses import angle_apart, difference, from_parts, perturbed
@@ -267,7 +267,7 @@ def own_cameras(
     Or for each of the groups, masks (n,) of views. The gain is that of one step from the adjustment of all views, as in
     a score test.
     """
-    adjustment, start = adjustment_of(found.model, found.camera, views)
+    adjustment, start = adjustment_of(found.model, found.camera, data_of(views, found.camera))
     state = adjustment.solve(start, ROUNDS).state
     free = np.flatnonzero(adjustment.free)
     parts: list[tuple[Array, Array]] = []

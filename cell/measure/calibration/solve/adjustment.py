@@ -94,7 +94,6 @@ class Adjusted:
     dots_rms_px: float
     stripe_rms_m: float
     priors: Priors
-    iterations: int
     excess: dict[str, float] = field(default_factory=dict)
     bow: Bow | None = None
 
@@ -126,13 +125,11 @@ class Adjustment:
         state = replace(
             start, flanges=[v.base_from_flange for v in self.views], rails=np.array([v.rail for v in self.views])
         )
-        iterations = 0
         normal = self.normal_at(state)
         for turn in range(variance_rounds + 1):
             # Until the noise is settled there is no point in the last digits.
             settled = 1e-3 if turn < variance_rounds else 1e-9
-            state, normal, used = self._minimise(state, normal, settled)
-            iterations += used
+            state, normal = self._minimise(state, normal, settled)
             if turn < variance_rounds:
                 self._update_noise(normal)
                 normal = self.normal_at(state)
@@ -144,7 +141,6 @@ class Adjustment:
             normal.total / expected,
             *self.residual_rms(state),
             self.priors,
-            iterations,
             {name: _scatter(normal, inverse, name) for name in ("shift", "turn", "rail")},
         )
 
@@ -156,17 +152,15 @@ class Adjustment:
                 dots.append(dots_block(state, view, flange, float(rail))[0].ravel())
             if len(view.stripe) and state.plane is not None:
                 stripe.append(stripe_block(state, view, flange, float(rail))[0])
-        return _rms(np.concatenate(dots)), _rms(np.concatenate(stripe))
+        return rms_of(np.concatenate(dots)), rms_of(np.concatenate(stripe))
 
-    def _minimise(self, state: AdjustmentState, normal: Normal, settled: float) -> tuple[AdjustmentState, Normal, int]:
+    def _minimise(self, state: AdjustmentState, normal: Normal, settled: float) -> tuple[AdjustmentState, Normal]:
         damping = 1e-6
-        used = 0
         for _ in range(STEPS):
             step = normal.step(damping)
             # A minimum that is reached promises nothing; trying on would only meet the last digits' noise.
             if normal.promised(step) < settled * normal.total + 1e-9:
                 break
-            used += 1
             if not np.isfinite(step).all():
                 break
             candidate = state.moved(step)
@@ -178,7 +172,7 @@ class Adjustment:
                 damping *= 20
                 if damping > 1e4:
                     break
-        return state, normal, used
+        return state, normal
 
     def rows_of(self, k: int, state: AdjustmentState) -> list[tuple[str, Array, Array, float]]:
         """Of view `k`: group, whitened rows (m, 34) and residuals (m,), robust weights included, and robust cost."""
@@ -286,7 +280,8 @@ def huber(size: Array) -> tuple[Array, float]:
     return weight, float(cost.sum())
 
 
-def _rms(values: Array) -> float:
+def rms_of(values: Array) -> float:
+    """NaN of none."""
     return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")
 
 

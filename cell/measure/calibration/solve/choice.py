@@ -143,7 +143,7 @@ def choose_solution(
             name, adjusted, views, free, left=left, pictures=pictures.covariance, joint=True, camera_free=camera_free
         )
 
-    plain = closed_form(observations, staged, views, held)
+    plain, plain_left = closed_form(observations, staged, views, held)
     weights = [(float(np.clip(t * arm[0], *ARM_RANGE)), float(np.clip(t * arm[1], *TURN_RANGE))) for t in TRUSTS]
     if arm[0] > 2 * GOOD_ARM[0]:
         weights.append(GOOD_ARM)
@@ -155,9 +155,9 @@ def choose_solution(
     if camera_may_move:
         tried += [solved(weights[best], share, True) for share in shares]
     # All follow the camera in the same way, the closed form too.
-    follow = replace(plain.left, by_held=first[best].left.by_held)
+    follow = replace(plain_left, by_held=first[best].left.by_held)
     closed = Solution(
-        "closed form (Park-Martin)", plain.adjusted, views, held, left=follow, pictures=pictures.covariance, joint=False
+        "closed form (Park-Martin)", plain, views, held, left=follow, pictures=pictures.covariance, joint=False
     )
     sound = [closed, *(s for s in tried if not _bent(s, pictures))]
     return Choice(min(sound, key=_handicapped), closed, [closed, *tried], arm)
@@ -218,18 +218,10 @@ def _arm_scatter(views: Sequence[ViewData], held: Mask, staged: Staged) -> tuple
     return found.arm_translation, found.arm_rotation
 
 
-@dataclass(frozen=True, eq=False)
-class ClosedForm:
-    """The closed form as an adjustment would return it, and how the others predict each frame."""
-
-    adjusted: Adjusted
-    left: LeftOut
-
-
 def closed_form(
     observations: Sequence[ScanObservation], staged: Staged, views: list[ViewData], free: Mask
-) -> ClosedForm:
-    """Hand-eye and light plane of all frames, and of all but one, with the same camera."""
+) -> tuple[Adjusted, LeftOut]:
+    """Hand-eye and light plane of all frames, as an adjustment would return them, and of all but one."""
     flanges, boards = [o.base_from_flange for o in observations], staged.camera_from_board
     clouds = points_on_boards(staged, observations)
     state = replace(start_state(staged), flanges=flanges, rails=np.zeros(len(views)))
@@ -253,7 +245,7 @@ def closed_form(
     seen = replace(state, flanges=[flange_seen(state, board) for board in boards])
     dots, stripe = Adjustment(views, free, Priors()).residual_rms(seen)
     nothing = np.zeros((SHARED, SHARED))
-    return ClosedForm(Adjusted(state, nothing, float("nan"), dots, stripe, priors=Priors(), iterations=0), left)
+    return Adjusted(state, nothing, float("nan"), dots, stripe, priors=Priors()), left
 
 
 def flange_seen(state: AdjustmentState, camera_from_board: pin.SE3) -> pin.SE3:

@@ -115,11 +115,11 @@ class _LensFit:
 def choose_lens(views: Sequence[BoardView]) -> tuple[Intrinsics, Intrinsics]:
     """The camera with the lens model that the views support, and the one without distortion. Raises RefusedError."""
     start = zhang(views, lens=False)
-    plain = _fitted(PLAIN, start, _data(views, start))
+    plain = _fitted(PLAIN, start, data_of(views, start))
     if len(views) < LEAST_LEFT_OUT:
         # Too few to choose a lens: what one with distortion would say is not known better.
         try:
-            other = _fitted(RADIAL[0], start, _data(views, start)).camera
+            other = _fitted(RADIAL[0], start, data_of(views, start)).camera
         except (RefusedError, np.linalg.LinAlgError):
             other = None
         found = _intrinsics(plain, views, {}, other)
@@ -127,10 +127,10 @@ def choose_lens(views: Sequence[BoardView]) -> tuple[Intrinsics, Intrinsics]:
     fits = [plain]
     try:
         curved = zhang(views)
-        data = _data(views, curved)
+        data = data_of(views, curved)
         fits += [_fitted(model, curved, data) for model in RADIAL]
     except RefusedError:
-        curved, data = start, _data(views, start)
+        curved, data = start, data_of(views, start)
     best = min(fits, key=lambda fit: fit.held_out)
     for name, terms in FURTHER:
         if name == "tangential" and len(views) < TANGENTIAL_VIEWS:
@@ -166,7 +166,7 @@ def given_camera(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:
 
 def beside_given(camera: CameraModel, views: Sequence[BoardView]) -> Intrinsics:
     """Focal lengths and principal point that the views give by themselves, with the lens of a camera that is known."""
-    return _intrinsics(_fitted(GIVEN, camera, _data(views, camera)), views, {})
+    return _intrinsics(_fitted(GIVEN, camera, data_of(views, camera)), views, {})
 
 
 def _clearly_better(more: _LensFit, less: _LensFit) -> bool:
@@ -177,14 +177,8 @@ def _clearly_better(more: _LensFit, less: _LensFit) -> bool:
     return bool(gain.sum() > CLEAR_DEVIATIONS * np.sqrt(len(gain)) * gain.std(ddof=1))
 
 
-def adjustment_of(
-    model: LensModel, start: CameraModel, views: Sequence[BoardView]
-) -> tuple[Adjustment, AdjustmentState]:
+def adjustment_of(model: LensModel, start: CameraModel, data: list[ViewData]) -> tuple[Adjustment, AdjustmentState]:
     """The adjustment of a camera with such a lens and of each view's pose, and where it starts."""
-    return _adjustment(model, start, _data(views, start))
-
-
-def _adjustment(model: LensModel, start: CameraModel, data: list[ViewData]) -> tuple[Adjustment, AdjustmentState]:
     free = np.zeros(SHARED, dtype=np.bool_)
     free[CAMERA] = model.free
     at = AdjustmentState(model.held(start), None, np.zeros(3), pin.SE3.Identity(), pin.SE3.Identity())
@@ -192,7 +186,7 @@ def _adjustment(model: LensModel, start: CameraModel, data: list[ViewData]) -> t
 
 
 def _fitted(model: LensModel, start: CameraModel, data: list[ViewData]) -> _LensFit:
-    adjustment, at = _adjustment(model, start, data)
+    adjustment, at = adjustment_of(model, start, data)
     result = adjustment.solve(at, ROUNDS)
     left = leave_out(adjustment, result) if len(data) >= LEAST_LEFT_OUT else None
     bend = bend_of(adjustment, result.state) if left is not None else None
@@ -234,7 +228,8 @@ def _pull(camera: CameraModel, left: LeftOut, covariance: Array) -> Array:
     return np.asarray(np.einsum("ni,ij,nj->n", apart, np.linalg.pinv(covariance[:4, :4]), apart) / 4)
 
 
-def _data(views: Sequence[BoardView], camera: CameraModel) -> list[ViewData]:
+def data_of(views: Sequence[BoardView], camera: CameraModel) -> list[ViewData]:
+    """The views for an adjustment, each with the board's pose in the camera for its flange."""
     poses = [board_pose(view, camera).camera_from_board.inverse() for view in views]
     return [
         ViewData(v.object_points, v.pixels, v.sigma, dot_radius=v.dot_radius, base_from_flange=pose)

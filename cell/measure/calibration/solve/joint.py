@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cell.measure.calibration.archive import ScanObservation
 from cell.measure.calibration.judge.scale import BoardSize
-from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment, Priors, shared_mask
+from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment, Priors, rms_of, shared_mask
 from cell.measure.calibration.solve.bow import with_bow
 from cell.measure.calibration.solve.normal import (
     CAMERA,
@@ -195,7 +195,7 @@ def _held_out(views: list[ViewData], free: NDArray[np.bool_], adjusted: Adjusted
             off, away = residuals_as_reported(result.state, view)
             dots.append(off.ravel())
             stripe.append(away)
-    return _rms(np.concatenate(dots)), _rms(np.concatenate(stripe))
+    return rms_of(np.concatenate(dots)), rms_of(np.concatenate(stripe))
 
 
 def residuals_as_reported(state: AdjustmentState, view: ViewData) -> tuple[Array, Array]:
@@ -233,7 +233,3 @@ def effective_hand_eye_covariance(joint: Joint) -> Array:
         return np.asarray(covariance[HAND, HAND], dtype=np.float64)
     mean = np.mean(parts, axis=0)
     return np.asarray(0.5 * (mean + mean.T), dtype=np.float64)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else float("nan")

@@ -115,6 +115,12 @@ class ScanCalibration:
         """The camera's pose in the flange frame at a rail position in m."""
         return self.flange_from_camera * from_parts(rail_position * self.rail_direction)
 
+    def state(self, base_from_board: pin.SE3) -> AdjustmentState:
+        """As an adjustment knows it, with the board there."""
+        return AdjustmentState(
+            self.camera, self.light_plane, self.rail_direction, self.flange_from_camera, base_from_board
+        )
+
     def geometry(self) -> ScanGeometry:
         """What triangulation needs."""
         return ScanGeometry(self.camera, self.light_plane, self.rail_direction, self.flange_from_camera)
@@ -126,9 +132,7 @@ class ScanCalibration:
 
     def variants(self) -> list[ScanGeometry]:
         """The geometry moved by one standard deviation along each independent direction of the covariance."""
-        state = AdjustmentState(
-            self.camera, self.light_plane, self.rail_direction, self.flange_from_camera, pin.SE3.Identity()
-        )
+        state = self.state(pin.SE3.Identity())
         made = []
         by_bow = self.bow_sigma * self.bow_gain
         steps = list(covariance_root(self.covariance - np.outer(by_bow, by_bow)).T)
@@ -236,6 +240,10 @@ class TargetCalibration:
             Reference.of(joint.adjusted),
         )
 
+    def state(self, base_from_board: pin.SE3) -> AdjustmentState:
+        """As an adjustment knows it, with the board there; no light plane, no rail."""
+        return AdjustmentState(self.camera, None, np.zeros(3), self.flange_from_camera, base_from_board)
+
     def as_dict(self) -> dict[str, object]:
         """For storage."""
         return {
@@ -263,26 +271,12 @@ def sigmas(covariance: Array) -> dict[str, float]:
     return dict(zip(PARAMETERS, np.sqrt(np.maximum(0.0, np.diag(covariance))).tolist(), strict=True))
 
 
-def calibrate_scan(
-    observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
-) -> ScanCalibration:
-    """Closed form and joint adjustment; raises `RefusedError` when the observations do not determine it."""
-    return ScanCalibration.of(adjust_scan(observations, nominal, rail_direction, priors))
-
-
 def adjust_scan(
     observations: Sequence[ScanObservation], nominal: CameraModel, rail_direction: Array, priors: Priors
 ) -> Joint:
     """The joint adjustment of the scan head; observations of one rest share what the arm's repeatability made there."""
     staged = solve_staged(observations, nominal, rail_direction)
     return _solve(observations, staged, priors, camera="scan", board="fine", nominal=nominal)
-
-
-def calibrate_target(
-    observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors
-) -> TargetCalibration:
-    """The same for a camera without laser and rail."""
-    return TargetCalibration.of(adjust_target(observations, nominal, priors))
 
 
 def adjust_target(observations: Sequence[TargetObservation], nominal: CameraModel, priors: Priors) -> Joint:

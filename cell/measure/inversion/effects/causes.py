@@ -162,7 +162,7 @@ class _Cells:
         raw = np.array([np.median(each) for each in groups])
         scatter = [np.median(np.abs(np.diff(each))) for each, good in zip(groups, many, strict=True) if good]
         raw = raw[many]
-        sweeps = cloud.sweeps[line] if len(cloud.sweeps) else 0 * line
+        sweeps = cloud.sweep_of[line]
         at = mean(line.astype(np.float64), times[line], row.astype(np.float64), sweeps.astype(np.float64))
         poses = mean(found.jacobian)
         # Each sweep has a pose of its own: what that is off by is no cause.

@@ -69,7 +69,7 @@ def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.S
     mean = np.bincount(of, rows.heights, minlength=cloud.shape[0])[good] / count[good]
     sums = [np.bincount(of, scan.points[rows.index, axis], minlength=len(good)) for axis in range(3)]
     places = np.column_stack(sums)[good] / count[good, None]
-    sweeps = cloud.sweeps[good] if len(cloud.sweeps) else np.zeros(len(mean), dtype=np.intp)
+    sweeps = cloud.sweep_of[good]
     made = [_Sweep.of(times[good][here], mean[here], places[here]) for here in _each(sweeps)]
     known = [sweep for sweep in made if sweep is not None]
     if sum(len(sweep.times) for sweep in known) < LEAST_LINES:
@@ -153,7 +153,7 @@ def rocking_motions(
     """(n, 3, 4 s) displacements in m, base axes, of the points at (lines, rows) by the sine and the cosine of roll and
     pitch, each of `size` rad, in each of s sweeps."""
     arms = cloud.points[lines, rows] - base_from_vehicle.translation
-    sweeps = cloud.sweeps[lines] if len(cloud.sweeps) else np.zeros(len(lines), dtype=np.intp)
+    sweeps = cloud.sweep_of[lines]
     waves = _waves(times[lines], hz)
     count = int(sweeps.max()) + 1 if len(sweeps) else 1
     motions = np.zeros((len(lines), 3, 4 * count))
@@ -308,7 +308,7 @@ def bow(cloud: Cloud, nominal: NominalSurface, pose: pin.SE3, head: Head) -> tup
     # Least squares of each line: how far it lies off along the camera's axis.
     square = np.bincount(of, facing**2, minlength=cloud.shape[0])[good]
     off = np.bincount(of, facing * found.heights, minlength=cloud.shape[0])[good] / np.maximum(square, 1e-6)
-    sweeps = cloud.sweeps[good] if len(cloud.sweeps) else np.zeros(len(off), dtype=np.intp)
+    sweeps = cloud.sweep_of[good]
     way = head.share[good]
     own = (sweeps[:, None] == np.unique(sweeps)).astype(np.float64)
     columns = np.hstack([(way**2)[:, None], own, own * way[:, None]])

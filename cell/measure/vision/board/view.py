@@ -97,12 +97,6 @@ class BoardSpec:
         return np.column_stack([flat, np.zeros(len(flat))]).astype(np.float64)
 
     @property
-    def centre(self) -> tuple[float, float, float]:
-        """Middle of the points in the board frame in m."""
-        x, y, z = (float(v) for v in 0.5 * (self.points().min(axis=0) + self.points().max(axis=0)))
-        return (x, y, z)
-
-    @property
     def dot_radius(self) -> float:
         """Radius of a dot in m where the kind of board fixes it, else 0 (corners, or dots of any size)."""
         return 0.25 * self.pitch if self.kind == "marked_dots" else 0.0

@@ -4,8 +4,6 @@
 (docs/explanation/theory.md, section 5, with what other ways make of the same pictures). What it means in space is the
 business of the geometry.
 
-The stripe of a picture of which nothing is known but that a line laser was on: how it runs, and in which colour.
-
 The stripe in pictures that stream by, such as a sweep's: what they have in common is measured in some of them.
 
 Laser, lens and surface make the speckle, camera and exposure the noise, not the single picture: both are measured in
@@ -23,7 +21,6 @@ from numpy.typing import NDArray
 
 from cell.measure.vision.pictures import Dark, Taken
 from cell.measure.vision.stripe.careful.careful import read_carefully
-from cell.measure.vision.stripe.careful.follow import FAINTEST, CoarseLines, choose_mix, coarse, refuse_unsure
 from cell.measure.vision.stripe.careful.surroundings import widen_what_departs
 from cell.measure.vision.stripe.ordinary.quick import DOUBLE, QuickVerdict, read_quickly, refuse_white
 from cell.measure.vision.stripe.planes import FULL, Picture, as_picture
@@ -141,47 +138,14 @@ def _check(image: Taken, dark: Dark | None) -> None:
         raise ValueError(f"the image is {image.shape[1]}×{image.shape[0]} px; at least 32×32 are needed")
 
 
-LEAST_POINTS = 30
-
-
-def read_stripe(
-    image: Taken, off: Dark | None = None, laser: LaserChannel | str = LaserChannel.AUTO,
-    settings: StripeSettings | None = None,
-) -> StripeProfile | None:  # fmt: skip
-    """The stripe of `image` (h, w), (h, w, 3) or (h, w, 4), red first, along rows or columns, whichever it follows.
-
-    `off` is a picture of the same view without the laser, `laser` the channel to read it in. None where no line of
-    LEAST_POINTS points is found. Raises what `extract` raises, and PictureRefused where it is not sure which line is
-    the laser's.
-    """
-    settings, laser = settings or StripeSettings(), LaserChannel(laser)
-    picture, dark = subtracted(image, off, settings)
-    looks: dict[Axis, tuple[CoarseLines, str]] = {}
-    for axis in ("rows", "columns"):
-        part = picture if axis == "rows" else picture.turned()
-        shade = None if dark is None else (dark if axis == "rows" else dark.turned())
-        mix = choose_mix(part, shade, laser)
-        value = part.plane(mix)[0] if shade is None else part.plane(mix)[0] - shade.plane(mix)[0]
-        looks["rows" if axis == "rows" else "columns"] = coarse(value), mix
-    best = max(looks, key=lambda axis: looks[axis][0].chain.score)
-    if looks[best][0].chain.score < FAINTEST:
-        return None
-    refuse_unsure(*looks[best])
-    profile = extract(image, off, best, settings, laser=laser)
-    return profile if len(profile.rows) >= LEAST_POINTS else None
-
-
 BLOCK = 16
 """Pictures for which what was measured holds: 1.6 mm of a sweep at .1 mm a profile."""
 
 
 class StripeStream:
-    """`extract` for one picture after the other of a stream, all of one size and axis."""
+    """`extract` for one picture after the other of a stream, all of one size, with the stripe along rows."""
 
-    def __init__(self, dark: Dark | None = None, axis: Axis = "rows", settings: StripeSettings | None = None) -> None:
-        self._dark = dark
-        self._axis = axis
-        self._settings = settings
+    def __init__(self) -> None:
         self._like: StripeProfile | None = None
         self._seen = 0
 
@@ -189,7 +153,7 @@ class StripeStream:
         """The profile of the next picture (h, w); raises what `extract` raises."""
         if self._seen % BLOCK == 0:
             self._like = None
-        profile = extract(image, self._dark, self._axis, self._settings, like=self._like)
+        profile = extract(image, like=self._like)
         # A block's first picture that shows too few lines, such as a covered one, says nothing of the others.
         told = profile.speckle is not None or profile.learned is not None
         self._like = profile if told else replace(profile, noise=None)

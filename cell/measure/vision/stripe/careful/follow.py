@@ -3,7 +3,7 @@
 A row's response is how far a spot stands above *both* its sides, so that an edge of the scene answers little.
 Candidates of neighbouring rows are chained by dynamic programming: a chain may bend and have gaps; a jump, such as a
 step of the surface makes, costs as much as several clear rows are worth. A coarse look in some rows says in which mix
-of colours the line stands out, and whether it is surely the laser's.
+of colours the line stands out.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.base.compiled import compiled
-from cell.measure.vision.pictures import PictureRefused, Reason
 from cell.measure.vision.stripe.careful.learning import FREE_SCALE
 from cell.measure.vision.stripe.careful.shaped_fit import Noise, Plane, binned, fit_shape, gaussian
 from cell.measure.vision.stripe.careful.surroundings import around, carried, surrounded
@@ -317,11 +316,6 @@ def difference(
     return value - shade, usable & fine, shade
 
 
-CLEAR = 10.0
-"""A line that says this much for itself, over noise and what else is in the picture, a row on average, is taken."""
-MOST_RIVAL = 0.36
-"""A fainter one only where the next best line says no more than this share of what it says. In pictures of seven
-set-ups the right lines below CLEAR had at most 0.32, those of which an eighth or more was wrong 0.39 and more."""
 APART = 4.0
 """Widths beside the line from which on another one begins."""
 
@@ -331,29 +325,3 @@ def without_line(found: Candidates, chain: StripeChain) -> Candidates:
     width = float(np.median(found.scale[chain.rows, chain.which]))
     own = np.interp(np.arange(len(found.rows)), chain.rows, found.place[chain.rows, chain.which])
     return replace(found, clear=np.where(np.abs(found.place - own[:, None]) > APART * width, found.clear, 0.0))
-
-
-def rivalry(look: CoarseLines) -> float:
-    """What the next best line of a picture says for itself, over what the one that was followed says."""
-    found, chain = look.found, look.chain
-    if not len(chain.rows):
-        return 0.0
-    rest = without_line(found, chain)
-    return _said(rest, follow(rest)) / max(_said(found, chain), 1e-6)
-
-
-def refuse_unsure(look: CoarseLines, mix: str) -> None:
-    """Refuse a picture whose line is neither clear nor without a rival; `mix` is what it was looked for in."""
-    rival = rivalry(look)
-    if look.chain.score >= CLEAR or rival <= MOST_RIVAL:
-        return
-    raise PictureRefused(
-        Reason.AMBIGUOUS,
-        f"which line is the laser's is not sure: in {mix} the best has {look.chain.score:.1f} (sure from {CLEAR:.0f}), "
-        f"another says {rival:.2f} of what it says, allowed {MOST_RIVAL}; give a colour picture, or that of the same "
-        "view with the laser off, or darken the room",
-    )
-
-
-def _said(found: Candidates, chain: StripeChain) -> float:
-    return float(np.sum(np.minimum(found.clear[chain.rows, chain.which], MOST) - LEAST))

@@ -225,10 +225,9 @@ class Fitted:
 
 
 def fit_shape(
-    plane: Plane, lines: NDArray[np.intp], starts: Array, shape: Shape, noise: Noise, scale_prior: float,
-    log_scales: Array | None = None,
-) -> Fitted:  # fmt: skip
-    """Fit `lines` (m,) of `plane` from `starts` (m,) px; the scale's logarithm is `log_scales` (m,) ± `scale_prior`.
+    plane: Plane, lines: NDArray[np.intp], starts: Array, shape: Shape, noise: Noise, scale_prior: float
+) -> Fitted:
+    """Fit `lines` (m,) of `plane` from `starts` (m,) px; the scale's logarithm is 0 ± `scale_prior`.
 
     Unknown are centre, amplitude, scale and a linear background.
     """
@@ -247,11 +246,10 @@ def fit_shape(
     )
     # What is lighter or darker than its surroundings is not known exactly to be so.
     speckle = noise.contrast**2 + (ALBEDO_DOUBT * (1 - 1 / albedo)) ** 2
-    expected = np.zeros(len(lines)) if log_scales is None else log_scales
     ramp = np.broadcast_to(offset / half, value.shape)
     centre = starts - origin
-    amplitude, level, slope = _linear_start(value, usable, offset, centre, log_scale=expected, shape=shape, ramp=ramp)
-    found = np.stack([centre, amplitude, expected, level, slope], axis=1)
+    amplitude, level, slope = _linear_start(value, usable, offset, centre, shape=shape, ramp=ramp)
+    found = np.stack([centre, amplitude, np.zeros(len(lines)), level, slope], axis=1)
     good = usable.sum(axis=1) > LEAST_PIXELS
     going = good.copy()
     inverses = np.zeros((len(lines), PARAMETERS, PARAMETERS))
@@ -260,12 +258,11 @@ def fit_shape(
     table = shape.first, shape.step, np.ascontiguousarray(shape.value), np.ascontiguousarray(shape.slope)
     pixels = value, usable, shade, albedo, speckle, offset / half
     limits = scale_prior**-2, LARGEST_STEP * shape.width, float(half)
-    expected = np.ascontiguousarray(expected, dtype=np.float64)
     for _ in range(STEPS):
         began = going[left]
         _improve(
-            left, table, pixels, noise=(noise.floor, noise.gain), expected=expected, limits=limits, found=found,
-            good=good, going=going, inverses=inverses,
+            left, table, pixels, noise=(noise.floor, noise.gain), limits=limits, found=found, good=good, going=going,
+            inverses=inverses,
         )  # fmt: skip
         left = left[began]
         if not going.any():
@@ -289,7 +286,7 @@ def fit_shape(
 @compiled
 def _improve(
     lines: NDArray[np.intp], table: tuple[float, float, Array, Array],
-    pixels: tuple[Array, NDArray[np.bool_], Array, Array, Array, Array], noise: tuple[float, float], expected: Array,
+    pixels: tuple[Array, NDArray[np.bool_], Array, Array, Array, Array], noise: tuple[float, float],
     limits: tuple[float, float, float], found: Array, good: NDArray[np.bool_], going: NDArray[np.bool_],
     inverses: Array,
 ) -> None:  # fmt: skip  # pragma: no cover
@@ -332,7 +329,7 @@ def _improve(
                 for j in range(i + 1):
                     normal[i, j] += weighted * row[j]
         normal[2, 2] += precision
-        right[2] += precision * (expected[line] - now[2])
+        right[2] -= precision * now[2]
         for i in range(5):
             scale[i] = np.sqrt(max(normal[i, i], 1e-30))
         # Cholesky's factor, and then its inverse in the same place.
@@ -371,7 +368,7 @@ def _improve(
         far = change[0] * change[0] > CONVERGED * CONVERGED * max(inverse[0, 0], 1e-8) or abs(change[2]) > 1e-3
         if not good[line]:
             now[0] = 0.0
-        now[2] = min(max(now[2], expected[line] - 1.5), expected[line] + 1.5)
+        now[2] = min(max(now[2], -1.5), 1.5)
         going[line] = began and good[line] and far
 
 
@@ -392,11 +389,10 @@ def _model(
 
 
 def _linear_start(
-    value: Array, usable: NDArray[np.bool_], offset: NDArray[np.intp], centre: Array, log_scale: Array, shape: Shape,
-    ramp: Array,
-) -> tuple[Array, Array, Array]:  # fmt: skip
-    """Amplitude, level and slope (m,) that fit best where centre and scale are as given."""
-    profile, _ = shape.at((offset - centre[:, None]) * np.exp(-log_scale)[:, None])
+    value: Array, usable: NDArray[np.bool_], offset: NDArray[np.intp], centre: Array, shape: Shape, ramp: Array
+) -> tuple[Array, Array, Array]:
+    """Amplitude, level and slope (m,) that fit best where the centre is as given, with the profile's own scale."""
+    profile, _ = shape.at(offset - centre[:, None])
     basis = np.stack([profile, np.ones_like(ramp), ramp], axis=1) * usable[:, None, :]
     normal = basis @ np.swapaxes(basis, 1, 2) + 1e-6 * np.eye(3)
     right = np.einsum("mpk,mk->mp", basis, value)

@@ -7,8 +7,9 @@ import pytest
 
 from cell.config.calibrations.store import nominal_camera, solve_observations
 from cell.config.cell_config import load_config
-from cell.measure.calibration import TargetObservation, calibrate_scan
+from cell.measure.calibration import ScanCalibration, TargetObservation
 from cell.measure.calibration.archive import Observations
+from cell.measure.calibration.solve.results import adjust_scan
 from cell.measure.geometry.poses import from_parts
 from lab.bench.calibration.campaign import observe
 from lab.bench.calibration.world import Noise, draw_head
@@ -28,7 +29,7 @@ def archived(world) -> Observations:
     camera = nominal_camera(config.scan_camera)
     priors = NOISE.priors
     # The same views serve a camera without a rail, on a flange that went where the carriage had gone.
-    head = calibrate_scan(scan, camera, np.array([1.0, 0.0, 0.0]), priors)
+    head = ScanCalibration.of(adjust_scan(scan, camera, np.array([1.0, 0.0, 0.0]), priors))
     along = head.flange_from_camera.rotation @ head.rail_direction
     target = [TargetObservation(o.view, o.base_from_flange * from_parts(o.rail_position * along), o.name) for o in scan]
     return Observations(scan, target, camera, camera, priors, 2e-3, {"arm": "A1", "rail": "R1"}, "abc", 1.7e9)

@@ -10,24 +10,14 @@ import pytest
 from cell.measure.geometry import poses
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane, triangulate
+from tests.unit.cell.measure.geometry.test_board_projection import CAMERA, numerical
 
-CAMERA = CameraModel(640, 480, 1666.0, 1670.0, 322.0, 236.0, (-0.12, 0.21, 1.1e-3, -0.7e-3, -0.05))
 THETA = np.arctan(3.5)
 
 
 def points_in_front(n: int = 50) -> np.ndarray:
     rng = np.random.default_rng(4)
     return np.column_stack([rng.uniform(-0.02, 0.02, n), rng.uniform(-0.015, 0.015, n), rng.uniform(0.11, 0.15, n)])
-
-
-def numerical(f, x, step=1e-6):
-    """Central differences of a vector function at x: (outputs, inputs)."""
-    columns = []
-    for k in range(len(x)):
-        d = np.zeros(len(x))
-        d[k] = step
-        columns.append((f(x + d) - f(x - d)) / (2 * step))
-    return np.column_stack(columns)
 
 
 def test_projection_is_opencvs():
@@ -160,14 +150,3 @@ def test_covariances_travel_like_random_perturbations():
     )
     expected = poses.compose_covariance(a_from_b, cov_ab, b_from_c, cov_bc)
     assert np.abs(np.cov(draws.T) - expected).max() < 0.05 * np.abs(expected).max()
-
-
-def test_a_points_covariance_includes_its_poses():
-    pose = pin.SE3.Random()
-    point, delta = np.array([[0.1, -0.2, 0.5]]), 1e-6
-    for k in range(6):
-        d = np.zeros(6)
-        d[k] = delta
-        moved = (poses.transform(poses.perturbed(pose, d), point) - poses.transform(pose, point))[0]
-        cov = poses.point_covariances(pose, np.outer(d, d), point, np.zeros((1, 3, 3)))[0]
-        np.testing.assert_allclose(cov, np.outer(moved, moved), atol=1e-17)

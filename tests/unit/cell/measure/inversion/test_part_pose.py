@@ -87,9 +87,10 @@ def test_what_moves_part_and_surface_alike_leaves_nothing_open_and_what_moves_on
         high = ((points - TRUE.translation) @ TRUE.rotation)[:, 2] > 0.0135
         return 0.2e-3 * high[:, None, None] * TRUE.rotation[:, :1]
 
-    sure, same, own = (np.sqrt(np.diag(found(moved).covariance)) for moved in (nothing, alike, apart))
+    looked = [found(moved) for moved in (nothing, alike, apart)]
+    sure, same, own = (np.sqrt(np.diag(one.covariance)) for one in looked)
     assert sure[:3].max() < 0.02e-3 and np.allclose(same, sure, rtol=0.2)
     assert own[0] == pytest.approx(0.2e-3, rel=0.15)
-    seen = found(alike)
+    seen = looked[1]
     assert np.abs(seen.surface_from_part.translation).max() < 0.04e-3 and seen.beside > 1000
     assert np.linalg.norm(seen.base_from_surface.translation - TRUE.translation) < 0.04e-3

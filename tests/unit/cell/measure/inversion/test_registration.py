@@ -22,7 +22,7 @@ from cell.measure.inversion.registration import register
 from cell.measure.reconstruction import Cloud, merge
 from drivers.errors import ConfigError, NotObservable, RefusedError
 from lab.bench.inversion.campaign import judge_case
-from lab.bench.inversion.scenes import PARTS, Setting, scan
+from lab.bench.inversion.scenes import PARTS, TRUE, Setting, scan, start_away
 from lab.bench.inversion.scenes import nominal as part_surface
 
 Array = NDArray[np.float64]
@@ -31,7 +31,6 @@ Height = Callable[[Array, Array], Array]
 
 SIGMA = 40e-6
 RAIL_SIGMA = 8e-6
-TRUE = pin.SE3(pin.exp3(np.array([0.01, -0.02, 0.03])), np.array([0.75, 0.01, 0.05]))
 JOB = Tolerance(translation=0.0006, rotation=0.006)
 LOOSE = np.diag([0.008**2] * 3 + [np.radians(20) ** 2] * 3)
 BOARD = np.diag([0.002**2] * 3 + [np.radians(0.6) ** 2] * 3)
@@ -62,11 +61,6 @@ def flat(x: Array, y: Array) -> Array:
 def ledges(x: Array, y: Array) -> Array:
     """Two steep ledges that cross on a plane, m: of all points 0.7 and 1.3 % lie on them."""
     return 0.004 + 0.003 * np.clip(x / 0.0005, 0.0, 1.0) + 0.002 * np.clip((y - 0.004) / 0.0005, 0.0, 1.0)
-
-
-def cap(x: Array, y: Array) -> Array:
-    """A cap of a sphere of radius 40 mm about (0, 0, −32) mm, m."""
-    return -0.032 + np.sqrt(np.maximum(0.040**2 - x**2 - y**2, 0.0))
 
 
 @cache
@@ -117,12 +111,6 @@ def scanned(
     )  # fmt: skip
 
 
-def start_away(rng: np.random.Generator, metres: float, degrees: float) -> pin.SE3:
-    way, axis = rng.normal(size=3), rng.normal(size=3)
-    turn = np.radians(degrees) * axis / np.linalg.norm(axis)
-    return perturbed(TRUE, np.concatenate([metres * way / np.linalg.norm(way), turn]))
-
-
 def inverted(height: Height, cloud: Cloud, prior: Prior, **options: object) -> PlacePose:
     return invert_pose(cloud, nominal(height), prior, JOB, **options)  # type: ignore[arg-type]
 
@@ -166,43 +154,18 @@ def test_a_mesh_is_read_in_its_unit_and_refused_in_the_wrong_one(tmp_path: Path)
 
 
 @pytest.mark.parametrize("height", [freeform, seat])
-@pytest.mark.parametrize("missing", [0.0, 0.4])
-def test_the_true_pose_is_found_from_the_boards_with_the_uncertainty_stated(height: Height, missing: float) -> None:
+def test_the_true_pose_is_found_from_the_boards_with_the_uncertainty_stated(height: Height) -> None:
     rng = np.random.default_rng(5)
     scores = []
     for seed in range(6):
         prior = Prior(perturbed(TRUE, rng.normal(size=6) * np.sqrt(np.diag(BOARD))), BOARD)
-        found = register(Scan.of(scanned(height, seed, missing=missing), 4000), nominal(height), prior)
+        found = register(Scan.of(scanned(height, seed, missing=0.4 * (seed % 2)), 4000), nominal(height), prior)
         error = difference(found.base_from_surface, TRUE)
         assert np.linalg.norm(error[:3]) < 30e-6
         assert np.linalg.norm(error[3:]) < 1e-3
         scores.append(error @ np.linalg.solve(found.covariance, error))
     # The mean of six χ² variables of six degrees of freedom, within four of its standard deviations.
     assert 6 - 4 * np.sqrt(12 / 6) < np.mean(scores) < 6 + 4 * np.sqrt(12 / 6)
-
-
-@pytest.mark.parametrize("height", [freeform, seat])
-def test_the_pose_is_found_from_twenty_degrees_and_eight_millimetres_away(height: Height) -> None:
-    rng = np.random.default_rng(7)
-    scan = Scan.of(scanned(height, 3), 3000)
-    for _ in range(4):
-        start = start_away(rng, 0.008, 20.0)
-        found = register(scan, nominal(height), Prior(start, LOOSE))
-        error = difference(found.base_from_surface, TRUE)
-        assert np.linalg.norm(error[:3]) < 50e-6
-        assert np.linalg.norm(error[3:]) < 1.5e-3
-
-
-@pytest.mark.campaign
-@pytest.mark.parametrize("height", [freeform, seat])
-def test_at_least_99_of_100_starts_lead_to_the_true_pose(height: Height) -> None:
-    rng = np.random.default_rng(11)
-    lost = 0
-    for k in range(100):
-        scan = Scan.of(scanned(height, k, missing=0.4 * (k % 2)), 3000)
-        found = register(scan, nominal(height), Prior(start_away(rng, 0.008, 20.0), LOOSE))
-        lost += bool(np.linalg.norm(difference(found.base_from_surface, TRUE)[:3]) > 1e-4)
-    assert lost <= 1
 
 
 def test_a_prior_that_is_sharper_than_the_scan_is_followed() -> None:
@@ -319,28 +282,10 @@ def test_a_prior_that_is_off_does_not_pull_the_pose_from_steep_walls(seed: int) 
     assert np.linalg.norm(difference(found.base_from_surface, TRUE)[:3]) < 1e-4
 
 
-def test_a_plane_leaves_three_motions_open() -> None:
-    with pytest.raises(NotObservable) as caught:
-        inverted(flat, scanned(flat, 1, outliers=0.0), Prior(TRUE, BOARD))
-    assert str(caught.value).count("is not determined") == 3
-    assert "rotation about the z axis" in str(caught.value)
-    assert "translation along" in str(caught.value)
-
-
-def test_a_sphere_turns_freely_about_its_centre() -> None:
-    sharp = np.diag([0.002**2] * 3 + [0.0005**2] * 3)
-    board = perturbed(TRUE, [0.0003, 0.0002, -0.0004, 0, 0, 0])
-    surface = nominal(cap)
-    pose = invert_pose(scanned(cap, 1), surface, Prior(board, sharp), Tolerance(0.0006, 0.006))
-    assert len(pose.verdict.unseen) == 3
-    assert any("through (" in words and "-3" in words for words in pose.verdict.unseen)
-
-
 def test_a_freeform_surface_leaves_nothing_to_the_board() -> None:
     pose = inverted(freeform, scanned(freeform, 4), Prior(TRUE, BOARD))
     assert pose.verdict.unseen == ()
-    assert pose.verdict.observable
-    assert pose.verdict.spectrum[0] > 1e-3
+    assert not pose.verdict.weak
 
 
 # --- refusals ---
@@ -387,31 +332,20 @@ def test_every_part_is_found_from_far_away_with_foreign_objects_on_it_and_40_per
         assert turn < 2e-3
 
 
-@pytest.mark.parametrize(
-    ("part", "motions"),
-    [
-        ("turned", ["rotation about the z axis of the surface frame is not determined"]),
-        (
-            "cap",
-            [
-                "rotation about the z axis of the surface frame is not determined",
-                r"rotation about the x axis of the surface frame through \(-?0.0, -?0.0, -32.0\) mm is not determined",
-                r"rotation about the y axis of the surface frame through \(-?0.0, -?0.0, -32.0\) mm is not determined",
-            ],
-        ),
-    ],
-)
-def test_the_motions_that_a_part_leaves_open_are_named_one_by_one(part: str, motions: list[str]) -> None:
+def test_the_motions_that_a_sphere_leaves_open_are_named_one_by_one() -> None:
     with pytest.raises(NotObservable) as caught:
-        invert_pose(scan(PARTS[part], np.random.default_rng(4)), part_surface(part), Prior(TRUE, BOARD), JOB)
-    assert str(caught.value).count("is not determined: 3σ") == len(motions)
-    for motion in motions:
-        assert re.search(motion, str(caught.value)), motion
+        invert_pose(scan(PARTS["cap"], np.random.default_rng(4)), part_surface("cap"), Prior(TRUE, BOARD), JOB)
+    assert str(caught.value).count("is not determined: 3σ") == 3
+    assert "rotation about the z axis of the surface frame is not determined" in str(caught.value)
+    for axis in "xy":
+        through = rf"rotation about the {axis} axis of the surface frame through \(-?0.0, -?0.0, -32.0\) mm is not"
+        assert re.search(through, str(caught.value))
 
 
 def test_a_plane_slides_along_two_axes_and_turns_about_its_normal() -> None:
     with pytest.raises(NotObservable) as caught:
         inverted(flat, scanned(flat, 1, outliers=0.0), Prior(TRUE, BOARD))
+    assert str(caught.value).count("is not determined") == 3
     for motion in ("translation along the x axis", "translation along the y axis", "rotation about the z axis"):
         assert motion in str(caught.value)
 
@@ -419,7 +353,7 @@ def test_a_plane_slides_along_two_axes_and_turns_about_its_normal() -> None:
 def test_a_verdict_names_what_is_known_worst_with_three_of_its_deviations() -> None:
     sigmas = np.array([0.1e-3, 0.15e-3, 0.1e-3, 1e-3, 1e-3, 1e-3])
     known = judge(np.diag(sigmas**2), 1e9 * np.eye(6), 1.0, 1, 0.02, JOB)
-    assert known.observable
+    assert not known.weak
     assert known.worst.words.startswith("translation along the y axis of the surface frame is known: 3σ 0.45 mm ≤ 0.6")
     sigmas[[1, 5]] = 0.5e-3, 4e-3
     verdict = judge(np.diag(sigmas**2), 1e9 * np.eye(6), 1.0, 1, 0.02, JOB)
@@ -434,7 +368,7 @@ def test_a_verdict_names_what_is_known_worst_with_three_of_its_deviations() -> N
 
 @pytest.mark.parametrize("case", ["bent 0.3 to 3 mm", "turned by 180°", "mirrored"])
 @pytest.mark.parametrize(
-    "seeds", [range(2), pytest.param(range(2, 8), marks=pytest.mark.campaign)], ids=["few", "more"]
+    "seeds", [range(1), pytest.param(range(1, 8), marks=pytest.mark.campaign)], ids=["few", "more"]
 )
 def test_no_surface_that_is_not_the_nominal_one_leads_outside_the_tolerance(case: str, seeds: range) -> None:
     ended = [judge_case(case, seed).ended for seed in seeds]

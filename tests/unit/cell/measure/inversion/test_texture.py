@@ -81,14 +81,14 @@ def noisy(seed: int, lines: float = 0.0) -> np.ndarray:
 
 
 def test_noise_is_never_taken_for_a_surface() -> None:
-    for made in (measure_texture(scanned(noisy(seed, lines=20e-6))) for seed in range(24)):
+    for made in (measure_texture(scanned(noisy(seed, lines=20e-6))) for seed in range(12)):
         assert (made.sa, made.sq, made.sz) == (None, None, None) and made.limit is not None
         assert f"below {1e3 * made.limit:.4f} mm cannot be told from the sensor's noise" in made.reason
 
 
 def test_the_noise_is_taken_out_of_the_figures() -> None:
     plain = told(scanned(sine(0.06e-3)))[1]
-    made = [measure_texture(scanned(sine(0.06e-3) + noisy(seed))) for seed in range(24)]
+    made = [measure_texture(scanned(sine(0.06e-3) + noisy(seed))) for seed in range(12)]
     off = np.array([(each.sq or np.nan) / plain - 1.0 for each in made])
     raw = np.array([np.hypot(each.sq or np.nan, each.noise or np.nan) / plain - 1.0 for each in made])
     assert abs(off.mean()) < 0.01 < 0.05 < raw.mean() and np.abs(off).max() < 0.05

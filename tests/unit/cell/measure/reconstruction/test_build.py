@@ -1,4 +1,4 @@
-"""The cloud lies where an independent ray trace puts the surface, its noise is what it says, outliers are out."""
+"""The cloud lies where an independent ray trace puts the surface, and its noise is what it says."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from cell.measure.reconstruction import (
     deviation_colours,
     write_ply,
 )
-from cell.measure.reconstruction.outliers import find_outliers
 from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
+from lab.bench.reconstruction.scenes import swept
 
 Array = NDArray[np.float64]
 
@@ -65,11 +65,11 @@ def table_stripe(rail: float) -> Array:
 
 def built(noise: float = 0.0, lines: int = 60) -> Cloud:
     rng = np.random.default_rng(0)
-    builder = ProfileBuilder(GEOMETRY, expected_lines=16)
-    for rail in np.linspace(0.02, 0.08, lines):
-        centres = table_stripe(rail) + noise * rng.standard_normal(480)
-        assert builder.add(profile(centres, max(noise, 0.01)), rail, 1e-6) == 480
-    return builder.finish(BASE_FROM_FLANGE)
+    profiles = (
+        (profile(table_stripe(rail) + noise * rng.standard_normal(480), max(noise, 0.01)), rail)
+        for rail in np.linspace(0.02, 0.08, lines)
+    )
+    return swept(GEOMETRY, profiles, 1e-6, BASE_FROM_FLANGE)
 
 
 # --- triangulation and frames ---
@@ -103,12 +103,9 @@ def test_the_noise_of_the_points_is_what_the_cloud_says() -> None:
 
 
 def test_an_error_of_the_rail_moves_a_whole_line_as_its_spread_says() -> None:
-    clouds = []
-    for error in (0.0, 2e-5):
-        builder = ProfileBuilder(GEOMETRY)
-        for rail in np.linspace(0.04, 0.05, 10):
-            builder.add(profile(table_stripe(rail)), rail + error, 2e-5)
-        clouds.append(builder.finish(BASE_FROM_FLANGE))
+    seen = [(profile(table_stripe(rail)), rail) for rail in np.linspace(0.04, 0.05, 10)]
+    told = ([(one, rail + error) for one, rail in seen] for error in (0.0, 2e-5))
+    clouds = [swept(GEOMETRY, profiles, 2e-5, BASE_FROM_FLANGE) for profiles in told]
     moved = clouds[1].points - clouds[0].points
     assert np.abs(moved - clouds[0].rail_spread[:, None]).max() < 1e-12
     assert np.linalg.norm(clouds[0].rail_spread, axis=1) == pytest.approx(2e-5 * np.linalg.norm(RAIL))
@@ -119,21 +116,18 @@ def test_another_calibration_moves_the_points_as_foretold() -> None:
     other = ScanGeometry(CAMERA, LightPlane.of((1.0, 0.01, -1 / 3.501), -0.03512), RAIL * 1.0002, MOUNT)
     lines, rows = cloud.subsample(500)
     foretold = calibration_motions(cloud, lines, rows, BASE_FROM_FLANGE, GEOMETRY, [other])[:, :, 0]
-    builder = ProfileBuilder(other)
-    for rail in cloud.rail:
-        builder.add(profile(table_stripe(rail)), rail, 1e-6)
-    seen = builder.finish(BASE_FROM_FLANGE).points[lines, rows] - cloud.points[lines, rows]
+    moved = swept(other, ((profile(table_stripe(rail)), rail) for rail in cloud.rail), 1e-6, BASE_FROM_FLANGE)
+    seen = moved.points[lines, rows] - cloud.points[lines, rows]
     assert np.abs(foretold - seen).max() < 1e-9
     assert np.abs(foretold).max() > 1e-5
 
 
 def test_rows_without_a_stripe_are_holes_and_lines_are_sorted() -> None:
-    builder = ProfileBuilder(GEOMETRY)
-    for rail in (0.042, 0.040, 0.044, 0.041, 0.043):
-        centres = table_stripe(rail)
-        centres[100:200] = np.nan
-        builder.add(profile(centres), rail, 1e-5)
-    cloud = builder.finish(BASE_FROM_FLANGE)
+    rails = (0.042, 0.040, 0.044, 0.041, 0.043)
+    centres = [table_stripe(rail) for rail in rails]
+    for columns in centres:
+        columns[100:200] = np.nan
+    cloud = swept(GEOMETRY, zip(map(profile, centres), rails, strict=True), 1e-5, BASE_FROM_FLANGE)
     assert np.all(np.diff(cloud.rail) > 0)
     assert np.all(np.isnan(cloud.points[:, 100:200]))
     assert cloud.size == 5 * 380
@@ -141,14 +135,12 @@ def test_rows_without_a_stripe_are_holes_and_lines_are_sorted() -> None:
 
 def test_a_profile_of_another_camera_is_refused() -> None:
     with pytest.raises(ValueError, match="camera of 480 rows"):
-        ProfileBuilder(GEOMETRY).add(profile(np.full(1024, 300.0)), 0.0, 1e-5)
+        ProfileBuilder(GEOMETRY).see(profile(np.full(1024, 300.0)))
 
 
 def test_a_sweep_without_points_is_refused() -> None:
-    builder = ProfileBuilder(GEOMETRY)
-    builder.add(profile(np.full(480, np.nan)), 0.0, 1e-5)
     with pytest.raises(RefusedError, match="gave 0 points in 1 profiles"):
-        builder.finish(BASE_FROM_FLANGE)
+        swept(GEOMETRY, [(profile(np.full(480, np.nan)), 0.0)], 1e-5, BASE_FROM_FLANGE)
 
 
 def test_a_subsample_is_spread_over_all_lines_and_rows() -> None:
@@ -157,50 +149,6 @@ def test_a_subsample_is_spread_over_all_lines_and_rows() -> None:
     assert len(lines) <= 2000
     assert np.bincount(lines, minlength=60).min() > 20
     assert np.histogram(rows, bins=10, range=(0, 480))[0].min() > 150
-
-
-# --- outliers ---
-
-
-def relief(name: str, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Depth (256, 480) of a curved surface with noise, m, as a sweep samples it, and the noise's σ."""
-    x, y = np.meshgrid((np.arange(256) - 128) * 0.25e-3, (np.arange(480) - 240) * 0.078e-3, indexing="ij")
-    depth = 0.0015 * np.sin(150 * x + 70 * y) + 0.0011 * np.sin(230 * y - 90 * x)
-    if name == "steps":
-        depth = 3 * x**2 + 6 * y**2 + 0.0012 * np.tanh((0.97 * x - 0.24 * y - 0.01) / 0.0008)
-    sigma = 25e-6 * rng.uniform(0.7, 1.5, x.shape)
-    return depth + sigma * rng.standard_normal(x.shape), sigma
-
-
-def spoil(depth: Array, kind: str, share: float, rng: np.random.Generator) -> NDArray[np.bool_]:
-    bad = np.zeros(depth.shape, dtype=bool)
-    if kind == "streak":
-        # Streaks along a line, some lines apart so that each stands alone.
-        for line in rng.permutation(np.arange(3, 253, 7)):
-            if bad.mean() >= share:
-                break
-            first = rng.integers(5, 400)
-            bad[line, first : first + rng.integers(20, 70)] = True
-    else:
-        bad = rng.random(depth.shape) < share
-    low, high = (0.002, 0.008) if kind == "far" else (0.00028, 0.0008)
-    offset = rng.uniform(low, high, depth.shape) * np.where(kind == "streak", 1, rng.choice([-1, 1], depth.shape))
-    depth[bad] += offset[bad]
-    return bad
-
-
-@pytest.mark.parametrize("name", ["free-form", "steps"])
-@pytest.mark.parametrize("kind", ["far", "near", "streak"])
-@pytest.mark.parametrize("share", [0.01, 0.05])
-def test_outliers_are_found_and_little_else(name: str, kind: str, share: float) -> None:
-    rng = np.random.default_rng(4)
-    depth, sigma = relief(name, rng)
-    bad = spoil(depth, kind, share, rng)
-    depth[rng.random(depth.shape) < 0.02] = np.nan
-    bad &= np.isfinite(depth)
-    found = find_outliers(depth, sigma)
-    assert np.count_nonzero(found & bad) / np.count_nonzero(bad) >= 0.99
-    assert np.count_nonzero(found & bad) / np.count_nonzero(found) >= 0.90
 
 
 # --- PLY ---
@@ -215,8 +163,7 @@ def test_a_ply_is_read_back_by_another_library(tmp_path: Path) -> None:
     quality = points[:, :, 2] - TABLE
     colours = deviation_colours(quality, 1e-4)
     path = tmp_path / "cloud.ply"
-    normals = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    count = write_ply(path, points, normals=normals, quality=quality, colours=colours, comment="frame: arm base")
+    count = write_ply(path, points, quality=quality, colours=colours, comment="frame: arm base")
     kept = np.isfinite(points[:, :, 0])
     assert count == kept.sum()
     loaded = trimesh.load(path)
@@ -225,4 +172,4 @@ def test_a_ply_is_read_back_by_another_library(tmp_path: Path) -> None:
     header = path.read_bytes().split(b"end_header")[0].decode()
     for line in ("format binary_little_endian 1.0", "comment coordinates in metres", "comment frame: arm base"):
         assert line in header.splitlines()
-    assert path.stat().st_size == len(header) + len("end_header\n") + count * (7 * 4 + 3)
+    assert path.stat().st_size == len(header) + len("end_header\n") + count * (4 * 4 + 3)

@@ -24,6 +24,7 @@ from cell.motion.trajectory import FlangeTrack
 from drivers.clock import ClockMap, Latch
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmSafety, ArmState
+from lab.bench.reconstruction.scenes import swept
 from tests.unit.cell.measure.reconstruction.test_build import BASE_FROM_FLANGE, GEOMETRY, MOUNT, RAIL, TABLE
 
 Array = NDArray[np.float64]
@@ -64,15 +65,16 @@ def profile(centres: Array, rng: np.random.Generator) -> StripeProfile:
     )
 
 
-def swept(shift: tuple[float, float, float], error: Array, seed: int, lines: int = 16) -> Cloud:
+def scanned(shift: tuple[float, float, float], error: Array, seed: int, lines: int = 16) -> Cloud:
     """A rail sweep from a flange moved by `shift`, which is told to stand `error` (translation) from where it is."""
     rng = np.random.default_rng(seed)
     true = pin.SE3(BASE_FROM_FLANGE.rotation, BASE_FROM_FLANGE.translation + shift)
     told = pin.SE3(true.rotation, true.translation + error)
-    builder = ProfileBuilder(GEOMETRY)
-    for rail in np.linspace(0.047, 0.053, lines):
-        builder.add(profile(stripe(true * MOUNT * pin.SE3(np.eye(3), rail * RAIL)), rng), rail, 1e-6)
-    return builder.finish(told)
+    profiles = (
+        (profile(stripe(true * MOUNT * pin.SE3(np.eye(3), rail * RAIL)), rng), rail)
+        for rail in np.linspace(0.047, 0.053, lines)
+    )
+    return swept(GEOMETRY, profiles, 1e-6, told)
 
 
 ERROR = np.array([0.0, 0.0, 4e-5])
@@ -80,7 +82,7 @@ ERROR = np.array([0.0, 0.0, 4e-5])
 
 @pytest.fixture(scope="module")
 def pair() -> Cloud:
-    return merge([swept((0, 0, 0), np.zeros(3), 1), swept((0.0, 0.012, 0.0), ERROR, 2)])
+    return merge([scanned((0, 0, 0), np.zeros(3), 1), scanned((0.0, 0.012, 0.0), ERROR, 2)])
 
 
 def repeatability(sigma: float) -> list[Array]:
@@ -122,7 +124,7 @@ def test_a_sweep_without_neighbouring_lines_makes_no_seam(pair: Cloud) -> None:
 
 def test_a_pose_error_moves_its_own_sweep_as_the_motions_say() -> None:
     told = [np.zeros((6, 6)), np.diag([0, 0, 9e-10, 1e-8, 0, 0])]
-    cloud = merge([swept((0, 0, 0), np.zeros(3), 1, 8), swept((0, 0.012, 0), np.zeros(3), 2, 8)])
+    cloud = merge([scanned((0, 0, 0), np.zeros(3), 1, 8), scanned((0, 0.012, 0), np.zeros(3), 2, 8)])
     lines, rows = cloud.subsample(600)
     motions = flange_motions(cloud, lines, rows, told)
     covariance = np.einsum("nim,njm->nij", motions, motions)
@@ -156,7 +158,7 @@ def test_a_leaning_vehicle_moves_the_base_under_the_sweeps_as_the_motions_say(pa
 
 
 def test_a_sweep_by_the_rail_alone_does_not_move_the_base() -> None:
-    cloud = swept((0, 0, 0), np.zeros(3), 1, 4)
+    cloud = scanned((0, 0, 0), np.zeros(3), 1, 4)
     lines, rows = cloud.subsample(50)
     assert np.abs(lean_motions(cloud, lines, rows, pin.SE3.Identity(), 1e-3)).max() < 1e-12
 
@@ -194,7 +196,7 @@ def test_a_sweep_by_the_arm_lies_where_one_by_the_rail_does() -> None:
 
 
 def test_clouds_that_do_not_belong_together_are_not_merged() -> None:
-    one = swept((0, 0, 0), np.zeros(3), 1, 8)
+    one = scanned((0, 0, 0), np.zeros(3), 1, 8)
     without = Cloud(one.points, one.stripe_spread, one.rail_spread, one.centres, one.rail, one.rejected)
     with pytest.raises(ValueError, match="does not know where the flange stood"):
         merge([one, without])

@@ -73,9 +73,6 @@ def test_interpolated_points_are_never_measurements() -> None:
     assert not measured[whole.filled.lines, whole.filled.rows].any()
 
 
-# --- outliers ---
-
-
 # --- files ---
 
 

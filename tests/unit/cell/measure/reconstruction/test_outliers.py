@@ -37,9 +37,11 @@ def test_a_lone_point_is_an_outlier_and_an_empty_cloud_has_none() -> None:
     assert find_outliers(depth, np.full_like(depth, 1e-5))[10, 10]
 
 
+@pytest.mark.parametrize("surface", ["free-form", "steps"])
 @pytest.mark.parametrize("kind", KINDS)
-def test_whole_runs_and_near_outliers_are_found_too(kind: str) -> None:
-    made = scene("steps", kind, 0.03, 8)
+@pytest.mark.parametrize("share", [0.01, 0.05])
+def test_outliers_are_found_and_little_else(surface: str, kind: str, share: float) -> None:
+    made = scene(surface, kind, share, 8)
     found = find_outliers(made.depth, made.sigma)
     assert np.count_nonzero(found & made.bad) >= 0.99 * np.count_nonzero(made.bad)
     assert np.count_nonzero(found & made.bad) >= 0.90 * np.count_nonzero(found)

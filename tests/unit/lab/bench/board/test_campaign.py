@@ -28,7 +28,7 @@ def seen(name, kind, seed=0):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("name", ["even light", "defocus sigma 3 px", "cluttered background"])
+@pytest.mark.parametrize("name", ["defocus sigma 3 px", "cluttered background"])
 def test_a_board_is_found_with_every_point_under_its_own_name(name, kind):
     tally = BoardTally()
     judge(seen(name, kind), "found", tally)
@@ -69,22 +69,3 @@ def test_dots_seen_through_a_lens_leave_no_bias_in_the_pose(kind, tilt):
     assert np.abs(error[3:]).max() < 3e-5
     # Corners where the dots are: without the conic's projection the same pixels give a worse fit.
     assert board_pose(replace(view, dot_radius=0.0), camera_of(lens)).rms_px > 10 * found.rms_px
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_stated_covariance_of_the_pose_is_that_of_the_errors(kind):
-    rng = np.random.default_rng(11)
-    squares = []
-    for _ in range(60):
-        spec, lens = draw_spec(kind, rng), LENSES[int(rng.integers(3))]
-        placed = Placed(spec, draw_pose(spec, lens, float(rng.uniform(0.25, 0.8)), rng, 0.7))
-        truth = true_pixels(lens, placed)
-        sigma = np.full(len(truth), 0.05)
-        pixels = truth + rng.normal(0, 0.05, truth.shape)
-        radius = placed.radius if kind in DOTS else 0.0
-        view = BoardView(spec, (lens.width, lens.height), np.arange(len(truth)), pixels, sigma, False, radius)
-        found = board_pose(view, camera_of(lens))
-        error = difference(found.camera_from_board, pin.SE3(placed.pose))
-        squares.append(error @ np.linalg.solve(found.covariance, error))
-    # 360 degrees of freedom: one standard deviation of the mean is .07 of it.
-    assert 0.86 < np.sqrt(np.mean(squares) / 6) < 1.14

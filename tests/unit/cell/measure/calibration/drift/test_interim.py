@@ -13,7 +13,7 @@ from cell.config.cell_config import load_config
 from cell.measure.calibration import ScanObservation
 from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
 from cell.measure.calibration.drift.interim import CHANCE, SUSPICIOUS, HeadShift
-from cell.measure.calibration.solve.normal import HAND, AdjustmentState
+from cell.measure.calibration.solve.normal import HAND
 from cell.measure.geometry.poses import from_matrix
 from cell.procedures.arm.photograph import interim_view
 from lab.bench.calibration.observed_cell import ObservedCell, shifted
@@ -38,10 +38,7 @@ def look(cell: ObservedCell, calibration: CellCalibration, rests: int) -> HeadSh
         photo = cell.scan_view(rest, cell.carriage(view.rail_position))
         one = ScanObservation(photo, None, from_matrix(rest.reported), view.rail_position)
         seen.append(PictureMeasurements(dots_of(one), k, k))
-    state = AdjustmentState(
-        scan.camera, scan.light_plane, scan.rail_direction, scan.flange_from_camera, scan.reference.base_from_board
-    )
-    return HeadShift.of(state, scan.reference, seen)
+    return HeadShift.of(scan.state(scan.reference.base_from_board), scan.reference, seen)
 
 
 def test_a_head_that_nobody_touched_is_as_uncertain_as_it_is_said(

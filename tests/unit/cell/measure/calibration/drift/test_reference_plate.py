@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cell.measure.calibration.drift.reference_plate import LARGEST_RAD, PlateLine, Pointing, pointing, rolled, turned
-from cell.measure.geometry.camera import CameraModel
+from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane, triangulate
 from drivers.errors import RefusedError
 from sim_backends.optics.camera import CameraOptics
@@ -20,7 +20,7 @@ CAMERA = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5)
 LASER = LaserOptics()
 PLANE = LightPlane.of(LASER.normal, LASER.distance)
 EXIT = np.array([-0.035, 0.0, 0.0])
-SIGMA = 0.02
+SIGMA, WALL = 0.02, 0.130
 
 
 def pointed(angle: float) -> LaserOptics:
@@ -53,6 +53,15 @@ def seen(
     return PlateLine(0.0, columns, np.full(480, SIGMA))
 
 
+def wall(laser: LaserOptics, now: LightPlane, shift: float = 0.0) -> list[Array]:
+    """Points on a wall 130 mm away by the plane of the calibration and by `now`, the picture `shift` px aside."""
+    pose = np.eye(4)
+    pose[2, 3] = WALL
+    there = crossings(OPTICS, laser, PlaneInstance(pose, (0.2, 0.2)))
+    pixels = np.column_stack([there.columns + shift, there.rows])
+    return [triangulate(CAMERA, plane, pixels)[0] for plane in (PLANE, now)]
+
+
 @pytest.mark.parametrize("angle", [0.5e-3, -0.2e-3, 0.0])
 def test_the_turn_is_found_and_its_deviation_is_right(angle: float) -> None:
     off = []
@@ -67,25 +76,15 @@ def test_the_turn_is_found_and_its_deviation_is_right(angle: float) -> None:
 
 def test_depths_are_right_again_on_the_turned_plane() -> None:
     found = pointing(seen(0.0, 1), seen(0.5e-3, 2), CAMERA, PLANE, EXIT)
-    wall = np.eye(4)
-    wall[2, 3] = 0.130
-    there = crossings(OPTICS, pointed(0.5e-3), PlaneInstance(wall, (0.2, 0.2)))
-    pixels = np.column_stack([there.columns, there.rows])
-    before, _ = triangulate(CAMERA, PLANE, pixels)
-    after, _ = triangulate(CAMERA, turned(PLANE, EXIT, found.turn), pixels)
-    assert np.abs(before[:, 2] - 0.130).mean() > 0.2e-3
-    assert np.abs(after[:, 2] - 0.130).mean() < 0.02e-3
+    before, after = wall(pointed(0.5e-3), turned(PLANE, EXIT, found.turn))
+    assert np.abs(before[:, 2] - WALL).mean() > 0.2e-3
+    assert np.abs(after[:, 2] - WALL).mean() < 0.02e-3
 
 
 def test_a_shifted_picture_does_no_harm_to_depths_either() -> None:
     found = pointing(seen(0.0, 3), seen(0.0, 4, shift=0.3), CAMERA, PLANE, EXIT)
-    wall = np.eye(4)
-    wall[2, 3] = 0.130
-    there = crossings(OPTICS, LASER, PlaneInstance(wall, (0.2, 0.2)))
-    pixels = np.column_stack([there.columns + 0.3, there.rows])
-    before, _ = triangulate(CAMERA, PLANE, pixels)
-    after, _ = triangulate(CAMERA, turned(PLANE, EXIT, found.turn), pixels)
-    assert np.abs(after[:, 2] - 0.130).mean() < 0.2 * np.abs(before[:, 2] - 0.130).mean()
+    before, after = wall(LASER, turned(PLANE, EXIT, found.turn), shift=0.3)
+    assert np.abs(after[:, 2] - WALL).mean() < 0.2 * np.abs(before[:, 2] - WALL).mean()
 
 
 @pytest.mark.parametrize("turn", [2 * LARGEST_RAD, -2 * LARGEST_RAD])
@@ -137,13 +136,8 @@ def test_a_laser_that_rolled_about_its_beam_tilts_nothing_any_more(angle: float)
     assert abs(found.roll) == pytest.approx(abs(angle), abs=0.08e-3)
     assert found.roll_sigma >= abs(found.roll) and "about its beam" in found.notes[-1]
     assert abs(found.turn) < 0.025e-3
-    wall = np.eye(4)
-    wall[2, 3] = 0.130
-    there = crossings(OPTICS, laser, PlaneInstance(wall, (0.2, 0.2)))
-    pixels = np.column_stack([there.columns, there.rows])
-    before, _ = triangulate(CAMERA, PLANE, pixels)
-    after, _ = triangulate(CAMERA, rolled(turned(PLANE, EXIT, found.turn), EXIT, found.roll), pixels)
-    tilts = [abs(np.polyfit(points[:, 1], points[:, 2], 1)[0]) for points in (before, after)]
+    seen_on_wall = wall(laser, rolled(turned(PLANE, EXIT, found.turn), EXIT, found.roll))
+    tilts = [abs(np.polyfit(points[:, 1], points[:, 2], 1)[0]) for points in seen_on_wall]
     assert tilts[0] == pytest.approx(3.7 * abs(angle), rel=0.1)
     assert tilts[1] < 0.3e-3
 

@@ -44,7 +44,7 @@ def rests(cell: ObservedCell) -> list:
 
 
 def check(observations: list) -> None:
-    """What `calibrate_scan` does, without predicting held-out views."""
+    """What a calibration does, without predicting held-out views."""
     staged = solve_staged(observations, NOMINAL, ALONG)
     names = [o.name for o in observations]
     refuse_exchanged(names, [o.base_from_flange for o in observations], staged.camera_from_board)

@@ -9,12 +9,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.measure.calibration import Priors, ScanObservation, TargetObservation, calibrate_scan, calibrate_target
-from cell.measure.calibration.solve.results import PARAMETERS, ScanCalibration
+from cell.measure.calibration import Priors, ScanObservation, TargetCalibration, TargetObservation
+from cell.measure.calibration.solve.results import PARAMETERS, ScanCalibration, adjust_scan, adjust_target
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import difference, from_axes, from_parts, perturbed
 from cell.measure.vision import BoardView, parse_board
+from cell.measure.vision.board.view import centre_of
 from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
 
@@ -70,7 +71,7 @@ def observe(rng: np.random.Generator, count: int = 24, noise: float = 1.0) -> li
         tilt = np.radians(rng.uniform(8, 28)) * np.array([np.cos(k * 2.4), np.sin(k * 2.4), 0])
         rotation = pin.exp3(tilt) @ pin.exp3(np.array([0, 0, rng.uniform(-0.4, 0.4)]))
         centre = np.array([rng.uniform(-0.004, 0.004), rng.uniform(-0.003, 0.003), rng.uniform(0.118, 0.145)])
-        wanted = from_parts(centre - rotation @ np.array(BOARD.centre), rotation)
+        wanted = from_parts(centre - rotation @ centre_of(BOARD), rotation)
         s = float(rng.uniform(0.0, 0.1))
         flange = BASE_FROM_BOARD * (FLANGE_FROM_CAMERA * from_parts(s * RAIL) * wanted).inverse()
         reported = perturbed(flange, np.repeat([ARM_M, ARM_RAD], 3) * rng.normal(size=6) * noise)
@@ -91,9 +92,13 @@ def observe(rng: np.random.Generator, count: int = 24, noise: float = 1.0) -> li
 PRIORS = Priors(arm_translation=ARM_M, arm_rotation=ARM_RAD, rail=RAIL_M)
 
 
+def calibrated(observations: list[ScanObservation]) -> ScanCalibration:
+    return ScanCalibration.of(adjust_scan(observations, NOMINAL, np.array([1.0, 0, 0]), PRIORS))
+
+
 @pytest.fixture(scope="module")
 def scan():
-    return calibrate_scan(observe(np.random.default_rng(5)), NOMINAL, np.array([1.0, 0, 0]), PRIORS)
+    return calibrated(observe(np.random.default_rng(5)))
 
 
 def test_the_scan_head_is_found_within_its_stated_deviations(scan):
@@ -155,7 +160,7 @@ def test_chi_squared_says_that_the_assumed_noise_is_the_real_one(scan):
 
 
 def test_without_noise_the_truth_comes_out():
-    exact = calibrate_scan(observe(np.random.default_rng(2), 16, noise=0.0), NOMINAL, np.array([1.0, 0, 0]), PRIORS)
+    exact = calibrated(observe(np.random.default_rng(2), 16, noise=0.0))
     assert abs(abs(exact.light_plane.n @ PLANE.n) - 1) < 1e-8
     assert np.linalg.norm(exact.flange_from_camera.translation - FLANGE_FROM_CAMERA.translation) < 1e-4
     assert exact.quality.dots_rms_px < 0.01
@@ -171,7 +176,7 @@ def test_the_target_camera_is_found():
         tilt = np.radians(rng.uniform(10, 40)) * np.array([np.cos(k * 2.4), np.sin(k * 2.4), 0])
         rotation = pin.exp3(tilt) @ pin.exp3(np.array([0, 0, rng.uniform(-1, 1)]))
         centre = np.array([*rng.uniform(-0.1, 0.1, 2), rng.uniform(0.5, 0.8)])
-        seen = from_parts(centre - rotation @ np.array(board.centre), rotation)
+        seen = from_parts(centre - rotation @ centre_of(board), rotation)
         flange = perturbed(
             BASE_FROM_BOARD * (hand * seen).inverse(), np.repeat([ARM_M, ARM_RAD], 3) * rng.normal(size=6)
         )
@@ -179,7 +184,7 @@ def test_the_target_camera_is_found():
         view = BoardView(board, (1280, 1024), np.arange(63), pixels, np.full(63, 0.03), dot_radius=board.dot_radius)
         made.append(TargetObservation(view, flange))
     nominal = CameraModel(1280, 1024, 1666.7, 1666.7, 639.5, 511.5)
-    found = calibrate_target(made, nominal, PRIORS)
+    found = TargetCalibration.of(adjust_target(made, nominal, PRIORS))
     # Apart, camera and hand-eye are known less well than together: judge where they put a board.
     reach = from_parts((-0.08, -0.06, 0.65))
     pixels = camera.project(reach.act(np.array([0.08, 0.06, 0.0]))[None])
@@ -194,4 +199,4 @@ def test_the_target_camera_is_found():
 def test_views_from_one_side_do_not_make_a_camera():
     view = observe(np.random.default_rng(6), 1)[0]
     with pytest.raises(RefusedError):
-        calibrate_scan([view] * 2, NOMINAL, np.array([1.0, 0, 0]), PRIORS)
+        calibrated([view] * 2)

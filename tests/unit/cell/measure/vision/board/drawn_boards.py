@@ -8,6 +8,7 @@ import pinocchio as pin
 from cell.measure.geometry.camera import CameraModel, seen_centres
 from cell.measure.geometry.poses import transform
 from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import centre_of
 from sim_backends.optics.camera import CameraOptics
 from sim_backends.optics.render import render
 from sim_backends.optics.scene import Board, BoardInstance
@@ -26,7 +27,7 @@ def placed(text: str, distance: float, tilt: float, azimuth: float = 0.5, spin: 
     """camera_from_board of a board whose centre is at `distance` m, tilted by `tilt` degrees."""
     axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0]) * np.radians(tilt)
     rotation = pin.exp3(axis) @ pin.exp3(np.array([0.0, 0.0, spin]))
-    return pin.SE3(rotation, np.array([*shift, distance]) - rotation @ np.array(parse_board(text).centre))
+    return pin.SE3(rotation, np.array([*shift, distance]) - rotation @ centre_of(parse_board(text)))
 
 
 def photograph(optics, text, pose, laser=None, exposure=4e-3, seed=0):

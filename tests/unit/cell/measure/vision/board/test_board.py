@@ -81,7 +81,6 @@ def spoilt(kind: str) -> np.ndarray:
     return {
         "black": picture // 30,
         "saturated": np.full_like(picture, 255),
-        "wrong_size": picture[:500],
         "no_board": np.full_like(picture, 90),
         "mirrored": np.ascontiguousarray(picture[:, ::-1]),
     }[kind]
@@ -92,13 +91,12 @@ def spoilt(kind: str) -> np.ndarray:
     [
         ("black", Reason.BLACK),
         ("saturated", Reason.SATURATED),
-        ("wrong_size", Reason.WRONG_SIZE),
         ("no_board", Reason.NO_BOARD),
         ("mirrored", Reason.MIRRORED),
     ],
 )
 def test_a_useless_picture_is_refused_with_its_reason(kind, reason):
     with pytest.raises(PictureRefused) as refused:
-        find_board(spoilt(kind), parse_board(LARGE), (1280, 1024))
+        find_board(spoilt(kind), parse_board(LARGE))
     assert refused.value.reason is reason
     assert len(str(refused.value)) > 20

@@ -16,7 +16,7 @@ from cell.measure.vision import board_pose
 from cell.measure.vision.board.board import without_outliers
 from cell.measure.vision.board.dots import measure_dots
 from cell.measure.vision.board.lattice import Blobs
-from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.board.view import DOTS, KINDS, BoardView
 from lab.bench.board.campaign import camera_of
 from lab.bench.board.conditions import LENSES, draw_pose, draw_spec
 from lab.bench.board.render import Placed, true_pixels
@@ -29,7 +29,7 @@ def drawn(kind, rng, tilt):
     placed = Placed(spec, draw_pose(spec, lens, tilt, rng, 0.7))
     pixels = true_pixels(lens, placed)
     sigma = rng.uniform(0.01, 0.1, len(pixels))
-    radius = 0.0 if kind in ("chessboard", "charuco") else placed.radius
+    radius = placed.radius if kind in DOTS else 0.0
     view = BoardView(spec, (lens.width, lens.height), np.arange(len(pixels)), pixels, sigma, False, radius)
     return view, camera_of(lens), pin.SE3(placed.pose)
 
@@ -43,7 +43,7 @@ def test_the_covariance_is_true_where_points_are_not_alike(degrees):
     rng = np.random.default_rng(degrees)
     scores, whitened, turned = [], [], []
     for k in range(60):
-        view, camera, truth = drawn(("marked_dots", "chessboard")[k % 2], rng, np.radians(degrees))
+        view, camera, truth = drawn(KINDS[k % 6], rng, np.radians(degrees))
         seen = noisy(view, rng)
         found = board_pose(seen, camera)
         error = difference(found.camera_from_board, truth)
