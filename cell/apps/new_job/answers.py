@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from cell.apps.new_job.mesh_file import Drawn, MeshBody
 from cell.apps.new_job.questions import Asker, checked, choice, pose, pose_words, three
-from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, overlapping, raised, turned_over
+from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, raised, turned_over
 from cell.apps.new_job.text import METRES, deg, mm, possible_units, size_words, told_by_size
 from cell.config.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
 from cell.measure.geometry.poses import from_parts
@@ -66,10 +66,6 @@ def _bodies(asker: Asker, drawn: Drawn) -> list[MeshBody]:
     for k, body in enumerate(drawn.bodies[:LISTED]):
         sides = " x ".join(f"{side:.4g}" for side in body.size)
         asker.tell(f"  {k + 1}: {sides}, {len(body.triangles)} triangles, {'closed' if body.closed else 'open'}")
-    for one, other in overlapping(drawn.bodies[:LISTED]):
-        asker.tell(
-            f"  {one + 1} and {other + 1} overlap: what lies inside is no surface, and what lies double counts once"
-        )
 
     def parse(text: str) -> list[MeshBody]:
         if text.strip() == "all":

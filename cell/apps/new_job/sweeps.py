@@ -79,13 +79,9 @@ class Rays:
 
     def open_between(self, points: Array, eyes: Array) -> NDArray[np.bool_]:
         """(n,) whether nothing lies between each of `eyes` (n, 3) and the point (n, 3) on the mesh."""
-        return np.asarray(self.behind(points, eyes) > -NEAR)
-
-    def behind(self, points: Array, eyes: Array) -> Array:
-        """(n,) how far behind the point (n, 3) that lies which each of `eyes` (n, 3) sees there first, m."""
         ways = points - eyes
         length = np.linalg.norm(ways, axis=1)
-        return np.asarray(self.hits(eyes, ways / length[:, None])[1] - length)
+        return np.asarray(self.hits(eyes, ways / length[:, None])[1] - length > -NEAR)
 
     def smooth_normals(self, triangles: NDArray[np.int64], points: Array) -> Array:
         """Unit normals (n, 3) at points on triangles (n,), of the smooth surface that the triangles stand for.
