@@ -284,16 +284,8 @@ def print_health(told: Mapping[str, Any]) -> None:
         for part in told["parts"]:
             creeps = f"{part['a_day']:.3f}" if part["a_day"] else ""
             left = "" if part["days_left"] is None else f"{part['days_left']:.0f}"
-            seen = f"{part['last']:.3f}", f"{part['now']:.3f}"
-            table.add_row(
-                part["part"],
-                *seen,
-                f"{part['limit']:.2f}",
-                part["unit"],
-                creeps,
-                left,
-                sparks(part["values"], part["limit"]),
-            )
+            seen = f"{part['last']:.3f}", f"{part['now']:.3f}", f"{part['limit']:.2f}", part["unit"]
+            table.add_row(part["part"], *seen, creeps, left, sparks(part["values"], part["limit"]))
         console.print(table)
     for shock in told["shocks"]:
         console.print(
