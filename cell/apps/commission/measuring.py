@@ -275,14 +275,10 @@ class Axes:
 
 @dataclass(frozen=True, eq=False)
 class RoughMounting:
-    """A camera on the flange and the board before it, with `scale`, how much larger the board is than its name says.
-
-    `residual` (m, RMS) is how far apart the views put the board.
-    """
+    """A camera on the flange and the board before it; `residual` (m, RMS) is how far apart the views put the board."""
 
     flange_from_camera: pin.SE3
     base_from_board: pin.SE3
-    scale: float
     residual: float
 
 
@@ -330,7 +326,7 @@ def solve_mounting(
         flange * hand * from_parts(scale * board.translation, board.rotation)
         for flange, board in zip(flanges, boards, strict=True)
     ]
-    return RoughMounting(hand, mean(placed), scale, float(np.sqrt((residual**2).sum(axis=1).mean())))
+    return RoughMounting(hand, mean(placed), float(np.sqrt((residual**2).sum(axis=1).mean())))
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,7 +45,6 @@ class Made:
     job: Path
     mesh: Path
     picture: Path
-    name: str
     seen: float
     place: PlacePose
     notes: tuple[str, ...]
@@ -93,7 +92,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
             raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
         for target in (*targets[:2], *([] if part is None or part.same else [part.target])):
             _copied(there / target.name, target).replace(target)
-    return Made(targets[0], targets[1], targets[2], name=name, seen=proposal.share, place=found, notes=tuple(notes))
+    return Made(*targets, seen=proposal.share, place=found, notes=tuple(notes))
 
 
 def _origin(mesh: Path, unit: str, seen: Path, laid: Laid) -> tuple[str, ...]:
@@ -112,12 +111,12 @@ def _proposed(asker: Asker, laid: Laid, job: Job, config: CellConfig, *, step: f
         return next(iter(sweep_problems(tried, config, laid.box)), None)
 
     asker.tell("choosing sweeps …")
-    proposal = propose(laid, job, config, step=step, reachable=reachable, tell=asker.progress)
+    proposal = propose(laid, job, config, step=step, reachable=reachable)
     if not proposal.open or asker.given.get("turn") is not None:
         return laid, proposal
     # The light comes aslant from behind: from the other side it falls on other flanks.
     asker.tell("choosing sweeps from the other side as well …")
-    other = propose(about(laid), job, config, step=step, reachable=reachable, tell=asker.progress)
+    other = propose(about(laid), job, config, step=step, reachable=reachable)
     if other.open:
         return laid, proposal
     return about(laid), replace(other, notes=(*other.notes, "turned by half a turn, to see more flanks"))

@@ -6,7 +6,7 @@ A body has an underside and inner walls that no sweep sees; taken along, they wo
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -112,11 +112,11 @@ def centred(laid: Laid) -> Laid:
     return raised(laid, -round(0.5 * float(low[2] + high[2]), 3))
 
 
-def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,), tell: Callable[[str], None] = lambda text: None) -> Laid:
+def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,)) -> Laid:
     """What lies open to an eye in one of the directions `ways` (3,), unit, S, and is not too steep for it.
 
-    A triangle that is hidden in part is halved until its pieces are small. `tell` is told how far it is. Raises
-    `ConfigError` when next to nothing is seen.
+    A triangle that is hidden in part is halved until its pieces are small. Raises `ConfigError` when next to nothing
+    is seen.
     """
     rays = Rays(laid.vertices, laid.faces)
     finest = max(FINEST, float(np.ptp(laid.vertices, axis=0).max()) / PIECES)
@@ -126,7 +126,6 @@ def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,), tell: Callable[[str]
     pieces, normals = corners[facing], normals[facing]
     kept = []
     while len(pieces):
-        tell(f"what lies open to the scan head: {len(pieces)} triangles to look at")
         share = _seen_share(pieces, normals, rays, ways=towards, step=finest)
         longest = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2).max(axis=1)
         mixed = (share > 0.0) & (share < 1.0) & (longest > finest)
