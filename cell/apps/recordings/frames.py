@@ -119,18 +119,20 @@ def used(frames: Sequence[RecordedFrame]) -> list[RecordedFrame]:
 
 
 def read_frames(
-    listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str]] = (),
-    laser: LaserChannel | None = LaserChannel.AUTO, quick: bool = False,
-) -> tuple[list[RecordedFrame], ChosenChannel]:  # fmt: skip
+    listing: Listing,
+    spec: BoardSpec,
+    links: Sequence[dict[str, str]] = (),
+    laser: LaserChannel | None = LaserChannel.AUTO,
+) -> tuple[list[RecordedFrame], ChosenChannel]:
     """Every picture of a listing, with board and stripe, or refused with a reason; and where the laser was read.
 
-    `links` are pictures that a table names together; `laser` None looks for no stripe; a `quick` search for boards is
-    for a plan. Raises ConfigError where there are no pictures.
+    `links` are pictures that a table names together; `laser` None looks for no stripe. Raises ConfigError where there
+    are no pictures.
     """
     if not listing.pictures:
         raise ConfigError(f"{listing.folder} holds no pictures ({', '.join(PICTURES)})")
     frames = [RecordedFrame(path, listing.name(path)) for path in listing.pictures]
-    small = [_find_board(frame, spec, quick) for frame in frames]
+    small = [_find_board(frame, spec) for frame in frames]
     _refuse_same_files(frames)
     _refuse_drawn(frames, small)
     # One camera's pictures have one size: that of most with a board. Of two that are as frequent the larger: pictures
@@ -149,13 +151,13 @@ def read_frames(
     return frames, channel
 
 
-def _find_board(frame: RecordedFrame, spec: BoardSpec, quick: bool) -> Small | None:
+def _find_board(frame: RecordedFrame, spec: BoardSpec) -> Small | None:
     """Find the board in a frame's picture, or refuse it; a small copy (n,) of the picture that was read."""
     small = None
     try:
         image = read_picture(frame.path)
         small = cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
-        frame.view = find_board(image, spec, quick=quick)
+        frame.view = find_board(image, spec)
     except PictureRefused as refused:
         frame.refuse(refused.reason, str(refused))
     except (ArithmeticError, LookupError, ValueError, cv2.error) as error:

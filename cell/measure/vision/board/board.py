@@ -54,18 +54,17 @@ class BoardPose:
     obliquity: float
 
 
-def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = None, *, quick: bool = False) -> BoardView:
+def find_board(image: Image, spec: BoardSpec, size: tuple[int, int] | None = None) -> BoardView:
     """The points of a board in an 8-bit grey image (h, w), to sub-pixel accuracy.
 
-    `size` is the expected (width, height). A `quick` search measures chessboard corners in small windows, several times
-    less exactly: enough to tell which board is seen, and about where. Raises PictureRefused with the reason: black,
-    saturated, wrong size, no board, ambiguous order, mirrored.
+    `size` is the expected (width, height). Raises PictureRefused with the reason: black, saturated, wrong size, no
+    board, ambiguous order, mirrored.
     """
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"the board needs a grey 8-bit image, not {image.dtype} of shape {image.shape}")
     check_picture(image, size)
     if spec.kind == "chessboard":
-        return without_outliers(find_chessboard(image, spec, quick))
+        return without_outliers(find_chessboard(image, spec))
     find = _find_dots if spec.kind in DOTS else find_tags if spec.kind == "aprilgrid" else find_charuco
     return without_outliers(find(image, spec))
 

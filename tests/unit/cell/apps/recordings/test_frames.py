@@ -14,14 +14,6 @@ from cell.measure.vision.pictures import read_picture
 from tests.unit.cell.apps.recordings.pictures import BASE_FROM_BOARD, BOARD, CAMERA, FLANGE_FROM_CAMERA, POSES, lit
 
 
-def test_the_quick_search_of_a_plan_finds_the_same_boards(pictures, seen):
-    listing = list_folder(pictures)
-    found = [read_frames(listing, BOARD, laser=None, quick=quick)[0] for quick in (False, True)]
-    for fine, rough in zip(*found, strict=True):
-        assert np.array_equal(fine.view.ids, rough.view.ids)
-        assert 0 < np.abs(fine.view.pixels - rough.view.pixels).max() < 0.5
-
-
 def test_a_picture_whose_file_says_that_it_was_held_turned_is_read_as_the_sensor_has_it(tmp_path, pictures):
     path = tmp_path / "turned.jpg"
     image = cv2.imread(str(pictures / "frame03.png"), cv2.IMREAD_GRAYSCALE)
