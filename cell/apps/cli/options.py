@@ -1,8 +1,7 @@
-"""Options that several commands share, and how they print.
+"""Options that several commands share, how they print, and what the shell offers at tab.
 
-What the shell offers at tab: runs, jobs, devices, faults and effects, by their names.
-
-Asked for at each tab, so nothing heavy is loaded where a file's name tells it, and whatever is wrong offers nothing.
+That is asked for at each tab, so nothing heavy is loaded where a file's name tells it, and whatever is wrong offers
+nothing.
 """
 
 from __future__ import annotations

@@ -22,6 +22,7 @@ from cell.apps.new_job.questions import Asker, choice
 from cell.apps.new_job.surface import Laid, about, written
 from cell.apps.new_job.sweeps import FITS, Array, rivals
 from cell.apps.new_job.text import job_text, pose_text
+from cell.base.storage import replacing
 from cell.check.fit import require_fit
 from cell.check.reach import sweep_problems
 from cell.config.cell_config import CellConfig
@@ -91,7 +92,8 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         if asker.ask is not None and asker.get("write", "Write the job", "yes", choice("yes", "no")) == "no":
             raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
         for target in (*targets[:2], *([] if part is None or part.same else [part.target])):
-            _copied(there / target.name, target).replace(target)
+            with replacing(target) as file:
+                file.write((there / target.name).read_bytes())
     return Made(*targets, seen=proposal.share, place=found, notes=tuple(notes))
 
 
@@ -259,10 +261,3 @@ def _below(most: float) -> str:
 def _again(asker: Asker) -> str:
     words = [f"--{option} {shlex.quote(text)}" for option, text in asker.used.items() if option != "write"]
     return " ".join(["cell new-job", *words, *(["--yes"] if asker.ask is None else [])])
-
-
-def _copied(source: Path, target: Path) -> Path:
-    """Beside its target, complete, so that the target is replaced in one step."""
-    near = target.with_name(f".{target.name}.new")
-    near.write_bytes(source.read_bytes())
-    return near

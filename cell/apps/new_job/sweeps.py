@@ -3,12 +3,9 @@
 Everything is in the surface frame S, as if the arm's base were there. No noise and no blur: which points there will be,
 and how a stripe's centre that is off by `STRIPE_PX` moves each of them.
 
-Rays against a mesh: what they meet first, and whether anything lies between an eye and a point of it.
-
-Other places at which the sweeps would fit the surface as well: teeth, patterns of holes, little that tells.
-
-An inversion that begins near such a place ends there, with small residuals and a small sigma, and is wrong. So the
-points that the sweeps will see are laid onto the surface from every place that the board leaves open."""
+Also other places at which they would fit the surface as well: teeth, patterns of holes, little that tells. An inversion
+that begins near such a place ends there, with small residuals and a small sigma, and is wrong.
+"""
 
 from __future__ import annotations
 
