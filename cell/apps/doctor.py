@@ -13,9 +13,10 @@ import shutil
 import sys
 import time
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal
 
@@ -110,7 +111,7 @@ def clock_check(root: Path, needed: bool) -> DoctorCheck:
     except OSError:
         source = "not told"
     apart = _apart()
-    told = f"source {source}"
+    told = f"source {source}, steps by {1e9 * _tick():.0f} ns"
     if source in COARSE_CLOCKS:
         mend = "boot without clocksource=… and notsc on the kernel's command line; see `dmesg | grep -i clocksource`"
         return judged("clock", f"{told}: too coarse for stamps to a microsecond", told, mend, needed=needed)
@@ -118,6 +119,13 @@ def clock_check(root: Path, needed: bool) -> DoctorCheck:
         problem = f"date and clock went {1e3 * apart:.0f} ms apart within 0.2 s: something sets the date by steps"
         return judged("clock", problem, told, "systemctl status systemd-timesyncd chrony ntp", needed=needed)
     return judged("clock", "", told)
+
+
+def _tick() -> float:
+    begun = time.monotonic()
+    while (now := time.monotonic()) == begun:
+        pass
+    return now - begun
 
 
 def _apart() -> float:
@@ -214,6 +222,30 @@ def _told(what: str, problem: str) -> DoctorCheck:
 ALWAYS = ""
 """The name of what is asked for without an extra."""
 
+OWN = ("cell", "drivers", "statemachine", "sim_backends")
+"""The top-level packages of this program. Python knows one package by a name, whoever installed it."""
+
+
+def shadow_check(
+    installed: Callable[[], Mapping[str, list[str]]] = packages_distributions, root: Path = Path(__file__).parents[2]
+) -> DoctorCheck:
+    """Whether another distribution or another folder has a package of the same name as one of ours.
+
+    `installed` gives the distributions by package; `root` is the folder that holds our packages.
+    """
+    by_name = installed()
+    others = {name: sorted(set(by_name.get(name, ())) - {DISTRIBUTION}) for name in OWN}
+    for name, distributions in others.items():
+        if distributions:
+            problem = f"{' and '.join(distributions)} installs a package {name} as well, and one hides the other"
+            return judged("package names", problem, "", f"pip uninstall {' '.join(distributions)}; pip install -e .")
+    for name in OWN:
+        spec = find_spec(name)
+        if spec is not None and spec.origin and Path(spec.origin).parents[1] != root:
+            problem = f"{name} is imported from {spec.origin}, not from {root}"
+            return judged("package names", problem, "", "start Python in another folder, or unset PYTHONPATH")
+    return DoctorCheck("package names", "ok", f"{', '.join(OWN)} are this program's")
+
 
 def asked_for(extras: Iterable[str]) -> dict[str, list[Requirement]]:
     """What is asked for always and with each of these extras: by the checkout's pyproject.toml, which is newer than
@@ -291,6 +323,7 @@ def examine_computer(path: Path | None, root: Path = ROOT) -> list[DoctorCheck]:
     real = [name for name in DEVICES if name not in simulated]
     needed = set() if config is None else {EXTRA_OF_DRIVER.get(config.device(name).driver, "") for name in real} - {""}
     rows += [python_check(), *package_checks(sorted(needed), [name for name in OTHER_EXTRAS if name not in needed])]
+    rows.append(shadow_check())
     rows.append(disk_check(runs_folder(source) if source is not None else beside(source) / "runs"))
     needed_here = bool(real)
     rows += [date_check(clock_synchronised(), needed_here), clock_check(root, needed_here)]

@@ -1,4 +1,4 @@
-"""Progress bars while a run goes on."""
+"""Progress bars while a run goes on, and while a first run compiles."""
 
 from __future__ import annotations
 
@@ -7,7 +7,11 @@ import os
 import select
 import sys
 import termios
+import threading
+import time
+from contextlib import suppress
 from pathlib import Path
+from types import TracebackType
 
 from rich.console import Console
 from rich.markup import escape
@@ -19,8 +23,13 @@ from statemachine.step import Event
 
 SAID = ("note", "paused", "going_on")
 """Kinds of events whose text is shown as it is."""
-LOOPS = 90
-"""A first dry run compiles more loops than this, and keeps them on disk."""
+COMPILE = "compile"
+"""The row of what is compiled."""
+LOOPS = 105
+"""About as many loops does a first dry run compile and keep on disk, those of the simulated world among them."""
+LOOK_S = 2.0
+COMPILED_S = 60.0
+"""So long after the last loop was kept nothing more is waited for."""
 
 
 def tell_question(event: Event, console: Console | None = None) -> None:
@@ -49,11 +58,16 @@ def answer_here(control: RunControl, console: Console) -> None:
             control.abort("ended at the terminal")
 
 
-def kept_loops() -> int:
-    """How many compiled loops are kept for this Python."""
+def kept_loops() -> list[float]:
+    """When each compiled loop was kept for this Python, in whichever process, seconds since the epoch."""
     here = Path(__file__).parents[3]
     roots = [Path(folder)] if (folder := os.environ.get("NUMBA_CACHE_DIR")) else [here / "cell", here / "sim_backends"]
-    return sum(1 for root in roots for _ in root.rglob(f"*.py{sys.version_info.major}{sys.version_info.minor}.nbi"))
+    times = []
+    for index in (path for root in roots for path in root.rglob("*.nbi")):
+        if index.name.endswith(f".py{sys.version_info.major}{sys.version_info.minor}.nbi"):
+            with suppress(OSError):
+                times.append(index.stat().st_mtime)
+    return times
 
 
 class _Unheard(Console):
@@ -67,8 +81,8 @@ class _Unheard(Console):
 class ProgressDisplay:
     """Bars for the steps, a row each; an observer for `Cell.run` and `Cell.calibrate`. Writes to standard error.
 
-    Each row keeps to one line and its bar to its place, however long a text is. With `compiles` it is said first that
-    loops will be compiled, if they are.
+    Each row keeps to one line and its bar to its place, however long a text is. With `compiles` a row tells how far
+    the loops are compiled, once some are.
     """
 
     def __init__(self, *, compiles: bool = False) -> None:
@@ -80,23 +94,33 @@ class ProgressDisplay:
         )  # fmt: skip
         self._progress = Progress(*columns, console=self.console, expand=True)
         self._tasks: dict[str, TaskID] = {}
+        self._ended = threading.Event()
+        self._watch = threading.Thread(target=self._watch_compiler, name="compiler's progress", daemon=True)
         self._compiles = compiles
+        # The clock of files lags a little behind.
+        self._begun, self._kept = time.time() - 0.05, len(kept_loops()) if compiles else 0
         plain = self.console.options.ascii_only
         self._good, self._bad = ("+", "!") if plain else ("[green]✓", "[red]✗")
 
     def __enter__(self) -> ProgressDisplay:
-        if self._compiles and kept_loops() < LOOPS:
-            self.console.print("loops are compiled first, once, for a minute or more: the next run is quicker")
         self._progress.start()
+        if self._compiles:
+            self._watch.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
         self.end()
 
     def end(self) -> None:
         """Leave the rows as they are: what is printed from now on stands below them."""
-        if self._progress.live.is_started:
-            self._progress.stop()
+        if self._ended.is_set():
+            return
+        self._ended.set()
+        if self._compiles:
+            self._watch.join()
+        self._progress.stop()
 
     def __call__(self, event: Event) -> None:
         """Take an event of the runner."""
@@ -132,3 +156,20 @@ class ProgressDisplay:
         elif fraction < 1.0:
             mark, state = " ", f"{100 * fraction:.0f}%"
         self._progress.update(self._tasks[step], completed=fraction, description=escape(text), mark=mark, state=state)
+
+    def _watch_compiler(self) -> None:
+        """Show what is compiled and kept meanwhile, in whichever process, and how long the rest takes at this pace."""
+        made, last = 0, self._begun
+        while not self._ended.wait(LOOK_S) and time.time() < last + COMPILED_S:
+            now = sum(at > self._begun for at in kept_loops())
+            if now == made:
+                continue
+            if not made and not self.console.is_terminal:
+                self.console.print("compiling, once: the next run is quicker")
+            made, last = now, time.time()
+            total = max(LOOPS - self._kept, made + 1)
+            left = (total - made) / made * (last - self._begun)
+            words = f"once, about {left:.0f} s left" if self._kept + made < LOOPS else "once"
+            self._show(COMPILE, made / total, words)
+        if made:
+            self._show(COMPILE, 1.0, f"{made} loops, kept")

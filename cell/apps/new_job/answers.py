@@ -11,13 +11,12 @@ import pinocchio as pin
 
 from cell.apps.new_job.mesh_file import Drawn, MeshBody
 from cell.apps.new_job.questions import Asker, checked, choice, pose, pose_words, three
-from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, raised, turned_over
+from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, overlapping, raised, turned_over
 from cell.apps.new_job.text import METRES, deg, mm, possible_units, size_words, told_by_size
 from cell.config.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
-from cell.procedures.steps.sought_part import pose_record
 from drivers.common.addresses import checked_name
 from drivers.common.units import parse_quantity, shown
 from drivers.errors import ConfigError
@@ -67,6 +66,10 @@ def _bodies(asker: Asker, drawn: Drawn) -> list[MeshBody]:
     for k, body in enumerate(drawn.bodies[:LISTED]):
         sides = " x ".join(f"{side:.4g}" for side in body.size)
         asker.tell(f"  {k + 1}: {sides}, {len(body.triangles)} triangles, {'closed' if body.closed else 'open'}")
+    for one, other in overlapping(drawn.bodies[:LISTED]):
+        asker.tell(
+            f"  {one + 1} and {other + 1} overlap: what lies inside is no surface, and what lies double counts once"
+        )
 
     def parse(text: str) -> list[MeshBody]:
         if text.strip() == "all":
@@ -128,7 +131,7 @@ def station(asker: Asker, like: Job, name: str, mesh: str, laid: Laid) -> Job:
     stands = asker.get(
         "place", "Where the middle of the mesh stands on the table, in the place frame", "0 mm, 0 mm, 0 mm", pose(Pose)
     )
-    on_place = pose_record(stands.se3() * from_parts((0.0, 0.0, laid.foot)))
+    on_place = as_pose(stands.se3() * from_parts((0.0, 0.0, laid.foot)))
     prior = asker.get("prior", "How exactly the board tells where the surface is, 1 sigma",
                       _bare(mm(like.surface.prior_sigma)), checked(SurfaceSection, "prior_sigma"))  # fmt: skip
     angle = _bare(deg(like.surface.prior_sigma_angle))
@@ -184,7 +187,14 @@ def _same_centre(like: Job, spec: str) -> Pose:
         return like.board.place_from_board
     moved = from_parts(centre_of(parse_board(like.board.spec)) - centre_of(parse_board(spec)))
     where: pin.SE3 = like.place_from_board * moved
-    return pose_record(where)
+    return as_pose(where)
+
+
+def as_pose(where: pin.SE3) -> Pose:
+    """A pose as a job's record has it."""
+    roll, pitch, yaw = (float(angle) for angle in pin.rpy.matrixToRpy(where.rotation))
+    x, y, z = (float(value) for value in where.translation)
+    return Pose.model_construct(translation=(x, y, z), rotation=(roll, pitch, yaw))
 
 
 def job_name(asker: Asker, mesh: Path) -> str:

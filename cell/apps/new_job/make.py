@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cell.apps.new_job.answers import job_name, laid_mesh, station, template
+from cell.apps.new_job.answers import as_pose, job_name, laid_mesh, station, template
 from cell.apps.new_job.mesh_file import Drawn, read_drawing
 from cell.apps.new_job.observability import known, place_from, sight_problems, told_by_few
 from cell.apps.new_job.picture import draw_proposal
@@ -22,7 +22,6 @@ from cell.apps.new_job.questions import Asker, choice
 from cell.apps.new_job.surface import Laid, about, written
 from cell.apps.new_job.sweeps import FITS, Array, rivals
 from cell.apps.new_job.text import job_text, pose_text
-from cell.base.storage import replacing
 from cell.check.fit import require_fit
 from cell.check.reach import sweep_problems
 from cell.config.cell_config import CellConfig
@@ -31,7 +30,6 @@ from cell.devices.simulated.described import Described
 from cell.measure.inversion import NominalSurface, PlacePose, Tolerance
 from cell.measure.inversion.nominal import read_mesh
 from cell.measure.inversion.part_pose import seen_from_above, shown_by
-from cell.procedures.steps.sought_part import pose_record
 from drivers.common.units import parse_quantity
 from drivers.errors import CellError, ConfigError, NotObservable, RefusedError
 
@@ -47,6 +45,7 @@ class Made:
     job: Path
     mesh: Path
     picture: Path
+    name: str
     seen: float
     place: PlacePose
     notes: tuple[str, ...]
@@ -93,9 +92,8 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         if asker.ask is not None and asker.get("write", "Write the job", "yes", choice("yes", "no")) == "no":
             raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
         for target in (*targets[:2], *([] if part is None or part.same else [part.target])):
-            with replacing(target) as file:
-                file.write((there / target.name).read_bytes())
-    return Made(*targets, seen=proposal.share, place=found, notes=tuple(notes))
+            _copied(there / target.name, target).replace(target)
+    return Made(targets[0], targets[1], targets[2], name=name, seen=proposal.share, place=found, notes=tuple(notes))
 
 
 def _origin(mesh: Path, unit: str, seen: Path, laid: Laid) -> tuple[str, ...]:
@@ -103,7 +101,7 @@ def _origin(mesh: Path, unit: str, seen: Path, laid: Laid) -> tuple[str, ...]:
     return (
         f"Place onto the surface of {mesh.name}. Written by `cell new-job`; change what is not as it is.",
         f"Of the mesh, in {unit}, what the sweeps see is in {seen.name}: surface_from_mesh =",
-        "  " + pose_text(pose_record(laid.surface_from_mesh)),
+        "  " + pose_text(as_pose(laid.surface_from_mesh)),
     )
 
 
@@ -114,12 +112,12 @@ def _proposed(asker: Asker, laid: Laid, job: Job, config: CellConfig, *, step: f
         return next(iter(sweep_problems(tried, config, laid.box)), None)
 
     asker.tell("choosing sweeps …")
-    proposal = propose(laid, job, config, step=step, reachable=reachable)
+    proposal = propose(laid, job, config, step=step, reachable=reachable, tell=asker.progress)
     if not proposal.open or asker.given.get("turn") is not None:
         return laid, proposal
     # The light comes aslant from behind: from the other side it falls on other flanks.
     asker.tell("choosing sweeps from the other side as well …")
-    other = propose(about(laid), job, config, step=step, reachable=reachable)
+    other = propose(about(laid), job, config, step=step, reachable=reachable, tell=asker.progress)
     if other.open:
         return laid, proposal
     return about(laid), replace(other, notes=(*other.notes, "turned by half a turn, to see more flanks"))
@@ -262,3 +260,10 @@ def _below(most: float) -> str:
 def _again(asker: Asker) -> str:
     words = [f"--{option} {shlex.quote(text)}" for option, text in asker.used.items() if option != "write"]
     return " ".join(["cell new-job", *words, *(["--yes"] if asker.ask is None else [])])
+
+
+def _copied(source: Path, target: Path) -> Path:
+    """Beside its target, complete, so that the target is replaced in one step."""
+    near = target.with_name(f".{target.name}.new")
+    near.write_bytes(source.read_bytes())
+    return near

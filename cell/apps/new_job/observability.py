@@ -1,8 +1,8 @@
-"""Whether the planned sweeps tell where the surface is, before anything is swept, and which motion they leave open.
+"""Whether the planned sweeps tell where the surface is, before anything is swept; and which motion they leave open.
 
-The same inversion that a job does, on the points that the sweeps will see of the drawn surface. Also whether what the
-claw holds is in the way of scan and photograph.
-"""
+The same inversion that a job does, on the points that the sweeps will see of the drawn surface.
+
+Whether what the claw holds is in the way of light and sight: of the scan, and of the board's photograph."""
 
 from __future__ import annotations
 

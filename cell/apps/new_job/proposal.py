@@ -65,20 +65,24 @@ class Proposal:
         return seen_share(NominalSurface(self.surface.vertices, self.surface.faces), self.seen)
 
 
-def propose(body: Laid, job: Job, config: CellConfig, step: float, reachable: Callable[[Job], str | None]) -> Proposal:
+def propose(
+    body: Laid, job: Job, config: CellConfig, step: float, reachable: Callable[[Job], str | None],
+    tell: Callable[[str], None] = lambda text: None,
+) -> Proposal:  # fmt: skip
     """A scan of what lies open of `body`, with lines `step` m apart.
 
-    `reachable` says what keeps the arm from the poses of a job's sweeps, None when nothing does. Raises `ConfigError`
-    when the surface is too deep, too wide or too long for this scan head.
+    `reachable` says what keeps the arm from the poses of a job's sweeps, None when nothing does; `tell` is told how far
+    the choice is. Raises `ConfigError` when the surface is too deep, too wide or too long for this scan head.
     """
-    top = open_side(body)
+    top = open_side(body, tell=tell)
     scan, notes = _straight(top, job.scan, config, step)
-    search = _Search(config, Rays(body.vertices, body.faces), NominalSurface(top.vertices, top.faces), reachable)
+    search = _Search(config, Rays(body.vertices, body.faces), NominalSurface(top.vertices, top.faces), reachable, tell)
     straight = _with(job, scan)
+    tell(f"what {len(scan.swath)} straight sweeps see")
     seen = look(config, straight, search.rays)
     job, seen, more, excess = search.tilted(straight, seen)
     ways = [ABOVE, *(way(swath) for swath in job.scan.swath if swath.roll or swath.pitch)]
-    surface = top if len(ways) == 1 else open_side(body, ways)
+    surface = top if len(ways) == 1 else open_side(body, ways, tell)
     return Proposal(job, surface, tuple(seen), (*notes, *more), excess > 1.0)
 
 
@@ -160,6 +164,7 @@ class _Search:
     rays: Rays
     top: NominalSurface
     reachable: Callable[[Job], str | None]
+    tell: Callable[[str], None]
 
     def tilted(self, job: Job, seen: list[SeenSurface]) -> tuple[Job, list[SeenSurface], list[str], float]:
         """With tilted sweeps added as long as each makes the worst known motion better known by a third, or sees more
@@ -172,11 +177,17 @@ class _Search:
             if worst <= 1.0
             else "straight sweeps leave a motion of the surface open"
         )
-        left = {tilt: self._one(job, *tilt) for tilt in TILTS}
+        left = {}
+        for k, tilt in enumerate(TILTS):
+            self.tell(f"tilted sweep {k + 1} of {len(TILTS)}, {_words(*tilt)}")
+            left[tilt] = self._one(job, *tilt)
         refused: list[str] = []
         added: list[str] = []
         while left and len(added) < MOST_TILTED and (worst > ENOUGH or missed > UNSEEN):
-            tried = {tilt: (self._excess(job, [*seen, one]), self._missed([*seen, one])) for tilt, one in left.items()}
+            tried = {}
+            for tilt, one in left.items():
+                self.tell(f"which of {len(left)} tilted sweeps tells most, {len(added)} added so far")
+                tried[tilt] = self._excess(job, [*seen, one]), self._missed([*seen, one])
             tilt = min(tried, key=lambda each: tried[each][0] if worst > ENOUGH else tried[each][1])
             excess, unseen = tried[tilt]
             if not (excess < BETTER * worst or unseen < missed - SEES_MORE):

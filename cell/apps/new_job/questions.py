@@ -6,6 +6,8 @@ person is asked again, an option ends the command.
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeVar
@@ -16,6 +18,8 @@ from cell.base.toml_file import wording
 from drivers.common.units import shown
 from drivers.errors import ConfigError
 from drivers.make import Mounting, Pose
+
+PROGRESS_S = 3.0
 
 T = TypeVar("T")
 P = TypeVar("P", bound=Pose)
@@ -33,6 +37,13 @@ class Asker:
     ask: Callable[[str, str | None], str] | None
     tell: Callable[[str], None]
     used: dict[str, str] = field(default_factory=dict)
+    _told: float = -math.inf
+
+    def progress(self, text: str) -> None:
+        """Tell how far something is, unless that was told less than `PROGRESS_S` ago."""
+        if time.monotonic() >= self._told + PROGRESS_S:
+            self._told = time.monotonic()
+            self.tell(f"  {text} …")
 
     def get(self, option: str, question: str, default: str | None, parse: Callable[[str], T]) -> T:
         """The answer to a question, by `parse`, which raises `ValueError` or `ConfigError` for a wrong one.
@@ -47,7 +58,9 @@ class Asker:
         if text is not None:
             try:
                 found = parse(text)
-            except (ValueError, ConfigError) as error:
+            except ValueError as error:
+                raise ConfigError(f"--{option}: {error}") from error
+            except ConfigError as error:
                 raise ConfigError(f"--{option}: {error}") from error
             self._keep(option, text, default)
             return found

@@ -1,23 +1,94 @@
 """The surface that the cell will look for: the side of a mesh that a scan head above it sees, laid on the table.
 
 A body has an underside and inner walls that no sweep sees; taken along, they would count as surface that was missed.
+
+Bodies of one mesh that overlap: which do, and which of their faces lie in one another.
+
+What lies inside a body is hidden by its outside and needs no care. Two faces at one place are both seen: one counts.
 """
 
 from __future__ import annotations
 
+import itertools
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from cell.apps.new_job.mesh_file import MeshBody
-from cell.apps.new_job.sweeps import ABOVE, Array, Faces, Rays
+from cell.apps.new_job.sweeps import ABOVE, NEAR, Array, Faces, Rays
 from cell.apps.new_job.text import METRES
 from cell.measure.geometry.poses import from_parts
 from drivers.errors import ConfigError
+
+APART = 1e-4
+"""Share of a body's size by which another has to reach into it to overlap: bodies that touch do not."""
+
+
+def overlapping(bodies: Sequence[MeshBody]) -> list[tuple[int, int]]:
+    """Pairs of numbers of bodies that reach into each other, or of which one lies inside the other."""
+    pairs = [
+        pair
+        for pair in itertools.combinations(range(len(bodies)), 2)
+        if _boxes_meet(*(bodies[k].vertices for k in pair))
+    ]
+    rays = {k: Rays(bodies[k].vertices, bodies[k].triangles) for k in {k for pair in pairs for k in pair}}
+    return [
+        (i, j) for i, j in pairs if _enters(bodies[i], bodies[j], rays[j]) or _enters(bodies[j], bodies[i], rays[i])
+    ]
+
+
+def _boxes_meet(one: Array, other: Array) -> bool:
+    return bool((one.min(axis=0) <= other.max(axis=0)).all() and (other.min(axis=0) <= one.max(axis=0)).all())
+
+
+def _enters(body: MeshBody, other: MeshBody, rays: Rays) -> bool:
+    """Whether `body` has places of its surface inside `other`, which `rays` meet; where that is open, crosses it."""
+    apart = APART * float(other.size.max())
+    corners = body.vertices[body.triangles]
+    begin, way = corners.reshape(-1, 3), (np.roll(corners, -1, axis=1) - corners).reshape(-1, 3)
+    length = np.linalg.norm(way, axis=1)
+    way /= length[:, None]
+    _, met = rays.hits(begin, way)
+    crossed = np.flatnonzero((met > apart) & (met < length - apart))
+    if not other.closed:
+        return len(crossed) > 0
+    # A little inside `body` itself, so that faces that only touch do not count.
+    inwards = np.cross(corners[:, 2] - corners[:, 0], corners[:, 1] - corners[:, 0])
+    inwards *= apart / np.linalg.norm(inwards, axis=1, keepdims=True)
+    at = [
+        begin[crossed] + (met[crossed] + step)[:, None] * way[crossed] + inwards[crossed // 3]
+        for step in (-apart, apart)
+    ]
+    places = np.concatenate([corners.mean(axis=1) + inwards, *at])
+    triangle, met = rays.hits(places, np.tile(ABOVE, (len(places), 1)))
+    return bool(((triangle >= 0) & (met > 0.1 * apart) & (rays.normals[triangle] @ ABOVE > 0.0)).any())
+
+
+def before(vertices: Array, faces: Faces) -> tuple[NDArray[np.intp], list[Rays | None]]:
+    """(m,) the body of each triangle, and for each body the earlier ones that its box meets, None where there are none.
+
+    A place of a body that lies on one of those is there twice.
+    """
+    links = coo_matrix(
+        (np.ones(2 * len(faces)), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())), shape=(len(vertices),) * 2
+    )
+    _, label = connected_components(links, directed=False)
+    body = np.unique(label[faces[:, 0]], return_inverse=True)[1].reshape(-1).astype(np.intp)
+    parts = [faces[body == k] for k in range(int(body.max(initial=-1)) + 1)]
+    corners = [vertices[part.ravel()] for part in parts]
+    earlier: list[Rays | None] = []
+    for k in range(len(parts)):
+        met = [parts[j] for j in range(k) if _boxes_meet(corners[k], corners[j])]
+        earlier.append(Rays(vertices, np.concatenate(met)) if met else None)
+    return body, earlier
+
 
 UP = {"z": (0, 0, 1), "-z": (0, 0, -1), "x": (1, 0, 0), "-x": (-1, 0, 0), "y": (0, 1, 0), "-y": (0, -1, 0)}
 STEEPEST = 0.2
@@ -112,32 +183,38 @@ def centred(laid: Laid) -> Laid:
     return raised(laid, -round(0.5 * float(low[2] + high[2]), 3))
 
 
-def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,)) -> Laid:
+def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,), tell: Callable[[str], None] = lambda text: None) -> Laid:
     """What lies open to an eye in one of the directions `ways` (3,), unit, S, and is not too steep for it.
 
-    A triangle that is hidden in part is halved until its pieces are small. Raises `ConfigError` when next to nothing
-    is seen.
+    A triangle that is hidden in part is halved until its pieces are small. Where faces of overlapping bodies lie at
+    one place, the first body's counts. `tell` is told how far it is. Raises `ConfigError` when next to nothing is seen.
     """
     rays = Rays(laid.vertices, laid.faces)
+    body, earlier = before(laid.vertices, laid.faces)
     finest = max(FINEST, float(np.ptp(laid.vertices, axis=0).max()) / PIECES)
     corners, normals = laid.vertices[laid.faces], rays.normals
     towards = np.array(ways)
     facing = (normals @ towards.T > STEEPEST).any(axis=1)
-    pieces, normals = corners[facing], normals[facing]
+    pieces, normals, body = corners[facing], normals[facing], body[facing]
     kept = []
     while len(pieces):
-        share = _seen_share(pieces, normals, rays, ways=towards, step=finest)
+        tell(f"what lies open to the scan head: {len(pieces)} triangles to look at")
+        share = np.zeros(len(pieces))
+        for k in np.unique(body):
+            mine = body == k
+            share[mine] = _seen_share(pieces[mine], normals[mine], rays, earlier=earlier[k], ways=towards, step=finest)
         longest = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2).max(axis=1)
         mixed = (share > 0.0) & (share < 1.0) & (longest > finest)
         kept.append(pieces[~mixed & (share > 0.5)])
-        pieces, normals = _halved(pieces[mixed]), np.repeat(normals[mixed], 2, axis=0)
+        pieces, normals, body = _halved(pieces[mixed]), np.repeat(normals[mixed], 2, axis=0), np.repeat(body[mixed], 2)
     triangles = np.concatenate(kept) if kept else np.empty((0, 3, 3))
     vertices, numbers = np.unique(np.round(triangles.reshape(-1, 3), 9), axis=0, return_inverse=True)
     return _required(replace(laid, vertices=vertices, faces=numbers.reshape(-1, 3)))
 
 
-def _seen_share(pieces: Array, normals: Array, rays: Rays, ways: Array, step: float) -> Array:
-    """(n,) which share of places `step` m apart on each triangle (n, 3, 3) is seen from one of the ways (k, 3)."""
+def _seen_share(pieces: Array, normals: Array, rays: Rays, earlier: Rays | None, ways: Array, step: float) -> Array:
+    """(n,) which share of places `step` m apart on each triangle (n, 3, 3) is seen from one of the ways (k, 3), and
+    does not lie on an `earlier` body as well."""
     longest = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2).max(axis=1)
     divisions = np.clip(np.ceil(longest / step), 1, MOST_PLACES).astype(np.intp)
     share = np.zeros(len(pieces))
@@ -151,7 +228,10 @@ def _seen_share(pieces: Array, normals: Array, rays: Rays, ways: Array, step: fl
         for way in ways:
             ask = np.flatnonzero(normals[mine] @ way > STEEPEST)
             places = points[ask].reshape(-1, 3)
-            seen[ask] |= rays.open_between(places, places + FAR * way).reshape(len(ask), len(weights))
+            open_there = rays.open_between(places, places + FAR * way)
+            if earlier is not None:
+                open_there &= np.abs(earlier.behind(places, places + FAR * way)) > NEAR
+            seen[ask] |= open_there.reshape(len(ask), len(weights))
         share[mine] = seen.mean(axis=1)
     return share
 
@@ -178,13 +258,16 @@ def _required(laid: Laid) -> Laid:
     return laid
 
 
-def written(laid: Laid, path: Path, text: str) -> None:
-    """Write the triangles as a binary STL in mm; `text` is its heading, at most 80 characters."""
+def as_stl(laid: Laid, text: str) -> bytes:
+    """The triangles as a binary STL in mm; `text` is its heading, at most 80 characters."""
     corners = 1e3 * laid.vertices[laid.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     records = np.zeros(len(corners), dtype=[("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
     records["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     records["corners"] = corners
-    path.write_bytes(
-        text.encode("ascii", "replace")[:80].ljust(80) + struct.pack("<I", len(records)) + records.tobytes()
-    )
+    return text.encode("ascii", "replace")[:80].ljust(80) + struct.pack("<I", len(records)) + records.tobytes()
+
+
+def written(laid: Laid, path: Path, text: str) -> None:
+    """Write it."""
+    path.write_bytes(as_stl(laid, text))

@@ -3,9 +3,12 @@
 Everything is in the surface frame S, as if the arm's base were there. No noise and no blur: which points there will be,
 and how a stripe's centre that is off by `STRIPE_PX` moves each of them.
 
-Also other places at which they would fit the surface as well: teeth, patterns of holes, little that tells. An inversion
-that begins near such a place ends there, with small residuals and a small sigma, and is wrong.
-"""
+Rays against a mesh: what they meet first, and whether anything lies between an eye and a point of it.
+
+Other places at which the sweeps would fit the surface as well: teeth, patterns of holes, little that tells.
+
+An inversion that begins near such a place ends there, with small residuals and a small sigma, and is wrong. So the
+points that the sweeps will see are laid onto the surface from every place that the board leaves open."""
 
 from __future__ import annotations
 
@@ -76,9 +79,13 @@ class Rays:
 
     def open_between(self, points: Array, eyes: Array) -> NDArray[np.bool_]:
         """(n,) whether nothing lies between each of `eyes` (n, 3) and the point (n, 3) on the mesh."""
+        return np.asarray(self.behind(points, eyes) > -NEAR)
+
+    def behind(self, points: Array, eyes: Array) -> Array:
+        """(n,) how far behind the point (n, 3) that lies which each of `eyes` (n, 3) sees there first, m."""
         ways = points - eyes
         length = np.linalg.norm(ways, axis=1)
-        return np.asarray(self.hits(eyes, ways / length[:, None])[1] - length > -NEAR)
+        return np.asarray(self.hits(eyes, ways / length[:, None])[1] - length)
 
     def smooth_normals(self, triangles: NDArray[np.int64], points: Array) -> Array:
         """Unit normals (n, 3) at points on triangles (n,), of the smooth surface that the triangles stand for.

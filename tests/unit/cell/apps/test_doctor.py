@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cell.apps import doctor
-from cell.apps.doctor import can_check, link_checks, package_checks
+from cell.apps.doctor import OWN, can_check, link_checks, package_checks, shadow_check
 from cell.config.cell_config import DEVICES, load_config
 from drivers.vehicle.health import CanInterface
 
@@ -28,6 +28,15 @@ def test_packages_are_held_against_the_pins() -> None:
     assert (rows[1].state, rows[1].found) == ("wrong", "canopen is not installed")
     # What this cell does without is told, and is not wrong.
     assert (rows[2].state, rows[2].mend) == ("not needed", "pip install 'cascadio<0.2,>=0.1'")
+
+
+def test_a_package_of_the_same_name_is_told(tmp_path: Path) -> None:
+    ours = {name: ["assembly-cell", "assembly-cell"] for name in OWN}
+    assert shadow_check(lambda: ours).state == "ok"
+    row = shadow_check(lambda: {**ours, "statemachine": ["assembly-cell", "python-statemachine"]})
+    assert (row.state, row.mend) == ("wrong", "pip uninstall python-statemachine; pip install -e .")
+    assert row.found.startswith("python-statemachine installs a package statemachine as well")
+    assert shadow_check(lambda: ours, tmp_path).found.startswith("cell is imported from ")
 
 
 def test_a_port_and_its_group(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,12 +6,13 @@ import io
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from rich.console import Console
 
-from cell.apps.cli.progress import LOOPS, ProgressDisplay, answer_here
+from cell.apps.cli.progress import ProgressDisplay, answer_here, kept_loops
 from statemachine.control import RunControl
 from statemachine.step import Event
 
@@ -51,16 +52,27 @@ def test_at_80_columns_bars_keep_their_place_and_ended_rows_look_ended(
     assert "[C153]" in shown["laser_sweep"]
 
 
-@pytest.mark.parametrize(("kept", "said"), [(3, True), (LOOPS, False)])
-def test_a_first_run_says_that_it_compiles(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], kept: int, said: bool
+def test_a_first_run_shows_that_it_compiles_and_how_long_that_takes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    for k in range(kept):
-        (tmp_path / f"{k}.py{sys.version_info.major}{sys.version_info.minor}.nbi").touch()
+    monkeypatch.setattr("cell.apps.cli.progress.LOOK_S", 0.01)
+    told: list[str] = []
+    monkeypatch.setattr(ProgressDisplay, "_show", lambda self, step, fraction, text: told.append(f"{step} {text}"))
+    version = f"py{sys.version_info.major}{sys.version_info.minor}"
+    old = tmp_path / f"old.{version}.nbi"
+    old.touch()
+    os.utime(old, (1.0, 1.0))
     with ProgressDisplay(compiles=True):
-        pass
-    assert ("loops are compiled first, once" in capsys.readouterr().err) is said
+        for name in ("one", "two"):
+            (tmp_path / f"{name}.{version}.nbi").touch()
+        until = time.monotonic() + 20.0
+        while not told and time.monotonic() < until:
+            time.sleep(0.01)
+    assert told[0].startswith("compile once, about ")
+    assert told[-1] == "compile 2 loops, kept"
+    assert "compiling, once" in capsys.readouterr().err
+    assert len(kept_loops()) == 3
 
 
 def test_a_dry_run_says_something_before_it_loads_anything_heavy() -> None:

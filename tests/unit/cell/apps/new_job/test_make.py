@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import trimesh
 
@@ -14,12 +15,14 @@ from cell.measure.geometry.poses import transform
 from cell.measure.inversion.nominal import read_mesh
 from drivers.errors import ConfigError
 from lab.bench.job.part_jobs import body
-from tests.unit.cell.apps.new_job.meshes import bumps, from_options, relief
+from tests.unit.cell.apps.new_job.meshes import from_options, relief
 
 
 def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path: Path) -> None:
     """In metres, wider than one sweep; written twice: only when that is said."""
-    mesh = relief(tmp_path / "m.ply", bumps)
+    mesh = relief(
+        tmp_path / "m.ply", lambda x, y: 8 + 3 * np.sin(x / 9 + 0.3) * np.cos(y / 11 - 0.5) + np.sin((x + 2 * y) / 16)
+    )
     trimesh.load_mesh(mesh).apply_scale(1e-3).export(mesh)
     made = from_options(tmp_path, mesh=str(mesh), name="lid")
     assert (made.job.name, made.mesh.name, made.picture.name) == ("lid.toml", "lid.stl", "lid.png")
@@ -32,11 +35,11 @@ def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path: Path) -
     assert made.job.read_text(encoding="utf-8") == written
 
 
-def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("cell.apps.new_job.make.draw_proposal", lambda *_: None)
-    mesh = relief(tmp_path / "m.ply", bumps, half=14.0)
+def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(tmp_path: Path) -> None:
+    mesh = relief(
+        tmp_path / "m.ply", lambda x, y: 8 + 3 * np.sin(x / 9 + 0.3) * np.cos(y / 11 - 0.5) + np.sin((x + 2 * y) / 16),
+        half=14.0,
+    )  # fmt: skip
     job, surface = load_job(from_options(tmp_path, mesh=str(mesh), name="lid", like="shell").job)
     assert job.part is None and job.place.accept is None, "that of `shell` is another part"
     vertices, faces = read_mesh(surface, "mm")
