@@ -1,14 +1,14 @@
-"""Options that several commands share, and how they print.
+"""Options that several commands share, how they print, and what the shell offers at tab.
 
-What the shell offers at tab: runs, jobs, devices, faults and effects, by their names.
-
-Asked for at each tab, so nothing heavy is loaded where a file's name tells it, and whatever is wrong offers nothing.
+That is asked for at each tab, so nothing heavy is loaded where a file's name tells it, and whatever is wrong offers
+nothing.
 """
 
 from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -56,38 +56,42 @@ def devices(incomplete: str) -> list[str]:
     """Devices of a cell."""
     from cell.config.files import DEVICES
 
-    return [name for name in DEVICES if name.startswith(incomplete)]
+    return _beginning(incomplete, DEVICES)
 
 
 def jogged(incomplete: str) -> list[str]:
     """Devices that are jogged."""
-    return [name for name in ("rail", "arm", "vehicle") if name.startswith(incomplete)]
+    return _beginning(incomplete, ("rail", "arm", "vehicle"))
 
 
 def homed(incomplete: str) -> list[str]:
     """Devices that have a home."""
-    return [name for name in ("rail", "arm") if name.startswith(incomplete)]
+    return _beginning(incomplete, ("rail", "arm"))
 
 
 def faults(incomplete: str) -> list[str]:
     """Faults of a simulated cell; the step and how far it is then, as in `@laser_sweep:40%`, are for the person."""
     from sim_backends.faults import FAULT_NAMES
 
-    return [name for name in FAULT_NAMES if name.startswith(incomplete)]
+    return _beginning(incomplete, FAULT_NAMES)
 
 
 def steps(incomplete: str) -> list[str]:
     """Steps of the jobs that ship."""
     from cell.procedures.steps.kinds import PLACE
 
-    return [name for name in PLACE.names if name.startswith(incomplete)]
+    return _beginning(incomplete, PLACE.names)
 
 
 def effects(incomplete: str) -> list[str]:
     """Effects of a workshop in a simulated world."""
     from sim_backends.world.levels import Effects
 
-    return [name for name in Effects.names() if name.startswith(incomplete)]
+    return _beginning(incomplete, Effects.names())
+
+
+def _beginning(incomplete: str, names: Iterable[str]) -> list[str]:
+    return [name for name in names if name.startswith(incomplete)]
 
 
 class Level(StrEnum):

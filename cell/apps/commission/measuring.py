@@ -89,18 +89,13 @@ def camera_of(desk: CommissionWorkplace, eye: Eye) -> Camera:
     return devices.scan_camera if eye.name == "scan_camera" else devices.target_camera
 
 
-def take(desk: CommissionWorkplace, eye: Eye) -> Frame:
-    """A photograph at the configured exposure."""
+def see(desk: CommissionWorkplace, eye: Eye, board: BoardSpec | None = None) -> SeenBoard:
+    """The eye's board, or another one, from where the arm stands; `RefusedError` when it is not seen."""
     camera = camera_of(desk, eye)
     camera.configure(eye.config.photo_exposure, PHOTO_RATE)
-    return camera.grab()
-
-
-def see(desk: CommissionWorkplace, eye: Eye) -> SeenBoard:
-    """The board from where the arm stands; `RefusedError` when it is not seen."""
-    frame = take(desk, eye)
+    frame = camera.grab()
     try:
-        view = find_board(frame.image, eye.board)
+        view = find_board(frame.image, board or eye.board)
         pose = board_pose(view, eye.model)
     except RefusedError as refused:
         raise refused.showing(seen={"frame": frame}) from refused
@@ -275,14 +270,10 @@ class Axes:
 
 @dataclass(frozen=True, eq=False)
 class RoughMounting:
-    """A camera on the flange and the board before it, with `scale`, how much larger the board is than its name says.
-
-    `residual` (m, RMS) is how far apart the views put the board.
-    """
+    """A camera on the flange and the board before it; `residual` (m, RMS) is how far apart the views put the board."""
 
     flange_from_camera: pin.SE3
     base_from_board: pin.SE3
-    scale: float
     residual: float
 
 
@@ -330,7 +321,7 @@ def solve_mounting(
         flange * hand * from_parts(scale * board.translation, board.rotation)
         for flange, board in zip(flanges, boards, strict=True)
     ]
-    return RoughMounting(hand, mean(placed), scale, float(np.sqrt((residual**2).sum(axis=1).mean())))
+    return RoughMounting(hand, mean(placed), float(np.sqrt((residual**2).sum(axis=1).mean())))
 
 
 @dataclass(frozen=True, eq=False)
@@ -426,15 +417,14 @@ def measure(desk: CommissionWorkplace, result: Result, eye: Eye) -> tuple[Axes, 
     """
     first = find_view(desk, result, eye)
     desk.keep(result, f"{eye.name}-board", first.frame, first.view.pixels)
-    shifts = [from_parts(sign * eye.step * np.eye(3)[axis]) for axis in (0, 1, 2) for sign in (1.0, -1.0)]
-    shifted = _views(desk, eye, [first.base_from_flange * shift for shift in shifts])
+    shifted = shifted_views(desk, eye, first.base_from_flange, eye.step)
     seen = [first, *shifted]
-    axes = axes_from_shifts(*_poses(seen))
+    axes = axes_from_shifts(*poses_of(seen))
     # Nothing is known yet of where the camera sits: small turns first, then larger ones about the board.
     hand = from_parts(eye.config.flange_from_camera.se3().translation, axes.flange_from_camera)
     for turn in (SMALL_TURN, TURN):
-        seen += _views(desk, eye, _turned(eye, first, hand, axes.across, turn))
-        found = solve_mounting(*_poses(seen), axes.flange_from_camera, axes.across)
+        seen += views_from(desk, eye, _turned(eye, first, hand, axes.across, turn))
+        found = solve_mounting(*poses_of(seen), axes.flange_from_camera, axes.across)
         hand = found.flange_from_camera
     if len(seen) < 1 + len(shifted) + LEAST_TURNED:
         raise RefusedError(
@@ -445,7 +435,17 @@ def measure(desk: CommissionWorkplace, result: Result, eye: Eye) -> tuple[Axes, 
     return axes, found
 
 
-def _views(desk: CommissionWorkplace, eye: Eye, goals: Iterable[pin.SE3]) -> list[SeenBoard]:
+def shifted_views(
+    desk: CommissionWorkplace, eye: Eye, first: pin.SE3, step: float, board: BoardSpec | None = None
+) -> list[SeenBoard]:
+    """Views of the board with the flange shifted from `first` by `step` m each way along its axes."""
+    shifts = [from_parts(sign * step * np.eye(3)[axis]) for axis in (0, 1, 2) for sign in (1.0, -1.0)]
+    return views_from(desk, eye, [first * shift for shift in shifts], board)
+
+
+def views_from(
+    desk: CommissionWorkplace, eye: Eye, goals: Iterable[pin.SE3], board: BoardSpec | None = None
+) -> list[SeenBoard]:
     """What is seen from these places; those that cannot be reached, or do not show the board, are left out."""
     mover = desk.mover()
     made = []
@@ -453,7 +453,7 @@ def _views(desk: CommissionWorkplace, eye: Eye, goals: Iterable[pin.SE3]) -> lis
         desk.look_around()
         try:
             mover.to(goal, f"{eye.name} before its board")
-            made.append(see(desk, eye))
+            made.append(see(desk, eye, board))
         except DeviceFault:
             raise
         except CellError:
@@ -461,7 +461,7 @@ def _views(desk: CommissionWorkplace, eye: Eye, goals: Iterable[pin.SE3]) -> lis
     return made
 
 
-def _poses(seen: Sequence[SeenBoard]) -> tuple[list[pin.SE3], list[pin.SE3]]:
+def poses_of(seen: Sequence[SeenBoard]) -> tuple[list[pin.SE3], list[pin.SE3]]:
     """base_from_flange and camera_from_board of each view."""
     return [one.base_from_flange for one in seen], [one.camera_from_board for one in seen]
 

@@ -8,7 +8,6 @@ and has to say what was meant; else nothing is written. The old file is always k
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 import time
 import tomllib
@@ -24,6 +23,7 @@ from tomlkit.exceptions import TOMLKitError
 from cell.apps.commission.check import CheckVerdict, CommissionCheck, Progress, Result
 from cell.apps.commission.checks import arm, cameras, outputs, rail, stops, vehicle, whole_cell
 from cell.apps.commission.workplace import CommissionWorkplace, Declined, Person, told
+from cell.base.storage import replacing
 from cell.config.cell_config import CONFIGURATION, load_config, require_confirm
 from cell.config.job import job_path
 from cell.run.recorded_work import Hands
@@ -60,10 +60,9 @@ def write_changes(path: Path, changes: Mapping[str, str]) -> Path:
         new = edited(text, changes)
         backup = _free(path)
         shutil.copy2(path, backup)
-        beside = path.with_name(f".{path.name}.{os.getpid()}")
-        beside.write_text(new, encoding="utf-8")
-        shutil.copymode(path, beside)
-        beside.replace(path)
+        with replacing(path) as file:
+            file.write(new.encode())
+        shutil.copymode(backup, path)
     except OSError as error:
         raise ConfigError(f"{path} cannot be changed: {error.strerror or error}; see its permissions") from error
     return backup

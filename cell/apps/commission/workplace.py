@@ -70,17 +70,11 @@ class SimulatedPerson(Person):
     """Of a simulated cell: agrees to everything, has changed nothing, and says so through `tell`."""
 
     def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
+        def agree(text: str) -> bool:
+            tell(f"{text} (simulated person: yes)")
+            return True
 
-    def go_ahead(self, text: str) -> bool:
-        """See `Person.go_ahead`."""
-        self._tell(f"{text} (simulated person: go ahead)")
-        return True
-
-    def sees(self, question: str) -> bool:
-        """See `Person.sees`."""
-        self._tell(f"{question} (simulated person: yes)")
-        return True
+        super().__init__(agree)
 
     def again(self, question: str) -> bool:
         """See `Person.again`."""
@@ -88,10 +82,9 @@ class SimulatedPerson(Person):
 
     def does(self, task: str, by_itself: Callable[[], None] | None = None) -> bool:
         """See `Person.does`."""
-        self._tell(f"{task} (simulated person: done)")
         if by_itself is not None:
             by_itself()
-        return True
+        return super().does(task)
 
 
 class SlowMover(Mover):

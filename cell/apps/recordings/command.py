@@ -76,7 +76,7 @@ def calibrate_folder(folder: Path, spec: BoardSpec | None, options: Options | No
     series, links, unread = read_series(listing)
     belonging, strange = match_series(series, listing, links)
     # A plan tells of boards and poses; to read stripes takes seconds for each picture.
-    frames, channel = read_frames(listing, spec, links, None if options.plan else options.laser, options.plan)
+    frames, channel = read_frames(listing, spec, links, None if options.plan else options.laser)
     late = [one for one in series if not one.of and in_order_of_views(one, frames)]
     unread += _still_strange(strange, late)
     result = RecordedResult(spec.name, laser=channel.figures())

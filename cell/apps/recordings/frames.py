@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components
 
 from cell.apps.recordings.result import Figures
 from cell.apps.recordings.series import Listing, frame_key
-from cell.apps.recordings.stripes import ChosenChannel, ReadStripe, Source, calmest, choose_channel, read_on_board
+from cell.apps.recordings.stripes import ChosenChannel, ReadStripe, Source, choose_channel, read_on_board
 from cell.apps.recordings.texts import PICTURES
 from cell.measure.geometry.poses import difference, mean
 from cell.measure.vision.board.board import find_board
@@ -50,7 +50,6 @@ AT_POINTS, NEAR_PX = 0.6, 6
 # other numbers are one view when they differ by the second, which is what noise and another file format make. Views
 # whose middles differ by more than the third are not compared.
 SAME_PLACE_PX, SAME_VIEW_PX, FAR_PX = 2.0, 0.1, 20.0
-STRAIGHTENED = re.compile(r"undist|rectif|remap|straight", re.IGNORECASE)
 LASER_WORDS = re.compile(r"laser|stripe|(?<![a-z])(?:line|las|on)(?![a-z])")
 OFF_WORDS = re.compile(r"(?<![a-z])(?:off|no|without)(?![a-z])|laseroff|nolaser")
 # Two pictures are of one stop when their boards lie at the same pixels, as well as a corner is found in a poor
@@ -120,18 +119,20 @@ def used(frames: Sequence[RecordedFrame]) -> list[RecordedFrame]:
 
 
 def read_frames(
-    listing: Listing, spec: BoardSpec, links: Sequence[dict[str, str]] = (),
-    laser: LaserChannel | None = LaserChannel.AUTO, quick: bool = False,
-) -> tuple[list[RecordedFrame], ChosenChannel]:  # fmt: skip
+    listing: Listing,
+    spec: BoardSpec,
+    links: Sequence[dict[str, str]] = (),
+    laser: LaserChannel | None = LaserChannel.AUTO,
+) -> tuple[list[RecordedFrame], ChosenChannel]:
     """Every picture of a listing, with board and stripe, or refused with a reason; and where the laser was read.
 
-    `links` are pictures that a table names together; `laser` None looks for no stripe; a `quick` search for boards is
-    for a plan. Raises ConfigError where there are no pictures.
+    `links` are pictures that a table names together; `laser` None looks for no stripe. Raises ConfigError where there
+    are no pictures.
     """
     if not listing.pictures:
         raise ConfigError(f"{listing.folder} holds no pictures ({', '.join(PICTURES)})")
     frames = [RecordedFrame(path, listing.name(path)) for path in listing.pictures]
-    small = [_find_board(frame, spec, quick) for frame in frames]
+    small = [_find_board(frame, spec) for frame in frames]
     _refuse_same_files(frames)
     _refuse_drawn(frames, small)
     # One camera's pictures have one size: that of most with a board. Of two that are as frequent the larger: pictures
@@ -150,13 +151,13 @@ def read_frames(
     return frames, channel
 
 
-def _find_board(frame: RecordedFrame, spec: BoardSpec, quick: bool) -> Small | None:
+def _find_board(frame: RecordedFrame, spec: BoardSpec) -> Small | None:
     """Find the board in a frame's picture, or refuse it; a small copy (n,) of the picture that was read."""
     small = None
     try:
         image = read_picture(frame.path)
         small = cv2.resize(image, SMALL, interpolation=cv2.INTER_AREA).astype(np.float32).ravel()
-        frame.view = find_board(image, spec, quick=quick)
+        frame.view = find_board(image, spec)
     except PictureRefused as refused:
         frame.refuse(refused.reason, str(refused))
     except (ArithmeticError, LookupError, ValueError, cv2.error) as error:
@@ -179,11 +180,7 @@ def _refuse_same_files(frames: Sequence[RecordedFrame]) -> None:
 
 
 def _refuse_drawn(frames: Sequence[RecordedFrame], small: Sequence[Small | None]) -> None:
-    """Refuse frames that are others with something drawn in, or straightened; `small` copies (n,) by frame.
-
-    Corners, axes and markers are found by their pixels. A straightened copy differs everywhere a little: there its name
-    has to say it, too.
-    """
+    """Refuse frames that are others with corners, axes or markers drawn in; `small` copies (n,) by frame."""
     coloured = cache(_has_colour)
     for frame, mine in zip(frames, small, strict=True):
         for other, its in zip(frames, small, strict=True):
@@ -191,14 +188,9 @@ def _refuse_drawn(frames: Sequence[RecordedFrame], small: Sequence[Small | None]
                 continue
             if np.abs(mine - its).mean() > ALIKE_DN:
                 continue
-            if STRAIGHTENED.search(frame.name) and not STRAIGHTENED.search(other.name):
-                text = f"by its name it is {other.name}, straightened"
-            elif not frame.lit and coloured(frame.path) and _drawn_into(frame, other):
-                text = f"it is {other.name} with lines drawn into it"
-            else:
-                continue
-            frame.shows = other
-            frame.refuse(Reason.DUPLICATE, text)
+            if not frame.lit and coloured(frame.path) and _drawn_into(frame, other):
+                frame.shows = other
+                frame.refuse(Reason.DUPLICATE, f"it is {other.name} with lines drawn into it")
 
 
 def _has_colour(path: Path) -> bool:
@@ -263,10 +255,10 @@ class _Place:
         return [f.path for f in self.others if f.dark]
 
     def sources(self) -> list[tuple[RecordedFrame, Source]]:
-        """Where the stripe may be, each with the picture without the laser that takes most of the board away."""
+        """Where the stripe may be, each with a picture without the laser: that which says so, or the board's."""
         lit = [f for f in self.others if f.lit] or [f for f in self.others if not f.dark]
-        offs = [*self.dark, self.board.path]
-        return [(f, Source(f.path, self.view, calmest(f.path, offs, self.view))) for f in lit]
+        off = next(iter(self.dark), self.board.path)
+        return [(f, Source(f.path, self.view, off)) for f in lit]
 
 
 def _find_places(frames: Sequence[RecordedFrame], links: Sequence[dict[str, str]]) -> list[_Place]:

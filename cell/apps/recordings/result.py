@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, fields
 
 import numpy as np
 import pinocchio as pin
+from scipy.spatial.transform import Rotation
 
 from cell.measure.calibration.judge.checks import QualityCheck, refused_parts
 from cell.measure.calibration.judge.plane_checks import Flatness
@@ -102,9 +103,7 @@ def hand_eye_figures(
 
     `scatter` of the board in the base in m and rad; `sigma` (6,) in m and rad.
     """
-    r = pose.rotation
-    middle = math.asin(max(-1.0, min(1.0, float(r[0, 2]))))
-    first, last = math.atan2(-r[1, 2], r[2, 2]), math.atan2(-r[0, 1], r[0, 0])
+    first, middle, last = Rotation.from_matrix(pose.rotation).as_euler("XYZ").tolist()
     if first < 0:
         # Of the two triples for one rotation, that with the first angle in 0 … π.
         first, middle, last = first + math.pi, math.pi - middle, last + math.pi
@@ -112,7 +111,8 @@ def hand_eye_figures(
     found: Figures = {
         "method": method, "setup": setup,
         "pose": "flange_from_camera" if setup == "eye_in_hand" else "base_from_camera",
-        "translation_mm": 1e3 * pose.translation, "rotation": r, "rotation_vector_rad": pin.log3(r),
+        "translation_mm": 1e3 * pose.translation, "rotation": pose.rotation,
+        "rotation_vector_rad": pin.log3(pose.rotation),
         "euler_xyz_rad": [first, middle, last], "scatter_mm": 1e3 * scatter[0],
         "scatter_deg": math.degrees(scatter[1]),
     }  # fmt: skip

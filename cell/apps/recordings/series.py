@@ -398,7 +398,5 @@ def _series_name(name: str) -> str:
 
 def frame_key(name: str) -> str:
     """What two pictures of one frame have in common: their name without folders and the words for what is in them."""
-    path = Path(name)
-    stem = path.stem if path.suffix.lower() in (*PICTURES, *TEXTS) else path.name
-    words = re.split(r"[\s_\-.()]+|(?<=[a-z])(?=\d)", stem.lower())
+    words = re.split(r"[\s_\-.()]+|(?<=[a-z])(?=\d)", _stem(name).lower())
     return "-".join(str(int(w)) if w.isdecimal() else w for w in words if w and not re.fullmatch(ROLES, w))

@@ -115,7 +115,7 @@ def test_a_dry_run_shows_how_far_it_is_and_is_cancelled(screen: Screen, watcher:
     leave(screen, watcher)
 
 
-SIZES = [(1920, 1080), (1280, 800), (768, 1024)]
+SIZES = [(1280, 800), (768, 1024)]
 RUN = {
     "kind": "job", "run": "20260101T000000-abcd", "job": "pot", "state": "asking", "step": "laser_sweep", "attempt": 1,
     "fraction": 0.4, "text": "line 48 of 120", "elapsed_s": 40.0, "left_s": None, "steps": [],
@@ -155,14 +155,8 @@ def test_a_question_stands_beside_the_view_and_says_what_comes_of_an_answer(
     page.click("#question .choices button >> nth=0")
     assert page.input_value("#question textarea") == "nothing touches the arm"
     # A second attempt that runs is not told the fault of a run before it as its own end.
-    ended = {
-        "device": "arm",
-        "code": "c",
-        "text": "arm: lost",
-        "remedy": "ended the run",
-        "t": time.time(),
-        "over": True,
-    }
+    fault = {"device": "arm", "code": "c", "text": "arm: lost", "remedy": "ended the run"}
+    ended = {**fault, "t": time.time(), "over": True}
     changes |= {"question": None, "run": {**RUN, "state": "running", "attempt": 2}, "faults": [ended]}
     screen.shows("state", "RUNNING")
     screen.shows("run-text", "attempt 2")

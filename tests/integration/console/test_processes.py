@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import signal
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -36,21 +35,12 @@ def going(tmp_path: Path) -> Iterator[Going]:
 
 
 @pytest.mark.wire
-def test_a_console_whose_server_is_killed_stops_and_ends(going: Going) -> None:
-    browser = Browser(going.link())
-    assert browser.token not in " ".join(below(going.process.pid).values())
-    left = below(going.process.pid)
-    (server,) = (pid for pid, words in left.items() if "cell.apps.console.server.serve" in words)
-    begun = time.monotonic()
-    os.kill(server, signal.SIGKILL)
-    assert going.process.wait(20.0) == 1
-    print(f"ended {time.monotonic() - begun:.1f} s after its server")
-    assert until(lambda: not any(running(pid) for pid in left), 5.0)
-
-
-@pytest.mark.wire
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL], ids=["interrupted", "killed"])
-def test_a_console_that_ends_takes_its_dry_run_along(going: Going, number: signal.Signals) -> None:
+@pytest.mark.parametrize(("whom", "number", "code"), [
+    ("console", signal.SIGINT, 0), ("console", signal.SIGKILL, -signal.SIGKILL), ("server", signal.SIGKILL, 1),
+])  # fmt: skip
+def test_a_console_that_ends_takes_its_server_and_its_dry_run_along(
+    going: Going, whom: str, number: signal.Signals, code: int
+) -> None:
     browser = Browser(going.link())
     with browser.live() as page:
         key = json.loads(page.recv(timeout=20))["key"]
@@ -58,8 +48,10 @@ def test_a_console_that_ends_takes_its_dry_run_along(going: Going, number: signa
         assert browser.do(do="dry_run", job="pot", key=key).status == 200
         assert until(lambda: any("rehearsal" in words for words in below(going.process.pid).values()))
         left = below(going.process.pid)
-        going.process.send_signal(number)
-        going.process.wait(20.0)
+        assert browser.token not in " ".join(left.values())
+        (server,) = (pid for pid, words in left.items() if "cell.apps.console.server.serve" in words)
+        os.kill(server if whom == "server" else going.process.pid, number)
+        assert going.process.wait(20.0) == code
         assert until(lambda: not any(running(pid) for pid in left), 5.0), {
             pid: words for pid, words in left.items() if running(pid)
         }

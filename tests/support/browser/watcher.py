@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import threading
 import time
-import urllib.request
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
-from urllib.parse import urlsplit
 
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import ClientConnection, connect
-from websockets.typing import Subprotocol
+
+from tests.support.console.server import Browser
 
 
 class Watcher:
@@ -21,38 +20,23 @@ class Watcher:
     def __init__(self, link: str) -> None:
         self.state: dict[str, Any] = {}
         self._changed = threading.Condition()
-        parts = urlsplit(link)
-        with urllib.request.urlopen(link) as answer:
-            cookie = answer.headers["set-cookie"].split(";")[0]
-            key = answer.read().decode().partition("#key=")[2].partition('"')[0]
-        self._link = connect(
-            f"ws://{parts.netloc}/live",
-            origin=f"{parts.scheme}://{parts.netloc}",
-            additional_headers={"Cookie": cookie},
-            subprotocols=[Subprotocol("cell"), Subprotocol(key)],
-            compression=None,
-        )
+        self._link = Browser(link).live()
 
-    def _hear(self, socket: ClientConnection) -> None:
-        try:
-            for message in socket:
-                if isinstance(message, bytes):
-                    continue
-                said = json.loads(message)
-                if said["type"] == "state":
+    def _hear(self) -> None:
+        with suppress(ConnectionClosed):
+            for message in self._link:
+                if isinstance(message, str) and (said := json.loads(message))["type"] == "state":
                     with self._changed:
                         self.state = said
                         self._changed.notify_all()
-        except ConnectionClosed:
-            pass
 
     def __enter__(self) -> Watcher:
-        threading.Thread(target=self._hear, args=(self._link.__enter__(),), daemon=True).start()
+        threading.Thread(target=self._hear, daemon=True).start()
         self.until(lambda state: True)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._link.__exit__(None, None, None)
+        self._link.close()
 
     def until(self, holds: Callable[[dict[str, Any]], Any], timeout: float = 20.0) -> dict[str, Any]:
         """Wait for a state in which something holds, and give it."""

@@ -7,17 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cell.apps.cli import options
 from cell.apps.cli.calibration import stored
-from cell.apps.cli.options import (  # fmt: skip
-    ConfigOption,
-    JobOption,
-    JsonOption,
-    Level,
-    LevelOption,
-    SeedOption,
-    SimOption,
-    print_json,
-)
+from cell.apps.cli.options import ConfigOption, JsonOption, Level, print_json
 
 if TYPE_CHECKING:
     from cell.apps.recordings.command import Options
@@ -74,10 +66,10 @@ def register(app: typer.Typer) -> None:
 def calibrate(
     context: typer.Context,
     config: ConfigOption = None,
-    sim: SimOption = None,
-    seed: SeedOption = 1,
-    level: LevelOption = Level.nominal,
-    job: JobOption = "pot",
+    sim: options.SimOption = None,
+    seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal,
+    job: options.JobOption = "pot",
     source: SourceOption = None,
     board: BoardOption = None,
     plan: PlanOption = False,
@@ -103,8 +95,8 @@ def calibrate(
         for name in (name for name, value in given.items() if value):
             raise ConfigError(f"{name} belongs to --from; the boards on the deck are named in the configuration")
     else:
-        options = _options(plan, poses, pose_field, setup, camera=camera, laser=laser)
-        _from_folder(source, board, options, json, details)
+        said = _options(plan, poses, pose_field, setup, camera=camera, laser=laser)
+        _from_folder(source, board, said, json, details)
         return
     from cell.apps.cli.calibration.stored import print_examination
     from cell.apps.cli.display import print_calibration
@@ -152,14 +144,14 @@ def _options(
     )  # fmt: skip
 
 
-def _from_folder(folder: Path, board: str | None, options: Options, json: bool, details: bool) -> None:
+def _from_folder(folder: Path, board: str | None, said: Options, json: bool, details: bool) -> None:
     from cell.apps.cli.calibration.recorded_tables import print_recorded
     from cell.apps.recordings.command import calibrate_folder
     from cell.base.storage import sealed
     from cell.measure.vision import parse_board
     from drivers.errors import ConfigError, RefusedError
 
-    result = calibrate_folder(folder, None if board is None else parse_board(board, single_tag=True), options)
+    result = calibrate_folder(folder, None if board is None else parse_board(board, single_tag=True), said)
     if json:
         # Kept in a file, it may come back with --camera.
         print_json(sealed(result.as_dict()))
@@ -171,5 +163,5 @@ def _from_folder(folder: Path, board: str | None, options: Options, json: bool, 
         )
     if result.refused:
         raise RefusedError("; ".join(result.refused.values()))
-    if not options.plan and result.intrinsics is None and result.hand_eye is None:
+    if not said.plan and result.intrinsics is None and result.hand_eye is None:
         raise ConfigError(f"nothing could be calibrated from {folder}: {'; '.join(result.notes)}")

@@ -9,6 +9,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from cell.apps.cli.options import new_table
+
 Result = Mapping[str, Any]
 PARTS = {"intrinsics": "camera", "hand_eye": "hand-eye", "light_plane": "light plane"}
 
@@ -126,7 +128,7 @@ def _plain(found: Result) -> list[tuple[str, object]]:
 
 
 def _table(title: str, columns: Sequence[str], rows: Sequence[Sequence[object]]) -> Table:
-    table = Table(*columns, title=title)
+    table = new_table(title, *columns)
     for row in rows:
         table.add_row(*map(_shown, row))
     return table

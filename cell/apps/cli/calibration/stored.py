@@ -8,17 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from cell.apps.cli.options import (  # fmt: skip
-    ConfigOption,
-    JobOption,
-    JsonOption,
-    Level,
-    LevelOption,
-    SeedOption,
-    SimOption,
-    new_table,
-    print_json,
-)
+from cell.apps.cli import options
+from cell.apps.cli.options import ConfigOption, JsonOption, Level, new_table, print_json
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,7 +29,7 @@ def register(group: typer.Typer) -> None:
 def solve(
     archive: Annotated[Path, typer.Argument(help="The .observations.npz beside a stored calibration.")],
     config: ConfigOption = None,
-    job: JobOption = "pot",
+    job: options.JobOption = "pot",
     json: JsonOption = False,
 ) -> None:
     """Solve archived observations again, and examine the result; nothing moves and nothing stored is changed.
@@ -115,10 +106,10 @@ def _coverage(console: Console, figures: Summary) -> None:
 
 def verify(
     config: ConfigOption = None,
-    sim: SimOption = None,
-    seed: SeedOption = 1,
-    level: LevelOption = Level.nominal,
-    job: JobOption = "pot",
+    sim: options.SimOption = None,
+    seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal,
+    job: options.JobOption = "pot",
     json: JsonOption = False,
 ) -> None:
     """Say how good the stored calibration is today, from a view of each deck board and a sweep over the fine one.
@@ -178,10 +169,10 @@ def print_verification(summary: Summary) -> None:
 
 def timing(
     config: ConfigOption = None,
-    sim: SimOption = None,
-    seed: SeedOption = 1,
-    level: LevelOption = Level.nominal,
-    job: JobOption = "pot",
+    sim: options.SimOption = None,
+    seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal,
+    job: options.JobOption = "pot",
     json: JsonOption = False,
 ) -> None:
     """Sweep to and fro over the fine board on the deck and measure how late the scan camera's time stamps come.

@@ -248,11 +248,6 @@ def export(
 record = typer.Typer(help="The record of a run, record.mcap.", no_args_is_help=True)
 
 
-@record.callback()
-def _group() -> None:
-    """The record of a run, record.mcap."""
-
-
 @record.command()
 def repair(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
     """Close the record of a run that was cut off, so that every reader opens it; a whole one stays as it is."""

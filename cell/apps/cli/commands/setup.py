@@ -191,11 +191,6 @@ def _print_made(made: Made, where: str) -> None:
 sim = typer.Typer(help="The simulated cell.", no_args_is_help=True)
 
 
-@sim.callback()
-def _group() -> None:
-    """The simulated cell."""
-
-
 @sim.command()
 def serve(
     seed: options.SeedOption = 1,

@@ -10,15 +10,14 @@ import pinocchio as pin
 
 from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.checks.cameras import PITCH_OFF, renamed
-from cell.apps.commission.measuring import axes_from_shifts
+from cell.apps.commission.measuring import axes_from_shifts, eye_of, poses_of, see, shifted_views, views_from
 from cell.apps.commission.workplace import CommissionWorkplace
-from cell.config.calibrations.store import nominal_camera
 from cell.config.job import job_path, ships
-from cell.measure.geometry.poses import from_parts, from_ur
-from cell.measure.vision import BoardSpec, board_pose, find_board, parse_board
+from cell.measure.vision import BoardSpec, parse_board
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line
-from drivers.errors import CellError, DeviceFault, RefusedError
+from drivers.errors import RefusedError
+from drivers.interfaces import Frame
 
 WAY, SPEED = 0.050, 0.050
 MOST_OFF_MM = 5.0
@@ -30,7 +29,6 @@ STRIDE, STRIDE_SPEED, LEAST_LEFT = 0.25, 0.15, 0.40
 """How far the vehicle goes at a time, m, how fast, m/s, and how far it keeps from the job's target, m."""
 LEAST_SEEN = 0.012
 """A way that the camera sees must be this long, m, to say which way it went."""
-PHOTO_RATE = 10.0
 
 
 def _wheels(desk: CommissionWorkplace, result: Result) -> None:
@@ -145,23 +143,11 @@ def _drive(desk: CommissionWorkplace, odometry: RelativeOdometry, ahead: float) 
 
 def _pitch(desk: CommissionWorkplace, result: Result, look: pin.SE3) -> None:
     """How large the station's board is, by the ways of the arm before it; the arm is back at `look` afterwards."""
-    board, mover = parse_board(desk.job.board.spec), desk.mover()
-    flanges, boards = [], []
-    for shift in (np.zeros(3), *(sign * SHIFT * axis for axis in np.eye(3) for sign in (1.0, -1.0))):
-        desk.look_around()
-        try:
-            mover.to(look * from_parts(shift), "before the station's board")
-            frame = desk.devices.target_camera.grab()
-            seen = board_pose(find_board(frame.image, board), nominal_camera(desk.config.target_camera))
-        except DeviceFault:
-            raise
-        except CellError:
-            continue
-        flanges.append(from_ur(desk.devices.arm.state().flange))
-        boards.append(seen.camera_from_board)
-    mover.to(look, "the looking pose")
+    board, eye = parse_board(desk.job.board.spec), eye_of(desk, "target_camera")
+    views = [*views_from(desk, eye, [look], board), *shifted_views(desk, eye, look, SHIFT, board)]
+    desk.mover().to(look, "the looking pose")
     try:
-        across = axes_from_shifts(flanges, boards).across
+        across = axes_from_shifts(*poses_of(views)).across
     except RefusedError as refused:
         result.notes.append(f"the station's board could not be measured from here: {refused}")
         return
@@ -200,20 +186,17 @@ def _look(desk: CommissionWorkplace) -> Callable[[], None]:
 
 def _board_at(desk: CommissionWorkplace, result: Result, name: str) -> np.ndarray | None:
     """The station's board (3,) in the base, roughly; None when it is not seen."""
-    config, devices = desk.config, desk.devices
-    camera = devices.target_camera
-    camera.configure(config.target_camera.photo_exposure, PHOTO_RATE)
-    devices.clock.sleep(config.arm.settle_time)
-    frame = camera.grab()
+    eye = eye_of(desk, "target_camera")
+    desk.devices.clock.sleep(desk.config.arm.settle_time)
     try:
-        view = find_board(frame.image, parse_board(desk.job.board.spec))
-        pose = board_pose(view, nominal_camera(config.target_camera))
-    except RefusedError:
+        seen = see(desk, eye, parse_board(desk.job.board.spec))
+    except RefusedError as refused:
+        frame = refused.seen["frame"]
+        assert isinstance(frame, Frame)
         desk.keep(result, name, frame)
         return None
-    desk.keep(result, name, frame, view.pixels)
-    flange = from_ur(devices.arm.state().flange)
-    found: pin.SE3 = flange * config.target_camera.flange_from_camera.se3() * pose.camera_from_board
+    desk.keep(result, name, seen.frame, seen.view.pixels)
+    found: pin.SE3 = seen.base_from_flange * eye.config.flange_from_camera.se3() * seen.camera_from_board
     return np.asarray(found.translation)
 
 

@@ -2,8 +2,6 @@
 
 It ends with a stop, with the hold of the cell, or when it is switched off; nothing else can be begun meanwhile.
 
-Moving by holding a button: one press, from its first beat to its last.
-
 A press that has ended, for whatever reason, moves nothing any more: its later beats are thrown away, so that what comes
 late or again after a pause begins no motion. Two watch over it: the thread that began the motion, and beside this
 process the one that `drivers.interfaces.Attended` tells of."""

@@ -82,11 +82,6 @@ class Mailbox:
             self._news.clear()
             await self._news.wait()
 
-    @property
-    def waiting(self) -> int:
-        """How much waits."""
-        return len(self._words) + len(self._events) + len(self._newest) + len(self._clouds)
-
     def _put(self, queue: deque[str | bytes], item: str | bytes) -> None:
         queue.append(item)
         self._news.set()

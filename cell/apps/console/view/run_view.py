@@ -1,8 +1,8 @@
-"""What goes on in a run, as the page shows it: kept up to date from the run's own events, which wait for nobody.
+"""What goes on in a run, as the page shows it: by its own events, which wait for nobody; its pictures and its cloud.
 
-What the cell looks at, for the page: newest pictures with what was found in them, and the cloud as it grows.
-
-Taken from what the steps have kept already; who shows them computes with copies, and only as many as are shown."""
+These are taken from what the steps have kept already; who shows them computes with copies, and only as many as are
+shown.
+"""
 
 from __future__ import annotations
 

@@ -54,18 +54,16 @@ class BoardPose:
     obliquity: float
 
 
-def find_board(image: Image, spec: BoardSpec, *, quick: bool = False) -> BoardView:
+def find_board(image: Image, spec: BoardSpec) -> BoardView:
     """The points of a board in an 8-bit grey image (h, w), to sub-pixel accuracy.
 
-    A `quick` search measures chessboard corners in small windows, several times less exactly: enough to tell which
-    board is seen, and about where. Raises PictureRefused with the reason: black, saturated, no board, ambiguous order,
-    mirrored.
+    Raises PictureRefused with the reason: black, saturated, no board, ambiguous order, mirrored.
     """
     if image.ndim != 2 or image.dtype != np.uint8:
         raise ValueError(f"the board needs a grey 8-bit image, not {image.dtype} of shape {image.shape}")
     check_picture(image)
     if spec.kind == "chessboard":
-        return without_outliers(find_chessboard(image, spec, quick))
+        return without_outliers(find_chessboard(image, spec))
     find = _find_dots if spec.kind in DOTS else find_tags if spec.kind == "aprilgrid" else find_charuco
     return without_outliers(find(image, spec))
 

@@ -15,7 +15,7 @@ import scipy
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
-from cell.measure.vision.board.corners import WINDOW_SHARE, fit_corners
+from cell.measure.vision.board.corners import fit_corners
 from cell.measure.vision.board.ends import check_chess_ends, grey, next_places
 from cell.measure.vision.board.lattice import Places, PlaneMap, Seeds, by_outline, lattices
 from cell.measure.vision.board.view import BoardSpec, BoardView
@@ -25,8 +25,6 @@ LEAST_CORNERS = 6
 LEAST_SHARE = 0.5
 LEAST_SIGMA_PX = 0.0025
 LEAST_COLOURS = 0.85
-# A window of a quick search is so much of the distance to the next corner.
-QUICK_SHARE = 0.25
 # Of the places of a next row; clutter may look like a corner here and there.
 MOST_BEYOND = 0.4
 # The picture is searched at half its size first, where noise and blur are less.
@@ -44,10 +42,10 @@ LEAST_CONTRAST_DN = 5.0
 SEEDS = 40
 
 
-def find_chessboard(image: Image, spec: BoardSpec, quick: bool = False) -> BoardView:
-    """The inner corners of a chessboard in an 8-bit image (h, w); `quick` in small windows. Raises PictureRefused."""
+def find_chessboard(image: Image, spec: BoardSpec) -> BoardView:
+    """The inner corners of a chessboard in an 8-bit image (h, w). Raises PictureRefused."""
     least = max(LEAST_CORNERS, int(0.3 * len(spec.lattice())))
-    lit, share = laser_streaks(image), QUICK_SHARE if quick else WINDOW_SHARE
+    lit = laser_streaks(image)
     refusals: list[PictureRefused] = []
     for scale in SCALES:
         if scale * min(image.shape) < 100:
@@ -59,7 +57,7 @@ def find_chessboard(image: Image, spec: BoardSpec, quick: bool = False) -> Board
         views = []
         for index, places in corner_lattices(corners, least):
             try:
-                views.append(_view(image, lit, spec, corners=corners, index=index, places=places, share=share))
+                views.append(_view(image, lit, spec, corners=corners, index=index, places=places))
             except PictureRefused as refused:
                 refusals.append(refused)
         if views:
@@ -72,7 +70,7 @@ def find_chessboard(image: Image, spec: BoardSpec, quick: bool = False) -> Board
 
 
 def _view(
-    image: Image, lit: Image, spec: BoardSpec, corners: Corners, index: NDArray[np.intp], places: Places, share: float
+    image: Image, lit: Image, spec: BoardSpec, corners: Corners, index: NDArray[np.intp], places: Places
 ) -> BoardView:
     index, places = _extended(corners, index, places, spec.name)
     pixels = corners.places[index]
@@ -88,7 +86,7 @@ def _view(
     even = order[known].sum(axis=1) % 2 == 0
     first_is_dark = bool((dark_first == even).mean() > 0.5)
     dark = np.asarray((lattice.sum(axis=1) % 2 == 0) == first_is_dark, dtype=np.bool_)
-    measured, sigma, contrast = fit_corners(image, starts, plane.steps(flat), dark, share)
+    measured, sigma, contrast = fit_corners(image, starts, plane.steps(flat), dark)
     good = np.isfinite(sigma)
     if lit.any():
         good &= ~_near(lit, starts, 5)

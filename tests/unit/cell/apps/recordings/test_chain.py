@@ -33,7 +33,7 @@ def test_an_arm_that_scatters_does_not_bend_the_camera(arm_mm):
 @pytest.mark.parametrize(("larger", "said"), [(1.03, True), (1.004, False)])
 def test_a_board_of_another_size_counts_and_is_said_where_it_is_clear(larger, said):
     """A few per mille, as a printer makes, are hardly told from an arm that scatters."""
-    frames = scene() if said else scene(seed=1, count=12, arm_mm=0.1, arm_mrad=0.1, laser=False)
+    frames = scene(count=6) if said else scene(seed=1, count=12, arm_mm=0.1, arm_mrad=0.1, laser=False)
     for frame in frames:
         pose = frame.base_from_flange
         frame.base_from_flange = pin.SE3(pose.rotation, larger * pose.translation)
@@ -44,7 +44,7 @@ def test_a_board_of_another_size_counts_and_is_said_where_it_is_clear(larger, sa
 
 @pytest.mark.parametrize(("bend", "laser"), [(0.0005, True), pytest.param(0.002, False, marks=pytest.mark.campaign)])
 def test_a_bent_board_is_seen_and_counts(bend, laser):
-    result = solved(scene(seed=4, bend=bend, laser=laser))
+    result = solved(scene(seed=4, count=6, bend=bend, laser=laser))
     assert right(result)
     found = next(c for c in result["checks"] if c["name"] == "bend of the board")
     diagonal = np.hypot(6 * 18, 5 * 18)
@@ -64,12 +64,6 @@ def test_motions_that_tell_no_hand_eye_are_refused(axes):
     result = solved(scene(axes=axes))
     assert result["hand_eye"] is None
     assert "one axis" in result["refused"]["hand_eye"]
-    assert right(result)
-
-
-def test_three_frames_are_not_enough_to_check_anything():
-    result = solved(scene(count=3))
-    assert "needs 4 or more" in result["refused"]["hand_eye"]
     assert right(result)
 
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import cv2
 import pytest
 
-from cell.apps.recordings import frames as recorded_frames
 from cell.apps.recordings.command import Options, attach_poses, calibrate_folder
 from cell.apps.recordings.frames import read_frames
-from cell.measure.vision.board.board import find_board
 from drivers.errors import ConfigError
 from tests.unit.cell.apps.recordings.pictures import (
     BOARD,
@@ -35,17 +33,9 @@ def test_one_pose_in_another_unit_is_named(recording, seen):
     assert all(f.reason is None and f.base_from_flange is not None for f in others)
 
 
-def test_a_plan_is_made_by_the_quick_search(recording, monkeypatch):
+def test_a_plan_says_how_poses_are_read_and_calibrates_nothing(recording):
     tuples(recording)
-    asked: list[bool] = []
-
-    def find(image, spec, quick):
-        asked.append(quick)
-        return find_board(image, spec, quick=quick)
-
-    monkeypatch.setattr(recorded_frames, "find_board", find)
     plan = calibrate_folder(recording, BOARD, Options(plan=True)).as_dict()
-    assert asked == [True] * len(POSES)
     assert (plan["poses"]["reading"], plan["intrinsics"]) == ("xyz+quaternion-xyzw", None)
     assert plan["poses"]["turn_deg"] < 0.2
 

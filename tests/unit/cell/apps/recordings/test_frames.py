@@ -14,14 +14,6 @@ from cell.measure.vision.pictures import read_picture
 from tests.unit.cell.apps.recordings.pictures import BASE_FROM_BOARD, BOARD, CAMERA, FLANGE_FROM_CAMERA, POSES, lit
 
 
-def test_the_quick_search_of_a_plan_finds_the_same_boards(pictures, seen):
-    listing = list_folder(pictures)
-    found = [read_frames(listing, BOARD, laser=None, quick=quick)[0] for quick in (False, True)]
-    for fine, rough in zip(*found, strict=True):
-        assert np.array_equal(fine.view.ids, rough.view.ids)
-        assert 0 < np.abs(fine.view.pixels - rough.view.pixels).max() < 0.5
-
-
 def test_a_picture_whose_file_says_that_it_was_held_turned_is_read_as_the_sensor_has_it(tmp_path, pictures):
     path = tmp_path / "turned.jpg"
     image = cv2.imread(str(pictures / "frame03.png"), cv2.IMREAD_GRAYSCALE)
@@ -63,18 +55,6 @@ def test_pictures_that_a_program_drew_into_are_set_aside_by_their_pixels(tmp_pat
     frames, _ = read_frames(list_folder(tmp_path), BOARD, laser=None)
     assert {f.name: f.text for f in frames if f.reason is not None} == {
         f"a{kind}": "it is b.png with lines drawn into it"
-    }
-
-
-def test_a_straightened_copy_is_no_view_of_its_own(tmp_path, pictures):
-    for name in ("frame03", "frame04"):
-        image = cv2.imread(str(pictures / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
-        cv2.imwrite(str(tmp_path / f"{name}.png"), image)
-        focal = np.array([[1500.0, 0, image.shape[1] / 2], [0, 1500.0, image.shape[0] / 2], [0, 0, 1]])
-        cv2.imwrite(str(tmp_path / f"{name}_undistorted.png"), cv2.undistort(image, focal, np.array([-0.05, 0, 0, 0])))
-    frames, _ = read_frames(list_folder(tmp_path), BOARD, laser=None)
-    assert {f.name: f.text for f in frames if f.reason is not None} == {
-        f"{name}_undistorted.png": f"by its name it is {name}.png, straightened" for name in ("frame03", "frame04")
     }
 
 

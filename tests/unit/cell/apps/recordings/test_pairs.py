@@ -46,7 +46,7 @@ def test_the_light_plane_counts_stops_too():
 
 def test_many_pictures_of_three_stops_are_not_enough():
     result = solved(repeated(scene(count=3), 5))
-    assert "3 stops" in result["refused"]["hand_eye"]
+    assert "3 stops have a flange pose; a hand-eye that can be checked needs 4" in result["refused"]["hand_eye"]
     assert right(result)
 
 

@@ -59,23 +59,31 @@ LINKS = [
 ]
 LIST = [{"image": f"frame{k + 3:02d}.png", "robot": p.tolist(), "joints": [0.1] * 6} for k, p in enumerate(POSES)]
 PRINTED = str.maketrans(".-", ",\u2212")
-TEXTS = {
+# File and text, or what writes it; then reading, unit, and what matches poses and pictures.
+SPELLINGS: dict[str, tuple[str | Callable[[Path], None], str, tuple[str, str, str]]] = {
+    "halves_in_one_file": (halves_in_one_file, "", ("matrix-4x4", "m", "order")),
+    "tuples": (tuples, "", ("xyz+quaternion-xyzw", "m", "name")),
+    "yaml_in_a_sub_folder": (yaml_in_a_sub_folder, "", ("xyz+quaternion-xyzw", "m", "name")),
+    "numpy_stack_by_columns": (numpy_stack_by_columns, "", ("matrix-4x4-by-columns", "m", "order")),
     "wxyz in mm with names": (
         "robot.csv",
         "image,a1,a2,a3,a4,a5,a6,a7\n"
         + of_each(lambda k, p: f"frame{k:02d}.png,{row([*1e3 * p[:3, 3], *quaternion(p, 'wxyz')], ',')}"),
+        ("xyz+quaternion-wxyz", "mm", "name"),
     ),
     "named columns in another order": (
         "robot.csv",
         "frame;qw;qx;qy;qz;x;y;z\n"
         + "\n".join(of_each(lambda k, p: row([k, *quaternion(p, "wxyz"), *p[:3, 3]], ";")).split("\n")[::-1]),
+        ("xyz+quaternion-xyzw", "m", "number"),
     ),
     "decimal commas with bom and crlf": (
         "Stützpunkte.csv",
         "\ufeff" + of_each(lambda k, p: row([*1e3 * p[:3, 3], *angles(p, "ZYX", True)], ";").replace(".", ","), "\r\n"),
+        ("xyz+abc-deg", "mm", "order"),
     ),
-    "json list": ("data.json", json.dumps(LIST[::-1])),
-    "links of which one is the flange": ("poses.json", json.dumps(LINKS)),
+    "json list": ("data.json", json.dumps(LIST[::-1]), ("matrix-4x4", "m", "name")),
+    "links of which one is the flange": ("poses.json", json.dumps(LINKS), ("matrix-4x4", "m", "name")),
     "opencv yaml": (
         "robot.yml",
         "%YAML:1.0\n---\n"
@@ -84,6 +92,7 @@ TEXTS = {
                 f"pose{k}: !!opencv-matrix\n   rows: 3\n   cols: 4\n   dt: d\n   data: [ {row(p[:3], ', ')} ]\n"
             )
         ),
+        ("matrix-4x4", "m", "name"),
     ),
     "opencv xml": (
         "robot.xml",
@@ -95,81 +104,78 @@ TEXTS = {
             )
         )
         + "</opencv_storage>",
+        ("matrix-4x4", "m", "name"),
     ),
     "xml with a pose in an attribute": (
         "robot.xml",
         "<stops>" + of_each(lambda k, p: f"<pose_{k} value='{row([*p[:3, 3], *quaternion(p)])}'/>") + "</stops>",
+        ("xyz+quaternion-xyzw", "m", "name"),
     ),
     "decimal commas apart by spaces": (
         "p.txt",
         of_each(lambda k, p: row([*p[:3, 3], *quaternion(p)]).replace(".", ",")),
+        ("xyz+quaternion-xyzw", "m", "order"),
     ),
     "quoted decimal commas, minus signs of print": (
         "p.csv",
         of_each(lambda k, p: ",".join(f'"{v:.9f}"'.translate(PRINTED) for v in (*p[:3, 3], *quaternion(p)))),
+        ("xyz+quaternion-xyzw", "m", "order"),
     ),
-    "json with a number before": ("p.json", json.dumps([[k, *p[:3, 3], *angles(p)] for k, p in enumerate(POSES)])),
+    "json with a number before": (
+        "p.json",
+        json.dumps([[k, *p[:3, 3], *angles(p)] for k, p in enumerate(POSES)]),
+        ("xyz+rotvec-rad", "m", "order"),
+    ),
     "counted from another number": (
         "p.txt",
         "n x y z qx qy qz qw\n" + of_each(lambda k, p: row([k + 2, *p[:3, 3], *quaternion(p)])),
+        ("xyz+quaternion-xyzw", "m", "order"),
     ),
-    "xml with joints beside": ("robot.xml", f"<stops>{of_each(joints_and_pose)}</stops>"),
-    "times before rotation vectors": ("poses.txt", of_each(lambda k, p: row([1.7e9 + 3.7 * k, *p[:3, 3], *angles(p)]))),
+    "xml with joints beside": (
+        "robot.xml",
+        f"<stops>{of_each(joints_and_pose)}</stops>",
+        ("xyz+rpy-rad", "mm", "name"),
+    ),
+    "times before rotation vectors": (
+        "poses.txt",
+        of_each(lambda k, p: row([1.7e9 + 3.7 * k, *p[:3, 3], *angles(p)])),
+        ("xyz+rotvec-rad", "m", "order"),
+    ),
     "titles above rotation and position": (
         "info.txt",
         of_each(lambda k, p: f"{k}:\nRotation:\n{angles(p).tolist()}\nTranslation:\n{p[:3, 3].tolist()}\n"),
+        ("xyz+rotvec-rad", "m", "name"),
     ),
     "program of the arm": (
         "photographs.script",
         PROGRAM
         + of_each(lambda k, p: f"  movel(p[{row([*p[:3, 3], *angles(p)], ', ')}], a=1.2, v=0.25)\n  sleep(0.5)")
         + "\nend\n",
+        ("xyz+rotvec-rad", "m", "order"),
     ),
     "as the arm's client records them": (
         "robot_data.csv",
         f"timestamp {NAMES}\n" + of_each(lambda k, p: row([100.0 + k, *JOINTS[k], *p[:3, 3], *angles(p)])),
+        ("xyz+rotvec-rad", "m", "order"),
     ),
 }
-SPELLINGS = {
-    halves_in_one_file: ("matrix-4x4", "m", "order"),
-    tuples: ("xyz+quaternion-xyzw", "m", "name"),
-    yaml_in_a_sub_folder: ("xyz+quaternion-xyzw", "m", "name"),
-    numpy_stack_by_columns: ("matrix-4x4-by-columns", "m", "order"),
-    "opencv xml": ("matrix-4x4", "m", "name"),
-    "xml with a pose in an attribute": ("xyz+quaternion-xyzw", "m", "name"),
-    "xml with joints beside": ("xyz+rpy-rad", "mm", "name"),
-    "decimal commas apart by spaces": ("xyz+quaternion-xyzw", "m", "order"),
-    "quoted decimal commas, minus signs of print": ("xyz+quaternion-xyzw", "m", "order"),
-    "json with a number before": ("xyz+rotvec-rad", "m", "order"),
-    "counted from another number": ("xyz+quaternion-xyzw", "m", "order"),
-    "wxyz in mm with names": ("xyz+quaternion-wxyz", "mm", "name"),
-    "named columns in another order": ("xyz+quaternion-xyzw", "m", "number"),
-    "decimal commas with bom and crlf": ("xyz+abc-deg", "mm", "order"),
-    "json list": ("matrix-4x4", "m", "name"),
-    "opencv yaml": ("matrix-4x4", "m", "name"),
-    "program of the arm": ("xyz+rotvec-rad", "m", "order"),
-    "times before rotation vectors": ("xyz+rotvec-rad", "m", "order"),
-    "titles above rotation and position": ("xyz+rotvec-rad", "m", "name"),
-    "as the arm's client records them": ("xyz+rotvec-rad", "m", "order"),
-    "links of which one is the flange": ("matrix-4x4", "m", "name"),
-}
 
 
-def write(folder: Path, spelling: str | Callable[[Path], None]) -> None:
-    if isinstance(spelling, str):
-        name, text = TEXTS[spelling]
+def write(folder: Path, spelling: str) -> None:
+    name, text, _ = SPELLINGS[spelling]
+    if isinstance(name, str):
         (folder / name).write_bytes(text.encode())
     else:
-        spelling(folder)
+        name(folder)
 
 
-@pytest.mark.parametrize("spelling", SPELLINGS, ids=lambda w: w if isinstance(w, str) else w.__name__)
+@pytest.mark.parametrize("spelling", SPELLINGS)
 def test_poses_are_read_as_they_were_meant(recording, seen, spelling):
     write(recording, spelling)
     frames, understood, unread = understand(recording, seen)
     assert understood.notes == [], unread
     about = understood.about
-    assert (about["reading"], about["unit"], about["matched_by"]) == SPELLINGS[spelling]
+    assert (about["reading"], about["unit"], about["matched_by"]) == SPELLINGS[spelling][2]
     assert about["setup"] == "eye_in_hand"
     assert about["turn_deg"] < 0.1
     assert about["shift_mm"] < 0.5

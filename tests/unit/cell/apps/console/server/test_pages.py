@@ -128,7 +128,7 @@ def test_the_mailbox_keeps_the_newest_and_of_the_cloud_as_much_as_it_may() -> No
             mailbox.show("state", f"state {n}")
             mailbox.cloud(n.to_bytes(2, "big"))
         mailbox.say("hello")
-        return [await mailbox.take() for _ in range(mailbox.waiting)]
+        return [await mailbox.take() for _ in range(2 + MOST_CLOUDS)]
 
     taken = asyncio.run(fill())
     assert taken[:2] == ["hello", "state 499"]

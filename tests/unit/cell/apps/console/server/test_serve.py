@@ -25,7 +25,7 @@ def status(pid: int, what: str) -> int:
     ("seconds", "least_rate"),
     # Other tests take most of the processor beside the short one: what it says then would still deny a STOP without
     # the one slot for all of them.
-    [(4.0, 200.0), pytest.param(60.0, 1000.0, marks=pytest.mark.campaign)],
+    [(2.0, 200.0), pytest.param(60.0, 1000.0, marks=pytest.mark.campaign)],
 )
 def test_a_stop_is_carried_out_in_a_flood(tmp_path: Path, seconds: float, least_rate: float) -> None:
     """Pressed three times a second during a flood; each is carried out, and begun, in time."""
@@ -75,7 +75,7 @@ def test_stops_at_once_have_one_stop_in_common(tmp_path: Path) -> None:
 
 def test_a_stop_that_a_device_does_not_confirm_holds_up_no_other(tmp_path: Path) -> None:
     with serving(tmp_path) as server:
-        server.stop_s = 3.0
+        server.stop_s = 1.5
         _ = server.cookie
         presses = [threading.Thread(target=lambda: server.do(do="stop")) for _ in range(2)]
         presses[0].start()
