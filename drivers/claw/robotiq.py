@@ -18,7 +18,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from drivers.clock import Clock
+from drivers.clock import Clock, patience
 from drivers.errors import UNTOLD, DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import Identity, LinkStatistics, Reading
 from drivers.ports import forget_unasked
@@ -162,7 +162,6 @@ SAME = 4
 STANDS_S = 0.2
 """So long the fingers have to stand before it is believed that something stopped them."""
 _POLL_S = 0.02
-_WALL_FLOOR_S = 0.5
 _FAULTS = {
     5: "its action is delayed until it is activated anew",
     7: "it has to be activated before it moves",
@@ -292,7 +291,7 @@ class RobotiqClaw:
         grip = self._grip
         self._link.set({"POS": position, "SPE": grip.speed, "FOR": grip.force, "GTO": 1})
         now = self._clock.now()
-        until, since = now + max(timeout, _WALL_FLOOR_S * self._clock.rate), now
+        until, since = now + patience(self._clock, timeout), now
         before = (MOVING, -1)
         while True:
             taken = self._link.get("PRE") == position

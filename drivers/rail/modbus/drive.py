@@ -5,11 +5,11 @@ Its flag goes off when the drive loses its zero; that it stands says neither who
 
 from __future__ import annotations
 
-from drivers.clock import Clock
+from drivers.clock import Clock, patience
 from drivers.errors import DeviceFault, InterlockError, LimitError, shown
 from drivers.rail.axis import Samples
 from drivers.rail.modbus.link import Flag, ModbusLink, Number, Rate, RegisterMap
-from drivers.rail.motion import STANDSTILL_S, patience
+from drivers.rail.motion import STANDSTILL_S
 
 
 class ModbusDrive:

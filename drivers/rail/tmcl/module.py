@@ -18,11 +18,11 @@ import re
 import zlib
 from dataclasses import dataclass
 
-from drivers.clock import Clock
+from drivers.clock import Clock, patience
 from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, shown
 from drivers.interfaces import Reading
 from drivers.rail.axis import Samples
-from drivers.rail.motion import STANDSTILL_S, patience
+from drivers.rail.motion import STANDSTILL_S
 from drivers.rail.tmcl.link import NO_SUCH_TYPE, WRONG_VALUE, Axis, CommandRefused, TmclLink
 
 SUPPORTED = ("1210", "1211", "1240", "1241", "1260", "1270", "1276", "1278", "6212", "6214")

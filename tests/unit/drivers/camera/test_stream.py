@@ -1,4 +1,4 @@
-"""The camera driver on the simulated camera's wire: fresh frames, true times, known losses; and folders of pictures."""
+"""The camera driver on the simulated camera's wire: fresh frames, true times, known losses."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from cell.devices.diagnosis.diagnosis import examine
-from drivers.camera.folder import FolderCamera, image_files, read_image
 from drivers.camera.stream import StreamCamera, answers
 from drivers.clock import Clock, ClockMap, Latch
 from drivers.errors import (
@@ -28,7 +25,6 @@ from drivers.errors import (
     InterlockError,
     LimitError,
     NotConnectedError,
-    RefusedError,
 )
 from drivers.interfaces import Camera, Frame, FrameStream
 from sim_backends.clock import WorldClock
@@ -362,75 +358,6 @@ def test_a_peer_of_another_protocol_is_recognised() -> None:
         StreamCamera("scan_camera", f"127.0.0.1:{listener.getsockname()[1]}", clock=Clock())
     server.join(2.0)
     listener.close()
-
-
-# --- folder ---
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    for number in (1, 2, 10):
-        cv2.imwrite(str(tmp_path / f"frame{number}.png"), np.full((40, 60), number, np.uint8))
-    (tmp_path / "poses.csv").write_text("not a picture")
-    return tmp_path
-
-
-def test_a_folder_delivers_its_pictures_in_the_order_of_their_numbers(folder: Path) -> None:
-    camera: Camera = FolderCamera("recording", folder, clock=Clock())
-    assert camera.shape == (40, 60)
-    assert [path.name for path in image_files(folder)] == ["frame1.png", "frame2.png", "frame10.png"]
-    assert camera.grab().image[0, 0] == 1
-    with camera.stream() as stream:
-        assert [(frame.frame_id, int(frame.image[0, 0])) for frame in stream] == [(1, 2), (2, 10)]
-    with pytest.raises(DeviceFault, match="all 3 pictures"):
-        camera.grab()
-
-
-def test_bad_pictures_are_refused_by_name_one_by_one(folder: Path) -> None:
-    noise = np.random.default_rng(1).integers(0, 255, (40, 60), dtype=np.uint8)
-    cv2.imwrite(str(folder / "frame3.png"), noise)
-    whole = (folder / "frame3.png").read_bytes()
-    (folder / "frame3.png").write_bytes(whole[: len(whole) // 2])
-    cv2.imwrite(str(folder / "frame4.jpg"), noise)
-    whole = (folder / "frame4.jpg").read_bytes()
-    (folder / "frame4.jpg").write_bytes(whole[: 2 * len(whole) // 3])
-    (folder / "frame5.png").write_text("this is text")
-    (folder / "frame6.png").write_bytes(b"")
-    cv2.imwrite(str(folder / "frame7.png"), np.zeros((20, 30), np.uint8))
-    camera = FolderCamera("recording", folder, clock=Clock())
-    delivered, refused = [], []
-    for _ in range(8):
-        try:
-            delivered.append(int(camera.grab().image[0, 0]))
-        except RefusedError as error:
-            refused.append(str(error).replace(str(folder), "").lstrip("/"))
-    assert delivered == [1, 2, 10]
-    assert [text.split(":")[0] for text in refused] == [
-        "frame3.png",
-        "frame4.jpg",
-        "frame5.png",
-        "frame6.png",
-        "frame7.png",
-    ]
-    assert "cut off" in refused[0]
-    assert "cut off" in refused[1]
-    assert "not a picture" in refused[2]
-    assert "0 bytes" in refused[3]
-    assert "30x20 pixels instead of 60x40" in refused[4]
-
-
-def test_a_colour_picture_becomes_grey(tmp_path: Path) -> None:
-    cv2.imwrite(str(tmp_path / "colour.png"), np.full((5, 5, 3), (0, 0, 255), np.uint8))
-    assert read_image(tmp_path / "colour.png").shape == (5, 5)
-
-
-def test_a_folder_without_pictures_is_named(tmp_path: Path) -> None:
-    with pytest.raises(NotConnectedError, match="no pictures"):
-        FolderCamera("recording", tmp_path, clock=Clock())
-    with pytest.raises(NotConnectedError, match="not a folder"):
-        FolderCamera("recording", tmp_path / "missing", clock=Clock())
-    with pytest.raises(RefusedError, match=r"missing\.png"):
-        read_image(tmp_path / "missing.png")
 
 
 @pytest.mark.parametrize(
