@@ -17,13 +17,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from drivers.camera.frame_queue import alone
 from drivers.clock import Clock
 from drivers.errors import (
     Aborted,
     ConfigError,
     DeadlineError,
     DeviceFault,
-    InterlockError,
     LimitError,
     NotConnectedError,
     RefusedError,
@@ -254,9 +254,5 @@ class RecordedCamera:
 
     @contextmanager
     def _exclusive(self) -> Iterator[None]:
-        if not self._acquiring.acquire(blocking=False):
-            raise InterlockError(self.name, "frames are being acquired already. Close that stream first")
-        try:
+        with alone(self.name, self._acquiring):
             yield
-        finally:
-            self._acquiring.release()

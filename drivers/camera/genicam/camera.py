@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
-from drivers.camera.frame_queue import FrameQueue
+from drivers.camera.frame_queue import QUEUE_BYTES, FrameQueue, alone, capacity, check_fits
 from drivers.camera.genicam.acquisition import FORMATS, AcquiredPicture, Acquisition, Network
 from drivers.camera.genicam.aravis import AravisMissing, load
 from drivers.camera.genicam.device import GenicamDevice, Place, StampClock
@@ -33,7 +33,6 @@ from drivers.errors import (
 )
 from drivers.interfaces import Frame, Identity, LinkStatistics
 
-_QUEUE_BYTES = 64 * 1024 * 1024
 _LONGEST_GAP_S = 2.0
 _TRIES = 3
 _PACKETS_LOST = "camera.packets_lost"
@@ -115,11 +114,10 @@ class GenicamCamera:
 
         One at a time. Frames that nobody takes are kept up to 64 MB; later ones are dropped and counted as lost.
         """
-        height, width = self.shape
         with self._exclusive() as device:
             self._stamps.compare(device)
             set_trigger(device, self._setup.trigger, self._timing(device), photograph=False)
-            with self._acquire(device, capacity=max(8, _QUEUE_BYTES // (height * width)), whole=False) as frames:
+            with self._acquire(device, capacity(self.shape), whole=False) as frames:
                 yield frames
 
     def stop(self) -> None:
@@ -170,20 +168,16 @@ class GenicamCamera:
     def _exclusive(self) -> Iterator[GenicamDevice]:
         if self._look:
             raise InterlockError(self.name, "the camera is only looked at. Open it to use it")
-        if not self._acquiring.acquire(blocking=False):
-            raise InterlockError(self.name, "frames are being acquired already. Close that stream first")
-        try:
+        with alone(self.name, self._acquiring):
             try:
                 yield self._ready()
             except DeviceFault as fault:
                 if fault.code == "camera.lost":
                     self._device.abandon()
                 raise
-        finally:
-            self._acquiring.release()
 
     @contextmanager
-    def _acquire(self, device: GenicamDevice, *, capacity: int, whole: bool) -> Iterator[FrameQueue]:
+    def _acquire(self, device: GenicamDevice, most: int, *, whole: bool) -> Iterator[FrameQueue]:
         """Frames while the camera acquires; `whole`: an incomplete picture is a fault, not only a loss."""
 
         wrong: list[DeviceFault] = []
@@ -199,7 +193,7 @@ class GenicamCamera:
         queue = FrameQueue(
             self.name,
             self._clock,
-            capacity=capacity,
+            capacity=most,
             longest_gap=_LONGEST_GAP_S + (2.0 / self._wish.frame_rate if self._wish else 0.0),
             check=check,
             statistics=self.statistics,
@@ -216,7 +210,7 @@ class GenicamCamera:
                 queue.put(frame)
 
         network = self._setup.network if self._place.control else None
-        buffers = max(4, min(64, _QUEUE_BYTES // max(1, self.shape[0] * self.shape[1])))
+        buffers = max(4, min(64, QUEUE_BYTES // max(1, self.shape[0] * self.shape[1])))
         acquisition = Acquisition(device, network, buffers, take=take, failed=queue.wake, statistics=self.statistics)
         self._queue, self._acquisition = queue, acquisition
         try:
@@ -228,7 +222,7 @@ class GenicamCamera:
             queue.close()
 
     def _photograph(self, device: GenicamDevice, timeout: float, *, triggered: bool) -> Frame:
-        with self._acquire(device, capacity=4, whole=True) as frames:
+        with self._acquire(device, 4, whole=True) as frames:
             called = self._clock.now()
             if triggered:
                 device.call("software_trigger")
@@ -346,12 +340,7 @@ def set_timing(device: GenicamDevice, wish: Wish | None, *, paced: bool) -> Wish
         check_positive(device.name, "frame rate", wish.frame_rate, device.bounds("frame_rate")[1], "Hz")
     else:
         check_positive(device.name, "frame rate", wish.frame_rate, 10_000.0, "Hz")
-    if wish.exposure * wish.frame_rate > 1.0:
-        raise LimitError(
-            device.name,
-            f"exposure {shown(wish.exposure, 's')} does not fit into a frame at {wish.frame_rate:g} Hz; nothing was "
-            f"sent. Choose at most {shown(1.0 / wish.frame_rate, 's')}, or at most {1.0 / wish.exposure:g} Hz",
-        )
+    check_fits(device.name, wish.exposure, wish.frame_rate)
     # Either may limit the other on the way: what gets smaller goes first.
     shorter = wish.exposure * 1e6 <= device.call("get_exposure_time")
     if not shorter and rated:

@@ -14,7 +14,7 @@ from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.motion import RailMotion
 from drivers.rail.tmcl import module
-from drivers.rail.tmcl.link import NO_SUCH_TYPE, Axis, CommandRefused, ReferenceSearch, TmclLink
+from drivers.rail.tmcl.link import Axis, ReferenceSearch, TmclLink
 from drivers.rail.tmcl.module import (
     EXACT,
     SPEED,
@@ -95,12 +95,8 @@ class TmclRail(RailAxis):
 
     def examine(self, seconds: float) -> list[Reading]:
         """What the module tells of its motor driver, at once; see `drivers.rail.tmcl.module`."""
-        try:
-            return module.readings(self._link.get(Axis.DRIVER_ERRORS))
-        except CommandRefused as refused:
-            if refused.status == NO_SUCH_TYPE:
-                return []
-            raise
+        bits = self._link.get_if_there(Axis.DRIVER_ERRORS)
+        return [] if bits is None else module.readings(bits)
 
     def state(self) -> RailState:
         """Read position, velocity, switches and whether it is homed now.
@@ -135,12 +131,7 @@ class TmclRail(RailAxis):
         return self._position(), left, right, self._stalled
 
     def _stalled(self) -> bool:
-        try:
-            return bool(self._link.get(Axis.EXTENDED_ERRORS) & STALL_FLAG)
-        except CommandRefused as refused:
-            if refused.status == NO_SUCH_TYPE:
-                return False
-            raise
+        return bool((self._link.get_if_there(Axis.EXTENDED_ERRORS) or 0) & STALL_FLAG)
 
     def _require_zero(self) -> None:
         self._zero.require()

@@ -211,7 +211,7 @@ def test_lost_frames_are_known(bench: Bench) -> None:
 def test_pictures_that_nobody_takes_are_counted_as_lost_and_not_kept_for_ever(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("drivers.camera.stream._QUEUE_BYTES", 0)
+    monkeypatch.setattr("drivers.camera.frame_queue.QUEUE_BYTES", 0)
     bench.camera.configure(exposure=0.002, frame_rate=100.0)
     with bench.camera.stream() as stream:
         bench.clock.sleep(1.0)
