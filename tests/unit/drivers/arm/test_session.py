@@ -23,7 +23,7 @@ from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import ArmSafety
-from tests.support.wire.arm_bench import HOME, ArmBench, soon, stand_at_home
+from tests.support.wire.arm_bench import HOME, ArmBench, Shared, soon
 from tests.support.wire.cable import Cable
 
 pytestmark = pytest.mark.wire
@@ -48,34 +48,9 @@ def running():
         yield bench
 
 
-class Shared:
-    """The one connection that tests share as long as the arm can be moved over it: most leave one behind that can."""
-
-    def __init__(self, address):
-        self._address = address
-        self._arm = None
-
-    def ready(self):
-        """The driver, connected, with a program that moves the arm, which stands where it began."""
-        if self._arm is not None:
-            try:
-                stand_at_home(self._arm)
-            except CellError:
-                self.close()
-        if self._arm is None:
-            self._arm = connect(self._address)
-            stand_at_home(self._arm)
-        return self._arm
-
-    def close(self):
-        if self._arm is not None:
-            self._arm.close()
-            self._arm = None
-
-
 @pytest.fixture(scope="module")
 def shared(running):
-    shared = Shared(running.address)
+    shared = Shared(lambda: connect(running.address))
     yield shared
     running.ask("clear")
     shared.close()
