@@ -9,8 +9,7 @@ import pytest
 
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, InterlockError
-from drivers.rail.tmcl.rail import TmclRail
-from tests.support.wire.rail_bench import ACCELERATION, MAX_SPEED, Bench, connect, reply, telegram
+from tests.support.wire.rail_bench import ACCELERATION, Bench, connect, reply, telegram
 
 pytestmark = pytest.mark.wire
 
@@ -46,10 +45,7 @@ def test_the_next_program_finds_the_rail_homed_and_its_zero_where_it_was(homed: 
 
 def test_the_zero_of_another_configuration_is_not_taken_nor_given_back(homed: Bench) -> None:
     homed.rail.close()
-    other = TmclRail(
-        "rail", homed.peer.url, lead=0.004, steps_per_turn=200, microsteps=256, travel=(0.0, 0.1), max_speed=MAX_SPEED,
-        acceleration=ACCELERATION, clock=homed.clock,
-    )  # fmt: skip
+    other = connect(homed.peer.url, homed.clock, lead=0.004)
     assert not other.state().homed
     with pytest.raises(InterlockError, match="not homed"):
         other.move_to(0.01)
