@@ -31,10 +31,9 @@ class RobotiqClawConfig(ClawConfig):
 
 
 def _connect(name: str, config: RobotiqClawConfig, around: Surroundings) -> RobotiqClaw:
-    from drivers.claw.robotiq import Grip, RobotiqClaw
+    from drivers.claw.robotiq import RobotiqClaw
 
-    grip = Grip(config.open_at, config.closed_at, config.speed, config.force, config.inside)
-    return RobotiqClaw(name, config.address, grip, clock=around.clock, control=not around.look)
+    return RobotiqClaw(name, config, clock=around.clock, control=not around.look)
 
 
 ROBOTIQ: AnyMake = Make("claw", "robotiq", RobotiqClawConfig, _connect, simulated=with_endpoint("address"))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cell.devices.diagnosis.diagnosis import examine
 from drivers.camera.stream import StreamCamera, answers
-from drivers.clock import Clock, ClockMap, Latch
+from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, LimitError, NotConnectedError
 from drivers.interfaces import Camera, Frame, FrameStream
 from sim_backends.clock import WorldClock
@@ -117,21 +117,6 @@ def test_a_frame_that_is_lost_while_the_camera_is_examined_is_told_with_a_remedy
     assert found["frames lost"].value == 1.0
     assert not found["frames lost"].ok
     assert "cable" in found["frames lost"].remedy
-
-
-def test_clocks_are_mapped_by_the_shortest_round_trip() -> None:
-    device = ClockMap()
-    device.add([Latch(10.0, 500.0, 10.4), Latch(11.0, 501.002, 11.004), Latch(12.0, 502.0, 12.9)])
-    assert device.host_time(501.002) == pytest.approx(11.002)
-    assert device.uncertainty == pytest.approx(0.002)
-
-
-def test_the_devices_drift_is_learned_from_latches_far_apart() -> None:
-    device, drift = ClockMap(), 60e-6
-    for host in (0.0, 30.0, 120.0):
-        device.add([Latch(host - 1e-4, 7.0 + host * (1.0 + drift), host + 1e-4)])
-    assert device.drift == pytest.approx(-drift, rel=0.05)
-    assert device.host_time(7.0 + 150.0 * (1.0 + drift)) == pytest.approx(150.0, abs=3e-4)
 
 
 # --- frame stream ---

@@ -7,7 +7,8 @@ import socket
 import struct
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 import pytest
 from pymodbus.framer import FramerRTU
@@ -48,21 +49,18 @@ def test_a_lost_reply_is_asked_for_again_and_a_silent_drive_is_told_with_what_to
         drive.rail(unit=UNIT + 1)
 
 
-@pytest.mark.wire
-@pytest.mark.parametrize("late", [0.2, 0.4, 0.6])
-def test_late_answers_never_become_those_to_later_questions(late: float) -> None:
-    """Two replies are late, those behind them come at once after them; a drive that reads two registers at a time."""
-    listener, asked, ready = socket.create_server(("127.0.0.1", 0)), itertools.count(), threading.Event()
+@contextmanager
+def answered(answer: Callable[[int, int], bytes]) -> Iterator[ModbusLink]:
+    """A link to a drive that gives `answer(address, count)` to each question, after a first one that is asked here."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    ready = threading.Event()
 
     def serve() -> None:
         connection, _ = listener.accept()
         with connection:
             while request := connection.recv(8):
                 address, count = struct.unpack(">HH", request[2:6])
-                if ready.is_set() and next(asked) < 2:
-                    time.sleep(late)
-                body = bytes([UNIT, 3, 2 * count]) + struct.pack(">H", address) * count
-                connection.sendall(body + FramerRTU.compute_CRC(body).to_bytes(2, "big"))
+                connection.sendall(answer(address, count) if ready.is_set() else reply(address, count))
 
     threading.Thread(target=serve, daemon=True).start()
     link = ModbusLink(
@@ -71,48 +69,54 @@ def test_late_answers_never_become_those_to_later_questions(late: float) -> None
     )  # fmt: skip
     assert link.read(7, 2) == [7, 7]
     ready.set()
-    right = 0
-    for address in (16, 32, 48, 64, 80, 96):
-        with suppress(DeadlineError):
-            assert link.read(address, 2) == [address, address]
-            right += 1
-    assert right >= 3
+    yield link
     link.close()
     listener.close()
+
+
+def reply(address: int, count: int, unit: int = UNIT, function: int = 3) -> bytes:
+    """Each register holds its first one's address."""
+    body = bytes([unit, function, 2 * count]) + struct.pack(">H", address) * count
+    return body + FramerRTU.compute_CRC(body).to_bytes(2, "big")
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("late", [0.2, 0.4, 0.6])
+def test_late_answers_never_become_those_to_later_questions(late: float) -> None:
+    """Two replies are late, those behind them come at once after them; a drive that reads two registers at a time."""
+    asked = itertools.count()
+
+    def answer(address: int, count: int) -> bytes:
+        if next(asked) < 2:
+            time.sleep(late)
+        return reply(address, count)
+
+    right = 0
+    with answered(answer) as link:
+        for address in (16, 32, 48, 64, 80, 96):
+            with suppress(DeadlineError):
+                assert link.read(address, 2) == [address, address]
+                right += 1
+    assert right >= 3
 
 
 @pytest.mark.wire
 @pytest.mark.parametrize("spoilt", ["a bit", "another drive's", "another function's"])
 def test_a_reply_that_is_spoilt_or_anothers_is_asked_for_again(spoilt: str) -> None:
-    listener, ready = socket.create_server(("127.0.0.1", 0)), threading.Event()
-    spoiling = itertools.count()
+    asked = itertools.count()
 
-    def serve() -> None:
-        connection, _ = listener.accept()
-        with connection:
-            while request := connection.recv(8):
-                address, count = struct.unpack(">HH", request[2:6])
-                spoil = ready.is_set() and next(spoiling) == 0
-                unit = UNIT + (spoil and spoilt == "another drive's")
-                function = 3 + (spoil and spoilt == "another function's")
-                body = bytes([unit, function, 2 * count]) + struct.pack(">H", address + spoil) * count
-                reply = bytearray(body + FramerRTU.compute_CRC(body).to_bytes(2, "big"))
-                if spoil and spoilt == "a bit":
-                    reply[4] ^= 0x10
-                connection.sendall(reply)
+    def answer(address: int, count: int) -> bytes:
+        if next(asked) > 0:
+            return reply(address, count)
+        made = bytearray(
+            reply(address + 1, count, UNIT + (spoilt == "another drive's"), 3 + (spoilt == "another function's"))
+        )
+        made[4] ^= 0x10 * (spoilt == "a bit")
+        return bytes(made)
 
-    threading.Thread(target=serve, daemon=True).start()
-    statistics = LinkStatistics()
-    link = ModbusLink(
-        "rail", f"socket://127.0.0.1:{listener.getsockname()[1]}", unit=UNIT, baud=115200, parity="none", stop_bits=1,
-        stop_action=ActionConfig(address=1, value=1), clock=Clock(), statistics=statistics,
-    )  # fmt: skip
-    assert link.read(7, 2) == [7, 7]
-    ready.set()
-    assert link.read(16, 2) == [16, 16]
-    assert next(spoiling) >= 2, "it was asked for again"
-    link.close()
-    listener.close()
+    with answered(answer) as link:
+        assert link.read(16, 2) == [16, 16]
+    assert next(asked) >= 2, "it was asked for again"
 
 
 @pytest.mark.wire
