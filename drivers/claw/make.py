@@ -15,7 +15,11 @@ Count = Annotated[int, whole(0, 255, meaning=" as the gripper counts it: 0 open,
 
 
 class RobotiqClawConfig(ClawConfig):
-    """A Robotiq gripper, on the socket of its program on the arm's controller; `inside`: it holds by spreading."""
+    """A Robotiq gripper, on the socket of its program on the arm's controller; `inside`: it holds by spreading.
+
+    Where its fingers are open and where they are sent to hold, how fast they go and how strongly they press: all as the
+    gripper counts it.
+    """
 
     driver: Literal["robotiq"] = "robotiq"
     address: Annotated[str, Endpoint]
