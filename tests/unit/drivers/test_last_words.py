@@ -109,12 +109,13 @@ def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, di
         (signal.SIGKILL, SEARCH, lambda truth: truth["rail_moving"]),
         # Of an arm at rest no program ends, with which the controller would switch the laser off by itself.
         (signal.SIGKILL, LIT, lambda truth: truth["laser_on"]),
+        (signal.SIGSTOP, LIT, lambda truth: truth["laser_on"]),
         (signal.SIGSTOP, DRIVE, drives),
         (signal.SIGSTOP, MOVE, rail_moves),
         (signal.SIGSTOP, LIT_ARM, lit_arm_moves),
     ],
-    ids=["all killed", "rail killed as it searches its switch", "laser alone killed", "vehicle frozen", "rail frozen",
-         "arm and laser frozen"],
+    ids=["all killed", "rail killed as it searches its switch", "laser alone killed", "laser alone frozen",
+         "vehicle frozen", "rail frozen", "arm and laser frozen"],
 )  # fmt: skip
 def test_half_a_second_after_the_last_sign_of_life_all_is_safe(
     serving: tuple[Path, dict[str, Any]], how: signal.Signals, script: str, moving: Callable[[Truth], bool]
