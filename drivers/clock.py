@@ -77,6 +77,14 @@ MAX_DRIFT = 100e-6
 _KEEP = 64
 
 
+WALL_FLOOR_S = 0.5
+
+
+def patience(clock: Clock, seconds: float) -> float:
+    """`seconds` of the clock, or half a second of the wall where that is longer."""
+    return max(seconds, WALL_FLOOR_S * clock.rate)
+
+
 @dataclass(frozen=True)
 class Latch:
     """The device read `device` s somewhere between the host times `before` and `after`, s."""

@@ -12,12 +12,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from drivers.clock import Clock
+from drivers.clock import Clock, patience
 from drivers.errors import DeviceFault, InterlockError, in_the_end
 from drivers.interfaces import Identity, LinkStatistics
 
 _POLL_S = 0.01
-_WALL_FLOOR_S = 0.5
 
 
 class Shown(Protocol):
@@ -153,7 +152,7 @@ class ConfirmedClaw(ABC):
             )
 
     def _feedback_becomes(self, value: bool, timeout: float) -> bool:
-        deadline = self._clock.now() + max(timeout, _WALL_FLOOR_S * self._clock.rate)
+        deadline = self._clock.now() + patience(self._clock, timeout)
         while self.holding != value:
             if self._clock.now() >= deadline:
                 return False

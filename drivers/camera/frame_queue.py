@@ -10,11 +10,12 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 
-from drivers.clock import Clock
-from drivers.errors import Aborted, DeadlineError, DeviceFault
+from drivers.clock import Clock, Latch
+from drivers.errors import Aborted, DeadlineError, DeviceFault, InterlockError, LimitError, shown
 from drivers.interfaces import Frame, LinkStatistics
 
 AHEAD_S = 0.020
@@ -88,6 +89,52 @@ class StampCheck:
             hint="Restart the camera, and see whether something sets its clock meanwhile (time service, another "
             "program). If it comes back, the camera's firmware is at fault.",
         )
+
+
+QUEUE_BYTES = 64 * 1024 * 1024
+
+
+def capacity(shape: tuple[int, int]) -> int:
+    """How many frames of (height, width) pixels a stream keeps that nobody takes."""
+    return max(8, QUEUE_BYTES // (shape[0] * shape[1]))
+
+
+def check_fits(name: str, exposure: float, frame_rate: float) -> None:
+    """`LimitError` when an exposure, s, is longer than a frame at this rate, Hz, lasts."""
+    if exposure * frame_rate > 1.0:
+        raise LimitError(
+            name,
+            f"exposure {shown(exposure, 's')} does not fit into a frame at {frame_rate:g} Hz; nothing was sent. "
+            f"Choose at most {shown(1.0 / frame_rate, 's')}, or at most {1.0 / exposure:g} Hz",
+        )
+
+
+@contextmanager
+def alone(name: str, acquiring: threading.Lock) -> Iterator[None]:
+    """Inside this context only its owner acquires frames; `InterlockError` while another one does."""
+    if not acquiring.acquire(blocking=False):
+        raise InterlockError(name, "frames are being acquired already. Close that stream first")
+    try:
+        yield
+    finally:
+        acquiring.release()
+
+
+_LEAST_LATCHES, _MOST_LATCHES = 8, 32
+_GOOD_LATCH_WALL_S = 0.0005
+
+
+def latched(clock: Clock, latch: Callable[[], Latch | None]) -> list[Latch]:
+    """Latches of a camera's clock, as many as it takes to get a short round trip; none where it gives None."""
+    latches: list[Latch] = []
+    good = _GOOD_LATCH_WALL_S * clock.rate
+    while len(latches) < _LEAST_LATCHES or (
+        len(latches) < _MOST_LATCHES and min(made.after - made.before for made in latches) > good
+    ):
+        if (made := latch()) is None:
+            return []
+        latches.append(made)
+    return latches
 
 
 _SLOW_DEVICE_WALL_S = 2.0

@@ -18,26 +18,19 @@ from typing import Any
 
 import numpy as np
 
-from drivers.camera.frame_queue import FrameQueue
+from drivers.camera.frame_queue import FrameQueue, alone, capacity, check_fits, latched
 from drivers.clock import Clock, ClockMap, Latch
 from drivers.errors import (
     ConfigError,
     DeadlineError,
     DeviceFault,
-    InterlockError,
-    LimitError,
     NotConnectedError,
     check_positive,
     check_range,
     in_the_end,
-    shown,
 )
 from drivers.interfaces import Frame, Identity, LinkStatistics
 
-_LATCHES = 8
-_MAX_LATCHES = 32
-_GOOD_LATCH_WALL_S = 0.0005
-_QUEUE_BYTES = 64 * 1024 * 1024
 _LONGEST_GAP_S = 2.0
 _SETTING_TOLERANCE = 0.01
 _NUMBERS = ("height", "width", "exposure_min_s", "exposure_max_s", "frame_rate_max_hz")
@@ -108,12 +101,7 @@ class StreamCamera:
         about = self._about
         check_range(self.name, "exposure", exposure, low=about.exposure_min, high=about.exposure_max, unit="s")
         check_positive(self.name, "frame rate", frame_rate, about.frame_rate_max, "Hz")
-        if exposure * frame_rate > 1.0:
-            raise LimitError(
-                self.name,
-                f"exposure {shown(exposure, 's')} does not fit into a frame at {frame_rate:g} Hz; nothing was sent. "
-                f"Choose at most {shown(1.0 / frame_rate, 's')}, or at most {1.0 / exposure:g} Hz",
-            )
+        check_fits(self.name, exposure, frame_rate)
         with self._exclusive():
             set_to = self._link.request("configure", exposure_s=exposure, frame_rate_hz=frame_rate)[0]
         for key, asked in (("exposure_s", exposure), ("frame_rate_hz", frame_rate)):
@@ -136,7 +124,7 @@ class StreamCamera:
         with self._exclusive():
             self._compare_clocks()
             called = self._clock.now()
-            with self._queue(capacity=4) as frames:
+            with self._queue(4) as frames:
                 frames.expect(self._first_id("trigger", self._link.request("trigger")[0]))
                 while True:
                     frame = frames.next(timeout)
@@ -151,10 +139,9 @@ class StreamCamera:
         Frames that nobody takes are kept up to 64 MB; later ones are dropped and counted as lost.
         """
         settings = {} if self._frame_rate is None else {"frame_rate_hz": self._frame_rate}
-        height, width = self.shape
         with self._exclusive():
             self._compare_clocks()
-            with self._queue(capacity=max(8, _QUEUE_BYTES // (height * width))) as frames:
+            with self._queue(capacity(self.shape)) as frames:
                 frames.expect(self._first_id("start", self._link.request("start", **settings)[0]))
                 with in_the_end(self._end_acquisition):
                     yield frames
@@ -214,32 +201,25 @@ class StreamCamera:
         )
 
     def _compare_clocks(self) -> None:
-        latches: list[Latch] = []
-        good = _GOOD_LATCH_WALL_S * self._clock.rate
-        while len(latches) < _LATCHES or (
-            len(latches) < _MAX_LATCHES and min(latch.after - latch.before for latch in latches) > good
-        ):
+        def latch() -> Latch:
             reply, before, after = self._link.request("latch")
-            latches.append(Latch(before, self._number(reply, "latch", "device_ns") * 1e-9, after))
-        self._map.add(latches)
+            return Latch(before, self._number(reply, "latch", "device_ns") * 1e-9, after)
+
+        self._map.add(latched(self._clock, latch))
 
     @contextmanager
     def _exclusive(self) -> Iterator[None]:
         self._link.check()
-        if not self._acquiring.acquire(blocking=False):
-            raise InterlockError(self.name, "frames are being acquired already. Close that stream first")
-        try:
+        with alone(self.name, self._acquiring):
             yield
-        finally:
-            self._acquiring.release()
 
     @contextmanager
-    def _queue(self, capacity: int) -> Iterator[FrameQueue]:
+    def _queue(self, most: int) -> Iterator[FrameQueue]:
         gap = _LONGEST_GAP_S + (2.0 / self._frame_rate if self._frame_rate else 0.0)
         queue = FrameQueue(
             self.name,
             self._clock,
-            capacity=capacity,
+            capacity=most,
             longest_gap=gap,
             check=self._link.check,
             statistics=self.statistics,

@@ -17,18 +17,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from drivers.camera.frame_queue import FrameQueue
+from drivers.camera.frame_queue import FrameQueue, alone, capacity, check_fits
 from drivers.clock import Clock
 from drivers.errors import (
     CellError,
     ConfigError,
     DeviceFault,
     InterlockError,
-    LimitError,
     NotConnectedError,
     check_positive,
     check_range,
-    shown,
 )
 from drivers.interfaces import Frame, Identity, Image, LinkStatistics
 
@@ -67,7 +65,6 @@ _HIGHEST_HZ = 500.0
 _MANUAL = 1
 _TOLERANCE = 0.02
 _OLDEST_S = 10.0
-_QUEUE_BYTES = 64 * 1024 * 1024
 
 
 class V4l2Camera:
@@ -134,12 +131,7 @@ class V4l2Camera:
         """
         check_range(self.name, "exposure", exposure, *_EXPOSURES_S, "s")
         check_positive(self.name, "frame rate", frame_rate, _HIGHEST_HZ, "Hz")
-        if exposure * frame_rate > 1.0:
-            raise LimitError(
-                self.name,
-                f"exposure {shown(exposure, 's')} does not fit into a frame at {frame_rate:g} Hz; nothing was sent. "
-                f"Choose at most {shown(1.0 / frame_rate, 's')}, or at most {1.0 / exposure:g} Hz",
-            )
+        check_fits(self.name, exposure, frame_rate)
         with self._exclusive():
             self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL)
             self._set(cv2.CAP_PROP_EXPOSURE, "exposure", round(exposure / _EXPOSURE_UNIT_S), "x 0.1 ms")
@@ -160,7 +152,7 @@ class V4l2Camera:
     @contextmanager
     def stream(self) -> Iterator[FrameQueue]:
         """Frames as they come; lost ones are known from gaps between the stamps."""
-        with self._exclusive(), self._acquire(max(8, _QUEUE_BYTES // (self.shape[0] * self.shape[1]))) as frames:
+        with self._exclusive(), self._acquire(capacity(self.shape)) as frames:
             yield frames
 
     def stop(self) -> None:
@@ -223,25 +215,16 @@ class V4l2Camera:
         if self._look:
             raise InterlockError(self.name, "the camera is only looked at. Open it to use it")
         self._require()
-        if not self._acquiring.acquire(blocking=False):
-            raise InterlockError(self.name, "frames are being acquired already. Close that stream first")
-        try:
+        with alone(self.name, self._acquiring):
             yield
-        finally:
-            self._acquiring.release()
 
     @contextmanager
-    def _acquire(self, capacity: int) -> Iterator[FrameQueue]:
+    def _acquire(self, most: int) -> Iterator[FrameQueue]:
         self._ended.clear()
         self._failure = None
         longest = 2.0 + 2.0 / self._timing.frame_rate
         queue = FrameQueue(
-            self.name,
-            self._clock,
-            capacity=capacity,
-            longest_gap=longest,
-            check=self._check,
-            statistics=self.statistics,
+            self.name, self._clock, capacity=most, longest_gap=longest, check=self._check, statistics=self.statistics
         )
         self._queue = queue
         reader = threading.Thread(target=self._read, args=(queue,), name=f"{self.name} pictures", daemon=True)

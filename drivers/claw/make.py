@@ -15,7 +15,11 @@ Count = Annotated[int, whole(0, 255, meaning=" as the gripper counts it: 0 open,
 
 
 class RobotiqClawConfig(ClawConfig):
-    """A Robotiq gripper, on the socket of its program on the arm's controller; `inside`: it holds by spreading."""
+    """A Robotiq gripper, on the socket of its program on the arm's controller; `inside`: it holds by spreading.
+
+    Where its fingers are open and where they are sent to hold, how fast they go and how strongly they press: all as the
+    gripper counts it.
+    """
 
     driver: Literal["robotiq"] = "robotiq"
     address: Annotated[str, Endpoint]
@@ -31,10 +35,9 @@ class RobotiqClawConfig(ClawConfig):
 
 
 def _connect(name: str, config: RobotiqClawConfig, around: Surroundings) -> RobotiqClaw:
-    from drivers.claw.robotiq import Grip, RobotiqClaw
+    from drivers.claw.robotiq import RobotiqClaw
 
-    grip = Grip(config.open_at, config.closed_at, config.speed, config.force, config.inside)
-    return RobotiqClaw(name, config.address, grip, clock=around.clock, control=not around.look)
+    return RobotiqClaw(name, config, clock=around.clock, control=not around.look)
 
 
 ROBOTIQ: AnyMake = Make("claw", "robotiq", RobotiqClawConfig, _connect, simulated=with_endpoint("address"))

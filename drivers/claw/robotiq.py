@@ -16,9 +16,9 @@ import socket
 import threading
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 
-from drivers.clock import Clock
+from drivers.claw.make import RobotiqClawConfig
+from drivers.clock import Clock, patience
 from drivers.errors import UNTOLD, DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import Identity, LinkStatistics, Reading
 from drivers.ports import forget_unasked
@@ -162,7 +162,6 @@ SAME = 4
 STANDS_S = 0.2
 """So long the fingers have to stand before it is believed that something stopped them."""
 _POLL_S = 0.02
-_WALL_FLOOR_S = 0.5
 _FAULTS = {
     5: "its action is delayed until it is activated anew",
     7: "it has to be activated before it moves",
@@ -177,39 +176,22 @@ _FAULTS = {
 }
 
 
-@dataclass(frozen=True)
-class Grip:
-    """How the part is gripped: positions (0 open to 255 closed), speed and force as the gripper counts them, 0 to 255.
-
-    With `inside` the fingers hold the part by spreading.
-    """
-
-    open_at: int
-    closed_at: int
-    speed: int
-    force: int
-    inside: bool = False
-
-    @property
-    def stopped(self) -> int:
-        """OBJ of fingers that hold the part."""
-        return STOPPED_OPENING if self.inside else STOPPED_CLOSING
-
-
 class RobotiqClaw:
-    """The gripper at `address` ("HOST:PORT"), which somebody has activated.
+    """The gripper that `record` describes, which somebody has activated.
 
     It is never activated from here: that drives its fingers all the way to and fro, with or without a part.
     Raises `NotConnectedError` and `DeadlineError` when no gripper answers.
     """
 
-    def __init__(self, name: str, address: str, grip: Grip, *, clock: Clock, control: bool = True) -> None:
+    def __init__(self, name: str, record: RobotiqClawConfig, *, clock: Clock, control: bool = True) -> None:
         self.name = name
         self.statistics = LinkStatistics()
-        self._grip = grip
+        self._grip = record
+        self._held = STOPPED_OPENING if record.inside else STOPPED_CLOSING
+        """OBJ of fingers that hold the part."""
         self._clock = clock
         self._control = control
-        self._link = RobotiqLink(name, address, self.statistics)
+        self._link = RobotiqLink(name, record.address, self.statistics)
         try:
             self._link.get("STA")
         except BaseException:
@@ -240,7 +222,7 @@ class RobotiqClaw:
     def grip(self, timeout: float = 2.0) -> None:
         """Close; `DeviceFault` (claw.no_part) unless the fingers are stopped by a part within `timeout` s."""
         found = self._move(self._grip.closed_at, timeout)
-        if found == self._grip.stopped:
+        if found == self._held:
             return
         self._require_well()
         why = {AT_POSITION: "the fingers went all the way and met nothing", MOVING: "the fingers still move"}.get(
@@ -275,7 +257,7 @@ class RobotiqClaw:
         """Whether the gripper finds a part between its fingers now. Raises `DeviceFault` when it cannot know."""
         found = self._link.get("OBJ")
         self._require_well()
-        return found == self._grip.stopped and self._link.get("PRE") == self._grip.closed_at
+        return found == self._held and self._link.get("PRE") == self._grip.closed_at
 
     def stop(self) -> None:
         """Nothing to stop: the claw stays as it is, because opening would drop the part."""
@@ -292,7 +274,7 @@ class RobotiqClaw:
         grip = self._grip
         self._link.set({"POS": position, "SPE": grip.speed, "FOR": grip.force, "GTO": 1})
         now = self._clock.now()
-        until, since = now + max(timeout, _WALL_FLOOR_S * self._clock.rate), now
+        until, since = now + patience(self._clock, timeout), now
         before = (MOVING, -1)
         while True:
             taken = self._link.get("PRE") == position

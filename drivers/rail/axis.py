@@ -7,14 +7,27 @@ from __future__ import annotations
 
 import math
 import threading
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from typing import Protocol
+from typing import ClassVar
 
 from drivers.clock import Clock
-from drivers.errors import CellError, ConfigError, InterlockError, check_positive, check_range, shown
+from drivers.errors import (
+    Aborted,
+    CellError,
+    ConfigError,
+    DeviceFault,
+    InterlockError,
+    NotConnectedError,
+    check_positive,
+    check_range,
+    shown,
+)
 from drivers.interfaces import LONGEST_NUDGE_M, LinkStatistics
+from drivers.last_words import LastWords, attended_by, descriptor_of
+from drivers.ports import FAILURES, open_port
 from drivers.rail.motion import (
     LONGEST_S,
     SWEEP_MARGIN_M,
@@ -33,25 +46,104 @@ Samples = list[tuple[float, float, float]]
 """Host time in s, position in m, round trip in s of each reading."""
 
 
-class Link(Protocol):
-    """What an axis needs of the link to its drive."""
+QUIET_S = 0.05
+"""Wall seconds without a byte after which a line is quiet."""
 
-    @property
-    def stops(self) -> Stops:
+
+class RailLink(ABC):
+    """The serial port `url` with one drive on it; a read waits for `timeout` wall seconds.
+
+    `DRIVE` is what errors call it, `REPLY_S` the wall seconds that it has for a reply.
+
+    A stop overtakes: commands that were issued before it and have not been sent yet are refused. Raises
+    `NotConnectedError` when the port cannot be opened.
+    """
+
+    DRIVE: ClassVar[str]
+    REPLY_S: ClassVar[float]
+
+    def __init__(
+        self, name: str, url: str, statistics: LinkStatistics, *, baud: int, timeout: float,
+        parity: str = "none", stop_bits: int = 1,
+    ) -> None:  # fmt: skip
+        self.name = name
+        self.url = url
+        self.stops = Stops()
         """Those that were asked for: a command is only sent if none came since the caller read their count."""
+        self._statistics = statistics
+        self._timeout = timeout
+        self._lock = threading.Lock()
+        self._closed = False
+        self._in_step = True
+        self._last_words: LastWords | None = None
+        self._port = open_port(name, url, baud=baud, timeout=timeout, parity=parity, stop_bits=stop_bits)
 
     @property
     def closed(self) -> bool:
         """True once `close` was called."""
+        return self._closed
 
-    def attended(self) -> AbstractContextManager[Callable[[], None]]:
-        """See `drivers.interfaces.Attended`."""
-
+    @abstractmethod
     def stop(self) -> None:
         """Stop whatever the drive does; commands issued earlier are refused."""
 
+    @abstractmethod
+    def _stop_words(self) -> list[bytes]:
+        """What stops the drive when this process dies."""
+
     def close(self) -> None:
         """Close the port; every later call raises `NotConnectedError`."""
+        with self._lock:
+            self._closed = True
+            if self._last_words is not None:
+                self._last_words.close()
+            self._port.close()
+
+    def attended(self) -> AbstractContextManager[Callable[[], None]]:
+        """See `drivers.interfaces.Attended`."""
+        return attended_by(self.name, self._stop_after_death())
+
+    def _stop_after_death(self) -> LastWords | None:
+        """From the first motion on: who never moved it has nothing to end."""
+        port = descriptor_of(self._port)
+        if self._last_words is None and port is not None:
+            self._last_words = LastWords(self.name, port, self._stop_words())
+        return self._last_words
+
+    @contextmanager
+    def _line(self, issued: int | None) -> Iterator[None]:
+        """The line for this thread alone; `issued` is the count of stops when the caller decided to move, if it did.
+
+        Raises `Aborted` when a stop came since, `DeviceFault` (rail.link_lost) when the port fails.
+        """
+        with self._lock:
+            if self._closed:
+                raise NotConnectedError(self.name, "the rail was closed. Open it again")
+            if issued is not None and issued != self.stops.count:
+                raise Aborted(f"{self.name}: stopped before the command was sent")
+            try:
+                yield
+            except FAILURES as error:
+                self._statistics.count("link_lost")
+                raise DeviceFault(
+                    self.name,
+                    "rail.link_lost",
+                    f"the port {self.url} failed: {error}",
+                    recoverable=False,
+                    hint=f"Check the cable and the {self.DRIVE}'s supply, then open the cell again.",
+                ) from error
+
+    def _rest(self) -> bytes:
+        """What still comes in, until the line was quiet: thrown away, so that a late reply answers nothing else."""
+        end = time.monotonic() + self.REPLY_S
+        rest = b""
+        self._port.timeout = QUIET_S
+        try:
+            while (more := bytes(self._port.read(256))) and time.monotonic() < end:
+                rest += more
+        finally:
+            self._port.timeout = self._timeout
+        return rest
 
 
 class RailAxis(ABC):
@@ -61,7 +153,7 @@ class RailAxis(ABC):
     runs on it runs on. Raises `ConfigError` on impossible parameters.
     """
 
-    _link: Link
+    _link: RailLink
 
     def __init__(
         self, name: str, clock: Clock, *, travel: tuple[float, float], max_speed: float, acceleration: float,

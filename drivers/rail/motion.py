@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
-from drivers.clock import Clock
+from drivers.clock import Clock, patience
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, NotConnectedError, shown
 
 SWEEP_MARGIN_M = 0.5e-3
@@ -21,8 +21,6 @@ STANDSTILL_S = 0.5
 """A motor that has not moved for this long before its target has stalled."""
 POLL_S = 0.010
 POLL_WALL_S = 0.004
-WALL_FLOOR_S = 0.5
-"""No patience with the device is shorter than this on the wall, however fast the clock runs."""
 
 
 _TOO_SOON = 0.6
@@ -43,11 +41,6 @@ def move_duration(distance: float, speed: float, acceleration: float) -> float:
     if distance < 2.0 * run_up_distance(speed, acceleration):
         return 2.0 * math.sqrt(distance / acceleration)
     return distance / speed + speed / acceleration
-
-
-def patience(clock: Clock, seconds: float) -> float:
-    """`seconds` of the clock, or what the wall floor takes on this clock if that is longer."""
-    return max(seconds, WALL_FLOOR_S * clock.rate)
 
 
 class Stops:

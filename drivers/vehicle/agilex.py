@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 
-from drivers.clock import Clock
+from drivers.clock import Clock, patience
 from drivers.errors import (
     Aborted,
     CellError,
@@ -28,7 +28,7 @@ from drivers.interfaces import Identity, LinkStatistics, Reading, VehicleState
 from drivers.vehicle import health
 from drivers.vehicle.agilex_link import TEXT_REQUEST, UNKNOWN, AgilexLink, load_database
 from drivers.vehicle.faults import OUT_OF_COMMAND
-from drivers.vehicle.feedback import CAN_MODE, CYCLIC, WANTED, MessageFeedback, patience
+from drivers.vehicle.feedback import CAN_MODE, CYCLIC, WANTED, MessageFeedback
 from drivers.vehicle.health import can_interface
 
 KEEP_ALIVE_S = 0.020
@@ -87,7 +87,7 @@ class AgilexVehicle:
             options=dict(bus_options or {}),
             database=self._database,
             wanted=WANTED,
-            receive=self._feedback.take,
+            told=self._feedback.take,
             idle=self._feedback.idle,
             statistics=self.statistics,
         )

@@ -8,8 +8,7 @@ four numbers at 0x41A. Some firmware answers neither: then the version is unknow
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from importlib.resources import as_file, files
 from typing import cast
 
@@ -18,7 +17,7 @@ import cantools
 from cantools.database.can import Database, Message
 
 from drivers.interfaces import LinkStatistics
-from drivers.vehicle.can_link import CanLink
+from drivers.vehicle.can_link import CanLink, data_frame
 
 
 def load_database() -> Database:
@@ -27,24 +26,23 @@ def load_database() -> Database:
         return cast(Database, cantools.database.load_file(path))
 
 
-class AgilexLink:
-    """A `CanLink`; `receive` is called with each known message's name and signal values.
+class AgilexLink(CanLink):
+    """A `CanLink`; `told` is called with each known message's name and signal values.
 
     `wanted` names the messages that are decoded; others are ignored. Raises what `CanLink` does.
     """
 
     def __init__(
         self, name: str, interface: str, channel: str, *, bitrate: int, options: Mapping[str, object],
-        database: Database, wanted: frozenset[str], receive: Callable[[str, dict[str, float]], None],
+        database: Database, wanted: frozenset[str], told: Callable[[str, dict[str, float]], None],
         idle: Callable[[float], None], statistics: LinkStatistics,
     ) -> None:  # fmt: skip
         self._database = database
         self._wanted: dict[int, Message] = {
             message.frame_id: message for message in database.messages if message.name in wanted
         }
-        self._receive = receive
-        self._statistics = statistics
-        self._bus = CanLink(
+        self._told = told
+        super().__init__(
             name,
             interface,
             channel,
@@ -56,46 +54,22 @@ class AgilexLink:
             alone="the vehicle stops by itself 0.5 s after the last command",
         )
 
-    @property
-    def alive(self) -> bool:
-        """As `CanLink.alive`."""
-        return self._bus.alive
-
-    def check(self) -> None:
-        """As `CanLink.check`."""
-        self._bus.check()
-
-    @contextmanager
-    def listening(self) -> Iterator[list[tuple[float, can.Message]]]:
-        """As `CanLink.listening`."""
-        with self._bus.listening() as heard:
-            yield heard
-
-    def require_unspoken(self) -> None:
-        """As `CanLink.require_unspoken`."""
-        self._bus.require_unspoken()
-
     def send(self, name: str, **signals: float) -> None:
         """Send the message `name`; signals in the units of the DBC. Raises as `check` does."""
-        self._bus.check()
+        self.check()
         if name == "ControlModeCommand":
             # Who never commanded it has nothing to end.
             zero = self._frame("MotionCommand", Speed=0.0, YawRate=0.0, LateralSpeed=0.0, Steering=0.0)
-            self._bus.say_in_the_end((*[zero] * 3, self._frame("BrakeCommand", Locked=1)))
-        self._bus.send(self._frame(name, **signals), name)
+            self.say_in_the_end((*[zero] * 3, self._frame("BrakeCommand", Locked=1)))
+        self.send_frame(self._frame(name, **signals), name)
 
     def send_data(self, identifier: int, data: bytes) -> None:
         """Send a frame that is not in the message table. Raises as `check` does."""
-        frame = can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
-        self._bus.send(frame, f"0x{identifier:03X}")
-
-    def close(self) -> None:
-        """As `CanLink.close`."""
-        self._bus.close()
+        self.send_frame(data_frame(identifier, data), f"0x{identifier:03X}")
 
     def _frame(self, name: str, **signals: float) -> can.Message:
         message = self._database.get_message_by_name(name)
-        return can.Message(arbitration_id=message.frame_id, data=message.encode(signals), is_extended_id=False)
+        return data_frame(message.frame_id, message.encode(signals))
 
     def _take(self, frame: can.Message) -> None:
         message = self._wanted.get(frame.arbitration_id)
@@ -104,7 +78,7 @@ class AgilexLink:
         if len(frame.data) != message.length:
             self._statistics.count("malformed")
             return
-        self._receive(message.name, cast(dict[str, float], message.decode(bytes(frame.data), decode_choices=False)))
+        self._told(message.name, cast(dict[str, float], message.decode(bytes(frame.data), decode_choices=False)))
 
 
 TEXT_REQUEST = (0x4A1, b"\x01")

@@ -32,6 +32,11 @@ _BELL, _TAKEN = "\a", ("\r", "z\r", "Z\r")
 """How an slcan adapter answers what it refuses, and a frame that it has taken."""
 
 
+def data_frame(identifier: int, data: bytes) -> can.Message:
+    """A frame with a short identifier."""
+    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+
+
 class CanLink:
     """An open CAN bus; `receive` is called in the receive thread with each frame, error frames excepted, and `idle`
     with the seconds on the wall for which it has waited before each frame, whoever sent that.
@@ -93,7 +98,7 @@ class CanLink:
         finally:
             self._heard = None
 
-    def send(self, frame: can.Message, what: str) -> None:
+    def send_frame(self, frame: can.Message, what: str) -> None:
         """Send a frame; `what` names it in errors. Raises as `check` does."""
         self.check()
         try:

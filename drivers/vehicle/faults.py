@@ -55,74 +55,68 @@ def driver_trouble(motor: int, status: int) -> tuple[str, ...]:
     return tuple(f"motor {motor}: {word}" for word in _words(status & ~_DRIVER_WORKING & 0xFF, _DRIVER, 2))
 
 
-def vehicle_error(name: str, bits: int, trouble: tuple[str, ...], *, driven: bool) -> DeviceFault:
-    """The fault of a vehicle that reports an exception or trouble.
+_FAULTS: dict[str, tuple[str, bool, str]] = {
+    "vehicle.command_lost": (
+        "somebody took the remote control, or it was restarted, or a drive does not obey any more", False,
+        "Give command back, look where the vehicle stands, then run the job again.",
+    ),
+    "vehicle.disturbed": (
+        "somebody else commanded or moved it", False,
+        "Find out who else commands or pushes the vehicle and end it, then run the job again.",
+    ),
+    "vehicle.emergency_stop": (
+        "the emergency stop is pressed", False, "Release the button when it is safe, then `cell recover`.",
+    ),
+    "vehicle.setup": (
+        "a drive cannot be used as it is", False,
+        "Compare the drive's manual with docs/how-to/canopen.md, which lists what a drive must have.",
+    ),
+    "vehicle.silent": (
+        "it, or a part of it, is silent", True, "Check that the vehicle is on and the CAN bus is connected.",
+    ),
+    "vehicle.two_vehicles": (
+        "its motion and its standstill are not known", False,
+        "Take the other vehicle off the CAN bus, or give it identifiers of its own, then run the job again.",
+    ),
+    "vehicle.units": (
+        "speed and counts of a wheel contradict each other", False,
+        "Compare both with the drive's set-up, and try with the wheels off the floor.",
+    ),
+    "vehicle.watchdog": (
+        "a drive stays enabled without our heartbeat", False,
+        "Set object 6007h of the drive to 1, or try the other vehicle.guarding; see docs/how-to/canopen.md.",
+    ),
+}  # fmt: skip
 
-    One that came while it was `driven` may be a collision: that is for a person to look at, not for a program to clear.
+
+def vehicle_fault(name: str, code: str, text: str = "", hint: str = "") -> DeviceFault:
+    """The fault of the vehicle `name` with this code, in words and with a hint of its own where they are given."""
+    what, recoverable, usual = _FAULTS[code]
+    return DeviceFault(name, code, text or what, recoverable=recoverable, hint=hint or usual)
+
+
+def vehicle_error(name: str, bits: int, trouble: tuple[str, ...], *, driven: bool) -> DeviceFault:
+    """The fault of a vehicle that reports an exception or trouble; see `drive_error`."""
+    text = f"reports an error, bits 0x{bits:04x}: {'; '.join(trouble) or 'no bit says which'}"
+    return drive_error(name, text, driven=driven, more="; if it comes back, see the vehicle's manual.")
+
+
+def drive_error(name: str, text: str, *, driven: bool, more: str = ".") -> DeviceFault:
+    """The fault of a vehicle or a drive that reports one, with `more` in its hint where it was not `driven`.
+
+    One that came while it was driven may be a collision: that is for a person to look at, not for a program to clear.
     """
-    said = "; ".join(trouble) or "no bit says which"
     hint = (
         "It was driving: look what it may have driven against, and jog it away from there. Then run the job again."
         if driven
-        else "What has passed is cleared by taking command again; if it comes back, see the vehicle's manual."
+        else f"What has passed is cleared by taking command again{more}"
     )
-    text = f"reports an error, bits 0x{bits:04x}: {said}"
     return DeviceFault(name, "vehicle.error", text, recoverable=not driven, hint=hint)
-
-
-def command_lost(name: str, mode: int) -> DeviceFault:
-    """The fault of a vehicle that left CAN command: a person took the remote control, or it was restarted."""
-    return DeviceFault(
-        name,
-        "vehicle.command_lost",
-        f"left CAN command (mode {mode}): somebody took the remote control, or it was restarted",
-        recoverable=False,
-        hint="Give command back, look where the vehicle stands, then run the job again.",
-    )
-
-
-def emergency_stop(name: str) -> DeviceFault:
-    """The fault of a vehicle whose emergency stop is pressed."""
-    return DeviceFault(
-        name,
-        "vehicle.emergency_stop",
-        "the emergency stop is pressed",
-        recoverable=False,
-        hint="Release the button when it is safe, then `cell recover`.",
-    )
-
-
-def no_feedback(name: str, what: str) -> DeviceFault:
-    """The fault of a vehicle, or of a part of it, that is silent."""
-    return DeviceFault(
-        name,
-        "vehicle.silent",
-        what,
-        recoverable=True,
-        hint="Check that the vehicle is on and the CAN bus is connected.",
-    )
-
-
-def disturbed(name: str, what: str) -> DeviceFault:
-    """The fault of a vehicle that somebody else commanded or moved."""
-    return DeviceFault(
-        name,
-        "vehicle.disturbed",
-        what,
-        recoverable=False,
-        hint="Find out who else commands or pushes the vehicle and end it, then run the job again.",
-    )
 
 
 def two_vehicles(name: str, what: str) -> DeviceFault:
     """The fault of feedback that contradicts itself: nobody knows which vehicle it tells of."""
-    return DeviceFault(
-        name,
-        "vehicle.two_vehicles",
-        f"{what}. Its motion and its standstill are not known",
-        recoverable=False,
-        hint="Take the other vehicle off the CAN bus, or give it identifiers of its own, then run the job again.",
-    )
+    return vehicle_fault(name, "vehicle.two_vehicles", f"{what}. Its motion and its standstill are not known")
 
 
 def _words(bits: int, names: dict[int, str], digits: int) -> tuple[str, ...]:

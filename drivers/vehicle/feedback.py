@@ -11,20 +11,17 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from drivers.clock import Clock
+from drivers.clock import WALL_FLOOR_S, Clock, patience
 from drivers.errors import DeadlineError
 from drivers.interfaces import LinkStatistics, VehicleState
 from drivers.vehicle.agilex_link import ANSWERS, VersionAnswer
 from drivers.vehicle.faults import (
-    command_lost,
-    disturbed,
     driver_trouble,
-    emergency_stop,
-    no_feedback,
     system_trouble,
     system_warnings,
     two_vehicles,
     vehicle_error,
+    vehicle_fault,
 )
 
 _SPAN = 1 << 32
@@ -189,8 +186,6 @@ class Travel:
 CAN_MODE = 1
 SILENCE_S = 0.5
 """Feedback that stays away for this long is a fault."""
-WALL_FLOOR_S = 0.5
-"""No patience with the vehicle is shorter than this on the wall, however fast the clock runs."""
 QUIET_S = 2.0
 """A vehicle that nothing was heard of for this long, on the wall, while this program did listen, may have been
 restarted meanwhile: its odometry no longer tells where it is."""
@@ -199,7 +194,7 @@ _DRIVERS = {f"MotorDriver{motor}": motor for motor in range(1, 9)}
 _COMMANDS = ("MotionCommand", "BrakeCommand")
 WANTED = frozenset({*CYCLIC, *_DRIVERS, *_COMMANDS, *ANSWERS})
 """The vehicle's messages, and the commands of others on the bus; one's own do not come back."""
-_FAST_AGE_WALL_S = 0.2
+FAST_AGE_WALL_S = 0.2
 _SYSTEM_STATE_SLACK_S = 0.2
 _OK, _EMERGENCY_STOP = 0, 1
 STILL = 0.0035
@@ -211,22 +206,81 @@ _CREPT = 2
 """Counts in mm that an odometer may go on while the speed says standstill: one of noise, one of rounding."""
 
 
-def patience(clock: Clock, seconds: float) -> float:
-    """`seconds` of the clock, or what the wall floor takes on this clock if that is longer."""
-    return max(seconds, WALL_FLOOR_S * clock.rate)
+class Feedback:
+    """What a vehicle tells, taken by the receive thread under the lock `_news`, and how far its wheels have turned."""
+
+    def __init__(self, name: str, clock: Clock, travel: Travel) -> None:
+        self._name = name
+        self._clock = clock
+        self._travel = travel
+        self._news = threading.Condition(threading.RLock())
+
+    def commanded_to_move(self) -> None:
+        """The driver has just sent a velocity."""
+        with self._news:
+            self._travel.commanded_to_move()
+
+    def interrupt(self, why: str) -> None:
+        """From now on odometry does not tell where the vehicle is relative to where it was before."""
+        with self._news:
+            self._travel.interrupt(why)
+
+    @property
+    def interruptions(self) -> int:
+        """How often odometry lost its connection to where the vehicle was before."""
+        with self._news:
+            return self._travel.interruptions
+
+    def require_one(self) -> None:
+        """Raise the `DeviceFault` of two vehicles that report under the same identifiers."""
+        with self._news:
+            if what := self._travel.two_vehicles:
+                raise two_vehicles(self._name, what)
+
+    def acknowledge(self) -> None:
+        """Whoever takes command now has heard of what others did before."""
+        with self._news:
+            self._travel.acknowledge()
+
+    def wait_for(
+        self, happened: Callable[[], bool], timeout: float, alive: Callable[[], bool], floor: float = WALL_FLOOR_S
+    ) -> bool:
+        """Wait until news make `happened` true; False when they do not or `alive` turns false.
+
+        At most `timeout` s, or `floor` s on the wall if that is longer.
+        """
+        deadline = self._clock.now() + max(timeout, floor * self._clock.rate)
+        with self._news:
+            while not happened():
+                left = deadline - self._clock.now()
+                if left <= 0.0 or not alive():
+                    return False
+                self._news.wait(min(self._clock.wall(left), 0.1))
+        return True
+
+    def _require_young(self, told: float, max_age: float) -> None:
+        """`DeadlineError` when what was told at host time `told` is older than `max_age` s.
+
+        On a clock that runs faster than the wall, no age below 0.2 s of the wall counts as old.
+        """
+        if self._clock.rate > 1.0:
+            max_age = max(max_age, FAST_AGE_WALL_S * self._clock.rate)
+        age = self._clock.now() - told
+        if age > max_age:
+            raise DeadlineError(
+                self._name, f"the newest feedback is {age:.2f} s old, allowed {max_age:.2f} s. Check the CAN bus"
+            )
 
 
-class MessageFeedback:
+class MessageFeedback(Feedback):
     """The newest messages by name, each with its host time; filled by the receive thread through `take`."""
 
     def __init__(
         self, name: str, clock: Clock, *, track: float, max_speed: float, max_yaw_rate: float,
         statistics: LinkStatistics,
     ) -> None:  # fmt: skip
-        self._name = name
-        self._clock = clock
-        self._travel = Travel(clock, statistics, track=track, max_speed=max_speed, max_yaw_rate=max_yaw_rate)
-        self._news = threading.Condition(threading.RLock())
+        travel = Travel(clock, statistics, track=track, max_speed=max_speed, max_yaw_rate=max_yaw_rate)
+        super().__init__(name, clock, travel)
         self._newest: dict[str, tuple[float, dict[str, float]]] = {}
         self._quiet = dict.fromkeys(CYCLIC, 0.0)
         """Wall seconds for which the receiver has waited since each of them came."""
@@ -272,21 +326,6 @@ class MessageFeedback:
             for message in CYCLIC:
                 self._quiet[message] += seconds
 
-    def commanded_to_move(self) -> None:
-        """The driver has just sent a velocity."""
-        self._travel.commanded_to_move()
-
-    def interrupt(self, why: str) -> None:
-        """From now on odometry does not tell where the vehicle is relative to where it was before."""
-        with self._news:
-            self._travel.interrupt(why)
-
-    @property
-    def interruptions(self) -> int:
-        """How often odometry lost its connection to where the vehicle was before."""
-        with self._news:
-            return self._travel.interruptions
-
     @property
     def alarms(self) -> int:
         """How often somebody else commanded or moved the vehicle, or was taken for it."""
@@ -299,34 +338,12 @@ class MessageFeedback:
         with self._news:
             return bool(self._travel.disturbance or self._travel.two_vehicles)
 
-    def require_one(self) -> None:
-        """Raise the `DeviceFault` of two vehicles that report under the same identifiers."""
-        with self._news:
-            if what := self._travel.two_vehicles:
-                raise two_vehicles(self._name, what)
-
-    def acknowledge(self) -> None:
-        """Whoever takes command now has heard of what others did before."""
-        with self._news:
-            self._travel.acknowledge()
-
     def _trouble(self, *, commanded: bool) -> tuple[str, ...]:
         found = list(system_trouble(int(self._newest["SystemState"][1]["ErrorBits"]), commanded=commanded))
         for message, motor in _DRIVERS.items():
             if message in self._newest:
                 found += driver_trouble(motor, int(self._newest[message][1]["DriverStatus"]))
         return tuple(found)
-
-    def wait_for(self, happened: Callable[[], bool], timeout: float, alive: Callable[[], bool]) -> bool:
-        """Wait until news make `happened` true, at most `timeout` s; False when they do not or `alive` turns false."""
-        deadline = self._clock.now() + patience(self._clock, timeout)
-        with self._news:
-            while not happened():
-                left = deadline - self._clock.now()
-                if left <= 0.0 or not alive():
-                    return False
-                self._news.wait(min(self._clock.wall(left), 0.1))
-        return True
 
     def complete(self) -> bool:
         """True once every cyclic message has come."""
@@ -368,22 +385,15 @@ class MessageFeedback:
     def state(self, max_age: float, braked: bool | None) -> VehicleState:
         """All as one record; `DeadlineError` when it is older than `max_age` s.
 
-        Vehicle state and voltage, which come every 0.1 s, may be 0.2 s older. On a clock that runs faster than the
-        wall, no age below 0.2 s of the wall counts as old.
+        Vehicle state and voltage, which come every 0.1 s, may be 0.2 s older; see `_require_young`.
         """
-        if self._clock.rate > 1.0:
-            max_age = max(max_age, _FAST_AGE_WALL_S * self._clock.rate)
         with self._news:
             (moved, motion), (counted, _), (reported, system) = (self._newest[message] for message in CYCLIC)
             travel = self._travel
             x, y, yaw = travel.odometry.x, travel.odometry.y, travel.odometry.yaw
             interruptions, interruption = travel.interruptions, travel.interruption
             trouble = self._trouble(commanded=True)
-        age = self._clock.now() - min(moved, counted, reported + _SYSTEM_STATE_SLACK_S)
-        if age > max_age:
-            raise DeadlineError(
-                self._name, f"the newest feedback is {age:.2f} s old, allowed {max_age:.2f} s. Check the CAN bus"
-            )
+        self._require_young(min(moved, counted, reported + _SYSTEM_STATE_SLACK_S), max_age)
         return VehicleState(
             stamp=min(moved, counted),
             x=x,
@@ -418,13 +428,19 @@ class MessageFeedback:
             self.require_one()
         silent = self._clock.now() - oldest
         if silent > patience(self._clock, SILENCE_S) if driving else quiet > QUIET_S:
-            raise no_feedback(self._name, f"no feedback for {silent:.2f} s ({which} came last before that)")
+            raise vehicle_fault(
+                self._name, "vehicle.silent", f"no feedback for {silent:.2f} s ({which} came last before that)"
+            )
         if system["State"] == _EMERGENCY_STOP:
-            raise emergency_stop(self._name)
+            raise vehicle_fault(self._name, "vehicle.emergency_stop")
         if system["State"] != _OK or trouble:
             raise vehicle_error(self._name, int(system["ErrorBits"]), trouble, driven=self._travel.driven)
         if in_command and system["Mode"] != CAN_MODE:
             self.interrupt("it left CAN command")
-            raise command_lost(self._name, int(system["Mode"]))
+            raise vehicle_fault(
+                self._name,
+                "vehicle.command_lost",
+                f"left CAN command (mode {int(system['Mode'])}): somebody took the remote control, or it was restarted",
+            )
         if in_command and disturbance:
-            raise disturbed(self._name, disturbance)
+            raise vehicle_fault(self._name, "vehicle.disturbed", disturbance)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, InterlockError, check_range
 from drivers.interfaces import Identity, VehicleState
-from drivers.vehicle.faults import emergency_stop, system_trouble, vehicle_error
+from drivers.vehicle.faults import system_trouble, vehicle_error, vehicle_fault
 from drivers.vehicle.feedback import PlanarOdometry
 from sim_backends.direct.switches import DirectDevice
 from sim_backends.models.vehicle import ChassisState, Mode, VehicleModel
@@ -74,7 +74,7 @@ class DirectVehicle(DirectDevice):
         now = self._clock.now()
         feedback = self.model.feedback(now)
         if feedback.state is ChassisState.EMERGENCY_STOP:
-            raise emergency_stop(self.name)
+            raise vehicle_fault(self.name, "vehicle.emergency_stop")
         if feedback.state is not ChassisState.OK:
             trouble = system_trouble(feedback.errors, commanded=True)
             raise vehicle_error(self.name, feedback.errors, trouble, driven=now - self._driven < REST_AFTER_S)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from cell.devices.gate.gate import Gate, Gated
 from cell.devices.gate.interlocks import DeviceCommand
 from drivers.clock import Clock, Latch
-from drivers.errors import CellError, InterlockError, LimitError, check_range
+from drivers.errors import CellError, DeadlineError, InterlockError, LimitError, check_range
 from drivers.interfaces import (
     Arm,
     ArmMotion,
@@ -367,8 +367,15 @@ class GatedClaw(Gated[Claw]):
         return holding
 
 
+TRIES = 3
+"""How often at most a picture of a world that follows real devices is asked for, each time with the whole time that it
+may take."""
+
+
 class GatedCamera(Gated[Camera]):
-    """A camera whose commands are told at the gate."""
+    """A camera whose commands are told at the gate. `tries`: how often at most a picture is asked for."""
+
+    tries = 1
 
     def __init__(self, bare: Camera, gate: Gate) -> None:
         super().__init__(bare, gate)
@@ -385,8 +392,14 @@ class GatedCamera(Gated[Camera]):
         self.bare.configure(exposure, frame_rate)
 
     def grab(self, timeout: float = 2.0) -> Frame:
-        """See `Camera.grab`."""
+        """See `Camera.grab`; with more `tries` than one the last one's `DeadlineError`."""
         self.gate.asked(DeviceCommand(self.name, "grab"))
+        for k in range(1, self.tries):
+            try:
+                return self.bare.grab(timeout)
+            except DeadlineError as error:
+                self.statistics.count("picture asked for again")
+                log.info("%s; asked for again, %d of %d", error, k + 1, self.tries)
         return self.bare.grab(timeout)
 
     @contextmanager

@@ -20,8 +20,8 @@ from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
 from cell.devices.gate.gated import GatedArm
 from cell.devices.simulated.process import WorldLink
-from drivers.errors import CellError, DeadlineError, DeviceFault
-from drivers.interfaces import ArmState, Camera, Frame, FrameStream, Identity, Vector
+from drivers.errors import CellError, DeviceFault
+from drivers.interfaces import ArmState, Vector
 from drivers.make import OnArm
 
 Rows = list[list[float]]
@@ -351,54 +351,3 @@ class DeviceFollowing:
             if figures["not_made"] > told:
                 log.warning("the simulated world made no picture: %s", figures["why_not"])
             told = figures["not_made"]
-
-
-TRIES = 3
-"""How often at most a picture is asked for, each time with the whole time that it may take."""
-
-
-class FollowedCamera:
-    """A camera, `bare`, whose world follows real devices; see `drivers.interfaces.Camera`."""
-
-    def __init__(self, bare: Camera) -> None:
-        self.bare = bare
-        self.name, self.shape, self.statistics = bare.name, bare.shape, bare.statistics
-
-    def identity(self) -> Identity:
-        """See `Device.identity`."""
-        return self.bare.identity()
-
-    def ping(self) -> float:
-        """See `Device.ping`."""
-        return self.bare.ping()
-
-    @property
-    def time_bound(self) -> float:
-        """See `Camera.time_bound`."""
-        return self.bare.time_bound
-
-    def configure(self, exposure: float, frame_rate: float) -> None:
-        """See `Camera.configure`."""
-        self.bare.configure(exposure, frame_rate)
-
-    def grab(self, timeout: float = 2.0) -> Frame:
-        """See `Camera.grab`; tried up to `TRIES` times, then the last try's `DeadlineError`."""
-        for k in range(1, TRIES):
-            try:
-                return self.bare.grab(timeout)
-            except DeadlineError as error:
-                self.statistics.count("picture asked for again")
-                log.info("%s; asked for again, %d of %d", error, k + 1, TRIES)
-        return self.bare.grab(timeout)
-
-    def stream(self) -> AbstractContextManager[FrameStream]:
-        """See `Camera.stream`."""
-        return self.bare.stream()
-
-    def stop(self) -> None:
-        """See `Device.stop`."""
-        self.bare.stop()
-
-    def close(self) -> None:
-        """See `Device.close`."""
-        self.bare.close()

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from cell.config.cell_config import DEVICES, CellConfig, find_config, load_config
-from cell.devices.assembly import connect, connect_one
-from cell.devices.gate.gated import GatedArm
+from cell.devices.assembly import connect
+from cell.devices.gate.gated import TRIES, GatedArm, GatedCamera
 from cell.devices.lock import CellLock
-from cell.devices.simulated.following import DeviceFollowing, FollowedCamera
+from cell.devices.simulated.following import DeviceFollowing
 from cell.devices.simulated.process import SimulatedCell, WorldConnector, WorldLink, on_gige, with_endpoints
 from drivers.arm.make import ArmOutputClawConfig, ArmOutputLaserConfig
 from drivers.clock import Clock
@@ -212,13 +212,14 @@ class MixedCell:
         def otherwise(name: str, clock: Clock) -> Device | None:
             if name not in simulated:
                 return None
-            if link is not None and DEVICES[name] == "camera":
-                return FollowedCamera(connect_one(self.config, name, clock))
             return None if "arm" in simulated else _switched(self.config, name, link, clock)
 
         self.devices = connect(self.config, needed, otherwise)
         undo.callback(self.devices.close)
         if link is not None:
+            for device in self.devices:
+                if isinstance(device, GatedCamera) and device.name in simulated:
+                    device.tries = TRIES
             following = DeviceFollowing(link, self.devices, config, real, simulated)
             self.devices.following = following
             arm = self.devices.arm if "arm" in real else None

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from drivers.camera.genicam.aravis import Aravis, AravisError, BufferStatus, Handle
 from drivers.camera.genicam.device import GenicamDevice
+from drivers.camera.genicam.make import GigeCameraConfig
 from drivers.errors import CellError
 from drivers.interfaces import Image, LinkStatistics
 
@@ -137,20 +138,6 @@ class AcquiredPicture:
     device_ns: int
 
 
-@dataclass(frozen=True)
-class Network:
-    """How pictures come over the network: packets in bytes (None: the largest that passes), times in s.
-
-    `resend`: missing packets are asked for again; a picture is given up `retention` after its last packet.
-    """
-
-    packet_size: int | None = None
-    packet_delay: float = 0.0
-    resend: bool = True
-    packet_timeout: float = 0.02
-    retention: float = 0.5
-
-
 class BlockCount:
     """Block ids as a count: 1 for the first picture of the acquisition. A picture that comes out of turn counts less
     than the one before it."""
@@ -181,8 +168,8 @@ class Acquisition:
     """
 
     def __init__(
-        self, device: GenicamDevice, network: Network | None, buffers: int, take: Callable[[AcquiredPicture], None],
-        failed: Callable[[], None], statistics: LinkStatistics,
+        self, device: GenicamDevice, network: GigeCameraConfig | None, buffers: int,
+        take: Callable[[AcquiredPicture], None], failed: Callable[[], None], statistics: LinkStatistics,
     ) -> None:  # fmt: skip
         self.failure: CellError | None = None
         self.incomplete = 0
@@ -247,7 +234,7 @@ class Acquisition:
         if failed:
             raise failed[0]
 
-    def _set_network(self, network: Network) -> None:
+    def _set_network(self, network: GigeCameraConfig) -> None:
         for name, kind, value in (
             ("packet-resend", "gv_stream_packet_resend", int(network.resend)),
             # All of a picture's packets may be asked for again, not only a quarter of them.

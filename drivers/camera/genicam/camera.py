@@ -12,13 +12,13 @@ import ctypes
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
 
-from drivers.camera.frame_queue import FrameQueue
-from drivers.camera.genicam.acquisition import FORMATS, AcquiredPicture, Acquisition, Network
+from drivers.camera.frame_queue import QUEUE_BYTES, FrameQueue, alone, capacity, check_fits
+from drivers.camera.genicam.acquisition import FORMATS, AcquiredPicture, Acquisition
 from drivers.camera.genicam.aravis import AravisMissing, load
 from drivers.camera.genicam.device import GenicamDevice, Place, StampClock
+from drivers.camera.genicam.make import GenicamConfig, GigeCameraConfig
 from drivers.clock import Clock
 from drivers.errors import (
     CellError,
@@ -33,25 +33,24 @@ from drivers.errors import (
 )
 from drivers.interfaces import Frame, Identity, LinkStatistics
 
-_QUEUE_BYTES = 64 * 1024 * 1024
 _LONGEST_GAP_S = 2.0
 _TRIES = 3
 _PACKETS_LOST = "camera.packets_lost"
 
 
 class GenicamCamera:
-    """The camera at `place`; `look`: only looked at, so nothing is set and no picture can be taken.
+    """The camera at `place`, set as `record` says; `look`: only looked at, nothing is set and no picture can be taken.
 
     Raises `NotConnectedError` when the library or the camera is missing, `DeviceFault` when another application holds
     the camera or it refuses a setting, `LimitError` when a setting is outside its range.
     """
 
-    def __init__(self, name: str, place: Place, setup: GenicamSetup, *, clock: Clock, look: bool = False) -> None:
+    def __init__(self, name: str, place: Place, record: GenicamConfig, *, clock: Clock, look: bool = False) -> None:
         self.name = name
         self.statistics = LinkStatistics()
-        self.shape = (setup.region.height, setup.region.width)
+        self.shape = (record.height, record.width)
         self._place = place
-        self._setup = setup
+        self._record = record
         self._clock = clock
         self._look = look
         self._acquiring = threading.Lock()
@@ -88,7 +87,7 @@ class GenicamCamera:
         while frames are being acquired, `DeviceFault` when the camera takes other values.
         """
         with self._exclusive() as device:
-            self._wish = set_timing(device, Wish(exposure, frame_rate), paced=self._setup.trigger.paced)
+            self._wish = set_timing(device, Wish(exposure, frame_rate), paced=self._record.paced)
 
     def grab(self, timeout: float = 2.0) -> Frame:
         """One frame whose exposure began after the call: never a buffered one.
@@ -99,7 +98,7 @@ class GenicamCamera:
         """
         with self._exclusive() as device:
             self._stamps.compare(device)
-            triggered = set_trigger(device, self._setup.trigger, self._timing(device), photograph=True)
+            triggered = set_trigger(device, self._record, self._timing(device), photograph=True)
             tried = 0
             while True:
                 try:
@@ -115,11 +114,10 @@ class GenicamCamera:
 
         One at a time. Frames that nobody takes are kept up to 64 MB; later ones are dropped and counted as lost.
         """
-        height, width = self.shape
         with self._exclusive() as device:
             self._stamps.compare(device)
-            set_trigger(device, self._setup.trigger, self._timing(device), photograph=False)
-            with self._acquire(device, capacity=max(8, _QUEUE_BYTES // (height * width)), whole=False) as frames:
+            set_trigger(device, self._record, self._timing(device), photograph=False)
+            with self._acquire(device, capacity(self.shape), whole=False) as frames:
                 yield frames
 
     def stop(self) -> None:
@@ -142,7 +140,7 @@ class GenicamCamera:
 
     def _connect(self) -> None:
         device, self._serial = connect(
-            self.name, self._place, self._setup, self._wish, look=self._look, serial=self._serial
+            self.name, self._place, self._record, self._wish, look=self._look, serial=self._serial
         )
         self._device, self._stamps = device, StampClock(self.name, self._clock)
         if not self._look:
@@ -170,20 +168,16 @@ class GenicamCamera:
     def _exclusive(self) -> Iterator[GenicamDevice]:
         if self._look:
             raise InterlockError(self.name, "the camera is only looked at. Open it to use it")
-        if not self._acquiring.acquire(blocking=False):
-            raise InterlockError(self.name, "frames are being acquired already. Close that stream first")
-        try:
+        with alone(self.name, self._acquiring):
             try:
                 yield self._ready()
             except DeviceFault as fault:
                 if fault.code == "camera.lost":
                     self._device.abandon()
                 raise
-        finally:
-            self._acquiring.release()
 
     @contextmanager
-    def _acquire(self, device: GenicamDevice, *, capacity: int, whole: bool) -> Iterator[FrameQueue]:
+    def _acquire(self, device: GenicamDevice, most: int, *, whole: bool) -> Iterator[FrameQueue]:
         """Frames while the camera acquires; `whole`: an incomplete picture is a fault, not only a loss."""
 
         wrong: list[DeviceFault] = []
@@ -199,7 +193,7 @@ class GenicamCamera:
         queue = FrameQueue(
             self.name,
             self._clock,
-            capacity=capacity,
+            capacity=most,
             longest_gap=_LONGEST_GAP_S + (2.0 / self._wish.frame_rate if self._wish else 0.0),
             check=check,
             statistics=self.statistics,
@@ -215,8 +209,8 @@ class GenicamCamera:
             else:
                 queue.put(frame)
 
-        network = self._setup.network if self._place.control else None
-        buffers = max(4, min(64, _QUEUE_BYTES // max(1, self.shape[0] * self.shape[1])))
+        network = self._record if isinstance(self._record, GigeCameraConfig) else None
+        buffers = max(4, min(64, QUEUE_BYTES // max(1, self.shape[0] * self.shape[1])))
         acquisition = Acquisition(device, network, buffers, take=take, failed=queue.wake, statistics=self.statistics)
         self._queue, self._acquisition = queue, acquisition
         try:
@@ -228,7 +222,7 @@ class GenicamCamera:
             queue.close()
 
     def _photograph(self, device: GenicamDevice, timeout: float, *, triggered: bool) -> Frame:
-        with self._acquire(device, capacity=4, whole=True) as frames:
+        with self._acquire(device, 4, whole=True) as frames:
             called = self._clock.now()
             if triggered:
                 device.call("software_trigger")
@@ -253,7 +247,7 @@ class GenicamCamera:
     def _timing(self, device: GenicamDevice) -> Wish:
         """What is set; before the first `configure` whatever the camera has."""
         if self._wish is None:
-            self._wish = set_timing(device, None, paced=self._setup.trigger.paced)
+            self._wish = set_timing(device, None, paced=self._record.paced)
         return self._wish
 
     def _packets_lost(self) -> DeviceFault:
@@ -272,34 +266,6 @@ _OFF = 0
 
 
 @dataclass(frozen=True)
-class Region:
-    """The part of the sensor that is read, in pixels; `left` and `top` count from the sensor's first pixel."""
-
-    width: int
-    height: int
-    left: int = 0
-    top: int = 0
-
-
-@dataclass(frozen=True)
-class ExposureTrigger:
-    """What begins an exposure.
-
-    "software": a photograph is triggered by a command, a stream runs free. "free": both run free. "line": both wait for
-    pulses on `line`, and the frame rate is theirs.
-    """
-
-    kind: Literal["software", "free", "line"] = "software"
-    line: str = "Line1"
-    activation: str = "RisingEdge"
-
-    @property
-    def paced(self) -> bool:
-        """Whether the camera keeps the frame rate by itself."""
-        return self.kind != "line"
-
-
-@dataclass(frozen=True)
 class Wish:
     """Exposure in s and frame rate in Hz."""
 
@@ -307,7 +273,7 @@ class Wish:
     frame_rate: float
 
 
-def set_image(device: GenicamDevice, region: Region, pixel_format: str, gain: float | None) -> None:
+def set_image(device: GenicamDevice, record: GenicamConfig) -> None:
     """Set what does not change while the cell is open. Raises `LimitError` or `DeviceFault` (camera.setting)."""
     device.call("set_acquisition_mode", _OFF)  # continuous
     if device.call("is_exposure_auto_available"):
@@ -318,13 +284,13 @@ def set_image(device: GenicamDevice, region: Region, pixel_format: str, gain: fl
     for feature in ("OffsetX", "OffsetY"):
         if device.has(feature):
             _set_integer(device, feature, 0)
-    for feature, value in (("Width", region.width), ("Height", region.height)):
+    for feature, value in (("Width", record.width), ("Height", record.height)):
         _set_integer(device, feature, value)
-    for feature, value in (("OffsetX", region.left), ("OffsetY", region.top)):
+    for feature, value in zip(("OffsetX", "OffsetY"), record.offset, strict=True):
         if value or device.has(feature):
             _set_integer(device, feature, value)
-    _set_text(device, "PixelFormat", pixel_format, f"known here: {', '.join(FORMATS)}")
-    if gain is not None:
+    _set_text(device, "PixelFormat", record.pixel_format, f"known here: {', '.join(FORMATS)}")
+    if (gain := record.gain) is not None:
         low, high = device.bounds("gain")
         check_range(device.name, "gain", gain, low=low, high=high, unit="")
         device.call("set_gain", gain)
@@ -346,12 +312,7 @@ def set_timing(device: GenicamDevice, wish: Wish | None, *, paced: bool) -> Wish
         check_positive(device.name, "frame rate", wish.frame_rate, device.bounds("frame_rate")[1], "Hz")
     else:
         check_positive(device.name, "frame rate", wish.frame_rate, 10_000.0, "Hz")
-    if wish.exposure * wish.frame_rate > 1.0:
-        raise LimitError(
-            device.name,
-            f"exposure {shown(wish.exposure, 's')} does not fit into a frame at {wish.frame_rate:g} Hz; nothing was "
-            f"sent. Choose at most {shown(1.0 / wish.frame_rate, 's')}, or at most {1.0 / wish.exposure:g} Hz",
-        )
+    check_fits(device.name, wish.exposure, wish.frame_rate)
     # Either may limit the other on the way: what gets smaller goes first.
     shorter = wish.exposure * 1e6 <= device.call("get_exposure_time")
     if not shorter and rated:
@@ -365,12 +326,15 @@ def set_timing(device: GenicamDevice, wish: Wish | None, *, paced: bool) -> Wish
     return Wish(taken, wish.frame_rate)
 
 
-def set_trigger(device: GenicamDevice, trigger: ExposureTrigger, wish: Wish, *, photograph: bool) -> bool:
+def set_trigger(device: GenicamDevice, record: GenicamConfig, wish: Wish, *, photograph: bool) -> bool:
     """Set what begins the exposures of a photograph, or of a stream; whether a command has to trigger them.
+
+    "software": a photograph is triggered by a command, a stream runs free. "free": both run free. "line": both wait for
+    pulses on a line, and the frame rate is theirs.
 
     Raises `DeviceFault` when the camera does not offer it.
     """
-    if trigger.kind == "software" and photograph:
+    if record.trigger == "software" and photograph:
         if not device.call("is_software_trigger_supported"):
             raise DeviceFault(
                 device.name,
@@ -381,9 +345,10 @@ def set_trigger(device: GenicamDevice, trigger: ExposureTrigger, wish: Wish, *, 
             )
         device.call("set_trigger", b"Software")
         return True
-    if trigger.kind == "line":
-        device.call("set_trigger", trigger.line.encode())
-        _set_text(device, "TriggerActivation", trigger.activation, "usual: RisingEdge, FallingEdge")
+    if record.trigger == "line":
+        device.call("set_trigger", record.trigger_line.encode())
+        edge = f"{record.trigger_edge.capitalize()}Edge"
+        _set_text(device, "TriggerActivation", edge, "usual: RisingEdge, FallingEdge")
         return False
     device.call("clear_triggers")
     if device.call("is_frame_rate_available"):
@@ -449,19 +414,8 @@ _NO_RAW_SOCKETS = 1
 _NEVER = 0
 
 
-@dataclass(frozen=True)
-class GenicamSetup:
-    """How the camera is to be set: the picture's format and region, gain in dB (None: as it is), trigger, network."""
-
-    region: Region
-    pixel_format: str = "Mono8"
-    gain: float | None = None
-    trigger: ExposureTrigger = field(default_factory=ExposureTrigger)
-    network: Network = field(default_factory=Network)
-
-
 def connect(
-    name: str, place: Place, setup: GenicamSetup, wish: Wish | None, *, look: bool, serial: str | None
+    name: str, place: Place, record: GenicamConfig, wish: Wish | None, *, look: bool, serial: str | None
 ) -> tuple[GenicamDevice, str]:
     """The camera at `place`, set up unless it is only looked at, and its serial number.
 
@@ -482,18 +436,18 @@ def connect(
                 "Open the cell again, with the calibration of this camera",
             )
         if not look:
-            set_image(device, setup.region, setup.pixel_format, setup.gain)
-            if place.control:
-                _set_packets(device, setup.network)
+            set_image(device, record)
+            if isinstance(record, GigeCameraConfig):
+                _set_packets(device, record)
             if wish is not None:
-                set_timing(device, wish, paced=setup.trigger.paced)
+                set_timing(device, wish, paced=record.paced)
     except CellError:
         device.close()
         raise
     return device, found
 
 
-def _set_packets(device: GenicamDevice, network: Network) -> None:
+def _set_packets(device: GenicamDevice, network: GigeCameraConfig) -> None:
     # Raw sockets need rights that a cell should not have; the size is settled here, once, and not behind our back.
     device.plain("gv_set_stream_options", _NO_RAW_SOCKETS)
     device.plain("gv_set_packet_size_adjustment", _NEVER)

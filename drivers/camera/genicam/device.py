@@ -17,8 +17,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any, Protocol
 
+from drivers.camera.frame_queue import latched
 from drivers.camera.genicam.aravis import CONTROL_PRIVILEGE, PRIMARY_APPLICATION_ADDRESS, Aravis, AravisError, Handle
 from drivers.clock import Clock, ClockMap, Latch
 from drivers.errors import DeviceFault, NotConnectedError
@@ -257,8 +259,6 @@ class GenicamDevice:
         )
 
 
-_LATCHES, _MAX_LATCHES = 8, 32
-_GOOD_LATCH_WALL_S = 0.0005
 _SLACK_S = 0.002
 """By how much a time stamp may leave the interval of its trigger beyond what the clocks are known to."""
 
@@ -284,17 +284,9 @@ class StampClock:
 
     def compare(self, device: GenicamDevice) -> None:
         """Latch the camera's clock, as often as it takes to get a short round trip; nothing if it has no latch."""
-        latches: list[Latch] = []
-        good = _GOOD_LATCH_WALL_S * self._clock.rate
-        while len(latches) < _LATCHES or (
-            len(latches) < _MAX_LATCHES and min(latch.after - latch.before for latch in latches) > good
-        ):
-            latch = device.latch(self._clock)
-            if latch is None:
-                return
-            latches.append(latch)
-        self._latched = True
-        self._add(latches)
+        if latches := latched(self._clock, partial(device.latch, self._clock)):
+            self._latched = True
+            self._add(latches)
 
     def host_time(self, device_time: float, *, latest: float) -> float:
         """Host time in s of a stamp; `latest`, at which it was at the latest, while the clock is not known."""

@@ -15,7 +15,6 @@ from drivers.make import OPTICS, AnyMake, CameraConfig, Make, Surroundings, with
 
 if TYPE_CHECKING:
     from drivers.camera.genicam.camera import GenicamCamera
-    from drivers.camera.genicam.device import Place
 
 PixelFormat = Literal[
     "Mono8", "Mono10", "Mono10Packed", "Mono10p", "Mono12", "Mono12Packed", "Mono12p", "Mono16",
@@ -45,9 +44,18 @@ class GenicamConfig(CameraConfig):
     trigger_line: Annotated[str, StringConstraints(pattern=r"\w{1,40}")] = "Line1"
     trigger_edge: Literal["rising", "falling"] = "rising"
 
+    @property
+    def paced(self) -> bool:
+        """Whether the camera keeps the frame rate by itself."""
+        return self.trigger != "line"
+
 
 class GigeCameraConfig(GenicamConfig):
-    """A GigE Vision camera at an IPv4 address, and how its packets come over the network."""
+    """A GigE Vision camera at an IPv4 address, and how its packets come over the network.
+
+    `packet_size` None: the largest that passes. `resend`: missing packets are asked for again; a picture is given up
+    `retention` after its last packet.
+    """
 
     driver: Literal["gige"] = "gige"
     address: Annotated[str, AfterValidator(_ipv4)]
@@ -67,36 +75,18 @@ class Usb3CameraConfig(GenicamConfig):
     guid: Annotated[str, StringConstraints(pattern=r"[0-9A-Fa-f]{12}")]
 
 
-def _genicam(name: str, config: GenicamConfig, place: Place, around: Surroundings) -> GenicamCamera:
-    from drivers.camera.genicam.acquisition import Network
-    from drivers.camera.genicam.camera import ExposureTrigger, GenicamCamera, GenicamSetup, Region
-
-    left, top = config.offset
-    network = Network()
-    if isinstance(config, GigeCameraConfig):
-        network = Network(
-            config.packet_size, config.packet_delay, config.resend, config.packet_timeout, config.retention
-        )
-    setup = GenicamSetup(
-        Region(config.width, config.height, left, top),
-        config.pixel_format,
-        config.gain,
-        ExposureTrigger(config.trigger, config.trigger_line, f"{config.trigger_edge.capitalize()}Edge"),
-        network,
-    )
-    return GenicamCamera(name, place, setup, clock=around.clock, look=around.look)
-
-
 def _gige(name: str, config: GigeCameraConfig, around: Surroundings) -> GenicamCamera:
+    from drivers.camera.genicam.camera import GenicamCamera
     from drivers.camera.genicam.device import GigePlace
 
-    return _genicam(name, config, GigePlace(config.address), around)
+    return GenicamCamera(name, GigePlace(config.address), config, clock=around.clock, look=around.look)
 
 
 def _usb3(name: str, config: Usb3CameraConfig, around: Surroundings) -> GenicamCamera:
+    from drivers.camera.genicam.camera import GenicamCamera
     from drivers.camera.genicam.device import UsbPlace
 
-    return _genicam(name, config, UsbPlace(config.guid), around)
+    return GenicamCamera(name, UsbPlace(config.guid), config, clock=around.clock, look=around.look)
 
 
 def _without_aravis() -> str:

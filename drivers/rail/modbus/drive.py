@@ -5,42 +5,50 @@ Its flag goes off when the drive loses its zero; that it stands says neither who
 
 from __future__ import annotations
 
-from drivers.clock import Clock
+from drivers.clock import Clock, patience
 from drivers.errors import DeviceFault, InterlockError, LimitError, shown
 from drivers.rail.axis import Samples
-from drivers.rail.modbus.link import Flag, ModbusLink, Number, Rate, RegisterMap
-from drivers.rail.motion import STANDSTILL_S, patience
+from drivers.rail.modbus.link import ModbusLink
+from drivers.rail.modbus.make import AccelerationConfig, FlagConfig, ModbusRailConfig, NumberConfig, SpeedConfig
+from drivers.rail.motion import STANDSTILL_S
+
+Rate = SpeedConfig | AccelerationConfig
 
 
 class ModbusDrive:
-    """The drive at the other end of `link`; `lead` in m per turn, `counts_per_turn` as its position register counts."""
+    """The drive at the other end of `link`, as `record` describes it; `counts` of its position register to a metre."""
 
-    def __init__(self, link: ModbusLink, registers: RegisterMap, *, lead: float, counts_per_turn: int) -> None:
+    def __init__(self, link: ModbusLink, record: ModbusRailConfig) -> None:
         self.link = link
-        self.registers = registers
+        self.registers = record.registers
         self.name = link.name
-        self.counts = counts_per_turn / lead
-        self._lead = lead
-        self._turn = counts_per_turn
+        self.counts = record.counts_per_turn / record.lead
+        self._lead = record.lead
+        self._turn = record.counts_per_turn
+
+    def _ordered(self, words: list[int]) -> list[int]:
+        """Words as the drive has them of words with the high one first, or back."""
+        return words if self.registers.word_order == "high first" else words[::-1]
 
     def position(self) -> tuple[float, float, float]:
         """Host time in s, position in m, round trip in s of one reading."""
         number = self.registers.position
         words, stamp, round_trip = self.link.read_stamped(number.address, number.words, input=number.input)
-        return stamp, number.decode(words) / self.counts, round_trip
+        return stamp, number.decode(self._ordered(words)) / self.counts, round_trip
 
-    def says(self, flag: Flag | None) -> bool:
+    def says(self, flag: FlagConfig | None) -> bool:
         """What a flag says now; no for one that the drive does not have."""
         return flag is not None and flag.decode(self.link.read(flag.address, 1, input=flag.input)[0])
 
-    def read(self, number: Number, *, signed: bool = True) -> int:
+    def read(self, number: NumberConfig, *, signed: bool = True) -> int:
         """Read a number."""
-        return number.decode(self.link.read(number.address, number.words, input=number.input), signed=signed)
+        words = self.link.read(number.address, number.words, input=number.input)
+        return number.decode(self._ordered(words), signed=signed)
 
-    def set(self, number: Number, value: int, issued: int | None = None) -> None:
+    def set(self, number: NumberConfig, value: int, issued: int | None = None) -> None:
         """Write a number and read it back; `DeviceFault` (rail.setting) when the drive has another."""
         try:
-            words = number.encode(value)
+            words = self._ordered(number.encode(value))
         except ValueError as error:
             raise LimitError(
                 self.name,
@@ -50,9 +58,10 @@ class ModbusDrive:
         self.link.write(number.address, words, issued=issued)
         found = self.link.read(number.address, number.words)
         if found != words:
+            kept = number.decode(self._ordered(found))
             raise self.fault(
                 "rail.setting",
-                f"the drive keeps {number.decode(found)} in register {number.address:#06x} instead of {value}",
+                f"the drive keeps {kept} in register {number.address:#06x} instead of {value}",
                 "See whether another program sets the drive up, and whether the value is in its range (rail.registers, "
                 "rail.acceleration, rail.max_speed).",
                 recoverable=False,
@@ -60,15 +69,15 @@ class ModbusDrive:
 
     def set_rate(self, rate: Rate, value: float, issued: int | None = None) -> None:
         """Write a speed (m/s) or an acceleration (m/s²)."""
-        self.set(rate.number, rate.encode(value / self._lead, self._turn), issued)
+        self.set(rate, rate.units(value / self._lead, self._turn), issued)
 
     def kept(self, rate: Rate, value: float) -> float:
         """What a speed (m/s) or an acceleration (m/s²) would become in the drive's unit."""
-        return self._lead * rate.decode(rate.encode(value / self._lead, self._turn), self._turn)
+        return self._lead * rate.turns(rate.units(value / self._lead, self._turn), self._turn)
 
     def least(self, rate: Rate) -> float:
         """What one of the drive's units is, in m/s or m/s²."""
-        return self._lead * rate.decode(1, self._turn)
+        return self._lead * rate.turns(1, self._turn)
 
     @property
     def alarm(self) -> str:

@@ -3,141 +3,18 @@
 One frame at a time, with the silence between frames that the line's speed asks for; a reply belongs to its request or
 is thrown away; what may be said twice is tried twice. A stop overtakes: commands that were issued before it and have
 not been sent yet are refused. Source: docs/how-to/other-makes.md, section 1.
-
-What a Modbus drive's registers mean: the map that its manual gives, as data, and how numbers stand in them.
-
-Addresses are those on the wire, counted from 0. A number of 32 bits takes two registers, in either order."""
+"""
 
 from __future__ import annotations
 
-import threading
 import time
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 from drivers.clock import Clock
-from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
+from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
-from drivers.last_words import LastWords, attended_by, descriptor_of
-from drivers.ports import FAILURES, open_port
-from drivers.rail.motion import Stops
-
-SPEED_UNITS = {"counts/s": None, "rpm": 60.0, "0.1 rpm": 600.0, "1/240 rps": 240.0}
-"""Units that speeds are given to drives in: how many of them are one turn per second; None: the counts of a turn."""
-ACCELERATION_UNITS = {"counts/s^2": None, "rpm/s": 60.0, "1/6 rps/s": 6.0}
-"""The same for accelerations, of one turn per second each second."""
-TIME_UNITS = {"ms to 1000 rpm": 1000.0 * 1000.0 / 60.0}
-"""Accelerations given as the time that they take: this divided by turns per second each second."""
-
-
-@dataclass(frozen=True)
-class Number:
-    """A number in one or two registers at `address`; `input`: those that can only be read (function 4)."""
-
-    address: int
-    words: int = 1
-    input: bool = False
-    high_first: bool = True
-
-    def encode(self, value: int) -> list[int]:
-        """The registers of a number, negative ones as two's complement; `ValueError` when it does not fit."""
-        bits = 16 * self.words
-        if not -(1 << bits - 1) <= value < 1 << bits:
-            raise ValueError(f"{value} does not fit into {bits} bits")
-        value &= (1 << bits) - 1
-        words = [value & 0xFFFF] if self.words == 1 else [value >> 16, value & 0xFFFF]
-        return words if self.high_first else words[::-1]
-
-    def decode(self, registers: Sequence[int], *, signed: bool = True) -> int:
-        """The number in these registers."""
-        value = 0
-        for word in registers if self.high_first else reversed(registers):
-            value = value << 16 | word
-        bits = 16 * self.words
-        return value - (1 << bits) if signed and value >> bits - 1 else value
-
-
-@dataclass(frozen=True)
-class Rate:
-    """A speed or an acceleration: `number` of `unit`, a key of one of the tables above."""
-
-    number: Number
-    unit: str
-
-    def encode(self, turns: float, counts_per_turn: int) -> int:
-        """What stands for `turns` per second, or per second each second: at least 1.
-
-        A time is rounded down and a rate up, so that a ramp is never longer than reckoned.
-        """
-        if self.unit in TIME_UNITS:
-            return max(1, int(TIME_UNITS[self.unit] / turns))
-        value = turns * self._per_turn(counts_per_turn)
-        return max(1, -int(-value // 1) if self.unit in ACCELERATION_UNITS else round(value))
-
-    def decode(self, value: int, counts_per_turn: int) -> float:
-        """Turns per second, or per second each second, that a number stands for."""
-        if self.unit in TIME_UNITS:
-            return TIME_UNITS[self.unit] / value if value else 0.0
-        return value / self._per_turn(counts_per_turn)
-
-    def _per_turn(self, counts_per_turn: int) -> float:
-        return {**SPEED_UNITS, **ACCELERATION_UNITS}[self.unit] or float(counts_per_turn)
-
-
-@dataclass(frozen=True)
-class Flag:
-    """A bit of a register; it says yes where it is `set`."""
-
-    address: int
-    bit: int
-    set: bool = True
-    input: bool = False
-
-    def decode(self, register: int) -> bool:
-        """What the register says."""
-        return bool(register >> self.bit & 1) == self.set
-
-
-@dataclass(frozen=True)
-class Action:
-    """A command: `value` is written to `address`, then, for drives that look for an edge, `then`."""
-
-    address: int
-    value: int
-    then: int | None = None
-
-    @property
-    def writes(self) -> list[int]:
-        """What is written, in this order."""
-        return [self.value] if self.then is None else [self.value, self.then]
-
-
-@dataclass(frozen=True)
-class RegisterMap:
-    """The registers that the rail needs. `setup` are registers that are set, and read back, before motions.
-
-    `position` and `target` count; `homed` is set by the drive when its search has ended, and lost when it is switched
-    off. `speed` and the ramps are taken by the drive when `start` is given.
-    """
-
-    position: Number
-    target: Number
-    speed: Rate
-    acceleration: Rate
-    start: Action
-    home: Action
-    stop: Action
-    moving: Flag
-    homed: Flag
-    deceleration: Rate | None = None
-    fault: Flag | None = None
-    left_switch: Flag | None = None
-    right_switch: Flag | None = None
-    alarm: Number | None = None
-    serial: Number | None = None
-    setup: tuple[tuple[int, int], ...] = ()
-
+from drivers.rail.axis import QUIET_S, RailLink
+from drivers.rail.modbus.make import ActionConfig
 
 REPLY_TIMEOUT_S = 0.3
 """Wall seconds for a reply besides the time that its bits take: drives answer within some ms."""
@@ -155,7 +32,6 @@ _BITS_PER_BYTE = 11
 _SILENCE_BYTES = 3.5
 _LEAST_SILENCE_S = 0.00175
 """The standard's, above 19200 baud."""
-_QUIET_S = 0.05
 _IN_STEP_S = 0.25
 """Wall seconds for the reply to a question that is asked to be in step again."""
 _ATTEMPTS = 2
@@ -182,45 +58,29 @@ class ModbusRefused(DeviceFault):
         self.number = number
 
 
-class ModbusLink:
+class ModbusLink(RailLink):
     """A serial port (device path or pyserial URL) with the drive `unit` on it.
 
     Raises `NotConnectedError` when the port cannot be opened.
     """
 
+    DRIVE, REPLY_S = "drive", REPLY_TIMEOUT_S
+
     def __init__(
-        self, name: str, url: str, *, unit: int, baud: int, parity: str, stop_bits: int, stop_action: Action,
+        self, name: str, url: str, *, unit: int, baud: int, parity: str, stop_bits: int, stop_action: ActionConfig,
         clock: Clock, statistics: LinkStatistics,
     ) -> None:  # fmt: skip
-        self.name = name
-        self.url = url
-        self._unit = unit
-        self._line = f"{baud} baud, parity {parity}, {stop_bits} stop bit{'s' * (stop_bits - 1)}"
         byte_s = _BITS_PER_BYTE / baud
-        self._silence_s = max(_LEAST_SILENCE_S, _SILENCE_BYTES * byte_s)
         # Set once: to change it asks the system for the port's settings each time.
-        self._timeout_s = REPLY_TIMEOUT_S + 2 * _LONGEST_BYTES * byte_s
+        timeout = REPLY_TIMEOUT_S + 2 * _LONGEST_BYTES * byte_s
+        super().__init__(name, url, statistics, baud=baud, timeout=timeout, parity=parity, stop_bits=stop_bits)
+        self._unit = unit
+        self._wire = f"{baud} baud, parity {parity}, {stop_bits} stop bit{'s' * (stop_bits - 1)}"
+        self._silence_s = max(_LEAST_SILENCE_S, _SILENCE_BYTES * byte_s)
         self._clock = clock
-        self._statistics = statistics
         self._stop_action = stop_action
-        self._lock = threading.Lock()
-        self._stops = Stops()
-        self._closed = False
         self._echoes: bool | None = None
-        self._in_step = True
         self._quiet_since = 0.0
-        self._last_words: LastWords | None = None
-        self._port = open_port(name, url, baud=baud, timeout=self._timeout_s, parity=parity, stop_bits=stop_bits)
-
-    @property
-    def stops(self) -> Stops:
-        """Those that were asked for: a command is only sent if none came since the caller read their count."""
-        return self._stops
-
-    @property
-    def closed(self) -> bool:
-        """True once `close` was called."""
-        return self._closed
 
     def read(self, address: int, count: int, *, input: bool = False) -> list[int]:
         """Read `count` registers."""
@@ -253,7 +113,7 @@ class ModbusLink:
                 self.name, f"{data.hex(' ')} came, which does not confirm the register that was written"
             )
 
-    def do(self, action: Action, *, issued: int | None = None, moves: bool = False) -> None:
+    def do(self, action: ActionConfig, *, issued: int | None = None, moves: bool = False) -> None:
         """Give a command; one that `moves` is also ended when this process dies."""
         if moves:
             self._stop_after_death()
@@ -262,30 +122,14 @@ class ModbusLink:
 
     def stop(self) -> None:
         """Give the stop command; commands issued earlier are refused."""
-        with self._stops.one_more():
+        with self.stops.one_more():
             self.do(self._stop_action)
 
-    def close(self) -> None:
-        """Close the port; every later call raises `NotConnectedError`."""
-        with self._lock:
-            self._closed = True
-            if self._last_words is not None:
-                self._last_words.close()
-            self._port.close()
-
-    def attended(self) -> AbstractContextManager[Callable[[], None]]:
-        """See `drivers.interfaces.Attended`."""
-        return attended_by(self.name, self._stop_after_death())
-
-    def _stop_after_death(self) -> LastWords | None:
-        """From the first motion on: who never moved it has nothing to end."""
-        port = descriptor_of(self._port)
-        if self._last_words is None and port is not None:
-            action = self._stop_action
-            words = [_frame(self._unit, WRITE_ONE, *_words(action.address, value)) for value in action.writes]
-            # Twice: the owner may have died in the middle of a frame of its own, which spoils the first one.
-            self._last_words = LastWords(self.name, port, words * 2)
-        return self._last_words
+    def _stop_words(self) -> list[bytes]:
+        action = self._stop_action
+        words = [_frame(self._unit, WRITE_ONE, *_words(action.address, value)) for value in action.writes]
+        # Twice: the owner may have died in the middle of a frame of its own, which spoils the first one.
+        return words * 2
 
     def _exchange(self, request: bytes, length: int, what: str, issued: int | None) -> tuple[bytes, float, float]:
         """The choke point: send `request`, give its reply of `length` bytes, the middle of the round trip, its length.
@@ -297,11 +141,7 @@ class ModbusLink:
         for attempt in range(_ATTEMPTS):
             if attempt:
                 self._statistics.count("retries")
-            with self._lock:
-                if self._closed:
-                    raise NotConnectedError(self.name, "the rail was closed. Open it again")
-                if issued is not None and issued != self._stops.count:
-                    raise Aborted(f"{self.name}: stopped before the command was sent")
+            with self._line(issued):
                 try:
                     return self._once(request, length, what)
                 except FrameError as error:
@@ -311,20 +151,11 @@ class ModbusLink:
                 except ModbusRefused as refused:
                     if refused.number not in _BUSY or attempt + 1 == _ATTEMPTS:
                         raise
-                    time.sleep(_QUIET_S)
-                except FAILURES as error:
-                    self._statistics.count("link_lost")
-                    raise DeviceFault(
-                        self.name,
-                        "rail.link_lost",
-                        f"the port {self.url} failed: {error}",
-                        recoverable=False,
-                        hint="Check the cable and the drive's supply, then open the cell again.",
-                    ) from error
+                    time.sleep(QUIET_S)
         raise DeadlineError(
             self.name,
             f"no valid reply {what} within {REPLY_TIMEOUT_S} s, {_ATTEMPTS} attempts ({failure}). Check the drive's "
-            f"number {self._unit} (rail.unit), the line ({self._line}: rail.baud, rail.parity, rail.stop_bits), the "
+            f"number {self._unit} (rail.unit), the line ({self._wire}: rail.baud, rail.parity, rail.stop_bits), the "
             "wiring of A and B, and its supply",
         ) from failure
 
@@ -405,18 +236,6 @@ class ModbusLink:
             self._statistics.count("timeouts")
             raise FrameError(f"{len(data)} of {count} bytes came")
         return data
-
-    def _rest(self) -> bytes:
-        """What still comes in, until the line was quiet: thrown away, so that a late reply answers nothing else."""
-        end = time.monotonic() + REPLY_TIMEOUT_S
-        rest = b""
-        self._port.timeout = _QUIET_S
-        try:
-            while (more := bytes(self._port.read(256))) and time.monotonic() < end:
-                rest += more
-        finally:
-            self._port.timeout = self._timeout_s
-        return rest
 
 
 def _words(*values: int) -> bytes:

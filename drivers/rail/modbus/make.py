@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Self
 
 from pydantic import StringConstraints, model_validator
 
@@ -13,7 +13,6 @@ from drivers.errors import UNTOLD
 from drivers.make import AnyMake, Late, Make, RailConfig, Surroundings, Table, with_endpoint
 
 if TYPE_CHECKING:
-    from drivers.rail.modbus.link import Action, Flag, Number, Rate, RegisterMap
     from drivers.rail.modbus.rail import ModbusRail
 
 BAUDS = (4800, 9600, 19200, 38400, 57600, 115200, 230400)
@@ -23,6 +22,14 @@ Address = Annotated[int, whole(0, 0xFFFF, meaning=": a register's address on the
 Word = Annotated[int, whole(0, 0xFFFF)]
 
 
+SPEED_UNITS = {"counts/s": None, "rpm": 60.0, "0.1 rpm": 600.0, "1/240 rps": 240.0}
+"""Units that speeds are given to drives in: how many of them are one turn per second; None: the counts of a turn."""
+ACCELERATION_UNITS = {"counts/s^2": None, "rpm/s": 60.0, "1/6 rps/s": 6.0}
+"""The same for accelerations, of one turn per second each second."""
+TIME_UNITS = {"ms to 1000 rpm": 1000.0 * 1000.0 / 60.0}
+"""Accelerations given as the time that they take: this divided by turns per second each second."""
+
+
 class NumberConfig(Table):
     """A number in one register, or in two."""
 
@@ -30,18 +37,58 @@ class NumberConfig(Table):
     words: Annotated[int, whole(1, 2, meaning=" registers of 16 bits")] = 2
     input: bool = False
 
+    def encode(self, value: int) -> list[int]:
+        """The registers, high word first, negative numbers as two's complement; `ValueError` when it does not fit."""
+        bits = 16 * self.words
+        if not -(1 << bits - 1) <= value < 1 << bits:
+            raise ValueError(f"{value} does not fit into {bits} bits")
+        value &= (1 << bits) - 1
+        return [value & 0xFFFF] if self.words == 1 else [value >> 16, value & 0xFFFF]
 
-class SpeedConfig(NumberConfig):
-    """A speed in the drive's unit."""
+    def decode(self, registers: Sequence[int], *, signed: bool = True) -> int:
+        """The number in these registers, high word first."""
+        value = 0
+        for word in registers:
+            value = value << 16 | word
+        bits = 16 * self.words
+        return value - (1 << bits) if signed and value >> bits - 1 else value
+
+
+class _Rate(NumberConfig):
+    """A speed or an acceleration in the drive's unit, a key of one of the tables above."""
 
     words: Annotated[int, whole(1, 2)] = 1
+    unit: str
+
+    def units(self, turns: float, counts_per_turn: int) -> int:
+        """What stands for `turns` per second, or per second each second: at least 1.
+
+        A time is rounded down and a rate up, so that a ramp is never longer than reckoned.
+        """
+        if self.unit in TIME_UNITS:
+            return max(1, int(TIME_UNITS[self.unit] / turns))
+        value = turns * self._per_turn(counts_per_turn)
+        return max(1, -int(-value // 1) if self.unit in ACCELERATION_UNITS else round(value))
+
+    def turns(self, value: int, counts_per_turn: int) -> float:
+        """Turns per second, or per second each second, that a number stands for."""
+        if self.unit in TIME_UNITS:
+            return TIME_UNITS[self.unit] / value if value else 0.0
+        return value / self._per_turn(counts_per_turn)
+
+    def _per_turn(self, counts_per_turn: int) -> float:
+        return {**SPEED_UNITS, **ACCELERATION_UNITS}[self.unit] or float(counts_per_turn)
+
+
+class SpeedConfig(_Rate):
+    """A speed in the drive's unit."""
+
     unit: Literal["counts/s", "rpm", "0.1 rpm", "1/240 rps"]
 
 
-class AccelerationConfig(NumberConfig):
+class AccelerationConfig(_Rate):
     """An acceleration in the drive's unit, or the time that it takes to 1000 turns a minute."""
 
-    words: Annotated[int, whole(1, 2)] = 1
     unit: Literal["counts/s^2", "rpm/s", "1/6 rps/s", "ms to 1000 rpm"]
 
 
@@ -53,6 +100,10 @@ class FlagConfig(Table):
     set: bool = True
     input: bool = False
 
+    def decode(self, register: int) -> bool:
+        """What the register says."""
+        return bool(register >> self.bit & 1) == self.set
+
 
 class ActionConfig(Table):
     """A command: `value` is written, and then, for drives that look for an edge, `then`."""
@@ -60,6 +111,11 @@ class ActionConfig(Table):
     address: Address
     value: Word
     then: Word | None = None
+
+    @property
+    def writes(self) -> list[int]:
+        """What is written, in this order."""
+        return [self.value] if self.then is None else [self.value, self.then]
 
 
 class SetupConfig(Table):
@@ -70,7 +126,11 @@ class SetupConfig(Table):
 
 
 class RegistersConfig(Table):
-    """What stands where in the drive; names as in `drivers.rail.modbus.link`."""
+    """What stands where in the drive, at addresses as they are on the wire. `setup` is set before motions.
+
+    `position` and `target` count; `homed` is set by the drive when its search has ended, and lost when it is switched
+    off. `speed` and the ramps are taken by the drive when `start` is given.
+    """
 
     word_order: Literal["high first", "low first"] = "high first"
     position: NumberConfig
@@ -154,58 +214,10 @@ class ModbusRailConfig(RailConfig):
         return self
 
 
-def register_map(config: RegistersConfig) -> RegisterMap:
-    """The record as the driver takes it."""
-    from drivers.rail.modbus.link import RegisterMap
-
-    return RegisterMap(**dict(_parts(config)))
-
-
-def _parts(config: RegistersConfig) -> Iterator[tuple[str, Any]]:
-    from drivers.rail.modbus.link import Action, Flag, Number, Rate
-
-    high_first = config.word_order == "high first"
-
-    def made(entry: Any) -> Number | Rate | Flag | Action | None:
-        match entry:
-            case SpeedConfig() | AccelerationConfig():
-                return Rate(Number(entry.address, entry.words, entry.input, high_first), entry.unit)
-            case NumberConfig():
-                return Number(entry.address, entry.words, entry.input, high_first)
-            case FlagConfig():
-                return Flag(entry.address, entry.bit, entry.set, entry.input)
-            case ActionConfig():
-                return Action(entry.address, entry.value, entry.then)
-        return None
-
-    for name in type(config).model_fields:
-        if name == "setup":
-            yield name, tuple((entry.address, entry.value) for entry in config.setup)
-        elif name != "word_order":
-            yield name, made(getattr(config, name))
-
-
 def _connect(name: str, config: ModbusRailConfig, around: Surroundings) -> ModbusRail:
     from drivers.rail.modbus.rail import ModbusRail
 
-    return ModbusRail(
-        name,
-        config.url,
-        register_map(config.registers),
-        lead=config.lead,
-        counts_per_turn=config.counts_per_turn,
-        travel=config.travel,
-        max_speed=config.max_speed,
-        acceleration=config.acceleration,
-        clock=around.clock,
-        unit=config.unit,
-        baud=config.baud,
-        parity=config.parity,
-        stop_bits=config.stop_bits,
-        in_position=config.in_position,
-        serial=config.serial,
-        control=not around.look,
-    )
+    return ModbusRail(name, config, clock=around.clock, control=not around.look)
 
 
 MODBUS: AnyMake = Make(

@@ -11,8 +11,9 @@ from drivers.clock import Clock
 from drivers.errors import UNTOLD, ConfigError, LimitError, shown
 from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
-from drivers.rail.modbus.drive import DriveArrival, DriveZero, ModbusDrive
-from drivers.rail.modbus.link import ModbusLink, Number, Rate, RegisterMap
+from drivers.rail.modbus.drive import DriveArrival, DriveZero, ModbusDrive, Rate
+from drivers.rail.modbus.link import ModbusLink
+from drivers.rail.modbus.make import ModbusRailConfig, NumberConfig
 
 ROUNDING = 0.01
 """By what share a speed may be rounded to the drive's unit; an acceleration by five times that."""
@@ -20,66 +21,38 @@ _VELOCITY_S = 0.02
 
 
 class ModbusRail(RailAxis):
-    """A drive behind the serial port `url`, with number `unit`; its registers are those of `registers`.
+    """The drive that `record` describes: where it is, its registers, and the axis that it moves.
 
-    `lead` in m and `counts_per_turn` as the drive counts positions; `travel` (low, high) in m, `max_speed` in m/s,
-    `acceleration` in m/s². A drive may settle `in_position` counts off its target. `serial` is what the plate says, for
-    a drive that does not tell.
-
-    Raises `NotConnectedError` or `DeadlineError` when no drive answers, `ConfigError` on impossible parameters,
-    `ModbusRefused` for a register that it does not have.
+    With `control=False` it is only looked at; see `RailAxis`. Raises `NotConnectedError` or `DeadlineError` when no
+    drive answers, `ConfigError` on impossible parameters, `ModbusRefused` for a register that it does not have.
     """
 
-    def __init__(
-        self,
-        name: str,
-        url: str,
-        registers: RegisterMap,
-        *,
-        lead: float,
-        counts_per_turn: int,
-        travel: tuple[float, float],
-        max_speed: float,
-        acceleration: float,
-        clock: Clock,
-        unit: int = 1,
-        baud: int = 115200,
-        parity: str = "none",
-        stop_bits: int = 1,
-        in_position: int = 0,
-        serial: str = "",
-        control: bool = True,
-    ) -> None:
-        if not lead > 0 or not counts_per_turn > 0:
-            raise ConfigError(
-                f"{name}: lead {lead} m and counts per turn {counts_per_turn} must be greater than 0. Correct them in "
-                "the configuration"
-            )
+    def __init__(self, name: str, record: ModbusRailConfig, *, clock: Clock, control: bool = True) -> None:
         super().__init__(
             name,
             clock,
-            travel=travel,
-            max_speed=max_speed,
-            acceleration=acceleration,
-            counts=counts_per_turn / lead,
+            travel=record.travel,
+            max_speed=record.max_speed,
+            acceleration=record.acceleration,
+            counts=record.counts_per_turn / record.lead,
             control=control,
         )
-        self.registers = registers
-        self._in_position = in_position
-        self._serial = serial
+        self.registers = record.registers
+        self._in_position = record.in_position
+        self._serial = record.serial
         self._link: ModbusLink = ModbusLink(
             name,
-            url,
-            unit=unit,
-            baud=baud,
-            parity=parity,
-            stop_bits=stop_bits,
-            stop_action=registers.stop,
+            record.url,
+            unit=record.unit,
+            baud=record.baud,
+            parity=record.parity,
+            stop_bits=record.stop_bits,
+            stop_action=record.registers.stop,
             clock=clock,
             statistics=self.statistics,
         )
         try:
-            self._drive = ModbusDrive(self._link, registers, lead=lead, counts_per_turn=counts_per_turn)
+            self._drive = ModbusDrive(self._link, record)
             self._check_ramp()
             self._drive.position()
             self._zero = DriveZero(self._drive, clock)
@@ -193,8 +166,8 @@ class ModbusRail(RailAxis):
 
     def _set_up(self) -> None:
         """Tell the drive what it forgets when it is reset."""
-        for address, value in self.registers.setup:
-            self._drive.set(Number(address), value)
+        for entry in self.registers.setup:
+            self._drive.set(NumberConfig(address=entry.address, words=1), entry.value)
         for rate in self._ramps:
             self._drive.set_rate(rate, self._acceleration)
 

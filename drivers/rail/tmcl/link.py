@@ -9,20 +9,17 @@ Source: the maker's TMCL firmware manual; docs/reference/protocols.md, section 2
 from __future__ import annotations
 
 import struct
-import threading
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import TypeVar
 
 from drivers.clock import Clock
-from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedError
+from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
-from drivers.last_words import LastWords, attended_by, descriptor_of
-from drivers.ports import FAILURES, open_port
-from drivers.rail.motion import Stops
+from drivers.rail.axis import RailLink
 
 TELEGRAM_BYTES = 9
 STATUS_OK = 100
@@ -157,7 +154,6 @@ REPLY_TIMEOUT_S = 0.5
 """Wall seconds for a reply: modules answer within a few ms, a loaded machine may add tens."""
 WRONG_CHECKSUM, NO_SUCH_TYPE, WRONG_VALUE = 1, 3, 4
 """Some of the status codes of a reply."""
-_QUIET_S = 0.05
 _ATTEMPTS = 2
 _IN_STEP_S = 0.25
 """Wall seconds for the reply to a question that is asked to be in step again."""
@@ -185,42 +181,42 @@ class CommandRefused(DeviceFault):
         self.status = status
 
 
-class TmclLink:
+class TmclLink(RailLink):
     """A serial port (device path or pyserial URL) with one module at `address` on it.
 
     Raises `NotConnectedError` when the port cannot be opened.
     """
 
+    DRIVE, REPLY_S = "module", REPLY_TIMEOUT_S
+
     def __init__(
         self, name: str, url: str, *, address: int, motor: int, baud: int, clock: Clock, statistics: LinkStatistics
     ) -> None:
-        self.name = name
-        self.url = url
+        super().__init__(name, url, statistics, baud=baud, timeout=REPLY_TIMEOUT_S)
         self._address = address
         self._motor = motor
         self._baud = baud
         self._clock = clock
-        self._statistics = statistics
-        self._lock = threading.Lock()
-        self._stops = Stops()
-        self._in_step = True
-        self._closed = False
-        self._port = open_port(name, url, baud=baud, timeout=REPLY_TIMEOUT_S)
-        stops = (
-            TmclRequest(address, TmclCommand.REFERENCE_SEARCH, ReferenceSearch.STOP, motor),
-            TmclRequest(address, TmclCommand.MOTOR_STOP, 0, motor),
-        )
-        self._stop_words = [stop.encode() for stop in stops]
-        self._last_words: LastWords | None = None
 
-    @property
-    def stops(self) -> Stops:
-        """Those that were asked for: a command is only sent if none came since the caller read their count."""
-        return self._stops
+    def _stop_words(self) -> list[bytes]:
+        stops = (
+            TmclRequest(self._address, TmclCommand.REFERENCE_SEARCH, ReferenceSearch.STOP, self._motor),
+            TmclRequest(self._address, TmclCommand.MOTOR_STOP, 0, self._motor),
+        )
+        return [stop.encode() for stop in stops]
 
     def get(self, axis: Axis) -> int:
         """Read an axis parameter."""
         return self._command(TmclCommand.GET_AXIS, axis).value
+
+    def get_if_there(self, axis: Axis) -> int | None:
+        """Read an axis parameter; None for a module that does not have it."""
+        try:
+            return self.get(axis)
+        except CommandRefused as refused:
+            if refused.status == NO_SUCH_TYPE:
+                return None
+            raise
 
     def get_stamped(self, axis: Axis) -> tuple[int, float, float]:
         """Read an axis parameter: value, host time of the middle of the round trip, round trip; in clock seconds."""
@@ -244,7 +240,7 @@ class TmclLink:
 
     def stop(self) -> None:
         """Stop the reference search, whoever began it, and the motor; commands issued earlier are refused."""
-        with self._stops.one_more():
+        with self.stops.one_more():
             try:
                 self.reference_search(ReferenceSearch.STOP)
             finally:
@@ -264,30 +260,6 @@ class TmclLink:
         """Write the module's user variable `index`; those from 56 on are lost when the module is reset."""
         request = TmclRequest(self._address, TmclCommand.SET_GLOBAL, index, _USER_BANK, value)
         self._exchange(request, lambda data: self._checked(data, request), issued=issued)
-
-    @property
-    def closed(self) -> bool:
-        """True once `close` was called."""
-        return self._closed
-
-    def close(self) -> None:
-        """Close the port; every later call raises `NotConnectedError`."""
-        with self._lock:
-            self._closed = True
-            if self._last_words is not None:
-                self._last_words.close()
-            self._port.close()
-
-    def attended(self) -> AbstractContextManager[Callable[[], None]]:
-        """See `drivers.interfaces.Attended`."""
-        return attended_by(self.name, self._stop_after_death())
-
-    def _stop_after_death(self) -> LastWords | None:
-        """From the first motion on: who never moved it has nothing to end."""
-        port = descriptor_of(self._port)
-        if self._last_words is None and port is not None:
-            self._last_words = LastWords(self.name, port, self._stop_words)
-        return self._last_words
 
     def _command(self, command: TmclCommand, kind: int, value: int = 0, *, issued: int | None = None) -> TmclReply:
         request = TmclRequest(self._address, command, kind, self._motor, value)
@@ -316,11 +288,7 @@ class TmclLink:
         """
         failure: TelegramError | None = None
         for attempt in range(_ATTEMPTS):
-            with self._lock:
-                if self._closed:
-                    raise NotConnectedError(self.name, "the rail was closed. Open it again")
-                if issued is not None and issued != self._stops.count:
-                    raise Aborted(f"{self.name}: stopped before the command was sent")
+            with self._line(issued):
                 if self._last_words is not None and request.command not in _STOPS:
                     self._last_words.require_unspoken("rail.owner_frozen")
                 try:
@@ -329,15 +297,6 @@ class TmclLink:
                     # The first says most: the others may only not be in step any more.
                     failure = failure or error
                     self._in_step = False
-                except FAILURES as error:
-                    self._statistics.count("link_lost")
-                    raise DeviceFault(
-                        self.name,
-                        "rail.link_lost",
-                        f"the port {self.url} failed: {error}",
-                        recoverable=False,
-                        hint="Check the cable and the module's supply, then open the cell again.",
-                    ) from error
             if attempt + 1 < _ATTEMPTS:
                 self._statistics.count("retries")
         raise DeadlineError(
@@ -350,7 +309,7 @@ class TmclLink:
     def _once(self, request: TmclRequest, decode: Callable[[bytes], Answer]) -> tuple[Answer, float, float]:
         if self._port.in_waiting:
             self._statistics.count("stale_input")
-            self._drain()
+            self._rest()
         if not self._in_step:
             self._in_step = self._got_in_step(request)
         if not self._in_step:
@@ -390,7 +349,7 @@ class TmclLink:
         A reply names its command alone. So a harmless question of another command is asked: once its reply is there,
         none to an earlier one can follow. False when it does not come.
         """
-        self._drain()
+        self._rest()
         question = TmclCommand.GET_AXIS if request.command == TmclCommand.GET_GLOBAL else TmclCommand.GET_GLOBAL
         fence = TmclRequest(self._address, question, _FENCE_TYPE, 0)
         sent = fence.encode()
@@ -407,13 +366,3 @@ class TmclLink:
         finally:
             self._port.timeout = REPLY_TIMEOUT_S
         return False
-
-    def _drain(self) -> None:
-        """Throw away what still comes in, until the line was quiet, so that a late reply answers nothing else."""
-        end = time.monotonic() + REPLY_TIMEOUT_S
-        self._port.timeout = _QUIET_S
-        try:
-            while self._port.read(TELEGRAM_BYTES) and time.monotonic() < end:
-                pass
-        finally:
-            self._port.timeout = REPLY_TIMEOUT_S

@@ -72,23 +72,7 @@ class TmclRailConfig(RailConfig):
 def _connect(name: str, config: TmclRailConfig, around: Surroundings) -> TmclRail:
     from drivers.rail.tmcl.rail import TmclRail
 
-    return TmclRail(
-        name,
-        config.url,
-        lead=config.lead,
-        steps_per_turn=config.steps_per_turn,
-        microsteps=config.microsteps,
-        travel=config.travel,
-        max_speed=config.max_speed,
-        acceleration=config.acceleration,
-        address=config.address,
-        motor=config.motor,
-        baud=config.baud,
-        reference_mode=config.reference_mode,
-        reversed=config.reversed,
-        control=not around.look,
-        clock=around.clock,
-    )
+    return TmclRail(name, config, clock=around.clock, control=not around.look)
 
 
 TMCL: AnyMake = Make(

@@ -18,11 +18,11 @@ import re
 import zlib
 from dataclasses import dataclass
 
-from drivers.clock import Clock
+from drivers.clock import Clock, patience
 from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, shown
 from drivers.interfaces import Reading
 from drivers.rail.axis import Samples
-from drivers.rail.motion import STANDSTILL_S, patience
+from drivers.rail.motion import STANDSTILL_S
 from drivers.rail.tmcl.link import NO_SUCH_TYPE, WRONG_VALUE, Axis, CommandRefused, TmclLink
 
 SUPPORTED = ("1210", "1211", "1240", "1241", "1260", "1270", "1276", "1278", "6212", "6214")
@@ -131,13 +131,7 @@ def _if_there(link: TmclLink, axis: Axis, value: int, rounding: Rounding) -> Non
 
 def _in_pulses(link: TmclLink) -> None:
     """Some firmware knows units of its own as well, and says which in parameter 255."""
-    try:
-        mode = link.get(Axis.UNIT_MODE)
-    except CommandRefused as refused:
-        if refused.status == NO_SUCH_TYPE:
-            return
-        raise
-    if mode != PULSES_MODE:
+    if link.get_if_there(Axis.UNIT_MODE) not in (None, PULSES_MODE):
         set_checked(link, Axis.UNIT_MODE, PULSES_MODE, EXACT)
 
 
@@ -260,7 +254,6 @@ class ZeroMark:
 
 _NEAR = 1
 """Counts off its target at which a module may come to rest, without saying that it has reached it."""
-_STALL_FLAG = 1
 _DRIVER_FAULTS = {1: "driver too hot", 3: "short circuit in phase A", 4: "short circuit in phase B"}
 
 
@@ -334,7 +327,7 @@ class ArrivalWatch:
         self._forget_zero()
         flags = link.get(Axis.DRIVER_ERRORS)
         reasons = [text for bit, text in _DRIVER_FAULTS.items() if flags >> bit & 1]
-        if link.get(Axis.EXTENDED_ERRORS) & _STALL_FLAG:
+        if link.get(Axis.EXTENDED_ERRORS) & STALL_FLAG:
             reasons.append("stall detected")
         return DeviceFault(
             link.name,

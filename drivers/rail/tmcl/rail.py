@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from drivers.clock import Clock
-from drivers.errors import ConfigError
 from drivers.interfaces import Identity, RailState, Reading
 from drivers.rail.axis import RailAxis, Samples
 from drivers.rail.motion import RailMotion
 from drivers.rail.tmcl import module
-from drivers.rail.tmcl.link import NO_SUCH_TYPE, Axis, CommandRefused, ReferenceSearch, TmclLink
+from drivers.rail.tmcl.link import Axis, ReferenceSearch, TmclLink
+from drivers.rail.tmcl.make import TmclRailConfig
 from drivers.rail.tmcl.module import (
     EXACT,
     SPEED,
@@ -32,12 +32,8 @@ _HOME_SWITCH_ON_BELOW = (5, 7)
 
 
 class TmclRail(RailAxis):
-    """A TMCL rail behind the serial port `url` (device path or pyserial URL).
+    """The rail that `record` describes, behind a TMCL module; the module's serial number is its user variable 0.
 
-    `lead` in m per turn, `travel` (low, high) in m, `max_speed` in m/s, `acceleration` in m/s²; `microsteps` per full
-    step, a power of two up to 256. `reference_mode` is the module's axis parameter 193 (5: home switch in negative
-    direction, turning round at the left limit switch). `reversed` turns the motor the other way round for a growing
-    position (axis parameter 251). The module's serial number, if any, is its user variable 0.
     Every setting is read back; `DeviceFault` (rail.setting) when the module keeps another.
     A module that was homed under the same settings, and not reset since, stays homed.
 
@@ -48,35 +44,33 @@ class TmclRail(RailAxis):
     a module that is not in `drivers.rail.tmcl.module.SUPPORTED`.
     """
 
-    def __init__(
-        self, name: str, url: str, *, lead: float, steps_per_turn: int, microsteps: int, travel: tuple[float, float],
-        max_speed: float, acceleration: float, address: int = 1, motor: int = 0, clock: Clock, baud: int = 9600,
-        reference_mode: int = 5, reversed: bool = False, control: bool = True,
-    ) -> None:  # fmt: skip
-        for what, value in {"lead": lead, "steps per turn": steps_per_turn}.items():
-            if not value > 0:
-                raise ConfigError(f"{name}: {what} {value} must be greater than 0. Correct it in the configuration")
-        if microsteps not in (1, 2, 4, 8, 16, 32, 64, 128, 256):
-            raise ConfigError(f"{name}: microsteps {microsteps} must be a power of two from 1 to 256. Correct it")
+    def __init__(self, name: str, record: TmclRailConfig, *, clock: Clock, control: bool = True) -> None:
         super().__init__(
             name,
             clock,
-            travel=travel,
-            max_speed=max_speed,
-            acceleration=acceleration,
-            counts=steps_per_turn * microsteps / lead,
+            travel=record.travel,
+            max_speed=record.max_speed,
+            acceleration=record.acceleration,
+            counts=record.steps_per_turn * record.microsteps / record.lead,
             control=control,
         )
-        self._microsteps = microsteps
-        self._reference_mode = reference_mode
-        self._reversed = reversed
+        self._resolution = record.microsteps.bit_length() - 1
+        self._reference_mode = record.reference_mode
+        self._reversed = record.reversed
         self._link: TmclLink = TmclLink(
-            name, url, address=address, motor=motor, baud=baud, clock=clock, statistics=self.statistics
+            name,
+            record.url,
+            address=record.address,
+            motor=record.motor,
+            baud=record.baud,
+            clock=clock,
+            statistics=self.statistics,
         )
-        self._zero = ZeroMark(self._link, (lead, steps_per_turn, microsteps, motor, reference_mode, reversed))
+        counted = record.lead, record.steps_per_turn, record.microsteps, record.motor
+        self._zero = ZeroMark(self._link, (*counted, record.reference_mode, record.reversed))
         try:
             require_supported(name, self._link.firmware())
-            self._zero.meet(microsteps.bit_length() - 1, reference_mode, mark=control)
+            self._zero.meet(self._resolution, self._reference_mode, mark=control)
             if control:
                 self._set_up()
         except BaseException:
@@ -95,12 +89,8 @@ class TmclRail(RailAxis):
 
     def examine(self, seconds: float) -> list[Reading]:
         """What the module tells of its motor driver, at once; see `drivers.rail.tmcl.module`."""
-        try:
-            return module.readings(self._link.get(Axis.DRIVER_ERRORS))
-        except CommandRefused as refused:
-            if refused.status == NO_SUCH_TYPE:
-                return []
-            raise
+        bits = self._link.get_if_there(Axis.DRIVER_ERRORS)
+        return [] if bits is None else module.readings(bits)
 
     def state(self) -> RailState:
         """Read position, velocity, switches and whether it is homed now.
@@ -135,12 +125,7 @@ class TmclRail(RailAxis):
         return self._position(), left, right, self._stalled
 
     def _stalled(self) -> bool:
-        try:
-            return bool(self._link.get(Axis.EXTENDED_ERRORS) & STALL_FLAG)
-        except CommandRefused as refused:
-            if refused.status == NO_SUCH_TYPE:
-                return False
-            raise
+        return bool((self._link.get_if_there(Axis.EXTENDED_ERRORS) or 0) & STALL_FLAG)
 
     def _require_zero(self) -> None:
         self._zero.require()
@@ -175,7 +160,7 @@ class TmclRail(RailAxis):
     def _set_up(self) -> None:
         """Tell the module what it forgets when it is reset."""
         set_direction(self._link, self._reversed)
-        set_checked(self._link, Axis.MICROSTEP_RESOLUTION, self._microsteps.bit_length() - 1, EXACT)
+        set_checked(self._link, Axis.MICROSTEP_RESOLUTION, self._resolution, EXACT)
         set_ramp(self._link, self._pulses(self._acceleration))
         set_checked(self._link, Axis.REFERENCE_MODE, self._reference_mode, EXACT)
         set_checked(self._link, Axis.REFERENCE_SEARCH_SPEED, self._pulses(0.5 * self._max_speed), SPEED)

@@ -1,16 +1,14 @@
 """The CANopen bus with this program as its master: values of the drives by SDO, NMT, SYNC, and who else commands there.
 
 The SDO protocol is the `canopen` package's; its frames go over the same `CanLink` as all the others.
-
-The faults of a vehicle of two wheel drives, in words."""
+"""
 
 from __future__ import annotations
 
 import logging
 import struct
 import threading
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from typing import TypeVar
 
 import can
@@ -20,7 +18,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from drivers.errors import DeadlineError, DeviceFault
 from drivers.interfaces import LinkStatistics
-from drivers.vehicle.can_link import CanLink
+from drivers.vehicle.can_link import CanLink, data_frame
 from drivers.vehicle.cia402.drive import (
     COMMAND,
     EMERGENCY,
@@ -34,67 +32,18 @@ from drivers.vehicle.cia402.drive import (
     SYNC,
     Entry,
 )
+from drivers.vehicle.faults import OUT_OF_COMMAND, vehicle_fault
 
 Answer = TypeVar("Answer")
 
 SETUP = "vehicle.setup"
-TOLD_ONCE = ("vehicle.command_lost", "vehicle.disturbed", "vehicle.two_vehicles", "vehicle.units")
+TOLD_ONCE = (*OUT_OF_COMMAND, "vehicle.units")
 """Codes of faults that end command: whoever is in charge afterwards is no fault of the vehicle."""
-
-
-def drive_error(name: str, trouble: tuple[str, ...], *, driven: bool) -> DeviceFault:
-    """Drives with a fault; one that came while the vehicle was `driven` is for a person to look at."""
-    hint = (
-        "It was driving: look what it may have driven against, and jog it away from there. Then run the job again."
-        if driven
-        else "What has passed is cleared by taking command again."
-    )
-    return DeviceFault(name, "vehicle.error", "; ".join(trouble), recoverable=not driven, hint=hint)
-
-
-def command_lost(name: str, why: str) -> DeviceFault:
-    """A drive does not obey any more, without a fault of its own."""
-    return DeviceFault(
-        name,
-        "vehicle.command_lost",
-        why,
-        recoverable=False,
-        hint="See why, look where the vehicle stands, then run the job again.",
-    )
-
-
-def wrong_units(name: str, mismatch: str) -> DeviceFault:
-    """Speed and counts of a wheel contradict each other."""
-    return DeviceFault(
-        name,
-        "vehicle.units",
-        mismatch,
-        recoverable=False,
-        hint="Compare both with the drive's set-up, and try with the wheels off the floor.",
-    )
-
-
-def unguarded(name: str, who: str, took: float, allowed: float) -> DeviceFault:
-    """A drive stays enabled without our heartbeat; `took` and `allowed` in s."""
-    return DeviceFault(
-        name,
-        "vehicle.watchdog",
-        f"without our heartbeat the {who} drive stays enabled, {took:.1f} s long (vehicle.watchdog is {allowed:g} s): "
-        "it would drive on if this program died",
-        recoverable=False,
-        hint="Set object 6007h of the drive to 1, or try the other vehicle.guarding; see docs/how-to/canopen.md.",
-    )
 
 
 def unfit(name: str, what: str) -> DeviceFault:
     """A drive that cannot be used as it is."""
-    return DeviceFault(
-        name,
-        SETUP,
-        what,
-        recoverable=False,
-        hint="Compare the drive's manual with docs/how-to/canopen.md, which lists what a drive must have.",
-    )
+    return vehicle_fault(name, SETUP, what)
 
 
 ANSWER_S = 0.5
@@ -115,7 +64,7 @@ class Absent(Exception):
     """The drive has no such value, or does not let it be written."""
 
 
-class CanopenBus:
+class CanopenBus(CanLink):
     """An open bus with the drives `nodes` and this program as node `own`.
 
     In the receive thread `take` is called with a node, the service (the identifier without the node) and the data of
@@ -132,9 +81,7 @@ class CanopenBus:
         self._own = own
         self._nodes = nodes
         self._take_from, self._other = take, other
-        self._statistics = statistics
-        self._heard: set[int] = set()
-        """Nodes that have said something."""
+        self._nodes_heard: set[int] = set()
         self._asking = threading.Lock()
         self._network = _Network(self)
         self._clients: dict[int, SdoClient] = {}
@@ -144,7 +91,7 @@ class CanopenBus:
             self._network.add_node(remote)
             self._clients[node] = remote.sdo
             remote.sdo.RESPONSE_TIMEOUT = ANSWER_S
-        self._link = CanLink(
+        super().__init__(
             name,
             interface,
             channel,
@@ -156,43 +103,16 @@ class CanopenBus:
             alone=alone,
         )
 
-    @property
-    def alive(self) -> bool:
-        """As `CanLink.alive`."""
-        return self._link.alive
-
-    def check(self) -> None:
-        """As `CanLink.check`."""
-        self._link.check()
-
-    @contextmanager
-    def listening(self) -> Iterator[list[tuple[float, can.Message]]]:
-        """As `CanLink.listening`."""
-        with self._link.listening() as heard:
-            yield heard
-
-    def say_in_the_end(self, frames: list[tuple[int, bytes]]) -> None:
-        """As `CanLink.say_in_the_end`, by identifier and data."""
-        self._link.say_in_the_end([_frame(identifier, data) for identifier, data in frames])
-
-    def require_unspoken(self) -> None:
-        """As `CanLink.require_unspoken`."""
-        self._link.require_unspoken()
-
-    def close(self) -> None:
-        """As `CanLink.close`."""
-        self._link.close()
-
     # --- what a master sends ---
 
     def send(self, identifier: int, data: bytes) -> None:
         """Send a frame; raises as `check` does."""
-        self._link.send(_frame(identifier, data), f"0x{identifier:03X}")
+        self.send_frame(data_frame(identifier, data), f"0x{identifier:03X}")
 
     def guard(self, node: int) -> None:
         """Ask a node for its NMT state, as node guarding does."""
         frame = can.Message(arbitration_id=HEARTBEAT + node, is_remote_frame=True, dlc=1, is_extended_id=False)
-        self._link.send(frame, "node guarding")
+        self.send_frame(frame, "node guarding")
 
     def command(self, node: int, command: int) -> None:
         """Send an NMT command to one node."""
@@ -240,10 +160,10 @@ class CanopenBus:
             except struct.error as error:
                 raise unfit(self.name, f"the drive with node number {node} answers {what} in too few bytes") from error
             except SdoCommunicationError as silence:
-                self._link.check()
+                self.check()
                 self._statistics.count("timeouts")
                 if tries == _TRIES - 1:
-                    heard = ", ".join(map(str, sorted(self._heard))) or "none"
+                    heard = ", ".join(map(str, sorted(self._nodes_heard))) or "none"
                     raise DeadlineError(
                         self.name,
                         f"node {node} does not answer for {what} within {ANSWER_S} s; nodes heard on this bus: "
@@ -260,7 +180,7 @@ class CanopenBus:
         identifier, data = frame.arbitration_id, bytes(frame.data)
         service, node = identifier & 0x780, identifier & 0x7F
         if node and service in _FROM_DRIVES:
-            self._heard.add(node)
+            self._nodes_heard.add(node)
         if frame.is_remote_frame:
             if service == HEARTBEAT and node in self._nodes:
                 self._other(f"somebody else guards node {node}")
@@ -299,7 +219,3 @@ class _Network(canopen.Network):
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send what the package has to send."""
         self._over.send(can_id, bytes(data))
-
-
-def _frame(identifier: int, data: bytes) -> can.Message:
-    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)

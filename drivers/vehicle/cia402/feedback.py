@@ -7,18 +7,16 @@ Whether a wheel's speed and its counts tell of the same way: a unit may be wrong
 from __future__ import annotations
 
 import math
-import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.clock import Clock
-from drivers.errors import DeadlineError, DeviceFault
+from drivers.clock import Clock, patience
+from drivers.errors import DeviceFault
 from drivers.interfaces import LinkStatistics, VehicleState
-from drivers.vehicle.cia402.bus import command_lost, drive_error, wrong_units
 from drivers.vehicle.cia402.drive import OPERATIONAL, STATUS, DriveState, SideDrive, may_turn
-from drivers.vehicle.faults import disturbed, emergency_stop, no_feedback, two_vehicles
-from drivers.vehicle.feedback import Travel, difference
+from drivers.vehicle.faults import drive_error, two_vehicles, vehicle_fault
+from drivers.vehicle.feedback import FAST_AGE_WALL_S, QUIET_S, SILENCE_S, STILL, Feedback, Travel, difference
 
 VelocityUnit = Literal["counts/s", "rpm", "0.1 rpm", "0.01 rpm", "0.001 rpm"]
 SIDES = ("left", "right")
@@ -137,45 +135,29 @@ class UnitCheck:
         return ratio if self._wrong >= IN_A_ROW else 0.0
 
 
-SILENCE_S = 0.5
-"""Feedback that stays away for this long is a fault."""
-WALL_FLOOR_S = 0.5
-"""No patience with the vehicle is shorter than this on the wall, however fast the clock runs."""
-QUIET_S = 2.0
-"""Of a drive that stands nothing may be heard for this long, on the wall, while this program does listen."""
 UNHEARD = 8
 """A drive that drives and was asked so many times for its state without an answer is lost."""
-STILL = 0.0035
-"""Speeds up to this, m/s and rad/s, count as standstill."""
 CREPT_M = 0.001
 """What a wheel may go on by its counts while its speed says standstill: a rotor hunts by some of them."""
 AT_REST = 3
 """So many pairs of readings in a row have to say standstill: a speed alone may come from a drive that tells none."""
 _RELEASED_WALL_S = 0.3
-_FAST_AGE_WALL_S = 0.2
 _PAIR_WALL_S = 0.006
 """Both drives answer one SYNC within this; the next comes after 10 ms at the earliest."""
 
 
-def patience(clock: Clock, seconds: float) -> float:
-    """`seconds` of the clock, or what the wall floor takes on this clock if that is longer."""
-    return max(seconds, WALL_FLOOR_S * clock.rate)
-
-
-class DriveFeedback:
+class DriveFeedback(Feedback):
     """Both drives and the way of their wheels; `take` is called by the receive thread."""
 
     def __init__(
         self, name: str, clock: Clock, wheels: WheelDrives, *, max_speed: float, max_yaw_rate: float,
         statistics: LinkStatistics,
     ) -> None:  # fmt: skip
-        self._name = name
-        self._clock = clock
         self._wheels = wheels
         self._statistics = statistics
         self.drives = tuple(SideDrive(side, node) for side, node in zip(SIDES, wheels.nodes, strict=True))
         self._by_node = {drive.node: drive for drive in self.drives}
-        self._travel = Travel(
+        travel = Travel(
             clock,
             statistics,
             track=wheels.track,
@@ -183,7 +165,7 @@ class DriveFeedback:
             max_yaw_rate=max_yaw_rate,
             unit=wheels.count_length,
         )
-        self._news = threading.Condition(threading.RLock())
+        super().__init__(name, clock, travel)
         self._single: tuple[int, float] | None = None
         self._units = [UnitCheck(clock, wheels), UnitCheck(clock, wheels)]
         self._rests_at: tuple[int, ...] = ()
@@ -262,60 +244,22 @@ class DriveFeedback:
             for drive in self.drives:
                 drive.waited += 1
 
-    def commanded_to_move(self) -> None:
-        """A velocity was just sent."""
-        with self._news:
-            self._travel.commanded_to_move()
-
     def acknowledge(self) -> None:
         """Whoever takes command now has heard of what was before."""
         with self._news:
-            self._travel.acknowledge()
+            super().acknowledge()
             self.mismatch = ""
             for drive, units in zip(self.drives, self._units, strict=True):
                 drive.waited = 0
                 units.forget()
 
-    def require_one(self) -> None:
-        """Raise the `DeviceFault` of two vehicles that report under the same identifiers."""
-        with self._news:
-            if what := self._travel.two_vehicles:
-                raise two_vehicles(self._name, what)
-
-    def interrupt(self, why: str) -> None:
-        """From now on odometry does not tell where the vehicle is relative to where it was before."""
-        with self._news:
-            self._travel.interrupt(why)
-
     # --- what is told ---
-
-    @property
-    def interruptions(self) -> int:
-        """How often odometry lost its connection to where the vehicle was before."""
-        with self._news:
-            return self._travel.interruptions
 
     @property
     def disturbance(self) -> str:
         """How somebody else commands or moves the vehicle."""
         with self._news:
             return self._travel.disturbance
-
-    def wait_for(
-        self, happened: Callable[[], bool], timeout: float, alive: Callable[[], bool], floor: float = WALL_FLOOR_S
-    ) -> bool:
-        """Wait until news make `happened` true; False when they do not or `alive` turns false.
-
-        At most `timeout` s, or `floor` s on the wall if that is longer.
-        """
-        deadline = self._clock.now() + max(timeout, floor * self._clock.rate)
-        with self._news:
-            while not happened():
-                left = deadline - self._clock.now()
-                if left <= 0.0 or not alive():
-                    return False
-                self._news.wait(min(self._clock.wall(left), 0.1))
-        return True
 
     def complete(self) -> bool:
         """True once both drives have told status and motion."""
@@ -360,10 +304,13 @@ class DriveFeedback:
             if found := self._reported():
                 return found
             for drive in self.drives:
-                if drive.waited > UNHEARD and self._clock.wall(self._clock.now() - drive.told) > _FAST_AGE_WALL_S:
-                    return no_feedback(self._name, f"the {drive.side} drive does not tell its state any more")
+                if drive.waited > UNHEARD and self._clock.wall(self._clock.now() - drive.told) > FAST_AGE_WALL_S:
+                    return vehicle_fault(
+                        self._name, "vehicle.silent", f"the {drive.side} drive does not tell its state any more"
+                    )
                 if why := drive.left_command():
-                    return command_lost(self._name, why)
+                    hint = "See why, look where the vehicle stands, then run the job again."
+                    return vehicle_fault(self._name, "vehicle.command_lost", why, hint)
             return self._contradicted()
 
     def _reported(self) -> DeviceFault | None:
@@ -371,9 +318,9 @@ class DriveFeedback:
         if what := self._travel.two_vehicles:
             return two_vehicles(self._name, what)
         if self._stopped():
-            return emergency_stop(self._name)
+            return vehicle_fault(self._name, "vehicle.emergency_stop")
         trouble = self._trouble()
-        return drive_error(self._name, trouble, driven=self._travel.driven) if trouble else None
+        return drive_error(self._name, "; ".join(trouble), driven=self._travel.driven) if trouble else None
 
     def _trouble(self) -> tuple[str, ...]:
         return () if self.proving else tuple(word for drive in self.drives for word in drive.trouble())
@@ -381,13 +328,14 @@ class DriveFeedback:
     def _contradicted(self) -> DeviceFault | None:
         """What a vehicle that obeys must not show: another master, or units that do not fit."""
         if self.mismatch:
-            return wrong_units(self._name, self.mismatch)
-        return disturbed(self._name, self._travel.disturbance) if self._travel.disturbance else None
+            return vehicle_fault(self._name, "vehicle.units", self.mismatch)
+        disturbance = self._travel.disturbance
+        return vehicle_fault(self._name, "vehicle.disturbed", disturbance) if disturbance else None
 
     def require_released(self) -> None:
         """Raise the `DeviceFault` of an emergency stop that is pressed; one that was just released is waited for."""
         if not self.wait_for(lambda: not self._stopped(), 0.0, lambda: True, _RELEASED_WALL_S):
-            raise emergency_stop(self._name)
+            raise vehicle_fault(self._name, "vehicle.emergency_stop")
 
     def _stopped(self) -> bool:
         """Whether a drive's input says that the emergency stop is pressed."""
@@ -397,12 +345,7 @@ class DriveFeedback:
         return any((drive.inputs >> bit & 1 == 1) == self._wheels.stop_active for drive in self.drives)
 
     def state(self, max_age: float, braked: bool | None, in_command: bool) -> VehicleState:
-        """All as one record; `DeadlineError` when it is older than `max_age` s.
-
-        On a clock that runs faster than the wall, no age below 0.2 s of the wall counts as old.
-        """
-        if self._clock.rate > 1.0:
-            max_age = max(max_age, _FAST_AGE_WALL_S * self._clock.rate)
+        """All as one record; `DeadlineError` when it is older than `max_age` s."""
         with self._news:
             told = min(min(drive.told, drive.moved) for drive in self.drives)
             left, right = self.drives
@@ -426,11 +369,7 @@ class DriveFeedback:
                 interruptions=travel.interruptions,
                 interruption=travel.interruption,
             )
-        age = self._clock.now() - told
-        if age > max_age:
-            raise DeadlineError(
-                self._name, f"the newest feedback is {age:.2f} s old, allowed {max_age:.2f} s. Check the CAN bus"
-            )
+        self._require_young(told, max_age)
         return found
 
     def check(self, *, in_command: bool, driving: bool, lost: DeviceFault | None = None) -> None:
@@ -445,9 +384,13 @@ class DriveFeedback:
             untold, side = max((max(drive.untold.values()), drive.side) for drive in self.drives)
             reported, contradicted = self._reported(), self._contradicted()
         if untold > QUIET_S:
-            raise no_feedback(self._name, f"the {side} drive does not tell its state, for {untold:.2f} s")
+            raise vehicle_fault(
+                self._name, "vehicle.silent", f"the {side} drive does not tell its state, for {untold:.2f} s"
+            )
         if driving and silent > patience(self._clock, SILENCE_S):
-            raise no_feedback(self._name, f"no feedback of the {late.side} drive for {silent:.2f} s")
+            raise vehicle_fault(
+                self._name, "vehicle.silent", f"no feedback of the {late.side} drive for {silent:.2f} s"
+            )
         if reported is not None:
             raise reported
         if in_command and contradicted is not None:

@@ -253,13 +253,13 @@ def _ask(
     link: CanLink, node: int, entry: Entry, heard: dict[int, dict[int, bytes]], news: threading.Condition
 ) -> int | None:
     """A value of four bytes or less; None when the node is silent or has no such object."""
-    import can
+    from drivers.vehicle.can_link import data_frame
 
     with news:
         heard.get(node, {}).pop(SDO_REPLY, None)
     where = struct.pack("<HB", entry.index, entry.sub)
     data = bytes([_UPLOAD]) + where + bytes(4)
-    link.send(can.Message(arbitration_id=SDO_REQUEST + node, data=data, is_extended_id=False), str(entry))
+    link.send_frame(data_frame(SDO_REQUEST + node, data), str(entry))
 
     def answer() -> bytes | None:
         reply = heard.get(node, {}).get(SDO_REPLY, b"")

@@ -19,13 +19,14 @@ from functools import partial
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
+from drivers.vehicle.can_link import data_frame
 from drivers.vehicle.cia402 import drive as od
 from drivers.vehicle.cia402 import drive as states
-from drivers.vehicle.cia402.bus import Absent, CanopenBus, unguarded
+from drivers.vehicle.cia402.bus import Absent, CanopenBus
 from drivers.vehicle.cia402.drive import QUICK_STOP, DriveState, SideDrive
 from drivers.vehicle.cia402.feedback import DriveFeedback, WheelDrives
 from drivers.vehicle.cia402.setup import Watchdog, lock, set_up
-from drivers.vehicle.faults import disturbed
+from drivers.vehicle.faults import vehicle_fault
 
 
 def ask(bus: CanopenBus, feedback: DriveFeedback, wheels: WheelDrives) -> None:
@@ -122,7 +123,7 @@ class Master:
         """Set up drives that nobody else commands, and have them tell their state."""
         self._closed.wait(LISTEN_S)
         if what := self._feedback.disturbance:
-            raise disturbed(self._name, what)
+            raise vehicle_fault(self._name, "vehicle.disturbed", what)
         self.set_up()
         self._keeper.start()
         self.require_feedback()
@@ -148,7 +149,7 @@ class Master:
                 self._feedback.interrupt("the CAN bus failed and was opened again")
         self._feedback.acknowledge()
         self.set_up()
-        self.bus.say_in_the_end(last_words(self._wheels))
+        self.bus.say_in_the_end([data_frame(*word) for word in last_words(self._wheels)])
         self.require_feedback()
         self._feedback.require_one()
         self._feedback.require_released()
@@ -218,7 +219,7 @@ class Master:
             self._feedback.wait_for(moved, 0.0, self._alive, _STEP_WALL_S)
             self.bus.check()
             if what := self._feedback.disturbance:
-                raise disturbed(self._name, what)
+                raise vehicle_fault(self._name, "vehicle.disturbed", what)
             if self._clock.now() > deadline:
                 self._feedback.check(in_command=True, driving=False)
                 shown = ", ".join(f"{d.side} {d.state.value} ({d.statusword:04X}h)" for d in self._drives)
@@ -245,7 +246,12 @@ class Master:
             who = " and ".join(d.side for d in self._drives if states.may_turn(d.state))
             self._send_words(states.DISABLE_VOLTAGE)
             self._feedback.wait_for(partial(self._feedback.all_but, states.may_turn), WALK_TIMEOUT_S, self._alive)
-            raise unguarded(self._name, who, took, self._watchdog.seconds)
+            raise vehicle_fault(
+                self._name,
+                "vehicle.watchdog",
+                f"without our heartbeat the {who} drive stays enabled, {took:.1f} s long (vehicle.watchdog is "
+                f"{self._watchdog.seconds:g} s): it would drive on if this program died",
+            )
         _log.info("%s: without our heartbeat the drives stopped after %.2f s", self._name, took)
         self._proved = True
         for drive in self._drives:

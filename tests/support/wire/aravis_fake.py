@@ -16,11 +16,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from drivers.camera.genicam.acquisition import Network
 from drivers.camera.genicam.aravis import LIBRARIES
-from drivers.camera.genicam.camera import GenicamCamera, GenicamSetup, Region
-from drivers.camera.genicam.device import GigePlace
+from drivers.camera.genicam.camera import GenicamCamera
 from drivers.clock import Clock
+from tests.support.wire import gige_bench
 from tests.support.wire.gige_bench import require_aravis
 
 HOST = "127.0.0.1"
@@ -72,8 +71,7 @@ def fake_camera(picture: Callable[[float], NDArray[np.uint8]], serial: str = "GV
 
 def opened(host: str, clock: Clock) -> GenicamCamera:
     """The driver on it, set to 640 x 480 pixels; what the camera sends in one go is not cut short on a busy machine."""
-    setup = GenicamSetup(Region(640, 480), network=Network(packet_size=8000, retention=2.0))
-    return GenicamCamera("scan_camera", GigePlace(host), setup, clock=clock)
+    return gige_bench.opened(host, clock, width=640, height=480, packet_size=8000, retention=2.0)
 
 
 def _loaded(name: str) -> ctypes.CDLL | None:

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from drivers.camera.genicam.aravis import AravisMissing, load
-from drivers.camera.genicam.camera import GenicamCamera, GenicamSetup, Region
+from drivers.camera.genicam.camera import GenicamCamera
 from drivers.camera.genicam.device import GigePlace
+from drivers.camera.genicam.make import GigeCameraConfig
 from drivers.clock import Clock
 from drivers.interfaces import Frame
 from sim_backends.clock import WorldClock
@@ -22,7 +24,12 @@ from tests.support.wire.clocks import ahead
 
 SPEED = 3.0
 SPEC = CameraSpec("SimCam", "SIM000007-SCAN", 64, 48, frame_rate_max=120.0, epoch=5000.0, drift_ppm=60.0)
-WHOLE = Region(64, 48)
+
+
+def opened(host: str, clock: Clock, *, look: bool = False, **changed: Any) -> GenicamCamera:
+    """The driver of the camera at `host`, whose record has these values instead of the usual ones."""
+    record = GigeCameraConfig.model_construct(**{"width": 64, "height": 48, **changed})
+    return GenicamCamera("scan_camera", GigePlace(host), record, clock=clock, look=look)
 
 
 def require_aravis() -> None:
@@ -49,10 +56,9 @@ class Bench:
     world: WorldClock
     clock: Clock
 
-    def open(self, setup: GenicamSetup | None = None, *, look: bool = False) -> GenicamCamera:
-        """The driver, connected."""
-        place = GigePlace(self.peer.address)
-        return GenicamCamera("scan_camera", place, setup or GenicamSetup(WHOLE), clock=self.clock, look=look)
+    def open(self, *, look: bool = False, **changed: Any) -> GenicamCamera:
+        """The driver, connected, its record `changed` so."""
+        return opened(self.peer.address, self.clock, look=look, **changed)
 
     def shown(self, frame: Frame) -> float:
         """Host time that the picture shows."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from drivers.clock import Clock
-from drivers.rail.modbus.make import ModbusRailConfig, register_map
+from drivers.rail.modbus.make import ModbusRailConfig
 from drivers.rail.modbus.rail import ModbusRail
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
@@ -42,12 +42,8 @@ class Drive:
         return cls(record, model, peer, Clock(SPEED))
 
     def rail(self, url: str | None = None, *, control: bool = True, **changed: Any) -> ModbusRail:
-        record = self.record.model_copy(update=changed)
-        return ModbusRail(
-            "rail", url or self.peer.url, register_map(record.registers), lead=record.lead,
-            counts_per_turn=record.counts_per_turn, travel=record.travel, max_speed=record.max_speed,
-            acceleration=record.acceleration, clock=self.clock, unit=record.unit, serial=record.serial, control=control,
-        )  # fmt: skip
+        record = self.record.model_copy(update={"url": url or self.peer.url, **changed})
+        return ModbusRail("rail", record, clock=self.clock, control=control)
 
     def homed(self, **how: Any) -> ModbusRail:
         rail = self.rail(**how)

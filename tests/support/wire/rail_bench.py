@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 from drivers.clock import Clock
+from drivers.common.units import KEPT
+from drivers.rail.tmcl.make import TmclRailConfig
 from drivers.rail.tmcl.rail import TmclRail
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
@@ -42,15 +44,14 @@ class Bench:
         return self.model.carriage(host_time - ahead(self.clock, self.world))
 
 
-def connect(
-    url: str, clock: Clock, travel: tuple[float, float] = (0.0, 0.1), address: int = 1, control: bool = True,
-    reversed: bool = False, reference_mode: int = 5,
-) -> TmclRail:  # fmt: skip
-    return TmclRail(
-        "rail", url, lead=0.002, steps_per_turn=200, microsteps=256, travel=travel, max_speed=MAX_SPEED,
-        acceleration=ACCELERATION, address=address, motor=0, reference_mode=reference_mode, reversed=reversed,
-        control=control, clock=clock,
-    )  # fmt: skip
+def connect(url: str, clock: Clock, *, control: bool = True, **changed: Any) -> TmclRail:
+    """The rail at `url`, its record changed so; lengths in m."""
+    record = {
+        "url": url, "lead": 0.002, "steps_per_turn": 200, "microsteps": 256, "travel": (0.0, 0.1),
+        "max_speed": MAX_SPEED, "acceleration": ACCELERATION,
+    }  # fmt: skip
+    made = TmclRailConfig.model_validate(record, context=KEPT).model_copy(update=changed)
+    return TmclRail("rail", made, clock=clock, control=control)
 
 
 def telegram(command: int, kind: int, value: int) -> bytes:

@@ -18,7 +18,7 @@ from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, NotConnectedError
 from drivers.interfaces import ArmSafety
-from tests.support.wire.arm_bench import ArmBench, soon
+from tests.support.wire.arm_bench import ArmBench, Shared, soon
 from tests.support.wire.cable import Cable
 
 pytestmark = pytest.mark.wire
@@ -38,19 +38,27 @@ def running():
         yield bench
 
 
-@pytest.fixture
-def bench(running):
+@pytest.fixture(scope="module")
+def shared(running):
+    shared = Shared(lambda: connect(running.address))
+    yield shared
     running.ask("clear")
+    shared.close()
+
+
+@pytest.fixture
+def bench(request, running, shared):
+    """The arm as after switching on; in use by nobody where the test does not take it with `arm`."""
+    running.ask("clear")
+    if "arm" not in request.fixturenames:
+        shared.close()
     running.ask("reset")
     return running
 
 
 @pytest.fixture
-def arm(bench):
-    arm = connect(bench.address)
-    yield arm
-    bench.ask("clear")
-    arm.close()
+def arm(bench, shared):
+    return shared.ready()
 
 
 def send(address, script):
@@ -63,18 +71,6 @@ def send(address, script):
 def nudge(arm):
     state = arm.state()
     arm.move_joints(state.joints + 0.02, 0.5, 1.0).wait(10.0)
-
-
-def test_reduced_mode_is_no_fault_to_connect_to_move_in_and_to_recover_in(bench):
-    bench.ask("reduced_mode")
-    arm = connect(bench.address)
-    try:
-        assert arm.state().safety is ArmSafety.NORMAL
-        nudge(arm)
-        arm.recover()
-        nudge(arm)
-    finally:
-        arm.close()
 
 
 def test_a_payload_that_another_has_set_is_named_before_the_next_motion_and_recover_sets_it_again(arm, bench):
@@ -92,6 +88,31 @@ def test_a_payload_that_another_has_set_is_named_before_the_next_motion_and_reco
     nudge(arm)
     arm.set_payload(2.5, np.array([0.0, 0.01, 0.02]))
     nudge(arm)
+    arm.set_payload(PAYLOAD[0], np.array(PAYLOAD[1]))
+
+
+def test_a_program_that_another_client_starts_is_a_program_that_ended_and_can_be_recovered(arm, bench):
+    moving = arm.move_joints(arm.state().joints + 0.5, 0.2, 1.0)
+    with socket.create_connection((bench.address, 30001), timeout=2.0) as other:
+        other.sendall(b'def other():\n  textmsg("mine now")\n  sleep(0.1)\nend\n')
+        other.recv(4096)
+        with pytest.raises(DeviceFault) as caught:
+            moving.wait(10.0)
+    assert caught.value.code == "arm.program_stopped"
+    arm.recover()
+    nudge(arm)
+
+
+def test_reduced_mode_is_no_fault_to_connect_to_move_in_and_to_recover_in(bench):
+    bench.ask("reduced_mode")
+    arm = connect(bench.address)
+    try:
+        assert arm.state().safety is ArmSafety.NORMAL
+        nudge(arm)
+        arm.recover()
+        nudge(arm)
+    finally:
+        arm.close()
 
 
 def test_a_tool_that_another_has_set_is_named_before_the_next_motion(bench):
@@ -147,18 +168,6 @@ def test_an_e_series_arm_may_leave_out_its_e(told, model, same):
     board = SimpleNamespace(ask=lambda question: told)
     with nullcontext() if same else pytest.raises(DeviceFault, match=told):
         require_named("arm", board, model)
-
-
-def test_a_program_that_another_client_starts_is_a_program_that_ended_and_can_be_recovered(arm, bench):
-    moving = arm.move_joints(arm.state().joints + 0.5, 0.2, 1.0)
-    with socket.create_connection((bench.address, 30001), timeout=2.0) as other:
-        other.sendall(b'def other():\n  textmsg("mine now")\n  sleep(0.1)\nend\n')
-        other.recv(4096)
-        with pytest.raises(DeviceFault) as caught:
-            moving.wait(10.0)
-    assert caught.value.code == "arm.program_stopped"
-    arm.recover()
-    nudge(arm)
 
 
 def test_an_input_register_that_another_client_holds_is_named_at_connecting(bench):

@@ -10,6 +10,7 @@ import pytest
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeadlineError, DeviceFault
 from drivers.rail.tmcl.rail import TmclRail
+from tests.support.wire import rail_bench
 from tests.support.wire.other_module import NAMES, Order, OtherModule
 
 pytestmark = pytest.mark.wire
@@ -18,10 +19,9 @@ COUNTS = 200 * 256 / 0.01
 
 
 def connect(module: OtherModule, address: int = 1) -> TmclRail:
-    return TmclRail(
-        "rail", module.url, lead=0.01, steps_per_turn=200, microsteps=256, travel=(-0.001, 0.05), max_speed=0.2,
-        acceleration=ACCELERATION, address=address, clock=Clock(),
-    )  # fmt: skip
+    return rail_bench.connect(
+        module.url, Clock(), lead=0.01, travel=(-0.001, 0.05), max_speed=0.2, acceleration=ACCELERATION, address=address
+    )
 
 
 @pytest.fixture

@@ -25,13 +25,16 @@ ATTENDING = """
 import sys, threading
 import numpy as np
 from drivers.arm.ur import UrArm
+from drivers.rail.tmcl.make import TmclRailConfig
 from drivers.rail.tmcl.rail import TmclRail
 from drivers.clock import Clock
+from drivers.common.units import KEPT
 from drivers.errors import CellError
 clock = Clock()
 arm = UrArm("arm", sys.argv[1], clock=clock)
-rail = TmclRail("rail", sys.argv[2], lead=0.002, steps_per_turn=200, microsteps=256, travel=(0.0, 0.1),
-                max_speed=0.04, acceleration=0.2, clock=clock)
+record = dict(url=sys.argv[2], lead=0.002, steps_per_turn=200, microsteps=256, travel=(0.0, 0.1), max_speed=0.04,
+              acceleration=0.2)
+rail = TmclRail("rail", TmclRailConfig.model_validate(record, context=KEPT), clock=clock)
 rail.home().wait(60.0)
 print("ready", flush=True)
 for line in sys.stdin:

@@ -11,8 +11,7 @@ import pytest
 
 from cell.config.job import load_job
 from cell.procedures.drive.way import Whereabouts
-from drivers.errors import DeviceFault, InterlockError, LimitError, RefusedError
-from drivers.interfaces import Vehicle
+from drivers.errors import DeviceFault, InterlockError, RefusedError
 from sim_backends.models.vehicle import Mode
 from tests.support.wire.vehicle_bench import SPEED, STANDSTILL, Bench, benched
 
@@ -29,15 +28,6 @@ def bench() -> Iterator[Bench]:
 def enabled(bench: Bench) -> Bench:
     bench.vehicle.enable()
     return bench
-
-
-def test_the_vehicle_says_which_versions_it_has(bench: Bench) -> None:
-    vehicle: Vehicle = bench.vehicle
-    identity = vehicle.identity()
-    assert identity.firmware == "SIMULATED HW2.1 CONTROLLER 204 DRIVERS 110"
-    assert identity.address == f"slcan:{bench.peer.channel}"
-    assert 0.0 < vehicle.ping() < 0.5
-    assert vehicle.statistics.round_trips_s
 
 
 def test_it_starts_in_standby_and_does_not_move_before_it_is_enabled(bench: Bench) -> None:
@@ -63,46 +53,6 @@ def test_it_drives_as_told_and_odometry_follows(enabled: Bench) -> None:
     state = enabled.vehicle.state()
     assert (state.x, state.y) == pytest.approx((x, y), abs=0.005)
     assert state.yaw == pytest.approx(yaw, abs=0.005)
-
-
-def test_limits_are_checked_before_anything_is_sent(enabled: Bench) -> None:
-    with pytest.raises(LimitError, match=r"speed 600 mm/s is outside -500 mm/s to 500 mm/s"):
-        enabled.vehicle.drive(0.6, 0.0)
-    with pytest.raises(LimitError, match=r"yaw rate .* deg/s"):
-        enabled.vehicle.drive(0.0, -1.0)
-    with pytest.raises(LimitError):
-        enabled.vehicle.drive(float("nan"), 0.0)
-    enabled.clock.sleep(0.3)
-    assert enabled.true_speed() == 0.0
-
-
-def test_a_velocity_that_nobody_renews_is_dropped(enabled: Bench) -> None:
-    enabled.vehicle.drive(0.3, 0.0)
-    enabled.until(lambda: enabled.true_speed() > 0.0)
-    enabled.until(lambda: enabled.true_speed() == 0.0)
-    assert enabled.vehicle.statistics.errors["dead_man"] == 1
-    # The keep-alive goes on, so it was the driver's dead-man and not the vehicle's own time-out.
-    assert enabled.truth()[0] < 0.3
-
-
-def test_stop_returns_when_the_vehicle_stands(enabled: Bench) -> None:
-    enabled.drive_for(1.5, 0.5)
-    enabled.vehicle.stop()
-    assert enabled.true_speed() <= STANDSTILL
-    enabled.vehicle.stop()
-    assert enabled.vehicle.state().speed == 0.0
-
-
-def test_the_brake_holds_until_it_is_released(enabled: Bench) -> None:
-    enabled.drive_for(0.5, 0.3)
-    enabled.vehicle.brake()
-    enabled.until(lambda: enabled.model.feedback(enabled.world.now()).braked)
-    assert enabled.vehicle.state().braked
-    with pytest.raises(InterlockError, match="brake is locked"):
-        enabled.vehicle.drive(0.1, 0.0)
-    enabled.vehicle.enable()
-    enabled.drive_for(0.5, 0.3)
-    assert enabled.true_speed() > 0.0
 
 
 def test_an_emergency_stop_is_a_fault_that_names_it(enabled: Bench) -> None:
@@ -149,23 +99,6 @@ def test_recovering_clears_the_error_with_the_brake_locked_all_along(enabled: Be
         enabled.vehicle.drive(0.1, 0.0)
 
 
-def test_what_somebody_else_commands_on_the_bus_ends_the_command(enabled: Bench) -> None:
-    enabled.drive_for(0.3, 0.2)
-    enabled.vehicle.brake()
-    with can.Bus(interface="slcan", channel=enabled.peer.channel, sleep_after_open=0) as other:
-        other.send(can.Message(arbitration_id=0x131, data=[0], is_extended_id=False))
-        with pytest.raises(DeviceFault, match="released its brake") as caught:
-            enabled.until(lambda: enabled.vehicle.check() is not None)
-        assert caught.value.code == "vehicle.disturbed"
-        assert not caught.value.recoverable
-        enabled.vehicle.enable()
-        other.send(can.Message(arbitration_id=0x111, data=[0, 100, 0, 0, 0, 0, 0, 0], is_extended_id=False))
-        with pytest.raises(DeviceFault, match="commands it to move"):
-            enabled.until(lambda: enabled.vehicle.drive(0.1, 0.0) is not None)
-        with pytest.raises(InterlockError, match="not under CAN command"):
-            enabled.vehicle.drive(0.1, 0.0)
-
-
 class Recorder(can.Listener):
     """What was on the bus, with the times at which an adapter of its own heard it."""
 
@@ -183,13 +116,13 @@ class Recorder(can.Listener):
 
 
 @pytest.mark.parametrize(
-    ("fault", "mark", "code"),
+    ("fault", "mark", "code", "asked"),
     [
-        ("can.foreign_commands", (0x111, b"\x00\xc8"), "vehicle.disturbed"),
-        ("can.second_vehicle", (0x311, b"\x00\x00\x2e\xe0"), "vehicle.two_vehicles"),
+        ("can.foreign_commands", (0x111, b"\x00\xc8"), "vehicle.disturbed", False),
+        ("can.foreign_commands", (0x111, b"\x00\xc8"), "vehicle.disturbed", True),
+        ("can.second_vehicle", (0x311, b"\x00\x00\x2e\xe0"), "vehicle.two_vehicles", False),
     ],
 )
-@pytest.mark.parametrize("asked", [False, True])
 def test_it_is_braked_first_against_others_on_the_bus(
     fault: str, mark: tuple[int, bytes], code: str, asked: bool
 ) -> None:

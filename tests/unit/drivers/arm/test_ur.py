@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 
 from drivers.errors import InterlockError, LimitError
-from drivers.interfaces import Arm, ArmSafety
 from tests.support.wire.arm_bench import joints_away, swing
 
 pytestmark = pytest.mark.wire
-
-
-def test_it_keeps_the_interface(arm):
-    device: Arm = arm
-    assert device.name == "arm"
 
 
 def test_it_knows_who_the_arm_is_and_how_long_a_round_trip_takes(arm, bench):
@@ -33,15 +27,6 @@ def test_it_sets_a_zero_tool_and_the_payload_and_keeps_them_through_a_recovery(a
     assert bench.ask("show")["payload"] == 2.5
     arm.recover()
     assert bench.ask("show")["payload"] == 2.5
-
-
-def test_states_are_fresh_and_stamped(arm):
-    clock = arm._clock
-    before = clock.now()
-    state = arm.state(max_age=0.0)
-    assert before - 0.02 <= state.stamp <= clock.now()
-    assert state.safety is ArmSafety.NORMAL
-    assert not state.moving
 
 
 def test_nothing_is_sent_when_limits_or_interlocks_forbid_it(arm, bench):

@@ -13,7 +13,7 @@ from cell.config.cell_config import load_config
 from cell.devices.assembly import connect
 from cell.devices.contracts import Bench, CameraContract
 from cell.makes import make_of
-from drivers.camera.folder import RecordedCamera
+from drivers.camera.folder import RecordedCamera, read_image
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault, LimitError, NotConnectedError, RefusedError
 from drivers.interfaces import Camera
@@ -101,14 +101,29 @@ def test_another_exposure_or_rate_than_the_recorded_is_refused(tmp_path: Path) -
         camera.configure(EXPOSURE_S, 30.0)
 
 
-def test_a_cut_picture_is_refused_by_name_and_the_next_one_comes(tmp_path: Path) -> None:
-    folder = record(tmp_path / "r", [1, 2, 3])
+def test_a_bad_picture_is_refused_by_name_and_the_next_one_comes(tmp_path: Path) -> None:
+    folder = record(tmp_path / "r", [1, 2, 3, 4, 5, 6])
+    noise = np.random.default_rng(1).integers(0, 255, (48, 64), dtype=np.uint8)
+    whole = cv2.imencode(".jpg", noise)[1].tobytes()
     (folder / "2.png").write_bytes((folder / "2.png").read_bytes()[:40])
+    (folder / "3.png").write_bytes(whole[: 2 * len(whole) // 3])
+    (folder / "4.png").write_text("this is text")
+    cv2.imwrite(str(folder / "5.png"), np.zeros((20, 30), np.uint8))
     camera = opened(folder)
     camera.grab()
-    with pytest.raises(RefusedError, match=r"2\.png: is cut off"):
-        camera.grab()
-    assert camera.grab().frame_id == 3
+    for words in (
+        r"2\.png: is cut off",
+        r"3\.png: is cut off",
+        r"4\.png: is not a picture .*12 bytes",
+        r"5\.png: has 30x20 pixels instead of 64x48",
+    ):
+        with pytest.raises(RefusedError, match=words):
+            camera.grab()
+    assert camera.grab().frame_id == 6
+    with pytest.raises(RefusedError, match=r"missing\.png"):
+        read_image(folder / "missing.png")
+    cv2.imwrite(str(folder / "colour.png"), np.full((5, 5, 3), (0, 0, 255), np.uint8))
+    assert read_image(folder / "colour.png").shape == (5, 5)
 
 
 def test_nothing_moves_by_a_recording(tmp_path: Path) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 from pyrobotiqur import RobotiqGripper
 
-from drivers.claw.robotiq import Grip, RobotiqClaw
+from drivers.claw.make import RobotiqClawConfig
+from drivers.claw.robotiq import RobotiqClaw
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from sim_backends.peers.switches import RobotiqPeer
@@ -18,8 +20,12 @@ from sim_backends.world.world import World
 
 pytestmark = pytest.mark.wire
 
-GRIP = Grip(open_at=0, closed_at=255, speed=255, force=100)
 SPEED = 5.0
+
+
+def opened(address: str, clock: Clock, *, control: bool = True, **changed: Any) -> RobotiqClaw:
+    record = RobotiqClawConfig(address=address, speed=255, force=100, **changed)
+    return RobotiqClaw("claw", record, clock=clock, control=control)
 
 
 @dataclass
@@ -28,8 +34,8 @@ class Bench:
     peer: RobotiqPeer
     clock: Clock
 
-    def claw(self, grip: Grip = GRIP, *, control: bool = True) -> RobotiqClaw:
-        return RobotiqClaw("claw", self.peer.address, grip, clock=self.clock, control=control)
+    def claw(self, *, control: bool = True, **changed: Any) -> RobotiqClaw:
+        return opened(self.peer.address, self.clock, control=control, **changed)
 
 
 @pytest.fixture
@@ -75,7 +81,7 @@ def test_a_part_is_held_because_the_gripper_found_it(bench: Bench) -> None:
 
 def test_fingers_that_are_stopped_too_early_do_not_hold_from_inside(bench: Bench) -> None:
     """Stopped while closing is no grip of a part that is held by spreading."""
-    claw = bench.claw(Grip(255, 0, 255, 100, inside=True))
+    claw = bench.claw(open_at=255, closed_at=0, inside=True)
     assert not claw.holding
     with pytest.raises(DeviceFault, match=r"claw\.stuck"):
         claw.release(1.0)
@@ -136,12 +142,12 @@ def test_what_is_no_gripper_is_told(bench: Bench) -> None:
     silly = TcpServer("silly", lambda link: [link.sendall(b"hello") for _ in iter(lambda: link.recv(99), b"")])  # type: ignore[arg-type, return-value]
     silly.start()
     with pytest.raises(DeadlineError, match="b'hello' came"):
-        RobotiqClaw("claw", silly.address, GRIP, clock=Clock())
+        opened(silly.address, Clock())
     silly.stop()
     babbling = TcpServer("babbling", lambda link: [link.sendall(b"x" * 200) for _ in iter(int, 1)])  # type: ignore[arg-type, return-value]
     babbling.start()
     with pytest.raises(DeadlineError):
-        RobotiqClaw("claw", babbling.address, GRIP, clock=Clock())
+        opened(babbling.address, Clock())
     babbling.stop()
     with pytest.raises(NotConnectedError, match="takes no connection"):
-        RobotiqClaw("claw", silly.address, GRIP, clock=Clock())
+        opened(silly.address, Clock())

@@ -14,31 +14,6 @@ from tests.support.wire.rail_bench import Bench, benched, connect
 pytestmark = pytest.mark.wire
 
 
-def test_nothing_moves_before_homing(bench: Bench) -> None:
-    before = bench.carriage()
-    with pytest.raises(InterlockError, match="home"):
-        bench.rail.move_to(0.05)
-    assert not bench.rail.state().homed
-    assert bench.carriage() == before
-
-
-def test_homing_puts_zero_at_the_switch(homed: Bench) -> None:
-    state = homed.rail.state()
-    assert state.homed
-    assert not state.moving
-    assert state.position == 0.0
-    assert homed.carriage() == pytest.approx(0.0, abs=1e-6)
-
-
-def test_a_move_ends_where_it_was_sent(homed: Bench) -> None:
-    motion = homed.rail.move_to(0.0421, speed=0.03)
-    assert not motion.done
-    motion.wait(10.0)
-    assert motion.done
-    assert homed.rail.state().position == pytest.approx(0.0421, abs=1e-8)
-    assert homed.carriage() == pytest.approx(0.0421, abs=1e-6)
-
-
 def test_limits_are_checked_before_anything_is_sent(homed: Bench) -> None:
     sent = len(homed.rail.statistics.round_trips_s)
     with pytest.raises(LimitError, match=r"position 120 mm is outside 0 mm to 100 mm"):
@@ -98,15 +73,6 @@ def test_a_search_whose_stop_has_no_answer_is_not_told_as_stopped(bench: Bench) 
     assert told.value.code == "rail.not_stopped"
     bench.peer.clear()
     bench.rail.stop()
-
-
-def test_a_wait_that_runs_out_stops_the_rail(homed: Bench) -> None:
-    motion = homed.rail.move_to(0.09, speed=0.005)
-    with pytest.raises(DeadlineError, match="was stopped"):
-        motion.wait(1.0)
-    homed.clock.sleep(0.5)
-    assert homed.rail.state().velocity == 0.0
-    assert homed.carriage() < 0.05
 
 
 @pytest.mark.parametrize(

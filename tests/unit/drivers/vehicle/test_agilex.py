@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -97,7 +98,7 @@ def test_a_velocity_that_nobody_renews_becomes_zero(bench: Bench) -> None:
     bench.until(lambda: bench.speed() == 0.0)
 
 
-@pytest.mark.parametrize(("speed", "yaw_rate"), [(0.51, 0.0), (-0.51, 0.0), (0.0, 0.81), (0.0, -0.81)])
+@pytest.mark.parametrize(("speed", "yaw_rate"), [(0.51, 0.0), (-0.51, 0.0), (0.0, 0.81), (0.0, -0.81), (math.nan, 0.0)])
 def test_no_velocity_beyond_a_limit_is_sent_in_either_direction(bench: Bench, speed: float, yaw_rate: float) -> None:
     with pytest.raises(LimitError, match="nothing was sent"):
         bench.vehicle.drive(speed, yaw_rate)
@@ -145,24 +146,15 @@ def test_a_stop_that_nobody_confirms_is_told_bars_driving_meanwhile_and_the_brak
     bench.until(bench.braked)
 
 
-def test_silence_is_told_to_one_who_drives_within_half_a_second(bench: Bench) -> None:
+def test_silence_is_told_to_one_who_drives_within_half_a_second_and_an_old_reading_is_none(bench: Bench) -> None:
     bench.drive_until_fast()
     bench.bus.talking = False
     begun = time.monotonic()
-    with pytest.raises(DeviceFault, match="no feedback"):
+    with pytest.raises(DeviceFault, match="no feedback") as caught:
         while time.monotonic() - begun < 3.0:
             bench.vehicle.drive(0.3, 0.0)
             time.sleep(0.01)
     assert time.monotonic() - begun < 1.2
-
-
-def test_silence_ends_driving_and_an_old_reading_is_none(bench: Bench) -> None:
-    bench.drive_until_fast()
-    bench.bus.talking = False
-    with pytest.raises(DeviceFault, match="no feedback") as caught:
-        for _ in range(300):
-            bench.vehicle.drive(0.3, 0.0)
-            time.sleep(0.01)
     assert caught.value.code == "vehicle.silent"
     with pytest.raises(DeadlineError, match="old, allowed"):
         bench.vehicle.state()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from collections.abc import Callable
 
@@ -19,7 +18,7 @@ from cell.measure.geometry.poses import from_parts, from_ur, to_ur
 from cell.motion.collision import BASE, FLANGE, block, tool_bodies
 from cell.motion.kinematics import HOME
 from drivers.clock import Clock
-from drivers.errors import ConfigError, DeadlineError, DeviceFault, InterlockError, LimitError
+from drivers.errors import ConfigError, DeviceFault, InterlockError, LimitError
 from sim_backends.models.arm import Power
 from sim_backends.models.arm_kinematics import Kinematics
 from tests.support import ROOT
@@ -92,11 +91,6 @@ def test_the_arm_moves_only_while_the_vehicle_is_parked_and_braked(
     assert np.array_equal(devices.arm.state().joints, stood)
     devices.vehicle.brake()
     devices.arm.move_joints(away, 0.5, 1.0).wait(30.0)
-
-
-def test_a_brake_that_this_program_has_not_locked_is_not_taken_as_locked() -> None:
-    arm = VirtualCell(CONFIG, seed=4, level="ideal").devices.arm
-    refused("vehicle_parked", lambda: arm.move_joints(HOME, 0.5, 1.0), "not known to be locked")
 
 
 def test_the_vehicle_drives_only_with_the_arm_at_rest_in_a_transport_pose(world: VirtualCell, devices: Devices) -> None:
@@ -290,34 +284,6 @@ def test_a_drive_that_is_refused_ends_the_velocity_before_it(world: VirtualCell,
     assert devices.vehicle.state().speed == 0.0
 
 
-class Fixed:
-    """A device of which only the newest state is asked."""
-
-    def __init__(self, name: str, state: object) -> None:
-        self.name, self.newest, self.asked = name, state, []
-
-    def state(self, max_age: float = 0.1) -> object:
-        self.asked.append(max_age)
-        return self.newest
-
-
-def test_driving_is_judged_by_the_newest_state_without_waiting_for_another(devices: Devices) -> None:
-    situation = devices.interlocks.situation
-    drive = DeviceCommand("vehicle", "drive", {"speed": 0.1, "yaw_rate": 0.0})
-    now = devices.arm.state()
-    shaken = dataclasses.replace(now, joint_speeds=np.full(6, 0.02), moving=True)
-    situation.arm = Fixed("arm", shaken)
-    devices.interlocks.require(drive)
-    assert set(situation.arm.asked) == {np.inf}
-    situation.arm = Fixed("arm", dataclasses.replace(shaken, joint_speeds=np.full(6, 0.08)))
-    refused("arm_stowed", lambda: devices.interlocks.require(drive), "the arm moves")
-    situation.arm = Fixed("arm", dataclasses.replace(now, stamp=now.stamp - 0.6))
-    with pytest.raises(DeadlineError, match=r"0\.60 s old, allowed 0\.50 s"):
-        devices.interlocks.require(drive)
-    situation.arm = Fixed("arm", dataclasses.replace(now, digital_outputs=1 << LASER))
-    refused("laser_off_to_drive", lambda: devices.interlocks.require(drive), "the laser is on")
-
-
 @pytest.mark.parametrize(
     "joints", [np.full(6, np.nan), np.full(6, 1e6), np.zeros(5), ["a"] * 6], ids=["nan", "far", "five", "words"]
 )
@@ -435,14 +401,6 @@ def test_what_is_near_at_the_beginning_may_part_but_not_come_nearer(devices: Dev
     up_and_down = np.array([here, higher, here])
     refused("way_clear", lambda: arm.follow(np.array([0.0, 3.0, 6.0]), up_and_down), "claw and shelf")
     arm.follow(np.array([0.0, 3.0]), up_and_down[:2]).wait(30.0)
-
-
-def test_an_output_that_another_device_owns_is_switched_by_that_device(devices: Devices) -> None:
-    refused("own_switch", lambda: devices.arm.set_digital_output(LASER, True), "output 0 is the laser's")
-    refused("own_switch", lambda: devices.arm.set_digital_output(CONFIG.claw.output, False), "the claw's")
-    devices.arm.set_digital_output(LASER, False)
-    devices.arm.set_digital_output(7, True)
-    assert devices.claw.holding
 
 
 @pytest.mark.parametrize(("row", "column", "by"), [(1, 0, 0.06e-3), (4, 3, 0.2e-3)], ids=["length", "zero"])

@@ -36,8 +36,10 @@ class Told:
 
     def __init__(self, name: str, state: Any) -> None:
         self.name, self.newest = name, state
+        self.asked: list[float] = []
 
     def state(self, max_age: float = 0.1) -> Any:
+        self.asked.append(max_age)
         return self.newest
 
 
@@ -176,6 +178,18 @@ def test_a_late_reading_is_waited_for_and_an_old_one_is_enough_of_a_vehicle_that
         interlocks.require(MOVE)
 
 
+def test_driving_is_judged_by_the_arms_newest_state_without_waiting_for_another() -> None:
+    """The arm is shaken a little as the vehicle drives; the laser's output shows in the same state."""
+    shaken = arm_state(joint_speeds=np.full(6, 0.02), moving=True)
+    interlocks = rules(arm=shaken, laser=Told("laser", None), outputs={0: "laser"})
+    interlocks.require(DRIVE)
+    arm: Any = interlocks.situation.arm
+    assert set(arm.asked) == {math.inf}
+    arm.newest = arm_state(digital_outputs=1)
+    with pytest.raises(InterlockError, match="laser_off_to_drive"):
+        interlocks.require(DRIVE)
+
+
 def test_nothing_drives_by_an_old_state_of_the_arm() -> None:
     old = arm_state(stamp=Clock().now() - LATE_S - 0.1)
     with pytest.raises(DeadlineError, match="newest state is"):
@@ -193,7 +207,7 @@ def test_of_the_outputs_of_others_the_lasers_alone_may_be_switched_off(index: in
     if not refused:
         interlocks.require(command)
         return
-    with pytest.raises(InterlockError, match="own_switch"):
+    with pytest.raises(InterlockError, match=rf"output {index} is the .*'s\. Use the .*own_switch"):
         interlocks.require(command)
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from cell import Cell
 from cell.config.job import job_path
-from cell.devices.simulated.following import FollowedCamera
+from cell.devices.gate.gated import GatedCamera
 from drivers.errors import CalibrationStale, DeadlineError
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
@@ -64,11 +64,10 @@ def test_pictures_follow_a_real_rail_and_there_are_none_while_nobody_knows_where
             camera.grab()
             told = world.truth()["rail"]
             assert told["carriage"] == pytest.approx(0.02 * told["scale"], abs=5e-5)
-            followed = camera.bare
-            assert isinstance(followed, FollowedCamera)
+            assert isinstance(camera, GatedCamera)
             moving = rail.move_to(0.06)
             with pytest.raises(DeadlineError):
-                followed.bare.grab(0.4)
+                camera.bare.grab(0.4)
             camera.grab()
             assert camera.statistics.errors["picture asked for again"] >= 1, "into the gap once more, then after it"
             moving.wait(10.0)

@@ -165,7 +165,7 @@ def on_the_bus(path: Path) -> None:
     other = can.Bus(interface="virtual", channel=str(path))
     try:
         for frame in FRAMES:
-            link.send(frame, "a frame")
+            link.send_frame(frame, "a frame")
         for frame in FRAMES:
             other.send(frame)
         until = time.monotonic() + 5.0

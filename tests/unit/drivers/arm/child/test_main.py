@@ -15,7 +15,7 @@ import pytest
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import NotConnectedError
-from tests.support.wire.arm_bench import ArmBench, gone, joints_away, keep_outputs, soon
+from tests.support.wire.arm_bench import gone, joints_away, keep_outputs, soon
 
 pytestmark = pytest.mark.wire
 
@@ -43,8 +43,8 @@ threading.Event().wait(60)
 
 
 @pytest.mark.parametrize("way", [signal.SIGKILL, signal.SIGTERM])
-def test_when_the_owner_dies_the_laser_goes_off_the_arm_stops_and_the_child_ends(way):
-    with ArmBench() as bench, owned(bench) as (owner, child):
+def test_when_the_owner_dies_the_laser_goes_off_the_arm_stops_and_the_child_ends(bench, way):
+    with owned(bench) as (owner, child):
         keep_outputs(bench)
         owner.send_signal(way)
         assert soon(lambda: not bench.ask("show")["moving"])
@@ -52,8 +52,8 @@ def test_when_the_owner_dies_the_laser_goes_off_the_arm_stops_and_the_child_ends
         assert soon(lambda: gone(child))
 
 
-def test_when_the_owner_and_its_child_die_the_controller_switches_off_what_was_tried():
-    with ArmBench() as bench, owned(bench) as (owner, child):
+def test_when_the_owner_and_its_child_die_the_controller_switches_off_what_was_tried(bench):
+    with owned(bench) as (owner, child):
         owner.send_signal(signal.SIGSTOP)
         os.kill(child, signal.SIGKILL)
         owner.kill()
@@ -80,22 +80,22 @@ def owned(bench):
     owner.communicate(timeout=10)
 
 
-def test_ctrl_c_does_not_reach_the_child(arm):
-    os.kill(arm._session.link.pid, signal.SIGINT)
-    arm.move_joints(joints_away(arm, -0.02), 1.0, 2.0).wait(5.0)
-
-
-def test_close_leaves_the_laser_off_and_no_process_and_may_be_repeated():
-    with ArmBench() as bench:
-        arm = UrArm("arm", bench.address, safe_off_outputs=(LASER,), clock=Clock())
-        arm.set_digital_output(LASER, True)
-        keep_outputs(bench)
-        child = arm._session.link.pid
-        arm.close()
-        arm.close()
-        assert not bench.ask("show")["outputs"] & 1 << LASER
-        assert gone(child)
+def test_close_leaves_the_laser_off_and_no_process_and_may_be_repeated(bench):
+    arm = UrArm("arm", bench.address, safe_off_outputs=(LASER,), clock=Clock())
+    arm.set_digital_output(LASER, True)
+    keep_outputs(bench)
+    child = arm._session.link.pid
+    arm.close()
+    arm.close()
+    assert not bench.ask("show")["outputs"] & 1 << LASER
+    assert gone(child)
     with pytest.raises(NotConnectedError, match="was closed"):
         arm.state()
     with pytest.raises(NotConnectedError, match="was closed"):
         arm.move_joints(np.zeros(6), 1.0, 1.0)
+
+
+# Last: it takes the arm for the shared driver.
+def test_ctrl_c_does_not_reach_the_child(arm):
+    os.kill(arm._session.link.pid, signal.SIGINT)
+    arm.move_joints(joints_away(arm, -0.02), 1.0, 2.0).wait(5.0)

@@ -32,14 +32,6 @@ def lowering(arm, depth, seconds):
     return times, np.array(joints)
 
 
-def test_a_trajectory_is_followed_in_its_time_to_its_end(arm):
-    times, joints = swing(arm, 0.3, 0.6)
-    begun = time.monotonic()
-    arm.follow(times, joints).wait(5.0)
-    assert 0.6 <= time.monotonic() - begun < 1.6
-    assert np.abs(arm.state().joints - joints[-1]).max() < 2e-3
-
-
 def test_a_guarded_descent_ends_at_rest_on_the_table(arm):
     above = arm.state().flange
     above[2] = 0.53

@@ -8,10 +8,9 @@ import time
 import numpy as np
 import pytest
 
-from drivers.camera.genicam.acquisition import FORMATS, BlockCount, Network
-from drivers.camera.genicam.camera import GenicamSetup
+from drivers.camera.genicam.acquisition import FORMATS, BlockCount
 from drivers.errors import DeadlineError, DeviceFault
-from tests.support.wire.gige_bench import WHOLE, Bench
+from tests.support.wire.gige_bench import Bench
 
 pytestmark = pytest.mark.wire
 
@@ -34,7 +33,7 @@ def test_a_picture_out_of_turn_is_no_new_beginning_of_the_block_ids() -> None:
     "name", ["Mono8", "Mono10", "Mono10Packed", "Mono10p", "Mono12", "Mono12Packed", "Mono12p", "BayerRG8", "RGB8"]
 )
 def test_every_pixel_format_comes_as_the_grey_that_was_sent(bench: Bench, name: str) -> None:
-    camera = bench.open(GenicamSetup(WHOLE, name))
+    camera = bench.open(pixel_format=name)
     camera.configure(0.004, 50.0)
     image = camera.grab().image
     camera.close()
@@ -44,7 +43,7 @@ def test_every_pixel_format_comes_as_the_grey_that_was_sent(bench: Bench, name: 
 
 
 def test_lost_packets_come_again(bench: Bench) -> None:
-    camera = bench.open(GenicamSetup(WHOLE, network=Network(packet_size=576)))
+    camera = bench.open(packet_size=576)
     camera.configure(0.004, 20.0)
     bench.peer.lose_packets(lambda number: number in (2, 3))
     with camera.stream() as frames:
@@ -56,7 +55,7 @@ def test_lost_packets_come_again(bench: Bench) -> None:
 
 
 def test_without_resending_a_picture_with_a_hole_is_lost_and_never_handed_out(bench: Bench) -> None:
-    camera = bench.open(GenicamSetup(WHOLE, network=Network(packet_size=576, resend=False, retention=0.05)))
+    camera = bench.open(packet_size=576, resend=False, retention=0.05)
     camera.configure(0.004, 20.0)
     lose = iter([True, False, True] + [False] * 1000)
     bench.peer.lose_packets(lambda number: number == 3 and next(lose))

@@ -15,7 +15,8 @@ import pytest
 from cell.devices.contracts import Bench, CameraContract
 from cell.devices.contracts.device import EXPOSURE_S, PATIENCE_S, RATE_HZ
 from drivers.camera.genicam.aravis import LIBRARIES, Aravis
-from drivers.camera.genicam.camera import GenicamCamera, GenicamSetup, Region
+from drivers.camera.genicam.camera import GenicamCamera
+from drivers.camera.genicam.make import GenicamConfig
 from drivers.clock import Clock
 from drivers.interfaces import Camera
 from tests.support.wire.aravis_fake import fake_camera, opened
@@ -70,9 +71,7 @@ class TestUsb3(CameraContract):
     @classmethod
     def bench(cls) -> Iterator[Bench[Camera]]:
         require_aravis()
-        clock = Clock()
-        made: Bench[Camera] = Bench(
-            lambda: GenicamCamera("scan_camera", InProcess(), GenicamSetup(Region(512, 512)), clock=clock), clock
-        )
+        clock, record = Clock(), GenicamConfig.model_construct(width=512, height=512)
+        made: Bench[Camera] = Bench(lambda: GenicamCamera("scan_camera", InProcess(), record, clock=clock), clock)
         yield made
         made.over()

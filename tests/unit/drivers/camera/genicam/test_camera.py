@@ -10,11 +10,9 @@ import pytest
 
 from cell.devices.contracts import Bench as ContractBench
 from cell.devices.contracts import CameraContract
-from drivers.camera.genicam.acquisition import Network
-from drivers.camera.genicam.camera import ExposureTrigger, GenicamSetup, Region
 from drivers.errors import Aborted, DeadlineError, DeviceFault, LimitError, NotConnectedError
 from drivers.interfaces import Camera
-from tests.support.wire.gige_bench import WHOLE, Bench, served
+from tests.support.wire.gige_bench import Bench, served
 
 pytestmark = pytest.mark.wire
 
@@ -47,7 +45,7 @@ def test_times_are_those_that_the_pictures_show(bench: Bench) -> None:
 
 
 def test_region_gain_and_packet_size_are_set(bench: Bench) -> None:
-    camera = bench.open(GenicamSetup(Region(32, 16, 32, 32), gain=6.0206, network=Network(packet_size=576)))
+    camera = bench.open(width=32, height=16, offset=(32, 32), gain=6.0206, packet_size=576)
     camera.configure(0.004, 50.0)
     image = camera.grab().image
     camera.close()
@@ -58,18 +56,18 @@ def test_region_gain_and_packet_size_are_set(bench: Bench) -> None:
 
 def test_what_the_camera_has_not_is_refused_with_what_it_has(bench: Bench) -> None:
     with pytest.raises(LimitError, match=r"Width 80 is none .*allowed: 16 to 64 in steps of 1"):
-        bench.open(GenicamSetup(Region(80, 48)))
+        bench.open(width=80)
     with pytest.raises(LimitError, match="OffsetX 80 is none"):
-        bench.open(GenicamSetup(Region(32, 16, 80, 0)))
+        bench.open(width=32, height=16, offset=(80, 0))
     with pytest.raises(DeviceFault, match="no PixelFormat Mono16, it stays Mono8"):
-        bench.open(GenicamSetup(WHOLE, "Mono16"))
+        bench.open(pixel_format="Mono16")
     with pytest.raises(LimitError, match="gain 90"):
-        bench.open(GenicamSetup(WHOLE, gain=90.0))
+        bench.open(gain=90.0)
     bench.open().close()
 
 
 def test_a_line_triggers_streams_and_photographs(bench: Bench) -> None:
-    camera = bench.open(GenicamSetup(WHOLE, trigger=ExposureTrigger("line")))
+    camera = bench.open(trigger="line")
     camera.configure(0.004, 50.0)
     with camera.stream() as frames:
         with pytest.raises(DeadlineError):
@@ -82,7 +80,7 @@ def test_a_line_triggers_streams_and_photographs(bench: Bench) -> None:
 
 
 def test_a_photograph_can_come_from_a_free_run(bench: Bench) -> None:
-    camera = bench.open(GenicamSetup(WHOLE, trigger=ExposureTrigger("free")))
+    camera = bench.open(trigger="free")
     camera.configure(0.004, 20.0)
     called = bench.clock.now()
     assert bench.shown(camera.grab()) > called
@@ -90,7 +88,7 @@ def test_a_photograph_can_come_from_a_free_run(bench: Bench) -> None:
 
 
 def test_stop_ends_a_stream_that_waits(bench: Bench) -> None:
-    camera = bench.open(GenicamSetup(WHOLE, trigger=ExposureTrigger("line")))
+    camera = bench.open(trigger="line")
     camera.configure(0.004, 50.0)
     with camera.stream() as frames:
         stopper = threading.Timer(0.1, camera.stop)

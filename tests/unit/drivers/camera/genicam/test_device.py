@@ -6,11 +6,9 @@ from dataclasses import replace
 
 import pytest
 
-from drivers.camera.genicam.camera import GenicamCamera, GenicamSetup
-from drivers.camera.genicam.device import GigePlace
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
-from tests.support.wire.gige_bench import SPEC, WHOLE, Bench, require_aravis, served
+from tests.support.wire.gige_bench import SPEC, Bench, opened, require_aravis, served
 
 pytestmark = pytest.mark.wire
 
@@ -102,4 +100,4 @@ def test_another_camera_at_the_address_is_not_taken_for_the_lost_one() -> None:
 def test_an_address_without_a_camera_is_named_with_a_remedy() -> None:
     require_aravis()
     with pytest.raises(NotConnectedError, match=r"127\.1\.255\.254.*Remedy: check power and cable"):
-        GenicamCamera("scan_camera", GigePlace("127.1.255.254"), GenicamSetup(WHOLE), clock=Clock())
+        opened("127.1.255.254", Clock())

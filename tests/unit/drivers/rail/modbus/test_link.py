@@ -7,7 +7,8 @@ import socket
 import struct
 import threading
 import time
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 
 import pytest
 from pymodbus.framer import FramerRTU
@@ -16,7 +17,8 @@ from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError
 from drivers.interfaces import LinkStatistics
 from drivers.rail.modbus import link as modbus_link
-from drivers.rail.modbus.link import Action, ModbusLink, ModbusRefused, Number, Rate
+from drivers.rail.modbus.link import ModbusLink, ModbusRefused
+from drivers.rail.modbus.make import ActionConfig
 from tests.support.modbus_maps import PATHS
 from tests.support.wire.modbus_bench import UNIT, Drive, config
 
@@ -24,23 +26,6 @@ from tests.support.wire.modbus_bench import UNIT, Drive, config
 def test_frames_carry_the_checksum_that_pymodbus_computes() -> None:
     for frame in (bytes(range(n)) for n in range(2, 40)):
         assert modbus_link._crc(frame) == FramerRTU.compute_CRC(frame).to_bytes(2, "big")
-
-
-@pytest.mark.parametrize("value", [0, 1, -1, 65_536, -70_000, 2**31 - 1, -(2**31)])
-def test_a_number_of_two_registers_comes_back_in_either_order(value: int) -> None:
-    high, low = Number(0, 2), Number(0, 2, high_first=False)
-    assert high.decode(high.encode(value)) == value == low.decode(low.encode(value))
-    assert high.encode(value) == low.encode(value)[::-1]
-    with pytest.raises(ValueError, match="16 bits"):
-        Number(0).encode(70_000)
-
-
-def test_a_ramp_in_the_drives_unit_is_never_longer_than_reckoned() -> None:
-    """v²/2a has to hold: the acceleration is rounded up, the time that stands for it down."""
-    for unit in ("rpm/s", "1/6 rps/s", "counts/s^2", "ms to 1000 rpm"):
-        rate = Rate(Number(0), unit)
-        for turns in (0.7, 3.3, 41.7, 100.0, 777.7):
-            assert rate.decode(rate.encode(turns, 4096), 4096) >= turns * (1 - 1e-12)
 
 
 @pytest.mark.wire
@@ -64,71 +49,74 @@ def test_a_lost_reply_is_asked_for_again_and_a_silent_drive_is_told_with_what_to
         drive.rail(unit=UNIT + 1)
 
 
-@pytest.mark.wire
-@pytest.mark.parametrize("late", [0.2, 0.4, 0.6])
-def test_late_answers_never_become_those_to_later_questions(late: float) -> None:
-    """Two replies are late, those behind them come at once after them; a drive that reads two registers at a time."""
-    listener, asked, ready = socket.create_server(("127.0.0.1", 0)), itertools.count(), threading.Event()
+@contextmanager
+def answered(answer: Callable[[int, int], bytes]) -> Iterator[ModbusLink]:
+    """A link to a drive that gives `answer(address, count)` to each question, after a first one that is asked here."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    ready = threading.Event()
 
     def serve() -> None:
         connection, _ = listener.accept()
         with connection:
             while request := connection.recv(8):
                 address, count = struct.unpack(">HH", request[2:6])
-                if ready.is_set() and next(asked) < 2:
-                    time.sleep(late)
-                body = bytes([UNIT, 3, 2 * count]) + struct.pack(">H", address) * count
-                connection.sendall(body + FramerRTU.compute_CRC(body).to_bytes(2, "big"))
+                connection.sendall(answer(address, count) if ready.is_set() else reply(address, count))
 
     threading.Thread(target=serve, daemon=True).start()
     link = ModbusLink(
         "rail", f"socket://127.0.0.1:{listener.getsockname()[1]}", unit=UNIT, baud=115200, parity="none", stop_bits=1,
-        stop_action=Action(1, 1), clock=Clock(), statistics=LinkStatistics(),
+        stop_action=ActionConfig(address=1, value=1), clock=Clock(), statistics=LinkStatistics(),
     )  # fmt: skip
     assert link.read(7, 2) == [7, 7]
     ready.set()
-    right = 0
-    for address in (16, 32, 48, 64, 80, 96):
-        with suppress(DeadlineError):
-            assert link.read(address, 2) == [address, address]
-            right += 1
-    assert right >= 3
+    yield link
     link.close()
     listener.close()
+
+
+def reply(address: int, count: int, unit: int = UNIT, function: int = 3) -> bytes:
+    """Each register holds its first one's address."""
+    body = bytes([unit, function, 2 * count]) + struct.pack(">H", address) * count
+    return body + FramerRTU.compute_CRC(body).to_bytes(2, "big")
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize("late", [0.2, 0.4, 0.6])
+def test_late_answers_never_become_those_to_later_questions(late: float) -> None:
+    """Two replies are late, those behind them come at once after them; a drive that reads two registers at a time."""
+    asked = itertools.count()
+
+    def answer(address: int, count: int) -> bytes:
+        if next(asked) < 2:
+            time.sleep(late)
+        return reply(address, count)
+
+    right = 0
+    with answered(answer) as link:
+        for address in (16, 32, 48, 64, 80, 96):
+            with suppress(DeadlineError):
+                assert link.read(address, 2) == [address, address]
+                right += 1
+    assert right >= 3
 
 
 @pytest.mark.wire
 @pytest.mark.parametrize("spoilt", ["a bit", "another drive's", "another function's"])
 def test_a_reply_that_is_spoilt_or_anothers_is_asked_for_again(spoilt: str) -> None:
-    listener, ready = socket.create_server(("127.0.0.1", 0)), threading.Event()
-    spoiling = itertools.count()
+    asked = itertools.count()
 
-    def serve() -> None:
-        connection, _ = listener.accept()
-        with connection:
-            while request := connection.recv(8):
-                address, count = struct.unpack(">HH", request[2:6])
-                spoil = ready.is_set() and next(spoiling) == 0
-                unit = UNIT + (spoil and spoilt == "another drive's")
-                function = 3 + (spoil and spoilt == "another function's")
-                body = bytes([unit, function, 2 * count]) + struct.pack(">H", address + spoil) * count
-                reply = bytearray(body + FramerRTU.compute_CRC(body).to_bytes(2, "big"))
-                if spoil and spoilt == "a bit":
-                    reply[4] ^= 0x10
-                connection.sendall(reply)
+    def answer(address: int, count: int) -> bytes:
+        if next(asked) > 0:
+            return reply(address, count)
+        made = bytearray(
+            reply(address + 1, count, UNIT + (spoilt == "another drive's"), 3 + (spoilt == "another function's"))
+        )
+        made[4] ^= 0x10 * (spoilt == "a bit")
+        return bytes(made)
 
-    threading.Thread(target=serve, daemon=True).start()
-    statistics = LinkStatistics()
-    link = ModbusLink(
-        "rail", f"socket://127.0.0.1:{listener.getsockname()[1]}", unit=UNIT, baud=115200, parity="none", stop_bits=1,
-        stop_action=Action(1, 1), clock=Clock(), statistics=statistics,
-    )  # fmt: skip
-    assert link.read(7, 2) == [7, 7]
-    ready.set()
-    assert link.read(16, 2) == [16, 16]
-    assert next(spoiling) >= 2, "it was asked for again"
-    link.close()
-    listener.close()
+    with answered(answer) as link:
+        assert link.read(16, 2) == [16, 16]
+    assert next(asked) >= 2, "it was asked for again"
 
 
 @pytest.mark.wire

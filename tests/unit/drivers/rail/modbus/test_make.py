@@ -9,9 +9,9 @@ import pytest
 
 from cell.config.cell_config import load_config
 from drivers.errors import ConfigError
-from drivers.rail.modbus.link import Number
-from drivers.rail.modbus.make import register_map
+from drivers.rail.modbus.make import AccelerationConfig, NumberConfig
 from tests.support.modbus_maps import EDGES, PATHS, RAIL
+from tests.support.wire.modbus_bench import config
 from tests.support.wire.other_makes import LCUS, MODBUS, ROBOTIQ, cell
 
 
@@ -32,9 +32,24 @@ def registers(**changed: Any) -> dict[str, Any]:
     return {"rail": {**RAIL, "registers": {**PATHS, **changed}}}
 
 
-def test_the_map_of_a_drive_reaches_the_driver_as_it_is_written() -> None:
-    made = register_map(cell({"rail": {**RAIL, "registers": EDGES}}).rail.registers)  # type: ignore[attr-defined]
-    assert made.position == Number(0x00CC, 2, True, False)
+@pytest.mark.parametrize("value", [0, 1, -1, 65_536, -70_000, 2**31 - 1, -(2**31)])
+def test_a_number_of_two_registers_comes_back(value: int) -> None:
+    number = NumberConfig(address=0)
+    assert number.decode(number.encode(value)) == value
+    with pytest.raises(ValueError, match="16 bits"):
+        NumberConfig(address=0, words=1).encode(70_000)
+
+
+@pytest.mark.parametrize("unit", ["rpm/s", "1/6 rps/s", "counts/s^2", "ms to 1000 rpm"])
+def test_a_ramp_in_the_drives_unit_is_never_longer_than_reckoned(unit: str) -> None:
+    """v²/2a has to hold: the acceleration is rounded up, the time that stands for it down."""
+    rate = AccelerationConfig(address=0, unit=unit)  # type: ignore[arg-type]
+    for turns in (0.7, 3.3, 41.7, 100.0, 777.7):
+        assert rate.turns(rate.units(turns, 4096), 4096) >= turns * (1 - 1e-12)
+
+
+def test_actions_and_flags_of_a_map_mean_what_its_manual_says() -> None:
+    made = config(EDGES).registers
     assert made.start.writes == [8, 0]
     assert made.moving.decode(0) and not made.moving.decode(1 << 5)
 

@@ -17,7 +17,6 @@ from cell.devices.contracts import Bench, Faults, RailContract
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, LimitError
 from drivers.interfaces import Rail
-from drivers.rail.modbus.make import register_map
 from sim_backends.peers.rail.modbus_drive import ModbusPeer
 from tests.support.modbus_maps import EDGES, PATHS
 from tests.support.wire.modbus_bench import UNIT, Drive, config
@@ -136,10 +135,11 @@ def test_who_only_looks_writes_nothing(drive: Drive) -> None:
 OWNER = """
 import sys
 from drivers.clock import Clock
+from drivers.common.units import KEPT
+from drivers.rail.modbus.make import ModbusRailConfig
 from drivers.rail.modbus.rail import ModbusRail
-from drivers.rail.modbus.link import *
-rail = ModbusRail("rail", sys.argv[1], eval(sys.argv[2]), lead=0.002, counts_per_turn=10_000, travel=(0.0, 0.1),
-    max_speed=0.04, acceleration=0.2, clock=Clock(5.0), unit=7)
+record = ModbusRailConfig.model_validate_json(sys.argv[1], context=KEPT)
+rail = ModbusRail("rail", record, clock=Clock(5.0))
 rail.home().wait(60)
 motion = rail.move_to(0.09, 0.002)
 print("moves", flush=True)
@@ -149,7 +149,8 @@ motion.wait(600)
 
 def test_the_rail_stands_when_its_owner_is_killed() -> None:
     drive = Drive.of(config(PATHS), pty=True)
-    command = [sys.executable, "-c", OWNER, str(drive.peer.pty), repr(register_map(drive.record.registers))]
+    record = drive.record.model_copy(update={"url": str(drive.peer.pty)})
+    command = [sys.executable, "-c", OWNER, record.model_dump_json()]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as owner:
         assert owner.stdout is not None
         assert owner.stdout.readline() == b"moves\n"

@@ -9,8 +9,7 @@ import pytest
 
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, InterlockError
-from drivers.rail.tmcl.rail import TmclRail
-from tests.support.wire.rail_bench import ACCELERATION, MAX_SPEED, Bench, connect, reply, telegram
+from tests.support.wire.rail_bench import ACCELERATION, Bench, connect, reply, telegram
 
 pytestmark = pytest.mark.wire
 
@@ -46,10 +45,7 @@ def test_the_next_program_finds_the_rail_homed_and_its_zero_where_it_was(homed: 
 
 def test_the_zero_of_another_configuration_is_not_taken_nor_given_back(homed: Bench) -> None:
     homed.rail.close()
-    other = TmclRail(
-        "rail", homed.peer.url, lead=0.004, steps_per_turn=200, microsteps=256, travel=(0.0, 0.1), max_speed=MAX_SPEED,
-        acceleration=ACCELERATION, clock=homed.clock,
-    )  # fmt: skip
+    other = connect(homed.peer.url, homed.clock, lead=0.004)
     assert not other.state().homed
     with pytest.raises(InterlockError, match="not homed"):
         other.move_to(0.01)
@@ -131,28 +127,15 @@ def test_a_position_read_after_a_reset_is_a_fault_and_then_that_of_a_rail_not_ho
     assert not homed.rail.state().homed
 
 
-@pytest.mark.parametrize("goal", [0.05, 0.0])
-def test_a_reset_on_the_way_is_never_an_arrival(homed: Bench, goal: float) -> None:
+def test_a_reset_on_the_way_to_0_is_never_an_arrival(homed: Bench) -> None:
     homed.rail.move_to(0.03).wait(10.0)
-    motion = homed.rail.move_to(goal, speed=0.01)
+    motion = homed.rail.move_to(0.0, speed=0.01)
     homed.clock.sleep(1.0)
     homed.peer.fault("rail.reset")
     with pytest.raises(DeviceFault, match="Home the rail again") as caught:
         motion.wait(20.0)
     assert caught.value.code == "rail.reset"
     assert caught.value.recoverable
-
-
-def test_a_reset_in_a_sweep_leaves_no_window(homed: Bench) -> None:
-    homed.rail.move_to(homed.rail.sweep_start(0.02, 0.06, 0.02)).wait(10.0)
-    sweep = homed.rail.sweep(0.02, 0.06, 0.02)
-    homed.clock.sleep(1.0)
-    homed.peer.fault("rail.reset")
-    with pytest.raises(DeviceFault) as caught:
-        sweep.wait(20.0)
-    assert caught.value.code == "rail.reset"
-    with pytest.raises(DeviceFault):
-        _ = sweep.window
 
 
 def test_a_reset_in_the_search_does_not_end_it_well(bench: Bench) -> None:
