@@ -43,6 +43,8 @@ GLOBALS: dict[int, tuple[int, int, int]] = {
 }  # fmt: skip
 """Global parameters of bank 0: number → (value at power-on, smallest, largest value)."""
 
+EEPROM_LOCK, UNLOCK, LOCK = 73, 4321, 1234
+"""The global parameter that locks the EEPROM, and its two values."""
 USER_VARIABLES = 256
 """Number of variables in bank 2, all of them in RAM and 0 at power-on but for those that were stored."""
 STORED_VARIABLES = 56
@@ -51,7 +53,7 @@ INPUTS = 4
 """Number of digital inputs."""
 
 
-OK, BAD_CHECKSUM, BAD_COMMAND, BAD_TYPE, BAD_VALUE = 100, 1, 2, 3, 4
+OK, BAD_CHECKSUM, BAD_COMMAND, BAD_TYPE, BAD_VALUE, LOCKED = 100, 1, 2, 3, 4, 5
 MODEL = 1260
 SERIAL_VARIABLE = 0
 FACTORY_RAMP: dict[str, Any] = {
@@ -79,14 +81,17 @@ class TmclModule:
         self.clock = clock
         self._lock = threading.Lock()
         self._globals = {number: value for number, (value, _, _) in GLOBALS.items()}
+        self._stored: dict[int, int] = {}
         self._stored_variables = {SERIAL_VARIABLE: rail.params.serial & 0x7FFFFFFF}
         self._power_on()
+        self._locked = False
         self._commands: dict[int, Callable[[int, int, int], int]] = {
             1: lambda kind, motor, value: self._rotate(kind, motor, value),
             2: lambda kind, motor, value: self._rotate(kind, motor, -value),
             3: lambda kind, motor, value: self._rotate(kind, motor, 0), 4: self._move, 5: self._set_axis,
-            6: self._get_axis, 9: self._set_global, 10: self._get_global, 11: self._store_global, 13: self._search,
-            14: self._set_output, 15: self._get_input,
+            6: self._get_axis, 7: self._store_axis, 8: self._restore_axis, 9: self._set_global, 10: self._get_global,
+            11: self._store_global, 12: self._restore_global, 13: self._search, 14: self._set_output,
+            15: self._get_input,
         }  # fmt: skip
 
     def _power_on(self) -> None:
@@ -97,10 +102,12 @@ class TmclModule:
         self.rail.configure(now, dataclasses.replace(self.rail.settings, **FACTORY_RAMP))
 
     def reset(self) -> None:
-        """Lose counter, motion, outputs, settings, and variables that were not stored in the EEPROM."""
+        """Lose all that is not in the EEPROM: counter, motion, outputs, settings and variables that were not stored."""
         with self._lock:
             self.rail.reset(self.clock.now())
             self._power_on()
+            for kind, value in self._stored.items():
+                self._set_axis(kind, 0, value)
 
     def handle(self, request: bytes) -> bytes | None:
         """The reply to nine bytes, or None when they are addressed to another module."""
@@ -131,7 +138,7 @@ class TmclModule:
             return MODEL << 16 | major << 8 | minor
         if command not in self._commands:
             raise TmclRefused(BAD_COMMAND)
-        if 1 <= command <= 6 or command == 13:
+        if 1 <= command <= 8 or command == 13:
             _check(motor, 0, 0)
         return self._commands[command](kind, motor, value)
 
@@ -214,6 +221,19 @@ class TmclModule:
             raise TmclRefused(BAD_TYPE)
         return value
 
+    def _store_axis(self, kind: int, motor: int, value: int) -> int:
+        if self._locked:
+            raise TmclRefused(LOCKED)
+        if kind not in SETTINGS and kind not in PLAIN:
+            raise TmclRefused(BAD_TYPE)
+        self._stored[kind] = self._get_axis(kind, motor, 0)
+        return self._stored[kind]
+
+    def _restore_axis(self, kind: int, motor: int, value: int) -> int:
+        if kind not in self._stored:
+            raise TmclRefused(BAD_TYPE)
+        return self._set_axis(kind, motor, self._stored[kind])
+
     # --- global parameters ---
 
     def _get_global(self, kind: int, bank: int, value: int) -> int:
@@ -231,15 +251,24 @@ class TmclModule:
         elif bank == 0 and kind in self._globals:
             _check(value, *GLOBALS[kind][1:])
             self._globals[kind] = value
+            if kind == EEPROM_LOCK and value in (LOCK, UNLOCK):
+                self._locked = value == LOCK
         else:
             raise TmclRefused(BAD_TYPE if bank == 0 else BAD_VALUE)
         return value
 
     def _store_global(self, kind: int, bank: int, value: int) -> int:
+        if self._locked:
+            raise TmclRefused(LOCKED)
         if bank == 2:
             if kind >= STORED_VARIABLES:
                 raise TmclRefused(BAD_TYPE)
             self._stored_variables[kind] = self._variables[kind]
+        return self._get_global(kind, bank, 0)
+
+    def _restore_global(self, kind: int, bank: int, value: int) -> int:
+        if bank == 2 and kind < STORED_VARIABLES:
+            self._variables[kind] = self._stored_variables.get(kind, 0)
         return self._get_global(kind, bank, 0)
 
     # --- inputs and outputs ---
