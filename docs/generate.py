@@ -11,6 +11,7 @@ import re
 import types
 import typing
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -250,24 +251,28 @@ def words(node: ast.AST | None, names: dict[str, str]) -> str:
     return names.get(node.id, "…") if isinstance(node, ast.Name) else "…"
 
 
+def texts(nodes: list[Any]) -> dict[str, str]:
+    """The texts that assignments among these nodes give names."""
+    found = [(target, each.value) for each in nodes if isinstance(each, ast.Assign) for target in each.targets]
+    return {target.id: words(value, {}) for target, value in found if isinstance(target, ast.Name)}
+
+
 def codes(text: str, devices: tuple[str, ...] = ()) -> list[str]:
     """The codes that an argument names; one without its device is that of each of `devices`."""
     both = [text.replace("…", device) for device in devices] if re.fullmatch(r"…\.[a-z_]+", text) else [text]
     return [each for each in both if CODE.fullmatch(each)]
 
 
+@cache
 def causes() -> Causes:
     """What happened, who recovers and what to do, by fault code, as the source has them."""
     found: Causes = {}
     for path in sorted(path for room in ("drivers", "cell") for path in (ROOT / room).rglob("*.py")):
-        tree = ast.parse(path.read_text(encoding="utf-8"))
-        at_top = {
-            t.id: words(n.value, {})
-            for n in tree.body
-            if isinstance(n, ast.Assign)
-            for t in n.targets
-            if isinstance(t, ast.Name)
-        }
+        text = path.read_text(encoding="utf-8")
+        if not (CODE.search(text) or any(f"{maker}(" in text for maker in FAULTS)):
+            continue
+        tree = ast.parse(text)
+        at_top = texts(tree.body)
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef):
                 made_in(node, at_top, found, ("laser", "claw") if "relay" in path.parts else ("arm", "rail", "camera"))
@@ -282,22 +287,16 @@ def causes() -> Causes:
 def made_in(function: ast.FunctionDef, at_top: dict[str, str], found: Causes, devices: tuple[str, ...]) -> None:
     """The faults that a function makes."""
     nodes = list(ast.walk(function))
-    own = {
-        t.id: words(n.value, {})
-        for n in nodes
-        if isinstance(n, ast.Assign)
-        for t in n.targets
-        if isinstance(t, ast.Name)
-    }
+    names = at_top | texts(nodes)
     for node in nodes:
         if not isinstance(node, ast.Call) or getattr(node.func, "id", getattr(node.func, "attr", "")) not in FAULTS:
             continue
-        args = [words(each, at_top | own) for each in node.args] + ["", ""]
+        args = [words(each, names) for each in node.args] + ["", ""]
         at = next((i for i, each in enumerate(args) if codes(each, devices)), None)
         if at is not None:
             named = {each.arg: each.value for each in node.keywords}
             what = args[at + 1] if args[at + 1].strip(" …") else summary_of(ast.get_docstring(function))
-            hint = words(named["hint"], at_top | own) if "hint" in named else args[at + 2]
+            hint = words(named["hint"], names) if "hint" in named else args[at + 2]
             for code in codes(args[at], devices):
                 add(found, code, what, named.get("recoverable"), hint)
 
@@ -343,15 +342,8 @@ def arrows() -> set[tuple[str, str]]:
     found = set()
     for path in (path for room in ("cell", *BESIDE) for path in (ROOT / room).rglob("*.py")):
         here = room_of(".".join(path.relative_to(ROOT).with_suffix("").parts))
-        for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            modules = (
-                [node.module or ""]
-                if isinstance(node, ast.ImportFrom)
-                else [each.name for each in getattr(node, "names", [])]
-                if isinstance(node, ast.Import)
-                else []
-            )
-            found |= {(here, room_of(module)) for module in modules}
+        modules = re.findall(r"^(?:from|import) ([\w.]+)", path.read_text(encoding="utf-8"), re.MULTILINE)
+        found |= {(here, room_of(module)) for module in modules}
     rooms = {*ROOMS, *BESIDE}
     return {(a, b) for a, b in found if a != b and {a, b} <= rooms}
 

@@ -11,6 +11,7 @@ the time and slow ones do no harm. What all replies are late by stays unknown, a
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -139,26 +140,16 @@ _LEAST_ROUNDING = 2.0
 """Counts by which a reading may be off besides: its own rounding, and the ramp's."""
 
 
-class RailSweep(RailMotion):
-    """A running sweep, constant between `start` and `stop` (m) at `speed` (m/s); `resolution` is a count in m."""
+class EvenSweep(ABC):
+    """Where the rail was in its sweep, by the even motion that explains its readings."""
 
-    def __init__(
-        self, name: str, clock: Clock, *, start: float, stop: float, speed: float, resolution: float,
-        record: list[tuple[float, float, float]], arrived: Callable[[], bool], halt: Callable[[], None],
-        duration: float,
-    ) -> None:  # fmt: skip
-        self._start = start
-        self._stop = stop
-        self._speed = speed
-        self._resolution = resolution
-        self._record = record
-        self._motion: EvenMotion | None = None
-        super().__init__(name, clock, arrived=arrived, halt=halt, duration=duration, readings=record)
+    _name: str
+    _start: float
+    _stop: float
 
-    @property
-    def samples(self) -> Vector:
-        """Recorded (n, 2) array of host time in s and position in m, so far."""
-        return np.array([row[:2] for row in list(self._record)], dtype=np.float64).reshape(-1, 2)
+    @abstractmethod
+    def _even(self) -> EvenMotion:
+        """That motion; raises why there is none (yet)."""
 
     @property
     def window(self) -> tuple[float, float]:
@@ -190,6 +181,28 @@ class RailSweep(RailMotion):
     def unevenness(self) -> float:
         """Median distance in m of the readings from an even motion; see `drivers.interfaces.Sweep`."""
         return self._even().unevenness
+
+
+class RailSweep(EvenSweep, RailMotion):
+    """A running sweep, constant between `start` and `stop` (m) at `speed` (m/s); `resolution` is a count in m."""
+
+    def __init__(
+        self, name: str, clock: Clock, *, start: float, stop: float, speed: float, resolution: float,
+        record: list[tuple[float, float, float]], arrived: Callable[[], bool], halt: Callable[[], None],
+        duration: float,
+    ) -> None:  # fmt: skip
+        self._start = start
+        self._stop = stop
+        self._speed = speed
+        self._resolution = resolution
+        self._record = record
+        self._motion: EvenMotion | None = None
+        super().__init__(name, clock, arrived=arrived, halt=halt, duration=duration, readings=record)
+
+    @property
+    def samples(self) -> Vector:
+        """Recorded (n, 2) array of host time in s and position in m, so far."""
+        return np.array([row[:2] for row in list(self._record)], dtype=np.float64).reshape(-1, 2)
 
     def _even(self) -> EvenMotion:
         if not self.done:

@@ -25,13 +25,21 @@ def over_cores(tasks: Sequence[Task], workers: int = 0) -> Iterator[tuple[int, A
     # One thread a process: the sums, and so the figures, are then the same on every machine and the cores are full.
     for name in SINGLE_THREADED:
         os.environ.setdefault(name, "1")
-    pool = ProcessPoolExecutor(workers or len(os.sched_getaffinity(0)), get_context("spawn"))
+    pool = ProcessPoolExecutor(
+        workers or len(os.sched_getaffinity(0)), get_context("spawn"), initializer=_vision_on_one_thread
+    )
     try:
         waiting = {pool.submit(task[0], *task[1:]): number for number, task in enumerate(tasks)}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _vision_on_one_thread() -> None:
+    import cv2
+
+    cv2.setNumThreads(1)
 
 
 def run_all(

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from cell.measure.calibration import ScanCalibration, ScanObservation
 from cell.measure.calibration.solve.joint import solve_joint, solve_staged
@@ -278,8 +279,6 @@ def point_covariances(
 
 
 def aligned(found: Array, truth: Array) -> Array:
-    """What is left (n, 3) of found − truth after the best rigid motion of the found points (Kabsch)."""
+    """What is left (n, 3) of found − truth after the rigid motion of the found points that is best in least squares."""
     a, b = found - found.mean(axis=0), truth - truth.mean(axis=0)
-    u, _, vt = np.linalg.svd(a.T @ b)
-    turn = np.diag([1.0, 1.0, float(np.sign(np.linalg.det(u @ vt)))])
-    return np.asarray(a @ (u @ turn @ vt) - b, dtype=np.float64)
+    return np.asarray(Rotation.align_vectors(b, a)[0].apply(a) - b, dtype=np.float64)

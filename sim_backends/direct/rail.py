@@ -13,7 +13,7 @@ from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, check_range
 from drivers.interfaces import LONGEST_NUDGE_M, Identity, RailState, Vector
 from drivers.rail.motion import POLL_S, STANDSTILL_S, SWEEP_MARGIN_M, CarriageWatch, ZeroCheck, run_up_distance
-from drivers.rail.sweep import EvenMotion
+from drivers.rail.sweep import EvenMotion, EvenSweep
 from sim_backends.direct.switches import DirectDevice
 from sim_backends.models.rail import RailModel
 
@@ -108,7 +108,7 @@ class RailMove:
                 self._end(error)
         elif self._target is None:
             if not model.searching(now) and model.velocity(now) == 0:
-                rail.found_zero()
+                rail.homed = True
                 self._end(None)
         elif model.reached(now):
             self._end(None)
@@ -147,12 +147,12 @@ class RailMove:
         )
 
 
-class DirectSweep(RailMove):
+class DirectSweep(EvenSweep, RailMove):
     """A sweep with a reading every 10 ms; between them the line that is fitted to them."""
 
     def __init__(self, rail: DirectRail, target: int, start: float, stop: float) -> None:
         super().__init__(rail, target)
-        self._start, self._stop = start, stop
+        self._name, self._start, self._stop = rail.name, start, stop
         self._readings: list[tuple[float, float]] = []
         self._motion: EvenMotion | None = None
 
@@ -163,29 +163,6 @@ class DirectSweep(RailMove):
         while (due := self._begun + len(self._readings) * POLL_S) + self._rail.round_trip <= self._rail.clock.now():
             self._readings.append(self._rail.read(due))
         return np.array(self._readings, dtype=np.float64).reshape(-1, 2)
-
-    @property
-    def window(self) -> tuple[float, float]:
-        """Host times between which the velocity is constant; `InterlockError` while the sweep runs."""
-        motion = self._even()
-        return motion.time_at(self._start), motion.time_at(self._stop)
-
-    def position_at(self, host_time: float) -> float:
-        """Position in m at a host time inside `window`; `ValueError` outside."""
-        begin, end = self.window
-        if not begin <= host_time <= end:
-            raise ValueError(f"{host_time:.4f} s is outside the sweep's window, {begin:.4f} to {end:.4f} s")
-        return self._even().position_at(host_time)
-
-    @property
-    def time_bound(self) -> float:
-        """Largest error in s of the times behind `position_at`; see `drivers.interfaces.Sweep`."""
-        return self._even().time_bound
-
-    @property
-    def unevenness(self) -> float:
-        """Median distance in m of the readings from an even motion; see `drivers.interfaces.Sweep`."""
-        return self._even().unevenness
 
     def _even(self) -> EvenMotion:
         if not self.done:
@@ -223,8 +200,9 @@ class DirectRail(DirectDevice):
         """By how many seconds each reply comes later than the module answers."""
         self._wire = wire
         self._counts = setup.steps_per_turn * setup.microsteps / setup.lead
-        self._homed = False
-        self._lost = False
+        self.homed = False
+        self.lost_zero = False
+        """Whether the module was reset and nobody was told yet."""
         self._motion: RailMove | None = None
         self._set_up()
 
@@ -249,13 +227,13 @@ class DirectRail(DirectDevice):
 
     def state(self) -> RailState:
         """Read position, velocity and switches now; `DeviceFault` (rail.reset), once, when the zero was lost."""
-        if self._lost:
+        if self.lost_zero:
             raise self.reset_fault("since its last motion")
         now = self.clock.now()
         stamp, position = self.read(now)
         velocity = self.model.velocity(now) / self._counts
         return RailState(
-            stamp=stamp, position=position, velocity=velocity, homed=self._homed, homed_here=self._homed,
+            stamp=stamp, position=position, velocity=velocity, homed=self.homed, homed_here=self.homed,
             moving=velocity != 0.0 or self.model.searching(now), left_switch=self.model.left_switch(now),
             right_switch=self.model.right_switch(now),
         )  # fmt: skip
@@ -264,7 +242,7 @@ class DirectRail(DirectDevice):
         """Search the home switch; position 0 is there afterwards."""
         self._require_free()
         self._set_up()
-        self._homed = self._lost = False
+        self.homed = self.lost_zero = False
         self.model.search(self.clock.now())
         self._motion = RailMove(self, None, self._watch(self.travel[1] - self.travel[0]))
         return self._motion
@@ -334,22 +312,13 @@ class DirectRail(DirectDevice):
 
     # --- the zero ---
 
-    def found_zero(self) -> None:
-        """The search has come to its end."""
-        self._homed = True
-
     def forget_zero(self) -> None:
         """The count can no longer be trusted."""
-        self._homed = False
-
-    @property
-    def lost_zero(self) -> bool:
-        """Whether the module was reset and nobody was told yet."""
-        return self._lost
+        self.homed = False
 
     def reset_fault(self, when: str) -> DeviceFault:
         """The fault of a module that was reset; told once."""
-        self._lost = False
+        self.lost_zero = False
         return DeviceFault(
             self.name, "rail.reset", f"the module has lost its zero {when}: it was reset or without power",
             recoverable=True, hint="Home the rail again; check the module's supply.",
@@ -357,7 +326,7 @@ class DirectRail(DirectDevice):
 
     def reset(self) -> None:
         """What is to happen to the module: it starts anew, and has forgotten its zero and its settings."""
-        self._lost, self._homed = self._homed or self.model.searching(self.clock.now()), False
+        self.lost_zero, self.homed = self.homed or self.model.searching(self.clock.now()), False
         self.model.reset(self.clock.now())
 
     # --- inside ---
@@ -402,9 +371,9 @@ class DirectRail(DirectDevice):
         return target
 
     def _require_zero(self) -> None:
-        if self._lost:
+        if self.lost_zero:
             raise self.reset_fault("since its last motion")
-        if not self._homed:
+        if not self.homed:
             raise InterlockError(self.name, "is not homed, so positions mean nothing yet. Call home() first")
 
     def _send(self, target: int, speed: float) -> None:

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from drivers.clock import Clock
-from drivers.errors import DeviceFault, InterlockError
+from drivers.errors import InterlockError
 from drivers.interfaces import Identity, LinkStatistics
+from drivers.switches import ConfirmedClaw
 from sim_backends.world.world import World
 
 TAKES_S = 0.01
 """From a command until the switch has switched, s."""
-_POLL_S = 0.01
 
 
 class DirectDevice:
@@ -79,20 +79,10 @@ class DirectLaser(_DirectSwitch):
         self.stop()
 
 
-class DirectClaw(_DirectSwitch):
+class DirectClaw(_DirectSwitch, ConfirmedClaw):
     """The claw; see `drivers.interfaces.Claw`."""
 
-    def grip(self, timeout: float = 2.0) -> None:
-        """Close; `DeviceFault` (claw.no_part) when no part is held after `timeout` s."""
-        self._set(True)
-        self._held_becomes(
-            True, timeout, "claw.no_part", "See that the part lies between the fingers, then grip again."
-        )
-
-    def release(self, timeout: float = 2.0) -> None:
-        """Open; `DeviceFault` (claw.stuck) when a part is still held after `timeout` s."""
-        self._set(False)
-        self._held_becomes(False, timeout, "claw.stuck", "See whether the part sticks to the fingers.")
+    _shown_by = "its feedback"
 
     @property
     def holding(self) -> bool:
@@ -105,10 +95,5 @@ class DirectClaw(_DirectSwitch):
     def close(self) -> None:
         """The claw stays as it is."""
 
-    def _held_becomes(self, held: bool, timeout: float, code: str, hint: str) -> None:
-        until = self._clock.now() + timeout
-        while self.holding != held:
-            if self._clock.now() >= until:
-                text = f"after {timeout:.3g} s a part is {'not' if held else 'still'} held"
-                raise DeviceFault(self.name, code, text, recoverable=True, hint=hint)
-            self._clock.sleep(_POLL_S)
+    def _close(self, closed: bool) -> None:
+        self._set(closed)

@@ -21,7 +21,8 @@ def generator() -> Any:
     return module
 
 
-PAGES = generator().PAGES
+GENERATOR = generator()
+PAGES = GENERATOR.PAGES
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -31,14 +32,14 @@ def test_a_generated_page_is_current(page: str) -> None:
 
 
 def test_fault_codes_have_what_happened_and_what_to_do() -> None:
-    faults = generator().causes()
+    faults = GENERATOR.causes()
     assert {"rail.reset", "arm.protective_stop", "camera.late_readings", "laser.relay"} <= faults.keys()
     what, who, hint = faults["rail.reset"]
     assert any("lost its zero" in text for text in what) and who == {"the program"} and any("Home" in h for h in hint)
 
 
 def test_a_protective_stop_is_not_cleared_without_a_person() -> None:
-    (row,) = [line for line in generator().faults().splitlines() if line.startswith("| `arm.protective_stop`")]
+    (row,) = [line for line in GENERATOR.faults().splitlines() if line.startswith("| `arm.protective_stop`")]
     assert "after a person confirms" in row
 
 

@@ -10,13 +10,14 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from cell.config.cell_config import CellConfig, load_config
+from cell.config.cell_config import load_config
 from cell.config.job import Job, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.devices.simulated.process import ask_truth
@@ -100,7 +101,7 @@ def tried(record: JobRecord, job: Job, nominal: NominalSurface, step: str, root:
         else:
             raise AssertionError(f"{step} was to fail, it made {made}")
     result = RunResult(failure.outcome, failure.reason, failure.code, records(step), before, failed)
-    return reported(folder, CONFIG, job, nominal, work, result, frames, None)
+    return reported(work, result)
 
 
 def records(failed: str | None, faults: tuple[FaultRecord, ...] = ()) -> tuple[StepRecord, ...]:
@@ -122,45 +123,46 @@ def real(record: JobRecord, root: Path) -> Ended:
     return of_placed(record, root, simulated=False)
 
 
-def of_placed(record: JobRecord, root: Path, faults: tuple[FaultRecord, ...] = (), *, simulated: bool = True) -> Ended:
-    """The report of a run that placed."""
-    job, nominal = pot()
-    assert record.calibration is not None and record.at_end is not None
+@contextmanager
+def begun(record: JobRecord, root: Path) -> Iterator[Workplace]:
+    """Where a run of `record` in a new folder works; its frames are kept until the end."""
     folder = new_run(root)
-    result = RunResult(Outcome.PLACED, "all steps done", "", records(None, faults), record.results, faults=faults)
     cell = VirtualCell(CONFIG, record.seed, record.level)
     with FrameStore(folder / "frames") as frames:
-        work = work_of(cell, job, nominal, record, frames, folder)
+        yield work_of(cell, *pot(), record, frames, folder)
+
+
+def of_placed(record: JobRecord, root: Path, faults: tuple[FaultRecord, ...] = (), *, simulated: bool = True) -> Ended:
+    """The report of a run that placed."""
+    result = RunResult(Outcome.PLACED, "all steps done", "", records(None, faults), record.results, faults=faults)
+    with begun(record, root) as work:
+        pass
     if not simulated:
-        return reported(folder, CONFIG, job, nominal, work, result, frames, None, simulated=False)
+        return reported(work, result, simulated=False)
     at_end = record.at_end
+    assert at_end is not None
     witness = TruthRecorder(lambda: at_end)
     witness.at_sweep = record.at_sweep
-    return reported(folder, CONFIG, job, nominal, work, result, frames, witness)
+    return reported(work, result, witness)
 
 
 def ended(record: JobRecord, root: Path, failure: Failure, step: str, faults: tuple[FaultRecord, ...] = ()) -> Ended:
     """A run of `record` that broke off in `step`, with nothing to show for it."""
-    job, nominal = pot()
-    assert record.calibration is not None
-    folder = new_run(root)
-    cell = VirtualCell(CONFIG, record.seed, record.level)
-    with FrameStore(folder / "frames") as frames:
-        work = work_of(cell, job, nominal, record, frames, folder)
-        frames.keep("stripe", record.results["laser_sweep"].middle)
+    with begun(record, root) as work:
+        work.frames.keep("stripe", record.results["laser_sweep"].middle)
     before = {name: record.results[name] for name in NAMES[: NAMES.index(step)]}
     result = RunResult(
         failure.outcome, failure.reason, failure.code, records(step, faults), before, CellError(failure.reason),
         faults=faults,
     )  # fmt: skip
-    return reported(folder, CONFIG, job, nominal, work, result, frames, None)
+    return reported(work, result)
 
 
 def reported(
-    folder: Path, config: CellConfig, job: Job, nominal: NominalSurface, work: Workplace, result: RunResult,
-    frames: FrameStore, witness: TruthRecorder | None, *, simulated: bool = True,
+    work: Workplace, result: RunResult, witness: TruthRecorder | None = None, *, simulated: bool = True
 ) -> Ended:  # fmt: skip
     """The report of a result, with the facts that `cell.run.job_run.JobRun` adds."""
+    config, job = work.config, work.job
     info: dict[str, Any] = {
         "kind": "job", "pid": os.getpid(), "part": work.part.state.value, "cell": config.cell.name, "job": job.job.name,
         "job_kind": job.job.kind, "simulated": simulated, "seed": 2 if simulated else None,
@@ -170,10 +172,10 @@ def reported(
     }  # fmt: skip
     started = time.time() - 31.0
     finished = FinishedJob(
-        folder, config, job, nominal, work.repeatability,
-        result=result, info=info, started=started, witness=witness, frames=frames,
+        work.folder, config, job, work.nominal, work.repeatability,
+        result=result, info=info, started=started, witness=witness, frames=work.frames,
     )  # fmt: skip
-    return Ended(finished.report(), folder)
+    return Ended(finished.report(), work.folder)
 
 
 def with_few_lines(record: JobRecord, lines: int) -> JobRecord:
@@ -252,18 +254,13 @@ def aborted(record: JobRecord, root: Path) -> Ended:
 
 def crippled(record: JobRecord, root: Path) -> Ended:
     """A run that placed, whose frames, truth and picture all came to grief."""
-    job, nominal = pot()
-    assert record.calibration is not None
-    folder = new_run(root)
-    (folder / "picture.png").symlink_to("/dev/full")
-    cell = VirtualCell(CONFIG, record.seed, record.level)
-    with FrameStore(folder / "frames") as frames:
-        work = work_of(cell, job, nominal, record, frames, folder)
-        (folder / "frames").write_text("no folder", encoding="utf-8")
-        frames.keep("stripe", record.results["laser_sweep"].middle)
+    with begun(record, root) as work:
+        (work.folder / "picture.png").symlink_to("/dev/full")
+        (work.folder / "frames").write_text("no folder", encoding="utf-8")
+        work.frames.keep("stripe", record.results["laser_sweep"].middle)
     result = RunResult(Outcome.PLACED, "all steps done", "", records(None), record.results)
     witness = TruthRecorder(partial(ask_truth, "127.0.0.1:1"))
-    return reported(folder, CONFIG, job, nominal, work, result, frames, witness)
+    return reported(work, result, witness)
 
 
 def read_strictly(path: Path) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from drivers.interfaces import Vector
 from lab.bench.acceptance.campaign import acceptance
 from lab.bench.job.expected import expect
 from lab.bench.job.scan_errors import COVERED, by_pose, own_base, scan_errors, surface_at_middle
-from lab.bench.job.whole_job import JobRecord, run_whole_job
+from lab.bench.job.whole_job import JobRecord, job_and_surface, run_whole_job
 from lab.bench.over_cores import over_cores
 from sim_backends.world.levels import assumed_noise
 
@@ -70,11 +70,7 @@ def campaign(
 
 def one_run(job: str, seed: int, level: str) -> dict[str, Any]:
     """Calibrate and run one world; its errors in mm and mrad, JSON-ready."""
-    import cv2
-
-    cv2.setNumThreads(1)
-    config, (loaded, mesh) = load_config(None), load_job(job)
-    nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
+    config, (loaded, nominal) = load_config(None), job_and_surface(job)
     return figures(run_whole_job(config, loaded, nominal, seed, level), config, loaded, nominal)
 
 

@@ -16,7 +16,7 @@ import pinocchio as pin
 from scipy.stats import chi2
 
 from cell.config.cell_config import load_config
-from cell.config.job import Job, load_job
+from cell.config.job import Job
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import NominalSurface
 from cell.procedures.placed_part import LIKELY, PlacedPart
@@ -25,7 +25,7 @@ from drivers.errors import ConfigError
 from lab.bench.job.part_effects import EFFECTS, PartEffect
 from lab.bench.job.part_jobs import ALL, MIDDLE, job_with_part
 from lab.bench.job.scan_errors import COVERED
-from lab.bench.job.whole_job import JobRecord, run_whole_job
+from lab.bench.job.whole_job import JobRecord, job_and_surface, run_whole_job
 from lab.bench.over_cores import over_cores
 
 Row = dict[str, Any]
@@ -57,9 +57,6 @@ def campaign(
 
 def one_world(job: str, seed: int, level: str, names: Sequence[str], place: str, whole: bool) -> list[Row]:
     """The effects on one world, which is calibrated once."""
-    import cv2
-
-    cv2.setNumThreads(1)
     rows: list[Row] = []
     calibrated: JobRecord | None = None
     for name in names:
@@ -76,8 +73,9 @@ def one_part(
     file: Path, seed: int, level: str, effect: PartEffect, *, half: tuple[float, float], calibrated: JobRecord | None
 ) -> tuple[JobRecord, Row]:
     """A job with its part in one world under one effect, and how that part did."""
-    job, mesh = load_job(file)
-    nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
+    job, nominal = job_and_surface(file)
+    mesh = nominal.source
+    assert mesh is not None
     record = run_whole_job(
         load_config(None), job, nominal, seed, level, calibrated=calibrated,
         changed=lambda cell: effect.put_into(cell.world, job, mesh, half, file.parent),

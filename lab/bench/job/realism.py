@@ -16,12 +16,12 @@ from scipy.stats import chi2
 from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import difference
-from cell.measure.inversion import NominalSurface, PlacePose
+from cell.measure.inversion import PlacePose
 from cell.procedures.part_error import part_covariance
 from cell.run.report.report import pose_of
 from lab.bench.job.accuracy import WANTED, figures, interval
 from lab.bench.job.scan_errors import COVERED
-from lab.bench.job.whole_job import JobRecord, run_whole_job
+from lab.bench.job.whole_job import JobRecord, job_and_surface, run_whole_job
 from lab.bench.over_cores import over_cores
 from sim_backends.world.levels import Effects, assumed_noise
 
@@ -74,11 +74,7 @@ def level_of(effect: str) -> str:
 
 def one_run(job: str, seed: int, effect: str) -> dict[str, Any]:
     """One world with one effect: its errors in mm and mrad and whether they lie within what was stated; JSON-ready."""
-    import cv2
-
-    cv2.setNumThreads(1)
-    config, (loaded, mesh) = load_config(None), load_job(job)
-    nominal = NominalSurface.load(mesh, unit=loaded.surface.mesh_unit)
+    config, (loaded, nominal) = load_config(None), job_and_surface(job)
     record = run_whole_job(config, loaded, nominal, seed, level_of(effect), stood=STOOD_S)
     made = figures(record, config, loaded, nominal)
     run: dict[str, Any] = {key: made[key] for key in ("seed", "outcome", "reason", "stage", "wall_s")}
@@ -96,9 +92,7 @@ def one_run(job: str, seed: int, effect: str) -> dict[str, Any]:
 def flags_of(record: JobRecord) -> list[str]:
     """What calibration and job said by themselves of what is not as it should be."""
     flags = [] if record.calibration is None else list(record.calibration.scan.notes)
-    for result in record.results.values():
-        flags += getattr(result, "notes", ())
-    return flags
+    return flags + [note for result in record.results.values() for note in getattr(result, "notes", ())]
 
 
 def _part(record: JobRecord, config: CellConfig, job: Job) -> dict[str, Any]:
@@ -137,8 +131,8 @@ def summed_up(effect: str, runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "worlds": len(runs),
         **count,
         "between": interval(count["inside"] + count["named"], len(runs)),
-        "pose_inside": _share(runs, "pose_inside"),
-        "part_inside": _share(runs, "part_inside"),
+        "pose_inside": _mean(runs, "pose_inside"),
+        "part_inside": _mean(runs, "part_inside"),
         "outside_tolerance": sum(run["within_tolerance"] is False for run in runs),
         "arm_base_mm": _mean(runs, "arm_base_mm"),
         "placement_mm": _mean(runs, "placement_mm"),
@@ -160,11 +154,6 @@ def is_well(entry: dict[str, Any]) -> bool:
     refused without its name, and none was placed outside the tolerance."""
     good = int(entry["inside"]) + int(entry["named"])
     return interval(good, int(entry["worlds"]))[1] >= WANTED[0] and not entry["outside_tolerance"]
-
-
-def _share(runs: Sequence[dict[str, Any]], name: str) -> float | None:
-    known = [run[name] for run in runs if run[name] is not None]
-    return sum(known) / len(known) if known else None
 
 
 def _mean(runs: Sequence[dict[str, Any]], name: str) -> float | None:

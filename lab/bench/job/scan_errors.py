@@ -28,6 +28,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.run.report.report import SENSOR_POINTS, pose_of
 from drivers.interfaces import Vector
 from lab.bench.job.whole_job import JobRecord
+from lab.paper.rig import aligned
 from sim_backends.models.arm import ArmParams
 from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics
 from sim_backends.world.drawing import inverse
@@ -96,7 +97,7 @@ def scan_errors(record: JobRecord, nominal: NominalSurface, kinematic: Vector) -
     found, true = _moved(reported[part.lines], part.found), _moved(flanges[part.lines], part.true)
     return ScanErrors(
         scan=_length(in_camera - true_in_camera),
-        aligned=_length(transform(_rigid(in_camera, true_in_camera), in_camera) - true_in_camera),
+        aligned=_length(aligned(in_camera, true_in_camera)),
         own=_length(found - transform(own_from_base, true)),
         absolute=_length(found - true),
         inside=np.einsum("ni,nij,nj->n", off, np.linalg.inv(stated), off) <= chi2.ppf(COVERED, 3),
@@ -207,14 +208,6 @@ def _near_part(record: JobRecord, nominal: NominalSurface, cloud: Cloud, lines: 
     local = transform(pose_of(record.at_sweep, "base_from_surface").inverse(), cloud.points[lines, rows])
     away, nearest = cKDTree(local).query(part_points(nominal), distance_upper_bound=NEAR_M)
     return np.asarray(nearest)[np.isfinite(away)]
-
-
-def _rigid(points: Vector, onto: Vector) -> pin.SE3:
-    """The motion that brings points (n, 3) closest to others in least squares (Kabsch)."""
-    centre, target = points.mean(axis=0), onto.mean(axis=0)
-    u, _, vt = np.linalg.svd((onto - target).T @ (points - centre))
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return pin.SE3(rotation, target - rotation @ centre)
 
 
 def _length(vectors: Vector) -> Vector:

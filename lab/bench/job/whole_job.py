@@ -14,7 +14,7 @@ import numpy as np
 
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
-from cell.config.job import Job
+from cell.config.job import Job, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration import ScanObservation, TargetObservation
@@ -41,6 +41,12 @@ from statemachine.step import Event
 
 Progress = Callable[[float, str], None]
 Result = TypeVar("Result")
+
+
+def job_and_surface(name: str | Path) -> tuple[Job, NominalSurface]:
+    """A job that ships, or of a file, and its surface."""
+    job, mesh = load_job(name)
+    return job, NominalSurface.load(mesh, unit=job.surface.mesh_unit)
 
 
 class NoFrames(FrameStore):

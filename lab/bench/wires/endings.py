@@ -11,7 +11,6 @@ import logging
 import math
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -23,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from cell.devices.simulated.process import TIMEOUT_S
+from cell.devices.simulated.process import ask_truth
 from cell.procedures.steps.kinds import PLACE
 from cell.run.folder import is_going, list_runs
 from drivers.clock import Clock
@@ -203,34 +202,25 @@ def _end(process: subprocess.Popen[bytes], run: Path, way: str) -> None:
 def _watch(address: str) -> tuple[float, str]:
     """When something moved or shone last after now, in wall s, and what did so after the limit."""
     begun = time.monotonic()
-    host, port = address.rsplit(":", 1)
     last, late = 0.0, set()
     before: dict[str, Any] | None = None
-    with socket.create_connection((host, int(port)), timeout=TIMEOUT_S) as link, link.makefile("rwb") as file:
-        while (passed := time.monotonic() - begun) < WATCHED_S:
-            file.write(b'{"op": "truth"}\n')
-            file.flush()
-            truth = json.loads(file.readline())["truth"]
-            if moving := _moving(truth, before):
-                last = passed
-                if passed > LIMIT_S:
-                    late |= moving
-            before = truth
-            Clock().sleep(0.02)
+    while (passed := time.monotonic() - begun) < WATCHED_S:
+        truth = ask_truth(address)
+        if moving := _moving(truth, before):
+            last = passed
+            if passed > LIMIT_S:
+                late |= moving
+        before = truth
+        Clock().sleep(0.02)
     return last, ", ".join(sorted(late))
 
 
 def _moving(truth: dict[str, Any], before: dict[str, Any] | None) -> set[str]:
-    moving = {
-        name
-        for name, does in (
-            ("laser", truth["laser_on"]),
-            ("rail", truth["rail_moving"]),
-            ("arm", truth["arm"]["moving"]),
-            ("vehicle", not truth["vehicle"]["stopped"]),
-        )
-        if does
-    }
+    shown = {
+        "laser": truth["laser_on"], "rail": truth["rail_moving"], "arm": truth["arm"]["moving"],
+        "vehicle": not truth["vehicle"]["stopped"],
+    }  # fmt: skip
+    moving = {name for name, does in shown.items() if does}
     if before is not None:
         for name, pose in (("arm", "base_from_flange"), ("vehicle", "world_from_vehicle")):
             if np.abs(np.array(truth["poses"][pose]) - np.array(before["poses"][pose])).max() > _MOVED:

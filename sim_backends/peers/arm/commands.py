@@ -231,58 +231,28 @@ _CONTACT_FORCE = 10.0
 # --- moves ---
 
 
-def _move_j(c: Context) -> Job | None:
-    return _move_joints(c, c.doubles(0))
-
-
-def _move_j_ik(c: Context) -> Job | None:
-    return _move_joints(c, c.solve(c.pose(0)))
-
-
-def _move_l(c: Context) -> Job | None:
-    return _move_tool(c, c.pose(0))
-
-
-def _move_l_fk(c: Context) -> Job | None:
-    return _move_tool(c, c.forward(c.doubles(0)))
+def _move(c: Context, job: Job) -> Job | None:
+    c.require_free()
+    c.end_background()
+    return c.sync_or_async(job)
 
 
 def _move_joints(c: Context, target: Vector) -> Job | None:
-    c.require_free()
-    c.end_background()
-    return c.sync_or_async(c.wait(JointMove(target, c.double(6), c.double(7))))
+    return _move(c, c.wait(JointMove(target, c.double(6), c.double(7))))
 
 
 def _move_tool(c: Context, target: Matrix) -> Job | None:
-    c.require_free()
-    c.end_background()
-    return c.sync_or_async(c.wait(LinearMove(target, c.double(6), c.double(7))))
-
-
-def _move_path(c: Context) -> Job | None:
-    c.require_free()
-    c.end_background()
-    return c.sync_or_async(c.path())
+    return _move(c, c.wait(LinearMove(target, c.double(6), c.double(7))))
 
 
 def _stop_move(c: Context) -> Job | None:
-    c.require_free()
-    c.end_background()
     # Once an asynchronous stop was asked for, the script brakes linearly, whichever of the two commands comes.
     if c.integer(1) == 1:
         c.stop_is_linear = True
-    return c.sync_or_async(c.wait(StopMotion(c.double(0), linear=c.stop_is_linear)))
+    return _move(c, c.wait(StopMotion(c.double(0), linear=c.stop_is_linear)))
 
 
 # --- streams ---
-
-
-def _servo_j(c: Context) -> None:
-    _servo(c, c.doubles(0))
-
-
-def _servo_l(c: Context) -> None:
-    _servo(c, c.solve(c.pose(0)))
 
 
 def _servo(c: Context, target: Vector) -> None:
@@ -305,9 +275,9 @@ def _servo_c(c: Context) -> None:
         c.model.start(LinearMove(matrix_from_pose(target), c.double(6), c.double(7)))
 
 
-def _servo_stop(c: Context) -> Job:
+def _stop_stream(c: Context, deceleration: float, *, linear: bool = True) -> Job:
     c.thread = None
-    return c.wait(StopMotion(c.double(0), linear=True))
+    return c.wait(StopMotion(deceleration, linear=linear))
 
 
 def _speed_j(c: Context) -> None:
@@ -329,11 +299,6 @@ def _speed(c: Context, thread: str, wanted: JointSpeed | LinearSpeed) -> None:
         c.model.start(wanted)
 
 
-def _speed_stop(c: Context) -> Job:
-    c.thread = None
-    return c.wait(StopMotion(c.double(0), linear=c.speed_is_linear))
-
-
 def _jog_start(c: Context) -> None:
     speed, feature = c.doubles(0), round(c.double(6))
     turn = np.eye(3)
@@ -343,11 +308,6 @@ def _jog_start(c: Context) -> None:
         turn = c.pose(8)[:3, :3]
     twist = np.concatenate((turn.dot(speed[:3]), turn.dot(speed[3:])))
     _speed(c, "jog", LinearSpeed(twist, c.double(7)))
-
-
-def _jog_stop(c: Context) -> Job:
-    c.thread = None
-    return c.wait(StopMotion(1.2, linear=True))
 
 
 # --- compliance and contact ---
@@ -443,16 +403,20 @@ def _joint_torques(c: Context) -> None:
 
 
 COMMANDS: dict[int, Callable[[Context], Job | None]] = {
-    1: _move_j, 2: _move_j_ik, 3: _move_l, 4: _move_l_fk, 6: _force_mode,
+    1: lambda c: _move_joints(c, c.doubles(0)), 2: lambda c: _move_joints(c, c.solve(c.pose(0))),
+    3: lambda c: _move_tool(c, c.pose(0)), 4: lambda c: _move_tool(c, c.forward(c.doubles(0))), 6: _force_mode,
     7: lambda c: c.wait(StopMotion(10.0, linear=True)), 8: lambda c: c.model.zero_force(), 9: _speed_j, 10: _speed_l,
-    11: _servo_j, 12: _servo_c, 15: _speed_stop, 16: _servo_stop, 17: _set_payload, 24: _servo_l,
+    11: lambda c: _servo(c, c.doubles(0)), 12: _servo_c,
+    15: lambda c: _stop_stream(c, c.double(0), linear=c.speed_is_linear), 16: lambda c: _stop_stream(c, c.double(0)),
+    17: _set_payload, 24: lambda c: _servo(c, c.solve(c.pose(0))),
     25: lambda c: c.answer_integer(tool_contact(c, c.doubles(0))), 26: lambda c: c.answer(np.array([CYCLE])),
     27: lambda c: c.answer(c.joints_before(c.integer(1))), 28: _forward_now, 29: _set_tcp, 30: _inverse_near,
     31: lambda c: c.model.protective_stop("triggered by the program"), 33: _stop_move, 34: _stop_move,
     35: _set_watchdog, 36: lambda c: c.answer_integer(int(c.has_solution())), 37: _joints_within_limits,
     38: _joint_torques, 39: lambda c: c.answer(pose_from_matrix(c.pose(0).dot(c.pose(6)))),
-    40: lambda c: c.answer(pose_from_matrix(c.model.drive.flange_from_tcp)), 41: _jog_start, 42: _jog_stop,
-    43: _forward_now, 44: _forward_of, 45: _move_path, 46: lambda c: c.answer(c.solve(c.pose(0))),
+    40: lambda c: c.answer(pose_from_matrix(c.model.drive.flange_from_tcp)), 41: _jog_start,
+    42: lambda c: _stop_stream(c, 1.2), 43: _forward_now, 44: _forward_of, 45: lambda c: _move(c, c.path()),
+    46: lambda c: c.answer(c.solve(c.pose(0))),
     47: lambda c: c.answer_integer(int(c.model.steady)), 51: _move_until_contact, 54: lambda c: c.answer_integer(0),
     58: lambda c: c.answer(pose_from_matrix(c.model.reported_flange())),
     60: lambda c: c.answer_integer(int(c.has_solution())),

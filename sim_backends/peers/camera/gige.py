@@ -121,8 +121,8 @@ Address = tuple[str, int]
 class GigePeer:
     """Serves one camera at `address`, an address in 127.0.0.0/8."""
 
-    def __init__(self, name: str, clock: WorldClock, render: Render, spec: CameraSpec, host: str | None = None) -> None:
-        """Bind on `host`, or on the first free address of this process; OSError when none is.
+    def __init__(self, name: str, clock: WorldClock, render: Render, spec: CameraSpec) -> None:
+        """Bind on the first free address of this process; OSError when none is.
 
         `render` is called in the session's thread, once the exposure that it is to show is over; it gives the whole
         sensor.
@@ -130,7 +130,7 @@ class GigePeer:
         self.name = name
         self.camera = CameraState(spec)
         self._clock = clock
-        self._control, self.address = _bound(host)
+        self._control, self.address = _bound()
         self._memory = GigeMemory(spec, self.address)
         self._stream = GigeStream(self.address, self._memory)
         self._session = FrameSession(name, self.camera, clock, render, self._send)
@@ -171,11 +171,6 @@ class GigePeer:
     def drop_controller(self) -> None:
         """Forget who controls the camera, as after a short loss of its power."""
         self._release()
-
-    def pulse(self) -> None:
-        """A pulse on Line1."""
-        if self._memory.word(memory.TRIGGER_SOURCE) == memory.LINE:
-            self._trigger()
 
     # --- control ---
 
@@ -289,11 +284,11 @@ class GigePeer:
         self._stream.send(image, block_id, spec.device_ns(exposure.begin + spec.latency))
 
 
-def _bound(host: str | None) -> tuple[socket.socket, str]:
-    """A socket on `host`, or on the first of 127.1.n.2 … 127.1.n.254 that is free; n follows from the process."""
+def _bound() -> tuple[socket.socket, str]:
+    """A socket on the first of 127.1.n.2 … 127.1.n.254 that is free; n follows from the process."""
     net = os.getpid() % 250
     problem: OSError | None = None
-    for candidate in [host] if host is not None else [f"127.1.{net}.{i}" for i in range(2, 255)]:
+    for candidate in (f"127.1.{net}.{i}" for i in range(2, 255)):
         bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             bound.bind((candidate, PORT))
@@ -302,4 +297,4 @@ def _bound(host: str | None) -> tuple[socket.socket, str]:
             problem = error
             continue
         return bound, candidate
-    raise OSError(f"UDP port {PORT} is not free on {host or f'127.1.{net}.2 …'}: stop the other simulator ({problem})")
+    raise OSError(f"UDP port {PORT} is not free on 127.1.{net}.2 …: stop the other simulator ({problem})")

@@ -6,9 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sim_backends.optics import CameraOptics, LaserOptics, Light, Mesh, expected_image
+from tests.support.simulator.optics_scene import FOCAL_PX, LENS
 
-FOCAL_PX = 8e-3 / 4.8e-6
-LENS = (-0.08, 0.03, 4e-4, -3e-4, 0.01)
 OPTICS = CameraOptics(640, 480, FOCAL_PX, FOCAL_PX, 319.5, 239.5, LENS, transmission=0.4)
 MATRIX = np.array([[FOCAL_PX, 0, 319.5], [0, FOCAL_PX, 239.5], [0, 0, 1.0]])
 LASER = LaserOptics()

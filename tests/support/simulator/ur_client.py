@@ -17,7 +17,7 @@ from rtde_io import RTDEIOInterface
 from rtde_receive import RTDEReceiveInterface
 
 from drivers.clock import Clock
-from tests.support.wire.arm_bench import ArmBench
+from tests.support.wire.arm_bench import HOME, ArmBench, soon
 
 SPEED = 5.0
 CLOCK = Clock()
@@ -45,10 +45,7 @@ def distance(a: pin.SE3, b: pin.SE3) -> float:
 
 
 def until(condition: Callable[[], bool], timeout: float = 5.0) -> None:
-    deadline = CLOCK.now() + timeout
-    while not condition():
-        assert CLOCK.now() < deadline, "it did not happen in time"
-        CLOCK.sleep(0.004)
+    assert soon(condition, timeout), "it did not happen in time"
 
 
 class Client:
@@ -73,9 +70,6 @@ class Client:
         until(lambda: bool(self.control.isProgramRunning()))
         assert self.control.moveJ(HOME.tolist(), 2.0, 20.0)
         assert self.control.setTcp([0.0] * 6)
-
-
-HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
 
 
 def dashboard(address: str, *commands: str) -> list[str]:

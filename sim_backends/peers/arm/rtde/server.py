@@ -16,7 +16,6 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
@@ -44,20 +43,10 @@ _FLOOD = 65536
 """Bytes from which on everything is taken at once: that is no stream at the controller's rate."""
 
 
-class Controller(Protocol):
-    """What a connection needs of the controller."""
-
-    def claim(self, name: str, session: RtdeSession) -> bool:
-        """Give an input variable to a connection; False when another one holds it."""
-
-    def input_recipe(self, names: list[str]) -> InputRecipe:
-        """A recipe that writes to this controller's inputs."""
-
-
 class RtdeSession:
     """One RTDE connection: its recipes and whether it has been started."""
 
-    def __init__(self, controller: Controller, client: Client) -> None:
+    def __init__(self, controller: RtdePeer, client: Client) -> None:
         self._controller = controller
         self._client = client
         self._buffer = b""

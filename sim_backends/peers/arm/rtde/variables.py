@@ -34,7 +34,6 @@ class Registers:
         self.commands = 0
         """How many packets have carried the command so far."""
         self.command_fields: frozenset[str] = frozenset()
-        self.external_force = [0.0] * 6
         self.analog_out = [0.0, 0.0]
         self.written: dict[str, int] = {}
         """How often clients have written to the inputs that a program watches."""
@@ -236,6 +235,7 @@ _add_registers()
 
 
 _COMMANDS = frozenset({"input_int_register_0", "input_int_register_24"})
+_BANKS = {"int": "int_in", "double": "double_in", "bit": "bits_in"}
 _REGISTER = re.compile(r"input_(int|double|bit)_register_(\d+)")
 
 
@@ -250,20 +250,14 @@ class InputRecipe:
         self._unpacker = struct.Struct(">" + "".join(FORMATS[INPUTS[name]] for name in names))
         self._slots: list[tuple[list[int] | list[float] | list[bool], int]] = []
         self._others: list[tuple[str, int]] = []
-        self._force = place = 0
+        place = 0
         for name in names:
             match = _REGISTER.fullmatch(name)
             if match is None:
                 self._others.append((name, place))
-                if name == "external_force_torque":
-                    self._force = place
                 self._slots += [([0.0], 0)] * (6 if INPUTS[name] == "VECTOR6D" else 1)
-            elif match[1] == "int":
-                self._slots.append((registers.int_in, int(match[2])))
-            elif match[1] == "bit":
-                self._slots.append((registers.bits_in, int(match[2])))
             else:
-                self._slots.append((registers.double_in, int(match[2])))
+                self._slots.append((getattr(registers, _BANKS[match[1]]), int(match[2])))
             place = len(self._slots)
 
     def apply(self, payload: bytes) -> None:
@@ -277,8 +271,6 @@ class InputRecipe:
             self._registers.command_fields = self._names
         for name in self._registers.written.keys() & self._names:
             self._registers.written[name] += 1
-        if "external_force_torque" in self._names:
-            self._registers.external_force = list(numbers[self._force : self._force + 6])
         if self._others:
             self._write_outputs({name: numbers[place] for name, place in self._others})
 

@@ -306,8 +306,12 @@ def _norm(value: float | list[float]) -> float:
     return math.hypot(*value) if isinstance(value, list) else abs(value)
 
 
-def _distance(a: List, b: List, first: int) -> float:
-    return math.dist(a[first : first + 3], b[first : first + 3])
+def _distance(a: List, b: List) -> float:
+    return math.dist(a[:3], b[:3])
+
+
+def _inverse(pose: List) -> ScriptPose:
+    return as_pose(invert(matrix(pose)))
 
 
 def _turn_between(a: List, b: List) -> float:
@@ -391,13 +395,11 @@ def commands(environment: Environment) -> Commands:
         "atan2": math.atan2, "sqrt": math.sqrt, "pow": math.pow, "exp": math.exp,
         "log": lambda base, x: math.log(x, base),
         "floor": math.floor, "ceil": math.ceil, "round": round, "norm": _norm, "random": random.random,
-        "d2r": math.radians, "r2d": math.degrees, "inv": lambda pose: as_pose(invert(matrix(pose))),
-        "pose_inv": lambda pose: as_pose(invert(matrix(pose))),
+        "d2r": math.radians, "r2d": math.degrees, "inv": _inverse, "pose_inv": _inverse,
         "pose_trans": lambda a, b: as_pose(matrix(a).dot(matrix(b))),
         "pose_add": _pose_add,
-        "pose_sub": lambda a, b: _pose_add(a, as_pose(invert(matrix(b)))),
-        "pose_dist": lambda a, b: _distance(a, b, 0),
-        "point_dist": lambda a, b: _distance(a, b, 0),
+        "pose_sub": lambda a, b: _pose_add(a, _inverse(b)),
+        "pose_dist": _distance, "point_dist": _distance,
         "rotation_dist": _turn_between,
         "interpolate_pose": _interpolate,
         "wrench_trans": _twist,

@@ -22,21 +22,7 @@ from lab.paper.figure2 import (
     smallest_baseline,
     uniformity,
 )
-
-
-def light_point(x: np.ndarray, y: np.ndarray, baseline: float, focal: float, theta: float) -> np.ndarray:
-    """Points (n, 3) in m where the ray through sensor points x', y' (n,) in m meet the laser's fan.
-
-    Camera at the origin looking along +z, upright image. The laser stands at (−baseline, 0, 0); its fan is spanned by
-    the ray at the angle θ to the baseline and by the y axis. Each crossing solves t·ray = laser + a·middle + b·side.
-    """
-    laser = np.array([-baseline, 0.0, 0.0])
-    middle = np.array([np.cos(theta), 0.0, np.sin(theta)])
-    side = np.array([0.0, 1.0, 0.0])
-    ray = np.column_stack([x, y, np.full(len(x), focal)])
-    sytems = np.stack([ray, np.tile(-middle, (len(x), 1)), np.tile(-side, (len(x), 1))], axis=2)
-    shares = np.linalg.solve(sytems, np.tile(laser, (len(x), 1))[:, :, None])[:, 0]
-    return np.asarray(ray * shares, dtype=np.float64)
+from tests.unit.lab.paper.test_equations import FOCAL, point_of
 
 
 @pytest.mark.parametrize(
@@ -69,17 +55,17 @@ def test_35_mm_is_the_smallest_that_meets_a_fifth_of_a_millimetre_at_a_tenth_of_
 
 
 def test_errors_are_what_moved_rays_do() -> None:
-    head = Head.at_stand_off(0.035, 8e-3)
+    head = Head.at_stand_off(0.035, FOCAL)
     x, y, delta = np.array([-0.8e-3, 0.0, 0.9e-3]), np.array([0.7e-3, -0.4e-3, -0.9e-3]), 1e-8
-    moved = {name: np.zeros(3) for name in ("dx", "dy", "dz")}
-    for first in (-delta, delta):
-        for second in (-delta, delta):
-            there = light_point(x + first, y + second, head.baseline, head.focal, head.theta)
-            off = np.abs(there - light_point(x, y, head.baseline, head.focal, head.theta))
-            for k, name in enumerate(moved):
-                moved[name] = np.maximum(moved[name], off[:, k])
+
+    def points(first: float, second: float) -> np.ndarray:
+        """Where the moved rays meet the laser's fan, (3, 3) m."""
+        moved = zip(x + first, y + second, strict=True)
+        return np.array([point_of(*ray, head.baseline, head.theta) for ray in moved])
+
+    off = [np.abs(points(a, b) - points(0.0, 0.0)) for a in (-delta, delta) for b in (-delta, delta)]
     found = errors(head, x, y, delta)
-    for name, value in moved.items():
+    for name, value in zip(("dx", "dy", "dz"), np.max(off, axis=0).T, strict=True):
         np.testing.assert_allclose(found[name], value, rtol=1e-4)
 
 

@@ -27,8 +27,9 @@ Array = NDArray[np.float64]
 def test_each_models_joints_turn_as_fast_as_the_maker_says_and_no_faster(name: str, fastest: tuple[float, ...]) -> None:
     for joint, limit in enumerate(fastest):
         model = ArmModel(ArmParams.of(name), np.random.default_rng(3), WorldClock())
-        goal = model.drive.q.copy()
-        goal[joint] += 1.5
+        # The others go as well, but not as far: the leading joint limits all.
+        goal = model.drive.q + 0.1
+        goal[joint] += 1.4
         model.start(JointMove(goal, 100.0, 1000.0))
         seen = 0.0
         for step in range(1, 1000):

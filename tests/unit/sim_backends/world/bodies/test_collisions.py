@@ -79,8 +79,7 @@ def test_cleared_of_its_error_it_can_go_back_and_not_ahead(world: World) -> None
     assert world.vehicle.feedback(world.clock.now()).state is ChassisState.OK
 
 
-def test_a_vehicle_may_stand_a_millimetre_before_the_table_and_not_one_in_it() -> None:
-    world = World(seed=1, level="ideal", clock=SteppedClock())
+def test_a_vehicle_may_stand_a_millimetre_before_the_table_and_not_one_in_it(world: World) -> None:
     collisions = Collisions(world.scene, world.part)
     edge = -nominal.TABLE_HALF - 0.5
     assert not collisions.blocks(0.0, (edge - 0.001, 0.0, 0.0))
@@ -91,11 +90,12 @@ def test_a_vehicle_may_stand_a_millimetre_before_the_table_and_not_one_in_it() -
     assert collisions.blocks(0.0, (-nominal.TABLE_HALF - corner + 0.001, 0.0, math.pi / 4))
 
 
-def test_the_arm_that_is_sent_into_the_deck_stops_as_a_real_one_does(world: World) -> None:
+def test_the_arm_that_is_sent_into_the_deck_stops_as_a_real_one_does_and_can_leave_it_unlocked(world: World) -> None:
     world.arm.start(JointMove(OVER_DECK, 1.0, 2.0))
     advance(world, 8.0)
     assert world.arm.safety is Safety.NORMAL
-    down = world.arm.base_from_flange(world.clock.now()).copy()
+    up = world.arm.base_from_flange(world.clock.now()).copy()
+    down = up.copy()
     down[2, 3] = -0.1
     world.arm.start(LinearMove(down, 0.1, 0.5))
     advance(world, 8.0)
@@ -104,16 +104,6 @@ def test_the_arm_that_is_sent_into_the_deck_stops_as_a_real_one_does(world: Worl
     assert {row["obstacle"] for row in truth(world)["collisions"]} == {"vehicle"}
     # Stopped where it hit: a look every 50 ms at 0.1 m/s, and braking.
     assert world.arm.base_from_flange(world.clock.now())[2, 3] > down[2, 3] + 0.05
-
-
-def test_an_arm_that_was_unlocked_can_leave_what_it_hit(world: World) -> None:
-    world.arm.start(JointMove(OVER_DECK, 1.0, 2.0))
-    advance(world, 8.0)
-    up = world.arm.base_from_flange(world.clock.now()).copy()
-    down = up.copy()
-    down[2, 3] = -0.1
-    world.arm.start(LinearMove(down, 0.1, 0.5))
-    advance(world, 8.0)
     count = len(world.collisions.found)
     advance(world, world.arm.params.unlock_delay)
     world.arm.halt()

@@ -10,6 +10,7 @@ import pytest
 from dashboard_client import DashboardClient
 from rtde_control import RTDEControlInterface
 
+from tests.support.simulator.rtde_client import Rtde
 from tests.support.simulator.ur_client import CLOCK, HOME, SPEED, Client, dashboard, distance, flange, se3, until
 from tests.support.wire.arm_bench import ArmBench
 
@@ -112,10 +113,6 @@ def test_a_second_control_interface_is_refused(arm: Client) -> None:
     assert arm.control.moveJ((HOME + 0.05).tolist(), 1.5, 5.0)
 
 
-def packet(kind: str, payload: bytes = b"") -> bytes:
-    return struct.pack(">HB", 3 + len(payload), ord(kind)) + payload
-
-
 def test_clients_that_vanish_send_garbage_or_never_read_leave_the_others_alone(arm: Client) -> None:
     address = arm.simulator.address
     for port in (30004, 29999, 30003):
@@ -124,12 +121,13 @@ def test_clients_that_vanish_send_garbage_or_never_read_leave_the_others_alone(a
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
             connection.send(junk)
             connection.close()
-    deaf = socket.create_connection((address, 30004), timeout=5.0)
-    deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    deaf.sendall(packet("O", struct.pack(">d", 500.0) + b"actual_q,actual_TCP_pose,") + packet("S"))
+    deaf = Rtde(address)
+    deaf.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    deaf.ask("O", struct.pack(">d", 500.0) + b"actual_q,actual_TCP_pose,")
+    deaf.ask("S")
     assert arm.control.moveJ((HOME + 0.05).tolist(), 1.5, 5.0)
     until(lambda: bool(np.allclose(arm.q(), HOME + 0.05)))
-    deaf.close()
+    deaf.socket.close()
 
 
 def test_two_arms_run_side_by_side_and_a_client_can_leave_and_come_back(arm: Client) -> None:
@@ -145,33 +143,17 @@ def test_two_arms_run_side_by_side_and_a_client_can_leave_and_come_back(arm: Cli
         np.testing.assert_allclose(arm.q(), HOME, atol=1e-9)
 
 
-def answer(connection: socket.socket) -> tuple[str, bytes]:
-    header = connection.recv(3, socket.MSG_WAITALL)
-    size, kind = struct.unpack(">HB", header)
-    return chr(kind), connection.recv(size - 3, socket.MSG_WAITALL)
-
-
-def test_the_protocol_tells_unknown_variables_apart_and_pads_or_cuts_packets(arm: Client) -> None:
-    with socket.create_connection((arm.simulator.address, 30004), timeout=5.0) as connection:
-        connection.sendall(packet("V", b"\0\2"))
-        assert answer(connection) == ("V", b"\1")
-        connection.sendall(packet("v"))
-        major, minor, _, _ = struct.unpack(">4I", answer(connection)[1])
-        assert (major, minor) == (5, 15)
-        connection.sendall(packet("O", struct.pack(">d", 500.0) + b"timestamp,no_such_thing,"))
-        assert answer(connection) == ("O", b"\0DOUBLE,NOT_FOUND")
-        connection.sendall(packet("I", b"input_int_register_47,standard_digital_output_mask"))
-        assert answer(connection)[1].endswith(b"INT32,IN_USE"), "ur_rtde's IO interface owns the outputs"
-        connection.sendall(packet("I", b"input_double_register_46,input_double_register_47,"))
-        assert answer(connection) == ("I", b"\1DOUBLE,DOUBLE")
-        wanted = b"input_double_register_46,input_double_register_47"
-        connection.sendall(packet("O", struct.pack(">d", 125.0) + wanted))
-        assert answer(connection) == ("O", b"\1DOUBLE,DOUBLE")
-        for body, values in ((struct.pack(">3d", 1.0, 2.0, 3.0), (1.0, 2.0)), (struct.pack(">d", 4.0), (4.0, 0.0))):
-            connection.sendall(packet("U", b"\1" + body) + packet("S"))
-            assert answer(connection) == ("S", b"\1")
-            assert struct.unpack(">B2d", answer(connection)[1]) == (1, *values)
-            connection.sendall(packet("P"))
-            while (reply := answer(connection))[0] == "U":
-                assert struct.unpack(">B2d", reply[1]) == (1, *values)
-            assert reply == ("P", b"\1")
+def test_inputs_of_ur_rtde_are_in_use_and_packets_are_padded_or_cut(arm: Client) -> None:
+    client = Rtde(arm.simulator.address)
+    assert struct.unpack(">4I", client.ask("v"))[:2] == (5, 15)
+    reply = client.ask("I", b"input_int_register_47,standard_digital_output_mask")
+    assert reply.endswith(b"INT32,IN_USE"), "ur_rtde's IO interface owns the outputs"
+    names = b"input_double_register_46,input_double_register_47"
+    assert client.ask("I", names + b",") == b"\1DOUBLE,DOUBLE"
+    assert client.ask("O", struct.pack(">d", 125.0) + names) == b"\1DOUBLE,DOUBLE"
+    client.ask("S")
+    for body, values in ((struct.pack(">3d", 1.0, 2.0, 3.0), (1.0, 2.0)), (struct.pack(">d", 4.0), (4.0, 0.0))):
+        client.tell(b"\1" + body)
+        client.ask("v")
+        assert struct.unpack(">B2d", client.states(2)[-1]) == (1, *values)
+    client.socket.close()
