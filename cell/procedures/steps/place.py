@@ -243,7 +243,7 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
     require_held(here.part)
     while True:
         held, pose = context.held_s, context.made(PlacePose)
-        aim = Aim.of(here, pose)
+        aim = AimedPlace.of(here, pose)
         mating = _mated(here, pose, aim.touching, context)
         look = _looked_again(here, pose, context)
         if look is not None and look.creep is not None:
@@ -276,7 +276,7 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
 
 
 @dataclass(frozen=True, eq=False)
-class Aim:
+class AimedPlace:
     """Where the part is put down so that it comes to lie in its place: `job` has it held so. `allowed` is by how much
     that is aside, None for nothing; `touching` is where on the surface it meets that, surface_from_part."""
 
@@ -285,7 +285,7 @@ class Aim:
     touching: pin.SE3
 
     @classmethod
-    def of(cls, here: Workplace, pose: PlacePose) -> Aim:
+    def of(cls, here: Workplace, pose: PlacePose) -> AimedPlace:
         """By the parts of the batch before; straight at the place where they do not tell."""
         points, grasp, belongs = part_points(here.nominal), here.job.grasp, here.job.place.surface_from_part.se3()
         unsure = np.diag([grasp.sigma**2] * 3 + [grasp.sigma_angle**2] * 3)

@@ -41,7 +41,7 @@ SETTLING, TIPS = 20, 5e-3
 _LEAN = 0.015
 """How much higher than drawn, m, a point of a leaning table's surface may be."""
 _BESIDE, _FLOOR = 1.5 * drawing.TABLE_HALF, 0.1
-"""Farther than that, m, from the table's middle the floor is the ground; and what is higher than that, m, is above it."""
+"""Farther than that, m, from the table's middle the floor is the ground, and what is higher, m, is above it."""
 
 
 @dataclass(frozen=True, eq=False)
