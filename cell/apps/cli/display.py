@@ -279,13 +279,21 @@ def print_health(told: Mapping[str, Any]) -> None:
     """A row for each part that the jobs look at, and when a calibration is due."""
     console = Console(highlight=False)
     if told["parts"]:
-        columns = ("part", ">last", ">by now", ">limit", "unit", ">a day", ">days left")
+        columns = ("part", ">last", ">by now", ">limit", "unit", ">a day", ">days left", "each job")
         table = new_table(f"since the calibration of {told['calibrated']}, jobs: {told['jobs']}", *columns)
         for part in told["parts"]:
             creeps = f"{part['a_day']:.3f}" if part["a_day"] else ""
             left = "" if part["days_left"] is None else f"{part['days_left']:.0f}"
-            seen = f"{part['last']:.3f}", f"{part['now']:.3f}", f"{part['limit']:.2f}", part["unit"]
-            table.add_row(part["part"], *seen, creeps, left)
+            seen = f"{part['last']:.3f}", f"{part['now']:.3f}"
+            table.add_row(
+                part["part"],
+                *seen,
+                f"{part['limit']:.2f}",
+                part["unit"],
+                creeps,
+                left,
+                sparks(part["values"], part["limit"]),
+            )
         console.print(table)
     for shock in told["shocks"]:
         console.print(
@@ -294,6 +302,17 @@ def print_health(told: Mapping[str, Any]) -> None:
     if told["unlooked"]:
         console.print(f"{told['unlooked']} of {told['jobs']} jobs did not look at the fine board", markup=False)
     console.print(told["due"], markup=False, soft_wrap=True)
+
+
+SPARKS = "▁▂▃▄▅▆▇█"
+MOST_SPARKS = 10
+
+
+def sparks(values: Sequence[float], limit: float) -> str:
+    """The newest of these values as bars; a full one has reached the limit."""
+    return "".join(
+        SPARKS[min(len(SPARKS) - 1, int((len(SPARKS) - 1) * value / limit))] for value in values[-MOST_SPARKS:]
+    )
 
 
 def _simulated(row: Mapping[str, object]) -> str:

@@ -172,6 +172,11 @@ class GigePeer:
         """Forget who controls the camera, as after a short loss of its power."""
         self._release()
 
+    def pulse(self) -> None:
+        """A pulse on Line1."""
+        if self._memory.word(memory.TRIGGER_SOURCE) == memory.LINE:
+            self._trigger()
+
     # --- control ---
 
     def _serve(self) -> None:

@@ -127,7 +127,7 @@ def test_a_part_that_is_put_down_aslant_touches_along_its_own_way() -> None:
     corners = 0.02 * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
     flat = NominalSurface(corners, [[0, 1, 2], [0, 2, 3]])
     made, none = np.diag([1e-8] * 3 + [0.0] * 3), np.zeros((6, 6))
-    verdict = PoseVerdict(SmallMotion(np.zeros(3), np.zeros(3), 0.0, ""), (), (), np.ones(6))
+    verdict = PoseVerdict(SmallMotion(np.zeros(3), np.zeros(3), 0.0, ""), (), ())
     pose = PlacePose(pin.SE3.Identity(), made, none, made, verdict, 0.0, 1.0, 1000, 1.0, 1.0, 0.0, np.zeros(6), 0.0)
     known = replaced_grasp(1e-9, 1e-9)
 

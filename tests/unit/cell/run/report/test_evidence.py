@@ -138,7 +138,7 @@ def test_a_surface_as_drawn_shows_no_waviness(placed: Ended) -> None:
 def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: Path) -> None:
     def waved(cell: VirtualCell) -> None:
         drawing = cell.world.scene.drawing
-        station = replace(drawing.station, waviness=(0.1e-3, 0.015, 0.25 * math.pi))
+        station = replace(drawing.station, waviness=(0.06e-3, 0.015, 0.25 * math.pi))
         cell.world.remake(replace(cell.world.scene, drawing=replace(drawing, station=station)), Station.of(station))
 
     site = AtStation(placed_pot, tmp_path, changed=waved)
@@ -146,7 +146,7 @@ def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: 
     run = report_runs.placed(replace(placed_pot, results=site.made), tmp_path / "runs")
     (tmp_path / "cloud.ply").rename(run.folder / "cloud.ply")
     report = run.report
-    texture, through = report["scan"]["texture"], 0.1 * 2.0 ** -((5.0 / 15.0) ** 2)
+    texture, through = report["scan"]["texture"], 0.06 * 2.0 ** -((5.0 / 15.0) ** 2)
     assert texture["sq_mm"] == pytest.approx(through / math.sqrt(2.0), rel=0.03)
     assert texture["sz_mm"] == pytest.approx(2.0 * through, rel=0.25)  # the form bends so few waves
     assert report["measured"][-1]["name"] == "waviness of the surface, Sq"
