@@ -18,7 +18,7 @@ from cell.measure.inversion.disagreement import STEEPEST, spread_for_journal, sp
 from cell.measure.inversion.nominal import Array, NominalSurface
 from cell.measure.reconstruction.cloud import Cloud
 
-REACH_M = 3e-3
+REACH_M = 4.5e-3
 """Farther from what is drawn a point belongs to something else, such as to the surface below a part's rim."""
 BESIDE_M = 6e-3
 """A piece of the edge is held against what lies nearer than this."""
