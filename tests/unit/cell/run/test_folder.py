@@ -103,14 +103,16 @@ def test_of_two_that_go_on_one_has_to_be_named(tmp_path: Path) -> None:
 
 def test_a_time_of_maintenance_takes_no_requests_and_keeps_no_run_from_being_asked(tmp_path: Path) -> None:
     root = tmp_path / "runs"
-    job = new_run(root)
-    Journal(job, job.name, {"kind": "job", "pid": os.getpid()})
-    maintenance = new_run(root)
-    Journal(maintenance, maintenance.name, {"kind": "maintenance", "pid": os.getpid()})
+    job, maintenance = new_run(root), new_run(root)
+    # Kept: a journal that nobody holds is closed at some time, and its run has ended then.
+    journals = [Journal(job, job.name, {"kind": "job", "pid": os.getpid()})]
+    journals.append(Journal(maintenance, maintenance.name, {"kind": "maintenance", "pid": os.getpid()}))
     assert is_going(maintenance)
     assert find_going(root, None) == job
     with pytest.raises(ConfigError, match="nothing is going on there"):
         find_going(root, maintenance.name)
+    for journal in journals:
+        journal.close()
 
 
 def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(
