@@ -23,13 +23,15 @@ GRIPPED = np.diag([20e-6**2] * 3 + [0.2e-3**2] * 3)
 """Covariance of how a claw that closes on a part where it let it go moves it, m² and rad²: stated, as the grasp is."""
 SLIPS = 2.0
 """A part slips as the claw opens where it moves so many times as far as a correction leaves it off, on average."""
+FARTHEST_M = 2e-3
+"""A part that lies farther aside is neither gripped, since the fingers may not find it, nor allowed for."""
 NEWEST = 10
 """So many parts of a batch tell how the next one will come to lie."""
 ALIKE = 0.5
 """Parts came to lie alike where they differ from their median by at most this share of it, on average."""
 
 
-def held_so(job: Job, flange_from_part: pin.SE3, seen: Vector) -> Job:
+def job_with_grasp(job: Job, flange_from_part: pin.SE3, seen: Vector) -> Job:
     """The job with its part held at `flange_from_part`, known to `seen` (6, 6)."""
     roll, pitch, yaw = pin.rpy.matrixToRpy(flange_from_part.rotation)
     x, y, z = flange_from_part.translation
@@ -41,10 +43,12 @@ def held_so(job: Job, flange_from_part: pin.SE3, seen: Vector) -> Job:
     return job.model_copy(update={"grasp": grasp})
 
 
-def brought(job: Job, repeatability: Vector, pose: PlacePose, points: Vector, seen: Vector) -> Vector:
-    """How far along the surface the part's `points` (n, 3), part frame, lie from where they belong after a correction,
-    on average: drawn (2000,), m, from the arm's `repeatability` (6, 6), and from what is not known of the part where it
-    was `seen`, (6, 6), surface axes."""
+def expected_residual(
+    job: Job, repeatability: Vector, pose: PlacePose, points: Vector, seen: Vector, *, corrections: int = 1
+) -> float:  # fmt: skip
+    """How far along the surface, m, the part's `points` (n, 3), part frame, lie off their places on average after up to
+    so many corrections: from the arm's `repeatability` (6, 6), and what is not known of the part where it was `seen`,
+    (6, 6), surface axes."""
     belongs = job.place.surface_from_part.se3()
     base_from_part = pose.base_from_surface * belongs
     flange = base_from_part * job.grasp.flange_from_part.se3().inverse()
@@ -54,16 +58,16 @@ def brought(job: Job, repeatability: Vector, pose: PlacePose, points: Vector, se
     rests = turn @ carried @ (2.0 * repeatability) @ carried.T @ turn.T
     drawn = draws_of(rests + seen + GRIPPED)
     apart = drawn[:, None, :3] + np.cross(drawn[:, None, 3:], points @ belongs.rotation.T)
-    return np.asarray(np.linalg.norm(apart[..., :2], axis=-1).mean(axis=1))
+    return best_expected(np.linalg.norm(apart[..., :2], axis=-1).mean(axis=1), corrections)
 
 
-def hoped(drawn: Vector, corrections: int) -> float:
-    """How far off a part is on average after up to `corrections`, of which each leaves it as far off as one of `drawn`
-    (n,), and which end as soon as those left promise no more: the optimal stopping of a search without recall."""
-    hope = float(drawn.mean())
+def best_expected(drawn: Vector, corrections: int) -> float:
+    """The mean after up to so many `corrections`, of which each leaves one of `drawn` (n,), and which end as soon as
+    those left promise no less: the optimal stopping of a search without recall."""
+    best = float(drawn.mean())
     for _ in range(corrections - 1):
-        hope = float(np.minimum(drawn, hope).mean())
-    return hope
+        best = float(np.minimum(drawn, best).mean())
+    return best
 
 
 def moved(motion: pin.SE3, points: Vector) -> float:
@@ -100,9 +104,9 @@ class GraspSeries:
         """
         return _alike(self.aside, points, noise)
 
-    def slip(self, points: Vector, noise: float) -> pin.SE3:
-        """How a part moves as the claw opens over it, as far as the parts tell."""
-        return _alike(self.opening, points, noise) or pin.SE3.Identity()
+    def slip(self, points: Vector, noise: float) -> pin.SE3 | None:
+        """How a part moves as the claw opens over it, be it not at all; None where the parts do not tell."""
+        return None if len(self.opening) < 2 else _alike(self.opening, points, noise) or pin.SE3.Identity()
 
 
 def _alike(rows: Vector, points: Vector, noise: float) -> pin.SE3 | None:
@@ -112,7 +116,8 @@ def _alike(rows: Vector, points: Vector, noise: float) -> pin.SE3 | None:
     found = _motion(*np.median(rows, axis=0))
     far = moved(found, points)
     apart = np.mean([moved(found.inverse() * _motion(*row), points) for row in rows])
-    return found if far >= SLIPS * noise / np.sqrt(len(rows)) and apart <= ALIKE * far else None
+    clear = SLIPS * noise / np.sqrt(len(rows)) <= far < FARTHEST_M
+    return found if clear and apart <= ALIKE * far else None
 
 
 def _row(motion: pin.SE3) -> Vector:

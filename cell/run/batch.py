@@ -153,8 +153,7 @@ def perform(
             if number > 1 and (work := _question(here, job, f"part {number} of {count}", batch.runs[-1])):
                 between(work)
             last = run(number, series)
-            if isinstance(seen := last.results.get("verify"), PlacedPart) and seen.came is not None:
-                series = series.after(seen.came, seen.slips)
+            series = _known_after(series, last)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).kept()
             tell(Event("note", None, {"text": str(batch)}))
@@ -167,6 +166,15 @@ def perform(
         why = f"after part {len(batch.runs)}: {error}"
         interrupted = isinstance(error, Interrupted | SignalInterrupt)
     return replace(batch, reason=why or "every part was tried", interrupted=interrupted).kept()
+
+
+def _known_after(series: GraspSeries, last: RunOutcome) -> GraspSeries:
+    """What parts tell of how the next one will come to lie; nothing after one that was refused, for whoever saw to it
+    may have mended the fingers, or changed the part."""
+    if last.outcome not in GOOD:
+        return GraspSeries()
+    seen = last.results.get("verify")
+    return series if not isinstance(seen, PlacedPart) or seen.came is None else series.after(seen.came, seen.slips)
 
 
 def _skipped(here: Opened, job: Job, last: RunOutcome) -> bool:

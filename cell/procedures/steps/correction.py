@@ -9,7 +9,7 @@ import pinocchio as pin
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.mating import scanned_gap
 from cell.procedures.arm.touch import expected_touch
-from cell.procedures.grasp import SLIPS, brought, held_so, hoped, moved
+from cell.procedures.grasp import SLIPS, expected_residual, job_with_grasp, moved
 from cell.procedures.part_error import part_points
 from cell.procedures.steps.gripping import note_part, take
 from cell.procedures.steps.place import PlaceResult, Placing
@@ -31,10 +31,10 @@ def correct(
     Raises what `Placing.put_down` raises, and `RefusedError` where something is met on the way to the part.
     """
     belongs, points = here.job.place.surface_from_part.se3(), part_points(here.nominal)
-    if moved(slip, points) < SLIPS * hoped(brought(here.job, here.repeatability, pose, points, seen), 1):
+    if moved(slip, points) < SLIPS * expected_residual(here.job, here.repeatability, pose, points, seen):
         # As little comes of the arm.
         slip = pin.SE3.Identity()
-    job = held_so(here.job, held * slip, seen)
+    job = job_with_grasp(here.job, held * slip, seen)
     expected = expected_touch(job, here.nominal, pose, here.repeatability)
     part = here.part_mesh
     assert part is not None

@@ -19,7 +19,7 @@ from cell.motion.collision import TOUCHES
 from cell.procedures.arm.moves import Mover, PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.arm.touch import FELT_M, REFUSED, TouchCheck, TouchHeight, expected_touch, felt_touch
-from cell.procedures.grasp import brought, held_so, hoped, moved
+from cell.procedures.grasp import expected_residual, job_with_grasp
 from cell.procedures.part_error import part_points
 from cell.procedures.steps.board_photo import require_unmoved
 from cell.procedures.steps.invert_pose import inverted
@@ -27,7 +27,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.second_look import SecondLook, require_in_place
 from cell.procedures.sweep.stored_sweep import SweepRecord
-from drivers.errors import CellError, Measured, NotObservable, RefusedError
+from drivers.errors import CellError, DeviceFault, Measured, NotObservable, RefusedError
 from drivers.interfaces import Arm, ArmState, Claw, Vector
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
@@ -243,8 +243,7 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
     require_held(here.part)
     while True:
         held, pose = context.held_s, context.made(PlacePose)
-        aim = AimedPlace.of(here, pose)
-        mating = _mated(here, pose, aim.touching, context)
+        aim, mating = AimedPlace.of(here, pose).fitted(here, pose, context)
         look = _looked_again(here, pose, context)
         if look is not None and look.creep is not None:
             swept = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
@@ -257,8 +256,6 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         # Whoever has the run held may reach in, also in the middle of a look: then it is looked at again.
         if context.held_s == held:
             break
-    if aim.allowed is not None:
-        context.note(text=aim.words(here))
     # While the arm comes down; the laser is off.
     carriage = here.devices.rail.check_zero() if look is not None and here.job.scan.mode == "rail" else None
     placing = Placing(
@@ -267,7 +264,16 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
         ready=lambda: None if carriage is None else carriage.wait(30.0),
     )  # fmt: skip
-    done = replace(placing.put_down(not here.looks_after), look=look, pose=pose, mating=mating)
+    try:
+        done = placing.put_down(not here.looks_after)
+    except RefusedError as refused:
+        # Steps that the rail has lost explain a touch that comes early: they are told first.
+        try:
+            placing.ready()
+        except DeviceFault as lost:
+            raise lost from refused
+        raise
+    done = replace(done, look=look, pose=pose, mating=mating)
     if aim.allowed is not None:
         done = replace(done, allowed=aim.allowed, parts=len(here.series.aside))
     for note in done.notes:
@@ -275,34 +281,54 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
     return done
 
 
+def aside_words(allowed: pin.SE3, parts: int) -> str:
+    """For people, what so many parts had alike, and this one allows for."""
+    x, y, _ = 1e3 * allowed.translation
+    turn = 1e3 * pin.log3(allowed.rotation)[2]
+    return (
+        f"As {parts} parts before it came to lie ({x:+.2f}, {y:+.2f}) mm and {turn:+.1f} mrad aside, it was put down "
+        "as far to the other side"
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class AimedPlace:
     """Where the part is put down so that it comes to lie in its place: `job` has it held so. `allowed` is by how much
-    that is aside, None for nothing; `touching` is where on the surface it meets that, surface_from_part."""
+    that is aside, None for nothing. `touching` are the places on the surface at which it may meet that then,
+    surface_from_part."""
 
     job: Job
     allowed: pin.SE3 | None
-    touching: pin.SE3
+    touching: tuple[pin.SE3, ...]
 
     @classmethod
     def of(cls, here: Workplace, pose: PlacePose) -> AimedPlace:
         """By the parts of the batch before; straight at the place where they do not tell."""
         points, grasp, belongs = part_points(here.nominal), here.job.grasp, here.job.place.surface_from_part.se3()
         unsure = np.diag([grasp.sigma**2] * 3 + [grasp.sigma_angle**2] * 3)
-        noise = hoped(brought(here.job, here.repeatability, pose, points, unsure), 1)
-        allowed = here.series.allowance(points, noise)
+        noise = expected_residual(here.job, here.repeatability, pose, points, unsure)
+        allowed, slip = here.series.allowance(points, noise), here.series.slip(points, noise)
         if allowed is None:
-            return cls(here.job, None, belongs)
-        job = held_so(here.job, grasp.flange_from_part.se3() * allowed, unsure)
-        return cls(job, allowed, belongs * here.series.slip(points, noise).inverse())
+            return cls(here.job, None, (belongs,))
+        # Held aside, it touches at its place. One that slips as the claw opens touches aside, and slips into it.
+        touching = (belongs, belongs * allowed.inverse()) if slip is None else (belongs * slip.inverse(),)
+        return cls(job_with_grasp(here.job, grasp.flange_from_part.se3() * allowed, unsure), allowed, touching)
 
-    def words(self, here: Workplace) -> str:
-        """For people, what is allowed for."""
-        assert self.allowed is not None
-        return (
-            f"{len(here.series.aside)} parts came to lie {1e3 * moved(self.allowed, part_points(here.nominal)):.2f} mm "
-            "aside alike: this one is put down as far to the other side"
-        )
+    def fitted(self, here: Workplace, pose: PlacePose, context: StepContext) -> tuple[AimedPlace, MatingGap | None]:
+        """This, and the gap where the part touches first; straight at the place where it would not fit aside.
+
+        Raises `RefusedError` where it does not fit at its place.
+        """
+        try:
+            gaps = [_mated(here, pose, lies, context) for lies in self.touching]
+        except RefusedError as refused:
+            if self.allowed is None:
+                raise
+            context.note(text=f"parts before came to lie aside alike, which is not allowed for: {refused}")
+            return AimedPlace(here.job, None, (here.job.place.surface_from_part.se3(),)).fitted(here, pose, context)
+        if self.allowed is not None:
+            context.note(text=aside_words(self.allowed, len(here.series.aside)))
+        return self, max(gaps, key=lambda gap: -np.inf if gap is None else gap.lift)
 
 
 def _mated(here: Workplace, pose: PlacePose, lies: pin.SE3, context: StepContext) -> MatingGap | None:

@@ -9,7 +9,7 @@ import numpy as np
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.part_pose import seen_from_below
 from cell.procedures.arm.touch import expected_touch
-from cell.procedures.grasp import held_so
+from cell.procedures.grasp import job_with_grasp
 from cell.procedures.steps.gripping import note_part
 from cell.procedures.steps.pick import HeldPart
 from cell.procedures.steps.place import PlaceResult, Placing
@@ -40,7 +40,7 @@ def _at(here: Workplace, context: StepContext) -> SetDown:
     base_from_part = nest.base_from_part.se3()
     known = np.diag([nest.sigma**2] * 3 + [nest.sigma_angle**2] * 3)
     pose = replace(context.made(PlacePose), base_from_surface=base_from_part, covariance=known)
-    held = held_so(job, job.grasp.flange_from_part.se3(), context.made(HeldPart).covariance)
+    held = job_with_grasp(job, job.grasp.flange_from_part.se3(), context.made(HeldPart).covariance)
     below = seen_from_below(part, job.place.surface_from_part.se3())
     placing = Placing(
         held, base_from_part, expected_touch(held, below, pose, here.repeatability), mover=here.mover,

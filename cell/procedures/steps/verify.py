@@ -16,12 +16,12 @@ from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
 from cell.measure.reconstruction import Cloud, write_cloud
 from cell.measure.reconstruction.cloud import Indices
 from cell.procedures.arm.moves import PartState
-from cell.procedures.grasp import brought, hoped
+from cell.procedures.grasp import FARTHEST_M, expected_residual
 from cell.procedures.part_error import part_covariance, part_points
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart, along_surface
 from cell.procedures.steps.correction import correct
 from cell.procedures.steps.laser_sweep import head_at, laser_sweep
-from cell.procedures.steps.place import PlaceResult
+from cell.procedures.steps.place import PlaceResult, aside_words
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
@@ -34,17 +34,18 @@ from statemachine.step import OnFailure, Step
 CLOUD = "placed.ply"
 SWEEPS = 3
 """How often at most the part is swept until no frames are lost."""
-FARTHEST_M = 2e-3
-"""A part that lies farther aside is not gripped: the fingers may not find it as it lies."""
 
 
 def _at(here: Workplace, context: StepContext) -> PlacedPart:
-    placed = context.made(PlaceResult)
+    first = placed = context.made(PlaceResult)
     pose, plan = placed.pose or context.made(PlacePose), here.job.place
     found, slips = _looked(here, pose, context), list[pin.SE3]()
-    leaves = hoped(brought(here.job, here.repeatability, pose, found.points, found.covariance), 1)
-    slip = here.series.slip(found.points, leaves)
-    came = along_surface(placed.allowed * found.belongs.inverse() * found.seen.surface_from_part)
+    leaves = expected_residual(here.job, here.repeatability, pose, found.points, found.covariance)
+    slip = here.series.slip(found.points, leaves) or pin.SE3.Identity()
+    # Along a motion that is not seen it lies where it belongs: that would confirm what was allowed for.
+    came = None if found.unseen else along_surface(
+        first.allowed * found.belongs.inverse() * found.seen.surface_from_part
+    )  # fmt: skip
     for left in range(plan.corrections, 0, -1):
         if not _worth_correcting(here, pose, found, left, context):
             break
@@ -72,7 +73,7 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     for note in found.notes:
         context.note(text=note)
     if not found.kept(plan):
-        raise found.misplaced(plan)
+        raise found.misplaced(plan, aside_words(first.allowed, first.parts) if first.parts else "")
     return replace(found, came=came, slips=tuple(slips))
 
 
@@ -81,7 +82,8 @@ def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left:
     plan = here.job.place
     if found.off <= (plan.tolerance if plan.accept is None else plan.accept) and found.kept(plan):
         return False
-    hope = hoped(brought(here.job, here.repeatability, pose, found.points, found.covariance), left)
+    known = here.job, here.repeatability, pose, found.points, found.covariance
+    hope = expected_residual(*known, corrections=left)
     why = f"placed again it would be {1e3 * hope:.2f} mm off"
     if found.aside >= FARTHEST_M:
         why = f"farther than {1e3 * FARTHEST_M:g} mm the claw may not find it"

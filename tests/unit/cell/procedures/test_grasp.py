@@ -31,8 +31,12 @@ def test_two_parts_that_came_alike_are_allowed_for_in_the_next() -> None:
 def test_one_part_may_have_been_bumped() -> None:
     assert series((0.4, 0.0, 0.0)).allowance(POINTS, NOISE) is None
     assert series((0.0, 0.02, 0.0), (0.5, 0.0, 0.0)).allowance(POINTS, NOISE) is None
-    bumped = series((0.30, 0.0, 0.0), (0.0, 0.9, 0.0), (0.32, 0.0, 0.0)).allowance(POINTS, NOISE)
-    assert bumped is None or np.linalg.norm(bumped.translation[:2] - [0.3e-3, 0.0]) < 0.02e-3
+    assert series((0.30, 0.0, 0.0), (0.0, 0.9, 0.0), (0.32, 0.0, 0.0)).allowance(POINTS, NOISE) is None
+
+
+def test_parts_that_lie_far_aside_are_for_a_person() -> None:
+    assert series((1.9, 0.0, 0.0), (1.9, 0.0, 0.0)).allowance(POINTS, NOISE) is not None
+    assert series((2.1, 0.0, 0.0), (2.1, 0.0, 0.0)).allowance(POINTS, NOISE) is None
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -50,8 +54,8 @@ def test_the_newest_parts_count() -> None:
 
 
 def test_how_a_part_slips_is_known_from_those_that_were_placed_again() -> None:
-    assert np.allclose(series((0.4, 0.0, 0.0), (0.4, 0.0, 0.0)).slip(POINTS, NOISE).translation, 0.0)
+    assert series((0.4, 0.0, 0.0), (0.4, 0.0, 0.0)).slip(POINTS, NOISE) == pin.SE3.Identity()
     slips = [moved(0.5e-3), moved(0.46e-3)]
-    assert GraspSeries().after(moved(0.48e-3), slips[:1]).slip(POINTS, NOISE) == pin.SE3.Identity()
+    assert GraspSeries().after(moved(0.48e-3), slips[:1]).slip(POINTS, NOISE) is None
     found = GraspSeries().after(moved(0.48e-3), slips).slip(POINTS, NOISE)
-    assert found.translation[0] == pytest.approx(0.48e-3)
+    assert found is not None and found.translation[0] == pytest.approx(0.48e-3)

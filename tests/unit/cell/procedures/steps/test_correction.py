@@ -13,7 +13,7 @@ import pytest
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix
 from cell.motion.collision import PLACED
-from cell.procedures.grasp import GraspSeries, held_so, hoped
+from cell.procedures.grasp import GraspSeries, best_expected, job_with_grasp
 from cell.procedures.steps.kinds import VERIFIED
 from drivers.errors import MisplacedError, RefusedError
 from lab.bench.job.part_effects import motion, opened
@@ -37,6 +37,13 @@ def test_a_part_that_lies_aside_is_gripped_and_placed_where_it_belongs(placed_po
     true = site.lies()
     assert np.linalg.norm(true.translation) < 0.2e-3 and np.abs(pin.log3(true.rotation)).max() < 1e-3
     assert any("it is gripped and placed again" in note for note in site.notes)
+
+
+def test_what_is_accepted_is_not_touched_and_what_is_not_is_corrected(placed_pot: JobRecord, tmp_path: Path) -> None:
+    off = moved(0.2e-3, z=0.1e-3)
+    assert LyingPart(placed_pot, tmp_path, also="corrections = 1").looked(off).before == ()
+    nearer = LyingPart(placed_pot, tmp_path, also='corrections = 1\naccept = "0.1 mm"').looked(off)
+    assert len(nearer.before) == 1 and nearer.off < nearer.before[0]
 
 
 def test_a_part_that_lies_on_something_is_left_there(placed_pot: JobRecord, tmp_path: Path) -> None:
@@ -123,7 +130,7 @@ def test_a_part_that_lies_too_far_aside_is_not_gripped(placed_pot: JobRecord, tm
 def test_the_grasp_that_was_seen_takes_the_place_of_the_stated_one() -> None:
     job, _ = pot()
     flange_from_part = job.grasp.flange_from_part.se3() * moved(1e-3, -2e-3, 0.5e-3, turn=(0.01, 0.02, -0.03))
-    held = held_so(job, flange_from_part, np.diag([9e-12] * 3 + [1e-10] * 3)).grasp
+    held = job_with_grasp(job, flange_from_part, np.diag([9e-12] * 3 + [1e-10] * 3)).grasp
     assert np.allclose(held.flange_from_part.se3().homogeneous, flange_from_part.homogeneous, atol=1e-12)
     assert held.size == job.grasp.size
     assert (held.sigma, held.sigma_angle) == (pytest.approx(20e-6, rel=0.02), pytest.approx(0.2e-3, rel=0.02))
@@ -134,6 +141,6 @@ def test_the_more_corrections_are_left_the_less_is_one_content_with() -> None:
     sigma = 40e-6
     drawn = np.random.default_rng(7).rayleigh(sigma, 400_000)
     mean = sigma * math.sqrt(math.pi / 2)
-    assert hoped(drawn, 1) == pytest.approx(mean, rel=5e-3)
-    assert hoped(drawn, 2) == pytest.approx(mean * math.erf(mean / (sigma * math.sqrt(2))), rel=5e-3)
-    assert hoped(drawn, 3) < hoped(drawn, 2) - 4e-6
+    assert best_expected(drawn, 1) == pytest.approx(mean, rel=5e-3)
+    assert best_expected(drawn, 2) == pytest.approx(mean * math.erf(mean / (sigma * math.sqrt(2))), rel=5e-3)
+    assert best_expected(drawn, 3) < best_expected(drawn, 2) - 4e-6

@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, from_parts
-from cell.procedures.grasp import GRIPPED, held_so
+from cell.procedures.grasp import GRIPPED, job_with_grasp
 from lab.bench.job.whole_job import JobRecord
 from tests.support.unloading import JOB, unloaded
 
@@ -33,7 +33,7 @@ def test_a_part_that_sticks_is_let_go_where_it_lies(placed_pot: JobRecord, tmp_p
 def test_a_grasp_that_was_seen_is_known_to_that_and_to_what_closing_moves() -> None:
     held = from_parts((0.001, -0.002, 0.17), pin.exp3(np.array([0.01, -0.02, 0.5])))
     seen = np.diag([30e-6**2, 40e-6**2, 20e-6**2, 0.3e-3**2, 0.1e-3**2, 0.2e-3**2])
-    grasp = held_so(JOB, held, seen).grasp
+    grasp = job_with_grasp(JOB, held, seen).grasp
     assert np.allclose(grasp.flange_from_part.se3().homogeneous, held.homogeneous, atol=1e-12)
     assert grasp.sigma == float(np.sqrt(40e-6**2 + GRIPPED[1, 1]))
     assert grasp.sigma_angle == float(np.sqrt(0.3e-3**2 + GRIPPED[3, 3])) and grasp.size == JOB.grasp.size

@@ -24,10 +24,11 @@ from cell.procedures.arm import touch as touch_height
 from cell.procedures.arm.moves import PLACED, Mover, PartProgress, PartState
 from cell.procedures.arm.touch import TouchHeight
 from cell.procedures.drive.way import Whereabouts
+from cell.procedures.grasp import GraspSeries
 from cell.procedures.part_error import stated_bound
 from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
-from cell.procedures.steps.place import PlaceResult, Placing, _mated
+from cell.procedures.steps.place import AimedPlace, PlaceResult, Placing, _mated
 from cell.procedures.steps.workplace import Workplace
 from cell.run.report.report import place_error
 from cell.run.resumption import UnfinishedRun
@@ -364,6 +365,29 @@ def test_a_part_as_drawn_is_held_against_the_scanned_surface_before_it_goes_down
     with pytest.raises(RefusedError, match=told):
         site.do("place")
     assert site.cell.world.part.held
+
+
+def test_what_parts_had_alike_is_aimed_beside_where_the_part_fits_there(placed_pot: JobRecord, tmp_path: Path) -> None:
+    site, notes = with_part(placed_pot, tmp_path), list[str]()
+    site.tell = lambda event: notes.append(str(event.data.get("text")))
+    pose, aside, still = placed_pot.results["invert_pose"], from_parts((0.2e-3, 0.0, 0.0)), pin.SE3.Identity()
+
+    def aimed(by: pin.SE3, *slips: pin.SE3) -> AimedPlace:
+        site.work.series = GraspSeries().after(by, slips).after(by, slips)
+        return AimedPlace.of(site.work, pose).fitted(site.work, pose, site.context("place"))[0]
+
+    def touching(aim: AimedPlace) -> list[float]:
+        return [round(1e3 * float(lies.translation[0]), 3) for lies in aim.touching]
+
+    assert touching(aimed(aside)) == [0.0, -0.2], "nobody knows whether it is held so, or slips as the claw opens"
+    assert touching(aimed(aside, still)) == [0.0] and touching(aimed(aside, aside)) == [-0.2]
+    held = aimed(aside).job.grasp.flange_from_part.se3()
+    assert np.allclose(held.translation, (JOB.grasp.flange_from_part.se3() * aside).translation)
+    assert any("(+0.20, +0.00) mm and +0.0 mrad aside" in note for note in notes)
+    # So far aside it would meet the flanks of the surface.
+    far = aimed(from_parts((1.9e-3, 0.0, 0.0)))
+    assert far.allowed is None and touching(far) == [0.0]
+    assert any("which is not allowed for" in note for note in notes)
 
 
 def test_where_nothing_was_scanned_it_is_told_that_the_underside_was_not_looked_at(
