@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,7 +30,7 @@ from cell.procedures.arm.photograph import NO_REFERENCE, CalibrationView, interi
 from cell.procedures.calibrate.boards import PHOTO_RATE, Keep, look_for
 from cell.procedures.calibrate.verification import DRAWS, SHARE, SURE, at_place
 from cell.procedures.sweep.sweeping import home_rail
-from drivers.errors import CalibrationStale, Measured, RefusedError
+from drivers.errors import CalibrationStale, CellError, Measured, RefusedError
 from drivers.interfaces import Vector
 
 LOOKS = 4
@@ -175,8 +176,11 @@ def interim_check(
         carriage = devices.rail.move_to(view.rail_position)
         try:
             mover.to_view(view.base_from_flange)
-        finally:
-            carriage.wait(30.0)
+        except BaseException:
+            with suppress(CellError):
+                devices.rail.stop()
+            raise
+        carriage.wait(30.0)
         refusals = Counter[str]()
         seen = look_for(devices.scan_camera, fine, refusals, keep, f"interim-{len(looks) + 1}")
         if seen is None:

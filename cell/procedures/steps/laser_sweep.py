@@ -84,10 +84,10 @@ def laser_sweep(
         sweeping(collector, base_from_surface)
         swaths.append(sweep(plan, here.mover, devices, errors, collector))
     looked = counted and scan.mode == "rail"
-    return SweepRecord(tuple(swaths), doubts=look_at_count(devices, progress) if looked else ())
+    return SweepRecord(tuple(swaths), doubts=check_lost_steps(devices, progress) if looked else ())
 
 
-def look_at_count(devices: Devices, progress: Callable[[float, str], None]) -> tuple[str, ...]:
+def check_lost_steps(devices: Devices, progress: Callable[[float, str], None]) -> tuple[str, ...]:
     """Look whether the rail has lost steps, which its readings do not show: they are its counter's. For people, that
     this cannot be seen. Raises `DeviceFault` (rail.lost_steps)."""
     progress(0.99, "looking whether the rail has lost steps")

@@ -14,6 +14,7 @@ from cell.procedures.arm.moves import PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.grasp import GRIPPED
 from cell.procedures.steps.gripping import note_part, take
+from cell.procedures.steps.laser_sweep import check_lost_steps
 from cell.procedures.steps.place import carried_on
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace
@@ -60,6 +61,8 @@ def _at(here: Workplace, context: StepContext) -> HeldPart:
         # Whoever has the run held may reach in, and move the part.
         if context.held_s == before:
             break
+    if job.scan.mode == "rail":
+        check_lost_steps(here.devices, lambda _, text: context.progress(0.05, text))
     for note in look.notes:
         context.note(text=note)
     grip = pose.base_from_surface * job.place.surface_from_part.se3() * job.grasp.flange_from_part.se3().inverse()

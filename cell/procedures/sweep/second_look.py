@@ -18,7 +18,7 @@ from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.calibrate.reference_plate import configure_fast
 from cell.procedures.steps.board_photo import require_unmoved as require_board_unmoved
-from cell.procedures.steps.laser_sweep import head_at, laser_sweep, look_at_count
+from cell.procedures.steps.laser_sweep import check_lost_steps, head_at, laser_sweep
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
@@ -69,7 +69,7 @@ def require_in_place(
     found, creep = _swept_again(here, fix, sweep, scan=scan, pose=pose, context=context)
     if found.moved and here.job.scan.mode == "rail":
         # Steps that the rail has lost look like a surface that moved.
-        look_at_count(here.devices, lambda _, text: context.progress(0.04, text))
+        check_lost_steps(here.devices, lambda _, text: context.progress(0.04, text))
     require_unmoved(found)
     tolerance = Tolerance(place.tolerance, place.tolerance_angle)
     hidden = tuple(found.hidden(pose.base_from_surface, tolerance, here.nominal.radius))
