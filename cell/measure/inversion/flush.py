@@ -18,8 +18,8 @@ from cell.measure.inversion.disagreement import STEEPEST, spread_for_journal, sp
 from cell.measure.inversion.nominal import Array, NominalSurface
 from cell.measure.reconstruction.cloud import Cloud
 
-REACH_M = 4.5e-3
-"""Farther from what is drawn a point belongs to something else, such as to the surface below a part's rim."""
+REACH_M = 6e-3
+"""Farther from what is drawn a point belongs to something else."""
 BESIDE_M = 6e-3
 """A piece of the edge is held against what lies nearer than this."""
 NOISY = 0.5
@@ -76,7 +76,7 @@ def flush_along_edge(
     at `base_from_surface`. Pieces are noisy by the place's `tolerance`, m. The vehicle `rocks` by so much, m, up and
     down: a piece and what is beside it may be swept at opposite ends of that. None where none says anything.
     """
-    own = _standing(part, base_from_surface, lies, faces)
+    own = _standing(part, base_from_surface, lies, faces, below=nominal)
     other = _standing(beside, base_from_surface, pin.SE3.Identity(), nominal)
     if own is None or other is None:
         return None
@@ -102,14 +102,22 @@ class _Squares(NamedTuple):
 
 
 def _standing(
-    cloud: Cloud, base_from_surface: pin.SE3, surface_from_it: pin.SE3, drawn: NominalSurface
-) -> _Squares | None:
-    """How much higher than `drawn` its points in the cloud stand, in squares of 2 mm of the surface; None for none."""
+    cloud: Cloud, base_from_surface: pin.SE3, surface_from_it: pin.SE3, drawn: NominalSurface,
+    below: NominalSurface | None = None,
+) -> _Squares | None:  # fmt: skip
+    """How much higher than `drawn` its points in the cloud stand, in squares of 2 mm of the surface; None for none.
+
+    What is nearer to the surface `below` is not its own: that shows below a part's rim.
+    """
     lines, rows = np.nonzero(cloud.valid)
     places = (cloud.points[lines, rows] - base_from_surface.translation) @ base_from_surface.rotation
     index, feet = drawn.feet((places - surface_from_it.translation) @ surface_from_it.rotation, REACH_M)
     up = feet.normals @ surface_from_it.rotation[2]
     kept = feet.inner & (up > STEEPEST)
+    if below is not None:
+        apart, (near, found) = np.full(len(places), np.inf), below.feet(places, REACH_M)
+        apart[near] = np.abs(found.heights)
+        kept &= np.abs(feet.heights) < apart[index]
     if not kept.any():
         return None
     index = index[kept]

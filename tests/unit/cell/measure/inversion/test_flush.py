@@ -165,3 +165,12 @@ def test_a_piece_whose_points_disagree_says_nothing() -> None:
     found = flush(replace(cloud, points=local @ TRUE.rotation.T + TRUE.translation))
     assert found.beyond < 0.0 and np.abs(found.higher).max() < 0.1e-3
     assert not ((found.places[:, 0] > 0.013) & (np.abs(found.places[:, 1]) < 0.004)).any()
+
+
+@pytest.mark.parametrize("thick", [0.003, 0.0045, 0.0059, 0.0061])
+def test_the_surface_below_a_rim_is_no_part_of_it(thick: float) -> None:
+    """A part that is drawn 3 mm longer than it is: there the surface shows through its drawn top."""
+    found = looked(
+        scanned(lambda x, y: np.where(np.abs(x) < HALF - 3e-3, thick, 0.0), 5), belongs=from_parts((0.0, 0.0, thick))
+    )
+    assert found is None or np.abs(found.higher).max() < 0.1e-3
