@@ -61,8 +61,8 @@ def write_changes(path: Path, changes: Mapping[str, str]) -> Path:
         backup = _free(path)
         shutil.copy2(path, backup)
         with replacing(path) as file:
+            shutil.copymode(path, file.name)
             file.write(new.encode())
-        shutil.copymode(backup, path)
     except OSError as error:
         raise ConfigError(f"{path} cannot be changed: {error.strerror or error}; see its permissions") from error
     return backup

@@ -82,9 +82,10 @@ class SimulatedPerson(Person):
 
     def does(self, task: str, by_itself: Callable[[], None] | None = None) -> bool:
         """See `Person.does`."""
+        agreed = super().does(task)
         if by_itself is not None:
             by_itself()
-        return super().does(task)
+        return agreed
 
 
 class SlowMover(Mover):

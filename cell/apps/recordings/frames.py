@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components
 
 from cell.apps.recordings.result import Figures
 from cell.apps.recordings.series import Listing, frame_key
-from cell.apps.recordings.stripes import ChosenChannel, ReadStripe, Source, choose_channel, read_on_board
+from cell.apps.recordings.stripes import ChosenChannel, ReadStripe, Source, calmest, choose_channel, read_on_board
 from cell.apps.recordings.texts import PICTURES
 from cell.measure.geometry.poses import difference, mean
 from cell.measure.vision.board.board import find_board
@@ -50,6 +50,7 @@ AT_POINTS, NEAR_PX = 0.6, 6
 # other numbers are one view when they differ by the second, which is what noise and another file format make. Views
 # whose middles differ by more than the third are not compared.
 SAME_PLACE_PX, SAME_VIEW_PX, FAR_PX = 2.0, 0.1, 20.0
+STRAIGHTENED = re.compile(r"undist|rectif|remap|straight", re.IGNORECASE)
 LASER_WORDS = re.compile(r"laser|stripe|(?<![a-z])(?:line|las|on)(?![a-z])")
 OFF_WORDS = re.compile(r"(?<![a-z])(?:off|no|without)(?![a-z])|laseroff|nolaser")
 # Two pictures are of one stop when their boards lie at the same pixels, as well as a corner is found in a poor
@@ -180,7 +181,11 @@ def _refuse_same_files(frames: Sequence[RecordedFrame]) -> None:
 
 
 def _refuse_drawn(frames: Sequence[RecordedFrame], small: Sequence[Small | None]) -> None:
-    """Refuse frames that are others with corners, axes or markers drawn in; `small` copies (n,) by frame."""
+    """Refuse frames that are others with something drawn in, or straightened; `small` copies (n,) by frame.
+
+    Corners, axes and markers are found by their pixels. A straightened copy differs everywhere a little: there its name
+    has to say it, too.
+    """
     coloured = cache(_has_colour)
     for frame, mine in zip(frames, small, strict=True):
         for other, its in zip(frames, small, strict=True):
@@ -188,9 +193,14 @@ def _refuse_drawn(frames: Sequence[RecordedFrame], small: Sequence[Small | None]
                 continue
             if np.abs(mine - its).mean() > ALIKE_DN:
                 continue
-            if not frame.lit and coloured(frame.path) and _drawn_into(frame, other):
-                frame.shows = other
-                frame.refuse(Reason.DUPLICATE, f"it is {other.name} with lines drawn into it")
+            if STRAIGHTENED.search(frame.name) and not STRAIGHTENED.search(other.name):
+                text = f"by its name it is {other.name}, straightened"
+            elif not frame.lit and coloured(frame.path) and _drawn_into(frame, other):
+                text = f"it is {other.name} with lines drawn into it"
+            else:
+                continue
+            frame.shows = other
+            frame.refuse(Reason.DUPLICATE, text)
 
 
 def _has_colour(path: Path) -> bool:
@@ -255,10 +265,10 @@ class _Place:
         return [f.path for f in self.others if f.dark]
 
     def sources(self) -> list[tuple[RecordedFrame, Source]]:
-        """Where the stripe may be, each with a picture without the laser: that which says so, or the board's."""
+        """Where the stripe may be, each with the picture without the laser that takes most of the board away."""
         lit = [f for f in self.others if f.lit] or [f for f in self.others if not f.dark]
-        off = next(iter(self.dark), self.board.path)
-        return [(f, Source(f.path, self.view, off)) for f in lit]
+        offs = [*self.dark, self.board.path]
+        return [(f, Source(f.path, self.view, calmest(f.path, offs, self.view))) for f in lit]
 
 
 def _find_places(frames: Sequence[RecordedFrame], links: Sequence[dict[str, str]]) -> list[_Place]:

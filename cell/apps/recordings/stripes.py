@@ -232,6 +232,16 @@ def _needed(white: float) -> float:
     return min(LASER_OVER_WHITE * max(white, 0.0) + OVER_DN, SATURATED_DN)
 
 
+def calmest(path: Path, offs: Sequence[Path], view: BoardView) -> Path:
+    """Of pictures without the laser, one or more, the one that takes most of the board away from the picture `path`."""
+    source = Source(path, view)
+    image = source.picture() if len(offs) > 1 else None
+    if image is None:
+        return offs[0]
+    sheet = source.sheet()
+    return min(offs, key=lambda off: _without(image, off, sheet)[1])
+
+
 def _without(image: Shot, path: Path, sheet: NDArray[np.bool_]) -> tuple[Shot | None, float]:
     """The picture without the laser, and the share of what varies on the board that is left when it is taken off."""
     try:

@@ -58,6 +58,18 @@ def test_pictures_that_a_program_drew_into_are_set_aside_by_their_pixels(tmp_pat
     }
 
 
+def test_a_straightened_copy_is_no_view_of_its_own(tmp_path, pictures):
+    for name in ("frame03", "frame04"):
+        image = cv2.imread(str(pictures / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(tmp_path / f"{name}.png"), image)
+        focal = np.array([[1500.0, 0, image.shape[1] / 2], [0, 1500.0, image.shape[0] / 2], [0, 0, 1]])
+        cv2.imwrite(str(tmp_path / f"{name}_undistorted.png"), cv2.undistort(image, focal, np.array([-0.05, 0, 0, 0])))
+    frames, _ = read_frames(list_folder(tmp_path), BOARD, laser=None)
+    assert {f.name: f.text for f in frames if f.reason is not None} == {
+        f"{name}_undistorted.png": f"by its name it is {name}.png, straightened" for name in ("frame03", "frame04")
+    }
+
+
 def test_pictures_without_colour_are_not_compared_in_full(tmp_path, pictures, monkeypatch):
     """Dark ones look alike when small; to compare each two of them took most of a plan's time."""
     image = cv2.imread(str(pictures / "frame04.png"), cv2.IMREAD_GRAYSCALE)

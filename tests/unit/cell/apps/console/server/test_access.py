@@ -118,6 +118,17 @@ def test_a_browser_that_says_that_another_site_asks_is_refused(server: Served) -
     assert server.ask("GET", "/api/cell", sec_fetch_site="same-origin").status == 200
 
 
+@pytest.mark.parametrize("headers", [{"cookie": "x=y"}, {"host": "evil.example"}])
+def test_the_live_link_asks_the_same(server: Served, headers: dict[str, str]) -> None:
+    request = {"Host": server.host, "Cookie": server.cookie, "Origin": server.origin}
+    request["Sec-WebSocket-Protocol"] = f"cell, {server.key}"
+    request |= {name.title(): value for name, value in headers.items()}
+    lines = [f"{name}: {value}" for name, value in request.items()]
+    upgrade = ["GET /live HTTP/1.1", "Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
+    said = server.raw("\r\n".join([*upgrade, "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", *lines, "", ""]).encode())
+    assert said.startswith(b"HTTP/1.1 403")
+
+
 def test_the_token_is_in_no_output_and_no_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with serving(tmp_path, TOKEN) as server:
         for path in (f"/enter?token={TOKEN}x", f"/nowhere?token={TOKEN}", f"/static/{TOKEN}", f"/api/runs/{TOKEN}"):
