@@ -20,6 +20,8 @@ from cell.measure.reconstruction.cloud import Cloud
 
 REACH_M = 6e-3
 """Farther from what is drawn a point belongs to something else."""
+UPRIGHT_M = 0.5e-3
+"""So far at most is a point, moved down or up by what it is higher, from what is drawn there."""
 BESIDE_M = 6e-3
 """A piece of the edge is held against what lies nearer than this."""
 NOISY = 0.5
@@ -76,7 +78,7 @@ def flush_along_edge(
     at `base_from_surface`. Pieces are noisy by the place's `tolerance`, m. The vehicle `rocks` by so much, m, up and
     down: a piece and what is beside it may be swept at opposite ends of that. None where none says anything.
     """
-    own = _standing(part, base_from_surface, lies, faces, below=nominal)
+    own = _standing(part, base_from_surface, lies, faces)
     other = _standing(beside, base_from_surface, pin.SE3.Identity(), nominal)
     if own is None or other is None:
         return None
@@ -102,24 +104,20 @@ class _Squares(NamedTuple):
 
 
 def _standing(
-    cloud: Cloud, base_from_surface: pin.SE3, surface_from_it: pin.SE3, drawn: NominalSurface,
-    below: NominalSurface | None = None,
-) -> _Squares | None:  # fmt: skip
-    """How much higher than `drawn` its points in the cloud stand, in squares of 2 mm of the surface; None for none.
-
-    What is nearer to the surface `below` is not its own: that shows below a part's rim.
-    """
+    cloud: Cloud, base_from_surface: pin.SE3, surface_from_it: pin.SE3, drawn: NominalSurface
+) -> _Squares | None:
+    """How much higher than `drawn` its points in the cloud stand, in squares of 2 mm of the surface; None for none."""
     lines, rows = np.nonzero(cloud.valid)
     places = (cloud.points[lines, rows] - base_from_surface.translation) @ base_from_surface.rotation
     index, feet = drawn.feet((places - surface_from_it.translation) @ surface_from_it.rotation, REACH_M)
     up = feet.normals @ surface_from_it.rotation[2]
     kept = feet.inner & (up > STEEPEST)
-    if below is not None:
-        apart, (near, found) = np.full(len(places), np.inf), below.feet(places, REACH_M)
-        apart[near] = np.abs(found.heights)
-        kept &= np.abs(feet.heights) < apart[index]
-    if not kept.any():
+    index, higher = index[kept], feet.heights[kept] / up[kept]
+    # A point of the part's side is below the rim of its top. Where that slopes, its foot lies well inside of the rim.
+    upright = places[index] - np.outer(higher, [0.0, 0.0, 1.0])
+    near, feet = drawn.feet((upright - surface_from_it.translation) @ surface_from_it.rotation, UPRIGHT_M)
+    index, higher = index[near][feet.inner], higher[near][feet.inner]
+    if not len(index):
         return None
-    index = index[kept]
-    medians, higher, noise = squares(square_of(places[index]), feet.heights[kept] / up[kept], lines[index])
+    medians, higher, noise = squares(square_of(places[index]), higher, lines[index])
     return _Squares(places[index[medians]], higher, noise) if len(medians) else None

@@ -167,10 +167,17 @@ def test_a_piece_whose_points_disagree_says_nothing() -> None:
     assert not ((found.places[:, 0] > 0.013) & (np.abs(found.places[:, 1]) < 0.004)).any()
 
 
-@pytest.mark.parametrize("thick", [0.003, 0.0045, 0.0059, 0.0061])
-def test_the_surface_below_a_rim_is_no_part_of_it(thick: float) -> None:
-    """A part that is drawn 3 mm longer than it is: there the surface shows through its drawn top."""
-    found = looked(
-        scanned(lambda x, y: np.where(np.abs(x) < HALF - 3e-3, thick, 0.0), 5), belongs=from_parts((0.0, 0.0, thick))
-    )
-    assert found is None or np.abs(found.higher).max() < 0.1e-3
+def test_the_side_of_a_part_below_its_sloped_top_is_no_piece_of_that() -> None:
+    """Its points lie at the rim; their feet on the top, which rises towards it, lie well inside."""
+    thick, slope = 0.004, np.tan(0.3)
+    belongs = pin.SE3(pin.rpy.rpyToMatrix(0.0, -0.3, 0.0), np.array([0.0, 0.0, thick]))
+    cloud = scanned(lambda x, y: np.where(np.abs(x) < HALF, thick + slope * x, 0.0 * y), 5)
+    local = (cloud.points - TRUE.translation) @ TRUE.rotation
+    side = (local[..., 0] > HALF - 2e-3) & (local[..., 0] < HALF)
+    local[side, 0] = HALF - 0.1e-3
+    local[side, 2] = thick + slope * HALF - np.random.default_rng(4).uniform(3.5e-3, 3.6e-3, int(side.sum()))
+    found = flush(
+        replace(cloud, points=local @ TRUE.rotation.T + TRUE.translation), faces=plate(HALF / np.cos(0.3)),
+        belongs=belongs,
+    )  # fmt: skip
+    assert found.beyond < 0.0 and np.abs(found.higher).max() < 0.1e-3
