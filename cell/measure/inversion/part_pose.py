@@ -7,6 +7,7 @@ Where too little of the surface shows, it is taken to lie where an earlier sweep
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -109,16 +110,22 @@ def find_part(
         beside = _surface_beside(around, nominal, surface, moved, rocked)
         return _against(beside, on_part, faces, belongs, tolerance=tolerance, moved=moved, rocked=rocked)
 
-    still = found(None)
-    rocking = find_rocking(on_part, faces, still.fit.base_from_surface, times)
-    if rocking is None:
-        return still
-    steady = found(
-        lambda lines, rows: rocking_motions(
-            cloud, lines, rows, base_from_vehicle=base_from_vehicle, times=times, hz=rocking.hz
-        )
-    )
-    return replace(steady, rocked=rocking.height)
+    def steadied(pose: pin.SE3) -> PartPose | None:
+        rocking = find_rocking(on_part, faces, pose, times)
+        if rocking is None:
+            return None
+        motions = partial(rocking_motions, cloud, base_from_vehicle=base_from_vehicle, times=times, hz=rocking.hz)
+        return replace(found(motions), rocked=rocking.height)
+
+    try:
+        still = found(None)
+    except RefusedError as refused:
+        # The waves of a vehicle that rocks are much for a quarter of a small part.
+        pose = refused.seen.get("pose")
+        if not isinstance(pose, pin.SE3) or (steady := steadied(pose)) is None:
+            raise
+        return steady
+    return steadied(still.fit.base_from_surface) or still
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.second_look import SecondLook, require_in_place
 from cell.procedures.sweep.stored_sweep import SweepRecord
-from drivers.errors import CellError, DeviceFault, Measured, NotObservable, RefusedError
+from drivers.errors import CellError, Measured, NotObservable, RefusedError
 from drivers.interfaces import Arm, ArmState, Claw, Vector
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
@@ -266,12 +266,9 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
     )  # fmt: skip
     try:
         done = placing.put_down(not here.looks_after)
-    except RefusedError as refused:
+    except RefusedError:
         # Steps that the rail has lost explain a touch that comes early: they are told first.
-        try:
-            placing.ready()
-        except DeviceFault as lost:
-            raise lost from refused
+        placing.ready()
         raise
     done = replace(done, look=look, pose=pose, mating=mating)
     if aim.allowed is not None:
