@@ -139,7 +139,8 @@ class RailLink(ABC):
         rest = b""
         self._port.timeout = QUIET_S
         try:
-            while (more := bytes(self._port.read(256))) and time.monotonic() < end:
+            # All that is there, and no more: it would wait for the rest of what was asked for, and a stop waits for it.
+            while (more := bytes(self._port.read(max(1, min(256, self._port.in_waiting))))) and time.monotonic() < end:
                 rest += more
         finally:
             self._port.timeout = self._timeout
