@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from typing import Any, TypeVar
 
 Task = tuple[Any, ...]
@@ -32,6 +32,11 @@ def over_cores(tasks: Sequence[Task], workers: int = 0) -> Iterator[tuple[int, A
         waiting = {pool.submit(task[0], *task[1:]): number for number, task in enumerate(tasks)}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
+    except BaseException:
+        # A worker that was killed may hold the queue on which the others wait, and those keep SIGTERM for their runs.
+        for worker in active_children():
+            worker.kill()
+        raise
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 

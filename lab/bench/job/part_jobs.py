@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import tomlkit
 import trimesh
 from numpy.typing import NDArray
 
@@ -59,9 +60,10 @@ def job_with_part(
     assert np.allclose(job.place.surface_from_part.se3().homogeneous, np.eye(4))
     surface = within(*read_mesh(mesh, job.surface.mesh_unit), half)
     body(*surface, changed, flat=flat).export(folder / f"{name}-part.ply")
-    (folder / f"{name}.ply").write_bytes(mesh.read_bytes())
-    text = job_path(name).read_text(encoding="utf-8")
+    (folder / mesh.name).write_bytes(mesh.read_bytes())
+    described = tomlkit.parse(job_path(name).read_text(encoding="utf-8"))
+    described["place"].update({"verify": verify, **tomlkit.parse(also)})
+    described["part"] = {"mesh": f"{name}-part.ply", "mesh_unit": "m"}
     path = folder / f"{name}.toml"
-    text = text.replace("\n[place]\n", f'\n[place]\nverify = "{verify}"\n{also}\n')
-    path.write_text(f'{text}\n[part]\nmesh = "{name}-part.ply"\nmesh_unit = "m"\n', encoding="utf-8")
+    path.write_text(tomlkit.dumps(described), encoding="utf-8")
     return path
