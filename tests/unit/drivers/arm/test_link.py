@@ -125,7 +125,10 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
             prompt = promptly()
             bench.ask("late_states")
             assert soon(lambda: lateness(arm, prompt) > 0.08 * rate)
-            late = min((arm.latch_clock() for _ in range(4)), key=lambda latch: latch.bound)
+            # What a controller that was held up stamped before it was asked is no latch of its clock.
+            begun = prompt.device - prompt.host
+            latches = (latch for _ in range(40) if (latch := arm.latch_clock()).device > latch.before + begun - 0.002)
+            late = min(islice(latches, 4), key=lambda latch: latch.bound)
             # The states show nothing of it, but half of their lateness of 0.1 s is what is not known now.
             # On a busy machine some of them are less late.
             assert 0.03 * rate < late.bound < 0.06 * rate
