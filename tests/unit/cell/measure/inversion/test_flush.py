@@ -176,8 +176,6 @@ def test_the_side_of_a_part_below_its_sloped_top_is_no_piece_of_that() -> None:
     side = (local[..., 0] > HALF - 2e-3) & (local[..., 0] < HALF)
     local[side, 0] = HALF - 0.1e-3
     local[side, 2] = thick + slope * HALF - np.random.default_rng(4).uniform(3.5e-3, 3.6e-3, int(side.sum()))
-    found = flush(
-        replace(cloud, points=local @ TRUE.rotation.T + TRUE.translation), faces=plate(HALF / np.cos(0.3)),
-        belongs=belongs,
-    )  # fmt: skip
+    cloud = replace(cloud, points=local @ TRUE.rotation.T + TRUE.translation)
+    found = flush(cloud, faces=plate(HALF / np.cos(0.3)), belongs=belongs)
     assert found.beyond < 0.0 and np.abs(found.higher).max() < 0.1e-3
