@@ -105,7 +105,7 @@ class GraspSeries:
         return _alike(self.aside, points, noise)
 
     def slip(self, points: Vector, noise: float) -> pin.SE3 | None:
-        """How a part moves as the claw opens over it, be it not at all; None where the parts do not tell."""
+        """How a part moves as the claw opens over it, the identity for not at all; None where the parts do not tell."""
         return None if len(self.opening) < 2 else _alike(self.opening, points, noise) or pin.SE3.Identity()
 
 
