@@ -75,10 +75,6 @@ def moved(motion: pin.SE3, points: Vector) -> float:
     return float(np.linalg.norm(transform(motion, points) - points, axis=1).mean())
 
 
-def _none() -> Vector:
-    return np.zeros((0, 3))
-
-
 @dataclass(frozen=True, eq=False)
 class GraspSeries:
     """How the newest parts of a batch came to lie along the surface: x and y in m and the turn in rad, part frame, from
@@ -88,8 +84,8 @@ class GraspSeries:
     that were placed again, of which it was seen before how they were held.
     """
 
-    aside: Vector = field(default_factory=_none)
-    opening: Vector = field(default_factory=_none)
+    aside: Vector = field(default_factory=lambda: np.zeros((0, 3)))
+    opening: Vector = field(default_factory=lambda: np.zeros((0, 3)))
 
     def after(self, came: pin.SE3, slips: Sequence[pin.SE3]) -> GraspSeries:
         """With one part more, which first `came` to lie so, and in its corrections by `slips`."""

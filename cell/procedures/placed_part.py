@@ -24,6 +24,7 @@ SURE_PERCENT = 99.9
 CLEARLY = 3.0
 """Standard deviations of the stated place beyond which a part has not come to lie so by chance."""
 FLUSH = "flush, beyond its noise"
+ROCKED = "the vehicle rocked by {:.2f} mm in the sweep of the part, or its top has such waves: they were taken out"
 NO_FLUSH = "how flush its edge is was not seen: no surface shows near it, or a vehicle that rocks moves both by more"
 BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
@@ -233,6 +234,7 @@ class PlacedPart:
         more = f"that is farther off than was stated before it was put down: most likely {self.likely}"
         return (
             f"the placed part lies {self.words}",
+            *((ROCKED.format(1e3 * self.seen.rocked),) if self.seen.rocked else ()),
             *(self.flush.notes if self.flush else (NO_FLUSH,) * bool(self.seen.beside)),
             *((more,) if np.abs(self._times).max() > CLEARLY else ()),
             *(f"not seen of the placed part: {motion}" for motion in self.unseen),

@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import active_children, get_context
 from typing import Any, TypeVar
+
+from statemachine.watch import SignalInterrupt
 
 Task = tuple[Any, ...]
 """A function and what it is called with."""
@@ -32,7 +35,7 @@ def over_cores(tasks: Sequence[Task], workers: int = 0) -> Iterator[tuple[int, A
         waiting = {pool.submit(task[0], *task[1:]): number for number, task in enumerate(tasks)}
         for future in as_completed(waiting):
             yield waiting[future], future.result()
-    except BaseException:
+    except (BrokenProcessPool, KeyboardInterrupt, SignalInterrupt):
         # A worker that was killed may hold the queue on which the others wait, and those keep SIGTERM for their runs.
         for worker in active_children():
             worker.kill()

@@ -140,6 +140,7 @@ def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(
     error = difference(found.seen.surface_from_part, moved(0.1e-3, z=0.05e-3))
     assert np.linalg.norm(error[:3]) < 0.03e-3 and np.abs(error[3:]).max() < 0.3e-3
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
+    assert any("rocked by 0.1" in note or "rocked by 0.08" in note for note in found.notes)
     if found.flush is None:
         assert much > 1.0 and NO_FLUSH in found.notes
         return
