@@ -9,13 +9,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from cell.config.job import Job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.inversion import NominalSurface
+from cell.measure.inversion.effects.between_sweeps import SurfaceMotion
 from cell.motion.kinematics import HOME
 from cell.procedures.steps.kinds import kind_of
+from cell.procedures.sweep import second_look
+from cell.procedures.sweep.second_look import require_unmoved
 from lab.bench.job.whole_job import JobRecord, NoFrames
 from statemachine.control import RunControl
 from statemachine.runner import Event, StepContext
@@ -70,3 +74,14 @@ class AtStation:
     def ended(self) -> JobRecord:
         """The record of what was done here instead, with the world's truth now."""
         return replace(self.record, results=self.made, rests=np.array(self.cell.arm.rests), at_end=self.cell.truth())
+
+
+def lose_few_steps_after_the_look(patch: pytest.MonkeyPatch, cell: Callable[[], VirtualCell]) -> None:
+    """Have the cell's rail lose .09 mm where it stands after the second look, whose lines do not show as little."""
+
+    def after_the_look(moved: SurfaceMotion) -> None:
+        rail, now = cell().world.rail, cell().clock.now()
+        rail.set_position(now, rail.position(now) + round(0.09e-3 * 200 * 256 / 0.002))
+        require_unmoved(moved)
+
+    patch.setattr(second_look, "require_unmoved", after_the_look)

@@ -127,7 +127,9 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
             assert soon(lambda: lateness(arm, prompt) > 0.08 * rate)
             # What a controller that was held up stamped before it was asked is no latch of its clock.
             begun = prompt.device - prompt.host
-            latches = (latch for _ in range(40) if (latch := arm.latch_clock()).device > latch.before + begun - 0.002)
+            latches = (
+                latch for _ in range(40) if (latch := arm.latch_clock()).device > latch.before + begun - 0.002 * rate
+            )
             late = min(islice(latches, 4), key=lambda latch: latch.bound)
             # The states show nothing of it, but half of their lateness of 0.1 s is what is not known now.
             # On a busy machine some of them are less late.

@@ -13,14 +13,12 @@ from cell import Cell
 from cell.config.calibrations.store import save_calibration
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix
-from cell.measure.inversion.effects.between_sweeps import SurfaceMotion
-from cell.procedures.sweep import second_look
-from cell.procedures.sweep.second_look import require_unmoved
 from cell.run.record.replay import replay
 from cell.run.report.page.make import make_page
 from drivers.errors import ConfigError
 from lab.bench.job.whole_job import JobRecord
 from statemachine.step import Event
+from tests.support.at_station import lose_few_steps_after_the_look
 from tests.support.unloading import JOB, Change, unloaded
 
 
@@ -52,15 +50,8 @@ def test_a_part_is_taken_from_its_surface_into_its_nest(placed_pot: JobRecord, t
 def test_steps_that_the_rail_lost_are_found_before_the_grip(
     placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """So few that the second look does not show them, lost where the rail stands after it."""
     cells: list[VirtualCell] = []
-
-    def lost(moved: SurfaceMotion) -> None:
-        rail, now = cells[0].world.rail, cells[0].clock.now()
-        rail.set_position(now, rail.position(now) + round(0.09e-3 * 200 * 256 / 0.002))
-        require_unmoved(moved)
-
-    monkeypatch.setattr(second_look, "require_unmoved", lost)
+    lose_few_steps_after_the_look(monkeypatch, lambda: cells[0])
     done = unloaded(placed_pot, cells.append)
     assert (done.outcome, done.stage) == ("faulted", "pick") and "lost steps" in done.reason
     assert not cells[0].world.part.held

@@ -22,22 +22,14 @@ from cell.measure.reconstruction.cloud import Filled
 from cell.procedures.arm.touch import felt_touch
 from cell.procedures.steps import place as place_step
 from cell.procedures.sweep import second_look
-from cell.procedures.sweep.second_look import (
-    LINES,
-    SecondLook,
-    by_times,
-    require_in_place,
-    require_points,
-    require_unmoved,
-    sparse,
-)
+from cell.procedures.sweep.second_look import LINES, SecondLook, by_times, require_in_place, require_points, sparse
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION
 from drivers.errors import CellError, DeviceFault, LimitError, NotObservable, RefusedError
 from lab.bench.job.scan_errors import own_base
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.world import World
 from statemachine.runner import Event
-from tests.support.at_station import AtStation
+from tests.support.at_station import AtStation, lose_few_steps_after_the_look
 from tests.support.report_runs import NAMES, changed, pot
 
 
@@ -218,15 +210,8 @@ def test_a_few_steps_that_the_rail_lost_are_found_before_the_part_touches(
 ) -> None:
     """As few do not show in the lines: the count is looked at while the arm comes down."""
     heard: list[str] = []
-
-    def lost(moved: SurfaceMotion) -> None:
-        """After the sweep, where the rail stands."""
-        rail, now = site.cell.world.rail, site.cell.clock.now()
-        rail.set_position(now, rail.position(now) + round(0.09e-3 * 200 * 256 / 0.002))
-        require_unmoved(moved)
-
-    monkeypatch.setattr(second_look, "require_unmoved", lost)
     site = AtStation(placed_pot, tmp_path, tell=lambda event: heard.append(str(event.data.get("text"))))
+    lose_few_steps_after_the_look(monkeypatch, lambda: site.cell)
     with pytest.raises(DeviceFault, match="lost steps"):
         site.do("place")
     assert "descending" in heard and "feeling for contact" not in heard
