@@ -73,8 +73,10 @@ def _kind(job: Job) -> Iterator[str]:
         yield f'job.kind "{kind.name}" finds the part by its mesh and takes it to the vehicle: give [part] and [nest]'
     if kind.unloads and job.place.verify == "none":
         yield f'place.verify = "none": job.kind "{kind.name}" looks at the part in its nest; write "all" or "seen"'
-    if not kind.unloads and job.nest is not None:
-        yield f'[nest]: job.kind "{kind.name}" sets no part down there; write kind = "unload", or no nest'
+    if kind.loads and (job.part is None or job.nest is None):
+        yield f'job.kind "{kind.name}" finds the part by its mesh in its nest: give [part] and [nest]'
+    if not kind.unloads and not kind.loads and job.nest is not None:
+        yield f'[nest]: job.kind "{kind.name}" has no use for it; write kind = "load" or "unload", or no nest'
     if job.part is None and verify.STEP.name in kind.names:
         yield f'job.kind "{kind.name}" looks at the placed part: give its mesh in [part]'
 

@@ -70,7 +70,7 @@ def contact_problems(job: Job, config: CellConfig, mesh: Path) -> Iterator[str]:
             f"place.contact_travel {1e3 * place.contact_travel:g} mm is less than three times grasp.sigma: the part "
             f"would often not touch within it (allowed: at least {3e3 * grasp.sigma:g} mm)"
         )
-    if job.nest is not None and place.contact_travel < 3 * job.nest.sigma:
+    if job.unloads and job.nest is not None and place.contact_travel < 3 * job.nest.sigma:
         yield (
             f"place.contact_travel {1e3 * place.contact_travel:g} mm is less than three times nest.sigma: the part "
             f"would often not touch within it (allowed: at least {3e3 * job.nest.sigma:g} mm)"

@@ -131,11 +131,13 @@ def _goals(job: Job, config: CellConfig) -> Iterator[Goal]:
     ):
         yield what, part * from_parts((0.0, 0.0, height)) * part_from_flange, touching
     if job.nest is not None:
-        for what, height in (("above the nest", job.place.approach), ("in the nest", -job.place.contact_travel)):
+        below = job.place.contact_travel if job.unloads else 0.0
+        for what, height in (("above the nest", job.place.approach), ("in the nest", -below)):
             nest = job.nest.base_from_part.se3() * from_parts((0.0, 0.0, height))
             yield f"the pose {what} (nest.base_from_part)", nest * part_from_flange, ()
         yield from _sweeps(job, config, job.nest.base_from_part.se3(), over="the part in its nest")
-        return
+        if job.unloads:
+            return
     try:
         faces = seen_faces(job)
     except ConfigError:

@@ -27,6 +27,9 @@ LEAST_LINES, MOST_LINES = 10, 20_000
 LONGEST_SWEEP_S = 100.0
 """The step of the laser sweep has 120 s."""
 
+LOAD = "load"
+"""The kind of job that takes its part from a nest on the vehicle."""
+
 Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
 Share = Annotated[float, number(-1, 1)]
 """Of a direction, along one axis."""
@@ -209,7 +212,8 @@ class PlaceSection(Table):
 
 
 class NestSection(Table):
-    """Where on the vehicle an unloaded part comes to lie, how exactly the arm finds that, and how exactly it lies."""
+    """Where on the vehicle the part lies that is to be loaded, or comes to lie that is unloaded; how exactly the arm
+    finds that, and how exactly it lies."""
 
     base_from_part: Mounting
     sigma: Annotated[float, quantity("mm", 0.01, 5)] = 2e-4
@@ -247,6 +251,11 @@ class Job(Table):
     def _distinct_obstacles(self) -> Self:
         once_each("obstacle", self.obstacle)
         return self
+
+    @property
+    def unloads(self) -> bool:
+        """Whether the part lies on the surface at first, and is set down in the nest."""
+        return self.nest is not None and self.job.kind != LOAD
 
     @property
     def place_from_board(self) -> pin.SE3:

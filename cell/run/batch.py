@@ -179,7 +179,7 @@ def _known_after(series: GraspSeries, last: RunOutcome) -> GraspSeries:
 
 def _skipped(here: Opened, job: Job, last: RunOutcome) -> bool:
     """Whether the batch goes on after this end: nobody knows how a part lies that is down and was refused."""
-    there = PartState.HELD if job.nest is None else PartState.LIES
+    there = PartState.first(job)
     untouched = last.report.get("part") == there.value and (job.nest is not None or here.devices.claw.holding)
     return last.outcome == "refused" and untouched and job.batch.on_refusal != "end"
 
@@ -201,7 +201,8 @@ def _question(here: Opened, job: Job, part: str, last: RunOutcome) -> Callable[[
                 claw.release()
         ready = "and step back: the arm moves next"
         if by_hand and job.nest is not None:
-            hands.ask(f"Take the last part out of the nest, see that {part} lies on its surface, {ready}")
+            gone, lies = ("out of the nest", "on its surface") if job.unloads else ("from the station", "in its nest")
+            hands.ask(f"Take the last part {gone}, see that {part} lies {lies}, {ready}")
         elif by_hand:
             hands.ask(f"The claw holds {part}; take away what was placed, prepare the next place, {ready}")
 

@@ -79,7 +79,7 @@ class ReadyJob:
         require_fit(job, config, mesh, calibrates=calibrates)
         kind = kind_of(job).until(until)
         kind.require_steps(script.after)
-        ground = None if job.nest is None else ground_below(job, mesh_box(mesh, job.surface.mesh_unit))
+        ground = ground_below(job, mesh_box(mesh, job.surface.mesh_unit)) if job.unloads else None
         job, mesh = sought(job, mesh)
         nominal = nominal_of(job, mesh)
         info: dict[str, object] = dict(job_source(file))
@@ -196,7 +196,7 @@ class JobRun:
         elif self.job.part is not None:
             result = replace(result, reason=seen_words(result))
         finished = FinishedJob(
-            folder, self.config, self.job, nominal=self.nominal, repeatability=here.repeatability, result=result,
+            folder, self.config, here.job, nominal=self.nominal, repeatability=here.repeatability, result=result,
             info=self._facts_after(begun, here), started=started, witness=witness, frames=frames,
         )  # fmt: skip
         report = finished.report()
@@ -211,7 +211,7 @@ class JobRun:
             folder=folder, whereabouts=whereabouts, earlier=self.earlier,
             needs_part=self.kind.places and self.job.nest is None, looks_after=verify.STEP.name in self.kind.names,
             sweeping=self._sweeping, registered=self._registered, pace=self.pace, ground=self.ground,
-            series=self.series, part=PartProgress(PartState.HELD if self.job.nest is None else PartState.LIES),
+            series=self.series, part=PartProgress(PartState.first(self.job)),
         )  # fmt: skip
 
     def _runner(self, here: Workplace, journal: Journal, observer: Observer) -> Runner:

@@ -131,7 +131,7 @@ def _require_held(folder: Path, record: JournalRecord) -> None:
     match _part(record):
         case PartState.HELD.value if not any("part" in event.data for event in record.events):
             return
-        case PartState.LIES.value:
+        case PartState.LIES.value | PartState.NESTED.value:
             return
         case PartState.HELD.value:
             raise ConfigError(

@@ -181,6 +181,8 @@ class StationDrawing:
     part_mesh_unit: str = "m"
     nest: Pose | None = None
     """base_from_part in a nest on the vehicle: the part lies on the surface at first, and the claw is empty."""
+    nest_filled: bool = False
+    """The part lies in the nest at first."""
     waviness: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Amplitude and wavelength, m, and direction from the surface's x, rad, of a sine that the job's mesh has not."""
 

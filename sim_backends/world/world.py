@@ -85,12 +85,14 @@ class World:
         self._report_grip()
 
     def _nest(self) -> Nest | None:
-        """The nest on the vehicle, where the job takes the part from the surface."""
+        """The nest on the vehicle, where the job takes the part from the surface, or from the nest."""
         station = self.scene.drawing.station
         if station.nest is None:
             return None
         there = station.nest @ inverse(station.surface_from_part)
-        return Nest(there, lambda: self.world_from_base(self.clock.now()), self.scene.surface_from_part)
+        return Nest(
+            there, lambda: self.world_from_base(self.clock.now()), self.scene.surface_from_part, station.nest_filled
+        )
 
     def _close_claw(self, closed: bool) -> None:
         self.switches["claw"] = closed

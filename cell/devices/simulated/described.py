@@ -66,7 +66,9 @@ class Described:
         if part is not None:
             station = replace(station, part_mesh=part.mesh, part_mesh_unit=part.mesh_unit)
         if self.job.nest is not None:
-            station = replace(station, nest=_matrix(self.job.nest.base_from_part.se3()))
+            station = replace(
+                station, nest=_matrix(self.job.nest.base_from_part.se3()), nest_filled=not self.job.unloads
+            )
         return drawn.settled(Drawing(_cell(config), station), STOCK)
 
 

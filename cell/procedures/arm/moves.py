@@ -260,9 +260,20 @@ class PartState(Enum):
     """Where the part is, as far as the claw's commands and its feedback tell."""
 
     LIES = "at the station"
+    NESTED = "in its nest"
     HELD = "held"
     UNKNOWN = "unknown"
     RELEASED = "released"
+
+    @property
+    def untaken(self) -> bool:
+        """Whether it lies where it is to be taken from: the claw is empty."""
+        return self in (PartState.LIES, PartState.NESTED)
+
+    @classmethod
+    def first(cls, job: Job) -> PartState:
+        """Where the part of a job is before it."""
+        return cls.HELD if job.nest is None else cls.LIES if job.unloads else cls.NESTED
 
 
 @dataclass(eq=False)
@@ -278,7 +289,7 @@ class PartProgress:
 
     def told(self, reason: str) -> str:
         """A run's reason, not to be read without what has become of the part."""
-        if self.state in (PartState.HELD, PartState.LIES) or self.where is None:
+        if self.state is PartState.HELD or self.state.untaken or self.where is None:
             return reason
         x, y, z = 1e3 * self.where.translation
         at = f"at ({x:.1f}, {y:.1f}, {z:.1f}) mm in the arm base"

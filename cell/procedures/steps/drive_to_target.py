@@ -11,7 +11,7 @@ import pinocchio as pin
 from cell.config.job import Job
 from cell.motion.collision import Body, CollisionError
 from cell.motion.kinematics import HOME, Unreachable
-from cell.procedures.arm.moves import Pace, PartState
+from cell.procedures.arm.moves import Pace
 from cell.procedures.arm.photograph import BoardFix, look_pose
 from cell.procedures.calibrate.interim import InterimCheck, interim_check
 from cell.procedures.drive.way import BACK_UP, Planar, Way, Whereabouts, drive_line, next_step, turn_to, wrap
@@ -251,9 +251,9 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
             f"the claw holds no part: put the part of job {here.job.job.name} into it, or see whether it was "
             "placed already"
         )
-    if here.part.state is PartState.LIES and here.devices.claw.holding:
+    if here.part.state.untaken and here.devices.claw.holding:
         raise RefusedError(
-            f"the claw holds a part, and job {here.job.job.name} takes one from its surface: take it out of the claw"
+            f"the claw holds a part, and job {here.job.job.name} takes one {here.part.state.value}: take it out of the claw"
         )
     vehicle = here.devices.vehicle
     if trouble := vehicle.state().trouble:

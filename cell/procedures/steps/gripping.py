@@ -69,6 +69,14 @@ def take(
     mover.line(above, plan.speed, TOUCHES)
 
 
+def require_lifted(here: Workplace, context: StepContext) -> None:
+    """Raise `RefusedError` where the claw does not hold the part that it has lifted."""
+    if not here.devices.claw.holding:
+        here.part.state = PartState.UNKNOWN
+        note_part(context, here.part)
+        raise RefusedError("the claw lost the part as it lifted it; look where it fell, and at the fingers")
+
+
 def _reached(here: Workplace, grip: pin.SE3, normal: Vector) -> bool:
     """Whether the open claw came down to `grip` along `normal`, (3,) on the flange, without touching anything."""
     plan, mover = here.job.place, here.mover

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import entry_points
 
+from cell.config import job as job_file
 from cell.config.job import Job
 from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps import (
@@ -19,6 +20,7 @@ from cell.procedures.steps import (
     invert_pose,
     laser_sweep,
     pick,
+    pick_nest,
     place,
     reconstruct,
     set_down,
@@ -59,6 +61,11 @@ class Kind:
     def places(self) -> bool:
         """Whether one of its steps places a part, or sees one in its nest."""
         return any(issubclass(step.makes, place.PlaceResult | PlacedPart) for step in self.steps)
+
+    @property
+    def loads(self) -> bool:
+        """Whether it takes the part from its nest: the claw is empty at first."""
+        return any(step is pick_nest.STEP for step in self.steps)
 
     @property
     def unloads(self) -> bool:
@@ -113,6 +120,8 @@ PLACE = Kind(
 )
 
 
+LOAD = replace(PLACE, name=job_file.LOAD, steps=(PLACE.steps[0], pick_nest.STEP, *PLACE.steps[1:]))
+"""Places a part that it takes from a nest on the vehicle."""
 VERIFIED = PLACE.with_step(verify.STEP, after=place.STEP.name, name=PLACE.name)
 """The same for a job that names a mesh of its part: what was placed is looked at."""
 
@@ -123,13 +132,14 @@ UNLOAD = Kind(
      set_down.STEP, verify_nest.STEP),
 )  # fmt: skip
 """Takes a part from its surface: the sweep looks for the part itself, which is gripped and set into a nest."""
-BUILT_IN = {kind.name: kind for kind in (PLACE, UNLOAD)}
+BUILT_IN = {kind.name: kind for kind in (PLACE, LOAD, UNLOAD)}
 
 
 def kind_of(job: Job) -> Kind:
     """The kind of this job; raises what `find_kind` raises."""
     kind = find_kind(job.job.kind)
-    return VERIFIED if kind is PLACE and job.part is not None and job.place.verify != "none" else kind
+    looks = kind in (PLACE, LOAD) and job.part is not None and job.place.verify != "none"
+    return kind.with_step(verify.STEP, after=place.STEP.name, name=kind.name) if looks else kind
 
 
 def find_kind(name: str) -> Kind:

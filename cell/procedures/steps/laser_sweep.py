@@ -137,7 +137,7 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
 def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     head = here.calibration.scan
     home_rail(here.devices, context.progress)
-    pointing, slip = _seen_on_plate(here, context)
+    pointing, slip = seen_on_plate(here, context)
     doubts = times_known(head, here.config)[1]
     if pointing is not None:
         head = head.pointed(pointing, here.config.laser.exit_point)
@@ -193,7 +193,7 @@ def unwatched(witness: PlateLine | None) -> tuple[str, ...]:
     return ()
 
 
-def _seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | None, Slip | None]:
+def seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | None, Slip | None]:
     """Where the laser points now, and how far the head has slipped; None where the calibration saw no plate, or no edge
     of it. `RefusedError` when anything was knocked."""
     head, config, devices, keep = here.calibration.scan, here.config, here.devices, here.frames.keep

@@ -13,7 +13,7 @@ from cell.measure.inversion.part_pose import seen_from_below
 from cell.procedures.arm.moves import PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.grasp import GRIPPED
-from cell.procedures.steps.gripping import note_part, take
+from cell.procedures.steps.gripping import require_lifted, take
 from cell.procedures.steps.laser_sweep import check_lost_steps
 from cell.procedures.steps.place import carried_on
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -71,10 +71,7 @@ def _at(here: Workplace, context: StepContext) -> HeldPart:
     # After a grip that found no part its fingers are closed.
     here.devices.claw.release()
     take(here, job, grip, context, what="the part", most_pull=MOST_PULL * job.place.contact_force)
-    if not here.devices.claw.holding:
-        part.state = PartState.UNKNOWN
-        note_part(context, part)
-        raise RefusedError("the claw lost the part as it lifted it; look where it fell, and at the fingers")
+    require_lifted(here, context)
     return HeldPart(grip, pose.covariance + here.repeatability + GRIPPED)
 
 

@@ -25,7 +25,7 @@ def sought(job: Job, mesh: Path) -> tuple[Job, Path]:
     To be unloaded, the part's upper side is the surface: it lies where `place.surface_from_part` has it, and is gripped
     where it is found. The scan head keeps its distance from it. Other jobs stay as they are.
     """
-    if job.nest is None or job.part is None or job.surface.mesh == job.part.mesh:
+    if not job.unloads or job.part is None or job.surface.mesh == job.part.mesh:
         return job, mesh
     there = job.surface.place_from_surface.se3() * job.place.surface_from_part.se3()
     surface = job.surface.model_copy(
@@ -41,7 +41,7 @@ def sought(job: Job, mesh: Path) -> tuple[Job, Path]:
 def nominal_of(job: Job, mesh: Path) -> NominalSurface:
     """The surface of a job as `sought` gives it, from its mesh's file. Raises `ConfigError`."""
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
-    return nominal if job.nest is None else seen_from_above(nominal, job.place.surface_from_part.se3())
+    return seen_from_above(nominal, job.place.surface_from_part.se3()) if job.unloads else nominal
 
 
 def ground_below(job: Job, extent: tuple[Vector, Vector]) -> tuple[Vector, Vector]:

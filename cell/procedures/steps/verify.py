@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.config.job import Job
+from cell.measure.calibration import ScanCalibration
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion.flush import flush_along_edge
@@ -106,7 +107,7 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     place, belongs = here.job.place, here.job.place.surface_from_part.se3()
     faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
     over = pose.base_from_surface * surface_from_faces(here.job, faces)
-    cloud, record = swept_part(here, sweep, over, context)
+    cloud, record = swept_part(here, head_at(here, sweep), over, context)
     by_calibration, by_poses = displacements(here, record, cloud)
 
     def moved(lines: Indices, rows: Indices) -> Vector:
@@ -134,12 +135,17 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     return replace(PlacedPart.of(here.job, seen, part_points(here.nominal), stated), gap=gap, flush=flush)
 
 
-def swept_part(here: Workplace, sweep: SweepRecord, over: pin.SE3, context: StepContext) -> tuple[Cloud, SweepRecord]:
-    """Sweep the part `over` what is in the place of the surface, base from there, with the head as in the first sweep,
-    look whether the rail has lost steps meanwhile, and fold the arm."""
+def swept_part(
+    here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, *, frames: str = "verify",
+    cloud: str = CLOUD,
+) -> tuple[Cloud, SweepRecord]:  # fmt: skip
+    """Sweep the part `over` what is in the place of the surface, base from there, look whether the rail has lost steps
+    meanwhile, and fold the arm. `frames` and `cloud` are what it is kept as."""
     while True:
         held = context.held_s
-        cloud, record = _swept(here, sweep, over, context)
+        record = _swept(here, head, over, context, frames)
+        points = build_cloud(record)
+        write_cloud(here.folder / cloud, points, here.config.cell.sim)
         context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
         looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
         here.mover.fold()
@@ -148,27 +154,23 @@ def swept_part(here: Workplace, sweep: SweepRecord, over: pin.SE3, context: Step
         context.safe_point()
         # Whoever has the run held may reach in, and move the part.
         if context.held_s == held:
-            return cloud, record
+            return points, record
 
 
-def _swept(here: Workplace, sweep: SweepRecord, over: pin.SE3, context: StepContext) -> tuple[Cloud, SweepRecord]:
+def _swept(here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, frames: str) -> SweepRecord:
     """One sweep of the part. Lost frames are swept again: nothing of the part is moved by that."""
     for left in reversed(range(SWEEPS)):
         try:
-            again = laser_sweep(
-                here, over, head_at(here, sweep), here.job.scan, check=context.check, counted=False,
-                keep_frame=lambda frame: here.frames.keep("verify", frame),
-                progress=lambda share, text: context.progress(0.85 * share, f"the placed part: {text}"),
+            return laser_sweep(
+                here, over, head, here.job.scan, check=context.check, counted=False,
+                keep_frame=lambda frame: here.frames.keep(frames, frame),
+                progress=lambda share, text: context.progress(0.85 * share, f"the part: {text}"),
             )  # fmt: skip
         except DeviceFault as fault:
             if fault.code != FRAMES_LOST or not left:
                 raise
-            context.note(text=f"the placed part is swept again: {fault}")
-        else:
-            break
-    cloud = build_cloud(again)
-    write_cloud(here.folder / CLOUD, cloud, here.config.cell.sim)
-    return cloud, again
+            context.note(text=f"the part is swept again: {fault}")
+    raise AssertionError("the last sweep returns or raises")
 
 
 def surface_from_faces(job: Job, faces: NominalSurface) -> pin.SE3:

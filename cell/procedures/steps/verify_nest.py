@@ -8,11 +8,13 @@ import numpy as np
 import pinocchio as pin
 
 from cell.config.job import Job
-from cell.measure.inversion import PlacePose, Prior, Tolerance
+from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion import invert_pose as register
 from cell.measure.inversion.part_pose import DEMANDS, SHIFTED, PartPose, parted
+from cell.measure.reconstruction import Cloud
 from cell.procedures.part_error import part_points
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart
+from cell.procedures.steps.laser_sweep import head_at
 from cell.procedures.steps.reconstruct import displacements
 from cell.procedures.steps.set_down import SetDown
 from cell.procedures.steps.sought_part import pose_record
@@ -27,18 +29,11 @@ from statemachine.step import OnFailure, Step
 def _at(here: Workplace, context: StepContext) -> PlacedPart:
     job, sweep = where_seen(here.job), context.made(SweepRecord)
     belongs = job.place.surface_from_part.se3()
-    cloud, record = swept_part(here, sweep, belongs, context)
-    by_calibration, by_poses = displacements(here, record, cloud)
-    on_part, _ = parted(cloud, here.nominal, belongs)
+    swept = swept_part(here, head_at(here, sweep), belongs, context)
     try:
-        fit = register(
-            on_part, here.nominal, Prior(belongs, np.diag(SHIFTED**2)),
-            Tolerance(job.place.tolerance, job.place.tolerance_angle), systematic=here.kinematic,
-            calibration=by_calibration, sweeps=by_poses, demands=DEMANDS, partly=True,
-        )  # fmt: skip
+        fit = part_in_base(here, job, here.nominal, swept)
     except RefusedError as error:
-        why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")
-        raise MisplacedError(f"the part is not seen in its nest: {why}. {NEXT_STEP}", *error.numbers) from error
+        raise MisplacedError(f"{error}. {NEXT_STEP}", *error.numbers) from error
     stated = context.made(SetDown).covariance
     found = replace(
         PlacedPart.of(job, _in_base(fit), part_points(here.nominal), stated), axes="axes of the arm base, in its nest"
@@ -50,15 +45,39 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     return found
 
 
+def part_in_base(here: Workplace, job: Job, faces: NominalSurface, swept: tuple[Cloud, SweepRecord]) -> PlacePose:
+    """Where the part with these `faces` lies in the arm base, by the sweep of its nest, which is the place of `job`.
+
+    Raises `RefusedError` where it is not seen there.
+    """
+    (cloud, record), belongs = swept, job.place.surface_from_part.se3()
+    by_calibration, by_poses = displacements(here, record, cloud)
+    on_part, _ = parted(cloud, faces, belongs)
+    try:
+        return register(
+            on_part, faces, Prior(belongs, np.diag(SHIFTED**2)),
+            Tolerance(job.place.tolerance, job.place.tolerance_angle), systematic=here.kinematic,
+            calibration=by_calibration, sweeps=by_poses, demands=DEMANDS, partly=True,
+        )  # fmt: skip
+    except RefusedError as error:
+        why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")
+        raise RefusedError(f"the part is not seen in its nest: {why}", *error.numbers) from error
+
+
 def _in_base(fit: PlacePose) -> PartPose:
     """The part as seen against the arm's base, which takes the place of a surface here."""
     return PartPose(pin.SE3.Identity(), fit.base_from_surface, fit.covariance, fit, beside=fit.n_points)
 
 
 def where_seen(job: Job) -> Job:
-    """The job with the place where its part is looked at: its own, or the nest in the arm base, with its tolerances."""
-    if (nest := job.nest) is None:
-        return job
+    """The job with the place where its part is looked at: its own, or the nest of one that unloads."""
+    return at_nest(job) if job.unloads else job
+
+
+def at_nest(job: Job) -> Job:
+    """The job with its nest, in the arm base, in the place of its place, with the nest's tolerances."""
+    nest = job.nest
+    assert nest is not None
     lies = pose_record(nest.base_from_part.se3())
     update = {"surface_from_part": lies, "tolerance": nest.tolerance, "tolerance_angle": nest.tolerance_angle}
     return job.model_copy(update={"place": job.place.model_copy(update=update)})

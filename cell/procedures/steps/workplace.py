@@ -80,8 +80,10 @@ class Workplace:
         """Planned moves of the arm with the job's part in the claw. It rests where the next job looks first."""
         devices = self.devices
         made = Mover(devices.arm, devices.clock, self.config, self.job, interlocks=devices.interlocks, pace=self.pace)
-        if self.part.state is PartState.LIES:
+        if self.part.state.untaken:
             made.hold_nothing()
+        if self.part.state is PartState.NESTED and self.job.nest is not None:
+            made.part_lies(self.job.nest.base_from_part.se3(), self.job.grasp.size)
         if self.config.calibration.each_job:
             with suppress(CalibrationStale):
                 rest = resting_pose(fine_board_view(self.config, self.calibration))

@@ -112,7 +112,7 @@ def measured(
         found.append(Measured("place error, largest of 45 points", truth["error_mm"]["d"]["max"], "mm", most=tolerance))
     if (seen := seen_placed(result)) is not None:
         found += seen.measured(where_seen(job).place)
-    elif bound is not None and job.nest is None:
+    elif bound is not None and not job.unloads:
         found.append(Measured("place error, stated 95 % bound", bound["d"], "mm", most=tolerance))
     if isinstance(placed, PlaceResult):
         travel = 1e3 * job.place.contact_travel

@@ -287,7 +287,7 @@ def draw_run(
     scanned = surface is not None or stripe is not None
     seams = (report["scan"] or {}).get("seams", ())
     seen = seen_placed(result)
-    if surface is not None and seen is not None and job.nest is None:
+    if surface is not None and seen is not None and not job.unloads:
         surface = replace(surface, flush=seen.flush, features=seen.features)
     more = 0 if surface is None else (surface.flush is not None) + bool(surface.features)
     waviness = textwrap.wrap(texture_words(report), TITLE_COLUMNS)

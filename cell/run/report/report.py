@@ -150,7 +150,7 @@ class FinishedJob:
         report["place_sigma"] = _sigma(pose)
         if (seen := seen_placed(self.result)) is not None:
             # What was seen says more than what was stated before.
-            frame = "surface" if self.job.nest is None else "arm base"
+            frame = "surface" if not self.job.unloads else "arm base"
             report["place_bound_95"] = {"frame": frame, "unit": "mm", **seen.bound}
             return
         covariance = self.job.grasp.covariance
@@ -241,12 +241,12 @@ def _add_truth(
     sweep, made, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
     if isinstance(pose, PlacePose) and witness.at_sweep is not None:
         # Arm base axes, at the sweep; also where the place was refused.
-        sought = "base_from_part" if job.nest is not None else "base_from_surface"
+        sought = "base_from_part" if job.unloads else "base_from_surface"
         report["pose_error"] = _apart(difference(pose.base_from_surface, pose_of(witness.at_sweep, sought)))
         report["pose_error_units"] = {"translation_mm": "mm", "rotation_mrad": "mrad"}
     if report["outcome"] not in ("placed", "misplaced") or not isinstance(pose, PlacePose):
         return
-    if job.nest is not None:
+    if job.unloads:
         if (nested := seen_placed(result)) is not None:
             report["nest_error"] = _apart(difference(nested.seen.surface_from_part, pose_of(now, "base_from_part")))
         return

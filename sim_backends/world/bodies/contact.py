@@ -47,11 +47,13 @@ _BESIDE, _FLOOR = 1.5 * drawing.TABLE_HALF, 0.1
 @dataclass(frozen=True, eq=False)
 class Nest:
     """A nest on the vehicle, which fits the part as the surface does: `base_from_surface` (4, 4) is where that would
-    be, and `world_from_base` tells where the vehicle has the arm's base. At first the part `lies` on the surface."""
+    be, and `world_from_base` tells where the vehicle has the arm's base. At first the part `lies` on the surface, or so
+    in the nest, where that is `filled`."""
 
     base_from_surface: Pose
     world_from_base: Callable[[], Pose]
     lies: Pose
+    filled: bool = False
 
 
 class PartContact:
@@ -113,7 +115,8 @@ class PartContact:
         self._table_at = inverse(self._table_from_world)[:2, 3].tolist()
         if nest is not None:
             self._claw_closed, self._lying = False, True
-            self._world_from_part = (self._settle if self._own else self._rest)(world_from_surface @ nest.lies)
+            below = nest.world_from_base() @ nest.base_from_surface if nest.filled else world_from_surface
+            self._let_go(below @ nest.lies)
 
     @property
     def held(self) -> bool:
@@ -122,7 +125,7 @@ class PartContact:
 
     @property
     def untouched(self) -> bool:
-        """Whether the part is where it was at first: in the claw, or on the surface."""
+        """Whether the part is where it was at first: in the claw, on the surface, or in the nest."""
         return self.held if self._nest is None else self._lying
 
     def part_pose(self, world_from_flange: Pose) -> Pose:

@@ -1,0 +1,61 @@
+"""Pick from the nest: the part is found by its mesh where it lies on the vehicle, gripped there, felt, and lifted."""
+
+from __future__ import annotations
+
+from cell.measure.geometry.poses import from_parts
+from cell.measure.inversion.part_pose import seen_from_above
+from cell.procedures.arm.moves import PartState
+from cell.procedures.grasp import job_with_grasp, moved
+from cell.procedures.part_error import part_points
+from cell.procedures.steps.gripping import require_lifted, take
+from cell.procedures.steps.laser_sweep import check_lost_steps, seen_on_plate
+from cell.procedures.steps.pick import MOST_PULL, HeldPart
+from cell.procedures.steps.verify import swept_part
+from cell.procedures.steps.verify_nest import at_nest, part_in_base
+from cell.procedures.steps.workplace import JobStep, Workplace
+from cell.procedures.sweep.sweeping import home_rail
+from drivers.errors import Measured, RefusedError
+from statemachine.runner import StepContext
+from statemachine.step import OnFailure, Step
+
+CLOUD = "nest.ply"
+
+
+def _at(here: Workplace, context: StepContext) -> HeldPart:
+    job, part, progress = at_nest(here.job), here.part_mesh, context.progress
+    assert part is not None
+    if here.part.state is not PartState.NESTED:
+        raise RefusedError(f"the part is {here.part.state.value}: nothing is gripped a second time")
+    home_rail(here.devices, progress)
+    head, (pointing, _) = here.calibration.scan, seen_on_plate(here, context)
+    if pointing is not None:
+        head = head.pointed(pointing, here.config.laser.exit_point)
+    belongs = job.place.surface_from_part.se3()
+    faces = seen_from_above(part, belongs)
+    over = belongs * from_parts((0.0, 0.0, 0.5 * float(sum(faces.extent)[2])))
+    fit = part_in_base(here, job, faces, swept_part(here, head, over, context, frames="nest", cloud=CLOUD))
+    off = 1e3 * moved(belongs.inverse() * fit.base_from_surface, part_points(faces))
+    most = 1e3 * job.place.tolerance
+    if not off <= most:
+        raise RefusedError(
+            f"the part lies {off:.2f} mm off its place in the nest, on average (allowed: {most:g} mm): the fingers may "
+            "not hold it as they should. Put it right, or correct nest.base_from_part",
+            Measured("part off its place in the nest", off, "mm", most=most),
+        )
+    context.note(text=f"the part lies {off:.2f} mm off its place in the nest, and is gripped where it lies")
+    if job.scan.mode == "rail":
+        check_lost_steps(here.devices, lambda _, text: progress(0.05, text))
+    grasp = here.job.grasp.flange_from_part.se3()
+    grip = fit.base_from_surface * grasp.inverse()
+    here.part.where = fit.base_from_surface
+    # After a grip that found no part its fingers are closed.
+    here.devices.claw.release()
+    take(here, here.job, grip, context, what="the part", most_pull=MOST_PULL * here.job.place.contact_force)
+    require_lifted(here, context)
+    known = fit.covariance + here.repeatability
+    here.job = job_with_grasp(here.job, grasp, known)
+    return HeldPart(grip, known)
+
+
+# What was interrupted with the part between the fingers is left to a person.
+STEP = JobStep(Step("pick", 600.0, on_failure=OnFailure.STOP), _at, HeldPart)
