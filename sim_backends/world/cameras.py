@@ -6,6 +6,7 @@ Poses come in, pictures go out; time and motion are the world's business.
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -59,8 +60,9 @@ class Cameras:
         self._rng = {name: stream(scene.seed, f"{name}_camera.noise") for name in self._cold}
         self._busy = {name: threading.Lock() for name in self._cold}
 
-    def show(self, scene: Scene, station: Station) -> None:
-        """From now on the cameras see this station, in this scene, of the same drawing and clocks."""
+    def show(self, scene: Scene, station: Station, others: Sequence[tuple[Scene, Station]] = ()) -> None:
+        """From now on the cameras see this station, in this scene, of the same drawing and clocks; and the surfaces of
+        `others` that lie elsewhere."""
         effects, cell = scene.effects, scene.drawing.cell
         self._lens = {"scan": scene.scan_lens, "target": scene.target_lens}
         self._cold = {
@@ -82,25 +84,27 @@ class Cameras:
             oil = Puddle(at, radius, effects.oil)
         self._grain = Grain(effects.texture, effects.dust, effects.gloss, oil)
         self._shown = scene, station, Board.parse(scene.drawing.station.board)
+        there = [(of.world_from_surface, other) for of, other in others]
+        self._others = [each for each in there if not np.array_equal(each[0], scene.world_from_surface)]
 
     def picture(
         self, camera: str, world_from_camera: Pose, world_from_base: Pose, laser: bool, exposure: float,
         warm: float = 0.0, t: float = 0.0, camera_from_flange: Pose | None = None,
-        world_from_part: Pose | None = None,
+        parts: Sequence[tuple[Station, Pose]] = (),
     ) -> Picture:  # fmt: skip
         """The picture (height, width) of `camera`, "scan" or "target", exposed for `exposure` s at these poses.
 
         `warm` is how far, of 0 to 1, laser and cameras have warmed up; `t` the world time, s, by which the sun moves.
-        With `camera_from_flange` the plate on the claw is shown where it comes into view, with `world_from_part` the
-        part, where the station has its shape.
+        With `camera_from_flange` the plate on the claw is shown where it comes into view. `parts` are shown at their
+        world_from_part where their stations have their shape.
         """
         optics = self._warmed(camera, warm)
         camera_from_world = inverse(world_from_camera)
         objects = self._objects(camera, camera_from_world, world_from_base)
         if camera == "scan" and camera_from_flange is not None:
             objects += self._witness(camera_from_flange)
-        if camera == "scan" and world_from_part is not None:
-            objects += self._part(camera_from_world @ world_from_part)
+        if camera == "scan":
+            objects += [seen for station, at in parts for seen in self._part(station, camera_from_world @ at)]
         with self._busy[camera]:
             lit = self.laser(warm) if laser and camera == "scan" else None
             return render(optics, objects, lit, exposure, self._rng[camera], light=self._sunny(camera_from_world, t))
@@ -114,9 +118,9 @@ class Cameras:
         left = (-0.55 * optics.width / optics.fx) * corners[:, 2]
         return [PlaneInstance(pose, drawing.WITNESS_SIZE, WITNESS_ALBEDO)] if (corners[:, 0] > left).any() else []
 
-    def _part(self, pose: Pose) -> list[SceneObject]:
-        """The part, if it has a shape and the camera may see any of it."""
-        mesh, optics = self._shown[1].part_seen, self._cold["scan"]
+    def _part(self, station: Station, pose: Pose) -> list[SceneObject]:
+        """The station's part, if it has a shape and the camera may see any of it."""
+        mesh, optics = station.part_seen, self._cold["scan"]
         if mesh is None:
             return []
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
@@ -159,7 +163,6 @@ class Cameras:
     def _objects(self, camera: str, camera_from_world: Pose, world_from_base: Pose) -> list[SceneObject]:
         scene, station, board_there = self._shown
         camera_from_base = camera_from_world @ world_from_base
-        camera_from_surface = camera_from_world @ scene.world_from_surface
         camera_from_table = camera_from_world @ scene.world_from_table
         table = (2 * drawing.TABLE_HALF, 2 * drawing.TABLE_HALF)
         placed: list[tuple[SceneObject, Pose, float]] = [
@@ -175,8 +178,9 @@ class Cameras:
             radius = float(np.hypot(max(-x0, x1), max(-y0, y1)))
             placed.append((BoardInstance(pose, board), pose, radius))
         if camera == "scan":
-            shown = MeshInstance(camera_from_surface, station.seen, SURFACE_ALBEDO, self._grain)
-            placed.append((shown, camera_from_surface, station.radius))
+            for world_from_surface, one in ((scene.world_from_surface, station), *self._others):
+                at = camera_from_world @ world_from_surface
+                placed.append((MeshInstance(at, one.seen, SURFACE_ALBEDO, self._grain), at, one.radius))
         optics = self._cold[camera]
         far = max(_FAR[camera][0], _FAR[camera][1] * optics.focus_distance)
         return [item for item, pose, radius in placed if in_view(optics, pose[:3, 3], radius, far)]

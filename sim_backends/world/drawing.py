@@ -183,8 +183,14 @@ class StationDrawing:
     """base_from_part in a nest on the vehicle: the part lies on the surface at first, and the claw is empty."""
     nest_filled: bool = False
     """The part lies in the nest at first."""
+    beside: tuple[StationDrawing, ...] = ()
+    """Of a job with several items the station of each, this one's as well, none of which has another beside it."""
     waviness: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Amplitude and wavelength, m, and direction from the surface's x, rad, of a sine that the job's mesh has not."""
+
+    def as_json(self) -> str:
+        """By which stations are told apart, to the last bit."""
+        return json.dumps(asdict(self), default=np.ndarray.tolist)
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,7 +272,7 @@ def _settled(value: Any, stock: Any) -> Any:
     if isinstance(value, np.ndarray) and stock is not None:
         same = np.abs(value - stock)
         return stock if same[:3, 3].max() < TEXT_M and same[:3, :3].max() < TEXT_RAD else value
-    if isinstance(value, float) or (isinstance(value, tuple) and isinstance(value[0], float)):
+    if isinstance(value, float) or (isinstance(value, tuple) and value and isinstance(value[0], float)):
         return stock if np.allclose(value, stock, rtol=1e-9, atol=1e-12) else value
     return value
 
@@ -278,7 +284,8 @@ def read(text: str) -> Drawing:
         cell, station = data["cell"], data["station"]
         made: dict[str, Any] = {name: CameraDrawing(**_plain(cell.pop(name))) for name in ("scan", "target")}
         made["rail"] = RailDrawing(**_plain(cell.pop("rail")))
-        return Drawing(CellDrawing(**made, **_plain(cell)), StationDrawing(**_plain(station)))
+        beside = tuple(StationDrawing(**_plain(each)) for each in station.pop("beside", ()))
+        return Drawing(CellDrawing(**made, **_plain(cell)), StationDrawing(**_plain(station), beside=beside))
     except (KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"no drawing of a cell: {error}") from error
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,15 @@ BANDS = 6
 """In so many bands a rolling shutter is drawn."""
 
 
+@dataclass(frozen=True, eq=False)
+class Item:
+    """One item of a job, or all of a job that has none: its scene, its station and its part."""
+
+    scene: Scene
+    station: Station
+    part: PartContact
+
+
 class World:
     """One seeded world. `scene` holds what was drawn, `arm`, `rail` and `vehicle` the models that the peers drive."""
 
@@ -62,7 +71,7 @@ class World:
         self.switches = {"laser": False, "claw": True}
         """What switches laser and claw where no output of the arm does: set by their peers."""
         self.parts = 0
-        """How often the claw was filled again."""
+        """How many parts were made ready before those of now."""
         self._cameras = Cameras(self.scene, self.station)
         self._stood = 0.0
         self._set_up()
@@ -72,27 +81,49 @@ class World:
         self.vehicle.blocked = lambda t, pose: self.collisions.blocks(t, pose)
         self.arm.contact = self._touch
 
+    @property
+    def part(self) -> PartContact:
+        """The part of the job, or of its present item; whichever the claw holds."""
+        return next((item.part for item in self._items if item.part.held), self._items[self._item].part)
+
     def _set_up(self, found: tuple[Collision, ...] = ()) -> None:
-        """Part in the claw, and bodies of cell and station that may meet."""
-        scene, station = self.scene, self.scene.drawing.station
-        self.part = PartContact(
-            self.station.ground, scene.world_from_surface, scene.flange_from_part,
-            world_from_table=scene.world_from_table, surface_from_part=station.surface_from_part,
-            table_height=station.height, part=self.station.part, nest=self._nest(),
-        )  # fmt: skip
-        self._solid = ArmPoints(scene.drawing)
-        self.collisions = Collisions(scene, self.part, found)
+        """Part in the claw, or those of all items where they lie at first, and bodies that may meet."""
+        self._item, self._items = 0, [Item(self.scene, self.station, self._part(self.scene, self.station))]
+        if beside := self.scene.drawing.station.beside:
+            own, first = replace(self.scene.drawing.station, beside=()), None
+            self._item, self._items = [each.as_json() for each in beside].index(own.as_json()), []
+            for k, drawn in enumerate(beside):
+                drawing = replace(self.scene.drawing, station=replace(drawn, beside=beside))
+                scene = draw(self.scene.seed, self.scene.level, drawing, self.parts + k)
+                # One table carries them all.
+                table = scene.world_from_table if first is None else first
+                first = table
+                scene = replace(scene, world_from_table=table, world_from_surface=table @ drawn.place_from_surface)
+                station = Station.of(drawn)
+                self._items.append(Item(scene, station, self._part(scene, station)))
+        self._take(found)
         self._report_grip()
 
-    def _nest(self) -> Nest | None:
-        """The nest on the vehicle, where the job takes the part from the surface, or from the nest."""
-        station = self.scene.drawing.station
-        if station.nest is None:
-            return None
-        there = station.nest @ inverse(station.surface_from_part)
-        return Nest(
-            there, lambda: self.world_from_base(self.clock.now()), self.scene.surface_from_part, station.nest_filled
-        )
+    def _take(self, found: tuple[Collision, ...]) -> None:
+        """What the cell does now is about this item."""
+        item = self._items[self._item]
+        self.scene, self.station = item.scene, item.station
+        self._solid = ArmPoints(item.scene.drawing)
+        self.collisions = Collisions(item.scene, item.part, found)
+        others = [other for other in self._items if other is not item]
+        self._cameras.show(item.scene, item.station, [(other.scene, other.station) for other in others])
+
+    def _part(self, scene: Scene, station: Station) -> PartContact:
+        drawn, nest = scene.drawing.station, None
+        if drawn.nest is not None:
+            there = drawn.nest @ inverse(drawn.surface_from_part)
+            nest = Nest(
+                there, lambda: self.world_from_base(self.clock.now()), scene.surface_from_part, drawn.nest_filled
+            )
+        return PartContact(
+            station.ground, scene.world_from_surface, scene.flange_from_part, world_from_table=scene.world_from_table,
+            surface_from_part=drawn.surface_from_part, table_height=drawn.height, part=station.part, nest=nest,
+        )  # fmt: skip
 
     def _close_claw(self, closed: bool) -> None:
         self.switches["claw"] = closed
@@ -104,23 +135,25 @@ class World:
         the surface where the job takes it from there.
 
         What lay at the station is taken away. Vehicle, arm and rail stay as they stand. Where the station stands
-        already, with its part in the claw, all stays as it is. Raises ValueError as `World`.
+        already, with the part of that item untouched, all stays as it is. Raises ValueError as `World`.
         """
-        drawing = replace(self.scene.drawing, station=station)
-        if self.part.untouched and drawing.as_json() == self.scene.drawing.as_json():
-            return
-        ready = Station.of(station)
-        scene = draw(self.scene.seed, self.scene.level, drawing, self.parts + 1)
-        self.scene, self.station, self.parts = scene, ready, self.parts + 1
+        wanted = replace(self.scene.drawing, station=station).as_json()
+        for k, item in enumerate(self._items):
+            if item.part.untouched and item.scene.drawing.as_json() == wanted:
+                if k != self._item:
+                    self._item = k
+                    self._take(self.collisions.found)
+                return
+        ready, parts = Station.of(station), self.parts + len(self._items)
+        scene = draw(self.scene.seed, self.scene.level, replace(self.scene.drawing, station=station), parts)
+        self.scene, self.station, self.parts = scene, ready, parts
         self._close_claw(station.nest is None)
         self._set_up(self.collisions.found)
-        self._cameras.show(scene, ready)
 
     def remake(self, scene: Scene, station: Station) -> None:
         """As if this scene had been drawn, and the part were in its claw; devices stay as they are."""
         self.scene, self.station = scene, station
         self._set_up(self.collisions.found)
-        self._cameras.show(scene, station)
 
     # --- where things are ---
 
@@ -170,7 +203,8 @@ class World:
         camera_from_flange = inverse(self.flange_from_camera(camera, t))
         return self._cameras.picture(
             camera, world_from_camera, world_from_base, laser=lit, exposure=exposure, warm=self.warmth(t), t=t,
-            camera_from_flange=camera_from_flange, world_from_part=self.part.part_pose(world_from_flange),
+            camera_from_flange=camera_from_flange,
+            parts=[(item.station, item.part.part_pose(world_from_flange)) for item in self._items],
         )  # fmt: skip
 
     def warmth(self, t: float) -> float:
@@ -227,7 +261,9 @@ class World:
         world_from_base = self.world_from_base(t)
         world_from_flange = world_from_base @ base_from_flange
         self.laser.record(t, self.switched("laser"))
-        self.part.set_claw(self.switched("claw"), world_from_flange)
+        closed = self.switched("claw")
+        for item in self._items:
+            item.part.set_claw(closed, world_from_flange)
         self._report_grip()
         self._meet(t, world_from_base)
         wrench = self.part.wrench(world_from_flange)
