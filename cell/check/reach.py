@@ -31,7 +31,7 @@ from cell.motion.collision import (
 )
 from cell.motion.kinematics import HOME, Unreachable, arm_kinematics
 from cell.motion.planning import Planner
-from cell.procedures.arm.moves import ROOM_ABOVE
+from cell.procedures.arm.moves import ROOM_ABOVE, nested_parts, placed_parts
 from cell.procedures.arm.photograph import (
     base_from_place_at_target,
     look_pose,
@@ -83,7 +83,9 @@ def station_planner(job: Job, config: CellConfig, extent: tuple[Vector, Vector])
         (extent[0].tolist(), (x, y, z + ROOM_ABOVE)),
     )  # fmt: skip
     station += station_obstacles(job.obstacle, base_from_place_at_target(config, job))
-    return Planner(kinematics, CollisionModel(kinematics, [*arm_bodies(config.arm.model), *part, *deck, *station]))
+    others = [*nested_parts(job), *placed_parts(job, base_from_place_at_target(config, job))]
+    bodies = [*arm_bodies(config.arm.model), *part, *deck, *station, *others]
+    return Planner(kinematics, CollisionModel(kinematics, bodies))
 
 
 def sweep_problems(job: Job, config: CellConfig, extent: tuple[Vector, Vector]) -> Iterator[str]:

@@ -231,6 +231,15 @@ class BatchSection(Table):
     on_refusal: Literal["end", "ask", "skip"] = "end"
 
 
+class ItemSection(Table):
+    """One part of several: its kind, and where its nest and its surface are, if not where [nest] and [surface] have
+    them. Items are done one after the other."""
+
+    kind: Literal["load", "unload"]
+    base_from_part: Mounting | None = None
+    place_from_surface: Pose | None = None
+
+
 class Job(Table):
     """A job, as typed and checked records."""
 
@@ -246,11 +255,48 @@ class Job(Table):
     nest: NestSection | None = None
     batch: BatchSection = Field(default=BatchSection(), exclude=True)
     obstacle: tuple[StationObstacle, ...] = ()
+    item: tuple[ItemSection, ...] = ()
 
     @model_validator(mode="after")
-    def _distinct_obstacles(self) -> Self:
+    def _distinct(self) -> Self:
         once_each("obstacle", self.obstacle)
+        if self.item and self.nest is None:
+            raise ValueError("[[item]] takes parts from nests, or to them: give [nest]")
         return self
+
+    def of_item(self, number: int) -> Job:
+        """The job of an item, counted from 1: it has that one's kind, nest and surface."""
+        item = self.item[number - 1]
+        assert self.nest is not None
+        nest = self.nest.model_copy(update={"base_from_part": item.base_from_part})
+        surface = self.surface.model_copy(update={"place_from_surface": item.place_from_surface})
+        job = self.job.model_copy(update={"name": f"{job_and_item(self.job.name)[0]}#{number}", "kind": item.kind})
+        return self.model_copy(update={"job": job, "nest": nest, "surface": surface})
+
+    @property
+    def others(self) -> list[tuple[int, pin.SE3, pin.SE3]]:
+        """The other items of the job of an item: their numbers, nests (base_from_part) and places (place_from_part)."""
+        own, on = job_and_item(self.job.name)[1], self.place.surface_from_part.se3()
+        return [
+            (k, item.base_from_part.se3(), item.place_from_surface.se3() * on)
+            for k, item in enumerate(self.item, 1)
+            if k != own and item.base_from_part is not None and item.place_from_surface is not None
+        ]
+
+    def with_whole_items(self) -> Job:
+        """The job with items that tell all of themselves."""
+        if self.nest is None:
+            return self
+        whole = [
+            item.model_copy(
+                update={
+                    "base_from_part": item.base_from_part or self.nest.base_from_part,
+                    "place_from_surface": item.place_from_surface or self.surface.place_from_surface,
+                }
+            )
+            for item in self.item
+        ]
+        return self.model_copy(update={"item": tuple(whole)})
 
     @property
     def unloads(self) -> bool:
@@ -268,11 +314,26 @@ def shipped_jobs() -> list[str]:
     return sorted(entry.name.removesuffix(".toml") for entry in _job_folder().iterdir() if entry.name.endswith(".toml"))
 
 
+def job_and_item(name: str | Path) -> tuple[str, int | None]:
+    """A job's name or file, and the number of an item of it: `tray4#2` is the second one of `tray4`."""
+    if found := re.fullmatch(r"(.+)#([1-9]\d{0,2})", str(name)):
+        return found[1], int(found[2])
+    return str(name), None
+
+
+def each_item(name: str | Path) -> list[str]:
+    """The names of a job's items, in their order; its own where it has none, or is one itself."""
+    file, number = job_and_item(name)
+    items = validate(Job, read_toml(job_path(file), "job", "cell new-job"), file).item if number is None else ()
+    return [f"{file}#{k}" for k in range(1, len(items) + 1)] or [str(name)]
+
+
 def job_path(name: str | Path) -> Path:
     """The file of a job: a path, or a name: `NAME.toml` of the present folder, else the job of that name that ships.
 
     So the `pot.toml` that `cell init` wrote is the job `pot` in its folder.
     """
+    name, _ = job_and_item(name)
     path = Path(name)
     if path.suffix == ".toml" or path.is_file():
         return path
@@ -291,8 +352,9 @@ def require_job_name(name: str) -> None:
 
     A file of the present folder is a regular one in it; a link to elsewhere and a pipe are none.
     """
-    path = job_path(name) if re.fullmatch(r"[\w+-][\w.+-]{0,63}", name) else Path(name)
-    if not (ships(path) or (path == Path(f"{name}.toml") and below(Path(), path.name) is not None)):
+    own, _ = job_and_item(name)
+    path = job_path(name) if re.fullmatch(r"[\w+-][\w.+-]{0,63}", own) else Path(name)
+    if not (ships(path) or (path == Path(f"{own}.toml") and below(Path(), path.name) is not None)):
         raise ConfigError(
             f"there is no job {shown(name)}; a job is named, never addressed: {shown(f'{name[:64]}.toml')} in the "
             f"present folder, or one that ships ({', '.join(shipped_jobs())})"
@@ -307,15 +369,18 @@ def ships(path: Path) -> bool:
 def load_job(name: str | Path) -> tuple[Job, Path]:
     """Read and check a job; also gives the path of its surface's mesh. Raises `ConfigError`.
 
-    Meshes exist; that of the part is named by its whole path.
+    Meshes exist; that of the part is named by its whole path. Of a job with items it is that of the first one, or of
+    the one that is named with its number.
     """
-    path = job_path(name)
+    path, (_, number) = job_path(name), job_and_item(name)
     job = validate(Job, read_toml(path, "job", "cell new-job"), str(path))
     mesh = _mesh_of(path, "surface", job.surface.mesh)
     if job.part is not None:
         part = job.part.model_copy(update={"mesh": str(_mesh_of(path, "part", job.part.mesh).resolve())})
         job = job.model_copy(update={"part": part})
-    return job, mesh
+    if number is not None and number > len(job.item):
+        raise ConfigError(f"{path} has {len(job.item)} items: there is no item {number}")
+    return job.with_whole_items().of_item(number or 1) if job.item else job, mesh
 
 
 def _mesh_of(path: Path, section: str, name: str) -> Path:

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Self
 
 from cell.base.storage import sealed, write_json
-from cell.config.job import Job
+from cell.config.job import Job, job_and_item
 from cell.devices.simulated.process import is_whole
 from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import GraspSeries
@@ -133,24 +133,29 @@ def require_count(count: int) -> None:
 
 
 def perform(
-    here: Opened, job: Job, count: int, run: Callable[[int, GraspSeries], RunOutcome],
+    here: Opened, jobs: Sequence[Job], count: int, run: Callable[[int, GraspSeries], RunOutcome],
     between: Callable[[Callable[[Hands], None]], None], observer: Observer | None,
 ) -> BatchOutcome:  # fmt: skip
     """Do a batch: `run(number, series)` a part, after those of the series; `between(work)` what a person is asked
-    before the next one; both wait.
+    before the next one; both wait. The parts have these `jobs` in turn, which are `count` times begun.
 
     `observer` is told each part's end; one that fails is told nothing more. Raises what keeps the first part from being
     begun, or is no error of the cell.
     """
-    require_count(count)
+    require_count(count := count * len(jobs))
     tell = each_of(() if observer is None else (observer,))
     name = f"batch-{time.strftime('%Y%m%dT%H%M%S')}-{secrets.token_hex(2)}.json"
-    batch, why, interrupted = BatchOutcome(job.job.name, count, here.runs_folder / name), "", False
+    whole = job_and_item(jobs[0].job.name)[0]
+    batch, why, interrupted = BatchOutcome(whole, count, here.runs_folder / name), "", False
     series = GraspSeries()
     try:
         while not why and len(batch.runs) < count:
             number = len(batch.runs) + 1
-            if number > 1 and (work := _question(here, job, f"part {number} of {count}", batch.runs[-1])):
+            job = jobs[(number - 1) % len(jobs)]
+            # A person makes all items ready at once.
+            refill = job is jobs[0]
+            part = f"part {number} of {count}"
+            if number > 1 and (work := _question(here, job, part, batch.runs[-1], refill=refill)):
                 between(work)
             last = run(number, series)
             series = _known_after(series, last)
@@ -184,26 +189,36 @@ def _skipped(here: Opened, job: Job, last: RunOutcome) -> bool:
     return last.outcome == "refused" and untouched and job.batch.on_refusal != "end"
 
 
-def _question(here: Opened, job: Job, part: str, last: RunOutcome) -> Callable[[Hands], None] | None:
-    """What asks a person whether to go on after a refusal, and at a cell with real devices for the next part."""
-    claw, simulated = here.devices.claw, here.simulated
-    by_hand, filled = not is_whole(simulated), simulated is not None and "claw" in simulated.simulated
+def _question(
+    here: Opened, job: Job, part: str, last: RunOutcome, *, refill: bool
+) -> Callable[[Hands], None] | None:  # fmt: skip
+    """What asks a person whether to go on after a refusal, and at a cell with real devices to `refill` it."""
+    by_hand = refill and not is_whole(here.simulated)
     refused = last.outcome == "refused" and job.batch.on_refusal == "ask" and here.config.cell.confirm != "simulated"
 
     def work(hands: Hands) -> None:
         if refused:
             hands.ask(f"The last part was {last}. Go on with {part}?")
-        while by_hand and job.nest is None and not (filled or claw.holding):
-            hands.ask(f"Hold {part} between the claw's fingers: the claw closes on it")
-            try:
-                claw.grip()
-            except DeviceFault:
-                claw.release()
-        ready = "and step back: the arm moves next"
-        if by_hand and job.nest is not None:
-            gone, lies = ("out of the nest", "on its surface") if job.unloads else ("from the station", "in its nest")
-            hands.ask(f"Take the last part {gone}, see that {part} lies {lies}, {ready}")
-        elif by_hand:
-            hands.ask(f"The claw holds {part}; take away what was placed, prepare the next place, {ready}")
+        if by_hand:
+            _refill(here, job, part, hands)
 
     return work if refused or by_hand else None
+
+
+def _refill(here: Opened, job: Job, part: str, hands: Hands) -> None:
+    """A person makes the next part ready."""
+    claw, simulated, ready = here.devices.claw, here.simulated, "and step back: the arm moves next"
+    filled = simulated is not None and "claw" in simulated.simulated
+    while job.nest is None and not (filled or claw.holding):
+        hands.ask(f"Hold {part} between the claw's fingers: the claw closes on it")
+        try:
+            claw.grip()
+        except DeviceFault:
+            claw.release()
+    if job.nest is None:
+        hands.ask(f"The claw holds {part}; take away what was placed, prepare the next place, {ready}")
+    elif job.item:
+        hands.ask(f"Take away what was placed, see that the parts lie where each item takes them from, {ready}")
+    else:
+        gone, lies = ("out of the nest", "on its surface") if job.unloads else ("from the station", "in its nest")
+        hands.ask(f"Take the last part {gone}, see that {part} lies {lies}, {ready}")

@@ -12,7 +12,7 @@ from typing import Any
 
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
-from cell.config.job import Job, job_path, load_job
+from cell.config.job import Job, job_and_item, job_path, load_job
 from cell.procedures.arm.moves import PartState
 from cell.procedures.steps import laser_sweep, verify
 from cell.procedures.steps.sought_part import sought
@@ -167,7 +167,8 @@ def _swept(record: JournalRecord) -> bool:
 
 def job_source(name: str | Path) -> dict[str, object]:
     """For journal and report: the job's file and its hash, and the file and the hash of each of its meshes alone."""
-    path = str(job_path(name).resolve())
+    number = job_and_item(name)[1]
+    path = str(job_path(name).resolve()) + ("" if number is None else f"#{number}")
     job, mesh = load_job(path)
     part = {} if job.part is None else {"part_mesh": mesh_source(Path(job.part.mesh))}
     return {"job_file": path, "job_hash": job_hash(path), "mesh": mesh_source(sought(job, mesh)[1]), **part}

@@ -62,13 +62,9 @@ class Described:
                 f"this cell cannot be simulated as it is described (job {self.job.job.name}):\n  "
                 + "\n  ".join(problems)
             )
-        station, part = _station(self.job, self.mesh, config.vehicle.DRIVES), self.job.part
-        if part is not None:
-            station = replace(station, part_mesh=part.mesh, part_mesh_unit=part.mesh_unit)
-        if self.job.nest is not None:
-            station = replace(
-                station, nest=_matrix(self.job.nest.base_from_part.se3()), nest_filled=not self.job.unloads
-            )
+        drives, items = config.vehicle.DRIVES, range(1, len(self.job.item) + 1)
+        beside = tuple(_station(self.job.of_item(k), self.mesh, drives) for k in items)
+        station = replace(_station(self.job, self.mesh, drives), beside=beside)
         return drawn.settled(Drawing(_cell(config), station), STOCK)
 
 
@@ -99,8 +95,8 @@ def _cell(config: CellConfig) -> drawn.CellDrawing:
 
 def _station(job: Job, mesh: Path, drives: bool) -> drawn.StationDrawing:
     approach, there = job.approach, job.surface
-    shipped = _closed_form(job, mesh)
-    return drawn.StationDrawing(
+    shipped, part, nest = _closed_form(job, mesh), job.part, job.nest
+    station = drawn.StationDrawing(
         height=-float(approach.target.se3().translation[2]),
         # To a fixed frame the station is brought, to where the job has it.
         place_from_start=_matrix((approach.start if drives else approach.target).se3()),
@@ -114,7 +110,12 @@ def _station(job: Job, mesh: Path, drives: bool) -> drawn.StationDrawing:
         surface_from_part=_matrix(job.place.surface_from_part.se3()),
         part_size=job.grasp.size,
         obstacles=_boxes({o.name: (o.place_from_centre, o.size) for o in job.obstacle}),
+        part_mesh="" if part is None else part.mesh,
+        part_mesh_unit="m" if part is None else part.mesh_unit,
+        nest=None if nest is None else _matrix(nest.base_from_part.se3()),
+        nest_filled=nest is not None and not job.unloads,
     )
+    return drawn.settled(station, STOCK.station)
 
 
 def _boxes(obstacles: dict[str, tuple[Pose, tuple[float, float, float]]]) -> dict[str, drawn.Box]:

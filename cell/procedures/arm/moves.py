@@ -66,6 +66,22 @@ def require_share(share: object) -> float:
     return float(share)
 
 
+def nested_parts(job: Job) -> list[Body]:
+    """Parts of other items, as they may lie in their nests."""
+    return [_part_at(f"part in the nest of item {k}", nest, job) for k, nest, _ in job.others]
+
+
+def placed_parts(job: Job, base_from_place: pin.SE3) -> list[Body]:
+    """Parts of other items, as they may lie in their places, but in the one that is this item's own, too."""
+    own = job.surface.place_from_surface.se3() * job.place.surface_from_part.se3()
+    others = [(k, place) for k, _, place in job.others if not place.isApprox(own)]
+    return [_part_at(f"part in the place of item {k}", base_from_place * place, job) for k, place in others]
+
+
+def _part_at(name: str, base_from_part: pin.SE3, job: Job) -> Body:
+    return box(name, BASE, base_from_part * from_parts((0.0, 0.0, 0.5 * job.grasp.size[2])), job.grasp.size)
+
+
 ROOM_ABOVE = 0.005
 """How much higher than drawn the surface is taken to be, m: where it stands is known roughly before it was scanned."""
 GRACE_WALL_S = 10.0
@@ -91,7 +107,7 @@ class Mover:
         self._clock = clock
         self._settle_time = config.arm.settle_time
         self._tool_speed = config.arm.max_tool_speed
-        self._obstacles = vehicle_obstacles(config.obstacle)
+        self._obstacles = [*vehicle_obstacles(config.obstacle), *([] if job is None else nested_parts(job))]
         self._station: list[Body] = []
         self._met: list[Body] = []
         self.kinematics = arm_kinematics(config.arm.model, arm.link_table(), _joint_limits(config.arm))
@@ -115,7 +131,8 @@ class Mover:
         on_place = job.surface.place_from_surface.se3()
         low, (x, y, z) = (corner.tolist() for corner in surface_extent)
         station = station_bodies(base_from_place, centre, on_place, (low, (x, y, z + ROOM_ABOVE)))
-        self._stand_before([*station, *station_obstacles(job.obstacle, base_from_place)])
+        others = placed_parts(job, base_from_place)
+        self._stand_before([*station, *station_obstacles(job.obstacle, base_from_place), *others])
 
     def hold_nothing(self) -> list[Body]:
         """From now on the claw is empty; what it held until now."""

@@ -253,7 +253,8 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         )
     if here.part.state.untaken and here.devices.claw.holding:
         raise RefusedError(
-            f"the claw holds a part, and job {here.job.job.name} takes one {here.part.state.value}: take it out of the claw"
+            f"the claw holds a part, and job {here.job.job.name} takes one that is {here.part.state.value}: take it "
+            "out of the claw"
         )
     vehicle = here.devices.vehicle
     if trouble := vehicle.state().trouble:

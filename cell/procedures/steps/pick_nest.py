@@ -32,7 +32,8 @@ def _at(here: Workplace, context: StepContext) -> HeldPart:
         head = head.pointed(pointing, here.config.laser.exit_point)
     belongs = job.place.surface_from_part.se3()
     faces = seen_from_above(part, belongs)
-    over = belongs * from_parts((0.0, 0.0, 0.5 * float(sum(faces.extent)[2])))
+    low, high = faces.extent
+    over = belongs * from_parts((0.0, 0.0, 0.5 * float(low[2] + high[2])))
     fit = part_in_base(here, job, faces, swept_part(here, head, over, context, frames="nest", cloud=CLOUD))
     off = 1e3 * moved(belongs.inverse() * fit.base_from_surface, part_points(faces))
     most = 1e3 * job.place.tolerance

@@ -17,7 +17,7 @@ from cell.base.compiled import load
 from cell.base.lateness import LATENESS
 from cell.config.calibrations.store import CalibrationEdited, CellCalibration
 from cell.config.cell_config import DEVICES, CellConfig, Confirm
-from cell.config.job import Job, load_job
+from cell.config.job import Job, each_item, load_job
 from cell.devices.devices import Devices, stop_cell
 from cell.devices.simulated.mixed import Sim
 from cell.devices.simulated.process import Injector, Simulation, is_whole
@@ -322,10 +322,14 @@ class Cell:
         Raises:
             CellError: What keeps the first part from being begun.
         """
+        names = each_item(job)
+        for name in names[1:]:
+            ReadyJob.read(name, self.config, None, NO_SCRIPT, calibrates=is_whole(self.simulated))
         return batches.perform(
-            self._here, load_job(job)[0], count,
+            self._here, [load_job(name)[0] for name in names], count,
             run=lambda number, series: self._start(
-                job, observer, {}, None, inject=inject, at_start=at_start and number == 1, series=series
+                names[(number - 1) % len(names)], observer, {}, None, inject=inject,
+                at_start=at_start and number == 1, series=series,
             ).result(),
             between=lambda work: self.perform("loading", work, observer), observer=observer,
         )  # fmt: skip
@@ -364,6 +368,8 @@ class Cell:
             injector = Injector.scheduled(inject, kind_of(load_job(job)[0]).names, self.simulated)
             info["injected"] = [str(injection) for injection in injector.injections]
             inline = (injector,)
+        if len(items := each_item(job)) > 1:
+            raise ConfigError(f"job {job} has {len(items)} items: name one, such as {items[0]}, or run all as a batch")
         self._runs.require_free()
         self._runs.require_no_late_stop()
         stops = self.stops

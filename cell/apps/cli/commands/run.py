@@ -27,7 +27,9 @@ if TYPE_CHECKING:
 UntilOption = Annotated[
     str | None, typer.Option(help="End the run, done, after the step of this name.", autocompletion=options.steps)
 ]
-CountOption = Annotated[int | None, typer.Option("--count", help="A batch: for so many parts, 1 to 10000.")]
+CountOption = Annotated[
+    int | None, typer.Option("--count", help="A batch: for so many parts, 1 to 10000, or rounds of items.")
+]
 AtStartOption = Annotated[
     bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
 ]
@@ -79,6 +81,7 @@ def run(
 
     The vehicle drives only when it is known where it stands: it sees the board, or somebody says --at-start.
     """
+    from cell.config.job import each_item
     from cell.procedures.arm.moves import require_share
     from cell.run.session.supervisor import Cell
 
@@ -87,6 +90,8 @@ def run(
         return cell.run(job, display, at_start=at_start, until=until)
 
     require_share(pace)
+    if count is None and len(each_item(job)) > 1:
+        count = 1
     opened = partial(Cell.open, config, sim=sim, seed=seed, level=level.value, job=job)
     if elsewhere and count is None:
         raise typer.BadParameter("--ask-elsewhere is for the questions of a batch: give --count too, or leave it out")
@@ -117,12 +122,14 @@ def dry_run(
     typer.echo(f"dry run of {job} in the simulated world {seed}: loading", err=True)
     from cell.check.fit import require_fit
     from cell.config.cell_config import find_config, load_config
-    from cell.config.job import load_job
+    from cell.config.job import each_item, load_job
     from cell.devices.simulated.process import Injection
     from cell.procedures.steps.kinds import kind_of
     from cell.run.session.supervisor import Cell
 
     loaded, mesh = load_job(job)
+    if count is None and len(each_item(job)) > 1:
+        count = 1
     described = load_config(find_config(config, simulated=True))
     require_fit(loaded, described, mesh, calibrates=True)
     if clock is None and speed is None:

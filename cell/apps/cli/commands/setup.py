@@ -61,7 +61,7 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
     from cell.check.fit import require_fit
     from cell.check.place import contact_notes
     from cell.config.cell_config import DEVICES, beside, example_addresses, find_config, load_config, require_confirm
-    from cell.config.job import job_path, load_job
+    from cell.config.job import each_item, job_path, load_job
     from cell.devices.simulated.mixed import require_possible
     from cell.run.report.figures import simulated_words
     from drivers.errors import ConfigError
@@ -71,9 +71,10 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
     try:
         loaded = load_config(source)
         require_confirm(loaded)
-        checked, mesh = load_job(job)
         told["job_file"] = str(job_path(job))
-        require_fit(checked, loaded, mesh)
+        for item in each_item(job):
+            checked, mesh = load_job(item)
+            require_fit(checked, loaded, mesh)
         if loaded.cell.meshes:
             link_meshes(beside(source) / loaded.cell.meshes)
     except ConfigError as error:
