@@ -16,15 +16,15 @@ from cell.check.placed_part import verify_problems
 from cell.check.reach import reach_problems
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
-from cell.config.job import Job
+from cell.config.job import Job, each_item, load_job
 from cell.measure.geometry.poses import transform
 from cell.measure.vision import BoardSpec, parse_board
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
+from cell.procedures.sought_part import around, ground_below, nominal_of, sought
 from cell.procedures.steps import verify
 from cell.procedures.steps.kinds import kind_of
-from cell.procedures.steps.sought_part import around, ground_below, nominal_of, sought
 from drivers.errors import ConfigError
 from drivers.make import CameraConfig
 
@@ -61,6 +61,17 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
     problems = problems or [*mating_problems(job, mesh), *verify_problems(job, config)]
     if problems:
         raise ConfigError(f"job {job.job.name} does not fit this cell:\n  " + "\n  ".join(problems))
+
+
+def read_fitting(name: str | Path, config: CellConfig, *, calibrates: bool = False) -> tuple[Job, Path]:
+    """The job of this file or name, or its first item, and the file of its surface's mesh.
+
+    Raises `ConfigError` where it does not fit the cell, or one of its items does not.
+    """
+    read = [load_job(item) for item in each_item(name)]
+    for job, mesh in read:
+        require_fit(job, config, mesh, calibrates=calibrates)
+    return read[0]
 
 
 def _kind(job: Job) -> Iterator[str]:

@@ -27,8 +27,8 @@ LEAST_LINES, MOST_LINES = 10, 20_000
 LONGEST_SWEEP_S = 100.0
 """The step of the laser sweep has 120 s."""
 
-LOAD = "load"
-"""The kind of job that takes its part from a nest on the vehicle."""
+LOAD, UNLOAD = "load", "unload"
+"""The kinds of job that take their part from a nest on the vehicle, and bring it into one."""
 
 Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
 Share = Annotated[float, number(-1, 1)]

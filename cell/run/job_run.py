@@ -28,9 +28,9 @@ from cell.procedures.arm.moves import Pace, PartProgress, PartState
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.grasp import GraspSeries
+from cell.procedures.sought_part import ground_below, nominal_of, sought
 from cell.procedures.steps import verify
 from cell.procedures.steps.kinds import Kind, kind_of
-from cell.procedures.steps.sought_part import ground_below, nominal_of, sought
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep
 from cell.procedures.sweep.swath import SweepCollector, Sweeping

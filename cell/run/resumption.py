@@ -14,8 +14,8 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, job_and_item, job_path, load_job
 from cell.procedures.arm.moves import PartState
+from cell.procedures.sought_part import sought
 from cell.procedures.steps import laser_sweep, verify
-from cell.procedures.steps.sought_part import sought
 from cell.procedures.sweep.stored_sweep import FILE, StoredSweep
 from cell.run.folder import list_runs
 from drivers.errors import ConfigError, RefusedError

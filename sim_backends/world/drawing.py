@@ -296,6 +296,6 @@ def _plain(data: dict[str, Any]) -> dict[str, Any]:
     def made(value: Any) -> Any:
         if not isinstance(value, list):
             return value
-        return np.array(value) if isinstance(value[0], list) else tuple(value)
+        return np.array(value) if value and isinstance(value[0], list) else tuple(value)
 
     return {name: made(value) for name, value in data.items()}

@@ -14,8 +14,8 @@ import pinocchio as pin
 
 from cell.measure.geometry.poses import difference
 from cell.procedures.arm.photograph import MOVED, BoardFix, photo_pose, swing_covariance
+from cell.procedures.sought_part import around
 from cell.procedures.steps.drive_to_target import VehicleArrival
-from cell.procedures.steps.sought_part import around
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
 from drivers.errors import Measured, RefusedError
 from statemachine.runner import StepContext

@@ -24,7 +24,6 @@ from cell.procedures.steps import (
     place,
     reconstruct,
     set_down,
-    sought_part,
     verify,
     verify_nest,
 )
@@ -127,7 +126,7 @@ VERIFIED = PLACE.with_step(verify.STEP, after=place.STEP.name, name=PLACE.name)
 
 
 UNLOAD = Kind(
-    sought_part.UNLOAD,
+    job_file.UNLOAD,
     (drive_to_target.STEP, board_photo.STEP, laser_sweep.STEP, reconstruct.STEP, invert_pose.STEP, pick.STEP,
      set_down.STEP, verify_nest.STEP),
 )  # fmt: skip

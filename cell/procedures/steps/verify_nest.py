@@ -14,10 +14,10 @@ from cell.measure.inversion.part_pose import DEMANDS, SHIFTED, PartPose, parted
 from cell.measure.reconstruction import Cloud
 from cell.procedures.part_error import part_points
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart
+from cell.procedures.sought_part import pose_record
 from cell.procedures.steps.laser_sweep import head_at
 from cell.procedures.steps.reconstruct import displacements
 from cell.procedures.steps.set_down import SetDown
-from cell.procedures.steps.sought_part import pose_record
 from cell.procedures.steps.verify import swept_part
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
@@ -53,6 +53,8 @@ def part_in_base(here: Workplace, job: Job, faces: NominalSurface, swept: tuple[
     (cloud, record), belongs = swept, job.place.surface_from_part.se3()
     by_calibration, by_poses = displacements(here, record, cloud)
     on_part, _ = parted(cloud, faces, belongs)
+    if not on_part.valid.any():
+        raise RefusedError("the nest is empty: nothing was seen where the part belongs")
     try:
         return register(
             on_part, faces, Prior(belongs, np.diag(SHIFTED**2)),
@@ -61,6 +63,7 @@ def part_in_base(here: Workplace, job: Job, faces: NominalSurface, swept: tuple[
         )  # fmt: skip
     except RefusedError as error:
         why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")
+        why = why.replace("scan and board disagree: the surface", "it").replace("where the board puts it", "there")
         raise RefusedError(f"the part is not seen in its nest: {why}", *error.numbers) from error
 
 

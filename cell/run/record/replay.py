@@ -31,10 +31,10 @@ from cell.measure.reconstruction.ply import read_cloud
 from cell.procedures.arm.photograph import BoardFix, photograph
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
+from cell.procedures.sought_part import nominal_of
 from cell.procedures.steps.board_photo import settled
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction, reconstructed
-from cell.procedures.steps.sought_part import nominal_of
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep, SweepRecord
 from cell.run.record.file import FILE as RECORD

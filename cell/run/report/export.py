@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cell.config.job import load_job
 from cell.measure.geometry.poses import from_ur, transform
 from cell.measure.reconstruction.ply import StoredCloud, deviation_colours, read_cloud, triangles, write_mesh, write_ply
-from cell.procedures.steps.sought_part import nominal_of, sought
+from cell.procedures.sought_part import nominal_of, sought
 from cell.run.folder import Report, read_report
 from cell.run.report.figures import simulated_words
 from drivers.errors import ConfigError

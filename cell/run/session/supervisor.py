@@ -15,6 +15,7 @@ from typing import TypeVar
 
 from cell.base.compiled import load
 from cell.base.lateness import LATENESS
+from cell.check.fit import read_fitting
 from cell.config.calibrations.store import CalibrationEdited, CellCalibration
 from cell.config.cell_config import DEVICES, CellConfig, Confirm
 from cell.config.job import Job, each_item, load_job
@@ -323,8 +324,7 @@ class Cell:
             CellError: What keeps the first part from being begun.
         """
         names = each_item(job)
-        for name in names[1:]:
-            ReadyJob.read(name, self.config, None, NO_SCRIPT, calibrates=is_whole(self.simulated))
+        read_fitting(job, self.config, calibrates=is_whole(self.simulated))
         return batches.perform(
             self._here, [load_job(name)[0] for name in names], count,
             run=lambda number, series: self._start(

@@ -120,18 +120,17 @@ def dry_run(
 ) -> None:
     """Run a job on a simulated cell, which is started and ended by itself. Calibrates it first if need be."""
     typer.echo(f"dry run of {job} in the simulated world {seed}: loading", err=True)
-    from cell.check.fit import require_fit
+    from cell.check.fit import read_fitting
     from cell.config.cell_config import find_config, load_config
-    from cell.config.job import each_item, load_job
+    from cell.config.job import each_item
     from cell.devices.simulated.process import Injection
     from cell.procedures.steps.kinds import kind_of
     from cell.run.session.supervisor import Cell
 
-    loaded, mesh = load_job(job)
     if count is None and len(each_item(job)) > 1:
         count = 1
     described = load_config(find_config(config, simulated=True))
-    require_fit(loaded, described, mesh, calibrates=True)
+    loaded, _ = read_fitting(job, described, calibrates=True)
     if clock is None and speed is None:
         clock = _clock(described)
     kind_of(loaded).until(until)

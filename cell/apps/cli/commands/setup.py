@@ -58,10 +58,10 @@ def init(
 def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption = False) -> None:
     """Read the configuration and the job and say what is wrong with them; touches no device."""
     from cell.apps.console.view.scene import link_meshes
-    from cell.check.fit import require_fit
+    from cell.check.fit import read_fitting
     from cell.check.place import contact_notes
     from cell.config.cell_config import DEVICES, beside, example_addresses, find_config, load_config, require_confirm
-    from cell.config.job import each_item, job_path, load_job
+    from cell.config.job import job_and_item, job_path
     from cell.devices.simulated.mixed import require_possible
     from cell.run.report.figures import simulated_words
     from drivers.errors import ConfigError
@@ -72,9 +72,7 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
         loaded = load_config(source)
         require_confirm(loaded)
         told["job_file"] = str(job_path(job))
-        for item in each_item(job):
-            checked, mesh = load_job(item)
-            require_fit(checked, loaded, mesh)
+        checked, mesh = read_fitting(job, loaded)
         if loaded.cell.meshes:
             link_meshes(beside(source) / loaded.cell.meshes)
     except ConfigError as error:
@@ -92,13 +90,13 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
     told |= {
         "ok": True, "cell": loaded.cell.name, "configuration_hash": loaded.calibration_hash(),
         "simulated": bool(loaded.cell.truth) or list(loaded.cell.sim), "confirm": loaded.cell.confirm,
-        "job": checked.job.name, "mesh": str(mesh), "problems": [], "notes": notes,
+        "job": job_and_item(checked.job.name)[0], "mesh": str(mesh), "problems": [], "notes": notes,
     }  # fmt: skip
     if json:
         print_json(told)
         return
     typer.echo(f"cell {loaded.cell.name}: configuration is valid ({told['configuration']})")
-    typer.echo(f"job {checked.job.name}: valid and in reach ({told['job_file']}), mesh {mesh}")
+    typer.echo(f"job {told['job']}: valid and in reach ({told['job_file']}), mesh {mesh}")
     if words := simulated_words(list(loaded.cell.sim)):
         typer.echo(f"note: {words} (cell.sim)")
     for note in notes:

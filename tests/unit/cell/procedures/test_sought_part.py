@@ -12,7 +12,7 @@ from cell.config.cell_config import load_config
 from cell.config.job import Job, load_job
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.part_pose import seen_from_below
-from cell.procedures.steps.sought_part import nominal_of, sought
+from cell.procedures.sought_part import nominal_of, sought
 from drivers.errors import ConfigError
 from drivers.make import Mounting
 from tests.support.unloading import JOB, MESH

@@ -15,9 +15,6 @@ from cell.measure.inversion.part_pose import seen_from_above
 from drivers.interfaces import Vector
 from drivers.make import Pose
 
-UNLOAD = "unload"
-"""The kind of job that takes a part from its surface."""
-
 
 def sought(job: Job, mesh: Path) -> tuple[Job, Path]:
     """The job with what its sweep looks for as its surface, and the file of that mesh.
