@@ -79,6 +79,7 @@ GROUPS = (
         "unit/cell/procedures/steps/test_invert_pose.py",
         "unit/cell/procedures/steps/test_gripping.py",
         "unit/cell/procedures/steps/test_pick.py",
+        "unit/cell/procedures/steps/test_pick_nest.py",
         "unit/cell/procedures/steps/test_verify_nest.py",
         "unit/cell/procedures/steps/test_place.py",
         "unit/cell/procedures/steps/test_verify.py",

@@ -1,11 +1,11 @@
-"""Unloading: whole virtual jobs that take a part from its surface."""
+"""Loading and unloading: whole virtual jobs that take a part from its nest or its surface."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
-from cell.config.job import load_job
+from cell.config.job import Job, job_path, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.inversion import NominalSurface
 from lab.bench.job.whole_job import JobRecord, run_whole_job
@@ -17,9 +17,20 @@ JOB = changed(SHIPPED, "scan", speed=2.0 * SHIPPED.scan.speed)
 Change = Callable[[VirtualCell], None]
 
 
-def unloaded(placed_pot: JobRecord, change: Change = lambda cell: None, runs: Path | None = None) -> JobRecord:
-    """The job `unload` in the world of `placed_pot`, with its calibration; `change` changes the cell before it."""
-    nominal = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit)
+def swap_file(folder: Path) -> Path:
+    """The job `swap`, swept twice as fast as shipped, as a file of this folder."""
+    text, file = job_path("swap").read_text(encoding="utf-8"), folder / "swap.toml"
+    for name in ("facets.ply", "shell-part.ply"):
+        text = text.replace(f'"{name}"', f'"{job_path("swap").parent / name}"')
+    file.write_text(text.replace('speed = "15 mm/s"', 'speed = "30 mm/s"'), encoding="utf-8")
+    return file
+
+
+def unloaded(
+    placed_pot: JobRecord, change: Change = lambda cell: None, runs: Path | None = None, job: Job = JOB
+) -> JobRecord:  # fmt: skip
+    """The `job` in the world of `placed_pot`, with its calibration; `change` changes the cell before it."""
+    nominal = NominalSurface.load(MESH, unit=job.surface.mesh_unit)
     return run_whole_job(
-        CONFIG, JOB, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot, runs=runs, changed=change
+        CONFIG, job, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot, runs=runs, changed=change
     )

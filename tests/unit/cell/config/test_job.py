@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from cell.config.job import job_path, load_job, shipped_jobs
+from cell.config.job import each_item, job_path, load_job, shipped_jobs
 from drivers.errors import ConfigError
 
 
 @pytest.mark.parametrize("name", shipped_jobs())
 def test_every_shipped_job_is_valid(name: str) -> None:
     job, mesh = load_job(name)
-    assert job.job.name == name
+    assert job.job.name == name + "#1" * bool(job.item)
     assert mesh.is_file()
 
 
@@ -46,4 +46,31 @@ def test_what_a_batch_does_is_checked_and_no_part_of_what_runs_rest_on(tmp_path:
     assert "batch" not in job.model_dump(mode="json")
     path.write_text(path.read_text().replace("skip", "later"))
     with pytest.raises(ConfigError, match=r'batch\.on_refusal.*"end", "ask" or "skip"'):
+        load_job(path)
+
+
+def test_an_item_has_its_own_nest_and_surface_and_knows_where_the_others_are() -> None:
+    first, third = load_job("tray4")[0], load_job("tray4#3")[0]
+    assert each_item("tray4") == [f"tray4#{k}" for k in (1, 2, 3, 4)] and each_item("tray4#2") == ["tray4#2"]
+    assert each_item("pot") == ["pot"]
+    assert third.nest is not None and third.nest.base_from_part.translation == pytest.approx((-0.7, 0.1, 0.03))
+    assert third.surface.place_from_surface.translation == (0.06, -0.06, 0.0)
+    assert (third.job.name, third.job.kind) == ("tray4#3", "load")
+    assert [number for number, _, _ in third.others] == [1, 2, 4]
+    assert third.others[0][1].isApprox(first.nest.base_from_part.se3()) if first.nest else False
+    assert third.others[0][2].isApprox(first.surface.place_from_surface.se3())
+    assert third.of_item(1) == first, "whichever item it is asked of"
+    # What an item does not say is as [nest] and [surface] have it.
+    old, new = load_job("swap")[0], load_job("swap#2")[0]
+    assert (old.unloads, new.unloads) == (True, False) and old.surface == new.surface
+    assert old.nest is not None and old.nest.base_from_part.translation == (-0.6, 0.06, 0.03)
+
+
+def test_an_item_that_is_not_there_and_items_without_a_nest_are_told(tmp_path: Path) -> None:
+    for name in ("tray4#5", "pot#1"):
+        with pytest.raises(ConfigError, match=r"has \d items: there is no item \d"):
+            load_job(name)
+    path = tmp_path / "mine.toml"
+    path.write_text(f'{job_path("pot").read_text(encoding="utf-8")}\n[[item]]\nkind = "load"\n')
+    with pytest.raises(ConfigError, match=r"\[\[item\]\] takes parts from nests, or to them: give \[nest\]"):
         load_job(path)

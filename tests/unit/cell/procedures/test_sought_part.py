@@ -62,7 +62,7 @@ def changed(**update: object) -> Job:
     [
         (changed(nest=None), r'job\.kind "unload" finds the part by its mesh .*give \[part\] and \[nest\]'),
         (changed(part=None), r"give \[part\] and \[nest\]"),
-        (changed(job=JOB.job.model_copy(update={"kind": "place"})), r'\[nest\]: job\.kind "place" sets no part down'),
+        (changed(job=JOB.job.model_copy(update={"kind": "place"})), r'\[nest\]: job\.kind "place" has no use for it'),
         (
             changed(
                 nest=JOB.nest

@@ -181,13 +181,14 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
         def work(hands: Hands) -> None:
             with cell.maintenance("the part is taken out", ["claw_at_contact"]):
                 claw.release()
-            question = _question(here, job, "part 2 of 2", last)
+            assert _question(here, job, "part 2 of 2", last, refill=False) is None
+            question = _question(here, job, "part 2 of 2", last, refill=True)
             assert question is not None
             question(replace(hands, ask=person))
 
         cell.perform("loading", work)
     assert asked == ["Hold", "Hold", "The"]
-    assert _question(cell._here, job, "part 2 of 2", last) is None
+    assert _question(cell._here, job, "part 2 of 2", last, refill=True) is None
 
 
 def test_the_command_line_shows_what_came_of_it(

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from sim_backends.clock import SteppedClock
 from sim_backends.world import drawing
 from sim_backends.world.world import World, truth
 from tests.support.simulator.standing_world import StandingWorld
@@ -65,3 +67,38 @@ def test_truth_is_complete_json_and_consistent() -> None:
     assert told["part"]["held"]
     assert not told["laser_on"]
     assert told["vehicle"]["stopped"]
+
+
+def test_the_items_of_a_job_stand_on_one_table_each_with_its_part_until_that_was_taken() -> None:
+    def at(x: float, y: float, z: float) -> np.ndarray:
+        return drawing.pose((x, y, z), (1, 0, 0), (0, 0, 1))
+
+    nests = [at(-0.6, y, 0.03) for y in (0.0, 0.1)]
+    beside = tuple(
+        replace(drawing.STOCK.station, nest=nest, nest_filled=True, place_from_surface=at(0.0, y, 0.0))
+        for nest, y in zip(nests, (-0.06, 0.06), strict=True)
+    )
+    first, second = (replace(drawing.STOCK, station=replace(each, beside=beside)) for each in beside)
+    assert drawing.read(second.as_json()).as_json() == second.as_json()
+    world = World(3, "nominal", drawing=first, clock=SteppedClock())
+    for item, drawn in zip(world._items, beside, strict=True):
+        scene = item.scene
+        np.testing.assert_allclose(
+            drawing.inverse(scene.world_from_table) @ scene.world_from_surface, drawn.place_from_surface, atol=1e-15
+        )
+        lies = drawing.inverse(world.world_from_base(0.0)) @ item.part.part_pose(np.eye(4))
+        assert 1e-5 < np.linalg.norm((lies - drawn.nest)[:3, 3]) < 2e-3 and not item.part.held  # type: ignore[operator]
+    assert world.part is world._items[0].part
+    world.make_ready(second.station)
+    assert (world.part is world._items[1].part, world.parts, world.scene) == (True, 0, world._items[1].scene)
+    flange = world._items[0].part.part_pose(np.eye(4)) @ drawing.inverse(drawing.FLANGE_FROM_PART)
+    for closed in (True, False):
+        for item in world._items:
+            item.part.set_claw(closed, flange)
+        held = [item.part.held for item in world._items]
+        assert held == [closed, False]
+        assert world.part is world._items[0 if closed else 1].part, "the one that is held counts"
+    world.make_ready(second.station)
+    assert world.parts == 0, "the second one lies as it lay"
+    world.make_ready(first.station)
+    assert world.parts == 2 and world._items[0].part.untouched, "the first one was taken: all is made ready again"

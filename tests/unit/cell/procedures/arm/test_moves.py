@@ -7,11 +7,12 @@ import pytest
 
 from cell import Cell
 from cell.config.cell_config import load_config
+from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.motion.collision import CollisionError
 from cell.motion.kinematics import HOME
-from cell.procedures.arm.moves import LEAST, Mover, Pace
+from cell.procedures.arm.moves import LEAST, Mover, Pace, nested_parts, placed_parts
 from cell.procedures.arm.photograph import drawn_interim_view
 from cell.procedures.calibrate.interim import resting_pose
 from cell.procedures.steps.drive_to_target import TargetDrive
@@ -150,3 +151,18 @@ def test_a_cell_is_slowed_from_outside_while_it_works() -> None:
         assert cell.mover(None).pace.share == 0.3
         with pytest.raises(ConfigError):
             cell.pace = 2.0
+
+
+def test_parts_of_other_items_are_kept_clear_of_but_in_the_items_own_place() -> None:
+    tray, new = load_job("tray4#2")[0], load_job("swap#2")[0]
+    place = from_parts((1.0, 0.0, 0.6))
+    nested, placed = nested_parts(tray), placed_parts(tray, place)
+    assert [body.name for body in nested] == [f"part in the nest of item {k}" for k in (1, 3, 4)]
+    assert [body.name for body in placed] == [f"part in the place of item {k}" for k in (1, 3, 4)]
+    middle = np.array([0.0, 0.0, 0.5 * tray.grasp.size[2]])
+    np.testing.assert_allclose(nested[0].placement.translation, middle + [-0.6, 0.1, 0.03], atol=1e-12)
+    np.testing.assert_allclose(placed[0].placement.translation, middle + [0.95, -0.06, 0.6], atol=1e-12)
+    assert placed_parts(new, place) == [] and len(nested_parts(new)) == 1
+    cell = VirtualCell(CONFIG, 2, "nominal")
+    mover = Mover(cell.devices.arm, cell.clock, CONFIG, tray)
+    assert {body.name for body in nested} <= {body.name for body in mover.solids()}

@@ -73,7 +73,7 @@ def hold(cell: VirtualCell) -> None:
     ("change", "stage", "told"),
     [
         (take_away, "invert_pose", "surface"),
-        (hold, "drive_to_target", "the claw holds a part, and job unload takes one from its surface"),
+        (hold, "drive_to_target", "the claw holds a part, and job unload takes one that is at the station"),
     ],
 )
 def test_where_there_is_no_part_or_the_claw_is_full_nothing_is_gripped(

@@ -1,0 +1,108 @@
+"""A part is found in its nest, gripped where it lies, and placed; and what keeps it from being gripped."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cell import Cell, ConfigError
+from cell.config.calibrations.store import save_calibration
+from cell.config.job import load_job
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import difference, from_matrix
+from lab.bench.job.whole_job import JobRecord
+from sim_backends.world.drawing import inverse
+from statemachine.step import Event
+from tests.support.report_runs import changed
+from tests.support.unloading import swap_file, unloaded
+
+SHIPPED, _ = load_job("load")
+JOB = changed(SHIPPED, "scan", speed=2.0 * SHIPPED.scan.speed)
+
+
+def aside(cell: VirtualCell, metres: float) -> None:
+    """The part lies so far beside its nest, along the arm base's x axis."""
+    pose = cell.world.part._base_from_part
+    assert pose is not None
+    pose[0, 3] += metres
+
+
+@pytest.mark.parametrize(
+    ("metres", "told"),
+    [
+        (3e-3, r"the part lies [23]\.\d\d mm off its place in the nest, on average \(allowed: 2 mm\)"),
+        (15e-3, r"the part is not seen in its nest: it lies 1[45]\.\d\d mm and .* deg from there"),
+        (0.2, "the nest is empty: nothing was seen where the part belongs"),
+    ],
+)
+def test_a_part_that_is_not_in_its_nest_is_not_gripped(placed_pot: JobRecord, metres: float, told: str) -> None:
+    cells: list[VirtualCell] = []
+
+    def change(cell: VirtualCell) -> None:
+        cells.append(cell)
+        aside(cell, metres)
+
+    done = unloaded(placed_pot, change, job=JOB)
+    assert (done.outcome, done.stage) == ("refused", "pick")
+    assert re.search(told, done.reason), done.reason
+    assert not cells[0].world.part.held and cells[0].world.part.untouched
+
+
+def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_resumed(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert placed_pot.calibration is not None
+    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
+    file = swap_file(tmp_path)
+    with Cell.open(sim="all", seed=placed_pot.seed, clock="virtual", job=file) as cell:
+        assert isinstance(cell.simulated, VirtualCell)
+        world, begun = cell.simulated.world, list[str]()
+        # It lies as the world has drawn it, which is not where the job expects it.
+        nest = load_job(f"{file}#2")[0].nest
+        assert nest is not None
+        lay = from_matrix(world._items[1].part._base_from_part)
+        off = difference(lay, nest.base_from_part.se3())
+        assert 0.1e-3 < np.linalg.norm(off[:3]) < 2e-3
+
+        def end(event: Event) -> None:
+            begun.extend([event.step or ""] * (event.kind == "step_started"))
+            if begun.count("pick") == 2 and cell.current is not None:
+                cell.current.abort("seen enough")
+
+        with pytest.raises(ConfigError, match=r"has 2 items: name one, such as .*swap\.toml#1, or run all as a batch"):
+            cell.run(file)
+        batch = cell.run_batch(file, observer=end)
+        assert [run.outcome for run in batch.runs] == ["placed", "aborted"]
+        assert [run.report["part"] for run in batch.runs] == ["released", "in its nest"]
+        assert begun[: begun.index("pick")] == [
+            "drive_to_target",
+            "board_photo",
+            "laser_sweep",
+            "reconstruct",
+            "invert_pose",
+        ]
+        assert begun[-2:] == ["drive_to_target", "pick"]
+        done = cell.resume()
+        assert (done.outcome, done.report["part"], done.report["job"]) == ("placed", "released", "swap#2")
+        old, new = (item.part for item in world._items)
+        assert not (old.held or new.held) and world.collisions.found == ()
+        flange = np.eye(4)
+        lies = from_matrix(inverse(world.scene.world_from_surface) @ new.part_pose(flange))
+        seen = done.results["verify"]
+        error = difference(seen.seen.surface_from_part, lies)
+        assert error @ np.linalg.solve(seen.covariance, error) < 22.5, "of 1,000 by chance one"
+        # The old one rides in its nest, .5 m from there.
+        assert np.linalg.norm((old.part_pose(flange) - new.part_pose(flange))[:2, 3]) > 0.3
+        # The claw holds the new one as it lay: known to what its sweep told, not to what the job states.
+        picked = done.results["pick"]
+        assert np.sqrt(np.diag(picked.covariance)[:3]).max() < 0.08e-3
+        assert done.results["place"].touch.expected.sigma < 0.11e-3
+        grip = difference(picked.base_from_flange, lay * JOB.grasp.flange_from_part.se3().inverse())
+        assert np.linalg.norm(grip[:3]) < 0.3e-3
+        # Both are gone: a person makes all ready again.
+        again = cell.run(f"{file}#1", until="drive_to_target")
+        assert (again.outcome, again.report["part"], world.parts) == ("done", "at the station", 2)
