@@ -183,10 +183,10 @@ def job_toml() -> str:
     part = PartSection.model_validate({"mesh": "part.stl", "mesh_unit": "mm"})
     pot = load_job("pot")[0]
     place = pot.place.model_copy(update={"accept": pot.place.tolerance})
-    # `pot` says most. What it leaves out `cell new-job` says for any job, `shell` and `unload` for themselves alone.
-    shipped = [comments(job_path(name).read_text(encoding="utf-8")) for name in ("unload", "shell", "pot")]
+    # `pot` says most. What it leaves out `cell new-job` says for any job, the others for themselves alone.
+    shipped = [comments(job_path(name).read_text(encoding="utf-8")) for name in ("tray4", "unload", "shell", "pot")]
     written = comments(job_text(pot.model_copy(update={"part": part, "place": place}), []))
-    told = shipped[0] | shipped[1] | written | shipped[2]
+    told = shipped[0] | shipped[1] | shipped[2] | written | shipped[3]
     text, models = "# job.toml\n\n" + NOTE, list(records(Job))
     text += '`cell new-job` writes such a file for a mesh. Every quantity carries its unit, such as `"35 mm"`.\n\n'
     for name, field in Job.model_fields.items():

@@ -160,8 +160,8 @@ def test_parts_of_other_items_are_kept_clear_of_but_in_the_items_own_place() -> 
     assert [body.name for body in nested] == [f"part in the nest of item {k}" for k in (1, 3, 4)]
     assert [body.name for body in placed] == [f"part in the place of item {k}" for k in (1, 3, 4)]
     middle = np.array([0.0, 0.0, 0.5 * tray.grasp.size[2]])
-    np.testing.assert_allclose(nested[0].placement.translation, middle + [-0.6, 0.1, 0.03], atol=1e-12)
-    np.testing.assert_allclose(placed[0].placement.translation, middle + [0.95, -0.06, 0.6], atol=1e-12)
+    np.testing.assert_allclose(nested[0].placement.translation, np.add(middle, (-0.6, 0.1, 0.03)), atol=1e-12)
+    np.testing.assert_allclose(placed[0].placement.translation, np.add(middle, (0.95, -0.06, 0.6)), atol=1e-12)
     assert placed_parts(new, place) == [] and len(nested_parts(new)) == 1
     cell = VirtualCell(CONFIG, 2, "nominal")
     mover = Mover(cell.devices.arm, cell.clock, CONFIG, tray)
