@@ -170,6 +170,9 @@ def perform(
             raise
         why = f"after part {len(batch.runs)}: {error}"
         interrupted = isinstance(error, Interrupted | SignalInterrupt)
+    if why and len(jobs) > 1 and len(batch.runs) < count:
+        rest = [jobs[k % len(jobs)].job.name for k in range(len(batch.runs), count)]
+        why += f"; not tried: {', '.join(rest[: len(jobs)])}"
     return replace(batch, reason=why or "every part was tried", interrupted=interrupted).kept()
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from cell.apps.console.host.manual import HOLD_SPEED, HOLD_TURN, rail_hold_speed
 from cell.apps.console.view.scene import scene
 from cell.config.cell_config import DEVICES, CellConfig
-from cell.config.job import load_job, require_job_name, shipped_jobs
+from cell.config.job import each_item, load_job, require_job_name, shipped_jobs
 from cell.devices.devices import Devices
 from cell.devices.gate.gate import Gated
 from cell.devices.gate.rules import RULES
@@ -208,16 +208,17 @@ def cell_facts(cell: Cell, job: str) -> dict[str, object]:
 
 
 def jobs(own: str) -> list[str]:
-    """The console's own first, those of the present folder, and those that ship."""
+    """The console's own first, those of the present folder, and those that ship; of several parts the items."""
     here = []
     for path in sorted(Path.cwd().glob("*.toml")):
         try:
             require_job_name(path.stem)
             load_job(path.stem)
-            here.append(path.stem)
+            here += each_item(path.stem)
         except CellError:
             continue
-    return list(dict.fromkeys((own, *here, *shipped_jobs())))
+    shipped = [item for name in shipped_jobs() for item in each_item(name)]
+    return list(dict.fromkeys((own, *here, *shipped)))
 
 
 def _jogs(cell: Cell, name: str) -> list[dict[str, object]]:

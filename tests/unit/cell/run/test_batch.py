@@ -17,7 +17,7 @@ from cell.config.calibrations.store import save_calibration
 from cell.config.job import job_path, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
-from cell.run.batch import _question
+from cell.run.batch import _question, perform
 from cell.run.folder import read_report
 from cell.run.job_run import RunOutcome
 from cell.run.recorded_work import Hands
@@ -152,6 +152,27 @@ def test_an_abort_in_the_second_part_leaves_the_first_whole_and_tells_what_was_n
     assert [run.outcome for run in batch.runs] == ["placed", "aborted"]
     assert (batch.reason, batch.counts["not tried"], batch.exit_code) == ("part 2 aborted: seen enough", 1, 1)
     assert read_report(batch.runs[0].folder)["outcome"] == "placed"
+
+
+def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
+    opened: Callable[..., Cell], tmp_path: Path
+) -> None:
+    jobs, asked, tried = [load_job(f"swap#{k}")[0] for k in (1, 2)], list[int](), list[int]()
+
+    def run(number: int, series: object) -> RunOutcome:
+        tried.append(number)
+        how = ("placed", "in place") if number < 4 else ("aborted", "seen enough")
+        return RunOutcome(*how, tmp_path, {"cell_s": 1.0, "measured": [], "steps": []})
+
+    with opened() as cell:
+        here = replace(cell._here, simulated=None)
+        batch = perform(here, jobs, 3, run, between=lambda work: asked.append(len(tried)), observer=None)
+    assert (tried, asked) == ([1, 2, 3, 4], [2]), "a person at a real cell makes both items ready again"
+    assert (batch.job, batch.count, batch.reason) == (
+        "swap",
+        6,
+        "part 4 aborted: seen enough; not tried: swap#1, swap#2",
+    )
 
 
 @pytest.mark.parametrize("count", [0, 1_000_001])
