@@ -166,6 +166,7 @@ def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
 
     with opened() as cell:
         here = replace(cell._here, simulated=None)
+        cell.runs_folder.mkdir()
         batch = perform(here, jobs, 3, run, between=lambda work: asked.append(len(tried)), observer=None)
     assert (tried, asked) == ([1, 2, 3, 4], [2]), "a person at a real cell makes both items ready again"
     assert (batch.job, batch.count, batch.reason) == (
