@@ -88,21 +88,27 @@ class World:
 
     def _set_up(self, found: tuple[Collision, ...] = ()) -> None:
         """Part in the claw, or those of all items where they lie at first, and bodies that may meet."""
-        self._item, self._items = 0, [Item(self.scene, self.station, self._part(self.scene, self.station))]
-        if beside := self.scene.drawing.station.beside:
-            own, first = replace(self.scene.drawing.station, beside=()), None
-            self._item, self._items = [each.as_json() for each in beside].index(own.as_json()), []
-            for k, drawn in enumerate(beside):
-                drawing = replace(self.scene.drawing, station=replace(drawn, beside=beside))
-                scene = draw(self.scene.seed, self.scene.level, drawing, self.parts + k)
-                # One table carries them all.
-                table = scene.world_from_table if first is None else first
-                first = table
-                scene = replace(scene, world_from_table=table, world_from_surface=table @ drawn.place_from_surface)
-                station = Station.of(drawn)
-                self._items.append(Item(scene, station, self._part(scene, station)))
+        drawn = self.scene.drawing.station
+        self._item, self._items = 0, [self._drawn_item(k) for k in range(len(drawn.beside))]
+        if self._items:
+            own = replace(drawn, beside=()).as_json()
+            self._item = [each.as_json() for each in drawn.beside].index(own)
+        else:
+            self._items = [Item(self.scene, self.station, self._part(self.scene, self.station))]
         self._take(found)
         self._report_grip()
+
+    def _drawn_item(self, k: int) -> Item:
+        """One of those beside each other. The table of the first one carries them all."""
+        beside, now = self.scene.drawing.station.beside, self.scene
+        first, own = (
+            draw(now.seed, now.level, replace(now.drawing, station=replace(beside[n], beside=beside)), self.parts + n)
+            for n in (0, k)
+        )
+        on_table = first.world_from_table @ beside[k].place_from_surface
+        scene = replace(own, world_from_table=first.world_from_table, world_from_surface=on_table)
+        station = Station.of(beside[k])
+        return Item(scene, station, self._part(scene, station))
 
     def _take(self, found: tuple[Collision, ...]) -> None:
         """What the cell does now is about this item."""

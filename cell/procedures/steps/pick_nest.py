@@ -8,7 +8,7 @@ from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import job_with_grasp, moved
 from cell.procedures.part_error import part_points
 from cell.procedures.steps.gripping import require_lifted, take
-from cell.procedures.steps.laser_sweep import check_lost_steps, seen_on_plate
+from cell.procedures.steps.laser_sweep import seen_on_plate
 from cell.procedures.steps.pick import MOST_PULL, HeldPart
 from cell.procedures.steps.verify import swept_part
 from cell.procedures.steps.verify_nest import at_nest, part_in_base
@@ -22,11 +22,11 @@ CLOUD = "nest.ply"
 
 
 def _at(here: Workplace, context: StepContext) -> HeldPart:
-    job, part, progress = at_nest(here.job), here.part_mesh, context.progress
+    job, part = at_nest(here.job), here.part_mesh
     assert part is not None
     if here.part.state is not PartState.NESTED:
         raise RefusedError(f"the part is {here.part.state.value}: nothing is gripped a second time")
-    home_rail(here.devices, progress)
+    home_rail(here.devices, context.progress)
     head, (pointing, _) = here.calibration.scan, seen_on_plate(here, context)
     if pointing is not None:
         head = head.pointed(pointing, here.config.laser.exit_point)
@@ -44,8 +44,6 @@ def _at(here: Workplace, context: StepContext) -> HeldPart:
             Measured("part off its place in the nest", off, "mm", most=most),
         )
     context.note(text=f"the part lies {off:.2f} mm off its place in the nest, and is gripped where it lies")
-    if job.scan.mode == "rail":
-        check_lost_steps(here.devices, lambda _, text: progress(0.05, text))
     grasp = here.job.grasp.flange_from_part.se3()
     grip = fit.base_from_surface * grasp.inverse()
     here.part.where = fit.base_from_surface
