@@ -166,7 +166,7 @@ def _perform_batch(
 
     require_count(count)
     if partly:
-        raise ConfigError("a batch does whole jobs, shown here: leave out --until and --console, or --count, or name one item")
+        raise ConfigError("a batch does whole jobs, shown here: leave out --until and --console, or name a single part")
     with ProgressDisplay(compiles=True) as display, opened() as cell:
         # In the background nobody reads a terminal: who tries is stopped.
         here = not elsewhere and _at_terminal()
