@@ -166,6 +166,10 @@ class Mover:
         bodies = CollisionModel(self.kinematics, [*self._moving, *self._obstacles, *still])
         return Planner(self.kinematics, bodies, tool_speed=self._tool_speed)
 
+    def _leaving(self, start: Joints) -> tuple[Pair, ...]:
+        """What may be near the part that was just put down: only what is so already."""
+        return tuple(pair for pair in self._planner.collisions.touching(start) if PLACED in pair)
+
     @property
     def joints(self) -> Joints:
         """Where the arm stands, (6,) rad."""
@@ -193,9 +197,7 @@ class Mover:
         """Move freely to joint angles and settle."""
         self.hold()
         start = self.joints
-        # Near the part that was just put down only what is so already may be.
-        leaving = tuple(pair for pair in self._planner.collisions.touching(start) if PLACED in pair)
-        self.follow(self._planner.free(start, joints, leaving).at_pace(self.pace.share))
+        self.follow(self._planner.free(start, joints, self._leaving(start)).at_pace(self.pace.share))
 
     def to_view(self, base_from_flange: pin.SE3) -> None:
         """Move freely to a view of a calibration with the calibration's joints, those nearest to HOME.
