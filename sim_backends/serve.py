@@ -180,8 +180,10 @@ class ServedCell:
     def start(self) -> None:
         """Begin to serve; every peer answers when this returns."""
         self.world.warm_up()
-        for peer in self._all():
-            peer.start()
+        devices = (self._arm, self._rail, self._vehicle, *self._cameras.values(), *self._switches)
+        for peer in (*devices, self._told, self._truth):
+            if peer is not None:
+                peer.start()
 
     def stop(self) -> None:
         """End every connection and thread; idempotent."""
@@ -246,10 +248,6 @@ class ServedCell:
         """As `picture`; raises `NotFollowed` where real devices do not say where they were."""
         self.following.require(camera, t_mid)
         return picture(self.world, camera, t_mid, exposure)
-
-    def _all(self) -> tuple[Peer, ...]:
-        devices = (self._arm, self._rail, self._vehicle, *self._cameras.values(), *self._switches)
-        return tuple(peer for peer in (*devices, self._told, self._truth) if peer is not None)
 
 
 def _bound(stack: contextlib.ExitStack, peer: P) -> P:

@@ -110,7 +110,9 @@ def clock_check(root: Path, needed: bool) -> DoctorCheck:
         source = (root / "sys/devices/system/clocksource/clocksource0/current_clocksource").read_text().strip()
     except OSError:
         source = "not told"
-    apart = _apart()
+    before = time.time() - time.monotonic()
+    time.sleep(0.2)
+    apart = abs(time.time() - time.monotonic() - before)
     told = f"source {source}, steps by {1e9 * _tick():.0f} ns"
     if source in COARSE_CLOCKS:
         mend = "boot without clocksource=… and notsc on the kernel's command line; see `dmesg | grep -i clocksource`"
@@ -126,12 +128,6 @@ def _tick() -> float:
     while (now := time.monotonic()) == begun:
         pass
     return now - begun
-
-
-def _apart() -> float:
-    before = time.time() - time.monotonic()
-    time.sleep(0.2)
-    return abs(time.time() - time.monotonic() - before)
 
 
 def scheduling_check(root: Path, needed: bool, most: float = LATE_S) -> DoctorCheck:

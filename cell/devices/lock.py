@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Collection
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from types import TracebackType
 
 from cell.config.cell_config import DEVICES, CellConfig
 from drivers.errors import InterlockError
@@ -65,9 +64,7 @@ class CellLock:
                 self._name, f"the {device} at {address} is held by {_holder(name)}; {_remedy(name)}"
             ) from None
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._held.close()
 
 

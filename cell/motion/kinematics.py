@@ -330,8 +330,7 @@ def arm_kinematics(model: str, told: LinkTable | None, limits: JointLimits | Non
     nominal = MODELS[model].table
     if told is None:
         return ArmKinematics(nominal, limits)
-    factory = DenavitHartenberg(told.d, told.a, told.alpha, told.theta)
-    made = ArmKinematics(factory, limits, nominal)
+    made = ArmKinematics(DenavitHartenberg(told.d, told.a, told.alpha, told.theta), limits, nominal)
     way, turn = _apart(made, ArmKinematics(nominal))
     if way > MOST_FACTORY_M or turn > MOST_FACTORY_RAD:
         away = {name: _apart(made, ArmKinematics(other.table))[0] for name, other in MODELS.items()}

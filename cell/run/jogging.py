@@ -105,16 +105,11 @@ def moved(cell: Cell, wish: Jog, job: Job, hands: Hands, begun: list[Begun] | No
         case "arm":
             return _jog_arm(cell, wish, [] if begun is None else begun)
         case _:
-            _name_look(cell, job)
+            mounting = cell.config.target_camera.flange_from_camera.se3()
+            look = look_pose(cell.config, job, parse_board(job.board.spec), mounting)
+            cell.devices.interlocks.may_drive_with(f"the looking pose of job {job.job.name}", look)
+            cell.devices.interlocks.may_drive_with("over the fine board", resting_pose(drawn_interim_view(cell.config)))
             return _jog_vehicle(cell, wish, hands.check)
-
-
-def _name_look(cell: Cell, job: Job) -> None:
-    """Where a run of `job` has the arm while it drives, and leaves it, by the cameras' mountings as configured."""
-    mounting = cell.config.target_camera.flange_from_camera.se3()
-    look = look_pose(cell.config, job, parse_board(job.board.spec), mounting)
-    cell.devices.interlocks.may_drive_with(f"the looking pose of job {job.job.name}", look)
-    cell.devices.interlocks.may_drive_with("over the fine board", resting_pose(drawn_interim_view(cell.config)))
 
 
 def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:

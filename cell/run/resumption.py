@@ -65,7 +65,14 @@ class UnfinishedRun:
                 f"run {folder.name} was looked at by a script between its steps: without it, it is not resumed. Call "
                 "Cell.resume with that script, or run the job again"
             )
-        _require_facts(folder, run.info)
+        for name in ("job_file", "job_hash", "simulated"):
+            if name not in run.info:
+                raise ConfigError(f"run {folder.name} does not tell its {name}; run the job again")
+        for name, kinds in FACTS.items():
+            if name in run.info and type(run.info[name]) not in kinds:
+                raise ConfigError(
+                    f"the journal of run {folder.name} tells its {name} as {run.info[name]!r}; run the job again"
+                )
         job, told = run.info["job_file"], run.info["job_hash"]
         try:
             changed = job_hash(job) != told
@@ -101,16 +108,6 @@ FACTS: dict[str, tuple[type, ...]] = {
     "speed": (int, float, NoneType), "until": (str,), "scripted": (bool,),
 }  # fmt: skip
 """What a journal tells of a run that a resumed one goes by, where it is there."""
-
-
-def _require_facts(folder: Path, info: dict[str, object]) -> None:
-    """`ConfigError` when the journal does not tell which job it was, or tells anything as what it cannot be."""
-    for name in ("job_file", "job_hash", "simulated"):
-        if name not in info:
-            raise ConfigError(f"run {folder.name} does not tell its {name}; run the job again")
-    for name, kinds in FACTS.items():
-        if name in info and type(info[name]) not in kinds:
-            raise ConfigError(f"the journal of run {folder.name} tells its {name} as {info[name]!r}; run the job again")
 
 
 def _later(folder: Path) -> Iterator[tuple[Path, JournalRecord]]:

@@ -26,8 +26,7 @@ def figure2(json: JsonOption = False, out: OutOption = None) -> None:
     """
     from lab.paper.figure2 import figure2 as numbers
 
-    result = numbers()
-    _show(result, json, out, "figure2")
+    _show(numbers(), json, out, "figure2")
     if out is not None:
         from lab.paper.figure2 import draw
 

@@ -118,8 +118,7 @@ def row_power(head: Head, x: ArrayLike, light: Light) -> Array:
 
 def peak_power(head: Head, x: ArrayLike, light: Light) -> Array:
     """Power in W in the brightest pixel of a row at x' in m: P_row · erf(1/(2√2 σ_px))."""
-    z = head.depth(x)
-    geometric = light.sheet * head.focal / (z * light.pixel * np.sin(head.theta))
+    geometric = light.sheet * head.focal / (head.depth(x) * light.pixel * np.sin(head.theta))
     sigma = np.sqrt(geometric**2 + light.psf_px**2 + 1 / 12)
     return np.asarray(row_power(head, x, light) * erf(1 / (2 * np.sqrt(2) * sigma)), dtype=np.float64)
 

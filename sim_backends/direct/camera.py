@@ -137,7 +137,10 @@ class DirectCamera(DirectDevice):
             return None
         stamp = 1e-9 * spec.device_ns(begin + spec.latency)
         image = self._world.render(self._camera, begin + 0.5 * exposure, exposure)
-        self.shots[frame_id] = self._shot(begin + 0.5 * exposure)
+        t = begin + 0.5 * exposure
+        world = self._world
+        base_from_surface = inverse(world.world_from_base(t)) @ world.scene.world_from_surface
+        self.shots[frame_id] = Shot(world.arm.base_from_flange(t), base_from_surface, world.rail.carriage(t))
         return Frame(image, frame_id, exposure, stamp, host_time=self._map.host_time(stamp), received=self.clock.now())
 
     def _compare_clocks(self) -> None:
@@ -160,11 +163,6 @@ class DirectCamera(DirectDevice):
         if self.model.silent:
             self.clock.sleep(ANSWER_S)
             raise DeadlineError(self.name, f"no answer within {ANSWER_S:g} s. Check that it has power and its network")
-
-    def _shot(self, t: float) -> Shot:
-        world = self._world
-        base_from_surface = inverse(world.world_from_base(t)) @ world.scene.world_from_surface
-        return Shot(world.arm.base_from_flange(t), base_from_surface, world.rail.carriage(t))
 
 
 class DirectStream:

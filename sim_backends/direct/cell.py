@@ -108,7 +108,10 @@ class VirtualClock(Clock):
             if self._time.now() >= until:
                 return False
             self._tick(until)
-        self._ring()
+        for ring in [ring for ring, due in self._alarms.items() if due <= self._time.now()]:
+            self._alarms.pop(ring, None)
+            if (again := ring()) is not None:
+                self._alarms[ring] = self.now() + again
         return True
 
     @contextmanager
@@ -119,12 +122,6 @@ class VirtualClock(Clock):
             yield
         finally:
             self._alarms.pop(ring, None)
-
-    def _ring(self) -> None:
-        for ring in [ring for ring, due in self._alarms.items() if due <= self._time.now()]:
-            self._alarms.pop(ring, None)
-            if (again := ring()) is not None:
-                self._alarms[ring] = self.now() + again
 
 
 @dataclass(frozen=True)

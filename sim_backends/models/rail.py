@@ -112,8 +112,7 @@ class RailModel:
     def carriage(self, t: float) -> float:
         """True carriage displacement in m at world time `t` (at most 30 s ago)."""
         with self._lock:
-            leg = self._leg(t)
-            return self.params.screw.travel(self._nut(leg, t))
+            return self.params.screw.travel(self._nut(self._leg(t), t))
 
     # --- what the controller sees ---
 
@@ -375,8 +374,7 @@ class RailModel:
         cut, time = ramp.clip(pieces, limit, direction)
         if time is None or not self.settings.soft_stop:
             return cut
-        before = [piece for piece in pieces if piece.t <= time][-1]
-        x, v = before.at(time)
+        x, v = [piece for piece in pieces if piece.t <= time][-1].at(time)
         return cut[:-1] + ramp.to_velocity(time, x, v, 0.0, self._acceleration())
 
     def _run(self, pieces: list[ramp.Piece], goal: float, pps: int) -> list[ramp.Piece]:

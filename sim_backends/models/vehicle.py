@@ -230,14 +230,11 @@ class VehicleModel:
 
     def _advance(self, t: float) -> None:
         while self._t < t:
-            if self._standing(self._t):
+            if self._speed == self._yaw_rate == 0.0 and self._wanted(self._t) == (0.0, 0.0):
                 self._t = t
             else:
                 self._step(min(_STEP, t - self._t))
             self._history.append(self._t, self._pose())
-
-    def _standing(self, t: float) -> bool:
-        return self._speed == self._yaw_rate == 0.0 and self._wanted(t) == (0.0, 0.0)
 
     def _wanted(self, t: float) -> tuple[float, float]:
         silent = t - self._commanded_at >= self.params.command_timeout

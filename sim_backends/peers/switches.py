@@ -279,7 +279,10 @@ def switch_peers(world: World) -> tuple[list[Peer], dict[str, dict[str, object]]
             endpoints |= {name: {"address": gripper.address} for name in on_it}
         elif make in BOARDS:
             kind, first = BOARDS[make]
-            wired = {wire["relay"]: _hanging(world, name) for name, wire in on_it.items()}
+            wired = {
+                wire["relay"]: (partial(world.switch, name), partial(world.switches.__getitem__, name))
+                for name, wire in on_it.items()
+            }
             lines: dict[int, Callable[[], bool]] = {
                 wire["feedback"]: partial(_grip, world, wire["active_high"])
                 for wire in on_it.values()
@@ -291,10 +294,6 @@ def switch_peers(world: World) -> tuple[list[Peer], dict[str, dict[str, object]]
         else:
             raise ValueError(f"nothing simulates a switch of the make {make!r}")
     return peers, endpoints
-
-
-def _hanging(world: World, name: str) -> tuple[Callable[[bool], None], Callable[[], bool]]:
-    return partial(world.switch, name), partial(world.switches.__getitem__, name)
 
 
 def _grip(world: World, active_high: bool) -> bool:

@@ -474,8 +474,7 @@ def _turned(eye: Eye, first: SeenBoard, hand: pin.SE3, scale: float, turn: float
     at = first.camera_from_board
     centre = at.rotation @ centre_of(eye.board) * scale + scale * at.translation
     depth = float(np.linalg.norm(centre))
-    base_from_camera = first.base_from_flange * hand
-    middle = base_from_camera * from_parts(centre)
+    middle = first.base_from_flange * hand * from_parts(centre)
     made = []
     for axis in range(3):
         for sign in (1.0, -1.0):

@@ -56,9 +56,10 @@ def edited(text: str, changes: Mapping[str, str]) -> str:
 def write_changes(path: Path, changes: Mapping[str, str]) -> Path:
     """Change the file, and keep the old one beside it; returns where that is. `ConfigError` when it cannot be done."""
     try:
-        text = path.read_text(encoding="utf-8")
-        new = edited(text, changes)
-        backup = _free(path)
+        new = edited(path.read_text(encoding="utf-8"), changes)
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        names = [f"{path.name}.before-{stamp}", *(f"{path.name}.before-{stamp}-{k}" for k in range(2, 100))]
+        backup = next(path.with_name(name) for name in names if not path.with_name(name).exists())
         shutil.copy2(path, backup)
         with replacing(path) as file:
             shutil.copymode(path, file.name)
@@ -66,12 +67,6 @@ def write_changes(path: Path, changes: Mapping[str, str]) -> Path:
     except OSError as error:
         raise ConfigError(f"{path} cannot be changed: {error.strerror or error}; see its permissions") from error
     return backup
-
-
-def _free(path: Path) -> Path:
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    names = [f"{path.name}.before-{stamp}", *(f"{path.name}.before-{stamp}-{k}" for k in range(2, 100))]
-    return next(path.with_name(name) for name in names if not path.with_name(name).exists())
 
 
 def _table(tables: Any, dotted: str) -> Any:

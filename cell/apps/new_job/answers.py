@@ -44,7 +44,8 @@ def laid_mesh(asker: Asker, drawn: Drawn) -> tuple[Laid, str]:
     up = asker.get("up", "Which axis of the mesh points up", "z", choice(*UP))
     turn = asker.get("turn", "Turn about it, or auto: the longer side along the sweep", "auto", _turn)
     laid = lay(bodies, unit, up, turn)
-    if up == "z" and 0.0 <= (lowest := _lowest(bodies) * METRES[unit]) <= ON_TABLE and lowest > 1e-6:
+    lowest = METRES[unit] * min(float(body.vertices[:, 2].min()) for body in bodies)
+    if up == "z" and 1e-6 < lowest <= ON_TABLE:
         laid = replace(raised(laid, lowest), foot=0.0)
         asker.tell(
             f"height: the mesh's own z = 0 is taken as the table's top, its lowest point is {1e3 * lowest:.4g} mm above"
@@ -105,10 +106,6 @@ def _unit(asker: Asker, drawn: Drawn, longest: float) -> tuple[str, str]:
     unit = asker.get("unit", question, default or None, choice(*METRES))
     words = f"{unit}: the longest side is {1e3 * METRES[unit] * longest:.4g} mm"
     return unit, why if unit == default and asker.given.get("unit") is None else words
-
-
-def _lowest(bodies: list[MeshBody]) -> float:
-    return min(float(body.vertices[:, 2].min()) for body in bodies)
 
 
 def _turn(text: str) -> float | None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from cell.apps.new_job.answers import as_pose, job_name, laid_mesh, station, template
-from cell.apps.new_job.mesh_file import Drawn, read_drawing
+from cell.apps.new_job.mesh_file import read_drawing
 from cell.apps.new_job.observability import known, place_from, sight_problems, told_by_few
 from cell.apps.new_job.picture import draw_proposal
 from cell.apps.new_job.proposal import Proposal, propose
@@ -54,7 +54,10 @@ class Made:
 def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) -> Made:
     """Ask, propose, check, draw, write. Raises `ConfigError` for answers that fit neither each other nor the cell,
     `NotObservable` when the surface does not tell where it is."""
-    drawn = asker.get("mesh", "The mesh of the surface (STL, PLY, STEP)", None, _read)
+    drawn = asker.get(
+        "mesh", "The mesh of the surface (STL, PLY, STEP)", None,
+        lambda text: read_drawing(Path(text.strip()).expanduser()),
+    )  # fmt: skip
     mesh = drawn.path
     laid, unit = laid_mesh(asker, drawn)
     name = job_name(asker, mesh)
@@ -62,8 +65,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     targets = (targets[0], _beside(targets[1], mesh), targets[2])
     part = _part(asker, folder, name)
     _require_room(asker, targets if part is None or part.same else (*targets, part.target), overwrite)
-    like = template(asker)
-    job = _with_part(asker, station(asker, like, name, targets[1].name, laid), part)
+    job = _with_part(asker, station(asker, template(asker), name, targets[1].name, laid), part)
     step = asker.get("step", "Lines of the scan, how far apart", "0.5 mm", lambda t: parse_quantity(t, "mm", *STEP_MM))
 
     laid, proposal = _proposed(asker, laid, job, config, step=step)
@@ -92,7 +94,10 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         if asker.ask is not None and asker.get("write", "Write the job", "yes", choice("yes", "no")) == "no":
             raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
         for target in (*targets[:2], *([] if part is None or part.same else [part.target])):
-            _copied(there / target.name, target).replace(target)
+            # Complete beside its target, so that the target is replaced in one step.
+            near = target.with_name(f".{target.name}.new")
+            near.write_bytes((there / target.name).read_bytes())
+            near.replace(target)
     return Made(targets[0], targets[1], targets[2], name=name, seen=proposal.share, place=found, notes=tuple(notes))
 
 
@@ -121,10 +126,6 @@ def _proposed(asker: Asker, laid: Laid, job: Job, config: CellConfig, *, step: f
     if other.open:
         return laid, proposal
     return about(laid), replace(other, notes=(*other.notes, "turned by half a turn, to see more flanks"))
-
-
-def _read(text: str) -> Drawn:
-    return read_drawing(Path(text.strip()).expanduser())
 
 
 @dataclass(frozen=True)
@@ -260,10 +261,3 @@ def _below(most: float) -> str:
 def _again(asker: Asker) -> str:
     words = [f"--{option} {shlex.quote(text)}" for option, text in asker.used.items() if option != "write"]
     return " ".join(["cell new-job", *words, *(["--yes"] if asker.ask is None else [])])
-
-
-def _copied(source: Path, target: Path) -> Path:
-    """Beside its target, complete, so that the target is replaced in one step."""
-    near = target.with_name(f".{target.name}.new")
-    near.write_bytes(source.read_bytes())
-    return near

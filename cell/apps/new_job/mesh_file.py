@@ -84,7 +84,10 @@ def read_drawing(path: Path) -> Drawn:
         raise ConfigError(f"no triangle of the mesh {path} has an area; export it again")
     bodies = [_turned(vertices, part, notes) for part in _parts(faces, len(vertices))]
     bodies.sort(key=lambda body: -float(np.prod(np.maximum(body.size, 1e-9))))
-    return Drawn(path, tuple(bodies), "m" if path.suffix.lower() in STEP else None, tuple(_summed(notes)))
+    # Bodies by the hundred need no line each.
+    if len(notes) > 6:
+        notes = [*notes[:5], f"… and {len(notes) - 5} more like these"]
+    return Drawn(path, tuple(bodies), "m" if path.suffix.lower() in STEP else None, tuple(notes))
 
 
 def _loaded(path: Path) -> tuple[Array, Faces]:
@@ -182,8 +185,3 @@ def _volume(vertices: Array, faces: Faces) -> float:
 
 def _as_expected(lone: int, edges: int) -> str:
     return " (a surface with a border, or holes in a body)" if lone < 0.5 * edges else " (triangles that do not join)"
-
-
-def _summed(notes: list[str]) -> list[str]:
-    """Bodies by the hundred need no line each."""
-    return notes if len(notes) <= 6 else [*notes[:5], f"… and {len(notes) - 5} more like these"]

@@ -5,7 +5,6 @@ Lengths in mm. Drawn before anything moves, from the drawing alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
 
@@ -67,8 +66,7 @@ def _draw_map(figure: Figure, axes: Axes, made: Proposal, nominal: NominalSurfac
     hidden = 1e3 * samples[missed]
     axes.scatter(hidden[:, 0], hidden[:, 1], color="tab:red", s=3, linewidths=0, label="not seen by any sweep")
     for k, each in enumerate(made.seen):
-        outline = _outline(each)
-        axes.plot(*1e3 * outline.T, color=COLOURS[k % len(COLOURS)], linewidth=1.6)
+        axes.plot(*1e3 * _outline(each).T, color=COLOURS[k % len(COLOURS)], linewidth=1.6)
     x, y, _ = 1e3 * np.array(made.job.grasp.size)
     where = 1e3 * made.job.place.surface_from_part.se3().translation
     axes.add_patch(
@@ -140,7 +138,13 @@ def _draw_cell(above: Axes, beside: Axes, made: Proposal, config: CellConfig, no
         joints, where = HOME, "folded: the first sweep is out of reach"
     placed = planner.collisions.placed(joints)
     for axes, (first, second), title in ((above, (0, 1), "from above"), (beside, (0, 2), "from the side")):
-        _draw_bodies(axes, placed, first, second)
+        for body in placed:
+            hull = 1e3 * _silhouette(body, first, second)
+            colour = SHADES.get(body.name, "0.4")
+            label = body.name if body.name in SHADES else None
+            axes.add_collection(PolyCollection([hull], facecolor=colour, edgecolor="0.2", alpha=0.45, label=label))
+            axes.update_datalim(hull)
+        axes.autoscale_view()
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("x of the arm's base in mm")
         axes.set_ylabel("y in mm" if second == 1 else "z in mm")
@@ -148,20 +152,9 @@ def _draw_cell(above: Axes, beside: Axes, made: Proposal, config: CellConfig, no
     beside.legend(fontsize=7, loc="upper right")
 
 
-def _draw_bodies(axes: Axes, bodies: Sequence[Body], first: int, second: int) -> None:
-    for body in bodies:
-        hull = 1e3 * _silhouette(body, first, second)
-        colour = SHADES.get(body.name, "0.4")
-        label = body.name if body.name in SHADES else None
-        axes.add_collection(PolyCollection([hull], facecolor=colour, edgecolor="0.2", alpha=0.45, label=label))
-        axes.update_datalim(hull)
-    axes.autoscale_view()
-
-
 def _silhouette(body: Body, first: int, second: int) -> Array:
     """Corners (n, 2) m around a body as seen along the third axis."""
-    half = 0.5 * np.array(body.size)
-    corners = np.array(list(product(*((-h, h) for h in half))))
+    corners = np.array(list(product(*((-h, h) for h in 0.5 * np.array(body.size)))))
     points = transform(body.placement, corners)
     if body.radius is not None:
         angles = np.linspace(0.0, 2 * np.pi, 24, endpoint=False)

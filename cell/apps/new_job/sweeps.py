@@ -61,8 +61,7 @@ class Rays:
         self._corners = corners
         self._faces = faces
         self._smooth: Array | None = None
-        made = trimesh.Trimesh(vertices, faces, process=False)
-        self._rays = RayMeshIntersector(made)
+        self._rays = RayMeshIntersector(trimesh.Trimesh(vertices, faces, process=False))
 
     def hits(self, origins: Array, ways: Array) -> tuple[NDArray[np.int64], Array]:
         """The first triangle (n,) that rays from `origins` (n, 3) along unit `ways` (n, 3) meet, −1 for none, and how
@@ -286,8 +285,7 @@ def rivals(seen: Sequence[SeenSurface], nominal: NominalSurface, job: Job) -> li
 
 def _fit(pose: pin.SE3, points: Array, nominal: NominalSurface) -> float:
     """Share of the points over the surface that lie on it; 0 where too few are over it."""
-    local = (points - pose.translation) @ pose.rotation
-    _, feet = nominal.feet(local, GATE)
+    _, feet = nominal.feet((points - pose.translation) @ pose.rotation, GATE)
     over = feet.inner
     if over.sum() < OVER * len(points):
         return 0.0

@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from cell.config.cell_config import StationObstacle
 from cell.config.job import Job, SwathSection
 from drivers.errors import ConfigError
 from drivers.make import Pose
@@ -66,7 +65,8 @@ def job_text(job: Job, heading: Sequence[str]) -> str:
             '# tolerance = "0.4 mm"',
         ]
     for obstacle in job.obstacle:
-        lines += ["", "[[obstacle]]", *_obstacle(obstacle)]
+        lines += ["", "[[obstacle]]", f'name = "{obstacle.name}"', f"size = [{', '.join(map(mm, obstacle.size))}]"]
+        lines.append(f"place_from_centre = {pose_text(obstacle.place_from_centre)}")
     return "\n".join(lines) + "\n"
 
 
@@ -173,14 +173,6 @@ def _swath(swath: SwathSection) -> str:
     keys = [f"across = {mm(swath.across)}"]
     keys += [f"{name} = {deg(angle)}" for name, angle in (("roll", swath.roll), ("pitch", swath.pitch)) if angle]
     return f"{{ {', '.join(keys)} }}"
-
-
-def _obstacle(obstacle: StationObstacle) -> list[str]:
-    return [
-        f'name = "{obstacle.name}"',
-        f"size = [{', '.join(map(mm, obstacle.size))}]",
-        f"place_from_centre = {pose_text(obstacle.place_from_centre)}",
-    ]
 
 
 def _plain(value: float) -> str:

@@ -30,7 +30,7 @@ from cell.measure.calibration.judge.plane_checks import (
 )
 from cell.measure.calibration.judge.scale import Scale, metric_scale
 from cell.measure.calibration.solve.adjustment import Adjustment
-from cell.measure.calibration.solve.choice import Choice, Solution, choose_solution, with_doubt_of_camera
+from cell.measure.calibration.solve.choice import Choice, choose_solution, with_doubt_of_camera
 from cell.measure.calibration.solve.intrinsics import Intrinsics, moved_by_bend
 from cell.measure.calibration.solve.joint import Staged, solve_staged
 from cell.measure.calibration.solve.normal import CAMERA, HAND, OWN, SHARED, stripe_block
@@ -141,7 +141,13 @@ def solve_chain(
         staged = solve_staged(seen, camera=pictures.camera)
     choice = choose_solution(observations, staged, pictures, camera_may_move=not hold_camera)
     choice, pictures = with_doubt_of_camera(choice, pictures)
-    unsure = _unsure(choice.best, pictures, scale)
+    # What the shared parameters would move with a bent board or the arm's scale, where these are believed.
+    best, unsure = choice.best, np.zeros(SHARED)
+    if pictures.bend is not None and pictures.bend.believed:
+        unsure = moved_by_bend(Adjustment(best.views, best.free, best.adjusted.priors), best.adjusted.state)
+    if scale is not None:
+        place = slice(HAND.start, HAND.start + 3)
+        unsure[place] = np.hypot(unsure[place], scale.unsure * scale.shift)
     plane = _plane_known(choice, stripes, observations, pictures, unsure)
     if scale is not None and plane is not None:
         reach = float(np.median([np.linalg.norm(b.translation) for b in staged.camera_from_board]))
@@ -151,17 +157,6 @@ def solve_chain(
     return CalibrationChain(
         setup, observations, staged, pictures=pictures, choice=choice, stripes=stripes, plane_known=plane, scale=scale
     )
-
-
-def _unsure(best: Solution, pictures: Intrinsics, scale: Scale | None) -> Array:
-    """What the shared parameters (27,) would move with a bent board or the arm's scale, where these are believed."""
-    unsure = np.zeros(SHARED)
-    if pictures.bend is not None and pictures.bend.believed:
-        unsure = moved_by_bend(Adjustment(best.views, best.free, best.adjusted.priors), best.adjusted.state)
-    if scale is not None:
-        place = slice(HAND.start, HAND.start + 3)
-        unsure[place] = np.hypot(unsure[place], scale.unsure * scale.shift)
-    return unsure
 
 
 def _plane_known(

@@ -94,8 +94,7 @@ def refuse_misplaced(frames: Sequence[RecordedFrame], camera: CameraModel) -> li
     """
     stops = by_stop(frames)
     boards, flanges = _poses([merged(stop) for stop in stops], camera)
-    misplaced = misplacements(flanges, boards)
-    for k, (off, others) in misplaced.items():
+    for k, (off, others) in misplacements(flanges, boards).items():
         for frame in stops[k]:
             frame.refuse(
                 Reason.NO_POSE,

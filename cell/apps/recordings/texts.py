@@ -404,7 +404,7 @@ def _table_record(path: Path, k: int, block: Sequence[_TableLine], header: Seque
     found = _numbers_of(block)
     if len(found) - 1 in COUNTS and (len(found) != 7 or timed):
         time, found = found[0], found[1:]
-        label = label or _number_word(time)
+        label = label or (f"{time:.0f}" if abs(time) < LARGEST_NUMBER and time == int(time) else "")
     if len(found) not in COUNTS:
         raise ValueError(f"line {k + 1} of its table holds {len(found)} numbers; {NEEDED}")
     return PoseRecord(path, "row", label or f"[{k}]", _squared(np.array(found)), time=time)
@@ -418,11 +418,6 @@ def _by_header(header: Sequence[str], cells: Sequence[str]) -> tuple[Array | Non
     numbers = (cell for name, cell in zip(header, cells, strict=True) if NUMBERING.search(name.lower()))
     times = (value for name, value in zip(header, values, strict=True) if TIMING.match(name.lower()))
     return *_named_numbers(header, values), next(numbers, ""), next(times, None)
-
-
-def _number_word(number: float) -> str:
-    """A picture's number; empty for a time."""
-    return f"{number:.0f}" if abs(number) < LARGEST_NUMBER and number == int(number) else ""
 
 
 def _numbers_of(block: Sequence[_TableLine]) -> list[float]:

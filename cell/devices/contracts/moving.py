@@ -489,8 +489,7 @@ class VehicleContract(DeviceContract):
 
     def test_an_end_after_a_fault_leaves_it_standing(self, bench: Bench[Vehicle]) -> None:
         """Connected anew, it stands, and is well once what caused the fault is gone."""
-        vehicle = bench.device
-        vehicle.enable()
+        bench.device.enable()
         self.drive(bench, DRIVE_SPEED * bench.motion, 0.5)
         with bench.faulty() as faults:
             faults.cause("vehicle.emergency_stop")

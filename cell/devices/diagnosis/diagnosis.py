@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,6 @@ from drivers.errors import CellError, ConfigError, InterlockError
 from drivers.interfaces import (
     Arm,
     Camera,
-    Claw,
     Device,
     Examined,
     Frame,
@@ -157,10 +156,8 @@ def diagnose(
         config, Described.of("pot"), seed=seed, level=level, speed=speed if whole else config.cell.time_scale,
         gige=[name for name in on_gige(config) if name in names], simulated=names,
     )  # fmt: skip
-    try:
+    with closing(world):
         rows = _diagnose(with_endpoints(config, world.endpoints, names if whole else served), only)
-    finally:
-        world.close()
     for row in rows:
         row.simulated = row.device in names
         if row.device in on_arm:
@@ -259,10 +256,6 @@ def _laser_state(laser: Laser) -> str:
     return f"not known now; {how}" if how else "ON" if laser.is_on else "off"
 
 
-def _claw_state(claw: Claw) -> str:
-    return "holds a part" if claw.holding else "empty"
-
-
 STATES: dict[str, Callable[[Any], str]] = {
     "arm": _arm_state,
     "rail": _rail_state,
@@ -270,6 +263,6 @@ STATES: dict[str, Callable[[Any], str]] = {
     "scan_camera": _camera_state,
     "target_camera": _camera_state,
     "laser": _laser_state,
-    "claw": _claw_state,
+    "claw": lambda claw: "holds a part" if claw.holding else "empty",
 }
 """The devices in the order in which they are asked, and how each tells its state in words."""

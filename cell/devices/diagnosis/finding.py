@@ -11,6 +11,7 @@ import socket
 import struct
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -79,13 +80,9 @@ def ask_module(port: str, config: CellConfig | None) -> Found:
     rail = None if config is None else of_make(config.rail, TmclRailConfig)
     baud, address = (_TMCL_BAUD, _TMCL_ADDRESS) if rail is None else (rail.baud, rail.address)
     try:
-        link = TmclLink(
-            "rail", port, address=address, motor=0, baud=baud, clock=Clock(), statistics=LinkStatistics()
-        )  # fmt: skip
-        try:
+        link = TmclLink("rail", port, address=address, motor=0, baud=baud, clock=Clock(), statistics=LinkStatistics())
+        with closing(link):
             version = link.firmware()
-        finally:
-            link.close()
     except CellError as error:
         return Found("TMCL module", port, str(error), False)
     return Found(
@@ -98,10 +95,8 @@ def _ask_rail(kind: str, port: str, record: RailConfig) -> Found:
     make = make_of("rail", record.driver)
     try:
         rail = make.connect("rail", record.model_copy(update={record.ADDRESS: port}), Surroundings(Clock(), look=True))
-        try:
+        with closing(rail):
             state = rail.state()
-        finally:
-            rail.close()
     except CellError as error:
         return Found(kind, port, str(error), False)
     told = f"answers: at {1e3 * state.position:.2f} mm, {'homed' if state.homed else 'not homed'}"

@@ -205,7 +205,8 @@ class MixedCell:
             gige=[name for name in on_gige(config) if name in simulated], simulated=simulated, follow=real,
         )  # fmt: skip
         undo.callback(self.world.close)
-        self.config = with_endpoints(config, self.world.endpoints, _addressed(config, simulated))
+        addressed = [name for name in simulated if not config.make(name).on_arm or "arm" in simulated]
+        self.config = with_endpoints(config, self.world.endpoints, addressed)
         self.lock = undo.enter_context(CellLock(self.config, needed))
         link = self.world.link
 
@@ -227,11 +228,6 @@ class MixedCell:
                 arm.touch = SimulatedTouch(following)
         for sentence in beware(simulated, needed):
             log.warning("%s", sentence)
-
-
-def _addressed(config: CellConfig, simulated: Collection[str]) -> list[str]:
-    """Those of them that are reached at an address of their own, or hang on a simulated arm."""
-    return [name for name in simulated if not config.make(name).on_arm or "arm" in simulated]
 
 
 def _switched(config: CellConfig, name: str, link: WorldLink | None, clock: Clock) -> Device | None:

@@ -23,7 +23,7 @@ from cell.measure.calibration.drift.reference_plate import PlateLine, read_edge
 from cell.measure.calibration.solve.adjustment import Priors
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.vision.board.view import BoardView, parse_board
-from cell.measure.vision.stripe.extract import Axis, StripeProfile
+from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import ConfigError
 
 
@@ -247,11 +247,7 @@ def _read_profiles(data: Mapping[str, Any], views: int) -> list[StripeProfile | 
     if not (sigma[np.isfinite(centres)] > 0).all():
         raise ValueError("stripe_sigma must be positive wherever stripe_centres has a number")
     rest = iter(zip(*arrays, strict=True))
-    return [None if axis == "" else StripeProfile(_axis(axis), *next(rest)) for axis in axes]
-
-
-def _axis(text: str) -> Axis:
-    return "columns" if text == "columns" else "rows"
+    return [StripeProfile("columns" if axis == "columns" else "rows", *next(rest)) if axis else None for axis in axes]
 
 
 def _finite(data: Mapping[str, object], name: str, shape: tuple[int, ...]) -> Array:

@@ -84,8 +84,7 @@ def from_quaternion(translation: ArrayLike, xyzw: ArrayLike) -> pin.SE3:
     length = float(np.linalg.norm(q))
     if q.shape != (4,) or not 0.99 < length < 1.01:
         raise ValueError(f"a rotation needs a quaternion (x, y, z, w) of length 1, not {q.tolist()}")
-    rotation = pin.Quaternion(*(q[[3, 0, 1, 2]] / length)).toRotationMatrix()
-    return from_parts(translation, rotation)
+    return from_parts(translation, pin.Quaternion(*(q[[3, 0, 1, 2]] / length)).toRotationMatrix())
 
 
 def cross(a: Array, b: Array) -> Array:

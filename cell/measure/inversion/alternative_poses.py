@@ -84,8 +84,7 @@ def told(where: pin.SE3, information: Array, radius: float) -> bool:
 def settled(pose: pin.SE3, points: Array, nominal: NominalSurface) -> pin.SE3:
     """Point to plane, a few steps; motions that the points (n, 3) leave open stay where they are."""
     for _ in range(STEPS):
-        local = (points - pose.translation) @ pose.rotation
-        index, feet = nominal.feet(local, GATE)
+        index, feet = nominal.feet((points - pose.translation) @ pose.rotation, GATE)
         keep = feet.inner
         normals = feet.normals[keep] @ pose.rotation.T
         arms = points[index[keep]] - pose.translation

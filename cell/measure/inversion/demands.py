@@ -78,7 +78,7 @@ def require_whole(scan: Scan, pose: pin.SE3, nominal: NominalSurface, tolerance:
     A robust fit finds the part of a bent or broken surface that agrees with the model, and a pose with it. Medians over
     squares bring to light what the noise of single points hides.
     """
-    allowed = _departure(tolerance, nominal)
+    allowed = min(tolerance.translation / 3, tolerance.rotation * nominal.radius)
     medians = _squares(scan, pose, nominal)
     departed = float(np.mean(~(np.abs(medians) <= allowed))) if len(medians) else 1.0
     if not departed <= demands.departed:
@@ -113,11 +113,6 @@ def require_agreement(found: Dissent, tolerance: Tolerance, demands: Demands) ->
     return max(0.0, found.excess)
 
 
-def _departure(tolerance: Tolerance, nominal: NominalSurface) -> float:
-    """How far a square of the surface may lie off it, m: no farther than what the tolerances move it by."""
-    return min(tolerance.translation / 3, tolerance.rotation * nominal.radius)
-
-
 def _squares(scan: Scan, pose: pin.SE3, nominal: NominalSurface) -> Array:
     """Median distances (k,) in m from the surface over squares of `SQUARE` m that hold enough points."""
     local = (scan.points - pose.translation) @ pose.rotation
@@ -125,11 +120,9 @@ def _squares(scan: Scan, pose: pin.SE3, nominal: NominalSurface) -> Array:
     index, heights = index[feet.inner], feet.heights[feet.inner]
     if len(index) == 0:
         return np.empty(0)
-    sides = across(nominal)[1]
-    cells = np.floor(local[index] @ sides.T / SQUARE).astype(np.intp)
+    cells = np.floor(local[index] @ across(nominal)[1].T / SQUARE).astype(np.intp)
     _, owner, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(owner, kind="stable")
-    groups = np.split(heights[order], np.cumsum(count)[:-1])
+    groups = np.split(heights[np.argsort(owner, kind="stable")], np.cumsum(count)[:-1])
     return np.array([np.median(group) for group in groups if len(group) >= SQUARE_POINTS])
 
 

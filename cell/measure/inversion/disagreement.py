@@ -251,8 +251,7 @@ def squares(square: Indices, heights: Array, line: Indices) -> tuple[Indices, Ar
 
 def _medians(owner: Indices, values: Array, count: Indices) -> tuple[Indices, Array]:
     """Of each owner's values the middle one, and where it is."""
-    order = np.lexsort((values, owner))
-    middle = order[np.cumsum(count) - count + count // 2]
+    middle = np.lexsort((values, owner))[np.cumsum(count) - count + count // 2]
     return middle, values[middle]
 
 

@@ -445,8 +445,7 @@ class Rows:
 
 def correspondences(pose: pin.SE3, scan: Scan, nominal: NominalSurface, gate: float) -> Rows:
     """Points within `gate` m of the surface and over it, with the derivative of their heights by the pose."""
-    local = (scan.points - pose.translation) @ pose.rotation
-    index, feet = nominal.feet(local, gate)
+    index, feet = nominal.feet((scan.points - pose.translation) @ pose.rotation, gate)
     keep = feet.inner & (np.abs(feet.heights) < gate)
     index = index[keep]
     normals = feet.normals[keep] @ pose.rotation.T

@@ -203,9 +203,9 @@ def _search(
 ) -> tuple[pin.SE3, float]:
     """The best pose found from `attempt`, and how well it fits. How far to look follows from `begin`, the start."""
     thin, sparse = scan.thinned(COARSE_POINTS), scan.thinned(OTHER_POINTS)
-    first = _first_gate(nominal, prior, begin)
-    tried = [_tried(_coarse(attempt, sparse, nominal, prior, first), thin, nominal)]
     spread = _prior_spread(prior, begin)
+    first = float(np.clip(spread[0] + nominal.radius * spread[1], 0.002, 0.5 * nominal.radius))
+    tried = [_tried(_coarse(attempt, sparse, nominal, prior, first), thin, nominal)]
     level = _levelled(attempt, sparse, nominal, first)
     for candidate in candidates(level, sparse.points, nominal, *spread, MOST_CANDIDATES):
         tried.append(_tried(_coarse(candidate, sparse, nominal, prior, SEARCH_GATE), thin, nominal))
@@ -236,12 +236,6 @@ def _prior_spread(prior: Prior, start: pin.SE3) -> tuple[float, float]:
     off = difference(start, prior.base_from_surface)
     shift = 3 * float(sigma[:3].max()) + float(np.linalg.norm(off[:3]))
     return shift, 3 * float(sigma[3:].max()) + float(np.linalg.norm(off[3:]))
-
-
-def _first_gate(nominal: NominalSurface, prior: Prior, start: pin.SE3) -> float:
-    """How far points may lie from the surface at the start."""
-    shift, turn = _prior_spread(prior, start)
-    return float(np.clip(shift + nominal.radius * turn, 0.002, 0.5 * nominal.radius))
 
 
 def _levelled(pose: pin.SE3, scan: Scan, nominal: NominalSurface, first: float) -> pin.SE3:

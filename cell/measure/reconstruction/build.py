@@ -71,7 +71,11 @@ class ProfileBuilder:
                 f"a profile of {len(profile.centres)} {profile.axis} does not fit a camera of {self._rows} rows"
             )
         if self._lines == len(self._points):
-            self._grow()
+            # Double the room for lines.
+            more = len(self._points)
+            self._points = np.concatenate([self._points, np.full((more, self._rows, 3), np.nan)])
+            self._spread = np.concatenate([self._spread, np.zeros((more, self._rows, 3), dtype=np.float32)])
+            self._centres = np.concatenate([self._centres, np.full((more, self._rows), np.nan)])
         line, rows = self._lines, profile.rows
         points, by_pixel = triangulate(self.geometry.camera, self.geometry.light_plane, profile.pixels())
         self._points[line, rows] = points
@@ -120,13 +124,6 @@ class ProfileBuilder:
             centres=self._centres[which].copy(), rail=np.asarray(rail, dtype=np.float64), rejected=rejected,
             flanges=np.array(flanges), sweeps=np.zeros(len(lines), dtype=np.intp),
         )  # fmt: skip
-
-    def _grow(self) -> None:
-        """Double the room for lines."""
-        more = len(self._points)
-        self._points = np.concatenate([self._points, np.full((more, self._rows, 3), np.nan)])
-        self._spread = np.concatenate([self._spread, np.zeros((more, self._rows, 3), dtype=np.float32)])
-        self._centres = np.concatenate([self._centres, np.full((more, self._rows), np.nan)])
 
 
 def calibration_motions(

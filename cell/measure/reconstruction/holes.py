@@ -71,8 +71,7 @@ def _fill(cloud: Cloud, lines: slice, largest: float) -> Filled:
 
 def _step(ways: Array) -> float:
     """Usual distance between neighbours, m; NaN when there are none."""
-    sample = ways[:: max(1, len(ways) // 50)]
-    lengths = np.linalg.norm(sample.reshape(-1, 3), axis=1)
+    lengths = np.linalg.norm(ways[:: max(1, len(ways) // 50)].reshape(-1, 3), axis=1)
     lengths = lengths[np.isfinite(lengths)]
     return float(np.median(lengths)) if len(lengths) else np.nan
 

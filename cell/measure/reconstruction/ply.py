@@ -42,7 +42,9 @@ def write_ply(
         columns.append(("quality", "<f4", np.asarray(quality, dtype=np.float64).reshape(-1)))
     for name, values in (scalars or {}).items():
         columns.append((name, np.dtype(values.dtype).newbyteorder("<").str.lstrip("|"), values.reshape(-1)))
-    _require_as_many(columns, len(xyz))
+    for name, _, values in columns:
+        if len(values) != len(xyz):
+            raise ValueError(f"{name} has {len(values)} values for {len(xyz)} points")
     keep = np.isfinite(xyz).all(axis=1)
     records = np.empty(int(keep.sum()), dtype=[(name, kind) for name, kind, _ in columns])
     for name, _, values in columns:
@@ -54,12 +56,6 @@ def write_ply(
     with replacing(path) as file:
         file.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace") + records.tobytes())
     return len(records)
-
-
-def _require_as_many(columns: Sequence[tuple[str, str, NDArray[np.generic]]], points: int) -> None:
-    for name, _, values in columns:
-        if len(values) != points:
-            raise ValueError(f"{name} has {len(values)} values for {points} points")
 
 
 def write_cloud(path: Path, cloud: Cloud, simulated: Sequence[str] = ()) -> int:
@@ -186,8 +182,7 @@ def _of_sweep(points: Array, line: Indices, row: Indices, mine: Indices) -> Indi
     if not len(faces):
         return faces
     corners = points[faces]
-    edges = corners - np.roll(corners, 1, axis=1)
-    lengths = np.linalg.norm(edges, axis=2).max(axis=1)
+    lengths = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     mean = normals.sum(axis=0)
     size = np.linalg.norm(normals, axis=1) * np.linalg.norm(mean)

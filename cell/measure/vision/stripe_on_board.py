@@ -96,8 +96,7 @@ def _clear_of_print(local: Array, half: Array, spec: BoardSpec, dot_radius: floa
     known = np.asarray(np.isfinite(local).all(axis=1), dtype=np.bool_)
     at = np.where(known[:, None], local, 0.0)
     if spec.kind in DOTS:
-        offset = at[:, None, :] - spec.points()[None, :, :2]
-        nearest = np.linalg.norm(offset, axis=2).min(axis=1)
+        nearest = np.linalg.norm(at[:, None, :] - spec.points()[None, :, :2], axis=2).min(axis=1)
         return np.asarray(known & (nearest > dot_radius + half), dtype=np.bool_)
     cols, rows = spec.grid
     inside = ((at > -spec.pitch - half[:, None]) & (at < np.array([cols, rows]) * spec.pitch + half[:, None])).all(

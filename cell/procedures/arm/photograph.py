@@ -203,8 +203,7 @@ class CalibrationView:
 
 def base_from_place_at_target(config: CellConfig, job: Job) -> pin.SE3:
     """Nominal pose of the place frame in the arm's base once the vehicle stands at its target."""
-    place_from_base = job.approach.target.se3() * config.arm.vehicle_from_base.se3()
-    return place_from_base.inverse()
+    return (job.approach.target.se3() * config.arm.vehicle_from_base.se3()).inverse()
 
 
 def facing(board: BoardSpec, base_from_board: pin.SE3, stand_off: float) -> pin.SE3:
@@ -245,8 +244,7 @@ def scan_plans(
         )
     normal, distance = np.array(calibration.light_plane.normal), calibration.light_plane.distance
     stripe_x = (distance - normal[2] * job.scan.stand_off) / normal[0]
-    looking_down = np.diag([1.0, -1.0, -1.0])
-    head = from_parts((-stripe_x, 0.0, job.scan.stand_off), looking_down)
+    head = from_parts((-stripe_x, 0.0, job.scan.stand_off), np.diag([1.0, -1.0, -1.0]))
     plans = []
     for swath in job.scan.swath:
         turn = pin.rpy.rpyToMatrix(swath.roll, swath.pitch, 0.0)

@@ -115,8 +115,7 @@ def expected_touch(job: Job, nominal: NominalSurface, pose: PlacePose, placing: 
     steps = np.random.default_rng(0).standard_normal((DRAWS, 6)) @ root.T
     every = max(1, len(nominal.samples) // UNDERSIDE)
     normals = nominal.normals[nominal.sample_triangles[::every]]
-    up = job.place.surface_from_part.se3().rotation[:, 2]
-    rise = normals @ up
+    rise = normals @ job.place.surface_from_part.se3().rotation[:, 2]
     ground = rise > STEEPEST
     if not ground.any():
         raise RefusedError(

@@ -165,8 +165,7 @@ def _rail_moves(
     made = []
     low, high = config.rail.travel
     for way in (-RAIL_MOVE, RAIL_MOVE):
-        position = min(max(here.rail_position + way, low), high)
-        devices.rail.move_to(position).wait(30.0)
+        devices.rail.move_to(min(max(here.rail_position + way, low), high)).wait(30.0)
         name = f"{here.name} {'+' if way > 0 else '-'}"
         seen = look_for(devices.scan_camera, board, Counter(), keep, name.replace(" ", "-"))
         if seen is not None:

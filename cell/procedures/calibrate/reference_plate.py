@@ -213,7 +213,8 @@ def _passed(
             keep("witness-edge", frame)
             times.append(frame.mid_exposure)
             light.append(_light(frame.image, witness))
-            dark.append(_surroundings(frame.image))
+            some = np.sort(frame.image[::8, ::8].astype(np.float64), axis=None)
+            dark.append(float(some[: len(some) * 3 // 4].mean()))
     begin, end = sweep.window
     inside = np.flatnonzero((np.array(times) >= begin) & (np.array(times) <= end))
     if len(inside) < LEAST_FRAMES:
@@ -227,12 +228,6 @@ def _passed(
     lit = lit / np.maximum(whole, LEAST_LIGHT_DN)
     order = np.argsort(places)
     return places[order], np.asarray(lit.mean(axis=1))[order]
-
-
-def _surroundings(image: NDArray[np.generic]) -> float:
-    """How bright a picture is beside the line and what it lights, DN."""
-    some = np.sort(image[::8, ::8].astype(np.float64), axis=None)
-    return float(some[: len(some) * 3 // 4].mean())
 
 
 def _require_fixed_gain(dark: Array) -> None:

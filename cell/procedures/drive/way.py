@@ -341,8 +341,7 @@ class Upright:
     def of(cls, body: Body, frame_from_parent: pin.SE3) -> Upright:
         """Around a body whose parent is at `frame_from_parent`."""
         pose = frame_from_parent * body.placement
-        radius = body.radius or 0.0
-        dx, dy, dz = np.abs(pose.rotation) @ (0.5 * np.array(body.size)) + radius
+        dx, dy, dz = np.abs(pose.rotation) @ (0.5 * np.array(body.size)) + (body.radius or 0.0)
         x, y, z = pose.translation
         corners = np.array([[x + dx, y + dy], [x - dx, y + dy], [x - dx, y - dy], [x + dx, y - dy]])
         return cls(body.name, corners, float(z - dz), float(z + dz))

@@ -12,7 +12,6 @@ from contextlib import suppress
 from functools import partial
 
 import numpy as np
-import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.devices.devices import Devices
@@ -24,7 +23,7 @@ from cell.procedures.arm.photograph import ScanPlan
 from cell.procedures.sweep.swath import RailPath, Swath, SweepCollector, SweepErrors, TimeBound, shift_by_times
 from drivers.clock import ClockMap
 from drivers.errors import CellError, DeviceFault
-from drivers.interfaces import Arm, ArmState, Sweep, Vector
+from drivers.interfaces import ArmState, Sweep, Vector
 
 RUN_UP_S = 0.7
 """Seconds at full speed by which the line is longer at both ends: the arm gains its speed and its wobble dies out."""
@@ -52,7 +51,10 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     scan, arm, camera = collector.scan, devices.arm, devices.scan_camera
     along, length = _straight(plan)
     devices.rail.move_to(plan.rail_start).wait(30.0)
-    line = _before_the_line(plan, mover, RUN_UP_S * scan.speed * along, scan.speed)
+    run_up = RUN_UP_S * scan.speed * along
+    start, stop = from_parts(-run_up) * plan.base_from_flange, from_parts(run_up) * plan.base_from_flange_end
+    way, line = mover.plan_line(start, stop, scan.speed)
+    mover.follow(way)
     rail = devices.rail.state().position
     camera.configure(scan.exposure, scan.frame_rate)
     clocks = ClockMap()
@@ -87,14 +89,6 @@ def _straight(plan: ScanPlan) -> tuple[Vector, float]:
     shift = plan.base_from_flange_end.translation - plan.base_from_flange.translation
     length = float(np.linalg.norm(shift))
     return shift / length, length
-
-
-def _before_the_line(plan: ScanPlan, mover: Mover, run_up: Vector, speed: float) -> Trajectory:
-    """Move to where the arm's line begins, `run_up` (3,), m, before what was planned; the line, as long after it."""
-    start, stop = from_parts(-run_up) * plan.base_from_flange, from_parts(run_up) * plan.base_from_flange_end
-    way, line = mover.plan_line(start, stop, speed)
-    mover.follow(way)
-    return line
 
 
 def _follow_lit(line: Trajectory, mover: Mover, devices: Devices, collector: SweepCollector) -> Sequence[ArmState]:
@@ -188,7 +182,13 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     times = np.array(collector.times) - late
     lines = np.flatnonzero((times >= begin) & (times <= end))
     swath = _swath_of(collector, lines, devices.scan_camera.name, errors)
-    _require_unmoved(arm, base_from_flange)
+    moved = np.linalg.norm(from_ur(arm.state().flange).translation - base_from_flange.translation)
+    if not moved <= MAX_FLANGE_MOTION:
+        raise DeviceFault(
+            arm.name, "arm.moved_in_sweep",
+            f"the flange moved by {1e3 * moved:.2f} mm during the sweep, allowed {1e3 * MAX_FLANGE_MOTION:.1f} mm",
+            recoverable=True, hint="See what pushed the arm; the sweep is of no use.",
+        )  # fmt: skip
     _require_even(rail.name, sweep, errors)
     times_known = [TimeBound(rail.name, "rail", sweep.time_bound), TimeBound.of(devices.scan_camera)]
     shift, variance = shift_by_times(times_known, scan.speed, errors.by_rail)
@@ -219,17 +219,6 @@ def _sweep_lit(plan: ScanPlan, devices: Devices, collector: SweepCollector) -> S
 
         collector.take(frames, ended)
     return sweep
-
-
-def _require_unmoved(arm: Arm, base_from_flange: pin.SE3) -> None:
-    """Raise `DeviceFault` where the flange has left where it was before the sweep."""
-    moved = np.linalg.norm(from_ur(arm.state().flange).translation - base_from_flange.translation)
-    if not moved <= MAX_FLANGE_MOTION:
-        raise DeviceFault(
-            arm.name, "arm.moved_in_sweep",
-            f"the flange moved by {1e3 * moved:.2f} mm during the sweep, allowed {1e3 * MAX_FLANGE_MOTION:.1f} mm",
-            recoverable=True, hint="See what pushed the arm; the sweep is of no use.",
-        )  # fmt: skip
 
 
 def _require_even(rail: str, sweep: Sweep, errors: SweepErrors) -> None:

@@ -77,8 +77,7 @@ def parts(stream: IO[bytes], told: Parts) -> Iterator[tuple[int, bytes]]:
                 yield from filter(lambda record: record[0] in (SCHEMA, CHANNEL), _records(BytesIO(index)))
         elif kind == DATA_END:
             # 0: not reckoned, in records of older versions.
-            expected = int.from_bytes(content[:4], "little")
-            if expected not in (0, crc) and not told.damaged:
+            if int.from_bytes(content[:4], "little") not in (0, crc) and not told.damaged:
                 told.damaged.append(f"something between its chunks, before byte {here}")
             crc, summary = 0, True
             continue
@@ -132,8 +131,7 @@ def _summary(stream: IO[bytes], size: int) -> bytes:
     foot = stream.read()
     if len(foot) < end or foot[0] != FOOTER or not foot.endswith(MAGIC):
         return b""
-    begin = int.from_bytes(foot[_HEAD.size : _HEAD.size + 8], "little")
-    stream.seek(min(begin, size))
+    stream.seek(min(int.from_bytes(foot[_HEAD.size : _HEAD.size + 8], "little"), size))
     index = stream.read()[:-end]
     fits = zlib.crc32(index + foot[: _HEAD.size + 16]).to_bytes(4, "little") == foot[_HEAD.size + 16 : _HEAD.size + 20]
     return index if fits else b""

@@ -205,7 +205,12 @@ class Recorder(logging.Handler):
 
     def close(self) -> None:
         """Listen no more, and end the file. A failure is told in the log; the run has ended as it has all the same."""
-        self._deafen()
+        for device in self._devices:
+            device.statistics.traffic.listener = None
+        for name in LOGGERS:
+            logging.getLogger(name).removeHandler(self)
+        self._run.record = None
+        self._devices.gate.listener = None
         self.file.close()
         if self.file.failure is not None:
             log.warning("%s is not whole: %s", self.file.path, self.file.failure)
@@ -226,14 +231,6 @@ class Recorder(logging.Handler):
         for device in self._devices:
             if device.name in DEVICES:
                 device.statistics.traffic.listener = self._wire(device.name)
-
-    def _deafen(self) -> None:
-        for device in self._devices:
-            device.statistics.traffic.listener = None
-        for name in LOGGERS:
-            logging.getLogger(name).removeHandler(self)
-        self._run.record = None
-        self._devices.gate.listener = None
 
     # --- who tells ---
 
@@ -274,7 +271,11 @@ class Recorder(logging.Handler):
 
     def frame(self, what: str, frame: Frame, picture: FrameFile) -> None:
         """A frame is kept, see `cell.procedures.frame_store.FrameStore`."""
-        camera = self._camera_of(what, frame)
+        # Which camera took it, by its size; where both have the same, by what it is kept as.
+        there = {name: getattr(self._devices, name).shape for name in CAMERAS if name in self._devices}
+        fits = [name for name, shape in there.items() if shape == frame.image.shape]
+        named = "target_camera" if what.startswith(("board", "target")) else "scan_camera"
+        camera = fits[0] if len(fits) == 1 else named
         at = self._times.of(frame.mid_exposure)
         told = {
             "file": picture.name, "frame_id": frame.frame_id, "exposure": frame.exposure,
@@ -284,13 +285,6 @@ class Recorder(logging.Handler):
         self._json(f"/{camera}/frame", at, told)
         self._put(f"/{camera}/calibration", at, lambda draw: draw.lens(at, camera))
         self._put(f"/{camera}/image", at, lambda draw: draw.image(at, camera, picture))
-
-    def _camera_of(self, what: str, frame: Frame) -> str:
-        """Which camera took it, by its size; where both have the same, by what it is kept as."""
-        there = {name: getattr(self._devices, name).shape for name in CAMERAS if name in self._devices}
-        fits = [name for name, shape in there.items() if shape == frame.image.shape]
-        named = "target_camera" if what.startswith(("board", "target")) else "scan_camera"
-        return fits[0] if len(fits) == 1 else named
 
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler.emit`."""

@@ -149,10 +149,21 @@ def replay(folder: Path, progress: Progress = lambda fraction, text: None) -> li
             whereabouts=Whereabouts(cast(Vehicle, None))
         )  # fmt: skip
         progress(0.05, "photograph")
-        fix = _photograph(here, folder, kept["photograph"])
-        compared = [_compare_fix(fix, kept["photograph"])]
+        told = kept["photograph"]
+        camera = here.calibration.target.camera
+        seen = _Kept(folder, told, (camera.height, camera.width))
+        fix = photograph(
+            cast(Arm, seen), cast(Camera, seen), here.calibration.target, spec=here.board, limits=here.job.photo,
+            repeatability=here.repeatability, count=len(told["files"]),
+        )  # fmt: skip
+        fix = settled(fix, here.config.arm.vehicle_from_base.se3().inverse())
+        off = pose_difference(fix.base_from_board, told["base_from_board"])
+        compared = [Compared("board's pose", off or _array_difference(fix.covariance, told["covariance"]))]
         progress(0.15, "sweep")
-        sweep = _sweep(here, folder, fix, resumed=bool(kept["earlier_sweep"]))
+        head, exit_point = here.calibration.scan, here.config.laser.exit_point
+        # What was changed comes out otherwise, which is what a replay is to show.
+        stored = StoredSweep.load(folder, head, here.job.scan, exit_point, as_written=False)
+        sweep = stored.confirmed_by(fix) if kept["earlier_sweep"] else stored.sweep
         compared += _perceive(here, folder, kept, sweep=sweep, fix=fix, progress=progress)
     progress(0.95, "pictures of the record")
     return compared + _pictures(folder)
@@ -193,23 +204,6 @@ class _Kept:
         return Frame(read_image(path, self._shape), self._next, 0.0, device_time=0.0, host_time=0.0, received=0.0)
 
 
-def _photograph(here: Workplace, folder: Path, told: dict[str, Any]) -> BoardFix:
-    camera = here.calibration.target.camera
-    seen = _Kept(folder, told, (camera.height, camera.width))
-    fix = photograph(
-        cast(Arm, seen), cast(Camera, seen), here.calibration.target, spec=here.board, limits=here.job.photo,
-        repeatability=here.repeatability, count=len(told["files"]),
-    )  # fmt: skip
-    return settled(fix, here.config.arm.vehicle_from_base.se3().inverse())
-
-
-def _sweep(here: Workplace, folder: Path, fix: BoardFix, *, resumed: bool) -> SweepRecord:
-    head, exit_point = here.calibration.scan, here.config.laser.exit_point
-    # What was changed comes out otherwise, which is what a replay is to show.
-    stored = StoredSweep.load(folder, head, here.job.scan, exit_point, as_written=False)
-    return stored.confirmed_by(fix) if resumed else stored.sweep
-
-
 def _perceive(
     here: Workplace, folder: Path, kept: dict[str, Any], sweep: SweepRecord, fix: BoardFix, progress: Progress
 ) -> list[Compared]:
@@ -243,11 +237,6 @@ def _perceive(
 
 def _refusal(refused: dict[str, str] | None) -> str:
     return "it was not refused" if refused is None else f"{refused['step']} refused: {refused['reason']}"
-
-
-def _compare_fix(fix: BoardFix, told: dict[str, Any]) -> Compared:
-    off = pose_difference(fix.base_from_board, told["base_from_board"])
-    return Compared("board's pose", off or _array_difference(fix.covariance, told["covariance"]))
 
 
 def pose_difference(found: pin.SE3, told: list[list[float]]) -> str:

@@ -71,8 +71,7 @@ _NOT_SAFE = 4
 
 def _terminal(index: int) -> tuple[str, int]:
     """Kind and number of digital output `index`: 0-7 standard, 8-15 configurable, 16-17 tool."""
-    kind = ("standard", "configurable", "tool")[index // 8]
-    return kind, index % 8
+    return ("standard", "configurable", "tool")[index // 8], index % 8
 
 
 def switch_output(io: RTDEIOInterface, index: int, value: bool) -> bool:

@@ -90,8 +90,7 @@ class ModbusLink(RailLink):
         """Read registers: values, host time of the middle of the round trip, round trip; in clock seconds."""
         if self._last_words is not None:
             self._last_words.require_unspoken("rail.owner_frozen")
-        function = READ_INPUT if input else READ
-        request = _frame(self._unit, function, *_words(address, count))
+        request = _frame(self._unit, READ_INPUT if input else READ, *_words(address, count))
         data, stamp, round_trip = self._exchange(request, 5 + 2 * count, f"to read register {address:#06x}", None)
         if data[2] != 2 * count:
             raise DeadlineError(self.name, f"{data[2]} bytes of registers came, {2 * count} were asked for")

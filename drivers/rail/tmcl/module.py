@@ -89,7 +89,9 @@ def set_ramp(link: TmclLink, acceleration: int) -> None:
 
     What a module does not have is left out: then there is nothing in it that bends the ramp.
     """
-    _in_pulses(link)
+    # Some firmware knows units of its own as well, and says which in parameter 255.
+    if link.get_if_there(Axis.UNIT_MODE) not in (None, PULSES_MODE):
+        set_checked(link, Axis.UNIT_MODE, PULSES_MODE, EXACT)
     set_checked(link, Axis.MAX_ACCELERATION, acceleration, ACCELERATION)
     for axis in (Axis.MAX_DECELERATION, Axis.RAMP_18):
         _if_there(link, axis, acceleration, ACCELERATION)
@@ -127,12 +129,6 @@ def _if_there(link: TmclLink, axis: Axis, value: int, rounding: Rounding) -> Non
     except CommandRefused as refused:
         if refused.status != NO_SUCH_TYPE:
             raise
-
-
-def _in_pulses(link: TmclLink) -> None:
-    """Some firmware knows units of its own as well, and says which in parameter 255."""
-    if link.get_if_there(Axis.UNIT_MODE) not in (None, PULSES_MODE):
-        set_checked(link, Axis.UNIT_MODE, PULSES_MODE, EXACT)
 
 
 TOO_HOT, SHORT_A, SHORT_B = 1 << 1, 1 << 3, 1 << 4

@@ -293,8 +293,7 @@ class DriveFeedback(Feedback):
         """True when both drives have reported standstill after host time `since`, and their counts do not deny it."""
         if self._travel.swings() or self._rested < AT_REST:
             return False
-        step = 1.5 * self._wheels.velocity_step
-        slow = max(STILL, step)
+        slow = max(STILL, 1.5 * self._wheels.velocity_step)
         at_rest = all(abs(drive.velocity) * self._wheels.velocity_step <= slow for drive in self.drives)
         return at_rest and all(drive.moved > since for drive in self.drives)
 

@@ -36,8 +36,7 @@ def ask(bus: CanopenBus, feedback: DriveFeedback, wheels: WheelDrives) -> None:
         if wheels.stop_input is not None:
             motion += struct.pack("<I", bus.read(drive.node, od.INPUTS))
         feedback.take(drive.node, od.MOTION, motion, in_pdo=False)
-        code = _optional(bus, drive, od.ERROR_CODE)
-        health = struct.pack("<H", code or 0)
+        health = struct.pack("<H", _optional(bus, drive, od.ERROR_CODE) or 0)
         if (millivolts := _optional(bus, drive, od.DC_LINK)) is not None:
             health += struct.pack("<I", millivolts)
         feedback.take(drive.node, od.HEALTH, health, in_pdo=False)

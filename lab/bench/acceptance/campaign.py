@@ -231,8 +231,7 @@ def acceptance(seed: int, level: str = "nominal", progress: Progress | None = No
 def _ball(cloud: Cloud) -> tuple[SphereFit, NDArray[np.bool_]]:
     """The sphere through the part of a ball that is judged, and which of the cloud's valid points those are."""
     points = cloud.points[cloud.valid]
-    first = fit_sphere(points)
-    chosen = cap(points, first.centre, np.array([0.0, 0.0, -1.0]), CAP)
+    chosen = cap(points, fit_sphere(points).centre, np.array([0.0, 0.0, -1.0]), CAP)
     return fit_sphere(points[chosen]), chosen
 
 
@@ -280,8 +279,7 @@ def _noise_band(cloud: Cloud, chosen: NDArray[np.bool_], normals: Array) -> floa
 
 
 def _worst(rows: list[dict[str, float]], key: str) -> float:
-    values = [row[key] for row in rows]
-    return float(max(values, key=abs))
+    return float(max([row[key] for row in rows], key=abs))
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,8 +322,7 @@ def plane_deviations(points: Array) -> Array:
 def form_all(deviations: Array) -> float:
     """Form error over all points: largest minus smallest deviation, the 3 ‰ farthest off left out. Unit as given."""
     most = np.sort(np.abs(deviations - np.median(deviations)))[len(deviations) - 1 - int(LET_GO * len(deviations))]
-    kept = deviations[np.abs(deviations - np.median(deviations)) <= most]
-    return float(np.ptp(kept))
+    return float(np.ptp(deviations[np.abs(deviations - np.median(deviations)) <= most]))
 
 
 def form_95(deviations: Array) -> float:

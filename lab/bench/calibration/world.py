@@ -210,8 +210,7 @@ def draw_head(rng: np.random.Generator) -> HeadWorld:
 
 def seen_dots(pixels: Array) -> NDArray[np.intp]:
     """Which dots (n, 2) lie in the picture with all of their rim."""
-    inside = ((pixels > 14) & (pixels < (WIDTH - 15, HEIGHT - 15))).all(axis=1)
-    return np.flatnonzero(inside)
+    return np.flatnonzero(((pixels > 14) & (pixels < (WIDTH - 15, HEIGHT - 15))).all(axis=1))
 
 
 def seen_rows(world: HeadWorld, view: int, own: Array) -> tuple[Array, NDArray[np.bool_]]:

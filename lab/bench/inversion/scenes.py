@@ -117,7 +117,9 @@ def nominal(name: str, step: float = 0.0005) -> NominalSurface:
     if part.round:
         x, y = _rings(0.0, 0.0, np.linspace(0.0, DISC, int(DISC / step) + 1), step)
     else:
-        x, y = _rectangle(step)
+        nx, ny = int(2 * HALF_X / step) + 1, int(2 * HALF_Y / step) + 1
+        x, y = np.meshgrid(np.linspace(-HALF_X, HALF_X, nx), np.linspace(-HALF_Y, HALF_Y, ny), indexing="ij")
+        x, y = x.ravel(), y.ravel()
     if name == "plate":
         for cx, cy in HOLES:
             away = np.hypot(x - cx, y - cy) > SINK + 0.4 * step
@@ -142,12 +144,6 @@ def _off_the_bores(x: Array, y: Array) -> tuple[Array, Array]:
         grow = np.where(r < BORE * 1.0001, BORE * 1.000001 / np.maximum(r, 1e-9), 1.0)
         x, y = cx + (x - cx) * grow, cy + (y - cy) * grow
     return x, y
-
-
-def _rectangle(step: float) -> tuple[Array, Array]:
-    nx, ny = int(2 * HALF_X / step) + 1, int(2 * HALF_Y / step) + 1
-    x, y = np.meshgrid(np.linspace(-HALF_X, HALF_X, nx), np.linspace(-HALF_Y, HALF_Y, ny), indexing="ij")
-    return x.ravel(), y.ravel()
 
 
 def _rings(cx: float, cy: float, radii: Array, step: float) -> tuple[Array, Array]:

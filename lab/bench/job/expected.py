@@ -120,8 +120,7 @@ def mean_after_contact(placing: Vector, nominal: NominalSurface, pose: PlacePose
     normals = nominal.normals[nominal.sample_triangles[::every]] @ surface.rotation.T
     # How far the underside lies over the ground, straight down, where it is displaced by d: n·d / n_z.
     above = (steps @ by_pose(under).transpose(0, 2, 1)).transpose(1, 0, 2)
-    gaps = np.einsum("kni,ni->kn", above, normals / normals[:, 2:])
-    drop = gaps.min(axis=1)
+    drop = np.einsum("kni,ni->kn", above, normals / normals[:, 2:]).min(axis=1)
     points = transform(surface, part_points(nominal)) - surface.translation
     ended = (steps @ by_pose(points).transpose(0, 2, 1)).transpose(1, 0, 2)
     ended[:, :, 2] -= drop[:, None]

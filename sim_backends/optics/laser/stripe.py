@@ -96,7 +96,8 @@ def render_stripe(
     for instance in scene:
         found, share = crossings(optics, laser, instance), None
         if isinstance(instance, PlaneInstance):
-            found = crossings(optics, laser, _with_rim(instance, laser))
+            width, height = np.array(instance.size) + 2 * RIM * _spread(instance, laser)
+            found = crossings(optics, laser, replace(instance, size=(float(width), float(height))))
         if len(found.rows):
             found = found.keep(lit(found.points, found.normals, instance, scene, laser))
         if not len(found.rows):
@@ -143,8 +144,7 @@ RIM = 3.0
 def share_on(instance: PlaneInstance, laser: LaserOptics, points: Vector) -> Vector:
     """How much (n,) of a sheet with its thickness meets a rectangle where its middle meets the plane, points (n, 3)."""
     pose, spread = np.asarray(instance.camera_from_plane, dtype=np.float64), _spread(instance, laser)
-    local = (points - pose[:3, 3]) @ pose[:3, :2]
-    beyond = np.abs(local) - np.array(instance.size) / 2
+    beyond = np.abs((points - pose[:3, 3]) @ pose[:3, :2]) - np.array(instance.size) / 2
     return np.asarray(scipy.special.ndtr(-beyond / np.maximum(spread, 1e-9)).prod(axis=1))
 
 
@@ -153,11 +153,6 @@ def _spread(instance: PlaneInstance, laser: LaserOptics) -> Vector:
     normal, _, _ = laser_frame(laser)
     across = np.asarray(instance.camera_from_plane, dtype=np.float64)[:3, :2].T @ normal
     return np.asarray(laser.width * np.abs(across) / max(float(across @ across), 1e-6))
-
-
-def _with_rim(instance: PlaneInstance, laser: LaserOptics) -> PlaneInstance:
-    width, height = np.array(instance.size) + 2 * RIM * _spread(instance, laser)
-    return replace(instance, size=(float(width), float(height)))
 
 
 @compiled

@@ -188,7 +188,9 @@ class GigePeer:
                 packet, client = b"", ("", 0)
             except OSError:
                 return
-            self._watch_heartbeat()
+            patience = 1e-3 * self._memory.word(memory.HEARTBEAT)
+            if self._controller is not None and time.monotonic() - self._heard > patience:
+                self._release()
             request = GvcpRequest.of(packet)
             if request is None or self.camera.silent:
                 continue
@@ -201,11 +203,6 @@ class GigePeer:
             if request.answered:
                 with contextlib.suppress(OSError):
                     self._control.sendto(answer, client)
-
-    def _watch_heartbeat(self) -> None:
-        patience = 1e-3 * self._memory.word(memory.HEARTBEAT)
-        if self._controller is not None and time.monotonic() - self._heard > patience:
-            self._release()
 
     def _release(self) -> None:
         self._controller = None

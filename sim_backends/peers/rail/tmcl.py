@@ -153,13 +153,10 @@ class TmclModule:
         if kind not in (0, 1):
             raise TmclRefused(BAD_TYPE)
         t = self.clock.now()
-        target = value if kind == 0 else self._base(t) + value
+        target = value if kind == 0 else (self.rail.position(t) if self._axis[127] else self.rail.target()) + value
         _check(target, -(2**31), 2**31 - 1)
         self.rail.move_to(t, target)
         return target
-
-    def _base(self, t: float) -> int:
-        return self.rail.position(t) if self._axis[127] else self.rail.target()
 
     def _search(self, kind: int, motor: int, value: int) -> int:
         t = self.clock.now()

@@ -108,7 +108,9 @@ class CanopenNode:
         if period and now - self._beat >= period:
             self._beat = now
             self._send(0x700 + self.number, bytes((self.state,)))
-        allowed = self._allowed_silence()
+        consumer = self._values[0x1016, 1].value & 0xFFFF
+        guarding = self._values[0x100C, 0].value * self._values[0x100D, 0].value
+        allowed = 1e-3 * (consumer or guarding)
         if not allowed:
             self._heard = None
         elif self._heard is not None and now - self._heard > allowed:
@@ -125,7 +127,9 @@ class CanopenNode:
             return
         if frame.remote:
             if frame.id == 0x700 + self.number:
-                self._guarded(now)
+                self._send(0x700 + self.number, bytes((self.state | self._guard_toggle,)))
+                self._guard_toggle ^= 0x80
+                self._heard = now
         elif frame.id == 0x000 and len(frame.data) == 2 and frame.data[1] in (0, self.number):
             self._manage(frame.data[0])
         elif frame.id == 0x080:
@@ -139,16 +143,6 @@ class CanopenNode:
             self._take_pdo(frame)
 
     # --- signs of life ---
-
-    def _allowed_silence(self) -> float:
-        consumer = self._values[0x1016, 1].value & 0xFFFF
-        guarding = self._values[0x100C, 0].value * self._values[0x100D, 0].value
-        return 1e-3 * (consumer or guarding)
-
-    def _guarded(self, now: float) -> None:
-        self._send(0x700 + self.number, bytes((self.state | self._guard_toggle,)))
-        self._guard_toggle ^= 0x80
-        self._heard = now
 
     def _manage(self, command: int) -> None:
         if command in (0x01, 0x02, 0x80):

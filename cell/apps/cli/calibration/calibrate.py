@@ -10,6 +10,7 @@ import typer
 from cell.apps.cli import options
 from cell.apps.cli.calibration import stored
 from cell.apps.cli.options import ConfigOption, JsonOption, Level, print_json
+from drivers.errors import ConfigError, RefusedError
 
 if TYPE_CHECKING:
     from cell.apps.recordings.command import Options
@@ -87,8 +88,6 @@ def calibrate(
     """
     if context.invoked_subcommand is not None:
         return
-    from drivers.errors import ConfigError
-
     given = {"--board": board, "--plan": plan, "--poses": poses, "--pose-field": pose_field, "--setup": setup}
     given |= {"--camera": camera, "--laser": laser, "--details": details}
     if source is None:
@@ -130,7 +129,6 @@ def _options(
     from cell.apps.recordings.command import Options
     from cell.apps.recordings.known_camera import read_camera
     from cell.measure.vision import LaserChannel
-    from drivers.errors import ConfigError
 
     lasers = ("none", "red", "green", "blue", "grey", "auto")
     if setup not in (None, "eye-in-hand", "eye-to-hand"):
@@ -149,7 +147,6 @@ def _from_folder(folder: Path, board: str | None, said: Options, json: bool, det
     from cell.apps.recordings.command import calibrate_folder
     from cell.base.storage import sealed
     from cell.measure.vision import parse_board
-    from drivers.errors import ConfigError, RefusedError
 
     result = calibrate_folder(folder, None if board is None else parse_board(board, single_tag=True), said)
     if json:

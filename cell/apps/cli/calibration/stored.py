@@ -10,6 +10,7 @@ import typer
 
 from cell.apps.cli import options
 from cell.apps.cli.options import ConfigOption, JsonOption, Level, new_table, print_json
+from drivers.errors import CalibrationStale, ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -202,7 +203,6 @@ def list_calibrations(config: ConfigOption = None, json: JsonOption = False) -> 
     from rich.console import Console
 
     from cell.config.calibrations.store import read_calibration
-    from drivers.errors import CalibrationStale
 
     rows: list[Summary] = []
     for path in sorted(_folder(config).glob("*.json")):
@@ -239,7 +239,6 @@ def show(
     """Show a stored calibration: its values with their deviations, and what was found out since."""
     from cell.apps.cli.display import print_calibration
     from cell.config.calibrations.store import read_calibration
-    from drivers.errors import CalibrationStale, ConfigError
 
     folder = _folder(config)
     paths = sorted(folder.glob("*.json"), key=lambda path: path.stat().st_mtime)
@@ -271,7 +270,6 @@ def accept(
     import getpass
 
     from cell.config.calibrations.store import accept_calibration
-    from drivers.errors import ConfigError
 
     path = _folder(config) / f"{name}.json"
     if not why.strip():

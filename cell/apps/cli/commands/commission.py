@@ -10,6 +10,7 @@ import typer
 
 from cell.apps.cli import options
 from cell.apps.cli.options import CellClock, ConfigOption, Confirm, Level, new_table, print_json, wide_console
+from drivers.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -54,7 +55,6 @@ def commission(
     from cell.apps.cli.progress import tell_question
     from cell.apps.commission.check import write_protocol
     from cell.apps.commission.sequence import CHECKS, begin, chosen, confirms_itself
-    from drivers.errors import ConfigError
 
     if sim != "all" and (truth is not None or confirm is Confirm.simulated):
         raise ConfigError("--truth and --confirm simulated are for a cell that is all simulated; give --sim all")

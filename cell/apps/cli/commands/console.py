@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cell.apps.cli.options import ConfigOption, JobOption, Level, LevelOption, SeedOption, SimOption
+from drivers.errors import CellError, ConfigError
+from statemachine.watch import SignalWatch
 
 if TYPE_CHECKING:
     from cell.apps.console.host.console import Address
@@ -65,8 +67,6 @@ def require_installed() -> None:
     """`ConfigError` where the packages of the console are missing."""
     from importlib.util import find_spec
 
-    from drivers.errors import ConfigError
-
     if missing := [name for name in ("starlette", "uvicorn", "websockets") if find_spec(name) is None]:
         raise ConfigError(f"the page's server needs {', '.join(missing)}; install: pip install -e '.[console]'")
 
@@ -76,8 +76,6 @@ def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
     import threading
 
     from cell.apps.console.host.console import Console
-    from drivers.errors import CellError
-    from statemachine.watch import SignalWatch
 
     gone = threading.Event()
     with SignalWatch() as signals, Console(cell, job, address, page_teller(open_page), gone.set):
@@ -100,7 +98,6 @@ def run_shown(
     import time
 
     from cell.apps.console.host.console import Address, Console
-    from statemachine.watch import SignalWatch
 
     virtual = cell.simulated is not None and cell.simulated.facts["clock"] == "virtual"
     with Console(cell, job, Address(port=port), page_teller(open_page)) as console:

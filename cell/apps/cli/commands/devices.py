@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cell.apps.cli import options
+from cell.apps.cli import EXIT_FAILED, options
 from cell.apps.cli.options import ConfigOption, JsonOption, Level, new_table, print_json, wide_console
+from drivers.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -39,7 +40,6 @@ def jog(
     from cell.run.jogging import jog as perform
     from cell.run.jogging import needed_for, parse_jog
     from cell.run.session.supervisor import Cell
-    from drivers.errors import ConfigError
 
     if device is None:
         raise ConfigError(
@@ -72,7 +72,6 @@ def home(
     from cell.apps.cli.progress import tell_question
     from cell.config.cell_config import DEVICES
     from cell.run.session.supervisor import HOMED, Cell
-    from drivers.errors import ConfigError
 
     if device not in (None, *HOMED):
         raise ConfigError(f"cannot home {device!r}; write `cell home`, or {' or '.join(HOMED)} behind it")
@@ -95,9 +94,6 @@ def recover(
     """
     import getpass
     import sys
-
-    from cell.apps.cli import EXIT_FAILED
-    from drivers.errors import ConfigError
 
     if by is None:
         if not sys.stdin.isatty():

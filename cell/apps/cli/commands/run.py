@@ -14,6 +14,7 @@ import typer
 from cell.apps.cli import options
 from cell.apps.cli.commands.runs import NoiseOption, RunArgument, folder_of_runs
 from cell.apps.cli.options import CellClock, ConfigOption, Confirm, JobOption, JsonOption, Level, print_json
+from drivers.errors import ConfigError
 from sim_backends.faults import FAULT_NAMES
 
 if TYPE_CHECKING:
@@ -162,7 +163,6 @@ def _perform_batch(
     from cell.apps.cli.progress import ProgressDisplay, answer_here
     from cell.devices.simulated.process import is_whole
     from cell.run.batch import require_count
-    from drivers.errors import ConfigError
 
     require_count(count)
     if partly:

@@ -15,8 +15,10 @@ from typing import Annotated
 
 import typer
 
-from cell.apps.cli import options
+from cell.apps.cli import EXIT_FAILED, options
 from cell.apps.cli.options import ConfigOption, JsonOption, print_json
+from cell.config.files import beside, find_config, runs_folder
+from drivers.errors import ConfigError
 
 RunArgument = Annotated[
     str | None, typer.Argument(help="A run's folder, name or id. Without it, the newest.", autocompletion=options.runs)
@@ -48,7 +50,6 @@ def abort(
 ) -> None:
     """End what is going on in another process (run, calibration, verification, homing, jog): the cell is stopped."""
     from cell.run.folder import list_runs, listens
-    from drivers.errors import ConfigError
 
     going = [run for run in list_runs(_going_folder(config)) if listens(run)] if name is None else []
     if not going:
@@ -93,9 +94,7 @@ def confirm(
     import getpass
     import sys
 
-    from cell.apps.cli import EXIT_FAILED
     from cell.run.folder import awaited_word
-    from drivers.errors import ConfigError
 
     folder = _going(name, config)
     if (waits := awaited_word(folder)) is None:
@@ -110,7 +109,6 @@ def confirm(
 
 
 def _ask(folder: Path, kind: str, reason: str, answer: str, number: int | None = None) -> None:
-    from drivers.errors import ConfigError
     from statemachine.journal import JournalError, request
 
     try:
@@ -147,7 +145,6 @@ def health(config: ConfigOption = None, json: JsonOption = False) -> None:
 
     from cell.apps.cli.display import print_health
     from cell.config.cell_config import load_config
-    from cell.config.files import beside, find_config
     from cell.run.health import health as found
 
     path = find_config(config, simulated=True)
@@ -177,7 +174,6 @@ def report(
     """Show the report of a run."""
     from cell.apps.cli.display import print_report
     from cell.run.folder import find_run, read_report
-    from drivers.errors import ConfigError
 
     if out is not None and not html:
         raise ConfigError("--out names the file of --html; give both")
@@ -218,7 +214,6 @@ def export(
     from cell.run.folder import find_run
     from cell.run.report.export import SUFFIXES, export_run
     from drivers.common.units import parse_quantity
-    from drivers.errors import ConfigError
 
     try:
         end = parse_quantity(limit, "mm", 0.001, 100)
@@ -253,7 +248,6 @@ def repair(name: RunArgument = None, config: ConfigOption = None, json: JsonOpti
     """Close the record of a run that was cut off, so that every reader opens it; a whole one stays as it is."""
     from cell.run.folder import is_going
     from cell.run.record import reading as work
-    from drivers.errors import ConfigError
 
     path, folder = _record(name, config)
     if folder is not None and is_going(folder):
@@ -320,7 +314,6 @@ def export_wires(
 ) -> None:
     """Write the raw traffic of a run: CAN in candump's log format, or CAN, serial lines and RTDE as text."""
     from cell.run.record.reading import FORMATS
-    from drivers.errors import ConfigError
 
     path, _ = _record(name, config)
     suffix, write = FORMATS[kind.value]
@@ -338,7 +331,6 @@ def export_wires(
 
 def replay(name: RunArgument = None, config: ConfigOption = None, json: JsonOption = False) -> None:
     """Feed a run's frames and readings through perception again: exits 1 unless cloud and pose come out bit for bit."""
-    from cell.apps.cli import EXIT_FAILED
     from cell.run.folder import find_run
     from cell.run.record import replay as work
 
@@ -389,8 +381,6 @@ def _bar(what: str) -> Iterator[Callable[[float, str], None]]:
 
 def folder_of_runs(config: Path | None) -> Path:
     """Where the runs are of the cell that is configured; raises `ConfigError` where its file cannot be read."""
-    from cell.config.files import find_config, runs_folder
-
     path = find_config(config, simulated=True)
     try:
         tomllib.loads("" if path is None else path.read_text(encoding="utf-8"))
@@ -404,6 +394,4 @@ def folder_of_runs(config: Path | None) -> Path:
 
 def _going_folder(config: Path | None) -> Path:
     """As `folder_of_runs`, for who ends or holds what goes on: the configuration may have become wrong meanwhile."""
-    from cell.config.files import find_config, runs_folder
-
     return runs_folder(find_config(config, simulated=True))

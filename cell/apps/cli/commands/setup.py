@@ -11,6 +11,7 @@ import typer
 
 from cell.apps.cli import EXIT_USAGE, options
 from cell.apps.cli.options import ConfigOption, JobOption, JsonOption, print_json
+from drivers.errors import ConfigError
 
 if TYPE_CHECKING:
     from cell.apps.new_job.make import Made
@@ -33,7 +34,6 @@ def init(
 
     from cell.config.cell_config import default_toml
     from cell.config.job import job_path, load_job
-    from drivers.errors import ConfigError
 
     source, (loaded, mesh) = job_path(job), load_job(job)
     meshes = [mesh] if loaded.part is None else [mesh, Path(loaded.part.mesh)]
@@ -64,7 +64,6 @@ def check(config: ConfigOption = None, job: JobOption = "pot", json: JsonOption 
     from cell.config.job import job_and_item, job_path
     from cell.devices.simulated.mixed import require_possible
     from cell.run.report.figures import simulated_words
-    from drivers.errors import ConfigError
 
     source = find_config(config, simulated=True)
     told: dict[str, object] = {"ok": False, "configuration": "the one that ships" if source is None else str(source)}
@@ -213,7 +212,6 @@ def serve(
 
     from cell.config.cell_config import config_to_open, tables_of
     from cell.devices.simulated.described import Described
-    from drivers.errors import ConfigError
     from sim_backends import serve as server
 
     path, loaded = config_to_open(config, simulated=True)
@@ -243,7 +241,6 @@ def fill(config: ConfigOption = None, job: JobOption = "pot") -> None:
     from cell.config.cell_config import find_config, load_config
     from cell.devices.simulated.described import Described
     from cell.devices.simulated.process import make_ready
-    from drivers.errors import ConfigError
 
     loaded, described = load_config(find_config(config)), Described.of(job)
     if not loaded.cell.truth:

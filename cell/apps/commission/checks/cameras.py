@@ -126,14 +126,10 @@ def _board(eye: Eye, result: Result, across: float, along: float, found: RoughMo
 
 def renamed(board: BoardSpec, times: float) -> str:
     """The name of a board that is so many times as large as its name says."""
-    pitch = _round_pitch(board.pitch * times)
-    return replace(board, pitch=pitch, marker=board.marker * pitch / board.pitch).name
-
-
-def _round_pitch(pitch: float) -> float:
-    """To half a millimetre where that is as good as what was measured, else to a twentieth."""
+    pitch = board.pitch * times
     half = round(pitch / 0.5e-3) * 0.5e-3
-    return half if abs(half / pitch - 1.0) < 0.02 else round(pitch / 0.05e-3) * 0.05e-3
+    pitch = half if abs(half / pitch - 1.0) < 0.02 else round(pitch / 0.05e-3) * 0.05e-3
+    return replace(board, pitch=pitch, marker=board.marker * pitch / board.pitch).name
 
 
 def pose_words(pose: pin.SE3) -> str:

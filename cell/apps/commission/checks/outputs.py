@@ -114,8 +114,7 @@ def _no_light(desk: CommissionWorkplace, result: Result, laser: int, claw: int, 
 def _switch(desk: CommissionWorkplace, output: int) -> Switched:
     """Switch an output on and off again, with a picture before and while it is on."""
     arm, clock = desk.devices.arm, desk.devices.clock
-    eye = eye_of(desk, "scan_camera")
-    camera = camera_of(desk, eye)
+    camera = camera_of(desk, eye_of(desk, "scan_camera"))
     camera.configure(desk.config.calibration.stripe_exposure, PHOTO_RATE)
     off = camera.grab()
     # What lights up may be the laser, whatever the configuration says: a stop must not leave it on.

@@ -31,7 +31,14 @@ def _direction(desk: CommissionWorkplace, result: Result) -> None:
     eye = eye_of(desk, "scan_camera")
     if not _nudged(desk) and not rail.state().homed_here:
         desk.fold()
-        _watched_homing(desk)
+        # The zero of a rail whose direction nobody has seen: a person watches it.
+        desk.confirm(
+            "rail", "it searches its home switch; watch whether it goes towards that, and stop it if not",
+            "its whole travel at most", "half its configured speed",
+        )  # fmt: skip
+        desk.devices.rail.home().wait(120.0)
+        if not desk.person.sees("Did the carriage go to its home switch and stop there?"):
+            raise RefusedError("the rail did not go to its home switch: have its drive turn the motor the other way")
     first = centred_view(desk, result, eye)
     desk.keep(result, "rail-before", first.frame, first.view.pixels)
     state = rail.state()
@@ -99,17 +106,6 @@ def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
             remedy="Read the lead on the screw; steps per turn (motor) and microsteps (module) count as well.",
             write={"rail.lead": f'"{1e3 * value:.4g} mm"'},
         )  # fmt: skip
-
-
-def _watched_homing(desk: CommissionWorkplace) -> None:
-    """The zero of a rail whose direction nobody has seen: a person watches it. Raises `RefusedError`."""
-    desk.confirm(
-        "rail", "it searches its home switch; watch whether it goes towards that, and stop it if not",
-        "its whole travel at most", "half its configured speed",
-    )  # fmt: skip
-    desk.devices.rail.home().wait(120.0)
-    if not desk.person.sees("Did the carriage go to its home switch and stop there?"):
-        raise RefusedError("the rail did not go to its home switch: have its drive turn the motor the other way")
 
 
 def _nudged(desk: CommissionWorkplace) -> bool:

@@ -213,12 +213,9 @@ class Console:
             case AskCell(number, job):
                 self._begin(number, lambda: cell_facts(self._cell, self.desk.named_job(job)))
             case Ready(token):
-                self._new_link(token)
-
-    def _new_link(self, token: str | None) -> None:
-        base = f"{self._scheme}://{self._names[0]}:{self.port}"
-        self.link = f"{base}/enter?token=" + (token or "TOKEN-OF-THE-FILE")
-        self._told(self.link)
+                base = f"{self._scheme}://{self._names[0]}:{self.port}"
+                self.link = f"{base}/enter?token=" + (token or "TOKEN-OF-THE-FILE")
+                self._told(self.link)
 
     def _begin(self, number: int, work: Callable[[], dict[str, object]]) -> None:
         if not self._working.acquire(blocking=False):

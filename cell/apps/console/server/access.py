@@ -196,7 +196,8 @@ class Holders:
                 raise InterlockError(
                     "cell", f"{self.name(str(self._holder))} holds it; ask them to hand it over, or to leave it"
                 )
-            self._names[client] = _clean(name)
+            # As it is shown to others and written to journals: one short line.
+            self._names[client] = " ".join("".join(c for c in name if c.isprintable()).split())[:LONGEST_NAME]
             self._holder = client
             return f"{self.name(client)} holds the cell"
 
@@ -223,8 +224,3 @@ class Holders:
         if client != self._holder or client not in self._names:
             who = "nobody" if self._holder is None else self.name(self._holder)
             raise InterlockError("cell", f"this page does not hold it ({who} does); nothing was done. Take it in hand")
-
-
-def _clean(name: str) -> str:
-    """A name as it is shown to others and written to journals: one short line."""
-    return " ".join("".join(c for c in name if c.isprintable()).split())[:LONGEST_NAME]

@@ -87,7 +87,8 @@ class RunView:
 
     def _take(self, event: Event) -> None:
         step, data = event.step, event.data
-        row = self._row_of(step) if step and _is_step(event) else None
+        of_step = event.kind in ("step_started", "step_done", "step_failed", "progress")
+        row = self._row_of(step) if step and of_step else None
         match event.kind:
             case "step_started" if row is not None:
                 self._step, self._attempt = step, int(str(data["attempt"]))
@@ -114,7 +115,9 @@ class RunView:
                 self._held = event.kind == "paused"
         if event.kind == "run_ended":
             self._step, self._text = None, "writing the report"
-            self.ended = self._end(event)
+            folder = None if self.run.folder is None else self.run.folder.name
+            told = {"outcome": str(data["outcome"]), "reason": str(data["reason"])}
+            self.ended = {"run": folder, "kind": self.run.kind, **told, "t": event.at}
 
     def _begin(self, row: dict[str, object]) -> None:
         """The step of this row is active from now on."""
@@ -123,11 +126,6 @@ class RunView:
             before["state"] = "done" if before["state"] == "active" else before["state"]
         self._fraction, self._text, self._step_begun = 0.0, "", time.monotonic()
         row |= {"state": "active", "reason": "", "retries": int(str(row["retries"])) + (self._attempt > 1)}
-
-    def _end(self, event: Event) -> dict[str, object]:
-        folder = None if self.run.folder is None else self.run.folder.name
-        told = {"outcome": str(event.data["outcome"]), "reason": str(event.data["reason"])}
-        return {"run": folder, "kind": self.run.kind, **told, "t": event.at}
 
 
 def words(event: Event) -> str:
@@ -143,10 +141,6 @@ def words(event: Event) -> str:
 
 def _row(name: str) -> dict[str, Any]:
     return {"name": name, "state": "open", "duration_s": None, "retries": 0, "reason": ""}
-
-
-def _is_step(event: Event) -> bool:
-    return event.kind in ("step_started", "step_done", "step_failed", "progress")
 
 
 def _device(code: str) -> str:

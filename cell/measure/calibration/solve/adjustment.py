@@ -236,8 +236,7 @@ class Adjustment:
         """Scale each group's σ so that its χ² meets its redundancy."""
         inverse = normal.inverse()
         factors = {}
-        groups = ["dots", "stripe"] + (["shift", "turn"] if self.priors.estimate_arm else [])
-        for name in groups:
+        for name in ["dots", "stripe"] + (["shift", "turn"] if self.priors.estimate_arm else []):
             if normal.groups[name].count:
                 factors[name] = _scatter(normal, inverse, name)
         p = self.priors
@@ -269,8 +268,7 @@ def shared_mask(*, plane: bool, rail: bool) -> NDArray[np.bool_]:
 
 def expected_cost(name: str, block: Block, inverse: Inverse) -> float:
     """What a group's robust cost is on average, when its noise is Gaussian and as large as assumed."""
-    redundancy = max(block.count - inverse.taken(block), 0.02 * block.count)
-    return redundancy * HUBER_COST.get(name, 1.0)
+    return max(block.count - inverse.taken(block), 0.02 * block.count) * HUBER_COST.get(name, 1.0)
 
 
 def huber(size: Array) -> tuple[Array, float]:
@@ -384,8 +382,7 @@ def predicted(view: ViewData, flange: pin.SE3, other: AdjustmentState) -> list[f
         for _ in range(BEST_POSE_STEPS):
             residual, jacobian = dots_block(other, view, flange, view.rail)
             rows = jacobian.reshape(-1, jacobian.shape[2])[:, FLANGE]
-            step = np.linalg.lstsq(rows, residual.ravel(), rcond=None)[0]
-            flange = perturbed(flange, step)
+            flange = perturbed(flange, np.linalg.lstsq(rows, residual.ravel(), rcond=None)[0])
         left = dots_block(other, view, flange, view.rail)[0].ravel()
         squares = float(left @ left)
         dots = float(np.sqrt(squares / len(left)))

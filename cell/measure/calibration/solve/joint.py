@@ -169,10 +169,7 @@ def solve_joint(
     observations: Sequence[ScanObservation], staged: Staged, priors: Priors, held_out: bool = True
 ) -> Joint:
     """Adjust everything together, and predict the views of every fourth rest from the others in turn."""
-    if staged.plane is None:
-        rows = [np.empty(0, dtype=np.intp)] * len(observations)
-    else:
-        rows = staged.plane.rows
+    rows = [np.empty(0, dtype=np.intp)] * len(observations) if staged.plane is None else staged.plane.rows
     views = [view_data(o, r) for o, r in zip(observations, rows, strict=True)]
     rail = float(np.ptp([o.rail_position for o in observations])) > 1e-3
     free = shared_mask(plane=staged.plane is not None, rail=rail)

@@ -93,8 +93,7 @@ class AdjustmentState:
 
 def tangents(normal: Array) -> tuple[Array, Array]:
     """Two unit vectors perpendicular to a unit normal and to each other."""
-    other = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    first = cross(normal, other)
+    first = cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
     first /= np.linalg.norm(first)
     return first, cross(normal, first)
 

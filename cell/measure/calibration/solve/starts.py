@@ -238,8 +238,7 @@ def _family(view: BoardView, ideal: Array, line: Array, axis: int) -> tuple[list
         dots = np.flatnonzero(local[:, 1 - axis] == value)
         if len(dots) < LEAST_IN_ROW:
             continue
-        row = _line(ideal[dots])
-        meeting = np.cross(row, line)
+        meeting = np.cross(_line(ideal[dots]), line)
         if abs(meeting[2]) < 1e-6:
             continue
         place = meeting[:2] / meeting[2]

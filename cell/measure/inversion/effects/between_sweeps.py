@@ -241,8 +241,7 @@ class Creep:
 
     def undone(self, cloud: Cloud, times: Array) -> Cloud:
         """The cloud as it would be had nothing moved since the middle of the sweep; its lines were taken at `times`."""
-        arms = cloud.points - self.origin
-        rates = self.rate[:3] + np.cross(self.rate[3:], arms)
+        rates = self.rate[:3] + np.cross(self.rate[3:], cloud.points - self.origin)
         return replace(cloud, points=cloud.points - (times - self.since)[:, None, None] * rates)
 
     def motions(self, cloud: Cloud, lines: Indices, rows: Indices, times: Array) -> Array:

@@ -170,6 +170,9 @@ class _Cells:
         free = np.linalg.qr(np.hstack([poses * (own == k)[:, None] for k in np.unique(own)]))[0]
         ray = np.einsum("ni,ni->n", scan.stripe_spread[found.index], normals)
         ray = ray / np.maximum(np.linalg.norm(scan.stripe_spread[found.index], axis=1), 1e-12)
+        ways = np.abs(np.diff(cloud.rail))
+        if len(cloud.flanges) == cloud.shape[0]:
+            ways = ways + np.linalg.norm(np.diff(cloud.flanges[:, :3, 3], axis=0), axis=1)
         return cls(
             heights=raw - free @ (free.T @ raw), raw=raw, poses=poses, free=free, lines=np.round(at[:, 0]),
             times=at[:, 1] - at[:, 1].mean(), rows=2.0 * at[:, 2] / cloud.shape[1] - 1.0,
@@ -177,7 +180,7 @@ class _Cells:
             scatter=np.array(scatter), normals=mean(normals),
             turns=mean(np.cross(points - base_from_vehicle.translation, normals)),
             along=mean(np.einsum("ni,ni->n", _ahead(cloud)[line], normals))[:, 0], ray=mean(ray)[:, 0],
-            pitch=_pitch(cloud), rate=1.0 / max(1e-6, float(np.median(np.abs(np.diff(times))))),
+            pitch=max(1e-6, float(np.median(ways))), rate=1.0 / max(1e-6, float(np.median(np.abs(np.diff(times))))),
         )  # fmt: skip
 
     @property
@@ -289,11 +292,3 @@ def _ahead(cloud: Cloud) -> Array:
     sizes = np.linalg.norm(cloud.rail_spread, axis=1, keepdims=True)
     back = np.median(np.diff(cloud.rail)) < 0
     return np.asarray((-1.0 if back else 1.0) * cloud.rail_spread / np.maximum(sizes, 1e-12))
-
-
-def _pitch(cloud: Cloud) -> float:
-    """From line to line, m."""
-    ways = np.abs(np.diff(cloud.rail))
-    if len(cloud.flanges) == cloud.shape[0]:
-        ways = ways + np.linalg.norm(np.diff(cloud.flanges[:, :3, 3], axis=0), axis=1)
-    return max(1e-6, float(np.median(ways)))

@@ -205,14 +205,10 @@ def require_firm(angle: float, moved: float, what: str, hz: float | None = None)
 def words(rocking: Rocking) -> str:
     """For people, where the scan fits without it as well."""
     return (
-        f"the vehicle rocks, or {_instead(rocking)}: at {rocking.hz:.1f} Hz the surface seems to go up and down by "
-        f"{1e3 * rocking.height:.3f} mm; the pose allows for rocking, and the stated uncertainty has what it does "
-        "while the part is put down"
+        f"the vehicle rocks, or the surface has waves of {1e3 * rocking.wave:.1f} mm: at {rocking.hz:.1f} Hz the "
+        f"surface seems to go up and down by {1e3 * rocking.height:.3f} mm; the pose allows for rocking, and the "
+        "stated uncertainty has what it does while the part is put down"
     )
-
-
-def _instead(rocking: Rocking) -> str:
-    return f"the surface has waves of {1e3 * rocking.wave:.1f} mm"
 
 
 def _each(sweeps: NDArray[np.intp]) -> list[NDArray[np.intp]]:
@@ -301,8 +297,7 @@ def bow(cloud: Cloud, nominal: NominalSurface, pose: pin.SE3, head: Head) -> tup
     found = correspondences(pose, scan, nominal, GATE_M)
     of = scan.lines[found.index]
     facing = np.einsum("ni,ni->n", found.normals, head.axes[of])
-    count = np.bincount(of, minlength=cloud.shape[0])
-    good = count >= LEAST_POINTS
+    good = np.bincount(of, minlength=cloud.shape[0]) >= LEAST_POINTS
     if np.count_nonzero(good) < LEAST_DROOP_LINES or float(np.ptp(head.share[good])) < LEAST_SHARE:
         return None
     # Least squares of each line: how far it lies off along the camera's axis.

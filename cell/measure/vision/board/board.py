@@ -208,8 +208,7 @@ def _refined(view: BoardView, camera: CameraModel, pose: pin.SE3, weights: Array
         )
         damped = normal.copy()
         damped.flat[::7] *= 1 + damping
-        step = np.linalg.solve(damped, right)
-        candidate = perturbed(pose, step)
+        candidate = perturbed(pose, np.linalg.solve(damped, right))
         new_residual, new_squares = residual_of(candidate)
         if new_squares <= squares:
             gain = squares - new_squares
@@ -248,8 +247,7 @@ def without_outliers(view: BoardView) -> BoardView:
         own = np.zeros(len(flat))
         own[keep] = np.einsum("nk,kn->n", design[keep], inverse)
         away = np.linalg.norm(residual - design @ (inverse @ residual[keep]), axis=1) / np.maximum(1 - own, 0.05)
-        limit = max(LEAST_PX, STRAY * float(np.median(away[keep])))
-        new = away < limit
+        new = away < max(LEAST_PX, STRAY * float(np.median(away[keep])))
         if new.sum() < terms + 4 or (new == keep).all():
             break
         keep = new

@@ -74,8 +74,7 @@ def _view(
 ) -> BoardView:
     index, places = _extended(corners, index, places, spec.name)
     pixels = corners.places[index]
-    orders = by_outline(spec, places, LEAST_SHARE)
-    order = _by_colour(spec, orders, pixels, corners.dark[index])
+    order = _by_colour(spec, by_outline(spec, places, LEAST_SHARE), pixels, corners.dark[index])
     known = (order >= 0).all(axis=1)
     plane = PlaneMap.fit(order[known], pixels[known], _tolerance(order[known], pixels[known]), spec.name)
     lattice = spec.lattice()

@@ -392,8 +392,7 @@ def _ring_scores(profiles: Array, rho: Array) -> Array:
     The second, the dot's whole darkness against the median of all dots, survives blur: a ring lacks a quarter of it.
     """
     middle = np.median(profiles[:, :, rho < 0.35].reshape(len(profiles), -1), axis=1)
-    annulus = profiles[:, :, (rho > 0.6) & (rho < 0.85)].min(axis=2)
-    dark = np.median(annulus, axis=1)
+    dark = np.median(profiles[:, :, (rho > 0.6) & (rho < 0.85)].min(axis=2), axis=1)
     bright = np.median(profiles[:, :, (rho > 1.25) & (rho < 1.6)].reshape(len(profiles), -1), axis=1)
     near = rho < 1.5
     mean = np.median(profiles[:, :, near], axis=1)

@@ -218,7 +218,14 @@ def identify(spec: BoardSpec, places: Places, ring_scores: Array) -> tuple[Place
     (−1, −1). Raises PictureRefused.
     """
     if spec.kind != "marked_dots":
-        return _by_edges(spec, places)
+        # Of a symmetric board the order whose rows run most nearly along the first step.
+        orders = by_outline(spec, places)
+        allowed = {"dots": 4 if spec.cols == spec.rows else 2}.get(spec.kind, 2 if spec.symmetric else 1)
+        if len(orders) > allowed:
+            raise PictureRefused(
+                Reason.AMBIGUOUS, f"the dots found fit {spec.name} in {len(orders)} ways; show the whole board"
+            )
+        return min(orders, key=lambda order: _lean(order, places)), spec.symmetric
     refused: PictureRefused | None = None
     for scores, least in zip(ring_scores.T, RING_SCORES, strict=True):
         try:
@@ -247,7 +254,7 @@ def _by_rings(spec: BoardSpec, places: Places, scores: Array, least: float) -> P
             continue
         inverse = np.round(np.linalg.inv(steps)).astype(np.intp)
         found = (places - rings[a]) @ inverse.T + np.array(spec.rings[0])
-        inside = _inside(spec, found)
+        inside = np.asarray(((found >= 0) & (found < (spec.cols, spec.rows))).all(axis=1), dtype=np.bool_)
         if inside.mean() > 0.9:
             if determinant < 0:
                 raise PictureRefused(
@@ -271,8 +278,7 @@ def by_outline(spec: BoardSpec, places: Places, least_share: float = LEAST_SHARE
         template = np.column_stack([(template[:, 0] + template[:, 1]) // 2, (template[:, 1] - template[:, 0]) // 2])
     number = {tuple(p): tuple(q) for p, q in zip(template.tolist(), spec.lattice().tolist(), strict=True)}
     most, best = _most_inside(places, template)
-    outside = len(places) - most
-    if most < least_share * len(template) or outside > max(2, MOST_OUTSIDE * most):
+    if most < least_share * len(template) or len(places) - most > max(2, MOST_OUTSIDE * most):
         raise PictureRefused(
             Reason.NO_BOARD,
             f"{len(places)} points in a lattice of {_size(places)} were found, of which {most} fit the {len(template)} "
@@ -308,17 +314,6 @@ def _most_inside(places: Places, template: Places) -> tuple[int, list[Places]]:
 def _size(places: Places) -> str:
     """Steps that the lattice found is long and wide."""
     return "×".join(map(str, sorted((np.ptp(places, axis=0) + 1).tolist(), reverse=True)))
-
-
-def _by_edges(spec: BoardSpec, places: Places) -> tuple[Places, bool]:
-    """The order of dots without marks. Of a symmetric board that whose rows run most nearly along the first step."""
-    orders = by_outline(spec, places)
-    allowed = {"dots": 4 if spec.cols == spec.rows else 2}.get(spec.kind, 2 if spec.symmetric else 1)
-    if len(orders) > allowed:
-        raise PictureRefused(
-            Reason.AMBIGUOUS, f"the dots found fit {spec.name} in {len(orders)} ways; show the whole board"
-        )
-    return min(orders, key=lambda order: _lean(order, places)), spec.symmetric
 
 
 def _spans(found: Places, wanted: set[tuple[int, ...]], template: Places) -> bool:
@@ -357,7 +352,3 @@ def _shifts(moved: Places, template: Places) -> list[Places]:
     base = template.min(axis=0) - moved.min(axis=0)
     ranges = [range(min(0, -int(s)), max(0, -int(s)) + 1) for s in slack]
     return [base + np.array(shift, dtype=np.intp) for shift in itertools.product(*ranges)]
-
-
-def _inside(spec: BoardSpec, found: Places) -> NDArray[np.bool_]:
-    return np.asarray(((found >= 0) & (found < (spec.cols, spec.rows))).all(axis=1), dtype=np.bool_)

@@ -171,8 +171,7 @@ def _view(image: Image, spec: BoardSpec, plane: PlaneMap, legacy: bool) -> Board
     dark = np.asarray((lattice.sum(axis=1) % 2 == 0) != legacy, dtype=np.bool_)
     # Up to the markers inside the white squares.
     share = 0.62 * (1 - spec.marker / spec.pitch)
-    steps = plane.steps(flat)
-    measured, sigma, _ = fit_corners(image, plane.pixels(flat), steps, dark, share)
+    measured, sigma, _ = fit_corners(image, plane.pixels(flat), plane.steps(flat), dark, share)
     good = np.isfinite(sigma)
     if good.sum() >= LEAST_CORNERS:
         # Once more from the corners found: the markers bend a little less than the lens does.

@@ -210,8 +210,7 @@ def propose_counts(spec: BoardSpec, corners: Array, ids: NDArray[np.intp]) -> st
 
 def _places(spec: BoardSpec, cols: int, count: int) -> list[NDArray[np.intp]]:
     """Column and row (count, 2) of each marker: all fields of a grid of tags, the white ones of a ChArUco board."""
-    number = np.arange(2 * count + 2 * cols)
-    row, column = np.divmod(number, cols)
+    row, column = np.divmod(np.arange(2 * count + 2 * cols), cols)
     every = np.column_stack([column, row])
     if spec.kind == "aprilgrid":
         return [every[:count]]
@@ -254,8 +253,7 @@ class BoardView:
         views = []
         for turn in range(0, 4, 4 // self.spec.orders):
             places = {tuple(p): k for k, p in enumerate(turned_places(lattice, turn))}
-            index = np.array([places[tuple(p)] for p in lattice])
-            views.append(replace(self, ids=index[self.ids]))
+            views.append(replace(self, ids=np.array([places[tuple(p)] for p in lattice])[self.ids]))
         return views
 
 

@@ -111,10 +111,6 @@ FORMATS = {
 Getter = Callable[[RegisterView], Iterable[float]]
 
 
-def _momentum(view: RegisterView) -> float:
-    return 5.0 * math.hypot(*view.tcp_speed()[:3])
-
-
 def _always(*values: float) -> Getter:
     return lambda view: values
 
@@ -166,7 +162,7 @@ OUTPUTS: dict[str, tuple[str, Getter]] = {
     "safety_status": ("INT32", lambda v: (v.model.safety_mode,)),
     "speed_scaling": ("DOUBLE", lambda v: (v.model.drive.speed_fraction,)),
     "target_speed_fraction": ("DOUBLE", lambda v: (v.model.drive.speed_fraction,)),
-    "actual_momentum": ("DOUBLE", lambda v: (_momentum(v),)),
+    "actual_momentum": ("DOUBLE", lambda v: (5.0 * math.hypot(*v.tcp_speed()[:3]),)),
     "actual_main_voltage": ("DOUBLE", _always(48.0)),
     "actual_robot_voltage": ("DOUBLE", lambda v: (48.0 if v.model.power is not Power.OFF else 0.0,)),
     "actual_robot_current": ("DOUBLE", _always(0.5)),

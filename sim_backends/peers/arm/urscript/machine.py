@@ -76,7 +76,9 @@ class Machine:
         except _Halt:
             return
         finally:
-            self._close()
+            for number in list(self._threads):
+                self._kill(number)
+            self._environment.close()
 
     def run_at_once(self) -> None:
         """Carry a secondary program out, which has nothing that takes time. Raises `ProgramError`."""
@@ -112,11 +114,6 @@ class Machine:
             if frame.f_code.co_filename == f"<{self.name}>":
                 found.line, found.column = self._places[number - 1]
         return found
-
-    def _close(self) -> None:
-        for number in list(self._threads):
-            self._kill(number)
-        self._environment.close()
 
     # --- what the program calls ---
 

@@ -286,8 +286,7 @@ def _believed(
     if keep.any():
         usual = float(np.median(fitted.log_scale[keep]))
         keep &= np.abs(fitted.log_scale - usual) < 0.8
-    n = plane.value.shape[1]
-    keep &= (fitted.centre > 1.0) & (fitted.centre < n - 2.0)
+    keep &= (fitted.centre > 1.0) & (fitted.centre < plane.value.shape[1] - 2.0)
     out = _nothing(lines)
     assert out.misfit is not None
     rows = fitted.lines[keep]

@@ -99,7 +99,9 @@ def candidates(
         if 6 * scale > n:
             continue
         response = respond(part, scale, along)
-        _take_better(response, np.float32(_noise(response)), k, best=best, answer=answer, of=of)
+        few = response[:: max(1, len(response) // 128), :: max(1, response.shape[1] // 512)]
+        low, middle = np.percentile(few, (30, 50))
+        _take_better(response, np.float32(max(float(middle - low) / 0.5244, 0.05)), k, best=best, answer=answer, of=of)
     edge = 2
     peak = np.zeros(part.shape, np.bool_)
     peak[:, edge:-edge] = (best[:, edge:-edge] >= best[:, edge - 1 : -edge - 1]) & (
@@ -127,13 +129,6 @@ def _take_better(
                 best[row, column], answer[row, column], of[row, column] = clear, response[row, column], k
 
 
-def _noise(response: NDArray[np.float32]) -> float:
-    """Scatter of what answers where nothing is, which is the middle of all answers."""
-    few = response[:: max(1, len(response) // 128), :: max(1, response.shape[1] // 512)]
-    low, middle = np.percentile(few, (30, 50))
-    return max(float(middle - low) / 0.5244, 0.05)
-
-
 def follow(found: Candidates, spacing: float = 1.0) -> StripeChain:
     """The chain through `found` whose rows are `spacing` px apart on average."""
     m = len(found.rows)
@@ -145,8 +140,7 @@ def follow(found: Candidates, spacing: float = 1.0) -> StripeChain:
         found.rows.astype(np.float64), found.place, gain, found.clear > 0, scale=found.scale, spacing=float(spacing)
     )
     rows, which, fresh = [], [], []
-    end = int(best.argmax())
-    r, k = divmod(end, CANDIDATES)
+    r, k = divmod(int(best.argmax()), CANDIDATES)
     while r >= 0 and best[r, k] > 0:
         rows.append(r)
         which.append(k)

@@ -212,8 +212,7 @@ def speckled(fitted: Fitted, clear: NDArray[np.bool_], noise: Noise, shape: Shap
     profile = np.where(usable, fitted.stripe[alike] / height, 0.0)
     power = np.sum(profile**2 * (np.where(usable, fitted.residual[alike], 0.0) / height) ** 2, axis=1)
     power = power[power <= np.quantile(power, KEPT)]
-    level = float(np.median(fitted.level[alike]))
-    photons, speckle = _left(shape, typical, level, noise)
+    photons, speckle = _left(shape, typical, float(np.median(fitted.level[alike])), noise)
     excess = float(power.mean()) - photons * KEPT
     if excess < SPECKLE_SIGMAS * float(power.std()) / np.sqrt(len(power)):
         return replace(noise, contrast=0.0)

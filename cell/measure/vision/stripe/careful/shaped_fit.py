@@ -90,8 +90,7 @@ def learn(x: Array, value: Array, weight: Array, width: float, reach: float) -> 
         return gaussian(width, reach)
     band += typical * (SMOOTHING * _roughness(size))
     band[3] += typical * RIDGE
-    coefficients = scipy.linalg.solveh_banded(band, right)
-    spline = scipy.interpolate.BSpline(knots, coefficients, 3)
+    spline = scipy.interpolate.BSpline(knots, scipy.linalg.solveh_banded(band, right), 3)
     step = spacing / FINE
     grid: Array = np.arange(-count * FINE, count * FINE + 1) * np.float64(step)
     table = spline(grid) + np.exp(-0.5 * (grid / width) ** 2)
