@@ -170,9 +170,8 @@ def perform(
             raise
         why = f"after part {len(batch.runs)}: {error}"
         interrupted = isinstance(error, Interrupted | SignalInterrupt)
-    if why and len(jobs) > 1 and len(batch.runs) < count:
-        rest = [jobs[k % len(jobs)].job.name for k in range(len(batch.runs), count)]
-        why += f"; not tried: {', '.join(rest[: len(jobs)])}"
+    rest = [jobs[k % len(jobs)].job.name for k in range(len(batch.runs), count)][: len(jobs)] if len(jobs) > 1 else ()
+    why += f"; not tried: {', '.join(rest)}" * bool(rest)
     return replace(batch, reason=why or "every part was tried", interrupted=interrupted).kept()
 
 
