@@ -6,7 +6,6 @@ import math
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 import can
 import numpy as np
@@ -22,20 +21,10 @@ from drivers.vehicle.feedback import QUIET_S
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
-from tests.support.inner_bus import Driven, InnerBus
+from tests.support.inner_bus import Driven, on_inner_bus
 
 RATE = 4.0
 TRACK = 0.583
-
-
-class OnInnerBus(AgilexPeer):
-    """The simulated vehicle's peer with its timing and its encoding, on a bus inside this process."""
-
-    def __init__(self, model: VehicleModel, clock: WorldClock, channel: str) -> None:
-        super().__init__(model, clock)
-        self._bus.stop()
-        self.inner = InnerBus(channel, self._receive)
-        self._bus = self.inner  # type: ignore[assignment]
 
 
 class Bench(Driven):
@@ -45,8 +34,8 @@ class Bench(Driven):
         self.channel = channel
         self.world, self.clock = WorldClock(RATE), Clock(RATE)
         params = VehicleParams(start=(0.0, 0.0, 0.0), track=TRACK)
-        self.peer = OnInnerBus(VehicleModel(params, np.random.default_rng(5)), self.world, channel)
-        self.bus = self.peer.inner
+        self.peer = AgilexPeer(VehicleModel(params, np.random.default_rng(5)), self.world)
+        self.bus = on_inner_bus(self.peer, channel)
         self.peer.start()
         self.vehicle = AgilexVehicle(
             "vehicle", "virtual", channel, track=TRACK, max_speed=0.5, max_yaw_rate=0.8, clock=self.clock
@@ -57,22 +46,16 @@ class Bench(Driven):
         return [bytes(sent.data) for sent in self.bus.frames if sent.arbitration_id == 0x111]
 
 
-@contextmanager
-def at_bench(channel: str) -> Iterator[Bench]:
-    made = Bench(channel)
+@pytest.fixture
+def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    made = Bench(request.node.name)
     try:
+        made.vehicle.enable()
         yield made
     finally:
         made.bus.talking = True
         made.vehicle.close()
         made.peer.stop()
-
-
-@pytest.fixture
-def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
-    with at_bench(request.node.name) as made:
-        made.vehicle.enable()
-        yield made
 
 
 def test_the_brake_locks_in_truth_and_then_nothing_drives(bench: Bench) -> None:

@@ -44,13 +44,10 @@ def test_bash_offers_runs_and_faults(tmp_path: Path) -> None:
     assert told.stdout.splitlines() == ["00bb 00aa", "arm.protective_stop"], told.stderr
 
 
-def test_names_are_offered_and_nothing_where_something_is_wrong(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.toml").write_text("[job]\n")
-    (tmp_path / "cell.toml").write_text("[cell]\n")
-    (tmp_path / "broken.toml").write_text("[job\n")
+def test_names_are_offered_and_nothing_where_something_is_wrong(here: Path) -> None:
+    (here / "mine.toml").write_text("[job]\n")
+    (here / "cell.toml").write_text("[cell]\n")
+    (here / "broken.toml").write_text("[job\n")
     assert completing.jobs("") == sorted([*shipped_jobs(), "mine"])
     assert completing.jobs("p") == [name for name in shipped_jobs() if name.startswith("p")]
     assert completing.devices("") == list(DEVICES)

@@ -10,8 +10,6 @@ from cell.config.cell_config import load_config
 from cell.devices.contracts import Bench, CameraContract, ClawContract, LaserContract
 from cell.devices.simulated.direct import VirtualCell
 
-CONFIG = load_config(None)
-
 
 class DirectFaults:
     """The faults of a cell on the virtual clock."""
@@ -21,12 +19,12 @@ class DirectFaults:
 
 
 class Direct:
-    NAME = ""
+    NAME, CONFIG = "", load_config(None)
 
     @pytest.fixture(scope="class")
     @classmethod
     def bench(cls) -> Bench[Any]:
-        cell = VirtualCell(CONFIG, seed=4, level="ideal")
+        cell = VirtualCell(cls.CONFIG, seed=4, level="ideal")
         device = getattr(cell, cls.NAME, None) or getattr(cell.devices, cls.NAME).bare
         return Bench(lambda: device, cell.clock, linked=False, faults=DirectFaults(cell))
 
