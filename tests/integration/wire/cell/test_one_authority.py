@@ -74,8 +74,8 @@ def _when_it_goes_on(folder: Path, timeout: float = 60.0) -> Path:
 )
 def test_a_signal_while_the_cell_starts_is_told_and_leaves_no_process(tmp_path: Path, number: signal.Signals) -> None:
     with started("dry-run", "--seed", "3", folder=tmp_path) as run:
-        deadline = time.monotonic() + 60
-        while not (children := _children(run.pid)):
+        deadline, started_by_it = time.monotonic() + 60, Path(f"/proc/{run.pid}/task/{run.pid}/children")
+        while not (children := started_by_it.read_text().split()):
             assert time.monotonic() < deadline
             Clock().sleep(0.02)
         os.kill(run.pid, number)
@@ -88,7 +88,3 @@ def test_a_signal_while_the_cell_starts_is_told_and_leaves_no_process(tmp_path: 
     while any(Path(f"/proc/{pid}").exists() for pid in children):
         assert time.monotonic() < deadline
         Clock().sleep(0.05)
-
-
-def _children(pid: int) -> list[str]:
-    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()

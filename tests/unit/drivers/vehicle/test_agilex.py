@@ -143,18 +143,15 @@ def test_silence_is_told_to_one_who_drives_within_half_a_second_and_an_old_readi
         bench.vehicle.state()
 
 
-def frame(bench: Bench, message: str, **signals: float) -> can.Message:
-    found = load_database().get_message_by_name(message)
-    return can.Message(arbitration_id=found.frame_id, data=found.encode(signals), is_extended_id=False)
-
-
 @pytest.mark.parametrize("take", ["brake", "recover"])
 def test_a_brake_that_somebody_else_released_is_not_taken_as_locked(bench: Bench, take: str) -> None:
     """Whether this program had taken command or has only braked."""
     getattr(bench.vehicle, take)()
     bench.until(lambda: bench.vehicle.state(1.0).braked is True)
     with can.Bus(channel=bench.channel, interface="virtual") as other:
-        other.send(frame(bench, "BrakeCommand", Locked=0))
+        message = load_database().get_message_by_name("BrakeCommand")
+        data = message.encode({"Locked": 0})
+        other.send(can.Message(arbitration_id=message.frame_id, data=data, is_extended_id=False))
         bench.until(lambda: bench.vehicle.state(1.0).braked is None)
         bench.vehicle.recover()
         assert bench.vehicle.state(1.0).braked is True

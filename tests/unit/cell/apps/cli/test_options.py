@@ -22,16 +22,12 @@ offered cell dry-run --inject arm.p
 """
 
 
-def folder_with_runs(folder: Path, runs: str) -> None:
-    for name in ("20260101T000000-00aa", "20260102T000000-00bb", "notes"):
-        (folder / runs / name).mkdir(parents=True)
-    for name in ("20260101T000000-00aa", "20260102T000000-00bb"):
-        (folder / runs / name / "journal.sqlite").write_text("")
-
-
 @pytest.mark.skipif(not Path("/bin/bash").exists(), reason="there is no bash here")
 def test_bash_offers_runs_and_faults(tmp_path: Path) -> None:
-    folder_with_runs(tmp_path, "elsewhere")
+    for name in ("20260101T000000-00aa", "20260102T000000-00bb"):
+        (tmp_path / "elsewhere" / name).mkdir(parents=True)
+        (tmp_path / "elsewhere" / name / "journal.sqlite").write_text("")
+    (tmp_path / "elsewhere" / "notes").mkdir()
     (tmp_path / "cell.toml").write_text('[cell]\nruns = "elsewhere"\n')
     command = tmp_path / "bin" / "cell"
     command.parent.mkdir()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -9,13 +10,6 @@ import pytest
 from cell.config.cell_config import load_config
 from cell.devices.contracts import Bench, CameraContract, ClawContract, LaserContract
 from cell.devices.simulated.direct import VirtualCell
-
-
-class DirectFaults:
-    """The faults of a cell on the virtual clock."""
-
-    def __init__(self, cell: VirtualCell) -> None:
-        self.cause, self.clear = cell.fault, cell.clear_faults
 
 
 class Direct:
@@ -26,7 +20,8 @@ class Direct:
     def bench(cls) -> Bench[Any]:
         cell = VirtualCell(cls.CONFIG, seed=4, level="ideal")
         device = getattr(cell, cls.NAME, None) or getattr(cell.devices, cls.NAME).bare
-        return Bench(lambda: device, cell.clock, linked=False, faults=DirectFaults(cell))
+        faults = SimpleNamespace(cause=cell.fault, clear=cell.clear_faults)
+        return Bench(lambda: device, cell.clock, linked=False, faults=faults)
 
 
 class TestScanCamera(Direct, CameraContract):
