@@ -8,7 +8,6 @@ over wires would disturb each other's time.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from functools import cache
 from pathlib import Path
 
@@ -16,7 +15,9 @@ import pytest
 from xdist.scheduler import LoadFileScheduling
 
 from cell.apps.cli import main
+from cell.config.calibrations.store import save_calibration
 from lab.bench.job.whole_job import JobRecord, run_whole_job
+from tests.support import Typed
 from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
 
 GROUPS = (
@@ -238,7 +239,22 @@ def ends(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> End
 
 
 @pytest.fixture
-def typed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str, str]]:
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The present folder, which is a new one."""
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def calibrated_folder(placed_pot: JobRecord, here: Path) -> Path:
+    """The present folder, with the calibration of `placed_pot` among its own."""
+    assert placed_pot.calibration is not None
+    save_calibration(placed_pot.calibration, here / "calibrations" / f"{placed_pot.calibration.name}.json")
+    return here
+
+
+@pytest.fixture
+def typed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Typed:
     """Gives what a `cell` command comes to, run in this process and folder: exit code, output, complaints."""
 
     def run(*words: str) -> tuple[int, str, str]:

@@ -77,8 +77,7 @@ def test_the_make_of_the_how_to_is_a_record_and_a_function() -> None:
     assert (make.kind, make.name, make.record.ADDRESS, make.calibrated) == ("rail", "acme", "port", {"belt"})
 
 
-def test_the_script_of_the_tutorial_makes_a_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_script_of_the_tutorial_makes_a_mesh(here: Path) -> None:
     defined("docs/tutorials/own-part.md", "faces")
-    mesh = trimesh.load_mesh(tmp_path / "saddle.ply")
+    mesh = trimesh.load_mesh(here / "saddle.ply")
     assert mesh.extents[:2] == pytest.approx([60.0, 30.0])

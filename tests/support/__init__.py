@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 """The checkout."""
+Typed = Callable[..., tuple[int, str, str]]
+"""What the fixture `typed` gives: what a `cell` command comes to: exit code, output, complaints."""

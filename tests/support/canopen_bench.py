@@ -21,7 +21,7 @@ from drivers.vehicle.cia402.vehicle import CanopenVehicle
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.canopen import CanopenPeer, CanopenSettings
-from tests.support.inner_bus import Driven, InnerBus
+from tests.support.inner_bus import Driven, on_inner_bus
 
 RATE = 3.0
 TRACK = 0.58
@@ -32,16 +32,6 @@ WHEELS = WheelDrives((1, 2), 0.1, 20.0, 4096, "0.1 rpm", (False, True), TRACK, 0
 SETTINGS = CanopenSettings(stop_bit=3)
 
 
-class OnInnerBus(CanopenPeer):
-    """The simulated drives with their timing and encoding, on a bus inside this process."""
-
-    def __init__(self, model: VehicleModel, clock: WorldClock, settings: CanopenSettings, channel: str) -> None:
-        super().__init__(model, clock, settings)
-        self._bus.stop()
-        self.inner = InnerBus(channel, self._receive)
-        self._bus = self.inner  # type: ignore[assignment]
-
-
 class Bench(Driven):
     """The driver, once connected, and the vehicle's truth at `RATE` times the wall."""
 
@@ -49,7 +39,8 @@ class Bench(Driven):
         self.channel = next(CHANNELS)
         self.world, self.clock = WorldClock(RATE), Clock(RATE)
         params = VehicleParams(start=(0.0, 0.0, 0.0), track=TRACK)
-        self.peer = OnInnerBus(VehicleModel(params, np.random.default_rng(5)), self.world, settings, self.channel)
+        self.peer = CanopenPeer(VehicleModel(params, np.random.default_rng(5)), self.world, settings)
+        self.bus = on_inner_bus(self.peer, self.channel)
         self.peer.start()
         self.vehicle: CanopenVehicle
 

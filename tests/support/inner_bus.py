@@ -60,6 +60,13 @@ class InnerBus:
                 self._receive(CanFrame(message.arbitration_id, data, False, message.is_remote_frame, message.dlc))
 
 
+def on_inner_bus(peer: Any, channel: str) -> InnerBus:
+    """Put a simulated vehicle's peer, with its timing and its encoding, on a bus inside this process."""
+    peer._bus.stop()
+    peer._bus = InnerBus(channel, peer._receive)
+    return peer._bus
+
+
 class Driven:
     """A vehicle's driver and the truth of the `peer` that it drives, by the world's clock."""
 

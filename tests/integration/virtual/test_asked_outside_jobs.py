@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from cell import Cell
-from cell.apps.cli import main
 from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.view.run_view import RunView
 from cell.devices.simulated.direct import VirtualCell
@@ -23,12 +22,12 @@ from cell.run.jogging import Jog, jog
 from cell.run.runs import Run
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, RefusedError
 from sim_backends.models.arm import Safety
+from tests.support import Typed
 from tests.support.console.server import until
 
 
 @pytest.fixture
-def cell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cell]:
-    monkeypatch.chdir(tmp_path)
+def cell(here: Path) -> Iterator[Cell]:
     with Cell.open(sim="all", seed=3, clock="virtual") as opened:
         yield opened
 
@@ -192,7 +191,7 @@ def test_a_pendant_that_is_switched_to_local_refuses_the_next_motion_of_a_job(ce
 
 
 def test_a_job_whose_first_calibration_fails_ends_as_any_run(
-    cell: Cell, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    cell: Cell, monkeypatch: pytest.MonkeyPatch, typed: Typed
 ) -> None:
     def refuse(*arguments: object) -> None:
         raise RefusedError("3 of 20 calibration views show the board")
@@ -204,10 +203,8 @@ def test_a_job_whose_first_calibration_fails_ends_as_any_run(
     view.news()
     assert view.ended is not None and (view.ended["kind"], view.ended["outcome"]) == ("job", "refused")
     cell.close()
-    monkeypatch.setattr("sys.argv", ["cell", "dry-run", "--clock", "virtual", "--seed", "3"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    said = " ".join(capsys.readouterr().out.split())
-    assert (ended.value.code, said.split()[0]) == (1, "refused")
+    code, out, _ = typed("dry-run", "--clock", "virtual", "--seed", "3")
+    said = " ".join(out.split())
+    assert (code, said.split()[0]) == (1, "refused")
     assert "in the calibration before the job: 3 of 20 calibration views show the board" in said
     assert "put that right, then cell dry-run --seed 3 --clock virtual -j pot" in said

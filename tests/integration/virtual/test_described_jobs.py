@@ -9,8 +9,6 @@ from typing import Any
 import pytest
 
 from cell import Cell
-from cell.config.calibrations.store import save_calibration
-from lab.bench.job.whole_job import JobRecord
 from tests.support.described_cells import Changes, described, pose, write_saddle
 
 FAST: Changes = {"scan": {"speed": '"30 mm/s"'}}
@@ -28,13 +26,11 @@ def require_placed(report: dict[str, Any]) -> None:
     assert truth["error_mm"]["d"]["mean"] / truth["bound_mm"] <= 1.5
 
 
-def test_one_job_after_another_in_one_world(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_one_job_after_another_in_one_world(calibrated_folder: Path) -> None:
     """The second has a surface of its own; the claw is filled again, and the vehicle stays where it sees the board."""
-    assert placed_pot.calibration is not None
-    cell, pot = described(tmp_path, None, FAST)
-    _, saddle = described(tmp_path / "saddle", None, SADDLE)
+    cell, pot = described(calibrated_folder, None, FAST)
+    _, saddle = described(calibrated_folder / "saddle", None, SADDLE)
     write_saddle(saddle.parent / "saddle.ply")
-    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
     with Cell.open(cell, sim="all", clock="virtual", seed=2, job=pot) as opened:
         first, second = opened.run(pot), opened.run(saddle)
     require_placed(first.report)

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
 
 from cell import Cell
-from cell.config.calibrations.store import save_calibration
 from drivers.errors import CalibrationStale
-from lab.bench.job.whole_job import JobRecord
+from tests.support import Typed
 
 
 def test_verify_tells_a_disturbed_calibration_from_a_good_one(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: Callable[..., tuple[int, str, str]]
+    calibrated_folder: Path, monkeypatch: pytest.MonkeyPatch, typed: Typed
 ) -> None:
-    assert placed_pot.calibration is not None
-    file = tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json"
-    save_calibration(placed_pot.calibration, file)
-    monkeypatch.chdir(tmp_path)
+    (file,) = (calibrated_folder / "calibrations").glob("*.json")
     monkeypatch.setattr(Cell, "open", partial(Cell.open, clock="virtual"))
     verify = ("calibrate", "verify", "--sim", "all", "--seed", "2", "--json")
     code, out, _ = typed(*verify)
@@ -46,8 +41,8 @@ def test_verify_tells_a_disturbed_calibration_from_a_good_one(
 
 
 @pytest.mark.campaign
-def test_cells_that_nobody_touched_are_called_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_cells_that_nobody_touched_are_called_good() -> None:
     alarms, alarmed, changes = 0, 0, 0
     for seed in range(1, 21):
         with Cell.open(sim="all", seed=seed, clock="virtual") as cell:

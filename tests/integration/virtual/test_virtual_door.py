@@ -16,8 +16,6 @@ import cv2
 import pytest
 
 from cell import Cell
-from cell.apps.cli import main
-from cell.config.calibrations.store import save_calibration
 from cell.config.cell_config import default_toml
 from cell.config.job import job_path
 from cell.devices.simulated.direct import VirtualCell
@@ -26,27 +24,25 @@ from cell.run.job_run import RunOutcome
 from cell.run.record.reading import Parts, said
 from cell.run.runs import Run
 from drivers.errors import Aborted, ConfigError, InterlockError, RefusedError
-from lab.bench.job.whole_job import JobRecord
 from statemachine.journal import request
 from statemachine.runner import Again, Script
 from statemachine.step import Event
 from tests.golden.golden import plain_journal, plain_report
+from tests.support import Typed
 
 SEED = 2
 STOP = "arm.protective_stop@laser_sweep:40%"
 
 
 @pytest.fixture(autouse=True)
-def folder(placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(calibrated_folder: Path) -> Path:
     """A calibrated cell's folder, with the job `pot` swept twice as fast as shipped."""
-    assert placed_pot.calibration is not None
-    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
-    text = job_path("pot").read_text(encoding="utf-8").replace('speed = "15 mm/s"', 'speed = "30 mm/s"')
+    shipped = job_path("pot")
+    text = shipped.read_text(encoding="utf-8").replace('speed = "15 mm/s"', 'speed = "30 mm/s"')
     assert tomllib.loads(text)["scan"]["speed"] == "30 mm/s"
-    (tmp_path / "pot.toml").write_text(text, encoding="utf-8")
-    shutil.copy(job_path("pot").parent / "pot.ply", tmp_path)
-    monkeypatch.chdir(tmp_path)
-    return tmp_path
+    (calibrated_folder / "pot.toml").write_text(text, encoding="utf-8")
+    shutil.copy(shipped.parent / "pot.ply", calibrated_folder)
+    return calibrated_folder
 
 
 @contextmanager
@@ -336,26 +332,16 @@ def test_a_paused_run_stands_until_it_goes_on() -> None:
         assert run.result(60.0).outcome == "done"
 
 
-def command(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
-    """The exit code of a command."""
-    monkeypatch.setattr("sys.argv", ["cell", *words])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert isinstance(ended.value.code, int)
-    return ended.value.code
-
-
-def test_an_aborted_run_is_resumed_through_the_same_door(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_aborted_run_is_resumed_through_the_same_door(typed: Typed) -> None:
     with opened() as cell:
         run = cell.start("pot.toml")
         upto(run, StepStarted, "board_photo")
         run.abort("to be resumed")
         aborted = run.result(60.0)
-    assert command(monkeypatch, "resume", aborted.folder.name, "--json") == 0
-    report = json.loads(capsys.readouterr().out)
-    assert (report["outcome"], report["clock"], report["resumed_from"]) == ("placed", "virtual", aborted.folder.name)
+    code, out, _ = typed("resume", aborted.folder.name, "--json")
+    report = json.loads(out)
+    assert (code, report["outcome"], report["clock"]) == (0, "placed", "virtual")
+    assert report["resumed_from"] == aborted.folder.name
 
 
 def test_a_resumed_run_ends_where_the_first_was_to_end() -> None:
@@ -384,13 +370,11 @@ def test_a_run_that_a_script_looked_at_is_resumed_with_a_script_only() -> None:
         assert cell.resume(aborted.folder, script=script).outcome == "aborted"
 
 
-def test_the_command_line_says_what_time_passed_here_and_there(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_line_says_what_time_passed_here_and_there(typed: Typed) -> None:
     virtual = ("dry-run", "-j", "pot.toml", "--clock", "virtual", "--seed", str(SEED), "--until", "drive_to_target")
-    assert command(monkeypatch, *virtual) == 0
-    assert re.search(r"whole run +\d+\.\d\d s +\d+\.\d\d s", capsys.readouterr().out)
-    assert command(monkeypatch, *virtual, "--speed", "2") == 2
+    code, out, _ = typed(*virtual)
+    assert code == 0 and re.search(r"whole run +\d+\.\d\d s +\d+\.\d\d s", out)
+    assert typed(*virtual, "--speed", "2")[0] == 2
 
 
 def test_a_run_goes_at_the_pace_that_was_set(tmp_path: Path) -> None:

@@ -6,8 +6,7 @@ Every case goes through the real command line: exit code 2, no traceback, no wor
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -16,9 +15,9 @@ import pytest
 import trimesh
 import typer.main
 
-from cell.apps.cli import main
 from cell.config.cell_config import default_toml
 from cell.config.job import job_path
+from tests.support import Typed
 
 JARGON = (
     "Traceback", "pydantic", "Input should be", "type=", "input_value", "valid string", "valid dictionary",
@@ -72,36 +71,15 @@ def commands_put_together_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(autouse=True)
+def place(here: Path) -> Path:
     """An empty folder to work in, with a small mesh beside it all."""
-    monkeypatch.chdir(tmp_path)
-    write_mesh(tmp_path / "pot.ply")
-    return tmp_path
+    write_mesh(here / "pot.ply")
+    return here
 
 
-def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, *words: str) -> tuple[int, str]:
-    """A `cell` command in this process: its exit code and all that it printed."""
-    monkeypatch.setattr(sys, "argv", ["cell", *words])
-    code: object = 0
-    try:
-        main()
-    except SystemExit as end:
-        code = end.code
-    shown = capsys.readouterr()
-    return (code if isinstance(code, int) else 0 if code is None else 1), shown.out + shown.err
-
-
-Run = Callable[..., tuple[int, str]]
-
-
-@pytest.fixture
-def cell(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, place: Path) -> Run:
-    """`cell(words…)` in an empty folder."""
-    return lambda *words: run(capsys, monkeypatch, *words)
-
-
-def assert_refused(code: int, shown: str, words: tuple[str, ...]) -> None:
+def assert_refused(ended: tuple[int, str, str], words: tuple[str, ...]) -> None:
+    code, shown = ended[0], ended[1] + ended[2]
     for word in words:
         assert word in shown, shown
     for word in JARGON:
@@ -212,11 +190,11 @@ WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
 
 @pytest.mark.parametrize(("key", "value", "words"), WRONG_CONFIGURATIONS)
 def test_a_wrong_configuration_does_not_pass_the_check(
-    cell: Run, place: Path, key: str, value: str | None, words: tuple[str, ...]
+    typed: Typed, place: Path, key: str, value: str | None, words: tuple[str, ...]
 ) -> None:
     (place / "cell.toml").write_text(changed(default_toml(), key, value))
     (place / "pot.toml").write_text(job_path("pot").read_text())
-    assert_refused(*cell("check"), words)
+    assert_refused(typed("check"), words)
 
 
 WRONG_JOBS: list[tuple[str, str | None, tuple[str, ...]]] = [
@@ -313,7 +291,7 @@ WRONG_JOBS: list[tuple[str, str | None, tuple[str, ...]]] = [
 
 @pytest.mark.parametrize(("key", "value", "words"), WRONG_JOBS)
 def test_a_wrong_job_does_not_pass_the_check(
-    cell: Run, place: Path, key: str, value: str | None, words: tuple[str, ...]
+    typed: Typed, place: Path, key: str, value: str | None, words: tuple[str, ...]
 ) -> None:
     (place / "text.stl").write_text("this is no mesh\n" * 40)
     (place / "empty.stl").write_bytes(b"")
@@ -322,22 +300,22 @@ def test_a_wrong_job_does_not_pass_the_check(
     write_mesh(place / "aside.stl", at=0.3)
     write_mesh(place / "high.stl", height=0.14)
     (place / "pot.toml").write_text(changed(job_path("pot").read_text(), key, value))
-    assert_refused(*cell("check", "-j", "pot.toml"), words)
+    assert_refused(typed("check", "-j", "pot.toml"), words)
 
 
-def test_times_that_no_step_has_are_refused(cell: Run, place: Path) -> None:
+def test_times_that_no_step_has_are_refused(typed: Typed, place: Path) -> None:
     slow = changed(job_path("pot").read_text(), "place.speed", '"2 mm/s"')
     (place / "pot.toml").write_text(changed(slow, "place.approach", '"500 mm"'))
-    assert_refused(*cell("check"), ("place.approach", "502 s", "at most 150 s"))
+    assert_refused(typed("check"), ("place.approach", "502 s", "at most 150 s"))
     slow = changed(job_path("pot").read_text(), "approach.speed", '"0.02 m/s"')
     (place / "pot.toml").write_text(changed(slow, "approach.start", pose(-6050, 0, -600)))
-    assert_refused(*cell("check"), ("the way of 5.00 m", "250 s", "raise approach.speed"))
+    assert_refused(typed("check"), ("the way of 5.00 m", "250 s", "raise approach.speed"))
 
 
-def test_all_that_is_wrong_is_told_at_once_and_as_json(cell: Run, place: Path) -> None:
+def test_all_that_is_wrong_is_told_at_once_and_as_json(typed: Typed, place: Path) -> None:
     text = changed(changed(default_toml(), "rail.lead", "2"), "laser.output", "18")
     (place / "cell.toml").write_text(text)
-    code, shown = cell("check", "--json")
+    code, shown, _ = typed("check", "--json")
     told = json.loads(shown)
     assert code == 2
     assert not told["ok"]
@@ -362,41 +340,37 @@ RIGHT_CONFIGURATIONS = [
 ]
 
 
-@pytest.mark.parametrize(("key", "value"), RIGHT_CONFIGURATIONS)
-def test_a_right_configuration_passes(cell: Run, place: Path, key: str, value: str) -> None:
-    (place / "cell.toml").write_text(changed(default_toml(), key, value))
-    (place / "pot.toml").write_text(job_path("pot").read_text())
-    code, shown = cell("check")
-    assert code == 0, shown
+RIGHT_JOBS = [
+    ("job.name", '"pot no. 7_b"'),
+    ("scan.mode", '"arm"'),
+    ("scan.swath", '[{ across = "-9 mm" }, { across = "9 mm", roll = "6 deg" }]'),
+    ("scan.length", '"80 mm"'),
+    ("approach.target", pose(-1000, 0, -600)),
+    ("approach.start", pose(-3050, 100, -600, 0, 0, 5)),
+    ("place.approach", '"80 mm"'),
+    ("place.tolerance", '"200 um"'),
+    ("photo.stand_off", '"850 mm"'),
+    ("grasp.size", '["60 mm", "40 mm", "25 mm"]'),
+    ("surface.place_from_surface", pose(10, -10, 2)),
+    ("board.spec", '"charuco:8x6:20mm"'),
+]
 
 
 @pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("job.name", '"pot no. 7_b"'),
-        ("scan.mode", '"arm"'),
-        ("scan.swath", '[{ across = "-9 mm" }, { across = "9 mm", roll = "6 deg" }]'),
-        ("scan.length", '"80 mm"'),
-        ("approach.target", pose(-1000, 0, -600)),
-        ("approach.start", pose(-3050, 100, -600, 0, 0, 5)),
-        ("place.approach", '"80 mm"'),
-        ("place.tolerance", '"200 um"'),
-        ("photo.stand_off", '"850 mm"'),
-        ("grasp.size", '["60 mm", "40 mm", "25 mm"]'),
-        ("surface.place_from_surface", pose(10, -10, 2)),
-        ("board.spec", '"charuco:8x6:20mm"'),
-    ],
+    ("file", "key", "value"),
+    [("cell.toml", *each) for each in RIGHT_CONFIGURATIONS] + [("pot.toml", *each) for each in RIGHT_JOBS],
 )
-def test_a_right_job_passes(cell: Run, place: Path, key: str, value: str) -> None:
-    (place / "pot.toml").write_text(changed(job_path("pot").read_text(), key, value))
-    code, shown = cell("check")
-    assert code == 0, shown
+def test_right_values_pass(typed: Typed, place: Path, file: str, key: str, value: str) -> None:
+    for name, text in (("cell.toml", default_toml()), ("pot.toml", job_path("pot").read_text())):
+        (place / name).write_text(changed(text, key, value) if name == file else text)
+    code, out, error = typed("check")
+    assert code == 0, out + error
 
 
-def test_a_mesh_in_millimetres_passes_with_its_unit(cell: Run, place: Path) -> None:
+def test_a_mesh_in_millimetres_passes_with_its_unit(typed: Typed, place: Path) -> None:
     write_mesh(place / "pot.ply", (70.0, 36.0), 8.0)
     (place / "pot.toml").write_text(changed(job_path("pot").read_text(), "surface.mesh_unit", '"mm"'))
-    assert cell("check")[0] == 0
+    assert typed("check")[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -410,10 +384,10 @@ def test_a_mesh_in_millimetres_passes_with_its_unit(cell: Run, place: Path) -> N
 )
 @pytest.mark.parametrize("option", ["-c", "-j"])
 def test_a_file_that_is_none_is_refused(
-    cell: Run, place: Path, option: str, content: bytes, words: tuple[str, ...]
+    typed: Typed, place: Path, option: str, content: bytes, words: tuple[str, ...]
 ) -> None:
     (place / "wrong.toml").write_bytes(content)
-    assert_refused(*cell("check", option, "wrong.toml"), words)
+    assert_refused(typed("check", option, "wrong.toml"), words)
 
 
 @pytest.mark.parametrize(
@@ -480,5 +454,5 @@ def test_a_file_that_is_none_is_refused(
         (("check", "--colour"), ("No such option",)),
     ],
 )
-def test_a_wrong_command_line_is_refused(cell: Run, words: tuple[str, ...], shown: tuple[str, ...]) -> None:
-    assert_refused(*cell(*words), shown)
+def test_a_wrong_command_line_is_refused(typed: Typed, words: tuple[str, ...], shown: tuple[str, ...]) -> None:
+    assert_refused(typed(*words), shown)

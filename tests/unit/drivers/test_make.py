@@ -7,9 +7,8 @@ from typing import Any
 import pytest
 
 from cell.devices.assembly import safe_off_outputs
-from cell.devices.contracts import Bench, ClawContract, LaserContract, RailContract
+from cell.devices.contracts import ClawContract, LaserContract, RailContract
 from cell.devices.simulated.described import Described
-from cell.devices.simulated.direct import VirtualCell
 from cell.makes import BUILT_IN
 from drivers.errors import ConfigError
 from sim_backends.peers.switches import switch_peers
@@ -17,7 +16,7 @@ from sim_backends.serve import rail_peer
 from sim_backends.world.drawing import read
 from sim_backends.world.world import World
 from tests.support.wire.other_makes import LCUS, MODBUS, NUMATO, ROBOTIQ, cell
-from tests.unit.cell.devices.contracts.test_device import DirectFaults
+from tests.unit.cell.devices.contracts.test_device import Direct
 
 
 @pytest.mark.parametrize("tables", [(MODBUS,), (NUMATO,), (LCUS, ROBOTIQ), (MODBUS, NUMATO, ROBOTIQ)])
@@ -55,15 +54,8 @@ def test_a_wrong_table_is_refused_with_key_value_and_what_is_allowed(
     assert told in str(met.value)
 
 
-class _Virtual:
-    NAME = ""
-
-    @pytest.fixture(scope="class")
-    @classmethod
-    def bench(cls) -> Bench[Any]:
-        virtual = VirtualCell(cell(MODBUS, LCUS, ROBOTIQ), seed=4, level="ideal")
-        device = getattr(virtual.devices, cls.NAME).bare
-        return Bench(lambda: device, virtual.clock, linked=False, faults=DirectFaults(virtual))
+class _Virtual(Direct):
+    CONFIG = cell(MODBUS, LCUS, ROBOTIQ)
 
 
 class TestVirtualRail(_Virtual, RailContract):

@@ -102,16 +102,12 @@ def test_the_claw_holds_when_its_feedback_says_so(arm: BenchArm) -> None:
     assert arm.history == [(1, True), (1, False)]
 
 
-def test_closing_on_nothing_is_a_fault(arm: BenchArm) -> None:
+def test_closing_on_nothing_and_a_part_that_sticks_are_faults(arm: BenchArm) -> None:
     claw = ArmSwitchedClaw("claw", arm, 1, 2, clock=Clock(100.0))
     with pytest.raises(DeviceFault, match="does not show a held part") as caught:
         claw.grip()
     assert caught.value.code == "claw.no_part"
-
-
-def test_a_part_that_sticks_is_a_fault(arm: BenchArm) -> None:
     arm.wiring = lambda outputs: 0b100
-    claw = ArmSwitchedClaw("claw", arm, 1, 2, clock=Clock(100.0))
     with pytest.raises(DeviceFault, match="still shows a held part") as caught:
         claw.release()
     assert caught.value.code == "claw.stuck"

@@ -93,16 +93,13 @@ def test_every_fault_and_repetition_is_in_the_result(tmp_path):
     ]
 
 
-def test_who_asks_for_the_end_as_a_run_comes_to_a_good_one_is_not_lost(tmp_path):
+@pytest.mark.parametrize("stopping", [True, False])
+def test_who_asks_for_the_end_after_the_last_step_or_as_the_run_ends_well_is_late_and_not_lost(tmp_path, stopping):
     bench = Bench(tmp_path)
-    bench.on_stop = lambda: bench.control.abort("Cell.stop()")
-    assert bench.run().outcome is Outcome.PLACED
-    assert bench.control.late
-
-
-def test_who_asks_for_the_end_after_the_last_step_and_before_the_end_is_late(tmp_path):
-    bench = Bench(tmp_path)
-    bench.runner.observer = lambda event: event.data.get("to") == "placed" and bench.control.abort("Cell.stop()")
+    if stopping:
+        bench.on_stop = lambda: bench.control.abort("Cell.stop()")
+    else:
+        bench.runner.observer = lambda event: event.data.get("to") == "placed" and bench.control.abort("Cell.stop()")
     assert bench.run().outcome is Outcome.PLACED
     assert bench.control.late
 

@@ -6,7 +6,7 @@ import json
 import re
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +19,13 @@ from cell.devices.assembly import connect
 from cell.devices.lock import CellLock
 from cell.run.jogging import jog, needed_for, parse_jog
 from drivers.errors import InterlockError, NotConnectedError
+from tests.support import Typed
 from tests.support.packages import RAIL, install, with_acme_rail
 from tests.support.wire.cells import ask, cell, served
 
 pytestmark = pytest.mark.wire
 
 STAYS = ("laser_on", "digital_outputs", "rail_moving", "vehicle", "arm", "part")
-Typed = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +37,10 @@ def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, di
 
 
 @pytest.fixture
-def endpoints(serving: tuple[Path, dict[str, Any]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+def endpoints(serving: tuple[Path, dict[str, Any]], here: Path) -> dict[str, Any]:
     """The served cell after a reset of the rail; its configuration is the `cell.toml` of the present folder."""
     folder, endpoints = serving
-    (tmp_path / "cell.toml").write_text((folder / "sim.toml").read_text(encoding="utf-8"), encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
+    (here / "cell.toml").write_text((folder / "sim.toml").read_text(encoding="utf-8"), encoding="utf-8")
     ask(endpoints, op="fault", name="rail.reset")
     ask(endpoints, op="reset")
     return endpoints

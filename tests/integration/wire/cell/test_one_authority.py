@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ import pytest
 from cell.run.folder import is_going, list_runs, read_report
 from drivers.clock import Clock
 from statemachine.journal import request
+from tests.support import Typed
 from tests.support.wire.cells import ask, assert_safe, served, started
 
 pytestmark = pytest.mark.wire
@@ -35,22 +36,16 @@ def endpoints(serving: tuple[Path, dict[str, Any]], tmp_path: Path) -> dict[str,
     return endpoints
 
 
-def test_cell_abort_ends_a_calibration(
-    endpoints: dict[str, Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    typed: Callable[..., tuple[int, str, str]],
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with started("calibrate", "-c", "sim.toml", folder=tmp_path) as work:
-        _when_it_goes_on(tmp_path)
+def test_cell_abort_ends_a_calibration(endpoints: dict[str, Any], here: Path, typed: Typed) -> None:
+    with started("calibrate", "-c", "sim.toml", folder=here) as work:
+        _when_it_goes_on(here)
         code, _, said = typed("abort", "-c", "sim.toml")
         _, error = work.communicate(timeout=60)
     assert code == 0, said
     assert work.returncode == 1, error
     assert "cell abort" in error
     assert_safe(endpoints)
-    assert [read_report(run)["outcome"] for run in list_runs(tmp_path / "runs")] == ["aborted"]
+    assert [read_report(run)["outcome"] for run in list_runs(here / "runs")] == ["aborted"]
 
 
 def test_a_jog_is_ended_by_a_request_and_stops_on_its_way(endpoints: dict[str, Any], tmp_path: Path) -> None:
@@ -79,8 +74,8 @@ def _when_it_goes_on(folder: Path, timeout: float = 60.0) -> Path:
 )
 def test_a_signal_while_the_cell_starts_is_told_and_leaves_no_process(tmp_path: Path, number: signal.Signals) -> None:
     with started("dry-run", "--seed", "3", folder=tmp_path) as run:
-        deadline = time.monotonic() + 60
-        while not (children := _children(run.pid)):
+        deadline, started_by_it = time.monotonic() + 60, Path(f"/proc/{run.pid}/task/{run.pid}/children")
+        while not (children := started_by_it.read_text().split()):
             assert time.monotonic() < deadline
             Clock().sleep(0.02)
         os.kill(run.pid, number)
@@ -93,7 +88,3 @@ def test_a_signal_while_the_cell_starts_is_told_and_leaves_no_process(tmp_path: 
     while any(Path(f"/proc/{pid}").exists() for pid in children):
         assert time.monotonic() < deadline
         Clock().sleep(0.05)
-
-
-def _children(pid: int) -> list[str]:
-    return Path(f"/proc/{pid}/task/{pid}/children").read_text().split()

@@ -8,7 +8,6 @@ import shutil
 import signal
 import sqlite3
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from cell.run.folder import list_runs, read_report
 from cell.run.record.reading import as_candump, information
 from drivers.vehicle.agilex_link import load_database
 from tests.integration.wire.conftest import supervise
+from tests.support import Typed
 from tests.support.wire.cells import Supervised, assert_safe, served, started, wait_for_step
 
 pytestmark = pytest.mark.wire
@@ -86,7 +86,7 @@ def test_the_record_holds_what_passed_on_the_wires(place: Path, placed: dict[str
 
 
 def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
-    place: Path, tmp_path: Path, typed: Callable[..., tuple[int, str, str]]
+    place: Path, tmp_path: Path, typed: Typed
 ) -> None:
     with served(place, "--seed", "3") as endpoints:
         # No calibration lies beside this copy.
@@ -106,7 +106,7 @@ def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
 
 
 @pytest.mark.campaign
-def test_cell_abort_ends_a_run_of_another_process(place: Path, typed: Callable[..., tuple[int, str, str]]) -> None:
+def test_cell_abort_ends_a_run_of_another_process(place: Path, typed: Typed) -> None:
     with served(place, "--seed", "3") as endpoints:
         with started("run", "-c", "sim.toml", "--at-start", "--json", folder=place) as run:
             wait_for_step(place, "drive_to_target", run)

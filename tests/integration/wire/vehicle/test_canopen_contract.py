@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,13 +23,6 @@ pytestmark = pytest.mark.wire
 SPEED = 3.0
 
 
-class PeerFaults:
-    """The faults of the simulated drives."""
-
-    def __init__(self, peer: CanopenPeer) -> None:
-        self.cause, self.clear = peer.fault, peer.clear
-
-
 class TestCanopenVehicle(VehicleContract):
     """Two simulated wheel drives behind an slcan adapter."""
 
@@ -45,7 +39,7 @@ class TestCanopenVehicle(VehicleContract):
                 max_speed=0.5, max_yaw_rate=0.8, clock=clock,
             ),
             clock,
-            faults=PeerFaults(peer),
+            faults=SimpleNamespace(cause=peer.fault, clear=peer.clear),
         )  # fmt: skip
         try:
             yield made

@@ -20,11 +20,9 @@ from cell.measure.inversion import NominalSurface
 from cell.measure.vision import parse_board
 from cell.motion.collision import CollisionError
 from cell.motion.kinematics import HOME
-from cell.motion.trajectory import Trajectory
 from cell.procedures.arm.moves import Mover
 from cell.procedures.drive.way import Planar, Upright, Way, Whereabouts
 from drivers.errors import ConfigError, InterlockError, RefusedError
-from drivers.make import Pose
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 
 JOB, MESH = load_job("pot")
@@ -58,12 +56,6 @@ def configured(folder: Path, text: str) -> CellConfig:
     return load_config(path)
 
 
-def swept(motion: Trajectory) -> np.ndarray:
-    """Where the flange's origin was on the way, (n, 3) m in the base, by the simulated arm's own kinematics."""
-    times = np.linspace(0.0, motion.duration, 400)
-    return np.array([forward(motion.at(time))[:3, 3] for time in times])
-
-
 def mover_of(config: CellConfig, job: Job | None = JOB) -> tuple[VirtualCell, Mover]:
     cell = VirtualCell(config, seed=1, level="ideal")
     cell.devices.vehicle.brake()
@@ -76,7 +68,7 @@ def test_the_arm_goes_round_a_post_on_the_vehicle_and_a_raw_move_into_it_is_refu
     here = from_ur(cell.devices.arm.state().flange)
     turned = HOME + np.array([1.2, 0.0, 0.0, 0.0, 0.0, 0.0])
     straight = free.plan_to(pin.SE3(forward(turned)), "beside")
-    middle = swept(straight)[200]
+    middle = forward(straight.at(200 / 399 * straight.duration))[:3, 3]
     config = configured(tmp_path, POST % tuple(1e3 * middle[:2]))
     cell, mover = mover_of(config, None)
     mover.to_joints(HOME)
@@ -141,10 +133,6 @@ def test_the_vehicle_keeps_the_arm_that_it_carries_off_the_station(tmp_path: Pat
             way.require_line(target)
 
 
-def _shifted(beam: StationObstacle, to: np.ndarray) -> Pose:
-    return beam.place_from_centre.model_copy(update={"translation": tuple(to.tolist())})
-
-
 def test_a_jobs_obstacle_is_met_by_no_planned_way(tmp_path: Path) -> None:
     config = load_config(None)
     cell, mover = mover_of(config)
@@ -155,7 +143,8 @@ def test_a_jobs_obstacle_is_met_by_no_planned_way(tmp_path: Path) -> None:
     at = goal.translation + np.array([0.0, 0.0, -0.16])
     extent = NominalSurface.load(MESH, unit=JOB.surface.mesh_unit).extent
     far = from_parts((0.0, 3.0, -1.0))
-    here = beam.model_copy(update={"place_from_centre": _shifted(beam, far.inverse().act(at))})
+    centre = beam.place_from_centre.model_copy(update={"translation": tuple(far.inverse().act(at).tolist())})
+    here = beam.model_copy(update={"place_from_centre": centre})
     mover.meet_station(far, JOB.model_copy(update={"obstacle": (here,)}), parse_board(JOB.board.spec), extent)
     with pytest.raises(CollisionError, match="station obstacle beam"):
         mover.plan_to(goal, "down")
@@ -234,8 +223,3 @@ def test_addresses_do_not_make_a_calibration_foreign_but_optics_do() -> None:
     other = validate(CellConfig, edited(scan_camera__focal_length="8.1 mm"), "cell.toml")
     assert moved.calibration_hash() == own
     assert other.calibration_hash() != own
-
-
-def test_a_job_that_does_not_exist_lists_those_that_do() -> None:
-    with pytest.raises(ConfigError, match="pot"):
-        load_job("teapot")

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from cell import Cell, ConfigError
-from cell.apps.cli import main
 from cell.config.cell_config import (
     config_to_open,
     default_toml,
@@ -21,6 +18,9 @@ from cell.config.cell_config import (
     runs_folder,
 )
 from cell.devices.simulated.process import with_endpoints
+from tests.support import Typed
+
+pytestmark = pytest.mark.usefixtures("here")
 
 MOVING = (["run"], ["home"], ["jog", "rail", "+5mm"], ["calibrate"], ["calibrate", "verify"], ["diag"])
 ENDPOINTS = {
@@ -34,57 +34,25 @@ ENDPOINTS = {
 }
 
 
-@pytest.fixture
-def cell(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Callable[..., tuple[int, str]]:
-    """`cell(words…)` in an empty folder: exit code and all that was printed."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words: str) -> tuple[int, str]:
-        monkeypatch.setattr(sys, "argv", ["cell", *words])
-        code: object = 0
-        try:
-            main()
-        except SystemExit as end:
-            code = end.code or 0
-        shown = capsys.readouterr()
-        assert isinstance(code, int)
-        return code, shown.out + shown.err
-
-    return run
-
-
 @pytest.mark.parametrize("words", MOVING, ids=" ".join)
-def test_without_a_configuration_nothing_moves(cell: Callable[..., tuple[int, str]], words: list[str]) -> None:
-    code, shown = cell(*words)
-    assert code == 2
-    assert "there is no cell.toml" in shown
-    assert "192.0.2" not in shown
-
-
-@pytest.mark.parametrize("words", MOVING, ids=" ".join)
-def test_the_configuration_of_the_present_folder_is_used(
-    cell: Callable[..., tuple[int, str]], words: list[str]
+def test_nothing_moves_without_a_configuration_of_the_present_folder_or_at_the_examples_addresses(
+    typed: Typed, words: list[str]
 ) -> None:
+    code, _, error = typed(*words)
+    assert code == 2
+    assert "there is no cell.toml" in error
+    assert "192.0.2" not in error
+    assert typed("init", "mine")[0] == 0
+    code, _, error = typed(*words, "-c", "mine/cell.toml")
+    assert code == 2
+    assert "still the example's" in error
     Path("cell.toml").write_text(default_toml().replace("192.0.2.10", "192.0.2.77"))
-    code, shown = cell(*words)
+    code, _, error = typed(*words)
     assert code == 2
-    assert 'arm.address = "192.0.2.77"' in shown
+    assert 'arm.address = "192.0.2.77"' in error
 
 
-@pytest.mark.parametrize("words", MOVING, ids=" ".join)
-def test_nothing_moves_at_an_address_that_is_only_the_example(
-    cell: Callable[..., tuple[int, str]], words: list[str]
-) -> None:
-    assert cell("init", "mine")[0] == 0
-    code, shown = cell(*words, "-c", "mine/cell.toml")
-    assert code == 2
-    assert "still the example's" in shown
-
-
-def test_what_is_named_wins_and_a_simulated_cell_needs_no_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_what_is_named_wins_and_a_simulated_cell_needs_no_file() -> None:
     assert find_config(None, simulated=True) is None
     with pytest.raises(ConfigError):
         find_config(None)
@@ -93,29 +61,29 @@ def test_what_is_named_wins_and_a_simulated_cell_needs_no_file(tmp_path: Path, m
     assert find_config(Path("other.toml")) == Path("other.toml")
 
 
-def test_a_broken_local_file_is_no_reason_to_take_another(cell: Callable[..., tuple[int, str]]) -> None:
+def test_a_broken_local_file_is_no_reason_to_take_another(typed: Typed) -> None:
     Path("cell.toml").symlink_to("gone.toml")
     for words in (["check"], ["runs"], ["dry-run"], *MOVING):
-        code, shown = cell(*words)
+        code, _, shown = typed(*words)
         assert code == 2
         assert "cell.toml does not exist" in shown
 
 
-def test_check_reads_the_local_files_and_says_which(cell: Callable[..., tuple[int, str]]) -> None:
-    assert json.loads(cell("check", "--json")[1])["configuration"] == "the one that ships"
-    assert cell("init")[0] == 0
-    told = json.loads(cell("check", "--json")[1])
+def test_check_reads_the_local_files_and_says_which(typed: Typed) -> None:
+    assert json.loads(typed("check", "--json")[1])["configuration"] == "the one that ships"
+    assert typed("init")[0] == 0
+    told = json.loads(typed("check", "--json")[1])
     assert (told["ok"], told["configuration"], told["job_file"]) == (True, "cell.toml", "pot.toml")
     assert told["job"] == "pot"
     assert told["mesh"] == "pot.ply"
     assert any("192.0.2.10" in note for note in told["notes"])
     Path("cell.toml").write_text(default_toml().replace('lead = "2 mm"', 'lead = "2"'))
-    assert cell("check")[0] == 2
+    assert typed("check")[0] == 2
 
 
-def test_runs_are_looked_for_where_the_local_file_says(cell: Callable[..., tuple[int, str]]) -> None:
+def test_runs_are_looked_for_where_the_local_file_says(typed: Typed) -> None:
     Path("cell.toml").write_text(default_toml().replace('runs = "runs"', 'runs = "mine"'))
-    code, shown = cell("report")
+    code, _, shown = typed("report")
     assert code == 2
     assert str(Path.cwd() / "mine") in shown
 

@@ -24,10 +24,8 @@ def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
         load_job(path)
 
 
-def test_the_job_of_the_present_folder_wins_over_the_one_that_ships(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_the_job_of_the_present_folder_wins_over_the_one_that_ships() -> None:
     shipped = job_path("pot")
     assert shipped.is_absolute()
     Path("pot").mkdir()

@@ -13,7 +13,6 @@ import pytest
 
 from cell import BatchOutcome, Cell, ConfigError
 from cell.base.storage import read_json
-from cell.config.calibrations.store import save_calibration
 from cell.config.job import job_path, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
@@ -23,26 +22,23 @@ from cell.run.job_run import RunOutcome
 from cell.run.recorded_work import Hands
 from lab.bench.job.part_effects import held, motion
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
-from lab.bench.job.whole_job import JobRecord
 from statemachine.step import Event
+from tests.support import Typed
 from tests.support.described_cells import Changes, described, pose
 
 FAST: Changes = {"scan": {"speed": '"30 mm/s"'}}
 
 
 @pytest.fixture
-def opened(placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Cell]:
+def opened(calibrated_folder: Path) -> Callable[..., Cell]:
     """Opens a calibrated cell with the job `own.toml` that has these rules; `moved`: its scan head was bumped since."""
-    assert placed_pot.calibration is not None
-    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
-    monkeypatch.chdir(tmp_path)
 
     def make(on_refusal: str = "", moved: bool = False) -> Cell:
-        config, own = described(tmp_path, None, FAST)
+        config, own = described(calibrated_folder, None, FAST)
         if on_refusal:
             own.write_text(f'{own.read_text()}\n[batch]\non_refusal = "{on_refusal}"\n')
         head: Changes = {"scan_camera": {"flange_from_camera": pose((92, -50, 80), (0, 0, 90))}}
-        true = described(tmp_path / "true", head)[0] if moved else None
+        true = described(calibrated_folder / "true", head)[0] if moved else None
         return Cell.open(config, sim="all", clock="virtual", seed=2, job=own, truth=true)
 
     return make
@@ -177,9 +173,7 @@ def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
 
 
 @pytest.mark.parametrize("count", [0, 1_000_001])
-def test_a_count_out_of_range_is_told_with_the_range(
-    opened: Callable[..., Cell], typed: Callable[..., tuple[int, str, str]], count: int
-) -> None:
+def test_a_count_out_of_range_is_told_with_the_range(opened: Callable[..., Cell], typed: Typed, count: int) -> None:
     with opened() as cell, pytest.raises(ConfigError, match="allowed: 1 to 10000"):
         cell.run_batch("own.toml", count)
     code, _, error = typed("dry-run", "-j", "own.toml", "--count", str(count))
@@ -213,9 +207,7 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
     assert _question(cell._here, job, "part 2 of 2", last, refill=True) is None
 
 
-def test_the_command_line_shows_what_came_of_it(
-    opened: Callable[..., Cell], typed: Callable[..., tuple[int, str, str]]
-) -> None:
+def test_the_command_line_shows_what_came_of_it(opened: Callable[..., Cell], typed: Typed) -> None:
     opened().close()
     words = ("dry-run", "-c", "cell.toml", "-j", "own.toml", "--clock", "virtual", "--seed", "2", "--count", "2")
     code, out, error = typed(*words, "--inject", "arm.emergency_stop@drive_to_target:40%")
@@ -224,12 +216,9 @@ def test_the_command_line_shows_what_came_of_it(
     assert typed(*words, "--until", "board_photo")[0] == 2
 
 
-def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: Callable[..., tuple[int, str, str]]
-) -> None:
+def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(here: Path, typed: Typed) -> None:
     """No terminal is here: the batch would wait for ever."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "pot.ply").write_bytes(job_path("pot").with_suffix(".ply").read_bytes())
-    (tmp_path / "asks.toml").write_text(f'{job_path("pot").read_text(encoding="utf-8")}\n[batch]\non_refusal = "ask"\n')
+    (here / "pot.ply").write_bytes(job_path("pot").with_suffix(".ply").read_bytes())
+    (here / "asks.toml").write_text(f'{job_path("pot").read_text(encoding="utf-8")}\n[batch]\non_refusal = "ask"\n')
     code, _, error = typed("dry-run", "-j", "asks", "--count", "2", "--clock", "virtual")
     assert code == 2 and "there is no terminal to ask at" in " ".join(error.split())

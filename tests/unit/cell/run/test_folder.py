@@ -115,11 +115,8 @@ def test_a_time_of_maintenance_takes_no_requests_and_keeps_no_run_from_being_ask
         journal.close()
 
 
-def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    root = tmp_path / "runs"
+def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(here: Path) -> None:
+    root = here / "runs"
     going = [new_run(root), new_run(root)]
     journals = [Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()}) for folder in going]
     first = min(going)
@@ -134,10 +131,9 @@ def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(
 
 
 def test_a_run_that_ended_as_the_others_were_asked_to_end_is_no_failure(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    root = tmp_path / "runs"
+    root = here / "runs"
     going = sorted([new_run(root), new_run(root)])
     journals = [Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()}) for folder in going]
     said = []

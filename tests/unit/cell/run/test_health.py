@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import datetime as dt
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from cell.run.folder import new_run
 from cell.run.health import DriftSeries, health
 from lab.bench.calibration.observed_cell import ObservedCell
 from sim_backends.world.scene import draw
+from tests.support import Typed
 
 MADE = dt.datetime(2026, 11, 1, 8, 0, 0).astimezone()
 CALIBRATED = MADE.strftime("%Y-%m-%d %H:%M:%S")
@@ -193,13 +193,10 @@ def test_a_protective_stop_since_is_named_and_what_is_no_job_is_left_out(tmp_pat
     assert told["parts"][0]["values"] == [0.0] and told["parts"][0]["days_left"] is None
 
 
-def test_the_command_shows_it_and_ends_with_1_when_a_calibration_is_due(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, typed: Callable[..., tuple[int, str, str]]
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_the_command_shows_it_and_ends_with_1_when_a_calibration_is_due(here: Path, typed: Typed) -> None:
     code, out, _ = typed("health")
     assert (code, "no job has run yet" in out) == (0, True)
-    job(tmp_path / "runs", 0.0, [0.3, 0.0, 0.0], outcome="faulted", code="arm.protective_stop", reason="arm: stopped")
+    job(here / "runs", 0.0, [0.3, 0.0, 0.0], outcome="faulted", code="arm.protective_stop", reason="arm: stopped")
     code, out, _ = typed("health")
     assert code == 1 and "parts may sit elsewhere: arm: stopped" in out and "is due now" in out
     assert "█" in out and "0.300" in out and "0.18" in out

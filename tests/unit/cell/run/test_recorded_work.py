@@ -13,7 +13,6 @@ import pytest
 from cell.base.lateness import Lateness
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
-from cell.devices.devices import Devices
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.vision import parse_board
 from cell.motion.kinematics import HOME
@@ -29,15 +28,10 @@ CONFIG = load_config(None)
 FINE = parse_board(CONFIG.calibration.fine.board)
 
 
-def well(devices: Devices) -> None:
-    """Nothing of this bench's health ends the work."""
-
-
 def recorded(root: Path, cell: VirtualCell, work: Any) -> tuple[dict[str, Any], Path]:
-    """The report of a calibration that is refused, and its folder."""
-    run: Run[None] = Run(
-        "calibration", lambda run: RecordedWork(run, "calibration", cell.devices, root, {}, well).perform(work)
-    )
+    """The report of a calibration that is refused, and its folder; nothing of the bench's health ends the work."""
+    given = "calibration", cell.devices, root, {}, lambda devices: None
+    run: Run[None] = Run("calibration", lambda run: RecordedWork(run, *given).perform(work))
     with pytest.raises(RefusedError):
         run.result(300.0)
     assert run.folder is not None

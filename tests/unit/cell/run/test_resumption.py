@@ -73,19 +73,18 @@ def test_a_sweep_is_not_read_under_another_calibration_or_configuration(
     assert said in why
 
 
-def rejected(journal: Journal) -> None:
-    journal.event("decided", "invert_pose", {"reason": "too few points", "again": "board_photo", "why": "wiped"})
+DECIDED = {"reason": "too few points", "again": "board_photo", "why": "wiped"}
 
 
-def failed(journal: Journal) -> None:
-    journal.step_ended(journal.step_started("laser_sweep", 2), 1.0, error="the arm was pushed")
-
-
-def begun_again(journal: Journal) -> None:
-    journal.step_started("laser_sweep", 1)
-
-
-@pytest.mark.parametrize("then", [rejected, failed, begun_again])
+@pytest.mark.parametrize(
+    "then",
+    [
+        lambda journal: journal.event("decided", "invert_pose", DECIDED),
+        lambda journal: journal.step_ended(journal.step_started("laser_sweep", 2), 1.0, error="the arm was pushed"),
+        lambda journal: journal.step_started("laser_sweep", 1),
+    ],
+    ids=["rejected", "failed", "begun again"],
+)
 def test_a_sweep_that_did_not_stay_the_last_word_is_not_used(tmp_path: Path, then: Callable[[Journal], None]) -> None:
     run, job = cut_short(tmp_path)
     journal = Journal(run.folder, "later", run.info)

@@ -61,32 +61,24 @@ def test_a_pose_out_of_reach_is_refused(axis):
 
 
 @pytest.mark.parametrize(
-    ("speed", "acceleration", "message"),
+    ("check", "speed", "acceleration", "message"),
     [
-        (0.0, 1.0, "joint speed 0 deg/s"),
-        (-1.0, 1.0, "joint speed"),
-        (4.0, 1.0, "to 180 deg/s"),
-        (1.0, 9.0, "acceleration"),
+        (LIMITS.check_joint_move, 0.0, 1.0, "joint speed 0 deg/s"),
+        (LIMITS.check_joint_move, -1.0, 1.0, "joint speed"),
+        (LIMITS.check_joint_move, 4.0, 1.0, "to 180 deg/s"),
+        (LIMITS.check_joint_move, 1.0, 9.0, "acceleration"),
+        (LIMITS.check_linear_move, 0.0, 1.0, "flange speed 0 mm/s"),
+        (LIMITS.check_linear_move, 1.1, 1.0, "to 1000 mm/s"),
+        (LIMITS.check_linear_move, 0.1, 5.1, "flange acceleration 5100 mm"),
+        (LIMITS.check_linear_move, 0.1, -1.0, "flange acc"),
     ],
 )
-def test_speeds_and_accelerations_have_limits(speed, acceleration, message):
-    with pytest.raises(LimitError, match=message):
-        LIMITS.check_joint_move("arm", speed, acceleration)
-
-
-@pytest.mark.parametrize(
-    ("speed", "acceleration", "message"),
-    [
-        (0.0, 1.0, "flange speed 0 mm/s"),
-        (1.1, 1.0, "to 1000 mm/s"),
-        (0.1, 5.1, "flange acceleration 5100 mm"),
-        (0.1, -1.0, "flange acc"),
-    ],
-)
-def test_straight_moves_have_limits_of_their_own(speed, acceleration, message):
+def test_speeds_and_accelerations_have_limits_and_those_of_straight_moves_their_own(
+    check, speed, acceleration, message
+):
     LIMITS.check_linear_move("arm", 1.0, 5.0)
     with pytest.raises(LimitError, match=message):
-        LIMITS.check_linear_move("arm", speed, acceleration)
+        check("arm", speed, acceleration)
 
 
 def test_a_payload_too_heavy_is_refused():

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from cell.devices.diagnosis.diagnosis import examine
 from drivers.camera.stream import StreamCamera, answers
@@ -20,11 +19,11 @@ from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, LimitError, NotConnectedError
 from drivers.interfaces import Camera, Frame, FrameStream
 from sim_backends.clock import WorldClock
-from sim_backends.peers.camera.frames import CameraSpec, FramePeer, message
+from sim_backends.peers.camera.frames import FramePeer, message
 from tests.support.wire.clocks import ahead
+from tests.support.wire.gige_bench import SPEC, render
 
 SPEED = 4.0
-SPEC = CameraSpec("SimCam", "SIM000007-SCAN", 64, 48, frame_rate_max=120.0, epoch=5000.0, drift_ppm=60.0)
 
 
 @dataclass
@@ -40,13 +39,6 @@ class Bench:
         """Host time that the picture shows, as drawn into its first pixels."""
         world = float(np.frombuffer(frame.image[0, :8].tobytes(), np.float64)[0])
         return world + ahead(self.clock, self.world)
-
-
-def render(t_mid: float, exposure: float) -> NDArray[np.uint8]:
-    image = np.full((48, 64), 100, np.uint8)
-    image[0, :8] = np.frombuffer(np.float64(t_mid).tobytes(), np.uint8)
-    image[47, 63] = 200
-    return image
 
 
 @pytest.fixture

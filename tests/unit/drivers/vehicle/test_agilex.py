@@ -6,7 +6,6 @@ import math
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 import can
 import numpy as np
@@ -22,20 +21,10 @@ from drivers.vehicle.feedback import QUIET_S
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
-from tests.support.inner_bus import Driven, InnerBus
+from tests.support.inner_bus import Driven, on_inner_bus
 
 RATE = 4.0
 TRACK = 0.583
-
-
-class OnInnerBus(AgilexPeer):
-    """The simulated vehicle's peer with its timing and its encoding, on a bus inside this process."""
-
-    def __init__(self, model: VehicleModel, clock: WorldClock, channel: str) -> None:
-        super().__init__(model, clock)
-        self._bus.stop()
-        self.inner = InnerBus(channel, self._receive)
-        self._bus = self.inner  # type: ignore[assignment]
 
 
 class Bench(Driven):
@@ -45,8 +34,8 @@ class Bench(Driven):
         self.channel = channel
         self.world, self.clock = WorldClock(RATE), Clock(RATE)
         params = VehicleParams(start=(0.0, 0.0, 0.0), track=TRACK)
-        self.peer = OnInnerBus(VehicleModel(params, np.random.default_rng(5)), self.world, channel)
-        self.bus = self.peer.inner
+        self.peer = AgilexPeer(VehicleModel(params, np.random.default_rng(5)), self.world)
+        self.bus = on_inner_bus(self.peer, channel)
         self.peer.start()
         self.vehicle = AgilexVehicle(
             "vehicle", "virtual", channel, track=TRACK, max_speed=0.5, max_yaw_rate=0.8, clock=self.clock
@@ -57,22 +46,16 @@ class Bench(Driven):
         return [bytes(sent.data) for sent in self.bus.frames if sent.arbitration_id == 0x111]
 
 
-@contextmanager
-def at_bench(channel: str) -> Iterator[Bench]:
-    made = Bench(channel)
+@pytest.fixture
+def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    made = Bench(request.node.name)
     try:
+        made.vehicle.enable()
         yield made
     finally:
         made.bus.talking = True
         made.vehicle.close()
         made.peer.stop()
-
-
-@pytest.fixture
-def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
-    with at_bench(request.node.name) as made:
-        made.vehicle.enable()
-        yield made
 
 
 def test_the_brake_locks_in_truth_and_then_nothing_drives(bench: Bench) -> None:
@@ -160,18 +143,15 @@ def test_silence_is_told_to_one_who_drives_within_half_a_second_and_an_old_readi
         bench.vehicle.state()
 
 
-def frame(bench: Bench, message: str, **signals: float) -> can.Message:
-    found = load_database().get_message_by_name(message)
-    return can.Message(arbitration_id=found.frame_id, data=found.encode(signals), is_extended_id=False)
-
-
 @pytest.mark.parametrize("take", ["brake", "recover"])
 def test_a_brake_that_somebody_else_released_is_not_taken_as_locked(bench: Bench, take: str) -> None:
     """Whether this program had taken command or has only braked."""
     getattr(bench.vehicle, take)()
     bench.until(lambda: bench.vehicle.state(1.0).braked is True)
     with can.Bus(channel=bench.channel, interface="virtual") as other:
-        other.send(frame(bench, "BrakeCommand", Locked=0))
+        message = load_database().get_message_by_name("BrakeCommand")
+        data = message.encode({"Locked": 0})
+        other.send(can.Message(arbitration_id=message.frame_id, data=data, is_extended_id=False))
         bench.until(lambda: bench.vehicle.state(1.0).braked is None)
         bench.vehicle.recover()
         assert bench.vehicle.state(1.0).braked is True

@@ -13,7 +13,6 @@ import pytest
 from cell import Cell
 from cell.check.fit import require_fit
 from cell.check.place import way_problems
-from cell.config.calibrations.store import save_calibration
 from cell.config.cell_config import default_toml, load_config
 from cell.config.job import load_job
 from cell.devices.assembly import connect_one
@@ -28,7 +27,6 @@ from drivers.clock import Clock
 from drivers.errors import ConfigError, InterlockError, NotConnectedError, RefusedError
 from drivers.interfaces import Vehicle
 from drivers.vehicle.fixed import FixedVehicle
-from lab.bench.job.whole_job import JobRecord
 from tests.support import ROOT
 
 JOB = load_job("pot")[0]
@@ -109,11 +107,8 @@ def test_in_a_simulated_cell_it_stands_still_where_the_job_has_it(tmp_path: Path
 
 
 @pytest.mark.campaign
-def test_a_whole_job_ends_placed_without_a_vehicle(placed_pot: JobRecord, tmp_path: Path) -> None:
-    assert placed_pot.calibration is not None
-    cell = fixed_cell(tmp_path)
-    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
-    with Cell.open(cell, sim="all", clock="virtual", seed=2, job="pot") as opened:
+def test_a_whole_job_ends_placed_without_a_vehicle(calibrated_folder: Path) -> None:
+    with Cell.open(fixed_cell(calibrated_folder), sim="all", clock="virtual", seed=2, job="pot") as opened:
         report = opened.run("pot").report
     assert (report["outcome"], report["end_state"]["collisions"]) == ("placed", [])
     assert report["truth"]["error_mm"]["d"]["mean"] / report["truth"]["bound_mm"] <= 1.5

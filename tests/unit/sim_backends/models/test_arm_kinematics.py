@@ -57,14 +57,10 @@ def test_with_a_memory_the_error_changes_with_the_way_and_keeps_its_size() -> No
     assert far[1] == pytest.approx(3e-8, rel=0.2)
 
 
-def random_table(rng: np.random.Generator) -> np.ndarray:
-    return UR10E_DH + rng.normal(scale=1e-3, size=(6, 4))
-
-
 def test_forward_kinematics_and_jacobian_agree_with_pinocchio() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):
-        table = random_table(rng)
+        table = UR10E_DH + rng.normal(scale=1e-3, size=(6, 4))
         q = rng.uniform(-2 * math.pi, 2 * math.pi, 6)
         pose, jacobian = Kinematics(table).forward_with_jacobian(q)
         np.testing.assert_allclose(pose, pinocchio_flange(table, q), atol=1e-12)

@@ -9,12 +9,11 @@ from typing import Any
 
 import pytest
 
-from cell.apps.cli import main
 from cell.apps.cli.display import HEIGHT, duration, end_screen, next_step, print_report
 from cell.run.folder import new_run, read_report, run_row, write_json
 from drivers.errors import CellError
 from statemachine.journal import Journal
-from tests.support import report_runs
+from tests.support import Typed, report_runs
 from tests.support.report_runs import NAMES, Ended, Ends, Make
 
 MAKES: list[tuple[Make, str]] = [
@@ -176,53 +175,41 @@ def spoiled(root: Path) -> dict[str, Path]:
 
 
 @pytest.fixture
-def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
+def root(here: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("COLUMNS", "80")
-    return tmp_path / "runs"
+    return here / "runs"
 
 
-def run_cell(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
-    monkeypatch.setattr("sys.argv", ["cell", *words])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
-
-
-def test_one_bad_report_does_not_spoil_the_list(
-    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_one_bad_report_does_not_spoil_the_list(root: Path, typed: Typed) -> None:
     good = new_run(root)
     write_json(good / "report.json", {"run": good.name, "outcome": "placed", "job": "pot", "wall_s": 31.2})
     folders = spoiled(root)
-    assert run_cell(monkeypatch, "runs", "--json") == 0
-    rows: dict[str, dict[str, Any]] = {row["run"]: row for row in json.loads(capsys.readouterr().out)}
+    code, out, _ = typed("runs", "--json")
+    rows: dict[str, dict[str, Any]] = {row["run"]: row for row in json.loads(out)}
+    assert code == 0
     assert len(rows) == 1 + len(folders)
     assert (rows[good.name]["outcome"], rows[good.name]["duration_s"]) == ("placed", 31.2)
     for folder in folders.values():
         assert rows[folder.name]["outcome"] == "unreadable"
         assert folder.name in rows[folder.name]["reason"]
-    assert run_cell(monkeypatch, "runs") == 0
-    lines = capsys.readouterr().out.splitlines()
+    code, out, _ = typed("runs")
+    lines = out.splitlines()
+    assert code == 0
     assert len(lines) == 1 + len(folders)
     assert max(map(len, lines)) <= 80
 
 
 @pytest.mark.parametrize("name", ["torn", "empty", "foreign", "list", "nothing", "journal", "no journal"])
-def test_a_report_that_cannot_be_read_is_an_error_in_our_words(
-    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
+def test_a_report_that_cannot_be_read_is_an_error_in_our_words(root: Path, typed: Typed, name: str) -> None:
     folder = spoiled(root)[name]
-    assert run_cell(monkeypatch, "report", folder.name) in (1, 2)
-    said = capsys.readouterr().err
+    code, _, said = typed("report", folder.name)
+    assert code in (1, 2)
     assert said.startswith("error: ")
     assert folder.name in said
     assert "Traceback" not in said
 
 
-def test_the_list_tells_when_what_how_and_how_long(
-    root: Path, ends: Ends, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_list_tells_when_what_how_and_how_long(root: Path, ends: Ends, typed: Typed) -> None:
     for data in (CALIBRATION, ends(report_runs.too_strict).report):
         write_json(new_run(root) / "report.json", data)
     going_on = new_run(root)
@@ -230,8 +217,9 @@ def test_the_list_tells_when_what_how_and_how_long(
     journal.step_ended(journal.step_started("drive_to_target", 1), 1.5, error="lost")
     journal.step_ended(journal.step_started("drive_to_target", 2), 2.0, {})
     journal.close()
-    assert run_cell(monkeypatch, "runs", "--json") == 0
-    rows = json.loads(capsys.readouterr().out)
+    code, out, _ = typed("runs", "--json")
+    rows = json.loads(out)
+    assert code == 0
     keys = {"run", "outcome", "job", "simulated", "seed", "level", "reason", "kind", "started", "duration_s"}
     assert all(set(row) == keys for row in rows)
     kinds = {row["kind"]: row for row in rows}
@@ -239,8 +227,8 @@ def test_the_list_tells_when_what_how_and_how_long(
     assert run_row(going_on)["outcome"] == "not ended"
     (step,) = read_report(going_on)["steps"]
     assert (step["state"], step["retries"], step["duration_s"]) == ("done", 1, 3.5)
-    assert run_cell(monkeypatch, "runs") == 0
-    text = capsys.readouterr().out
+    code, text, _ = typed("runs")
+    assert code == 0
     assert "2026-03-01 10:00" in text
     assert "2 min  stored" in text
     assert "job pot (sim)" in text

@@ -22,16 +22,12 @@ offered cell dry-run --inject arm.p
 """
 
 
-def folder_with_runs(folder: Path, runs: str) -> None:
-    for name in ("20260101T000000-00aa", "20260102T000000-00bb", "notes"):
-        (folder / runs / name).mkdir(parents=True)
-    for name in ("20260101T000000-00aa", "20260102T000000-00bb"):
-        (folder / runs / name / "journal.sqlite").write_text("")
-
-
 @pytest.mark.skipif(not Path("/bin/bash").exists(), reason="there is no bash here")
 def test_bash_offers_runs_and_faults(tmp_path: Path) -> None:
-    folder_with_runs(tmp_path, "elsewhere")
+    for name in ("20260101T000000-00aa", "20260102T000000-00bb"):
+        (tmp_path / "elsewhere" / name).mkdir(parents=True)
+        (tmp_path / "elsewhere" / name / "journal.sqlite").write_text("")
+    (tmp_path / "elsewhere" / "notes").mkdir()
     (tmp_path / "cell.toml").write_text('[cell]\nruns = "elsewhere"\n')
     command = tmp_path / "bin" / "cell"
     command.parent.mkdir()
@@ -44,13 +40,10 @@ def test_bash_offers_runs_and_faults(tmp_path: Path) -> None:
     assert told.stdout.splitlines() == ["00bb 00aa", "arm.protective_stop"], told.stderr
 
 
-def test_names_are_offered_and_nothing_where_something_is_wrong(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "mine.toml").write_text("[job]\n")
-    (tmp_path / "cell.toml").write_text("[cell]\n")
-    (tmp_path / "broken.toml").write_text("[job\n")
+def test_names_are_offered_and_nothing_where_something_is_wrong(here: Path) -> None:
+    (here / "mine.toml").write_text("[job]\n")
+    (here / "cell.toml").write_text("[cell]\n")
+    (here / "broken.toml").write_text("[job\n")
     assert completing.jobs("") == sorted([*shipped_jobs(), "mine"])
     assert completing.jobs("p") == [name for name in shipped_jobs() if name.startswith("p")]
     assert completing.devices("") == list(DEVICES)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -10,25 +11,17 @@ from cell.config.cell_config import load_config
 from cell.devices.contracts import Bench, CameraContract, ClawContract, LaserContract
 from cell.devices.simulated.direct import VirtualCell
 
-CONFIG = load_config(None)
-
-
-class DirectFaults:
-    """The faults of a cell on the virtual clock."""
-
-    def __init__(self, cell: VirtualCell) -> None:
-        self.cause, self.clear = cell.fault, cell.clear_faults
-
 
 class Direct:
-    NAME = ""
+    NAME, CONFIG = "", load_config(None)
 
     @pytest.fixture(scope="class")
     @classmethod
     def bench(cls) -> Bench[Any]:
-        cell = VirtualCell(CONFIG, seed=4, level="ideal")
+        cell = VirtualCell(cls.CONFIG, seed=4, level="ideal")
         device = getattr(cell, cls.NAME, None) or getattr(cell.devices, cls.NAME).bare
-        return Bench(lambda: device, cell.clock, linked=False, faults=DirectFaults(cell))
+        faults = SimpleNamespace(cause=cell.fault, clear=cell.clear_faults)
+        return Bench(lambda: device, cell.clock, linked=False, faults=faults)
 
 
 class TestScanCamera(Direct, CameraContract):

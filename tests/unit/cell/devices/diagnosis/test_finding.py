@@ -11,13 +11,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import pytest
-
-from cell.apps.cli import main
 from cell.config.cell_config import CellConfig, default_toml, load_config
 from cell.devices.diagnosis.finding import ask_module, configured, find, gige_camera
 from cell.devices.diagnosis.local_devices import Found
 from cell.devices.lock import CellLock, who_holds
+from tests.support import Typed
 from tests.support.wire.other_module import OtherModule
 
 
@@ -104,16 +102,8 @@ def test_a_module_is_asked_only_where_the_user_says_so(tmp_path: Path) -> None:
     assert not [each for each in find(None, root=tmp_path) if each.what == "TMCL module"]
 
 
-def test_a_broken_configuration_is_told_and_the_rest_is_still_listed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "cell.toml").write_text("[cell\n", encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sys.argv", ["cell", "find", "/dev/ttyNONE9", "--json"])
-    with pytest.raises(SystemExit):
-        main()
-    rows = json.loads(capsys.readouterr().out)
-    assert [each["what"] for each in rows if each["what"] in ("TMCL module", "configuration")] == [
-        "TMCL module",
-        "configuration",
-    ]
+def test_a_broken_configuration_is_told_and_the_rest_is_still_listed(here: Path, typed: Typed) -> None:
+    (here / "cell.toml").write_text("[cell\n", encoding="utf-8")
+    rows = json.loads(typed("find", "/dev/ttyNONE9", "--json")[1])
+    told = [each["what"] for each in rows if each["what"] in ("TMCL module", "configuration")]
+    assert told == ["TMCL module", "configuration"]

@@ -43,11 +43,12 @@ def test_who_listens_hears_what_passed_and_what_was_refused_with_why() -> None:
     assert heard == [(MOVE, None), (MOVE, str(barred.value))]
 
 
-def test_a_stop_that_comes_while_something_begins_undoes_it() -> None:
-    gate, undone = open_gate(), []
-    gate.enter(CancelToken())
+@pytest.mark.parametrize("stopped", [True, False], ids=["stopped", "its run cancelled"])
+def test_a_stop_or_the_end_of_its_run_that_comes_while_something_begins_undoes_it(stopped: bool) -> None:
+    gate, undone, token = open_gate(), [], CancelToken()
+    gate.enter(token)
     with pytest.raises(Aborted):
-        gate.begin(MOVE, gate.shut, lambda: undone.append("stopped"))
+        gate.begin(MOVE, gate.shut if stopped else lambda: token.cancel("enough"), lambda: undone.append("stopped"))
     assert undone == ["stopped"]
 
 
@@ -154,12 +155,3 @@ def test_a_stop_that_comes_while_the_rules_wait_lets_nothing_begin() -> None:
     with pytest.raises(Aborted, match="enough"):
         slow.begin(MOVE, lambda: begun.append("motion"), lambda: undone.append("stopped"))
     assert (begun, undone) == ([], [])
-
-
-def test_a_run_that_is_cancelled_while_something_begins_has_it_undone() -> None:
-    gate, undone = open_gate(), []
-    token = CancelToken()
-    gate.enter(token)
-    with pytest.raises(Aborted):
-        gate.begin(MOVE, lambda: token.cancel("enough"), lambda: undone.append("stopped"))
-    assert undone == ["stopped"]

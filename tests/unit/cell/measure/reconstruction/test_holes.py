@@ -9,16 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from cell.measure.reconstruction import Cloud, Filled, fill_holes, merge, write_cloud
+from cell.measure.reconstruction import Cloud, fill_holes, merge, write_cloud
 from cell.measure.reconstruction.ply import deviation_colours, read_cloud, triangles, write_mesh
 from drivers.errors import ConfigError
-from lab.bench.reconstruction.scenes import Scene, cut_holes, scene
-
-
-def z_of(made: Scene, filled: Filled) -> np.ndarray:
-    error = filled.points[:, 2] - made.true[filled.lines, filled.rows]
-    return np.asarray(error / np.sqrt(filled.covariances[:, 2, 2]))
-
+from lab.bench.reconstruction.scenes import cut_holes, scene
 
 # --- holes ---
 
@@ -32,7 +26,8 @@ def test_an_interpolated_point_errs_as_its_covariance_says(surface: str, size: t
     asked = cut[filled.lines, filled.rows]
     # Holes that happen to lie side by side are one wider hole, which stays open.
     assert asked.sum() > 0.85 * cut.sum()
-    z = z_of(made, filled)[asked]
+    error = filled.points[:, 2] - made.true[filled.lines, filled.rows]
+    z = (error / np.sqrt(filled.covariances[:, 2, 2]))[asked]
     assert 0.8 < np.sqrt(np.mean(z**2)) < 1.1
     assert np.abs(filled.points[:, 0] - made.x[filled.lines, filled.rows]).max() < 1e-6
 

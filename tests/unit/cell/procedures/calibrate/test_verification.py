@@ -86,11 +86,11 @@ def turned(placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_verification_keeps_the_turn_for_jobs_and_takes_it_back_when_the_plate_was_knocked(
-    turned: tuple[Verification, float], placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    turned: tuple[Verification, float], placed_pot: JobRecord, here: Path
 ) -> None:
     found, true = turned
     assert placed_pot.calibration is not None
-    folder, path = tmp_path / "calibrations", tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json"
+    folder, path = here / "calibrations", here / "calibrations" / f"{placed_pot.calibration.name}.json"
     save_calibration(placed_pot.calibration, path)
     kept = keep_confirmed(folder, placed_pot.calibration, found)
     assert kept is not None
@@ -99,7 +99,6 @@ def test_a_verification_keeps_the_turn_for_jobs_and_takes_it_back_when_the_plate
     again = read_calibration(path)
     assert again.scan.confirmed == kept
     assert again.hash() != placed_pot.calibration.hash()
-    monkeypatch.chdir(tmp_path)
     (row,) = json.loads(CliRunner().invoke(app, ["calibrate", "list", "--json"]).stdout)
     shown = json.loads(CliRunner().invoke(app, ["calibrate", "show", row["name"], "--json"]).stdout)
     assert row["laser_since"] == shown["laser_since"] == kept.summary()
@@ -112,8 +111,8 @@ def test_a_verification_keeps_the_turn_for_jobs_and_takes_it_back_when_the_plate
     assert read_calibration(path).scan.confirmed is None
 
 
-def test_a_calibration_that_is_not_there_is_not_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_a_calibration_that_is_not_there_is_not_shown() -> None:
     assert json.loads(CliRunner().invoke(app, ["calibrate", "list", "--json"]).stdout) == []
     assert CliRunner().invoke(app, ["calibrate", "show", "nobody's"]).exit_code != 0
 

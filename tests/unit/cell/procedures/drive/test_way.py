@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -85,32 +87,24 @@ def cell() -> VirtualCell:
     return made
 
 
-class Blocked:
-    """Odometry of wheels that do not come along."""
-
-    def pose(self) -> Planar:
-        return Planar(0.0, 0.0, 0.0)
-
-
 def speed(cell: VirtualCell) -> float:
     """True, the larger of m/s and rad/s."""
     told = cell.world.vehicle.feedback(cell.clock.now())
     return max(abs(told.speed), abs(told.yaw_rate))
 
 
-def ahead(cell: VirtualCell, odometry: object, check: object) -> None:
-    drive_line(cell.vehicle, odometry, Planar(0.3, 0.0, 0.0), 0.3, cell.clock, check)  # type: ignore[arg-type]
-
-
-def back(cell: VirtualCell, odometry: object, check: object) -> None:
-    drive_line(cell.vehicle, odometry, Planar(-0.1, 0.0, 0.0), 0.3, cell.clock, check)  # type: ignore[arg-type]
+def straight(goal: float, cell: VirtualCell, odometry: object, check: object) -> None:
+    drive_line(cell.vehicle, odometry, Planar(goal, 0.0, 0.0), 0.3, cell.clock, check)  # type: ignore[arg-type]
 
 
 def round_about(cell: VirtualCell, odometry: object, check: object) -> None:
     turn_to(cell.vehicle, odometry, 0.2, cell.clock, check)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("way", [ahead, back, round_about])
+WAYS = [partial(straight, 0.3), partial(straight, -0.1), round_about]
+
+
+@pytest.mark.parametrize("way", WAYS)
 def test_at_the_end_of_a_way_it_stands(cell: VirtualCell, way) -> None:
     way(cell, RelativeOdometry(cell.vehicle), lambda: None)
     assert speed(cell) == pytest.approx(0.0, abs=1e-3)
@@ -119,7 +113,8 @@ def test_at_the_end_of_a_way_it_stands(cell: VirtualCell, way) -> None:
 def test_what_does_not_come_along_is_given_up_and_left_for_a_person(cell: VirtualCell) -> None:
     begun = cell.clock.now()
     with pytest.raises(DeviceFault, match="in time") as caught:
-        round_about(cell, Blocked(), lambda: None)
+        # Odometry of wheels that do not come along.
+        round_about(cell, SimpleNamespace(pose=lambda: Planar(0.0, 0.0, 0.0)), lambda: None)
     assert (caught.value.code, caught.value.recoverable) == ("vehicle.blocked", False)
     assert speed(cell) == pytest.approx(0.0, abs=1e-3)
     assert cell.clock.now() - begun < 45.0
@@ -129,7 +124,7 @@ class Enough(Exception):
     pass
 
 
-@pytest.mark.parametrize("way", [ahead, back, round_about])
+@pytest.mark.parametrize("way", WAYS)
 def test_who_wants_the_end_of_a_way_is_asked_all_along(cell: VirtualCell, way) -> None:
     wanted = cell.clock.now() + 0.4
 
@@ -174,7 +169,7 @@ class Site:
         self.whereabouts.enter(job)
         drive = TargetDrive(
             job, VEHICLE_FROM_BASE, self.vehicle, self.whereabouts, self.photograph, clock=self.cell.clock,
-            check=_never, progress=lambda share, text: None, note=self.notes.append,
+            check=lambda: None, progress=lambda share, text: None, note=self.notes.append,
         )  # fmt: skip
         return drive.to_target()
 
@@ -183,10 +178,6 @@ class Site:
         self.vehicle.enable()
         turn_to(self.vehicle, RelativeOdometry(self.vehicle), angle, self.cell.clock, self.whereabouts.count)
         self.vehicle.brake()
-
-
-def _never() -> None:
-    pass
 
 
 def moved(before: Planar, after: Planar) -> float:
@@ -329,7 +320,7 @@ def test_turns_on_the_spot_are_counted_and_need_room_too() -> None:
     start = site.whereabouts.pose().yaw
     for goal in (0.5, -0.5, 0.0):
         site.vehicle.enable()
-        turn_to(site.vehicle, site.whereabouts, start + goal, site.cell.clock, _never)
+        turn_to(site.vehicle, site.whereabouts, start + goal, site.cell.clock, lambda: None)
     assert site.whereabouts.turned == pytest.approx(0.5 + 1.0 + 0.5, abs=0.05)
     assert site.whereabouts.way < 0.02
     with pytest.raises(RefusedError, match="of the table"):
@@ -355,7 +346,7 @@ def test_the_heading_is_off_by_no_more_than_is_reckoned_with_in_a_harsh_cell(see
     site.whereabouts.see(site.truth())
     for goal in (1.5, 3.0):
         site.vehicle.enable()
-        turn_to(site.vehicle, site.whereabouts, goal, site.cell.clock, _never)
+        turn_to(site.vehicle, site.whereabouts, goal, site.cell.clock, lambda: None)
     off = abs(wrap(site.whereabouts.pose().yaw - site.truth().yaw))
     assert site.whereabouts.turned == pytest.approx(3.0, abs=0.1)
     assert off < TURN_DRIFT * site.whereabouts.turned

@@ -15,7 +15,6 @@ import scipy
 import trimesh
 
 from cell import Cell
-from cell.config.calibrations.store import save_calibration
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, from_parts, transform
@@ -234,13 +233,8 @@ def test_what_is_accepted_is_no_farther_off_than_is_allowed(tmp_path: Path) -> N
         load_job(job_with_part(tmp_path, "pot", verify="all", also='accept = "0.7 mm"'))
 
 
-def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replayed(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert placed_pot.calibration is not None
-    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
-    job = job_with_part(tmp_path, "pot", verify="all", half=MIDDLE)
+def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replayed(calibrated_folder: Path) -> None:
+    job = job_with_part(calibrated_folder, "pot", verify="all", half=MIDDLE)
     text = job.read_text(encoding="utf-8").replace('speed = "15 mm/s"', 'speed = "30 mm/s"')
     job.write_text(
         f'{text}[[part.feature]]\nname = "left"\nkind = "edge"\nat = ["-15 mm", "0 mm", "5 mm"]\naxis = [0, 1, 0]\n'
@@ -265,7 +259,7 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replaye
     assert feature["off_mm"] < feature["bound_mm"] < feature["tolerance_mm"]
     assert rows["edge left, stated bound"]["value"] == pytest.approx(feature["bound_mm"], abs=1e-3)
     assert "place error, stated 95 % bound" not in rows
-    assert report["part_mesh"]["file"] == str(tmp_path / "pot-part.ply")
+    assert report["part_mesh"]["file"] == str(calibrated_folder / "pot-part.ply")
     assert rows["part into the surface"]["kept"] and rows["part into the surface"]["value"] < 0.05
     page = make_page(done.folder)
     assert "placed part off its place" in page and "part into the surface" in page

@@ -11,11 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.apps.cli import main
 from cell.run.record.replay import FILE as PERCEPTION
 from cell.run.record.replay import replay
 from drivers.errors import CellError, ConfigError
 from lab.bench.job.whole_job import JobRecord
+from tests.support import Typed
 
 
 @pytest.fixture
@@ -34,9 +34,7 @@ def test_perception_fed_again_gives_the_same_bits(folder: Path, placed_pot: JobR
     assert int(names[4].split()[0]) == len(list((folder / "frames").iterdir()))
 
 
-def test_a_pixel_or_a_reading_that_changed_is_found_and_exits_1(
-    copied: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_pixel_or_a_reading_that_changed_is_found_and_exits_1(copied: Path, typed: Typed) -> None:
     kept = json.loads((copied / PERCEPTION).read_text(encoding="utf-8"))
     kept["photograph"]["flange"][0] += 1e-9
     (copied / PERCEPTION).write_text(json.dumps(kept), encoding="utf-8")
@@ -44,11 +42,9 @@ def test_a_pixel_or_a_reading_that_changed_is_found_and_exits_1(
     middle = stripes[len(stripes) // 2]
     image = cv2.imread(str(middle), cv2.IMREAD_GRAYSCALE)
     cv2.imwrite(str(middle), np.roll(image, 1, axis=1))
-    monkeypatch.setattr("sys.argv", ["cell", "replay", str(copied), "--json"])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    assert ended.value.code == 1
-    told = json.loads(capsys.readouterr().out)
+    code, out, _ = typed("replay", str(copied), "--json")
+    assert code == 1
+    told = json.loads(out)
     assert not told["same"]
     by_name = {row["what"]: row["difference"] for row in told["compared"]}
     assert by_name["board's pose"].startswith("off by 1e-06 mm")

@@ -21,17 +21,15 @@ from cell.config.cell_config import default_toml
         ({"sim": "none", "truth": "cell.toml"}, "truth describes a cell that is all simulated"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused(
-    options: dict[str, Any], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_options_that_do_not_go_together_are_refused(options: dict[str, Any], says: str) -> None:
     Path("cell.toml").write_text(default_toml())
     with pytest.raises(ConfigError, match=says):
         Cell.open(**options)
 
 
-def test_the_supervisor_script_is_held_to_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.usefixtures("here")
+def test_the_supervisor_script_is_held_to_the_same() -> None:
     with pytest.raises(ConfigError, match="there is no cell"):
         Cell.open()
     Path("cell.toml").write_text(default_toml())

@@ -8,25 +8,20 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from pymodbus.client import ModbusSerialClient
 
-from cell.devices.contracts import Bench, Faults, RailContract
+from cell.devices.contracts import Bench, RailContract
 from drivers.clock import Clock
 from drivers.errors import Aborted, ConfigError, DeadlineError, DeviceFault, LimitError
 from drivers.interfaces import Rail
-from sim_backends.peers.rail.modbus_drive import ModbusPeer
 from tests.support.modbus_maps import EDGES, PATHS
 from tests.support.wire.modbus_bench import UNIT, Drive, config
 
 pytestmark = pytest.mark.wire
-
-
-class DriveFaults:
-    def __init__(self, peer: ModbusPeer) -> None:
-        self.cause, self.clear = peer.fault, peer.clear
 
 
 class _OverModbus(RailContract):
@@ -36,7 +31,7 @@ class _OverModbus(RailContract):
     @classmethod
     def bench(cls) -> Iterator[Bench[Rail]]:
         drive = Drive.of(config(cls.REGISTERS))
-        faults: Faults = DriveFaults(drive.peer)
+        faults = SimpleNamespace(cause=drive.peer.fault, clear=drive.peer.clear)
         made: Bench[Rail] = Bench(drive.rail, drive.clock, faults=faults)
         yield made
         made.over()

@@ -14,22 +14,36 @@ from tests.support.wire.rail_bench import ACCELERATION, Bench, connect, reply, t
 pytestmark = pytest.mark.wire
 
 
-def test_a_limit_switch_on_the_way_is_a_fault_that_names_it(bench: Bench) -> None:
+def require_not_homed(bench: Bench) -> None:
+    """The next program does not trust the zero, at no switch."""
+    again = connect(bench.peer.url, bench.clock)
+    state = again.state()
+    assert (state.homed, state.left_switch, state.right_switch) == (False, False, False)
+    again.close()
+
+
+@pytest.mark.parametrize(
+    ("obstacle", "told", "code"),
+    [(None, "right limit switch", "rail.limit_switch"), (0.08, "stall detected", "rail.stalled")],
+)
+def test_a_limit_switch_or_a_stall_on_the_way_is_a_fault_that_names_it_and_loses_the_zero(
+    bench: Bench, obstacle: float | None, told: str, code: str
+) -> None:
+    if obstacle is not None:
+        bench.model.params = replace(bench.model.params, ends=(-0.004, obstacle))
     rail = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
     rail.home().wait(20.0)
-    with pytest.raises(DeviceFault, match="right limit switch") as caught:
-        rail.move_to(0.11).wait(20.0)
-    assert caught.value.code == "rail.limit_switch"
+    with pytest.raises(DeviceFault, match=told) as caught:
+        rail.move_to(0.11).wait(30.0)
+    assert caught.value.code == code
+    assert not rail.state().homed
     with pytest.raises(InterlockError, match="home"):
         rail.move_to(0.05)
     rail.close()
-    # Somebody turns it off the switch by hand: that does not make the count right.
+    # Somebody turns it off the switch or the end by hand: that does not make the count right.
     bench.model.rotate(bench.world.now(), -51_200)
     bench.clock.sleep(2.0)
-    again = connect(bench.peer.url, bench.clock)
-    assert not again.state().right_switch
-    assert not again.state().homed
-    again.close()
+    require_not_homed(bench)
 
 
 def test_the_next_program_finds_the_rail_homed_and_its_zero_where_it_was(homed: Bench) -> None:
@@ -51,17 +65,7 @@ def test_the_zero_of_another_configuration_is_not_taken_nor_given_back(homed: Be
         other.move_to(0.01)
     other.close()
     # The other program has set the module up for itself since.
-    again = connect(homed.peer.url, homed.clock)
-    assert not again.state().homed
-    again.close()
-
-
-def test_a_module_set_to_other_microsteps_is_not_homed_any_more(homed: Bench) -> None:
-    homed.rail.close()
-    homed.peer.module.handle(telegram(5, 140, 7))
-    again = connect(homed.peer.url, homed.clock)
-    assert not again.state().homed
-    again.close()
+    require_not_homed(homed)
 
 
 def test_a_stall_that_nobody_watched_ends_the_trust_in_the_zero(homed: Bench) -> None:
@@ -71,27 +75,7 @@ def test_a_stall_that_nobody_watched_ends_the_trust_in_the_zero(homed: Bench) ->
     homed.clock.sleep(3.0)
     homed.model.rotate(homed.world.now(), 5 * 51_200)
     homed.clock.sleep(1.0)
-    again = connect(homed.peer.url, homed.clock)
-    assert not again.state().left_switch
-    assert not again.state().homed
-    again.close()
-
-
-def test_a_motor_that_stalls_before_its_target_loses_the_zero(bench: Bench) -> None:
-    bench.model.params = replace(bench.model.params, ends=(-0.004, 0.08))  # something lies in the carriage's way
-    rail = connect(bench.peer.url, bench.clock)
-    rail.home().wait(20.0)
-    with pytest.raises(DeviceFault, match="stall detected") as caught:
-        rail.move_to(0.09).wait(30.0)
-    assert caught.value.code == "rail.stalled"
-    assert not rail.state().homed
-    rail.close()
-    # The flag is gone once it has moved off the end; that does not make the count right.
-    bench.model.rotate(bench.world.now(), -51_200)
-    bench.clock.sleep(2.0)
-    again = connect(bench.peer.url, bench.clock)
-    assert not again.state().homed
-    again.close()
+    require_not_homed(homed)
 
 
 def test_a_rail_that_somebody_left_at_a_limit_switch_is_not_homed_any_more(bench: Bench) -> None:
@@ -205,13 +189,14 @@ def test_a_zero_that_was_lost_is_not_trusted_though_the_module_cannot_be_told(mo
     rail.close()
 
 
-def test_who_only_looks_trusts_no_doubtful_zero_and_leaves_it_to_who_controls(homed: Bench) -> None:
+def test_a_module_set_to_other_microsteps_is_not_homed_any_more_and_who_only_looks_leaves_it_so(homed: Bench) -> None:
     homed.rail.close()
     homed.peer.module.handle(telegram(5, 140, 7))
     looking = connect(homed.peer.url, homed.clock, control=False)
     assert not looking.state().homed
     looking.close()
     assert homed.model.settings.microsteps == 7
+    require_not_homed(homed)
 
 
 @pytest.mark.parametrize("off", [1, -1, 2])

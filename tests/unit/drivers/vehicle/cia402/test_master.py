@@ -60,7 +60,7 @@ def test_drives_that_another_master_commands_are_left_alone(apart: Bench) -> Non
             apart.connect()
         sender.stop()
     assert met.value.code == "vehicle.disturbed"
-    assert [message for message in apart.peer.inner.frames if message.arbitration_id not in (0x080, 0x7E)] == []
+    assert [message for message in apart.bus.frames if message.arbitration_id not in (0x080, 0x7E)] == []
 
 
 def test_what_is_said_when_this_program_is_killed_stops_both_and_locks_their_brakes() -> None:

@@ -89,5 +89,5 @@ def test_who_only_looks_sets_nothing(apart: Bench) -> None:
     vehicle.stop()
     vehicle.close()
     # Uploads of values and of the parts of a text; aborts of nothing.
-    assert {message.arbitration_id for message in apart.peer.inner.frames} == {0x601, 0x602}
-    assert {message.data[0] >> 5 for message in apart.peer.inner.frames} == {2, 3}
+    assert {message.arbitration_id for message in apart.bus.frames} == {0x601, 0x602}
+    assert {message.data[0] >> 5 for message in apart.bus.frames} == {2, 3}

@@ -15,10 +15,9 @@ from cell.config.cell_config import default_toml
 
 
 @pytest.fixture(autouse=True)
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def place(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cell.run.session.supervisor.Cell.open", lambda *_, **__: pytest.fail("the cell was opened"))
-    (tmp_path / "cell.toml").write_text(default_toml())
+    (here / "cell.toml").write_text(default_toml())
 
 
 def test_the_list_of_checks_connects_nothing_and_names_all_up_to_the_last_that_is_asked_for() -> None:

@@ -21,15 +21,14 @@ def test_a_jog_without_a_motion_and_a_recovery_by_nobody_say_what_they_lack(monk
     assert "a person has to look at the cell first" in str(refused.exception)
 
 
-def test_only_what_the_configured_cell_needs_ends_with_1(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_only_what_the_configured_cell_needs_ends_with_1(here: Path) -> None:
     without = json.loads(CliRunner().invoke(app, ["doctor", "--json"]).stdout)
     assert {row["what"] for row in without if row["state"] == "wrong"} <= {"packages", "disk"}
-    (tmp_path / "cell.toml").write_text(default_toml())
+    (here / "cell.toml").write_text(default_toml())
     real = CliRunner().invoke(app, ["doctor"])
     assert real.exit_code == 1
     assert "rail, port" in real.stdout
-    (tmp_path / "cell.toml").write_text("[cell]\n")
+    (here / "cell.toml").write_text("[cell]\n")
     broken = CliRunner().invoke(app, ["doctor", "--json"])
     assert broken.exit_code == 1
     assert json.loads(broken.stdout)[0]["mend"] == "cell check -c cell.toml"

@@ -8,18 +8,19 @@ from pathlib import Path
 
 import pytest
 
-from cell.apps.cli import main
 from cell.apps.cli.progress import ProgressDisplay
 from cell.run.folder import new_run
 from statemachine.journal import Journal, RunRequest
 from statemachine.step import Event
+from tests.support import Typed
+
+CONFIRM = ("confirm", "--by", "Bob")
 
 
 @pytest.fixture
-def waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Journal:
+def waiting(here: Path) -> Journal:
     """The journal of a run that goes on in the present folder and waits for a word on its second question."""
-    monkeypatch.chdir(tmp_path)
-    folder = new_run(tmp_path / "runs")
+    folder = new_run(here / "runs")
     journal = Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()})
     journal.event("confirm_needed", "laser_sweep", {"reason": "stopped in the sweep", "code": "x", "number": 1})
     journal.event("confirmed", "laser_sweep", {"by": "Ann", "reason": "stopped in the sweep"})
@@ -34,38 +35,34 @@ class Terminal(io.StringIO):
         return True
 
 
-def confirm(monkeypatch: pytest.MonkeyPatch, *words: str, typed: str | None = None) -> int:
-    monkeypatch.setattr("sys.argv", ["cell", "confirm", "--by", "Bob", *words])
-    monkeypatch.setattr("sys.stdin", io.StringIO() if typed is None else Terminal(typed))
-    with pytest.raises(SystemExit) as ended:
-        main()
-    return int(ended.value.code or 0)
+@pytest.fixture(autouse=True)
+def nobody_at_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())
 
 
-def test_a_word_for_an_earlier_question_is_refused_and_the_present_one_is_shown(
-    waiting: Journal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert confirm(monkeypatch, "--question", "1") == 2
-    said = capsys.readouterr().err
+def test_a_word_for_an_earlier_question_is_refused_and_the_present_one_is_shown(waiting: Journal, typed: Typed) -> None:
+    code, _, said = typed(*CONFIRM, "--question", "1")
+    assert code == 2
     assert "does not wait for question 1 but for question 2: stopped while placing" in said
     assert waiting.take_requests() == []
-    assert confirm(monkeypatch, "--question", "2") == 0
+    assert typed(*CONFIRM, "--question", "2")[0] == 0
     assert waiting.take_requests() == [RunRequest("confirm", "Bob", 2)]
 
 
 def test_without_a_number_the_question_that_waits_now_is_shown_and_that_one_is_answered(
-    waiting: Journal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    waiting: Journal, typed: Typed
 ) -> None:
-    assert confirm(monkeypatch) == 0
-    assert "question 2: stopped while placing" in capsys.readouterr().out
+    code, out, _ = typed(*CONFIRM)
+    assert (code, "question 2: stopped while placing" in out) == (0, True)
     assert waiting.take_requests() == [RunRequest("confirm", "Bob", 2)]
 
 
-@pytest.mark.parametrize(("typed", "code"), [("n\n", 1), ("y\n", 0)])
+@pytest.mark.parametrize(("answer", "code"), [("n\n", 1), ("y\n", 0)])
 def test_a_person_at_a_terminal_is_asked_whether_it_is_the_one_that_was_meant(
-    waiting: Journal, monkeypatch: pytest.MonkeyPatch, typed: str, code: int
+    waiting: Journal, monkeypatch: pytest.MonkeyPatch, typed: Typed, answer: str, code: int
 ) -> None:
-    assert confirm(monkeypatch, typed=typed) == code
+    monkeypatch.setattr("sys.stdin", Terminal(answer))
+    assert typed(*CONFIRM)[0] == code
     assert len(waiting.take_requests()) == (1 if code == 0 else 0)
 
 

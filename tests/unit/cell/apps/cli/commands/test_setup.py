@@ -13,12 +13,9 @@ from cell.config.job import shipped_jobs
 
 
 @pytest.mark.parametrize("job", shipped_jobs())
-def test_what_init_writes_passes_the_check_and_is_not_overwritten(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, job: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_what_init_writes_passes_the_check_and_is_not_overwritten(here: Path, job: str) -> None:
     assert CliRunner().invoke(app, ["init", "own", "--job", job]).exit_code == 0
-    written = {path.name: path.read_bytes() for path in (tmp_path / "own").iterdir()}
+    written = {path.name: path.read_bytes() for path in (here / "own").iterdir()}
     assert {"cell.toml", f"{job}.toml"} < written.keys()
     done = CliRunner().invoke(app, ["check", "-c", "own/cell.toml", "-j", f"own/{job}.toml", "--json"])
     told = json.loads(done.stdout)
@@ -27,4 +24,4 @@ def test_what_init_writes_passes_the_check_and_is_not_overwritten(
     assert any(note.startswith("arm.address") and "is the example's" in note for note in told["notes"])
     refused = CliRunner().invoke(app, ["init", "own", "--job", job])
     assert "exists already" in str(refused.exception)
-    assert {path.name: path.read_bytes() for path in (tmp_path / "own").iterdir()} == written
+    assert {path.name: path.read_bytes() for path in (here / "own").iterdir()} == written

@@ -12,7 +12,8 @@ from lab.bench.calibration.world import Noise
 
 def test_influences_and_advice_agree_with_the_covariance(world, solved):
     state, covariance = solved.scan.adjusted.state, solved.scan.adjusted.covariance
-    places = Places(np.array([[320.0, 100], [330, 240], [310, 400]]), np.array([0.02, 0.05, 0.08]), world_flange(world))
+    pixels, rails = np.array([[320.0, 100], [330, 240], [310, 400]]), np.array([0.02, 0.05, 0.08])
+    places = Places(pixels, rails, from_matrix(world.flanges[0]))
     by_parameter = derivatives(state, covariance, places)
     figures = influences(by_parameter, covariance)
     draws = np.random.default_rng(4).multivariate_normal(np.zeros(21), covariance[:21, :21], 20_000)
@@ -34,10 +35,6 @@ def test_influences_and_advice_agree_with_the_covariance(world, solved):
     again = next(row for row in rows if row["what"].startswith("all present views"))
     # Twice the information of everything but the lens's weak prior: 1/√2 of the deviation.
     assert again["gain"] == pytest.approx(1 - np.sqrt(0.5), abs=0.03)
-
-
-def world_flange(world):
-    return from_matrix(world.flanges[0])
 
 
 def test_coverage_counts_what_was_seen(solved, archived):

@@ -48,7 +48,8 @@ def test_refined_hand_eye_shrugs_off_a_wrong_pair():
 
 
 def test_the_paper_s_steps_find_the_plane_of_exact_views(world):
-    exact = observe(world, replace(Noise(), dots=1e-9, stripe=1e-9, rail=1e-12, arm=1e-12, arm_angle=1e-12), _rng())
+    noise = replace(Noise(), dots=1e-9, stripe=1e-9, rail=1e-12, arm=1e-12, arm_angle=1e-12)
+    exact = observe(world, noise, np.random.default_rng(3))
     camera = CameraModel(640, 480, 1.0, 1.0, 0.0, 0.0).with_parameters(world.lens)
     poses = [from_matrix(world.camera_from_board(k, np.zeros(7))) for k in range(len(exact))]
     stripes = [o.profile.pixels()[200:300] for o in exact]
@@ -56,10 +57,6 @@ def test_the_paper_s_steps_find_the_plane_of_exact_views(world):
     # The stripe's line is fitted without the print's rows left out, and the lens bends it by nothing that is left.
     np.testing.assert_allclose(plane.n / plane.distance, world.plane, rtol=1e-4, atol=2e-3)
     assert rms < 2e-6
-
-
-def _rng() -> np.random.Generator:
-    return np.random.default_rng(3)
 
 
 def test_three_dots_give_the_cross_ratio(world):
