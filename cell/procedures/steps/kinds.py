@@ -121,10 +121,6 @@ PLACE = Kind(
 
 LOAD = replace(PLACE, name=job_file.LOAD, steps=(PLACE.steps[0], pick_nest.STEP, *PLACE.steps[1:]))
 """Places a part that it takes from a nest on the vehicle."""
-VERIFIED = PLACE.with_step(verify.STEP, after=place.STEP.name, name=PLACE.name)
-"""The same for a job that names a mesh of its part: what was placed is looked at."""
-
-
 UNLOAD = Kind(
     job_file.UNLOAD,
     (drive_to_target.STEP, board_photo.STEP, laser_sweep.STEP, reconstruct.STEP, invert_pose.STEP, pick.STEP,

@@ -25,8 +25,8 @@ from cell.procedures.calibrate.reference_plate import look_at_witness, with_edge
 from cell.procedures.calibrate.timing import look_at_shutter
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
-from cell.procedures.steps.kinds import kind_of
 from cell.procedures.sought_part import nominal_of, sought
+from cell.procedures.steps.kinds import kind_of
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.calibration import arm_table

@@ -14,7 +14,7 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix
 from cell.motion.collision import PLACED
 from cell.procedures.grasp import GraspSeries, best_expected, job_with_grasp
-from cell.procedures.steps.kinds import VERIFIED
+from cell.procedures.steps import verify
 from drivers.errors import MisplacedError, RefusedError
 from lab.bench.job.part_effects import motion, opened
 from lab.bench.job.whole_job import JobRecord
@@ -116,7 +116,7 @@ def test_what_is_in_the_way_to_the_part_ends_the_run_with_the_part_where_it_lay(
 
 def test_what_is_interrupted_is_left_to_a_person() -> None:
     """The part may be between the fingers then."""
-    step = VERIFIED.policy().of("verify")
+    step = verify.STEP.policy
     assert (step.max_retries, step.retry_on, step.on_failure) == (0, (), OnFailure.STOP)
 
 

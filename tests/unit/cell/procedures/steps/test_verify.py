@@ -20,7 +20,7 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, from_parts, transform
 from cell.measure.inversion import NominalSurface
 from cell.procedures.placed_part import LIKELY, NO_FLUSH, PlacedPart
-from cell.procedures.steps.kinds import PLACE, VERIFIED, kind_of
+from cell.procedures.steps.kinds import PLACE, kind_of
 from cell.procedures.steps.verify import CLOUD
 from cell.run.record.replay import replay
 from cell.run.report.page.make import make_page
@@ -204,7 +204,7 @@ def test_steps_that_the_rail_lost_over_the_placed_part_are_found(placed_pot: Job
 def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(placed_pot: JobRecord, tmp_path: Path) -> None:
     """It moves nothing of the part, so nobody has to come for that."""
 
-    again = "the placed part is swept again"
+    again = "the part is swept again"
 
     def lossy(cell: VirtualCell, text: str = again) -> None:
         for _ in range(12 if text.startswith(again) else 0):
@@ -222,10 +222,10 @@ def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(placed_pot: 
 def test_a_job_looks_at_its_part_where_it_names_one_and_does_not_say_no(tmp_path: Path) -> None:
     job, _ = load_job("pot")
     assert kind_of(job) is PLACE
-    for verify, kind in (("all", VERIFIED), ("seen", VERIFIED), ("none", PLACE)):
+    for verify, looks in (("all", ["verify"]), ("seen", ["verify"]), ("none", [])):
         job, _ = load_job(job_with_part(tmp_path, "pot", verify=verify))
-        assert kind_of(job) is kind
-    assert VERIFIED.names == (*PLACE.names, "verify") and VERIFIED.name == PLACE.name
+        assert (kind_of(job).name, kind_of(job).names) == ("place", (*PLACE.names, *looks))
+    assert kind_of(load_job("load")[0]).names == (PLACE.names[0], "pick", *PLACE.names[1:], "verify")
 
 
 def test_what_is_accepted_is_no_farther_off_than_is_allowed(tmp_path: Path) -> None:
