@@ -19,7 +19,8 @@ import typer
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from cell.procedures.steps.kinds import VERIFIED
+from cell.config.job import Job, PartSection, job_path, load_job
+from cell.procedures.steps.kinds import kind_of
 from drivers.common.units import parse_quantity
 from statemachine.sequence import JobTrigger
 
@@ -178,7 +179,6 @@ def cell_toml() -> str:
 def job_toml() -> str:
     """The page of a job's file."""
     from cell.apps.new_job.text import job_text
-    from cell.config.job import Job, PartSection, job_path, load_job
 
     part = PartSection.model_validate({"mesh": "part.stl", "mesh_unit": "mm"})
     pot = load_job("pot")[0]
@@ -383,7 +383,7 @@ def sequence_page() -> str:
 
 def diagram() -> str:
     """The sequence of a job that looks at its placed part, for Mermaid; what all steps or states share is one arrow."""
-    sequence = VERIFIED.sequence()
+    sequence = kind_of(load_job("shell")[0]).sequence()
     steps, states = set(sequence.steps), {str(row.source) for row in sequence.table}
     inside: dict[str, None] = {}
     around: dict[str, None] = {}
