@@ -5,6 +5,7 @@ Frames: place P (table top, z up), board D, nominal surface S, part Q. A mesh is
 
 from __future__ import annotations
 
+import os
 import re
 from importlib.resources import files
 from pathlib import Path
@@ -316,9 +317,8 @@ def shipped_jobs() -> list[str]:
 
 def job_and_item(name: str | Path) -> tuple[str, int | None]:
     """A job's name or file, and the number of an item of it: `tray4#2` is the second one of `tray4`."""
-    if found := re.fullmatch(r"(.+)#([1-9]\d{0,2})", str(name)):
-        return found[1], int(found[2])
-    return str(name), None
+    found = re.fullmatch(r"(.+)#([1-9]\d{0,2})", os.fspath(name))
+    return (os.fspath(name), None) if found is None else (found[1], int(found[2]))
 
 
 def each_item(name: str | Path) -> list[str]:

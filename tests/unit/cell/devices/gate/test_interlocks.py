@@ -28,14 +28,16 @@ LASER = CONFIG.laser.output
 DOCUMENT = ROOT / "docs" / "reference" / "interlocks.md"
 
 
-@pytest.fixture
-def world() -> VirtualCell:
+def at_rest() -> VirtualCell:
     """A simulated cell: the vehicle braked, the arm folded, the rail homed, a part in the claw."""
     made = VirtualCell(CONFIG, seed=4, level="ideal")
     made.vehicle.brake()
     made.arm.move_joints(HOME, 1.0, 2.0).wait(60.0)
     made.rail.home().wait(60.0)
     return made
+
+
+world = pytest.fixture(at_rest, name="world")
 
 
 @pytest.fixture

@@ -66,7 +66,7 @@ def test_kinds_of_other_packages_are_found_by_name(monkeypatch: pytest.MonkeyPat
         find_kind("broken")
     with pytest.raises(ConfigError, match="is a float, no kind of job"):
         find_kind("number")
-    with pytest.raises(ConfigError, match="installed: broken, look_and_place, number, place"):
+    with pytest.raises(ConfigError, match="installed: broken, load, look_and_place, number, place"):
         find_kind("lunch")
 
 

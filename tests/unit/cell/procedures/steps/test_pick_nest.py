@@ -23,13 +23,6 @@ SHIPPED, _ = load_job("load")
 JOB = changed(SHIPPED, "scan", speed=2.0 * SHIPPED.scan.speed)
 
 
-def aside(cell: VirtualCell, metres: float) -> None:
-    """The part lies so far beside its nest, along the arm base's x axis."""
-    pose = cell.world.part._base_from_part
-    assert pose is not None
-    pose[0, 3] += metres
-
-
 @pytest.mark.parametrize(
     ("metres", "told"),
     [
@@ -41,11 +34,11 @@ def aside(cell: VirtualCell, metres: float) -> None:
 def test_a_part_that_is_not_in_its_nest_is_not_gripped(placed_pot: JobRecord, metres: float, told: str) -> None:
     cells: list[VirtualCell] = []
 
-    def change(cell: VirtualCell) -> None:
+    def aside(cell: VirtualCell) -> None:
         cells.append(cell)
-        aside(cell, metres)
+        cell.world.part._base_from_part[0, 3] += metres  # type: ignore[index]
 
-    done = unloaded(placed_pot, change, job=JOB)
+    done = unloaded(placed_pot, aside, job=JOB)
     assert (done.outcome, done.stage) == ("refused", "pick")
     assert re.search(told, done.reason), done.reason
     assert not cells[0].world.part.held and cells[0].world.part.untouched
