@@ -23,7 +23,7 @@ from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.sought_part import around, ground_below, nominal_of, sought
-from cell.procedures.steps import verify
+from cell.procedures.steps import pick, pick_nest, verify
 from cell.procedures.steps.kinds import kind_of
 from drivers.errors import ConfigError
 from drivers.make import CameraConfig
@@ -80,13 +80,12 @@ def _kind(job: Job) -> Iterator[str]:
     except ConfigError as error:
         yield str(error)
         return
-    if kind.unloads and (job.part is None or job.nest is None):
-        yield f'job.kind "{kind.name}" finds the part by its mesh and takes it to the vehicle: give [part] and [nest]'
-    if kind.unloads and job.place.verify == "none":
+    unloads, loads = pick.STEP in kind.steps, pick_nest.STEP in kind.steps
+    if (unloads or loads) and (job.part is None or job.nest is None):
+        yield f'job.kind "{kind.name}" finds the part by its mesh and has a nest for it: give [part] and [nest]'
+    if unloads and job.place.verify == "none":
         yield f'place.verify = "none": job.kind "{kind.name}" looks at the part in its nest; write "all" or "seen"'
-    if kind.loads and (job.part is None or job.nest is None):
-        yield f'job.kind "{kind.name}" finds the part by its mesh in its nest: give [part] and [nest]'
-    if not kind.unloads and not kind.loads and job.nest is not None:
+    if job.nest is not None and not (unloads or loads):
         yield f'[nest]: job.kind "{kind.name}" has no use for it; write kind = "load" or "unload", or no nest'
     if job.part is None and verify.STEP.name in kind.names:
         yield f'job.kind "{kind.name}" looks at the placed part: give its mesh in [part]'

@@ -107,12 +107,13 @@ def _dry_run(report: Mapping[str, object]) -> str:
 
 def _job(report: Mapping[str, object]) -> str:
     """The job as one would name it: the shipped ones by their names, others by their files."""
-    from cell.config.job import job_path, shipped_jobs
+    from cell.config.job import job_and_item, job_path, shipped_jobs
 
-    path = Path(str(report.get("job_file", report.get("job"))))
+    file, number = job_and_item(str(report.get("job_file", report.get("job"))))
+    path, item = Path(file), "" if number is None else f"#{number}"
     if path.suffix == ".toml" and path.stem in shipped_jobs() and path == job_path(path.stem):
-        return path.stem
-    return shlex.quote(_from_here(path))
+        return path.stem + item
+    return shlex.quote(_from_here(path) + item)
 
 
 def duration(seconds: float | None) -> str:

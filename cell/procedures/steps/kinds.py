@@ -61,16 +61,6 @@ class Kind:
         """Whether one of its steps places a part, or sees one in its nest."""
         return any(issubclass(step.makes, place.PlaceResult | PlacedPart) for step in self.steps)
 
-    @property
-    def loads(self) -> bool:
-        """Whether it takes the part from its nest: the claw is empty at first."""
-        return any(step is pick_nest.STEP for step in self.steps)
-
-    @property
-    def unloads(self) -> bool:
-        """Whether it takes the part from the surface: the claw is empty at first."""
-        return any(step is pick.STEP for step in self.steps)
-
     def sequence(self) -> Sequence:
         """A sequence at its start; it ends placed only where a step places."""
         return Sequence(self.names, JobState.PLACED if self.places else JobState.DONE)

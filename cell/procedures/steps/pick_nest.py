@@ -7,6 +7,7 @@ from cell.measure.inversion.part_pose import seen_from_above
 from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import job_with_grasp, moved
 from cell.procedures.part_error import part_points
+from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.gripping import require_lifted, take
 from cell.procedures.steps.laser_sweep import seen_on_plate
 from cell.procedures.steps.pick import MOST_PULL, HeldPart
@@ -22,15 +23,18 @@ CLOUD = "nest.ply"
 
 
 def _at(here: Workplace, context: StepContext) -> HeldPart:
-    job, part = at_nest(here.job), here.part_mesh
+    job, part, arrival = at_nest(here.job), here.part_mesh, context.made(VehicleArrival)
     assert part is not None
     if here.part.state is not PartState.NESTED:
         raise RefusedError(f"the part is {here.part.state.value}: nothing is gripped a second time")
+    belongs = job.place.surface_from_part.se3()
+    # The arm moves beside the station from here on, and about the part.
+    here.mover.meet_station(arrival.base_from_place, here.job, here.board, here.nominal.extent)
+    here.mover.part_lies(belongs, job.grasp.size)
     home_rail(here.devices, context.progress)
     head, (pointing, _) = here.calibration.scan, seen_on_plate(here, context)
     if pointing is not None:
         head = head.pointed(pointing, here.config.laser.exit_point)
-    belongs = job.place.surface_from_part.se3()
     faces = seen_from_above(part, belongs)
     low, high = faces.extent
     over = belongs * from_parts((0.0, 0.0, 0.5 * float(low[2] + high[2])))
@@ -57,4 +61,4 @@ def _at(here: Workplace, context: StepContext) -> HeldPart:
 
 
 # What was interrupted with the part between the fingers is left to a person.
-STEP = JobStep(Step("pick", 600.0, on_failure=OnFailure.STOP), _at, HeldPart)
+STEP = JobStep(Step("pick", 600.0, on_failure=OnFailure.STOP), _at, HeldPart, needs=(VehicleArrival,))

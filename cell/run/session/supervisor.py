@@ -322,8 +322,11 @@ class Cell:
         """
         names = each_item(job)
         read_fitting(job, self.config, calibrates=is_whole(self.simulated))
+        jobs = [load_job(name)[0] for name in names]
+        for each in jobs if inject else ():
+            Injector.scheduled(inject, kind_of(each).names, self.simulated)
         return batches.perform(
-            self._here, [load_job(name)[0] for name in names], count,
+            self._here, jobs, count,
             run=lambda number, series: self._start(
                 names[(number - 1) % len(names)], observer, {}, None, inject=inject,
                 at_start=at_start and number == 1, series=series,

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from cell.apps.cli.display import HEIGHT, duration, end_screen, next_step, print_report
+from cell.config.job import job_path
 from cell.run.folder import new_run, read_report, run_row, write_json
 from drivers.errors import CellError
 from statemachine.journal import Journal
@@ -258,4 +259,6 @@ def test_the_next_command_names_a_cell_that_is_elsewhere(tmp_path: Path) -> None
     folder.mkdir(parents=True)
     assert next_step(report, folder) == "cell resume aaaa: go on with the job"
     (tmp_path / "my cell" / "cell.toml").touch()
+    item = {**report, "outcome": "refused", "job_file": f"{job_path('swap')}#2"}
+    assert str(next_step(item, folder)).endswith(" -j swap#2")
     assert next_step(report, folder) == f"cell resume aaaa -c '{tmp_path}/my cell/cell.toml': go on with the job"

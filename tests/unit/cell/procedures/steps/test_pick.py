@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from cell import Cell
-from cell.config.calibrations.store import save_calibration
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix
 from cell.run.record.replay import replay
@@ -85,11 +84,8 @@ def test_where_there_is_no_part_or_the_claw_is_full_nothing_is_gripped(
 
 
 def test_through_the_public_door_it_is_not_resumed_once_it_was_gripped_and_the_next_part_lies_there(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, calibrated_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert placed_pot.calibration is not None
-    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
     with Cell.open(sim="all", seed=placed_pot.seed, clock="virtual", job="unload") as cell:
 
         def end(event: Event) -> None:

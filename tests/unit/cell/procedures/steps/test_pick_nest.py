@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from cell import Cell, ConfigError
-from cell.config.calibrations.store import save_calibration
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix
+from cell.motion.collision import PLACED
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
 from statemachine.step import Event
@@ -45,12 +45,9 @@ def test_a_part_that_is_not_in_its_nest_is_not_gripped(placed_pot: JobRecord, me
 
 
 def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_resumed(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, calibrated_folder: Path
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    assert placed_pot.calibration is not None
-    save_calibration(placed_pot.calibration, tmp_path / "calibrations" / f"{placed_pot.calibration.name}.json")
-    file = swap_file(tmp_path)
+    file = swap_file(calibrated_folder)
     with Cell.open(sim="all", seed=placed_pot.seed, clock="virtual", job=file) as cell:
         assert isinstance(cell.simulated, VirtualCell)
         world, begun = cell.simulated.world, list[str]()
@@ -66,6 +63,8 @@ def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_r
             if begun.count("pick") == 2 and cell.current is not None:
                 cell.current.abort("seen enough")
 
+        with pytest.raises(ConfigError, match="set_down"):
+            cell.run_batch(file, inject=["arm.protective_stop@set_down:40%"])
         with pytest.raises(ConfigError, match=r"has 2 items: name one, such as .*swap\.toml#1, or run all as a batch"):
             cell.run(file)
         batch = cell.run_batch(file, observer=end)
@@ -79,7 +78,14 @@ def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_r
             "invert_pose",
         ]
         assert begun[-2:] == ["drive_to_target", "pick"]
-        done = cell.resume()
+        standing: list[set[str]] = []
+
+        def stands(event: Event) -> None:
+            if (event.kind, event.step) == ("progress", "pick"):
+                standing.append({body.name for body in cell.devices.interlocks.situation.station})
+
+        done = cell.resume(observer=stands)
+        assert standing and all(names >= {"table", "board", PLACED} for names in standing)
         assert (done.outcome, done.report["part"], done.report["job"]) == ("placed", "released", "swap#2")
         old, new = (item.part for item in world._items)
         assert not (old.held or new.held) and world.collisions.found == ()
