@@ -28,11 +28,6 @@ class Attempts:
         self._steps = steps
         self._watchman = watchman
 
-    def resume(self, name: str, result: object) -> None:
-        """A step was done in an earlier run."""
-        self.results[name] = result
-        self.records[name] = StepRecord(name, "resumed")
-
     def forget_from(self, name: str) -> None:
         """This step and all after it are to be done again."""
         names = list(self.records)
@@ -86,27 +81,6 @@ class Attempts:
         if self._watchman.health is not None:
             self._watchman.health()
         return self._steps[context.step.name](context)
-
-
-def hold(sequence: Sequence, watchman: Watchman) -> tuple[Failure | None, Exception | None]:
-    """Stay paused for as long as it is asked for and the cell is well.
-
-    Why the run is to end, or None; and what ails the cell, which fails the next attempt.
-    """
-    end, ailment = watchman.asked(), None
-    control, tell = watchman.control, watchman.teller.tell
-    if end is None and control.paused():
-        step = sequence.state
-        sequence.fire(JobTrigger.PAUSE)
-        tell(Event("paused", step, {"text": f"held before {step}"}))
-        while end is None and control.paused() and ailment is None:
-            end = watchman.wait_briefly()
-            ailment = watchman.examine()
-        if end is None:
-            sequence.fire(JobTrigger.RESUME)
-            text = "goes on" if ailment is None else f"held no longer: {ailment}"
-            tell(Event("going_on", step, {"text": text}))
-    return end, ailment
 
 
 def await_word(step: Step, end: Failure, watchman: Watchman) -> tuple[Failure | None, str | None]:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
-from statemachine.attempts import Attempts, Recover, hold, performed
+from statemachine.attempts import Attempts, Recover, performed
 from statemachine.control import CancelToken, RunControl
 from statemachine.journal import Journal, JournalError
 from statemachine.sequence import JobTrigger, Sequence, SequenceError
@@ -25,7 +25,6 @@ from statemachine.step import (
     Outcome,
     Policy,
     RunResult,
-    Step,
     StepCall,
     StepContext,
     StepRecord,
@@ -167,17 +166,14 @@ class Runner:
         if missing:
             raise ValueError(f"no work was given for {', '.join(missing)}")
 
-    def run(self, done: Mapping[str, object] | None = None) -> RunResult:
-        """Do the steps that are not in `done` (results of an earlier run by step name) and return how it ended.
+    def run(self) -> RunResult:
+        """Do the steps and return how it ended.
 
         Raises nothing: every exception of a step, of the journal or of the runner itself becomes an outcome, after
         the safe stop.
         """
         with self._watching():
             self.sequence.on_change = self._teller.changed
-            for name, result in (done or {}).items():
-                self.sequence.facts.done.add(name)
-                self._attempts.resume(name, result)
             try:
                 end = self._drive()
             except Exception as error:
@@ -236,8 +232,11 @@ class Runner:
         self.sequence.fire(JobTrigger.START)
         while (state := self.sequence.state) in self.sequence.steps:
             attempts.tries = 1
+            step = self.policy.of(state)
             end = (
-                self._hold() or self._perform(self.policy.of(state)) or script.after(state, attempts.results.get(state))
+                self._hold()
+                or performed(step, attempts, self.recover, self.sequence, watchman=self._watchman, hold=self._hold)
+                or script.after(state, attempts.results.get(state))
             )
             if end is None:
                 self.sequence.facts.done.add(state)
@@ -251,8 +250,21 @@ class Runner:
         return None
 
     def _hold(self) -> Failure | None:
-        """Stay here while the run is paused; what ails the cell meanwhile fails the next attempt."""
-        end, self._attempts.met = hold(self.sequence, self._watchman)
+        """Stay here while the run is paused: why it is to end, or None. What ails the cell then fails the next try."""
+        watchman, attempts = self._watchman, self._attempts
+        end, attempts.met = watchman.asked(), None
+        if end is not None or not self.control.paused():
+            return end
+        step = self.sequence.state
+        self.sequence.fire(JobTrigger.PAUSE)
+        self._teller.tell(Event("paused", step, {"text": f"held before {step}"}))
+        while end is None and self.control.paused() and attempts.met is None:
+            end = watchman.wait_briefly()
+            attempts.met = watchman.examine()
+        if end is None:
+            self.sequence.fire(JobTrigger.RESUME)
+            text = "goes on" if attempts.met is None else f"held no longer: {attempts.met}"
+            self._teller.tell(Event("going_on", step, {"text": text}))
         return end
 
     def _go_back(self, name: str, end: Failure, chosen: Again) -> Failure | None:
@@ -265,10 +277,6 @@ class Runner:
         self.sequence.facts.chosen = chosen.step
         self.sequence.fire(JobTrigger.AGAIN)
         return None
-
-    def _perform(self, step: Step) -> Failure | None:
-        """Do one step, with its repetitions; None when it has succeeded."""
-        return performed(step, self._attempts, self.recover, self.sequence, watchman=self._watchman, hold=self._hold)
 
     # --- the end ---
 

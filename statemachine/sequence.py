@@ -48,7 +48,6 @@ class TransitionGuard(Enum):
     """Conditions on a transition; the value is what a reader of the diagram sees."""
 
     ALWAYS = ""
-    FIRST_OPEN = "first step not done"
     DONE = "done"
     RETRIES_LEFT = "retries left"
     RECOVERABLE = "recoverable"
@@ -70,7 +69,7 @@ def table(steps: tuple[str, ...], success: JobState) -> tuple[Transition, ...]:
     """Every transition of a job with these steps, which ends in `success` when all are done."""
     around = [state for state in JobState if state is success or state not in (JobState.PLACED, JobState.DONE)]
     states = [*around, *steps]
-    rows = [Transition(JobTrigger.START, JobState.IDLE, step, TransitionGuard.FIRST_OPEN) for step in steps]
+    rows = [Transition(JobTrigger.START, JobState.IDLE, steps[0])]
     rows += [
         Transition(JobTrigger.NEXT, step, after, TransitionGuard.DONE)
         for step, after in zip(steps, (*steps[1:], success), strict=True)
@@ -173,8 +172,6 @@ class Sequence:
     def _holds(self, row: Transition) -> bool:
         facts = self.facts
         match row.guard:
-            case TransitionGuard.FIRST_OPEN:
-                return row.target == next((step for step in self.steps if step not in facts.done), None)
             case TransitionGuard.DONE:
                 return row.source in facts.done
             case TransitionGuard.RETRIES_LEFT:

@@ -231,7 +231,7 @@ class StepContext:
 
 @dataclass(frozen=True)
 class StepRecord:
-    """How one step went; `state` is open, done, failed or resumed.
+    """How one step went; `state` is open, done or failed.
 
     `duration_s` sums all attempts in seconds of the cell's clock, `wall_s` in seconds on the wall.
     """

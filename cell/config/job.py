@@ -28,7 +28,6 @@ LEAST_LINES, MOST_LINES = 10, 20_000
 LONGEST_SWEEP_S = 100.0
 """The step of the laser sweep has 120 s."""
 
-LOAD, UNLOAD = "load", "unload"
 """The kinds of job that take their part from a nest on the vehicle, and bring it into one."""
 
 Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
@@ -266,13 +265,19 @@ class Job(Table):
         return self
 
     def of_item(self, number: int) -> Job:
-        """The job of an item, counted from 1: it has that one's kind, nest and surface."""
-        item = self.item[number - 1]
+        """The job of an item, counted from 1: with its kind, nest and surface. Its items leave nothing out."""
         assert self.nest is not None
-        nest = self.nest.model_copy(update={"base_from_part": item.base_from_part})
-        surface = self.surface.model_copy(update={"place_from_surface": item.place_from_surface})
-        job = self.job.model_copy(update={"name": f"{job_and_item(self.job.name)[0]}#{number}", "kind": item.kind})
-        return self.model_copy(update={"job": job, "nest": nest, "surface": surface})
+        lies, place = self.nest.base_from_part, self.surface.place_from_surface
+        whole = [
+            {"base_from_part": item.base_from_part or lies, "place_from_surface": item.place_from_surface or place}
+            for item in self.item
+        ]
+        items = tuple(item.model_copy(update=told) for item, told in zip(self.item, whole, strict=True))
+        own, name = items[number - 1], f"{job_and_item(self.job.name)[0]}#{number}"
+        nest = self.nest.model_copy(update={"base_from_part": own.base_from_part})
+        surface = self.surface.model_copy(update={"place_from_surface": own.place_from_surface})
+        job = self.job.model_copy(update={"name": name, "kind": own.kind})
+        return self.model_copy(update={"job": job, "nest": nest, "surface": surface, "item": items})
 
     @property
     def others(self) -> list[tuple[int, pin.SE3, pin.SE3]]:
@@ -284,25 +289,10 @@ class Job(Table):
             if k != own and item.base_from_part is not None and item.place_from_surface is not None
         ]
 
-    def with_whole_items(self) -> Job:
-        """The job with items that tell all of themselves."""
-        if self.nest is None:
-            return self
-        whole = [
-            item.model_copy(
-                update={
-                    "base_from_part": item.base_from_part or self.nest.base_from_part,
-                    "place_from_surface": item.place_from_surface or self.surface.place_from_surface,
-                }
-            )
-            for item in self.item
-        ]
-        return self.model_copy(update={"item": tuple(whole)})
-
     @property
     def unloads(self) -> bool:
         """Whether the part lies on the surface at first, and is set down in the nest."""
-        return self.nest is not None and self.job.kind != LOAD
+        return self.nest is not None and self.job.kind != "load"
 
     @property
     def place_from_board(self) -> pin.SE3:
@@ -380,7 +370,7 @@ def load_job(name: str | Path) -> tuple[Job, Path]:
         job = job.model_copy(update={"part": part})
     if number is not None and number > len(job.item):
         raise ConfigError(f"{path} has {len(job.item)} items: there is no item {number}")
-    return job.with_whole_items().of_item(number or 1) if job.item else job, mesh
+    return job.of_item(number or 1) if job.item else job, mesh
 
 
 def _mesh_of(path: Path, section: str, name: str) -> Path:

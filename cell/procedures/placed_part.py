@@ -184,6 +184,11 @@ class PlacedPart:
         A part that slipped comes to lie on slopes and edges, so it is tilted and raised as well; one that stands on
         something at an edge is raised as well. So the first of them that is clear counts.
         """
+        if self.seen.moved is not None:
+            shift, turn = (1e3 * float(np.linalg.norm(v)) for v in (self.seen.moved[:3], self.seen.moved[3:]))
+            return (
+                f"surface or vehicle was pushed: it stands {shift:.2f} mm and {turn:.1f} mrad from where it was swept"
+            )
         x, y, z, about_x, about_y, about_z = np.abs(self._times)
         times = {"shifted": max(x, y, about_z), "tilted": max(about_x, about_y)}
         times["raised" if self._times[2] > 0.0 else "deep"] = z

@@ -31,6 +31,7 @@ from cell.procedures.grasp import GraspSeries
 from cell.procedures.sought_part import ground_below, nominal_of, sought
 from cell.procedures.steps import verify
 from cell.procedures.steps.kinds import Kind, kind_of
+from cell.procedures.steps.pick import HeldPart
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep
 from cell.procedures.sweep.swath import SweepCollector, Sweeping
@@ -49,7 +50,7 @@ from drivers.errors import CalibrationStale, CellError
 from drivers.interfaces import Vector
 from statemachine.control import RunControl
 from statemachine.journal import Journal, JournalError
-from statemachine.runner import NO_SCRIPT, Event, Runner, Script
+from statemachine.runner import Event, Runner, Script
 from statemachine.step import Outcome
 
 
@@ -140,25 +141,22 @@ class JobRun:
     """Everything that one run of a job needs; `perform` does it. `info` goes into the journal and the report.
 
     `run` is the handle by which it is held. `inline` observers see each event before the run goes on: those that cause
-    faults or look at the truth. `earlier` is the sweep of a run that this one resumes; `script` works between steps.
-    `truth` asks a simulated world. `pace` says how fast arm and vehicle go, of what is planned. `series` is how the
-    parts before this one of its batch came to lie.
+    faults or look at the truth. `earlier` is the sweep of a run that this one resumes, `held` how that one had gripped
+    a part from its nest; `script` works between steps. `truth` asks a simulated world. `pace` says how fast arm and
+    vehicle go, of what is planned. `series` is how the parts before this one of its batch came to lie.
     """
 
     run: Run[object]
     config: CellConfig
     devices: Devices
-    job: Job
-    nominal: NominalSurface
+    ready: ReadyJob
     calibration: CellCalibration
     info: Mapping[str, object]
-    kind: Kind
-    script: Script = NO_SCRIPT
     inline: tuple[Observer, ...] = ()
     earlier: StoredSweep | None = None
+    held: HeldPart | None = None
     truth: Callable[[], dict[str, object]] | None = None
     pace: Pace = field(default_factory=Pace)
-    ground: tuple[Vector, Vector] | None = None
     series: GraspSeries = field(default_factory=GraspSeries)
 
     def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
@@ -193,10 +191,10 @@ class JobRun:
             self._open_again()
         if result.outcome is not Outcome.PLACED:
             result = replace(result, reason=here.part.told(result.reason))
-        elif self.job.part is not None:
+        elif self.ready.job.part is not None:
             result = replace(result, reason=seen_words(result))
         finished = FinishedJob(
-            folder, self.config, here.job, nominal=self.nominal, repeatability=here.repeatability, result=result,
+            folder, self.config, here.job, nominal=self.ready.nominal, repeatability=here.repeatability, result=result,
             info=self._facts_after(begun, here), started=started, witness=witness, frames=frames,
         )  # fmt: skip
         report = finished.report()
@@ -206,22 +204,24 @@ class JobRun:
         )  # fmt: skip
 
     def _workplace(self, folder: Path, whereabouts: Whereabouts, frames: FrameStore) -> Workplace:
+        job, kind = self.ready.job, self.ready.kind
+        state = PartState.first(job) if self.held is None else PartState.HELD
         return Workplace(
-            self.config, self.job, self.nominal, calibration=self.calibration, devices=self.devices, frames=frames,
-            folder=folder, whereabouts=whereabouts, earlier=self.earlier,
-            needs_part=self.kind.places and self.job.nest is None, looks_after=verify.STEP.name in self.kind.names,
-            sweeping=self._sweeping, registered=self._registered, pace=self.pace, ground=self.ground,
-            series=self.series, part=PartProgress(PartState.first(self.job)),
+            self.config, job, self.ready.nominal, calibration=self.calibration, devices=self.devices, frames=frames,
+            folder=folder, whereabouts=whereabouts, earlier=self.earlier, held=self.held,
+            needs_part=kind.places and state is PartState.HELD, looks_after=verify.STEP.name in kind.names,
+            sweeping=self._sweeping, registered=self._registered, pace=self.pace, ground=self.ready.ground,
+            series=self.series, part=PartProgress(state),
         )  # fmt: skip
 
     def _runner(self, here: Workplace, journal: Journal, observer: Observer) -> Runner:
         return Runner(
-            sequence=self.kind.sequence(), steps=self.kind.work(here),
-            policy=self.kind.policy(simulated_person=self.config.cell.confirm == "simulated"), journal=journal,
+            sequence=self.ready.kind.sequence(), steps=self.ready.kind.work(here),
+            policy=self.ready.kind.policy(simulated_person=self.config.cell.confirm == "simulated"), journal=journal,
             clock=self.devices.clock, classify=partial(classify, following=self.devices.following),
             safe_stop=lambda reason: stop_cell(self.devices), observer=observer, recover=partial(clear, self.devices),
             health=lambda: require_healthy(self.devices), control=self.run.control,
-            script=self._in_the_gate(self.script),
+            script=self._in_the_gate(self.ready.script),
         )  # fmt: skip
 
     def _open_again(self) -> None:
@@ -244,7 +244,7 @@ class JobRun:
 
     def _sweeping(self, collector: SweepCollector, base_from_surface: pin.SE3) -> None:
         self.run.registered = None
-        self.run.sweeping = Sweeping(collector, base_from_surface, self.nominal)
+        self.run.sweeping = Sweeping(collector, base_from_surface, self.ready.nominal)
 
     def _registered(self, base_from_surface: pin.SE3) -> None:
         self.run.registered = base_from_surface
@@ -257,8 +257,8 @@ class JobRun:
 
     def _facts(self) -> dict[str, object]:
         return {
-            "kind": "job", "pid": os.getpid(), "cell": self.config.cell.name, "job": self.job.job.name,
-            "job_kind": self.job.job.kind, **self.info, "speed": self.config.cell.time_scale,
+            "kind": "job", "pid": os.getpid(), "cell": self.config.cell.name, "job": self.ready.job.job.name,
+            "job_kind": self.ready.job.job.kind, **self.info, "speed": self.config.cell.time_scale,
             "configuration_hash": self.config.calibration_hash(), "calibration_hash": self.calibration.hash(),
             "calibration_date": self.calibration.date,
             **({"calibration_edits": list(self.calibration.edits)} if self.calibration.edits else {}),
@@ -266,7 +266,7 @@ class JobRun:
 
     def _keep_inputs(self, folder: Path) -> None:
         write_json(folder / "configuration.json", self.config.model_dump(mode="json"))
-        write_json(folder / "job.json", self.job.model_dump(mode="json"))
+        write_json(folder / "job.json", self.ready.job.model_dump(mode="json"))
         save_calibration(self.calibration, folder / "calibration.json")
 
     def _in_the_gate(self, script: Script) -> Script:
@@ -347,9 +347,9 @@ class JobWork:
             earlier, why = self.before.sweep(ready.job, cell.config, calibration)
             note(why if earlier is not None else f"{why}: sweeping again")
         job_run = JobRun(
-            run, cell.config, cell.devices, job=ready.job, nominal=ready.nominal, calibration=calibration,
-            info=self.info, kind=ready.kind, script=ready.script, inline=self.inline, earlier=earlier, truth=cell.truth,
-            pace=cell.pace, ground=ready.ground, series=self.series,
+            run, cell.config, cell.devices, ready=ready, calibration=calibration, info=self.info, inline=self.inline,
+            earlier=earlier, held=None if self.before is None else self.before.held, truth=cell.truth, pace=cell.pace,
+            series=self.series,
         )  # fmt: skip
         try:
             return job_run.perform(cell.runs_folder, cell.whereabouts)

@@ -12,10 +12,11 @@ from typing import Any
 
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
-from cell.config.job import Job, job_and_item, job_path, load_job
+from cell.config.job import Job, each_item, job_and_item, job_path, load_job
 from cell.procedures.arm.moves import PartState
 from cell.procedures.sought_part import sought
 from cell.procedures.steps import laser_sweep, verify
+from cell.procedures.steps.pick import HeldPart
 from cell.procedures.sweep.stored_sweep import FILE, StoredSweep
 from cell.run.folder import list_runs
 from drivers.errors import ConfigError, RefusedError
@@ -26,13 +27,15 @@ from statemachine.journal import JournalError, JournalRecord, read
 class UnfinishedRun:
     """A run that did not come to its end: its folder, its job, and what its journal says of it.
 
-    `swept` tells whether its last sweep was finished, and not decided to be done again.
+    `swept` tells whether its last sweep was finished, and not decided to be done again; `held` how the claw holds a
+    part that the run had taken from its nest.
     """
 
     folder: Path
     job: str
     info: dict[str, Any]
     swept: bool
+    held: HeldPart | None = None
 
     @classmethod
     def find(cls, folder: Path, *, scripted: bool = False) -> UnfinishedRun:
@@ -53,7 +56,8 @@ class UnfinishedRun:
                 f"run {folder.name} has ended {run.outcome} ({run.reason}); only a run that was aborted, faulted or "
                 "cut short can be resumed. Run its job again"
             )
-        _require_held(folder, record)
+        held = _held(record)
+        _require_held(folder, record, held)
         for later, told in _later(folder):
             if told.run.info.get("resumed_from") == folder.name:
                 raise ConfigError(
@@ -80,7 +84,7 @@ class UnfinishedRun:
             raise ConfigError(f"the job of run {folder.name} cannot be read: {error}; run a job anew") from error
         if changed:
             raise ConfigError(f"{job} or a mesh of it was changed since run {folder.name}; run the job again")
-        return cls(folder, job, run.info, _swept(record))
+        return cls(folder, job, run.info, _swept(record), held)
 
     def sweep(self, job: Job, config: CellConfig, calibration: CellCalibration) -> tuple[StoredSweep | None, str]:
         """The run's sweep, or None, and why it is or is not used; whether the station moved is seen later."""
@@ -123,26 +127,37 @@ def _part(record: JournalRecord) -> object:
     return next((e.data["part"] for e in reversed(record.events) if "part" in e.data), PartState.HELD.value)
 
 
-def _require_held(folder: Path, record: JournalRecord) -> None:
+def _held(record: JournalRecord) -> HeldPart | None:
+    """How the claw holds a part that lay in its nest, by the run's own pick or that of the run which it resumed."""
+    told = record.run.info.get("held", {})
+    for event in record.events:
+        told = event.data.get("held", {}) if "part" in event.data else told
+    with suppress(ValueError, TypeError, KeyError):
+        return HeldPart.of(told)
+    return None
+
+
+def _require_held(folder: Path, record: JournalRecord, held: HeldPart | None) -> None:
     """`ConfigError` when the part is not in the claw any more, or may not be."""
+    gripped = "held" in record.run.info or any("part" in event.data for event in record.events)
     match _part(record):
-        case PartState.HELD.value if not any("part" in event.data for event in record.events):
+        case PartState.HELD.value if held is not None or not gripped:
             return
         case PartState.LIES.value | PartState.NESTED.value:
             return
         case PartState.HELD.value:
             raise ConfigError(
                 f"run {folder.name} had gripped a part that lay: how the claw holds it is not known, and the run is "
-                "not resumed. Take the part out by hand, fold the arm with `cell home`, then "
-                "run the job anew"
+                "not resumed. Take the part out by hand, fold the arm with `cell home`, then run the job anew"
             )
         case PartState.RELEASED.value:
             step = next(event.step for event in reversed(record.events) if "part" in event.data)
             after = step in record.done or step == verify.STEP.name
+            following = record.run.info.get("next_item", "the job with the next part")
             failed = "what came after that" if after else "only the retreat"
             raise ConfigError(
                 f"run {folder.name} had put its part down already, {failed} failed: there is nothing to resume. Look "
-                "at the part, fold the arm with `cell home`, then run the job with the next part"
+                f"at the part, fold the arm with `cell home`, then run {following}"
             )
         case state:
             how = f"tells of its part {str(state)[:40]!r}, which is neither held nor released"
@@ -164,10 +179,12 @@ def _swept(record: JournalRecord) -> bool:
 
 def job_source(name: str | Path) -> dict[str, object]:
     """For journal and report: the job's file and its hash, and the file and the hash of each of its meshes alone."""
-    number = job_and_item(name)[1]
+    whole, number = job_and_item(name)
     path = str(job_path(name).resolve()) + ("" if number is None else f"#{number}")
     job, mesh = load_job(path)
-    part = {} if job.part is None else {"part_mesh": mesh_source(Path(job.part.mesh))}
+    part: dict[str, object] = {} if job.part is None else {"part_mesh": mesh_source(Path(job.part.mesh))}
+    if number is not None and f"{whole}#{number + 1}" in each_item(whole):
+        part["next_item"] = f"{job_path(name).resolve()}#{number + 1}"
     return {"job_file": path, "job_hash": job_hash(path), "mesh": mesh_source(sought(job, mesh)[1]), **part}
 
 

@@ -29,7 +29,7 @@ from sim_backends.world.bodies.station import Station
 from sim_backends.world.cameras import Cameras
 from sim_backends.world.drawing import CAMERA_RATE, STOCK, Drawing, StationDrawing, inverse, pose
 from sim_backends.world.levels import WARMING_S, assumed_noise
-from sim_backends.world.scene import CameraClock, Lens, Scene, draw, rotation, stream
+from sim_backends.world.scene import Lens, Scene, draw, rotation, stream
 
 Pose = NDArray[np.float64]
 
@@ -204,12 +204,10 @@ class World:
     def _exposed(self, camera: str, t: float, exposure: float) -> NDArray[np.uint8]:
         world_from_base = self.world_from_base(t)
         world_from_flange = world_from_base @ self.arm.base_from_flange(t)
-        world_from_camera = world_from_flange @ self.flange_from_camera(camera, t)
-        lit = self.laser.at(t)
-        camera_from_flange = inverse(self.flange_from_camera(camera, t))
+        seat = self.flange_from_camera(camera, t)
         return self._cameras.picture(
-            camera, world_from_camera, world_from_base, laser=lit, exposure=exposure, warm=self.warmth(t), t=t,
-            camera_from_flange=camera_from_flange,
+            camera, world_from_flange @ seat, world_from_base, laser=self.laser.at(t), exposure=exposure,
+            warm=self.warmth(t), t=t, camera_from_flange=inverse(seat),
             parts=[(item.station, item.part.part_pose(world_from_flange)) for item in self._items],
         )  # fmt: skip
 
@@ -390,8 +388,6 @@ def truth(world: World) -> dict[str, object]:
             "periodic": scene.rail_periodic_amplitude,
             "carriage": world.rail.carriage(t),
         },
-        "scan_clock": _timing(scene.scan_clock),
-        "target_clock": _timing(scene.target_clock),
         "part": {"held": world.part.held},
         "laser_on": world.switched("laser"),
         "digital_outputs": [bool(outputs >> i & 1) for i in range(8)],
@@ -438,7 +434,3 @@ def _nested(values: Pose) -> Any:
 
 def _lens(lens: Lens) -> dict[str, object]:
     return {"fx": lens.fx, "fy": lens.fy, "cx": lens.cx, "cy": lens.cy, "dist": list(lens.dist)}
-
-
-def _timing(clock: CameraClock) -> dict[str, float]:
-    return {"drift": clock.drift, "latency": clock.latency}

@@ -91,8 +91,8 @@ class Bench:
         """The data of the events of a kind that the observer was told."""
         return [dict(event.data) for event in self.events if event.kind == kind]
 
-    def run(self, done=None):
-        result = self.runner.run(done)
+    def run(self):
+        result = self.runner.run()
         self.record = read(self.folder)
         assert self.log[-1].startswith("stop: end of the run"), "the last thing is always the safe stop"
         assert sum(line.startswith("stop: end of the run") for line in self.log) == 1

@@ -53,7 +53,18 @@ def end_screen(report: Mapping[str, Any], folder: Path, width: int = WIDTH, *, w
     return [*head, *steps, *([""] * bool(figures[:fit])), *figures[:fit], more, *tail]
 
 
-LOOK_AT_PART = {"released": "look at the part, it is down", "unknown": "look what has become of the part"}
+def _look_at_part(report: Mapping[str, object]) -> str | None:
+    """What a person has to do about the part before the next job, if anything."""
+    match report.get("part"), report.get("job_kind"), report["outcome"]:
+        case _, _, "placed" | "done":
+            return None
+        case "released", _, _:
+            return "look at the part, it is down"
+        case "unknown", _, _:
+            return "look what has become of the part"
+        case ("held", "unload", _) | ("held", "load", "refused"):
+            return "take the part out of the claw"
+    return None
 
 
 def next_step(report: Mapping[str, object], folder: Path) -> str | None:
@@ -70,12 +81,13 @@ def next_step(report: Mapping[str, object], folder: Path) -> str | None:
         if outcome == "done":
             return f"cell calibrate verify{where}: how good it is" if kind == "calibration" else None
         return f"cell diag{where}: the state of every device"
-    part = None if outcome in ("placed", "done") else report.get("part")
-    if part in LOOK_AT_PART:
-        return f"{LOOK_AT_PART[part]}; cell home{where}: fold the arm; then {again} -j {_job(report)}: the next part"
+    if (first := _look_at_part(report)) is not None:
+        return f"{first}; cell home{where}: fold the arm; then {again} -j {_next_job(report)}"
     match outcome:
         case "done":
             return f"cell report {name}{where}: what was measured; nothing was placed"
+        case "placed" if "next_item" in report:
+            return f"{again} -j {_next_job(report)}: the next item; cell report {name}{where}: this one"
         case "placed":
             return f"cell report {name}{where} --html: all of it as a page; cell export{where}: the cloud"
         case "refused" if report.get("code") == "CalibrationStale":
@@ -103,6 +115,11 @@ def _dry_run(report: Mapping[str, object]) -> str:
     usual = {"seed": 1, "level": "nominal", "clock": "wall"}
     options = (f"--{key} {report[key]}" for key, value in usual.items() if report.get(key, value) != value)
     return " ".join(["cell dry-run", *options])
+
+
+def _next_job(report: Mapping[str, object]) -> str:
+    """Another one of that job, or the item after the one whose part is down."""
+    return _job({"job_file": report["next_item"]} if "next_item" in report and report["part"] == "released" else report)
 
 
 def _job(report: Mapping[str, object]) -> str:
@@ -287,14 +304,9 @@ def print_health(told: Mapping[str, Any]) -> None:
             left = "" if part["days_left"] is None else f"{part['days_left']:.0f}"
             seen = f"{part['last']:.3f}", f"{part['now']:.3f}"
             table.add_row(
-                part["part"],
-                *seen,
-                f"{part['limit']:.2f}",
-                part["unit"],
-                creeps,
-                left,
+                part["part"], *seen, f"{part['limit']:.2f}", part["unit"], creeps, left,
                 sparks(part["values"], part["limit"]),
-            )
+            )  # fmt: skip
         console.print(table)
     for shock in told["shocks"]:
         console.print(
@@ -306,14 +318,12 @@ def print_health(told: Mapping[str, Any]) -> None:
 
 
 SPARKS = "▁▂▃▄▅▆▇█"
-MOST_SPARKS = 10
 
 
 def sparks(values: Sequence[float], limit: float) -> str:
-    """The newest of these values as bars; a full one has reached the limit."""
-    return "".join(
-        SPARKS[min(len(SPARKS) - 1, int((len(SPARKS) - 1) * value / limit))] for value in values[-MOST_SPARKS:]
-    )
+    """The ten newest of these values as bars; a full one has reached the limit."""
+    most = len(SPARKS) - 1
+    return "".join(SPARKS[min(most, int(most * value / limit))] for value in values[-10:])
 
 
 def _simulated(row: Mapping[str, object]) -> str:

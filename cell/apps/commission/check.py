@@ -257,16 +257,10 @@ def write_protocol(progress: Progress, checks: Sequence[CommissionCheck], config
     cell = progress.cell
     world = (f"{name} {value}" for name, value in cell.items() if name != "simulated" and value is not None)
     text = render(
-        __package__,
-        "protocol.html.jinja",
-        cell=config.cell.name,
-        simulated=bool(cell.get("simulated")),
-        world=", ".join(world),
-        written=time.strftime("%Y-%m-%d %H:%M:%S"),
-        release=release(),
-        rows=[_row(progress, check, progress.standing(check, config)) for check in checks],
-        mended=progress.mended,
-    )
+        __package__, "protocol.html.jinja", cell=config.cell.name, simulated=bool(cell.get("simulated")),
+        world=", ".join(world), written=time.strftime("%Y-%m-%d %H:%M:%S"), release=release(),
+        rows=[_row(progress, check, progress.standing(check, config)) for check in checks], mended=progress.mended,
+    )  # fmt: skip
     path = progress.folder / PROTOCOL
     path.write_text(text, encoding="utf-8")
     return path

@@ -148,7 +148,10 @@ def _turned(vertices: Array, faces: Faces, notes: list[str]) -> MeshBody:
     _, edge, count = np.unique(np.sort(ways, axis=1), axis=0, return_inverse=True, return_counts=True)
     lone, crowded = int((count == 1).sum()), int((count > 2).sum())
     over = _turned_over(ways, edge.reshape(-1), count, len(before))
-    if lone == 0 and _volume(corners, np.where(over[:, None], before[:, ::-1], before)) < 0.0:
+    faces = np.where(over[:, None], before[:, ::-1], before)
+    a, b, c = (corners - corners.mean(axis=0))[faces].transpose(1, 0, 2)
+    # By its volume it is inside out.
+    if lone == 0 and np.einsum("ni,ni->", a, np.cross(b, c)) < 0.0:
         over = ~over
     if over.any():
         notes.append(f"{int(over.sum())} triangles turned round: they faced against their neighbours, or into the body")
@@ -176,11 +179,6 @@ def _turned_over(ways: Faces, edge: Faces, count: Faces, faces: int) -> NDArray[
     whole = np.bincount(label[:faces], minlength=2 * faces)
     as_is, turned = label[:faces], label[faces:]
     return np.asarray((whole[turned] > whole[as_is]) | ((whole[turned] == whole[as_is]) & (turned < as_is)))
-
-
-def _volume(vertices: Array, faces: Faces) -> float:
-    a, b, c = (vertices - vertices.mean(axis=0))[faces].transpose(1, 0, 2)
-    return float(np.einsum("ni,ni->", a, np.cross(b, c)))
 
 
 def _as_expected(lone: int, edges: int) -> str:

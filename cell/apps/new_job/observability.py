@@ -160,13 +160,9 @@ def place_from(seen: Sequence[SeenSurface], nominal: NominalSurface, job: Job, c
     arm = config.arm
     rest = np.diag([arm.repeatability**2] * 3 + [arm.repeatability_angle**2] * 3)
     return invert_pose(
-        cloud,
-        nominal,
-        Prior(pin.SE3.Identity(), prior_of(job)),
-        _tolerance(job),
-        systematic=shared_by_all(config),
+        cloud, nominal, Prior(pin.SE3.Identity(), prior_of(job)), _tolerance(job), systematic=shared_by_all(config),
         sweeps=lambda lines, rows: flange_motions(cloud, lines, rows, [rest] * len(seen)),
-    )
+    )  # fmt: skip
 
 
 def _tolerance(job: Job) -> Tolerance:

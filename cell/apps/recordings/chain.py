@@ -134,7 +134,8 @@ def solve_chain(
     staged = solve_staged(observations, stripe=False, camera=pictures.camera)
     scale = metric_scale([o.base_from_flange for o in observations], staged.camera_from_board)
     if scale is not None:
-        scale = scale.with_focal(float(pictures.sigma[0]) / pictures.camera.fx)
+        # The boards' distances follow the focal length.
+        scale = replace(scale, sigma=math.hypot(scale.sigma, float(pictures.sigma[0]) / pictures.camera.fx))
     stripes = stripes_of_one_plane(pictures.camera, staged.camera_from_board, frames)
     if stripes.plane is not None:
         seen = [replace(o, profile=profile) for o, profile in zip(observations, stripes.profiles, strict=True)]

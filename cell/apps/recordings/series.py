@@ -316,7 +316,7 @@ def _match(pictures: Sequence[str], labels: Sequence[str], times: Sequence[float
     """The label that belongs to each picture (names below the folder); the first way that serves most of them."""
     both = pictures, [label.replace("\\", "/") for label in labels]
     # The last is that of a folder for each pose.
-    named = (str, _base, _stem, frame_key, _folder)
+    named = (str, lambda name: Path(name).name, _stem, frame_key, _folder)
     ways = [("folder" if way is _folder else "name", [list(map(way, side)) for side in both]) for way in named]
     if not any(label.startswith("[") for label in labels):
         ways.append(("number", [_numbers(side) for side in both]))
@@ -370,10 +370,6 @@ def _nearest(pictures: Sequence[str], labels: Sequence[str], times: Sequence[flo
             of = {k: int(timed[near[k]]) for k in np.flatnonzero(good).tolist()}
             return _Match("time", of, [k for k in range(len(labels)) if k not in of.values()])
     return None
-
-
-def _base(name: str) -> str:
-    return Path(name).name
 
 
 def _folder(name: str) -> str:

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 
-from cell.measure.geometry.poses import composition_jacobians
+from cell.measure.geometry.poses import composition_jacobians, difference
 from cell.measure.inversion.demands import Demands
 from cell.measure.inversion.effects.during_sweep import find_rocking, rocking_motions
 from cell.measure.inversion.nominal import Array, Indices, NominalSurface, Scan
@@ -30,6 +30,8 @@ ABOUT_M = 4e-3
 """So far around the part, where it belongs, its points are looked for."""
 BESIDE_M = 1.5e-3
 """Nearer to the part, seen from above, nothing counts as the surface beside it."""
+SURFACE_MOVED = 40.0
+"""χ² of six degrees of freedom from which the surface does not lie where the earlier sweep found it."""
 LEAST_BESIDE = 500
 MOST_POINTS = 10_000
 NOISE_M = 20e-6
@@ -48,7 +50,8 @@ class PartPose:
 
     `fit` is how its faces lie in the scan; its verdict names the motions that these do not show. `beside` is the number
     of points of the surface that showed beside the part; 0 where the earlier sweep tells where that lies, which is at
-    `base_from_surface`. The vehicle rocked by `rocked`, m, up and down, as far as the sweep shows it.
+    `base_from_surface`. The vehicle rocked by `rocked`, m, up and down, as far as the sweep shows it. `moved` is how
+    the surface has moved in the arm base since the earlier sweep, (6,) m and rad; None where it lies as it lay.
     """
 
     base_from_surface: pin.SE3
@@ -57,6 +60,7 @@ class PartPose:
     fit: PlacePose
     beside: int
     rocked: float = 0.0
+    moved: Array | None = None
 
 
 def seen_from_above(part: NominalSurface, surface_from_part: pin.SE3) -> NominalSurface:
@@ -131,12 +135,14 @@ def find_part(
 @dataclass(frozen=True, eq=False)
 class _SurfaceSeen:
     """Where the surface lies by what shows of it beside the part: `base_from_surface`, its own covariance `unsure`
-    (6, 6), base axes, how it `follows` each parameter (6, m), and the number of its `points`."""
+    (6, 6), base axes, how it `follows` each parameter (6, m), the number of its `points`, and how it has `moved` (6,)
+    since the earlier sweep, None where it has not."""
 
     base_from_surface: pin.SE3
     unsure: Array
     follows: Array
     points: int
+    moved: Array | None = None
 
 
 def _surface_beside(
@@ -146,19 +152,31 @@ def _surface_beside(
     known = _SurfaceSeen(surface.base_from_surface, surface.covariance, np.zeros((6, 0)), 0)
     if around.size < LEAST_BESIDE:
         return known
-    try:
-        found = register(Scan.of(around, MOST_POINTS), nominal, surface)
-    except RefusedError:
-        # A table, or whatever else lies there.
+    scan, (lines, rows) = Scan.of(around, MOST_POINTS), around.subsample(MOST_POINTS)
+
+    def seen(prior: Prior) -> _SurfaceSeen | None:
+        try:
+            found = register(scan, nominal, prior)
+        except RefusedError:
+            # A table, or whatever else lies there.
+            return None
+        if len(found.used) < LEAST_BESIDE or not found.share >= DEMANDS.share:
+            return None
+        if rocked is not None:
+            found = balance(found, scan, rocked(lines[found.used], rows[found.used]), prior)
+        along = np.einsum("ni,nim->nm", found.normals, moved(lines[found.used], rows[found.used]))
+        _, patches = shared_by_patches(found, FORM_M)
+        return _SurfaceSeen(found.base_from_surface, found.covariance + patches, found.follow @ along, len(found.used))
+
+    # What the earlier sweep says would hold back a surface, or a vehicle, that has moved since.
+    alone = seen(Prior(surface.base_from_surface, surface.covariance + np.diag(SHIFTED**2)))
+    if alone is None:
         return known
-    if len(found.used) < LEAST_BESIDE or not found.share >= DEMANDS.share:
-        return known
-    lines, rows = around.subsample(MOST_POINTS)
-    if rocked is not None:
-        found = balance(found, Scan.of(around, MOST_POINTS), rocked(lines[found.used], rows[found.used]), surface)
-    along = np.einsum("ni,nim->nm", found.normals, moved(lines[found.used], rows[found.used]))
-    _, patches = shared_by_patches(found, FORM_M)
-    return _SurfaceSeen(found.base_from_surface, found.covariance + patches, found.follow @ along, len(found.used))
+    apart = difference(alone.base_from_surface, surface.base_from_surface)
+    spread = surface.covariance + alone.unsure + alone.follows @ alone.follows.T
+    if apart @ np.linalg.solve(spread, apart) > SURFACE_MOVED:
+        return replace(alone, moved=apart)
+    return seen(surface) or known
 
 
 def _against(
@@ -184,7 +202,10 @@ def _against(
         most_points=MOST_POINTS, partly=True, least_shared=FORM_M,
     )  # fmt: skip
     turn = np.kron(np.eye(2), there.rotation.T)
-    return PartPose(there, there.inverse() * fit.base_from_surface, turn @ fit.covariance @ turn.T, fit, beside.points)
+    return PartPose(
+        there, there.inverse() * fit.base_from_surface, turn @ fit.covariance @ turn.T, fit, beside.points,
+        moved=beside.moved,
+    )  # fmt: skip
 
 
 def parted(cloud: Cloud, faces: NominalSurface, base_from_part: pin.SE3) -> tuple[Cloud, Cloud]:

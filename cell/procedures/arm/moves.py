@@ -9,15 +9,16 @@ from enum import Enum
 
 import pinocchio as pin
 
-from cell.config.cell_config import ArmConfig, CellConfig, deck_plates, mounted, station_obstacles, vehicle_obstacles
+from cell.config.cell_config import CellConfig, deck_plates, mounted, station_obstacles, vehicle_obstacles
 from cell.config.job import Job
 from cell.devices.gate.interlocks import Interlocks
-from cell.measure.geometry.poses import from_parts
+from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import BoardSpec
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import (
     BASE,
     PLACED,
+    TOUCHES,
     Body,
     CollisionError,
     CollisionModel,
@@ -82,6 +83,8 @@ def _part_at(name: str, base_from_part: pin.SE3, job: Job) -> Body:
     return box(name, BASE, base_from_part * from_parts((0.0, 0.0, 0.5 * job.grasp.size[2])), job.grasp.size)
 
 
+RISE_M, RISE_SPEED = 0.05, 0.04
+"""How far the arm goes straight up from where it was stopped, m, and how fast, m/s."""
 ROOM_ABOVE = 0.005
 """How much higher than drawn the surface is taken to be, m: where it stands is known roughly before it was scanned."""
 GRACE_WALL_S = 10.0
@@ -108,15 +111,20 @@ class Mover:
         self._settle_time = config.arm.settle_time
         self._tool_speed = config.arm.max_tool_speed
         self._obstacles = [*vehicle_obstacles(config.obstacle), *([] if job is None else nested_parts(job))]
-        self._station: list[Body] = []
+        # Until the vehicle drives, what an earlier run met stands there still.
+        known = () if interlocks is None else interlocks.situation.station
+        self._station = [body for body in known if body.name != PLACED]
         self._met: list[Body] = []
-        self.kinematics = arm_kinematics(config.arm.model, arm.link_table(), _joint_limits(config.arm))
+        most = config.arm.max_joint_speed, config.arm.max_joint_acceleration, config.arm.max_joint_jerk
+        speed, acceleration, jerk = ((value,) * 6 for value in most)
+        limits = JointLimits(speed=speed, acceleration=acceleration, jerk=jerk)
+        self.kinematics = arm_kinematics(config.arm.model, arm.link_table(), limits)
         grasp = None if job is None else job.grasp
         self._interlocks = interlocks
         held, at = (None, None) if grasp is None else (grasp.size, grasp.flange_from_part.se3())
         tool = tool_bodies(held, at, mounted(config))
         self._moving = [*arm_bodies(config.arm.model), *tool, *vehicle_bodies(deck_plates(config))]
-        self._planner = self._plan_among([])
+        self._planner = self._plan_among(self._station)
         if interlocks is not None and grasp is not None:
             interlocks.carry([body for body in self._moving if body.name == "part"])
 
@@ -183,10 +191,6 @@ class Mover:
         bodies = CollisionModel(self.kinematics, [*self._moving, *self._obstacles, *still])
         return Planner(self.kinematics, bodies, tool_speed=self._tool_speed)
 
-    def _leaving(self, start: Joints) -> tuple[Pair, ...]:
-        """What may be near the part that was just put down: only what is so already."""
-        return tuple(pair for pair in self._planner.collisions.touching(start) if PLACED in pair)
-
     @property
     def joints(self) -> Joints:
         """Where the arm stands, (6,) rad."""
@@ -213,8 +217,18 @@ class Mover:
     def to_joints(self, joints: Joints) -> None:
         """Move freely to joint angles and settle."""
         self.hold()
+        self._rise()
         start = self.joints
         self.follow(self._planner.free(start, joints, self._leaving(start)).at_pace(self.pace.share))
+
+    def _leaving(self, start: Joints) -> tuple[Pair, ...]:
+        """What may be near the part that was just put down: only what is so already."""
+        return tuple(pair for pair in self._planner.collisions.touching(start) if PLACED in pair)
+
+    def _rise(self) -> None:
+        """Straight up, where the arm was stopped so near to the station that no way can be planned from there."""
+        if any(set(pair) & {"surface", "table"} for pair in self._planner.collisions.touching(self.joints)):
+            self.line(from_parts((0.0, 0.0, RISE_M)) * from_ur(self._arm.state().flange), RISE_SPEED, TOUCHES)
 
     def to_view(self, base_from_flange: pin.SE3) -> None:
         """Move freely to a view of a calibration with the calibration's joints, those nearest to HOME.
@@ -263,14 +277,6 @@ class Mover:
         motion.wait(3.0 * trajectory.duration + GRACE_WALL_S * self._clock.rate)
         self._clock.sleep(self._settle_time)
         return motion.contact
-
-
-def _joint_limits(config: ArmConfig) -> JointLimits:
-    return JointLimits(
-        speed=(config.max_joint_speed,) * 6,
-        acceleration=(config.max_joint_acceleration,) * 6,
-        jerk=(config.max_joint_jerk,) * 6,
-    )
 
 
 class PartState(Enum):

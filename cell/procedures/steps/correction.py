@@ -11,8 +11,8 @@ from cell.measure.inversion.mating import scanned_gap
 from cell.procedures.arm.touch import expected_touch
 from cell.procedures.grasp import SLIPS, expected_residual, job_with_grasp, moved
 from cell.procedures.part_error import part_points
-from cell.procedures.steps.gripping import note_part, take
-from cell.procedures.steps.place import PlaceResult, Placing
+from cell.procedures.steps.gripping import take
+from cell.procedures.steps.place import PlaceResult, Placing, note_part
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import Workplace
 from drivers.interfaces import Vector
@@ -44,7 +44,7 @@ def correct(
     if gap is not None:
         gap.require(here.job.place.tolerance)
         expected = replace(expected, height=expected.height + gap.lift)
-    take(here, job, placed.base_from_flange, context, what="the placed part")
+    take(here, job, placed.base_from_flange, context, what="the placed part", pulls=False)
     placing = Placing(
         job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
         part=here.part, check=context.check, progress=lambda share, text: context.progress(0.5, f"again: {text}"),

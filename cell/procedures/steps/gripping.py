@@ -6,24 +6,28 @@ import numpy as np
 import pinocchio as pin
 
 from cell.config.job import Job
-from cell.measure.geometry.poses import from_parts, to_ur
+from cell.measure.geometry.poses import from_parts
 from cell.motion.collision import TOUCHES
-from cell.procedures.arm.moves import PartProgress, PartState
-from cell.procedures.steps.place import FAST_FORCE
+from cell.procedures.arm.moves import PartState
+from cell.procedures.steps.place import FAST_FORCE, note_part
 from cell.procedures.steps.workplace import Workplace
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 
+MOST_PULL = 3.0
+"""Times the contact force with which a part is pulled at, at most: more, and it sticks."""
 
-def take(
-    here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what: str, most_pull: float | None = None
-) -> None:
+
+def take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what: str, pulls: bool = True) -> None:
     """Grip the part, `what` in words, with the flange at `grip`, base_from_flange, and lift it.
 
-    Raises `RefusedError` where the claw meets something on its way down, and, with `most_pull` in N, where the part
+    Raises `RefusedError` where the claw meets something on its way down, and, with `pulls`, where the part is lost, or
     sticks: it is let go again then.
     """
+    if pulls:
+        # After a grip that found no part its fingers are closed.
+        here.devices.claw.release()
     plan, mover, part = job.place, here.mover, here.part
     normal = job.grasp.flange_from_part.se3().rotation[:, 2]
     above = grip * from_parts(plan.approach * normal)
@@ -49,9 +53,11 @@ def take(
     where, part.state, part.where, part.left = part.where, PartState.HELD, None, False
     note_part(context, part)
     mover.take_part(job.grasp.flange_from_part.se3(), job.grasp.size)
-    if most_pull is not None and mover.line(
+    most_pull = MOST_PULL * plan.contact_force
+    if pulls and mover.line(
         grip * from_parts(plan.contact_travel * normal), plan.contact_speed, TOUCHES, force_limit=most_pull
     ):
+        pull = float(np.linalg.norm(here.devices.arm.state().wrench[:3]))
         part.state, part.where = PartState.UNKNOWN, where
         note_part(context, part)
         here.devices.claw.release()
@@ -64,16 +70,12 @@ def take(
             f"{what} sticks, or is heavier than place.contact_force lets the claw lift: it pulled with more than "
             f"{most_pull:.0f} N and let go, at most {1e3 * plan.contact_travel:g} mm above where the part lay. Look "
             "what holds it, or raise place.contact_force",
-            Measured("pull at the part", most_pull, "N", most=most_pull),
+            Measured("pull at the part", pull, "N", most=most_pull),
         )
     mover.line(above, plan.speed, TOUCHES)
-
-
-def require_lifted(here: Workplace, context: StepContext) -> None:
-    """Raise `RefusedError` where the claw does not hold the part that it has lifted."""
-    if not here.devices.claw.holding:
-        here.part.state = PartState.UNKNOWN
-        note_part(context, here.part)
+    if pulls and not here.devices.claw.holding:
+        part.state = PartState.UNKNOWN
+        note_part(context, part)
         raise RefusedError("the claw lost the part as it lifted it; look where it fell, and at the fingers")
 
 
@@ -87,9 +89,3 @@ def _reached(here: Workplace, grip: pin.SE3, normal: Vector) -> bool:
     if not np.linalg.norm(here.devices.arm.state().wrench[:3]) <= plan.contact_force:
         return False
     return not mover.line(grip, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
-
-
-def note_part(context: StepContext, part: PartProgress) -> None:
-    """Keep in the journal what has become of the part, and where it is, if that is known."""
-    where = {} if part.where is None else {"base_from_part": to_ur(part.where).tolist()}
-    context.note(part=part.state.value, **where)

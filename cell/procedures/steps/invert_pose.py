@@ -14,7 +14,6 @@ from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion import invert_pose as register
 from cell.measure.inversion.effects.causes import find_causes, likeliest
 from cell.measure.inversion.effects.during_sweep import (
-    Droop,
     Head,
     find_droop,
     find_rocking,
@@ -23,9 +22,8 @@ from cell.measure.inversion.effects.during_sweep import (
     roll_of,
     words,
 )
-from cell.measure.reconstruction.cloud import Indices
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.steps.reconstruct import Reconstruction, together
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import NotObservable, RefusedError
@@ -73,8 +71,9 @@ def invert_pose(
         told = type(refused)(f"{refused}{text and '. '}{text}".replace("?.", "?"), *refused.numbers)
         raise told.showing(seen=refused.seen) from refused
     droop = None if taken.head is None else find_droop(scan.cloud, nominal, found.base_from_surface, taken.head)
-    by_calibration = partial(_by_calibration_and_droop, scan, droop)
+    by_calibration = scan.by_calibration
     if droop is not None:
+        by_calibration = together(by_calibration, partial(droop.motions, scan.cloud))
         try:
             found = registered(systematic=unknown, calibration=by_calibration, sweeps=scan.by_poses)
         except NotObservable as refused:
@@ -82,9 +81,9 @@ def invert_pose(
         found = replace(found, notes=(droop.words,))
     if (rocking := find_rocking(scan.cloud, nominal, found.base_from_surface, taken.times)) is None:
         return found
-    by_poses = partial(_by_poses_and_rocking, scan, taken, rocking.hz)
+    shaken = partial(rocking_motions, scan.cloud, base_from_vehicle=vehicle, times=taken.times, hz=rocking.hz)
     unknown = kinematic + rocking_covariance(rocking, vehicle, place, roll)
-    still = registered(systematic=unknown, calibration=by_calibration, sweeps=by_poses)
+    still = registered(systematic=unknown, calibration=by_calibration, sweeps=together(scan.by_poses, shaken))
     return replace(still, notes=(*found.notes, words(rocking)))
 
 
@@ -95,17 +94,6 @@ def _prior(fix: BoardFix, job: Job) -> Prior:
     mounting = np.diag([surface.prior_sigma**2] * 3 + [surface.prior_sigma_angle**2] * 3)
     spread = compose_covariance(fix.base_from_board, fix.covariance, board_from_surface, mounting)
     return Prior(fix.base_from_board * board_from_surface, spread)
-
-
-def _by_calibration_and_droop(scan: Reconstruction, droop: Droop | None, lines: Indices, rows: Indices) -> Vector:
-    moved = [scan.by_calibration(lines, rows)] + ([] if droop is None else [droop.motions(scan.cloud, lines, rows)])
-    return np.concatenate(moved, axis=2)
-
-
-def _by_poses_and_rocking(scan: Reconstruction, taken: LineTimes, hz: float, lines: Indices, rows: Indices) -> Vector:
-    vehicle = taken.base_from_vehicle
-    shaken = rocking_motions(scan.cloud, lines, rows, base_from_vehicle=vehicle, times=taken.times, hz=hz)
-    return np.concatenate([scan.by_poses(lines, rows), shaken], axis=2)
 
 
 def _told_before(refused: NotObservable, before: str) -> NotObservable:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib.metadata import entry_points
 
-from cell.config import job as job_file
 from cell.config.job import Job
 from cell.procedures.placed_part import PlacedPart
 from cell.procedures.steps import (
@@ -94,6 +93,9 @@ class Kind:
 def _enter(here: Workplace, step: JobStep, context: StepContext) -> object:
     with here.devices.gate.entered(context.token):
         context.check()
+        if (here.needs_part or here.held is not None) and step is not drive_to_target.STEP:
+            note, when = partial(place.note_part, context), f"before the step {step.name}"
+            place.require_in_claw(here.devices.claw, here.part, note, when)
         here.devices.interlocks.work_with(here.calibration.configuration)
         here.mover.hold = context.safe_point
         here.frames.begin()
@@ -109,13 +111,9 @@ PLACE = Kind(
 )
 
 
-LOAD = replace(PLACE, name=job_file.LOAD, steps=(PLACE.steps[0], pick_nest.STEP, *PLACE.steps[1:]))
+LOAD = PLACE.with_step(pick_nest.STEP, after=drive_to_target.STEP.name, name="load")
 """Places a part that it takes from a nest on the vehicle."""
-UNLOAD = Kind(
-    job_file.UNLOAD,
-    (drive_to_target.STEP, board_photo.STEP, laser_sweep.STEP, reconstruct.STEP, invert_pose.STEP, pick.STEP,
-     set_down.STEP, verify_nest.STEP),
-)  # fmt: skip
+UNLOAD = Kind("unload", (*PLACE.steps[:-1], pick.STEP, set_down.STEP, verify_nest.STEP))
 """Takes a part from its surface: the sweep looks for the part itself, which is gripped and set into a nest."""
 BUILT_IN = {kind.name: kind for kind in (PLACE, LOAD, UNLOAD)}
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
 
-from cell.measure.geometry.poses import to_ur
+from cell.measure.geometry.poses import from_ur, to_ur
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.part_pose import seen_from_below
 from cell.procedures.arm.moves import PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.grasp import GRIPPED
-from cell.procedures.steps.gripping import require_lifted, take
+from cell.procedures.steps.gripping import take
 from cell.procedures.steps.laser_sweep import check_lost_steps
 from cell.procedures.steps.place import carried_on
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -24,9 +25,6 @@ from drivers.errors import RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
-
-MOST_PULL = 3.0
-"""Times the contact force with which a part is pulled at, at most: more, and it sticks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +43,18 @@ class HeldPart:
             "sigma_mm": [round(1e3 * float(v), 4) for v in sigma[:3]],
             "sigma_mrad": [round(1e3 * float(v), 4) for v in sigma[3:]],
         }
+
+    def as_dict(self) -> dict[str, object]:
+        """For the journal: what a resumed run has to know of it."""
+        return {"base_from_flange": to_ur(self.base_from_flange).tolist(), "covariance": self.covariance.tolist()}
+
+    @classmethod
+    def of(cls, told: Mapping[str, object]) -> HeldPart:
+        """As `as_dict` told; ValueError or KeyError for what is no such record."""
+        covariance = np.array(told["covariance"], dtype=np.float64)
+        if covariance.shape != (6, 6) or not np.linalg.eigvalsh(covariance)[0] >= 0.0:
+            raise ValueError("its covariance is none")
+        return cls(from_ur(np.array(told["base_from_flange"], dtype=np.float64)), covariance)
 
 
 def _at(here: Workplace, context: StepContext) -> HeldPart:
@@ -68,10 +78,7 @@ def _at(here: Workplace, context: StepContext) -> HeldPart:
     grip = pose.base_from_surface * job.place.surface_from_part.se3() * job.grasp.flange_from_part.se3().inverse()
     part.where = pose.base_from_surface
     _lies(here, fix, pose.base_from_surface)
-    # After a grip that found no part its fingers are closed.
-    here.devices.claw.release()
-    take(here, job, grip, context, what="the part", most_pull=MOST_PULL * job.place.contact_force)
-    require_lifted(here, context)
+    take(here, job, grip, context, what="the part")
     return HeldPart(grip, pose.covariance + here.repeatability + GRIPPED)
 
 

@@ -8,9 +8,9 @@ from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import job_with_grasp, moved
 from cell.procedures.part_error import part_points
 from cell.procedures.steps.drive_to_target import VehicleArrival
-from cell.procedures.steps.gripping import require_lifted, take
+from cell.procedures.steps.gripping import take
 from cell.procedures.steps.laser_sweep import seen_on_plate
-from cell.procedures.steps.pick import MOST_PULL, HeldPart
+from cell.procedures.steps.pick import HeldPart
 from cell.procedures.steps.verify import swept_part
 from cell.procedures.steps.verify_nest import at_nest, part_in_base
 from cell.procedures.steps.workplace import JobStep, Workplace
@@ -23,6 +23,13 @@ CLOUD = "nest.ply"
 
 
 def _at(here: Workplace, context: StepContext) -> HeldPart:
+    held = here.held if here.held is not None and here.part.state is PartState.HELD else _picked(here, context)
+    here.job = job_with_grasp(here.job, here.job.grasp.flange_from_part.se3(), held.covariance)
+    here.held = held
+    return held
+
+
+def _picked(here: Workplace, context: StepContext) -> HeldPart:
     job, part, arrival = at_nest(here.job), here.part_mesh, context.made(VehicleArrival)
     assert part is not None
     if here.part.state is not PartState.NESTED:
@@ -48,17 +55,13 @@ def _at(here: Workplace, context: StepContext) -> HeldPart:
             Measured("part off its place in the nest", off, "mm", most=most),
         )
     context.note(text=f"the part lies {off:.2f} mm off its place in the nest, and is gripped where it lies")
-    grasp = here.job.grasp.flange_from_part.se3()
-    grip = fit.base_from_surface * grasp.inverse()
+    grip = fit.base_from_surface * here.job.grasp.flange_from_part.se3().inverse()
     here.part.where = fit.base_from_surface
-    # After a grip that found no part its fingers are closed.
-    here.devices.claw.release()
-    take(here, here.job, grip, context, what="the part", most_pull=MOST_PULL * here.job.place.contact_force)
-    require_lifted(here, context)
-    known = fit.covariance + here.repeatability
-    here.job = job_with_grasp(here.job, grasp, known)
-    return HeldPart(grip, known)
+    take(here, here.job, grip, context, what="the part")
+    held = HeldPart(grip, fit.covariance + here.repeatability)
+    context.note(part=here.part.state.value, held=held.as_dict())
+    return held
 
 
-# What was interrupted with the part between the fingers is left to a person.
+# What was interrupted as the claw closed is left to a person.
 STEP = JobStep(Step("pick", 600.0, on_failure=OnFailure.STOP), _at, HeldPart, needs=(VehicleArrival,))

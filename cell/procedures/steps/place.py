@@ -14,7 +14,6 @@ from cell.measure.inversion import PlacePose
 from cell.measure.inversion.disagreement import highest_standing, require_bare
 from cell.measure.inversion.effects.between_sweeps import Creep
 from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, scanned_gap
-from cell.measure.reconstruction.cloud import Indices
 from cell.motion.collision import TOUCHES
 from cell.procedures.arm.moves import Mover, PartProgress, PartState
 from cell.procedures.arm.photograph import BoardFix
@@ -23,12 +22,12 @@ from cell.procedures.grasp import expected_residual, job_with_grasp
 from cell.procedures.part_error import part_points
 from cell.procedures.steps.board_photo import require_unmoved
 from cell.procedures.steps.invert_pose import inverted
-from cell.procedures.steps.reconstruct import Reconstruction
+from cell.procedures.steps.reconstruct import Reconstruction, together
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.second_look import SecondLook, require_in_place
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import CellError, Measured, NotObservable, RefusedError
-from drivers.interfaces import Arm, ArmState, Claw, Vector
+from drivers.interfaces import Arm, ArmState, Claw
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
 
@@ -145,14 +144,14 @@ class Placing:
     def _lift(self) -> None:
         plan = self.job.place
         self.mover.line(self._flange_at(plan.approach), plan.speed, TOUCHES)
+        require_in_claw(self.claw, self.part, self.note, "on its way down; it may lie on its place")
 
     def _approach(self) -> None:
         self.progress(0.05, "approaching")
         # Not held before it: nobody would look at the surface again.
         self.mover.follow(self.mover.plan_to(self._flange_at(self.job.place.approach), "the approach pose"))
         self.check()
-        if not self.claw.holding:
-            raise RefusedError("the claw does not hold the part any more before the descent; look where it was lost")
+        require_in_claw(self.claw, self.part, self.note, "before the descent")
 
     def _descend(self) -> None:
         """The fast part, to just above the place."""
@@ -233,6 +232,20 @@ class Placing:
         self.part.left = True
 
 
+def note_part(context: StepContext, part: PartProgress) -> None:
+    """Keep in the journal what has become of the part, and where it is, if that is known."""
+    where = {} if part.where is None else {"base_from_part": to_ur(part.where).tolist()}
+    context.note(part=part.state.value, **where)
+
+
+def require_in_claw(claw: Claw, part: PartProgress, note: Callable[[PartProgress], None], when: str) -> None:
+    """Raise `RefusedError` where the claw has lost the part that it held; that is noted."""
+    if part.state is PartState.HELD and not claw.holding:
+        part.state = PartState.UNKNOWN
+        note(part)
+        raise RefusedError(f"the claw lost the part {when}. Look where it is, and at the fingers")
+
+
 def require_held(part: PartProgress) -> None:
     """Raise `RefusedError` where the part is not in the claw any more, as far as this program knows."""
     if part.state is not PartState.HELD:
@@ -261,7 +274,7 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
     placing = Placing(
         aim.job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
         part=here.part, check=context.check, progress=context.progress,
-        note=lambda part: context.note(part=part.state.value, base_from_part=to_ur(part.where).tolist()),
+        note=lambda part: note_part(context, part),
         ready=lambda: None if carriage is None else carriage.wait(30.0),
     )  # fmt: skip
     try:
@@ -302,7 +315,7 @@ class AimedPlace:
     def of(cls, here: Workplace, pose: PlacePose) -> AimedPlace:
         """By the parts of the batch before; straight at the place where they do not tell."""
         points, grasp, belongs = part_points(here.nominal), here.job.grasp, here.job.place.surface_from_part.se3()
-        unsure = np.diag([grasp.sigma**2] * 3 + [grasp.sigma_angle**2] * 3)
+        unsure = grasp.covariance
         noise = expected_residual(here.job, here.repeatability, pose, points, unsure)
         allowed, slip = here.series.allowance(points, noise), here.series.slip(points, noise)
         if allowed is None:
@@ -355,12 +368,8 @@ def carried_on(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: B
 
     Raises what `inverted` raises, and `NotObservable` where too little is known of the rate.
     """
-
-    def by_poses(lines: Indices, rows: Indices) -> Vector:
-        moved = creep.motions(scan.cloud, lines, rows, sweep.times)
-        return np.concatenate([scan.by_poses(lines, rows), moved], axis=2)
-
-    still = replace(scan, cloud=creep.undone(scan.cloud, sweep.times), by_poses=by_poses)
+    crept = together(scan.by_poses, lambda lines, rows: creep.motions(scan.cloud, lines, rows, sweep.times))
+    still = replace(scan, cloud=creep.undone(scan.cloud, sweep.times), by_poses=crept)
     plan = here.job.place
     until = APPROACH_S + plan.approach / plan.speed + plan.contact_travel / plan.contact_speed
     pose = creep.carried(inverted(here, sweep, still, fix), here.devices.clock.now() + until / here.pace.share)

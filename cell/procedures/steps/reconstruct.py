@@ -72,13 +72,14 @@ def reconstructed(here: Workplace, sweep: SweepRecord) -> Reconstruction:
         refused.showing(seen={"cloud": built})
         raise
     by_calibration, by_poses = displacements(here, sweep, cloud)
-
-    def by_both(lines: Indices, rows: Indices) -> Array:
-        return np.concatenate([by_calibration(lines, rows), by_poses(lines, rows)], axis=2)
-
-    seams = tuple(find_seams(cloud, by_both))
+    seams = tuple(find_seams(cloud, together(by_calibration, by_poses)))
     write_cloud(path, cloud, simulated)
     return Reconstruction(cloud, seams, by_calibration, by_poses)
+
+
+def together(*motions: Motions) -> Motions:
+    """How points move by the parameters of all these motions."""
+    return lambda lines, rows: np.concatenate([each(lines, rows) for each in motions], axis=2)
 
 
 def displacements(here: Workplace, sweep: SweepRecord, cloud: Cloud) -> tuple[Motions, Motions]:

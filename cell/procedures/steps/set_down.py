@@ -10,9 +10,8 @@ from cell.measure.inversion import PlacePose
 from cell.measure.inversion.part_pose import seen_from_below
 from cell.procedures.arm.touch import expected_touch
 from cell.procedures.grasp import job_with_grasp
-from cell.procedures.steps.gripping import note_part
 from cell.procedures.steps.pick import HeldPart
-from cell.procedures.steps.place import PlaceResult, Placing
+from cell.procedures.steps.place import PlaceResult, Placing, note_part
 from cell.procedures.steps.workplace import JobStep, Workplace
 from drivers.errors import RefusedError
 from drivers.interfaces import Vector
@@ -53,7 +52,8 @@ def _at(here: Workplace, context: StepContext) -> SetDown:
         raise RefusedError(f"at the nest, where [nest] of the job has it: {error}", *error.numbers) from error
     for note in () if done.touch is None else done.touch.notes:
         context.note(text=f"at the nest: {note}")
-    return SetDown(done, known + context.made(HeldPart).covariance + here.repeatability)
+    # The nest bears the part; along its floor and about its normal the part lies where the arm has let it go.
+    return SetDown(done, known * [0, 0, 1, 1, 1, 0] + context.made(HeldPart).covariance + here.repeatability)
 
 
 # A part that may have touched its nest is not set down a second time by itself.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pinocchio as pin
 
 from cell.config.job import Job
@@ -15,7 +14,6 @@ from cell.measure.inversion.flush import flush_along_edge
 from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
 from cell.measure.reconstruction import Cloud, write_cloud
-from cell.measure.reconstruction.cloud import Indices
 from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import FARTHEST_M, expected_residual
 from cell.procedures.part_error import part_covariance, part_points
@@ -23,12 +21,11 @@ from cell.procedures.placed_part import NEXT_STEP, PlacedPart, along_surface
 from cell.procedures.steps.correction import correct
 from cell.procedures.steps.laser_sweep import head_at, laser_sweep
 from cell.procedures.steps.place import PlaceResult, aside_words
-from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements
+from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements, together
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.procedures.sweep.swath import FRAMES_LOST
 from drivers.errors import DeviceFault, MisplacedError, RefusedError
-from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
 
@@ -81,7 +78,8 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
 def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left: int, context: StepContext) -> bool:
     """Whether the part lies farther off than is accepted, and the corrections that are `left` would bring it nearer."""
     plan = here.job.place
-    if found.off <= (plan.tolerance if plan.accept is None else plan.accept) and found.kept(plan):
+    # What is worn lies low in its place as well: only what it is off along the surface can be mended.
+    if found.aside <= (plan.tolerance if plan.accept is None else plan.accept) and found.kept(plan):
         return False
     known = here.job, here.repeatability, pose, found.points, found.covariance
     hope = expected_residual(*known, corrections=left)
@@ -108,15 +106,10 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
     over = pose.base_from_surface * surface_from_faces(here.job, faces)
     cloud, record = swept_part(here, head_at(here, sweep), over, context)
-    by_calibration, by_poses = displacements(here, record, cloud)
-
-    def moved(lines: Indices, rows: Indices) -> Vector:
-        return np.concatenate([by_calibration(lines, rows), by_poses(lines, rows)], axis=2)
-
     try:
         seen = find_part(
             cloud, faces, here.nominal, surface=Prior(pose.base_from_surface, pose.covariance), belongs=belongs,
-            tolerance=tolerance, moved=moved, times=record.times,
+            tolerance=tolerance, moved=together(*displacements(here, record, cloud)), times=record.times,
             base_from_vehicle=here.config.arm.vehicle_from_base.se3().inverse(),
         )  # fmt: skip
     except RefusedError as error:

@@ -35,8 +35,10 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     except RefusedError as error:
         raise MisplacedError(f"{error}. {NEXT_STEP}", *error.numbers) from error
     stated = context.made(SetDown).covariance
+    # The arm's base takes the place of a surface here.
+    seen = PartPose(pin.SE3.Identity(), fit.base_from_surface, fit.covariance, fit, beside=fit.n_points)
     found = replace(
-        PlacedPart.of(job, _in_base(fit), part_points(here.nominal), stated), axes="axes of the arm base, in its nest"
+        PlacedPart.of(job, seen, part_points(here.nominal), stated), axes="axes of the arm base, in its nest"
     )
     for note in found.notes:
         context.note(text=f"in its nest: {note}")
@@ -65,11 +67,6 @@ def part_in_base(here: Workplace, job: Job, faces: NominalSurface, swept: tuple[
         why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")
         why = why.replace("scan and board disagree: the surface", "it").replace("where the board puts it", "there")
         raise RefusedError(f"the part is not seen in its nest: {why}", *error.numbers) from error
-
-
-def _in_base(fit: PlacePose) -> PartPose:
-    """The part as seen against the arm's base, which takes the place of a surface here."""
-    return PartPose(pin.SE3.Identity(), fit.base_from_surface, fit.covariance, fit, beside=fit.n_points)
 
 
 def where_seen(job: Job) -> Job:

@@ -31,6 +31,7 @@ from statemachine.runner import StepContext
 from statemachine.step import Step
 
 if TYPE_CHECKING:
+    from cell.procedures.steps.pick import HeldPart
     from cell.procedures.sweep.stored_sweep import StoredSweep
 
 
@@ -42,16 +43,16 @@ PHOTO_RATE_HZ = 10.0
 
 @dataclass(eq=False)
 class Workplace:
-    """What every step of a job may use. `earlier` is the sweep of a run that this one resumes.
+    """What every step of a job may use.
 
-    `needs_part` is False for a run that places nothing from the claw: it may be empty then. `looks_after` is
-    True for one that looks at the placed part. `whereabouts` is kept over retries and runs: the vehicle may stand
-    anywhere when a step is done again. `sweeping` is told who takes the frames of each sweep, before it begins, and
-    where the surface is by the board (base_from_surface), `registered` where it was found. `pace` says how fast arm and
-    vehicle go, of what is planned. `looked` says whether this run has tried to look at the fine board,
-    `interim` what that said, None where nothing was to be seen. `ground` is the box around the surface below a part
-    that is to be unloaded, its lowest and highest corner, m, part frame. `series` is how the parts before this one of
-    its batch came to lie.
+    `job` changes once: a pick from a nest replaces its grasp by the measured one. `earlier` is the sweep of a run that
+    this one resumes, `held` how that had gripped its part. `needs_part`: the claw must hold the part at the beginning.
+    `looks_after` is True for a run that looks at the placed part. `whereabouts` is kept over retries and runs: the
+    vehicle may stand anywhere when a step is done again. `sweeping` is told who takes the frames of each sweep, before
+    it begins, and where the surface is by the board (base_from_surface), `registered` where it was found. `pace` is the
+    share of the planned speed. `looked` says whether this run has tried to look at the fine board, `interim` what that
+    said, None where nothing was to be seen. `ground` is the box around the surface below a part to be unloaded, its
+    lowest and highest corner, m, part frame. `series` is how the parts before this one of its batch came to lie.
     """
 
     config: CellConfig
@@ -63,6 +64,7 @@ class Workplace:
     folder: Path
     whereabouts: Whereabouts
     earlier: StoredSweep | None = None
+    held: HeldPart | None = None
     needs_part: bool = True
     looks_after: bool = False
     sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None

@@ -89,11 +89,6 @@ _FIELDS: dict[str, dict[str, object]] = {
 """By schema: its fields. Not all of them are in each message, and a reading has those of its device."""
 
 
-def json_schema(name: str) -> bytes:
-    """The JSON schema of one of this cell's own messages."""
-    return json.dumps({"title": name, "type": "object", "properties": _FIELDS[name]}).encode()
-
-
 BY_TOPIC = {topic: channel for channel in CHANNELS for topic in channel.topics}
 
 
@@ -246,7 +241,8 @@ class _Out:
 
                 self._schemas[name] = register_schema(self.writer, message_class(name))
             else:
-                self._schemas[name] = self.writer.register_schema(name, "jsonschema", json_schema(name))
+                fields = json.dumps({"title": name, "type": "object", "properties": _FIELDS[name]}).encode()
+                self._schemas[name] = self.writer.register_schema(name, "jsonschema", fields)
         return self._schemas[name]
 
 

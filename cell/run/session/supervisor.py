@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -374,7 +375,12 @@ class Cell:
         self._runs.require_no_late_stop()
         stops = self.stops
         ready = ReadyJob.read(job, self.config, until, script, calibrates=is_whole(self.simulated))
-        if self.simulated is not None:
+        if before is not None and is_whole(self.simulated) and not self.devices.claw.holding:
+            # The part of a simulated world that has ended lies in its nest again.
+            before = replace(before, held=None)
+        if before is not None and before.held is not None:
+            info["held"] = before.held.as_dict()
+        elif self.simulated is not None:
             from cell.devices.simulated.described import Described
 
             self.simulated.make_ready(Described.of(job))

@@ -30,13 +30,14 @@ from cell.procedures.steps.kinds import kind_of
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.calibration import arm_table
-from cell.run.job_run import JobRun
+from cell.run.job_run import JobRun, ReadyJob
 from cell.run.recorded_work import Hands, RecordedWork, classify
 from cell.run.resumption import mesh_source
 from cell.run.runs import Run
 from drivers.errors import CellError
 from drivers.interfaces import Frame, Vector
 from sim_backends.direct.camera import Shot
+from statemachine.runner import NO_SCRIPT
 from statemachine.step import Event
 
 Progress = Callable[[float, str], None]
@@ -171,17 +172,10 @@ class _WholeJob:
         record.kinematic, record.placing = workplace.kinematic, workplace.repeatability
         self.cell.world.stand(stood)
         job_run = JobRun(
-            run,
-            self.config,
-            devices,
-            self.job,
-            self.nominal,
-            record.calibration,
-            {**self.cell.facts, "mesh": mesh_source(self.nominal.source)},
-            kind_of(self.job),
-            inline=(self._follow,),
-            truth=self.cell.truth,
-        )
+            run, self.config, devices, ReadyJob(self.job, kind_of(self.job), self.nominal, NO_SCRIPT, {}),
+            calibration=record.calibration, info={**self.cell.facts, "mesh": mesh_source(self.nominal.source)},
+            inline=(self._follow,), truth=self.cell.truth,
+        )  # fmt: skip
         with _Timed(record, "job"):
             ended = job_run.perform(folder, whereabouts)
         record.results, record.folder = dict(ended.results), ended.folder

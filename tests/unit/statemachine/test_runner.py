@@ -117,14 +117,6 @@ def test_a_signal_after_the_end_of_the_run_is_kept(tmp_path):
     assert bench.control.signal == signal.SIGINT
 
 
-def test_a_resumed_run_does_only_what_is_open(tmp_path):
-    bench = Bench(tmp_path, laser_sweep=lambda context: context.results["board_photo"] + "!")
-    result = bench.run(done={"drive_to_target": None, "board_photo": "stored"})
-    assert bench.log[0] == "laser_sweep"
-    assert result.results["laser_sweep"] == "stored!"
-    assert [record.state for record in result.steps[:3]] == ["resumed", "resumed", "done"]
-
-
 def test_a_journal_that_fails_ends_the_run_safe(tmp_path):
     bench = Bench(tmp_path, laser_sweep=lambda context: bench.runner.journal.close())
     result = bench.runner.run()

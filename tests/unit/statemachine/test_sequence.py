@@ -62,12 +62,6 @@ def test_no_step_is_left_before_it_is_done(step):
     assert sequence.state == step
 
 
-def test_a_job_with_done_steps_starts_at_the_first_open_one():
-    sequence = Sequence(STEPS)
-    sequence.facts.done |= {"drive_to_target", "board_photo"}
-    assert sequence.fire(JobTrigger.START) == "laser_sweep"
-
-
 @pytest.mark.parametrize("step", STEPS)
 def test_pause_and_recovery_come_back_to_the_step_they_left(step):
     sequence = at(step)

@@ -219,10 +219,7 @@ class ConsoleController:
         return f"{what} has begun" if ended.is_set() else f"starting {what} …"
 
     def _resume(self, client: str, words: Words) -> str:
-        def resume() -> object:
-            return self.cell.resume(words["run"], script=self._script(self.job))
-
-        return self._long(client, "resumed job", resume)
+        return self._long(client, "resumed job", lambda: self.cell.resume(words["run"], script=self._script(self.job)))
 
     def _home(self, client: str, words: Words) -> str:
         return self._long(client, "homing", lambda: self.cell.home(words["device"]))

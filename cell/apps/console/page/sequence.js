@@ -3,7 +3,7 @@
 import { byId, el, remake, say, seconds, show, words } from './dom.js';
 import { ended } from './status.js';
 
-const SIGNS = { open: '○', active: '▶', done: '✓', failed: '✗', resumed: '↺' };
+const SIGNS = { open: '○', active: '▶', done: '✓', failed: '✗' };
 const MOST_EVENTS = 100;
 // How long after an answer a button stays shut, until the state tells of what was begun.
 const SEEN_MS = 400;

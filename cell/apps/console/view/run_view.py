@@ -103,7 +103,8 @@ class RunView:
             case "step_failed" if row is not None:
                 row |= {"state": "failed", "reason": str(data["reason"])}
             case "fault":
-                fault = {"device": _device(str(data["code"])), "code": str(data["code"]), "text": str(data["reason"])}
+                code = str(data["code"])
+                fault = {"device": code.rpartition(".")[0], "code": code, "text": str(data["reason"])}
                 self.faults.append({**fault, "remedy": str(data.get("remedy", "")), "t": event.at})
                 del self.faults[:-KEPT_FAULTS]
             case "confirm_needed":
@@ -141,10 +142,6 @@ def words(event: Event) -> str:
 
 def _row(name: str) -> dict[str, Any]:
     return {"name": name, "state": "open", "duration_s": None, "retries": 0, "reason": ""}
-
-
-def _device(code: str) -> str:
-    return code.partition(".")[0] if "." in code else ""
 
 
 WIDTH = 640

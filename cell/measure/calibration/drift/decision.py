@@ -123,13 +123,9 @@ def verdict(evidences: Mapping[str, DriftEvidence], states: Mapping[str, Adjustm
     figures = [figure for name in evidences for figure in _figures(name, evidences[name], states[name])]
     seen = detectable(evidences, states, tests, scores=scores, factors=drawn, threshold=threshold)
     return DriftVerdict(
-        float(log_mean(found[None])[0]),
-        threshold,
-        fit,
-        _all_suspects(evidences, tests, threshold),
-        figures,
+        float(log_mean(found[None])[0]), threshold, fit, _all_suspects(evidences, tests, threshold), figures,
         detectable=seen,
-    )
+    )  # fmt: skip
 
 
 def _all_suspects(

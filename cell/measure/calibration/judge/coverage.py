@@ -69,16 +69,11 @@ class Coverage:
                 away.append(residual / sigma * view.stripe_sigma)
                 reach.append(state.plane.intersect(state.camera.rays(view.stripe))[:, 2])
         return cls(
-            (state.camera.width, state.camera.height),
-            np.concatenate([np.zeros((0, 2)), *dots]),
-            np.concatenate([np.zeros((0, 2)), *off]),
-            stripe=np.concatenate([np.zeros((0, 2)), *stripe]),
-            stripe_off=np.concatenate([np.zeros(0), *away]),
-            stripe_depth=np.concatenate([np.zeros(0), *reach]),
-            depth=np.array(depth),
-            tilt=np.array(tilt).reshape(-1, 2),
-            rail=np.asarray(state.rails),
-        )
+            (state.camera.width, state.camera.height), np.concatenate([np.zeros((0, 2)), *dots]),
+            np.concatenate([np.zeros((0, 2)), *off]), stripe=np.concatenate([np.zeros((0, 2)), *stripe]),
+            stripe_off=np.concatenate([np.zeros(0), *away]), stripe_depth=np.concatenate([np.zeros(0), *reach]),
+            depth=np.array(depth), tilt=np.array(tilt).reshape(-1, 2), rail=np.asarray(state.rails),
+        )  # fmt: skip
 
     def cells(self, pixels: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Column and row (n,) of the cell of `GRID` in which pixels (n, 2) lie."""
@@ -321,16 +316,10 @@ def _view(joint: Joint, board: BoardSpec, at: Array, turn: Array, rail: float) -
     sigma = float(np.median(np.concatenate([view.sigma for view in joint.views])))
     stripe_sigma = float(np.median(np.concatenate([view.stripe_sigma for view in lit])))
     return ViewData(
-        points[inside],
-        pixels[inside],
-        np.full(int(inside.sum()), sigma),
-        dot_radius=radius,
-        stripe=stripe,
-        stripe_sigma=np.full(len(stripe), stripe_sigma),
-        base_from_flange=flange,
-        rail=rail,
+        points[inside], pixels[inside], np.full(int(inside.sum()), sigma), dot_radius=radius, stripe=stripe,
+        stripe_sigma=np.full(len(stripe), stripe_sigma), base_from_flange=flange, rail=rail,
         stripe_axis=lit[0].stripe_axis,
-    )
+    )  # fmt: skip
 
 
 def _stripe(state: AdjustmentState, board: BoardSpec, camera_from_board: pin.SE3, radius: float, count: int) -> Array:

@@ -72,10 +72,6 @@ class Scale:
         beyond = min(1.0, off / max(UNSURE_SIGMAS * self.sigma, 1e-12))
         return 1.0 if self.believed else math.hypot(beyond, min(self.sigma, NAMED_SHARE) / max(off, 1e-12))
 
-    def with_focal(self, share: float) -> Scale:
-        """The same for a focal length that is known to `share` of itself: the boards' distances follow it."""
-        return replace(self, sigma=math.hypot(self.sigma, share))
-
     @property
     def unit(self) -> str | None:
         """The unit in which the arm's positions seem to be; None when it is the metre or none that is known."""

@@ -136,13 +136,9 @@ class Adjustment:
         inverse = normal.inverse()
         expected = sum(expected_cost(name, block, inverse) for name, block in normal.groups.items())
         return Adjusted(
-            state,
-            inverse.shared,
-            normal.total / expected,
-            *self.residual_rms(state),
-            self.priors,
+            state, inverse.shared, normal.total / expected, *self.residual_rms(state), self.priors,
             {name: _scatter(normal, inverse, name) for name in ("shift", "turn", "rail")},
-        )
+        )  # fmt: skip
 
     def residual_rms(self, state: AdjustmentState) -> tuple[float, float]:
         """RMS of the dots in px (per component) and of the stripe's distances from the board in m; NaN when unseen."""

@@ -160,7 +160,8 @@ def choose_solution(
         "closed form (Park-Martin)", plain, views, held, left=follow, pictures=pictures.covariance, joint=False
     )
     sound = [closed, *(s for s in tried if not _bent(s, pictures))]
-    return Choice(min(sound, key=_handicapped), closed, [closed, *tried], arm)
+    chosen = min(sound, key=lambda s: _or_last(s) / (WORTH_MOVING if s.camera_free else 1.0))
+    return Choice(chosen, closed, [closed, *tried], arm)
 
 
 def with_doubt_of_camera(choice: Choice, pictures: Intrinsics) -> tuple[Choice, Intrinsics]:
@@ -185,10 +186,6 @@ def with_doubt_of_camera(choice: Choice, pictures: Intrinsics) -> tuple[Choice, 
 def _or_last(solution: Solution) -> float:
     figure = solution.figure()
     return figure if np.isfinite(figure) else np.inf
-
-
-def _handicapped(solution: Solution) -> float:
-    return _or_last(solution) / (WORTH_MOVING if solution.camera_free else 1.0)
 
 
 def _bent(solution: Solution, pictures: Intrinsics) -> bool:

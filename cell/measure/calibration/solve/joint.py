@@ -142,16 +142,11 @@ def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> ViewData:
         stripe, sigma = stripe_means(profile, rows, STRIPE_POINTS)
     return ViewData(
         points=np.zeros((0, 3)) if view is None else view.object_points,
-        pixels=np.zeros((0, 2)) if view is None else view.pixels,
-        sigma=np.zeros(0) if view is None else view.sigma,
-        dot_radius=0.0 if view is None else view.dot_radius,
-        stripe=stripe,
-        stripe_sigma=sigma,
-        base_from_flange=observation.base_from_flange,
-        rail=observation.rail_position,
-        stripe_axis=1 if profile is not None and profile.axis == "columns" else 0,
-        same_rest=observation.same_rest,
-    )
+        pixels=np.zeros((0, 2)) if view is None else view.pixels, sigma=np.zeros(0) if view is None else view.sigma,
+        dot_radius=0.0 if view is None else view.dot_radius, stripe=stripe, stripe_sigma=sigma,
+        base_from_flange=observation.base_from_flange, rail=observation.rail_position,
+        stripe_axis=1 if profile is not None and profile.axis == "columns" else 0, same_rest=observation.same_rest,
+    )  # fmt: skip
 
 
 def start_state(staged: Staged) -> AdjustmentState:

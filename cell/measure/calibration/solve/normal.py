@@ -103,18 +103,11 @@ def dots_block(state: AdjustmentState, view: ViewData, flange: pin.SE3, rail: fl
     hand, board = state.flange_from_camera, state.base_from_board
     pixels, jacobian = np.empty(view.pixels.shape), np.empty((len(view.points), 2, COLUMNS))
     dots_terms(
-        state.camera.parameters,
-        board.rotation,
-        flange.rotation,
-        hand=hand.rotation,
-        places=np.array([board.translation, flange.translation, hand.translation]),
-        rail=float(rail),
-        travel=np.ascontiguousarray(state.rail_direction, dtype=np.float64),
-        points=np.ascontiguousarray(view.points),
-        radius=float(view.dot_radius),
-        pixels=pixels,
-        jacobian=jacobian,
-    )
+        state.camera.parameters, board.rotation, flange.rotation, hand=hand.rotation,
+        places=np.array([board.translation, flange.translation, hand.translation]), rail=float(rail),
+        travel=np.ascontiguousarray(state.rail_direction, dtype=np.float64), points=np.ascontiguousarray(view.points),
+        radius=float(view.dot_radius), pixels=pixels, jacobian=jacobian,
+    )  # fmt: skip
     return view.pixels - pixels, jacobian
 
 

@@ -99,17 +99,11 @@ class ScanCalibration:
         state, reference, bow = joint.adjusted.state, Reference.of(joint.adjusted), joint.adjusted.bow or FLAT
         assert state.plane is not None
         return cls(
-            state.camera,
-            state.plane,
-            state.rail_direction,
-            flange_from_camera=state.flange_from_camera,
-            covariance=reference.covariance[:KEPT, :KEPT],
-            quality=Quality.of(joint),
-            reference=reference,
-            bow_sigma=bow.sigma * joint.adjusted.inflation,
-            bow_gain=bow.gain[:KEPT],
+            state.camera, state.plane, state.rail_direction, flange_from_camera=state.flange_from_camera,
+            covariance=reference.covariance[:KEPT, :KEPT], quality=Quality.of(joint), reference=reference,
+            bow_sigma=bow.sigma * joint.adjusted.inflation, bow_gain=bow.gain[:KEPT],
             notes=(*((bow.words,) if bow.sigma else ()), *(joint.size.notes if joint.size else ())),
-        )
+        )  # fmt: skip
 
     def flange_from_camera_at(self, rail_position: float) -> pin.SE3:
         """The camera's pose in the flange frame at a rail position in m."""
@@ -204,18 +198,12 @@ class ScanCalibration:
             np.array(data["rail_direction"], dtype=np.float64),
             flange_from_camera=from_matrix(data["flange_from_camera"]),
             covariance=np.array(data["covariance"], dtype=np.float64).reshape(KEPT, KEPT),
-            quality=Quality(**data["quality"]),
-            reference=Reference.read(data.get("reference")),
+            quality=Quality(**data["quality"]), reference=Reference.read(data.get("reference")),
             bow_sigma=float(plane.get("bow_sigma", 0.0)),
             bow_gain=np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
-            notes=tuple(data.get("notes", ())),
-            witness=PlateLine.read(data.get("witness")),
-            confirmed=confirmed,
-            timing=timing,
-            shutter=shutter,
-            unread=tuple(unread),
-            refused=str(data.get("refused", "")),
-        )
+            notes=tuple(data.get("notes", ())), witness=PlateLine.read(data.get("witness")), confirmed=confirmed,
+            timing=timing, shutter=shutter, unread=tuple(unread), refused=str(data.get("refused", "")),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

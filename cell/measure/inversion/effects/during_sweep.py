@@ -70,7 +70,8 @@ def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.S
     sums = [np.bincount(of, scan.points[rows.index, axis], minlength=len(good)) for axis in range(3)]
     places = np.column_stack(sums)[good] / count[good, None]
     sweeps = cloud.sweep_of[good]
-    made = [_Sweep.of(times[good][here], mean[here], places[here]) for here in _each(sweeps)]
+    lines_of = [np.flatnonzero(sweeps == k) for k in np.unique(sweeps)]
+    made = [_Sweep.of(times[good][here], mean[here], places[here]) for here in lines_of]
     known = [sweep for sweep in made if sweep is not None]
     if sum(len(sweep.times) for sweep in known) < LEAST_LINES:
         return None
@@ -209,11 +210,6 @@ def words(rocking: Rocking) -> str:
         f"surface seems to go up and down by {1e3 * rocking.height:.3f} mm; the pose allows for rocking, and the "
         "stated uncertainty has what it does while the part is put down"
     )
-
-
-def _each(sweeps: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """The places (n,) of each sweep's lines."""
-    return [np.flatnonzero(sweeps == k) for k in np.unique(sweeps)]
 
 
 def _waves(t: Array, hz: float) -> Array:

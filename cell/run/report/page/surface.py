@@ -18,7 +18,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from cell.config.job import LOAD
 from cell.measure.geometry.poses import from_ur, transform
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.part_pose import seen_from_above
@@ -118,7 +117,7 @@ def _surface(folder: Path, report: Report) -> tuple[pin.SE3, NominalSurface]:
         if hashlib.sha256(file.read_bytes()).hexdigest() != told:
             raise _NotKnown(f"{file.name} was changed since the run: it is not the surface that was scanned for")
         nominal = NominalSurface.load(file, unit=unit)
-        if job.get("nest") is not None and job["job"]["kind"] != LOAD:
+        if job.get("nest") is not None and job["job"]["kind"] != "load":
             nominal = seen_from_above(nominal, surface_from_part)
     except (OSError, ValueError, KeyError, TypeError, CellError) as error:
         raise _NotKnown(f"the drawn surface cannot be read any more: {error}") from error

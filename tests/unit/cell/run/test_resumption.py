@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cell.config.job import load_job
+from cell.procedures.steps.pick import HeldPart
 from cell.procedures.sweep.stored_sweep import FILE
 from cell.run.folder import is_going, run_row
 from cell.run.resumption import UnfinishedRun, job_hash, job_source
@@ -114,6 +116,23 @@ def placing(folder: Path, *parts: str) -> Path:
 def test_a_part_that_is_not_known_to_be_held_is_looked_at_first(tmp_path: Path, parts: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError, match=r"[Ll]ook (at the part|what has become)"):
         UnfinishedRun.find(placing(tmp_path, *parts))
+
+
+def test_how_a_part_from_its_nest_is_held_is_known_until_it_is_gripped_again(tmp_path: Path) -> None:
+    told = HeldPart(pin.SE3.Identity(), 1e-8 * np.eye(6)).as_dict()
+    run, _ = cut_short(tmp_path)
+    journal = Journal(run.folder, "later", run.info)
+    for more in ({"part": "unknown"}, {"part": "held"}, {"part": "held", "held": told}):
+        journal.event("note", "pick", more)
+    held = UnfinishedRun.find(run.folder).held
+    assert held is not None and held.as_dict() == told
+    journal.event("note", "verify", {"part": "held"})
+    journal.close()
+    with pytest.raises(ConfigError, match="how the claw holds it is not known"):
+        UnfinishedRun.find(run.folder)
+    Journal(run.folder, "last", {**run.info, "held": {**told, "covariance": [0.0]}}).close()
+    with pytest.raises(ConfigError, match="how the claw holds it is not known"):
+        UnfinishedRun.find(run.folder)
 
 
 def damaged(data: bytes, count: int) -> Iterator[bytes]:

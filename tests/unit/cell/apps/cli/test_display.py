@@ -261,4 +261,10 @@ def test_the_next_command_names_a_cell_that_is_elsewhere(tmp_path: Path) -> None
     (tmp_path / "my cell" / "cell.toml").touch()
     item = {**report, "outcome": "refused", "job_file": f"{job_path('swap')}#2"}
     assert str(next_step(item, folder)).endswith(" -j swap#2")
+    down = {**item, "part": "released", "next_item": f"{job_path('tray4')}#3"}
+    assert str(next_step(down, folder)).endswith(" -j tray4#3")
+    assert " -j tray4#3: the next item; " in str(next_step({**down, "outcome": "placed"}, folder))
+    for kind, outcome in (("unload", "aborted"), ("load", "refused")):
+        held = {**report, "part": "held", "job_kind": kind, "outcome": outcome}
+        assert str(next_step(held, folder)).startswith("take the part out of the claw; ")
     assert next_step(report, folder) == f"cell resume aaaa -c '{tmp_path}/my cell/cell.toml': go on with the job"

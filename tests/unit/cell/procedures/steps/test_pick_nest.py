@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -105,3 +106,26 @@ def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_r
         # Both are gone: a person makes all ready again.
         again = cell.run(f"{file}#1", until="drive_to_target")
         assert (again.outcome, again.report["part"], world.parts) == ("done", "at the station", 2)
+
+
+def test_a_part_that_the_claw_took_from_its_nest_is_placed_by_the_run_that_resumes(
+    placed_pot: JobRecord, calibrated_folder: Path
+) -> None:
+    with Cell.open(sim="all", seed=placed_pot.seed, clock="virtual", job="load") as cell:
+
+        def until(step: str, text: str) -> Callable[[Event], None]:
+            def end(event: Event) -> None:
+                if event.step == step and text in str(event.data.get("text")) and cell.current is not None:
+                    cell.current.abort("seen enough")
+
+            return end
+
+        # Close above the surface, from where the arm goes straight up at first; and before the step that picks.
+        first = cell.run("load", observer=until("place", "feeling"))
+        second = cell.resume(observer=until("drive_to_target", "in sight"))
+        assert [(run.outcome, run.report["part"]) for run in (first, second)] == [("aborted", "held")] * 2
+        done = cell.resume()
+        assert (done.outcome, done.report["part"]) == ("placed", "released"), done.reason
+        assert np.array_equal(done.results["pick"].covariance, first.results["pick"].covariance)
+        assert list(first.folder.glob("frames/nest-*")) and not list(done.folder.glob("frames/nest-*"))
+        assert isinstance(cell.simulated, VirtualCell) and cell.simulated.world.collisions.found == ()

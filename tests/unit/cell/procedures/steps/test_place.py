@@ -276,8 +276,9 @@ def test_a_claw_that_lost_its_part_does_not_go_down() -> None:
     site = Site()
     site.cell.devices.claw.bare.release()
     site.heights.clear()
-    with pytest.raises(RefusedError, match="does not hold the part any more before the descent"):
+    with pytest.raises(RefusedError, match="the claw lost the part before the descent"):
         site.place()
+    assert site.noted == [PartState.UNKNOWN]
     assert site.height_above() > 0.9 * JOB.place.approach
     assert min(site.heights) > site.arm.state().flange[2] - 0.002
 

@@ -146,6 +146,24 @@ def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(
     assert (np.abs(found.flush.higher - lifted(found.flush.places, moved(0.1e-3, z=0.05e-3))) < found.flush.noise).all()
 
 
+def test_a_vehicle_that_was_pushed_since_the_sweep_does_not_make_the_part_look_turned(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    pushed = list[str]()
+
+    def push(cell: VirtualCell, text: str) -> None:
+        if not pushed:
+            stands, surface = cell.world.vehicle.world_from_vehicle, cell.world.scene.world_from_surface
+            turn = surface @ motion(turn=(0, 0, 12)) @ np.linalg.inv(surface)
+            cell.world.vehicle.world_from_vehicle = lambda t: turn @ stands(t)  # type: ignore[method-assign]
+        pushed.append(text)
+
+    found = LyingPart(placed_pot, tmp_path, heard=push).looked(moved(0.1e-3))
+    error = difference(found.seen.surface_from_part, moved(0.1e-3))
+    assert np.linalg.norm(error[:3]) < 0.03e-3 and np.abs(error[3:]).max() < 0.3e-3
+    assert re.search("surface or vehicle was pushed: it stands 0.* mm and 1[12].. mrad from", found.likely)
+
+
 def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lies(
     placed_pot: JobRecord, tmp_path: Path
 ) -> None:
