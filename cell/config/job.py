@@ -164,7 +164,7 @@ Edge = Annotated[float, quantity("mm", 1, 1_000)]
 
 
 class GraspSection(Table):
-    """How the claw holds the part, and how exactly: nothing of the cell sees the part before it is placed."""
+    """How the claw holds the part, and how exactly. A `load` measures that in the nest: its `sigma` does not count."""
 
     flange_from_part: Mounting
     size: tuple[Edge, Edge, Edge]
@@ -225,15 +225,14 @@ class NestSection(Table):
 class BatchSection(Table):
     """What a batch does after a refusal that left its part untouched: it ends, asks a person, or tries the next part.
 
-    A part that is misplaced, a fault and an abort always end it. Nothing that is made or measured rests on this.
+    A part that is misplaced, a fault and an abort always end it. No measurement depends on it.
     """
 
     on_refusal: Literal["end", "ask", "skip"] = "end"
 
 
 class ItemSection(Table):
-    """One part of several: its kind, and where its nest and its surface are, if not where [nest] and [surface] have
-    them. Items are done one after the other."""
+    """One part of several: its kind, its nest and its surface. What is left out is as in [nest] and [surface]."""
 
     kind: Literal["load", "unload"]
     base_from_part: Mounting | None = None

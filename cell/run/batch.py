@@ -1,7 +1,7 @@
 """A batch: one job for several parts, a run each, and what came of them as counts and distributions.
 
-Between two runs the next part comes into the claw. A simulated world puts it there by itself; at a real cell a person
-does, who is asked in a recorded run of its own: nothing moves before that is confirmed.
+Between two runs the next part is made ready. A simulated world does that by itself; at a real cell a person is asked in
+a recorded run of its own: nothing moves before the answer.
 """
 
 from __future__ import annotations

@@ -303,7 +303,7 @@ class PartState(Enum):
 class PartProgress:
     """What has become of the part, kept beside the step: a run may be ended by others while the part is on its way.
 
-    `where` is base_from_part at the release; `left` tells whether the arm has gone up from there.
+    `where` is base_from_part of a part that lies, None while it is held; `left` tells whether the arm has gone up.
     """
 
     state: PartState = PartState.HELD

@@ -21,8 +21,8 @@ from statemachine.step import OnFailure, Step
 
 @dataclass(frozen=True, eq=False)
 class SetDown:
-    """How the part was `put` into its nest, and `covariance` (6, 6), m² and rad², of where that is known to have put
-    it: of the nest, of how it was held, and of the arm. Nobody has looked at it there."""
+    """How the part was `put` into its nest. `covariance` (6, 6), m² and rad², is what nest, grip and arm leave open.
+    Nobody has looked at the part there."""
 
     put: PlaceResult
     covariance: Vector

@@ -341,8 +341,8 @@ class Cell:
     ) -> RunOutcome:  # fmt: skip
         """Do the job of a run that was aborted, faulted or cut short, as a new run, and wait for its end.
 
-        The vehicle stays where it stands if it sees the board from there, and what was swept is not swept again if
-        the board has not moved. It ends after the same step as that run was to end.
+        If the vehicle sees the board, it stays where it is. A finished sweep is used again if the board has not
+        moved. If that run had `until`, this one stops after the same step.
 
         Args:
             run: The run's name, the end of it, or its folder; without it the newest.

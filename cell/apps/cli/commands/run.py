@@ -26,10 +26,10 @@ if TYPE_CHECKING:
     from statemachine.step import Event
 
 UntilOption = Annotated[
-    str | None, typer.Option(help="End the run, done, after the step of this name.", autocompletion=options.steps)
+    str | None, typer.Option(help="Stop after this step; the run then ends done.", autocompletion=options.steps)
 ]
 CountOption = Annotated[
-    int | None, typer.Option("--count", help="A batch: for so many parts, 1 to 10000, or rounds of items.")
+    int | None, typer.Option("--count", help="Run a batch: this many parts, 1 to 10000, or rounds of items.")
 ]
 AtStartOption = Annotated[
     bool, typer.Option("--at-start", help="The vehicle stands at the job's start pose: somebody has looked.")
@@ -166,13 +166,17 @@ def _perform_batch(
 
     require_count(count)
     if partly:
-        raise ConfigError("a batch does whole jobs, shown here: leave out --until and --console, or name a single part")
+        raise ConfigError(
+            "a batch does whole jobs, shown here: leave out --until and --console, or name one item, such as tray4#2"
+        )
     with ProgressDisplay(compiles=True) as display, opened() as cell:
-        # In the background nobody reads a terminal: who tries is stopped.
+        # The system stops a process in the background that reads the terminal.
         here = not elsewhere and _at_terminal()
         if not (here or elsewhere or is_whole(cell.simulated)):
-            unasked = "there is no terminal to ask whether the next part is in the claw: run this in one, or with "
-            raise ConfigError(f"{unasked}--ask-elsewhere, and answer with `cell confirm`")
+            raise ConfigError(
+                "there is no terminal to ask whether the next part is in the claw: run this in one, or add "
+                "--ask-elsewhere and answer with `cell confirm`"
+            )
 
         def told(event: Event) -> None:
             display(event)
@@ -220,7 +224,7 @@ def resume(
     json: JsonOption = False,
     noise: NoiseOption = False,
 ) -> None:
-    """Go on with a run that was aborted, faulted or cut short: its job again, without sweeping what still holds.
+    """Run the job of an aborted, faulted or cut-short run again. A sweep that still holds is not repeated.
 
     A dry run's world has ended with it: its job is done again in the same simulated world from the start.
     """
