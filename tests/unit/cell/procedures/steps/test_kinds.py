@@ -100,7 +100,7 @@ def test_what_a_step_makes_serves_whoever_needs_a_base_of_it() -> None:
 
 
 def test_a_step_that_made_something_else_has_failed() -> None:
-    site = cast(Any, SimpleNamespace())
+    site = cast(Any, SimpleNamespace(needs_part=False, held=None))
     gate = SimpleNamespace(entered=nullcontext)
     site.devices = SimpleNamespace(gate=gate, interlocks=SimpleNamespace(work_with=print))
     site.calibration, site.mover = SimpleNamespace(configuration=""), SimpleNamespace()
