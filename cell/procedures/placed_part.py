@@ -185,10 +185,7 @@ class PlacedPart:
         something at an edge is raised as well. So the first of them that is clear counts.
         """
         if self.seen.moved is not None:
-            shift, turn = (1e3 * float(np.linalg.norm(v)) for v in (self.seen.moved[:3], self.seen.moved[3:]))
-            return (
-                f"surface or vehicle was pushed: it stands {shift:.2f} mm and {turn:.1f} mrad from where it was swept"
-            )
+            return self.pushed[0]
         x, y, z, about_x, about_y, about_z = np.abs(self._times)
         times = {"shifted": max(x, y, about_z), "tilted": max(about_x, about_y)}
         times["raised" if self._times[2] > 0.0 else "deep"] = z
@@ -242,8 +239,17 @@ class PlacedPart:
             *((ROCKED.format(1e3 * self.seen.rocked),) if self.seen.rocked else ()),
             *(self.flush.notes if self.flush else (NO_FLUSH,) * bool(self.seen.beside)),
             *((more,) if np.abs(self._times).max() > CLEARLY else ()),
+            *self.pushed,
             *(f"not seen of the placed part: {motion}" for motion in self.unseen),
         )
+
+    @property
+    def pushed(self) -> tuple[str, ...]:
+        """For people: how far surface or vehicle were pushed since the surface was swept; nothing if they were not."""
+        if self.seen.moved is None:
+            return ()
+        shift, turn = (1e3 * float(np.linalg.norm(v)) for v in (self.seen.moved[:3], self.seen.moved[3:]))
+        return (f"surface or vehicle was pushed: it stands {shift:.2f} mm and {turn:.1f} mrad from where it was swept",)
 
     def summary(self) -> dict[str, object]:
         """Figures for journal and report."""

@@ -395,22 +395,11 @@ class MessageFeedback(Feedback):
             trouble = self._trouble(commanded=True)
         self._require_young(min(moved, counted, reported + _SYSTEM_STATE_SLACK_S), max_age)
         return VehicleState(
-            stamp=min(moved, counted),
-            x=x,
-            y=y,
-            yaw=yaw,
-            speed=motion["Speed"],
-            yaw_rate=motion["YawRate"],
-            command_mode=system["Mode"] == CAN_MODE,
-            braked=braked,
-            emergency_stop=system["State"] == _EMERGENCY_STOP,
-            error_bits=int(system["ErrorBits"]),
-            battery_volts=round(system["BatteryVoltage"], 1),
-            trouble=trouble,
-            warnings=system_warnings(int(system["ErrorBits"])),
-            interruptions=interruptions,
-            interruption=interruption,
-        )
+            stamp=min(moved, counted), x=x, y=y, yaw=yaw, speed=motion["Speed"], yaw_rate=motion["YawRate"],
+            command_mode=system["Mode"] == CAN_MODE, braked=braked, emergency_stop=system["State"] == _EMERGENCY_STOP,
+            error_bits=int(system["ErrorBits"]), battery_volts=round(system["BatteryVoltage"], 1), trouble=trouble,
+            warnings=system_warnings(int(system["ErrorBits"])), interruptions=interruptions, interruption=interruption,
+        )  # fmt: skip
 
     def check(self, *, in_command: bool, driving: bool) -> None:
         """Raise the `DeviceFault` that the feedback shows: vehicle.two_vehicles, vehicle.silent,

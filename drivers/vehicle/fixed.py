@@ -33,18 +33,9 @@ class FixedVehicle:
         """At rest, braked and in command, as of now."""
         self._require_open()
         return VehicleState(
-            stamp=self._clock.now(),
-            x=0.0,
-            y=0.0,
-            yaw=0.0,
-            speed=0.0,
-            yaw_rate=0.0,
-            command_mode=True,
-            braked=True,
-            emergency_stop=False,
-            error_bits=0,
-            battery_volts=None,
-        )
+            stamp=self._clock.now(), x=0.0, y=0.0, yaw=0.0, speed=0.0, yaw_rate=0.0, command_mode=True, braked=True,
+            emergency_stop=False, error_bits=0, battery_volts=None,
+        )  # fmt: skip
 
     def check(self) -> None:
         """It has no faults."""

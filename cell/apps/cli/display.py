@@ -86,7 +86,7 @@ def next_step(report: Mapping[str, object], folder: Path) -> str | None:
     match outcome:
         case "done":
             return f"cell report {name}{where}: what was measured; nothing was placed"
-        case "placed" if "next_item" in report:
+        case "placed" if _next_item(report):
             return f"{again} -j {_next_job(report)}: the next item; cell report {name}{where}: this one"
         case "placed":
             return f"cell report {name}{where} --html: all of it as a page; cell export{where}: the cloud"
@@ -117,9 +117,15 @@ def _dry_run(report: Mapping[str, object]) -> str:
     return " ".join(["cell dry-run", *options])
 
 
+def _next_item(report: Mapping[str, object]) -> object:
+    """The item after the one whose part is down, if any: not in a dry run, whose next one has a world of its own."""
+    return None if report.get("simulated") is True or report.get("part") != "released" else report.get("next_item")
+
+
 def _next_job(report: Mapping[str, object]) -> str:
-    """Another one of that job, or the item after the one whose part is down."""
-    return _job({"job_file": report["next_item"]} if "next_item" in report and report["part"] == "released" else report)
+    """Another one of that job, or its next item."""
+    item = _next_item(report)
+    return _job({"job_file": item} if item else report)
 
 
 def _job(report: Mapping[str, object]) -> str:

@@ -52,8 +52,7 @@ def _at(here: Workplace, context: StepContext) -> SetDown:
         raise RefusedError(f"at the nest, where [nest] of the job has it: {error}", *error.numbers) from error
     for note in () if done.touch is None else done.touch.notes:
         context.note(text=f"at the nest: {note}")
-    # The nest bears the part; along its floor and about its normal the part lies where the arm has let it go.
-    return SetDown(done, known * [0, 0, 1, 1, 1, 0] + context.made(HeldPart).covariance + here.repeatability)
+    return SetDown(done, known + context.made(HeldPart).covariance + here.repeatability)
 
 
 # A part that may have touched its nest is not set down a second time by itself.

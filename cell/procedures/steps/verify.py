@@ -78,13 +78,14 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
 def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left: int, context: StepContext) -> bool:
     """Whether the part lies farther off than is accepted, and the corrections that are `left` would bring it nearer."""
     plan = here.job.place
-    # What is worn lies low in its place as well: only what it is off along the surface can be mended.
-    if found.aside <= (plan.tolerance if plan.accept is None else plan.accept) and found.kept(plan):
+    if found.off <= (plan.tolerance if plan.accept is None else plan.accept) and found.kept(plan):
         return False
     known = here.job, here.repeatability, pose, found.points, found.covariance
     hope = expected_residual(*known, corrections=left)
     why = f"placed again it would be {1e3 * hope:.2f} mm off"
-    if found.aside >= FARTHEST_M:
+    if found.seen.moved is not None:
+        why = "surface or vehicle does not stand where it was swept, and nobody looked where the claw would go"
+    elif found.aside >= FARTHEST_M:
         why = f"farther than {1e3 * FARTHEST_M:g} mm the claw may not find it"
     elif not found.kept(plan) and not found.slipped and not found.not_aside.kept(plan):
         why = "its height, tilt or edge is what the part lies on, or is, and comes again"

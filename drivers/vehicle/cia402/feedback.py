@@ -352,22 +352,13 @@ class DriveFeedback(Feedback):
             odometry, travel = self._travel.odometry, self._travel
             volts = [drive.millivolts for drive in self.drives if drive.millivolts is not None]
             found = VehicleState(
-                stamp=told,
-                x=odometry.x,
-                y=odometry.y,
-                yaw=odometry.yaw,
-                speed=speed,
-                yaw_rate=yaw_rate,
-                command_mode=in_command and not any(drive.left_command() for drive in self.drives),
-                braked=braked,
-                emergency_stop=self._stopped(),
-                error_bits=max(drive.code for drive in self.drives),
-                battery_volts=round(1e-3 * min(volts), 1) if volts else None,
-                trouble=self._trouble(),
+                stamp=told, x=odometry.x, y=odometry.y, yaw=odometry.yaw, speed=speed, yaw_rate=yaw_rate,
+                command_mode=in_command and not any(drive.left_command() for drive in self.drives), braked=braked,
+                emergency_stop=self._stopped(), error_bits=max(drive.code for drive in self.drives),
+                battery_volts=round(1e-3 * min(volts), 1) if volts else None, trouble=self._trouble(),
                 warnings=tuple(word for drive in self.drives for word in drive.warnings()),
-                interruptions=travel.interruptions,
-                interruption=travel.interruption,
-            )
+                interruptions=travel.interruptions, interruption=travel.interruption,
+            )  # fmt: skip
         self._require_young(told, max_age)
         return found
 

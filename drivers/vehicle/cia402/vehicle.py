@@ -94,20 +94,11 @@ class CanopenVehicle:
         """How many stops were asked for."""
         self._closed = threading.Event()
         open_bus = partial(
-            CanopenBus,
-            name,
-            interface,
-            channel,
-            bitrate=bitrate,
-            options=dict(bus_options or {}),
-            own=watchdog.own,
-            nodes=wheels.nodes,
-            take=self._feedback.take,
-            other=self._feedback.other,
-            idle=self._feedback.idle,
+            CanopenBus, name, interface, channel, bitrate=bitrate, options=dict(bus_options or {}), own=watchdog.own,
+            nodes=wheels.nodes, take=self._feedback.take, other=self._feedback.other, idle=self._feedback.idle,
             statistics=self.statistics,
             alone=f"the drives stop by themselves {watchdog.seconds:g} s after the last sign of life",
-        )
+        )  # fmt: skip
         self._master = Master(name, open_bus, self._feedback, wheels, watchdog, clock=clock, statistics=self.statistics)
         try:
             if look:

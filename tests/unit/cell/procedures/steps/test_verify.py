@@ -155,13 +155,15 @@ def test_a_vehicle_that_was_pushed_since_the_sweep_does_not_make_the_part_look_t
         if not pushed:
             stands, surface = cell.world.vehicle.world_from_vehicle, cell.world.scene.world_from_surface
             turn = surface @ motion(turn=(0, 0, 12)) @ np.linalg.inv(surface)
-            cell.world.vehicle.world_from_vehicle = lambda t: turn @ stands(t)  # type: ignore[method-assign]
+            cell.world.vehicle.world_from_vehicle = lambda t: turn @ stands(t)
         pushed.append(text)
 
-    found = LyingPart(placed_pot, tmp_path, heard=push).looked(moved(0.1e-3))
+    site = LyingPart(placed_pot, tmp_path, heard=push, also='corrections = 1\naccept = "0.05 mm"')
+    found = site.looked(moved(0.1e-3))
     error = difference(found.seen.surface_from_part, moved(0.1e-3))
     assert np.linalg.norm(error[:3]) < 0.03e-3 and np.abs(error[3:]).max() < 0.3e-3
-    assert re.search("surface or vehicle was pushed: it stands 0.* mm and 1[12].. mrad from", found.likely)
+    assert re.search("surface or vehicle was pushed: it stands 0.* mm and 1[12].. mrad from", str(site.notes))
+    assert not found.before and "nobody looked where the claw would go" in str(site.notes)
 
 
 def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lies(
