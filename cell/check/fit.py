@@ -16,7 +16,7 @@ from cell.check.placed_part import verify_problems
 from cell.check.reach import reach_problems
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
-from cell.config.job import Job, each_item, load_job
+from cell.config.job import Job, item_names, load_job
 from cell.measure.geometry.poses import transform
 from cell.measure.vision import BoardSpec, parse_board
 from cell.measure.vision.board.view import centre_of
@@ -68,7 +68,7 @@ def read_fitting(name: str | Path, config: CellConfig, *, calibrates: bool = Fal
 
     Raises `ConfigError` where it does not fit the cell, or one of its items does not.
     """
-    read = [load_job(item) for item in each_item(name)]
+    read = [load_job(item) for item in item_names(name)]
     for job, mesh in read:
         require_fit(job, config, mesh, calibrates=calibrates)
     return read[0]

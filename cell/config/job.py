@@ -279,7 +279,7 @@ class Job(Table):
         return self.model_copy(update={"job": job, "nest": nest, "surface": surface, "item": items})
 
     @property
-    def others(self) -> list[tuple[int, pin.SE3, pin.SE3]]:
+    def other_items(self) -> list[tuple[int, pin.SE3, pin.SE3]]:
         """The other items of the job of an item: their numbers, nests (base_from_part) and places (place_from_part)."""
         own, on = job_and_item(self.job.name)[1], self.place.surface_from_part.se3()
         return [
@@ -310,7 +310,7 @@ def job_and_item(name: str | Path) -> tuple[str, int | None]:
     return (os.fspath(name), None) if found is None else (found[1], int(found[2]))
 
 
-def each_item(name: str | Path) -> list[str]:
+def item_names(name: str | Path) -> list[str]:
     """The names of a job's items, in their order; its own where it has none, or is one itself."""
     file, number = job_and_item(name)
     items = validate(Job, read_toml(job_path(file), "job", "cell new-job"), file).item if number is None else ()

@@ -210,7 +210,7 @@ class PlacedPart:
             *(feature.measured for feature in self.features),
         )
 
-    def kept(self, place: PlaceSection) -> bool:
+    def in_tolerance(self, place: PlaceSection) -> bool:
         """Whether it is known to lie within all tolerances, with no piece of its edge clearly out of them."""
         return all(number.kept for number in self.measured(place))
 

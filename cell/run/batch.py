@@ -22,8 +22,8 @@ from cell.procedures.grasp import GraspSeries
 from cell.procedures.placed_part import PlacedPart
 from cell.run.folder import Report
 from cell.run.job_run import Observer, RunOutcome, each_of
-from cell.run.recorded_work import Hands
-from cell.run.session.session import Opened
+from cell.run.recorded_work import WorkContext
+from cell.run.session.session import OpenCell
 from drivers.errors import CellError, ConfigError, DeviceFault, Interrupted
 from statemachine.step import Event
 from statemachine.watch import SignalInterrupt
@@ -100,7 +100,7 @@ class BatchOutcome:
             "runs": [{"run": run.folder.name, "outcome": run.outcome, "reason": run.reason} for run in self.runs],
         }  # fmt: skip
 
-    def kept(self) -> Self:
+    def written(self) -> Self:
         """Itself, also in its file."""
         write_json(self.file, sealed(self.as_dict()))
         return self
@@ -133,8 +133,8 @@ def require_count(count: int) -> None:
 
 
 def perform(
-    here: Opened, jobs: Sequence[Job], count: int, run: Callable[[int, GraspSeries], RunOutcome],
-    between: Callable[[Callable[[Hands], None]], None], observer: Observer | None,
+    here: OpenCell, jobs: Sequence[Job], count: int, run: Callable[[int, GraspSeries], RunOutcome],
+    between: Callable[[Callable[[WorkContext], None]], None], observer: Observer | None,
 ) -> BatchOutcome:  # fmt: skip
     """Do a batch: `run(number, series)` a part, after those of the series; `between(work)` what a person is asked
     before the next one; both wait. The parts have these `jobs` in turn, which are `count` times begun.
@@ -160,7 +160,7 @@ def perform(
             last = run(number, series)
             series = _known_after(series, last)
             # What its steps made is large, and in its folder.
-            batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).kept()
+            batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()
             tell(Event("note", None, {"text": str(batch)}))
             interrupted = last.interrupted
             if interrupted or last.stopped_after_end or not (last.outcome in GOOD or _skipped(here, job, last)):
@@ -172,7 +172,7 @@ def perform(
         interrupted = isinstance(error, Interrupted | SignalInterrupt)
     rest = [jobs[k % len(jobs)].job.name for k in range(len(batch.runs), count)][: len(jobs)] if len(jobs) > 1 else ()
     why += f"; not tried: {', '.join(rest)}" * bool(rest)
-    return replace(batch, reason=why or "every part was tried", interrupted=interrupted).kept()
+    return replace(batch, reason=why or "every part was tried", interrupted=interrupted).written()
 
 
 def _known_after(series: GraspSeries, last: RunOutcome) -> GraspSeries:
@@ -184,7 +184,7 @@ def _known_after(series: GraspSeries, last: RunOutcome) -> GraspSeries:
     return series if not isinstance(seen, PlacedPart) or seen.came is None else series.after(seen.came, seen.slips)
 
 
-def _skipped(here: Opened, job: Job, last: RunOutcome) -> bool:
+def _skipped(here: OpenCell, job: Job, last: RunOutcome) -> bool:
     """Whether the batch goes on after this end: nobody knows how a part lies that is down and was refused."""
     there = PartState.first(job)
     untouched = last.report.get("part") == there.value and (job.nest is not None or here.devices.claw.holding)
@@ -192,35 +192,35 @@ def _skipped(here: Opened, job: Job, last: RunOutcome) -> bool:
 
 
 def _question(
-    here: Opened, job: Job, part: str, last: RunOutcome, *, refill: bool
-) -> Callable[[Hands], None] | None:  # fmt: skip
+    here: OpenCell, job: Job, part: str, last: RunOutcome, *, refill: bool
+) -> Callable[[WorkContext], None] | None:  # fmt: skip
     """What asks a person whether to go on after a refusal, and at a cell with real devices to `refill` it."""
     by_hand = refill and not is_whole(here.simulated)
     refused = last.outcome == "refused" and job.batch.on_refusal == "ask" and here.config.cell.confirm != "simulated"
 
-    def work(hands: Hands) -> None:
+    def work(context: WorkContext) -> None:
         if refused:
-            hands.ask(f"The last part was {last}. Go on with {part}?")
+            context.ask(f"The last part was {last}. Go on with {part}?")
         if by_hand:
-            _refill(here, job, part, hands)
+            _refill(here, job, part, context)
 
     return work if refused or by_hand else None
 
 
-def _refill(here: Opened, job: Job, part: str, hands: Hands) -> None:
+def _refill(here: OpenCell, job: Job, part: str, context: WorkContext) -> None:
     """A person makes the next part ready."""
     claw, simulated, ready = here.devices.claw, here.simulated, "and step back: the arm moves next"
     filled = simulated is not None and "claw" in simulated.simulated
     while job.nest is None and not (filled or claw.holding):
-        hands.ask(f"Hold {part} between the claw's fingers: the claw closes on it")
+        context.ask(f"Hold {part} between the claw's fingers: the claw closes on it")
         try:
             claw.grip()
         except DeviceFault:
             claw.release()
     if job.nest is None:
-        hands.ask(f"The claw holds {part}; take away what was placed, prepare the next place, {ready}")
+        context.ask(f"The claw holds {part}; take away what was placed, prepare the next place, {ready}")
     elif job.item:
-        hands.ask(f"Take away what was placed, see that the parts lie where each item takes them from, {ready}")
+        context.ask(f"Take away what was placed, see that the parts lie where each item takes them from, {ready}")
     else:
         gone, lies = ("out of the nest", "on its surface") if job.unloads else ("from the station", "in its nest")
-        hands.ask(f"Take the last part {gone}, see that {part} lies {lies}, {ready}")
+        context.ask(f"Take the last part {gone}, see that {part} lies {lies}, {ready}")

@@ -33,10 +33,10 @@ from cell.procedures.calibrate.reference_plate import look_at_witness, with_edge
 from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
 from cell.procedures.calibrate.verification import Verification, collect_verification, keep_confirmed
 from cell.run.folder import REPORT, new_run, release, run_log, when
-from cell.run.recorded_work import Hands
+from cell.run.recorded_work import WorkContext
 from cell.run.runs import Run
 from cell.run.session import warm_up as ahead
-from cell.run.session.session import Opened
+from cell.run.session.session import OpenCell
 from drivers.errors import CalibrationStale, CellError
 from drivers.interfaces import Device, why_untold
 from statemachine.journal import Journal, JournalError
@@ -69,7 +69,7 @@ def arm_table(config: CellConfig, devices: Devices) -> str:
     return kinematics_name(config.arm.model, devices.arm.link_table())
 
 
-def stored(cell: Opened) -> CellCalibration:
+def stored(cell: OpenCell) -> CellCalibration:
     """The stored calibration of this very cell as configured; see `find_calibration`, also for what it raises."""
     found = find_calibration(
         cell.calibrations_folder, serial_numbers(cell.devices), cell.config.calibration_hash(),
@@ -80,7 +80,7 @@ def stored(cell: Opened) -> CellCalibration:
     return found
 
 
-def calibrate(cell: Opened, run: Run[object], job: str | Path) -> CellCalibration:
+def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibration:
     """Move through the calibration poses, solve, and store the result and what it came from, recorded in `run`.
 
     `job` names the part that may be in the claw.
@@ -91,14 +91,14 @@ def calibrate(cell: Opened, run: Run[object], job: str | Path) -> CellCalibratio
 
     tell = partial(_tell, run, "calibrate")
 
-    def work(hands: Hands) -> tuple[Observations, CellCalibration]:
-        mover = cell.mover(part_of, hands.safe_point)
+    def work(context: WorkContext) -> tuple[Observations, CellCalibration]:
+        mover = cell.mover(part_of, context.safe_point)
         # In command, so that a vehicle that somebody else moves or releases is noticed.
         devices.vehicle.recover()
-        given = config, devices, mover, hands.check
-        scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), hands.keep)
-        witness = look_at_witness(config, devices, hands.keep)
-        target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), hands.keep)
+        given = config, devices, mover, context.check
+        scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), context.keep)
+        witness = look_at_witness(config, devices, context.keep)
+        target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), context.keep)
         tell(0.96, "solving")
         observations = gathered(
             scan, target, serial_numbers(devices), config=config, kinematics=arm_table(config, devices), witness=witness
@@ -106,8 +106,8 @@ def calibrate(cell: Opened, run: Run[object], job: str | Path) -> CellCalibratio
         made = solve_observations(observations).calibration
         tell(0.98, "looking at the scan camera's shutter")
         with kept_if_refused(cell.calibrations_folder, made.name):
-            made = look_at_shutter(config, devices, mover, calibration=made, check=hands.check, keep=hands.keep)
-        made = with_edge(config, devices, hands.keep, made)
+            made = look_at_shutter(config, devices, mover, calibration=made, check=context.check, keep=context.keep)
+        made = with_edge(config, devices, context.keep, made)
         return replace(observations, witness=made.scan.witness), made
 
     info = {"for_job": str(job)} if run.kind == "job" else None
@@ -138,25 +138,31 @@ def _tell(run: Run[object], step: str, fraction: float, text: str) -> None:
     run.tell(Event("progress", step, {"fraction": fraction, "text": text}))
 
 
-def _ready(cell: Opened, hands: Hands, calibration: CellCalibration, job: Job) -> Mover:
+def _ready(cell: OpenCell, context: WorkContext, calibration: CellCalibration, job: Job) -> Mover:
     """The arm's moves for work on this calibration, with the vehicle in command: one that is released is noticed."""
-    mover = cell.mover(job, hands.safe_point)
+    mover = cell.mover(job, context.safe_point)
     cell.devices.interlocks.work_with(calibration.configuration)
     cell.devices.vehicle.recover()
     return mover
 
 
-def verify(cell: Opened, run: Run[object], calibration: CellCalibration, job: Job) -> Verification:
+def verify(cell: OpenCell, run: Run[object], calibration: CellCalibration, job: Job) -> Verification:
     """Look at the deck boards again, recorded in `run`: how good `calibration` is, and what place error of `job`.
 
     What it finds out about the laser is kept with the stored calibration.
     """
     tell = partial(_tell, run, "verify")
 
-    def work(hands: Hands) -> Verification:
-        mover = _ready(cell, hands, calibration, job)
+    def work(context: WorkContext) -> Verification:
+        mover = _ready(cell, context, calibration, job)
         seen = collect_verification(
-            cell.config, cell.devices, mover, calibration=calibration, check=hands.check, progress=tell, keep=hands.keep
+            cell.config,
+            cell.devices,
+            mover,
+            calibration=calibration,
+            check=context.check,
+            progress=tell,
+            keep=context.keep,
         )
         return Verification.of(calibration, job, seen)
 
@@ -166,17 +172,17 @@ def verify(cell: Opened, run: Run[object], calibration: CellCalibration, job: Jo
     return made
 
 
-def time_stamps(cell: Opened, run: Run[object], calibration: CellCalibration, job: Job) -> CellCalibration:
+def time_stamps(cell: OpenCell, run: Run[object], calibration: CellCalibration, job: Job) -> CellCalibration:
     """Sweep to and fro over the fine board, recorded in `run`: `calibration`, stored with how late the scan camera's
     time stamps come. `job` names the part that may be in the claw.
     """
     tell = partial(_tell, run, "timing")
 
-    def work(hands: Hands) -> CellCalibration:
-        mover = _ready(cell, hands, calibration, job)
+    def work(context: WorkContext) -> CellCalibration:
+        mover = _ready(cell, context, calibration, job)
         with kept_if_refused(cell.calibrations_folder, calibration.name):
             timing = collect_timing(
-                cell.config, cell.devices, mover, calibration, check=hands.check, progress=tell, keep=hands.keep
+                cell.config, cell.devices, mover, calibration, check=context.check, progress=tell, keep=context.keep
             )
         return replace(calibration, scan=replace(calibration.scan, timing=timing))
 

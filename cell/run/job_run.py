@@ -45,7 +45,7 @@ from cell.run.report.figures import following_words
 from cell.run.report.report import FinishedJob, TruthRecorder
 from cell.run.resumption import UnfinishedRun, job_source
 from cell.run.runs import Run
-from cell.run.session.session import Opened
+from cell.run.session.session import OpenCell
 from drivers.errors import CalibrationStale, CellError
 from drivers.interfaces import Vector
 from statemachine.control import RunControl
@@ -308,7 +308,7 @@ class JobWork:
     how the parts before this one of its batch came to lie.
     """
 
-    cell: Opened
+    cell: OpenCell
     file: str | Path
     ready: ReadyJob
     info: Mapping[str, object]

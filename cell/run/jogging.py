@@ -18,7 +18,7 @@ from cell.measure.vision import parse_board
 from cell.procedures.arm.photograph import drawn_interim_view, look_pose
 from cell.procedures.calibrate.interim import resting_pose
 from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, turn_to
-from cell.run.recorded_work import Hands
+from cell.run.recorded_work import WorkContext
 from drivers.common.units import parse_quantity
 from drivers.errors import ConfigError, DeviceFault, LimitError
 from drivers.interfaces import Arm, ArmSafety, Vector
@@ -89,13 +89,13 @@ def jog(cell: Cell, wish: Jog, job: str | Path = "pot", observer: Observer | Non
 
     begun: list[Begun] = []
 
-    def work(hands: Hands) -> dict[str, str]:
-        return moved(cell, wish, loaded, hands, begun)
+    def work(context: WorkContext) -> dict[str, str]:
+        return moved(cell, wish, loaded, context, begun)
 
     return cell.perform("jog", work, observer, {"moved": f"{wish.device} {wish.axis}".strip()}, stops)
 
 
-def moved(cell: Cell, wish: Jog, job: Job, hands: Hands, begun: list[Begun] | None = None) -> dict[str, str]:
+def moved(cell: Cell, wish: Jog, job: Job, context: WorkContext, begun: list[Begun] | None = None) -> dict[str, str]:
     """The same as part of a run that goes on. `begun` keeps where the arm began, for who does it again after a fault:
     it then goes on to the same goal.
     """
@@ -109,7 +109,7 @@ def moved(cell: Cell, wish: Jog, job: Job, hands: Hands, begun: list[Begun] | No
             look = look_pose(cell.config, job, parse_board(job.board.spec), mounting)
             cell.devices.interlocks.may_drive_with(f"the looking pose of job {job.job.name}", look)
             cell.devices.interlocks.may_drive_with("over the fine board", resting_pose(drawn_interim_view(cell.config)))
-            return _jog_vehicle(cell, wish, hands.check)
+            return _jog_vehicle(cell, wish, context.check)
 
 
 def _jog_rail(cell: Cell, wish: Jog) -> dict[str, str]:

@@ -118,7 +118,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Hands:
+class WorkContext:
     """What work is given to be held by: `check` raises once it is to end, `safe_point` also holds it when paused.
 
     `keep(what, frame)` leaves a picture that the work looked at in the run's folder. `ask(what)` waits for a person.
@@ -147,7 +147,7 @@ class RecordedWork:
     health: Callable[[Devices], None] = require_healthy
     config: CellConfig | None = None
 
-    def perform(self, work: Callable[[Hands], Made]) -> Made:
+    def perform(self, work: Callable[[WorkContext], Made]) -> Made:
         """Do `work` and record how it ended.
 
         Raises `Aborted` when the run was ended (`Interrupted` by a signal), `DeviceFault` when the stop was not
@@ -192,7 +192,7 @@ class RecordedWork:
                 _last(action, ended)
             self.run.folder = outer or folder
 
-    def _watched(self, work: Callable[[Hands], Made], journal: Journal, frames: FrameStore) -> Made:
+    def _watched(self, work: Callable[[WorkContext], Made], journal: Journal, frames: FrameStore) -> Made:
         """Do it under the same watch as a job's step: a fault that a person may clear is asked about, then it is done
         again from its beginning.
         """
@@ -203,8 +203,8 @@ class RecordedWork:
             nonlocal stops
             with devices.gate.entered(context.token):
                 context.check()
-                hands = Hands(context.check, context.safe_point, context.progress, keep=frames.keep, ask=context.ask)
-                made = work(hands)
+                given = WorkContext(context.check, context.safe_point, context.progress, frames.keep, context.ask)
+                made = work(given)
             # A stop that a person asks for from here on is not cleared.
             stops = devices.gate.stops
             return made

@@ -12,7 +12,7 @@ from typing import Any
 
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
-from cell.config.job import Job, each_item, job_and_item, job_path, load_job
+from cell.config.job import Job, item_names, job_and_item, job_path, load_job
 from cell.procedures.arm.moves import PartState
 from cell.procedures.sought_part import sought
 from cell.procedures.steps import laser_sweep, verify
@@ -183,7 +183,7 @@ def job_source(name: str | Path) -> dict[str, object]:
     path = str(job_path(name).resolve()) + ("" if number is None else f"#{number}")
     job, mesh = load_job(path)
     part: dict[str, object] = {} if job.part is None else {"part_mesh": mesh_source(Path(job.part.mesh))}
-    if number is not None and f"{whole}#{number + 1}" in each_item(whole):
+    if number is not None and f"{whole}#{number + 1}" in item_names(whole):
         part["next_item"] = f"{job_path(name).resolve()}#{number + 1}"
     return {"job_file": path, "job_hash": job_hash(path), "mesh": mesh_source(sought(job, mesh)[1]), **part}
 

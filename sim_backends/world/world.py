@@ -79,23 +79,23 @@ class World:
             self._close_claw(False)
         self.vehicle.sag = self._sag
         self.vehicle.blocked = lambda t, pose: self.collisions.blocks(t, pose)
-        self.arm.contact = self._touch
+        self.arm.contact = self._contact_wrench
 
     @property
     def part(self) -> PartContact:
         """The part of the job, or of its present item; whichever the claw holds."""
-        return next((item.part for item in self._items if item.part.held), self._items[self._item].part)
+        return next((item.part for item in self._items if item.part.held), self._items[self._current].part)
 
     def _set_up(self, found: tuple[Collision, ...] = ()) -> None:
         """Part in the claw, or those of all items where they lie at first, and bodies that may meet."""
         drawn = self.scene.drawing.station
-        self._item, self._items = 0, [self._drawn_item(k) for k in range(len(drawn.beside))]
+        self._current, self._items = 0, [self._drawn_item(k) for k in range(len(drawn.beside))]
         if self._items:
             own = replace(drawn, beside=()).as_json()
-            self._item = [each.as_json() for each in drawn.beside].index(own)
+            self._current = [each.as_json() for each in drawn.beside].index(own)
         else:
             self._items = [Item(self.scene, self.station, self._part(self.scene, self.station))]
-        self._take(found)
+        self._make_current(found)
         self._report_grip()
 
     def _drawn_item(self, k: int) -> Item:
@@ -110,9 +110,9 @@ class World:
         station = Station.of(beside[k])
         return Item(scene, station, self._part(scene, station))
 
-    def _take(self, found: tuple[Collision, ...]) -> None:
+    def _make_current(self, found: tuple[Collision, ...]) -> None:
         """What the cell does now is about this item."""
-        item = self._items[self._item]
+        item = self._items[self._current]
         self.scene, self.station = item.scene, item.station
         self._solid = ArmPoints(item.scene.drawing)
         self.collisions = Collisions(item.scene, item.part, found)
@@ -146,9 +146,9 @@ class World:
         wanted = replace(self.scene.drawing, station=station).as_json()
         for k, item in enumerate(self._items):
             if item.part.untouched and item.scene.drawing.as_json() == wanted:
-                if k != self._item:
-                    self._item = k
-                    self._take(self.collisions.found)
+                if k != self._current:
+                    self._current = k
+                    self._make_current(self.collisions.found)
                 return
         ready, parts = Station.of(station), self.parts + len(self._items)
         scene = draw(self.scene.seed, self.scene.level, replace(self.scene.drawing, station=station), parts)
@@ -259,7 +259,7 @@ class World:
         if (grip := self.scene.drawing.cell.grip_input) is not None:
             self.arm.set_digital_input(grip, self.part.held)
 
-    def _touch(self, base_from_flange: Pose) -> NDArray[np.float64]:
+    def _contact_wrench(self, base_from_flange: Pose) -> NDArray[np.float64]:
         """Called by the arm at every tick: follow its outputs, then give the wrench (6,) on the flange in base axes."""
         t = self.arm.time
         world_from_base = self.world_from_base(t)
@@ -269,7 +269,7 @@ class World:
         for item in self._items:
             item.part.set_claw(closed, world_from_flange)
         self._report_grip()
-        self._meet(t, world_from_base)
+        self._stop_at_collision(t, world_from_base)
         wrench = self.part.wrench(world_from_flange)
         if not wrench.any():
             return wrench
@@ -278,7 +278,7 @@ class World:
         base_from_world = world_from_base[:3, :3].T
         return np.concatenate([base_from_world @ wrench[:3], base_from_world @ wrench[3:]])
 
-    def _meet(self, t: float, world_from_base: Pose) -> None:
+    def _stop_at_collision(self, t: float, world_from_base: Pose) -> None:
         """Stop the arm as its safety system does when a link or the tool meets something solid."""
         joints = self.arm.drive.q
         if not self.collisions.due(t, joints, world_from_base):

@@ -19,7 +19,7 @@ from cell.measure.inversion.effects.between_sweeps import SurfaceMotion
 from cell.motion.kinematics import HOME
 from cell.procedures.steps.kinds import kind_of
 from cell.procedures.sweep import second_look
-from cell.procedures.sweep.second_look import require_unmoved
+from cell.procedures.sweep.second_look import require_surface_unmoved
 from lab.bench.job.whole_job import JobRecord, NoFrames
 from statemachine.control import RunControl
 from statemachine.runner import Event, StepContext
@@ -82,6 +82,6 @@ def lose_few_steps_after_the_look(patch: pytest.MonkeyPatch, cell: Callable[[], 
     def after_the_look(moved: SurfaceMotion) -> None:
         rail, now = cell().world.rail, cell().clock.now()
         rail.set_position(now, rail.position(now) + round(0.09e-3 * 200 * 256 / 0.002))
-        require_unmoved(moved)
+        require_surface_unmoved(moved)
 
-    patch.setattr(second_look, "require_unmoved", after_the_look)
+    patch.setattr(second_look, "require_surface_unmoved", after_the_look)

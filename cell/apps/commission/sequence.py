@@ -26,7 +26,7 @@ from cell.apps.commission.workplace import CommissionWorkplace, Declined, Person
 from cell.base.storage import replacing
 from cell.config.cell_config import CONFIGURATION, load_config, require_confirm
 from cell.config.job import job_path
-from cell.run.recorded_work import Hands
+from cell.run.recorded_work import WorkContext
 from cell.run.session.supervisor import Cell
 from drivers.errors import Aborted, CellError, ConfigError, DeviceFault, RefusedError
 from drivers.interfaces import Frame
@@ -151,22 +151,22 @@ class Commissioning:
         desk = self.desk
         name: list[str] = []
 
-        def work(hands: Hands) -> None:
+        def work(context: WorkContext) -> None:
             # Done again after a fault that a person has confirmed: without what was noted before it.
             vars(result).update(vars(Result()))
             current = desk.cell.current
             if current is not None and current.folder is not None:
                 name[:] = [current.folder.name]
-            desk.hands = hands
+            desk.context = context
             try:
                 check.work(desk, result)
             finally:
-                desk.hands = None
+                desk.context = None
 
         try:
             desk.cell.perform("commission", work, desk.heard, {"check": check.name})
         finally:
-            desk.hands = None
+            desk.context = None
         return name[0] if name else ""
 
     def _mend(self, check: CommissionCheck, result: Result) -> bool:

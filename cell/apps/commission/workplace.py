@@ -24,7 +24,7 @@ from cell.devices.devices import Devices
 from cell.devices.simulated.process import cause_fault, make_ready
 from cell.motion.kinematics import HOME, Joints
 from cell.procedures.arm.moves import Mover
-from cell.run.recorded_work import Hands
+from cell.run.recorded_work import WorkContext
 from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import Frame, Image
 from statemachine.step import Observer
@@ -127,7 +127,7 @@ class CommissionWorkplace:
     folder: Path
     job_file: str
     simulated: bool
-    hands: Hands | None = None
+    context: WorkContext | None = None
     heard: Observer | None = None
     """Is told what goes on in a check, such as a question to a person."""
     last_views: dict[str, pin.SE3] = field(default_factory=dict)
@@ -204,8 +204,8 @@ class CommissionWorkplace:
 
     def look_around(self) -> None:
         """Raise when the work is to end; wait while it is paused."""
-        if self.hands is not None:
-            self.hands.safe_point()
+        if self.context is not None:
+            self.context.safe_point()
 
     def mover(self) -> Mover:
         """Planned moves of the arm at the speed of somebody who stands beside it; the vehicle is braked first.
@@ -246,8 +246,8 @@ class CommissionWorkplace:
 
     def keep(self, result: Result, name: str, frame: Frame, marks: ArrayLike | None = None) -> None:
         """Keep a picture for the protocol, with points (n, 2) px marked in it, and the whole frame in the run."""
-        if self.hands is not None:
-            self.hands.keep(name, frame)
+        if self.context is not None:
+            self.context.keep(name, frame)
         pictures = self.folder / "pictures"
         pictures.mkdir(parents=True, exist_ok=True)
         path = pictures / f"{name}.png"

@@ -69,13 +69,13 @@ def require_share(share: object) -> float:
 
 def nested_parts(job: Job) -> list[Body]:
     """Parts of other items, as they may lie in their nests."""
-    return [_part_at(f"part in the nest of item {k}", nest, job) for k, nest, _ in job.others]
+    return [_part_at(f"part in the nest of item {k}", nest, job) for k, nest, _ in job.other_items]
 
 
 def placed_parts(job: Job, base_from_place: pin.SE3) -> list[Body]:
     """Parts of other items, as they may lie in their places, but in the one that is this item's own, too."""
     own = job.surface.place_from_surface.se3() * job.place.surface_from_part.se3()
-    others = [(k, place) for k, _, place in job.others if not place.isApprox(own)]
+    others = [(k, place) for k, _, place in job.other_items if not place.isApprox(own)]
     return [_part_at(f"part in the place of item {k}", base_from_place * place, job) for k, place in others]
 
 
@@ -128,7 +128,7 @@ class Mover:
         if interlocks is not None and grasp is not None:
             interlocks.carry([body for body in self._moving if body.name == "part"])
 
-    def meet_station(
+    def avoid_station(
         self, base_from_place: pin.SE3, job: Job, board: BoardSpec, surface_extent: tuple[Vector, Vector]
     ) -> None:
         """From now on avoid the station as well, where it was measured.
@@ -142,7 +142,7 @@ class Mover:
         others = placed_parts(job, base_from_place)
         self._stand_before([*station, *station_obstacles(job.obstacle, base_from_place), *others])
 
-    def hold_nothing(self) -> list[Body]:
+    def empty_claw(self) -> list[Body]:
         """From now on the claw is empty; what it held until now."""
         part = [body for body in self._moving if body.name == "part"]
         self._moving = [body for body in self._moving if body.name != "part"]
@@ -151,24 +151,24 @@ class Mover:
 
     def leave_part(self, base_from_part: pin.SE3) -> None:
         """From now on the claw is empty, and the part stands where it was put: it is not to be met again."""
-        for part in self.hold_nothing():
-            self.part_lies(base_from_part, part.size)
+        for part in self.empty_claw():
+            self.avoid_part(base_from_part, part.size)
 
-    def part_lies(self, base_from_part: pin.SE3, size: Sequence[float]) -> None:
+    def avoid_part(self, base_from_part: pin.SE3, size: Sequence[float]) -> None:
         """From now on a part of this size, m, stands there and is not to be met."""
         middle = from_parts((0.0, 0.0, 0.5 * size[2]))
         self._stand_before([*self._station, box(PLACED, BASE, base_from_part * middle, size)])
 
-    def meet_part(self) -> None:
+    def allow_part_contact(self) -> None:
         """From now on the part that was put down may be met: the empty claw goes to take it."""
         self._met = [body for body in self._station if body.name == PLACED]
         self._stand_before([body for body in self._station if body.name != PLACED])
 
-    def spare_part(self) -> None:
+    def forbid_part_contact(self) -> None:
         """From now on that part is not to be met again: it was not taken."""
         self._stand_before([*self._station, *self._met])
 
-    def take_part(self, flange_from_part: pin.SE3, size: Sequence[float]) -> None:
+    def hold_part(self, flange_from_part: pin.SE3, size: Sequence[float]) -> None:
         """From now on the claw holds a part of this size, m, there."""
         part = [body for body in tool_bodies(size, flange_from_part) if body.name == "part"]
         self._moving = [*self._moving, *part]

@@ -77,7 +77,7 @@ def rocks_on(swung: float, waited: float) -> str:
     )
 
 
-def require_unmoved(here: Workplace, fix: BoardFix, since: str, progress: Callable[[float, str], None]) -> None:
+def require_board_unmoved(here: Workplace, fix: BoardFix, since: str, progress: Callable[[float, str], None]) -> None:
     """Photograph the board again from where it was photographed; `since` says when that was, for people.
 
     Raises `RefusedError` when it stands elsewhere by more than the arm's repeatability and the pictures leave open, and
@@ -109,7 +109,7 @@ def require_unmoved(here: Workplace, fix: BoardFix, since: str, progress: Callab
 
 def _at(here: Workplace, context: StepContext) -> BoardFix:
     arrival, job = context.made(VehicleArrival), here.job
-    here.mover.meet_station(arrival.base_from_place, job, here.board, around(here.nominal.extent, here.ground))
+    here.mover.avoid_station(arrival.base_from_place, job, here.board, around(here.nominal.extent, here.ground))
     goal = photo_pose(job, here.board, arrival.fix.base_from_board, here.calibration.target.flange_from_camera)
     fix = photographed(here, goal, context.progress)
     for note in fix.notes:

@@ -34,12 +34,12 @@ def take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what
     context.progress(0.5, f"gripping {what}")
     context.check()
     mover.follow(mover.plan_to(above, f"above {what}"))
-    mover.meet_part()
+    mover.allow_part_contact()
     part.left = False
     here.devices.arm.zero_force()
     if not _reached(here, grip, normal):
         mover.line(above, plan.speed, TOUCHES)
-        mover.spare_part()
+        mover.forbid_part_contact()
         part.left = True
         raise RefusedError(
             f"the claw touched something as it went to grip {what}; it went back up, the part lies where it was. Look "
@@ -52,7 +52,7 @@ def take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what
     here.devices.claw.grip()
     where, part.state, part.where, part.left = part.where, PartState.HELD, None, False
     note_part(context, part)
-    mover.take_part(job.grasp.flange_from_part.se3(), job.grasp.size)
+    mover.hold_part(job.grasp.flange_from_part.se3(), job.grasp.size)
     most_pull = MOST_PULL * plan.contact_force
     if pulls and mover.line(
         grip * from_parts(plan.contact_travel * normal), plan.contact_speed, TOUCHES, force_limit=most_pull
@@ -63,8 +63,8 @@ def take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what
         here.devices.claw.release()
         part.state, part.left = before, True
         note_part(context, part)
-        mover.hold_nothing()
-        mover.spare_part()
+        mover.empty_claw()
+        mover.forbid_part_contact()
         mover.line(above, plan.speed, TOUCHES)
         raise RefusedError(
             f"{what} sticks, or is heavier than place.contact_force lets the claw lift: it pulled with more than "

@@ -19,7 +19,7 @@ from cell.measure.calibration.drift.slip import Slip, slip_since
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.procedures.arm.photograph import BoardFix, scan_plans
 from cell.procedures.calibrate.reference_plate import require_edge, require_witness
-from cell.procedures.steps.board_photo import require_unmoved
+from cell.procedures.steps.board_photo import require_board_unmoved
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord, save_sweep
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION, SweepCollector, SweepErrors, rehearse
@@ -115,7 +115,9 @@ def _at(here: Workplace, context: StepContext) -> SweepRecord:
     (here.folder / FILE).unlink(missing_ok=True)
     if context.attempt > 1:
         # After a fault the arm's base may stand elsewhere.
-        require_unmoved(here, fix, "before the fault that ended the sweep", lambda _, text: context.progress(0.0, text))
+        require_board_unmoved(
+            here, fix, "before the fault that ended the sweep", lambda _, text: context.progress(0.0, text)
+        )
         context.note(text="the board has not moved since the fault")
     # Used once: whoever has it swept again was not content with it.
     earlier, here.earlier = here.earlier, None

@@ -88,8 +88,8 @@ def _lies(here: Workplace, fix: BoardFix, base_from_part: pin.SE3) -> None:
     assert part is not None
     below = seen_from_below(part, here.job.place.surface_from_part.se3()).extent if here.ground is None else here.ground
     base_from_place = fix.base_from_board * here.job.place_from_board.inverse()
-    here.mover.meet_station(base_from_place, here.job, here.board, below)
-    here.mover.part_lies(base_from_part, here.job.grasp.size)
+    here.mover.avoid_station(base_from_place, here.job, here.board, below)
+    here.mover.avoid_part(base_from_part, here.job.grasp.size)
 
 
 # What was interrupted with the part between the fingers is left to a person.

@@ -36,8 +36,8 @@ def _picked(here: Workplace, context: StepContext) -> HeldPart:
         raise RefusedError(f"the part is {here.part.state.value}: nothing is gripped a second time")
     belongs = job.place.surface_from_part.se3()
     # The arm moves beside the station from here on, and about the part.
-    here.mover.meet_station(arrival.base_from_place, here.job, here.board, here.nominal.extent)
-    here.mover.part_lies(belongs, job.grasp.size)
+    here.mover.avoid_station(arrival.base_from_place, here.job, here.board, here.nominal.extent)
+    here.mover.avoid_part(belongs, job.grasp.size)
     home_rail(here.devices, context.progress)
     head, (pointing, _) = here.calibration.scan, seen_on_plate(here, context)
     if pointing is not None:

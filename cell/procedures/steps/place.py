@@ -20,7 +20,7 @@ from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.arm.touch import FELT_M, REFUSED, TouchCheck, TouchHeight, expected_touch, felt_touch
 from cell.procedures.grasp import expected_residual, job_with_grasp
 from cell.procedures.part_error import part_points
-from cell.procedures.steps.board_photo import require_unmoved
+from cell.procedures.steps.board_photo import require_board_unmoved
 from cell.procedures.steps.invert_pose import inverted
 from cell.procedures.steps.reconstruct import Reconstruction, together
 from cell.procedures.steps.workplace import JobStep, Workplace
@@ -392,7 +392,7 @@ def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> Sec
         sweep, scan = context.made(SweepRecord), context.made(Reconstruction)
     except LookupError:
         # A kind of job that measures in another way.
-        require_unmoved(here, fix, "before its place was measured", context.progress)
+        require_board_unmoved(here, fix, "before its place was measured", context.progress)
         return None
     lies = here.job.place.surface_from_part.se3()
     found = highest_standing(scan.cloud, here.nominal, pose.base_from_surface, lies, here.job.grasp.size)

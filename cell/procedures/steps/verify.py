@@ -55,7 +55,7 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
             if here.part.state is not PartState.RELEASED:
                 raise
             here.mover.fold()
-            if not found.kept(plan):
+            if not found.in_tolerance(plan):
                 raise found.misplaced(plan, f"It was not corrected: {error}") from error
             context.note(text=f"it was not corrected: {error}")
             # The claw was near it, and may have moved it.
@@ -70,7 +70,7 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
         slips.append(slip)
     for note in found.notes:
         context.note(text=note)
-    if not found.kept(plan):
+    if not found.in_tolerance(plan):
         raise found.misplaced(plan, aside_words(first.allowed, first.parts) if first.parts else "")
     return replace(found, came=came, slips=tuple(slips))
 
@@ -78,7 +78,7 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
 def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left: int, context: StepContext) -> bool:
     """Whether the part lies farther off than is accepted, and the corrections that are `left` would bring it nearer."""
     plan = here.job.place
-    if found.off <= (plan.tolerance if plan.accept is None else plan.accept) and found.kept(plan):
+    if found.off <= (plan.tolerance if plan.accept is None else plan.accept) and found.in_tolerance(plan):
         return False
     known = here.job, here.repeatability, pose, found.points, found.covariance
     hope = expected_residual(*known, corrections=left)
@@ -87,7 +87,7 @@ def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left:
         why = "surface or vehicle does not stand where it was swept, and nobody looked where the claw would go"
     elif found.aside >= FARTHEST_M:
         why = f"farther than {1e3 * FARTHEST_M:g} mm the claw may not find it"
-    elif not found.kept(plan) and not found.slipped and not found.not_aside.kept(plan):
+    elif not found.in_tolerance(plan) and not found.slipped and not found.not_aside.in_tolerance(plan):
         why = "its height, tilt or edge is what the part lies on, or is, and comes again"
     elif hope < found.aside:
         return True

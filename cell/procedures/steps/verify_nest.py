@@ -42,7 +42,7 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     )
     for note in found.notes:
         context.note(text=f"in its nest: {note}")
-    if not found.kept(job.place):
+    if not found.in_tolerance(job.place):
         raise found.misplaced(job.place)
     return found
 

@@ -83,9 +83,9 @@ class Workplace:
         devices = self.devices
         made = Mover(devices.arm, devices.clock, self.config, self.job, interlocks=devices.interlocks, pace=self.pace)
         if self.part.state.untaken:
-            made.hold_nothing()
+            made.empty_claw()
         if self.part.state is PartState.NESTED and self.job.nest is not None:
-            made.part_lies(self.job.nest.base_from_part.se3(), self.job.grasp.size)
+            made.avoid_part(self.job.nest.base_from_part.se3(), self.job.grasp.size)
         if self.config.calibration.each_job:
             with suppress(CalibrationStale):
                 rest = resting_pose(fine_board_view(self.config, self.calibration))

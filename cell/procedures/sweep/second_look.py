@@ -17,7 +17,7 @@ from cell.measure.inversion.observability import Tolerance
 from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.calibrate.reference_plate import configure_fast
-from cell.procedures.steps.board_photo import require_unmoved as require_board_unmoved
+from cell.procedures.steps.board_photo import require_board_unmoved
 from cell.procedures.steps.laser_sweep import check_lost_steps, head_at, laser_sweep
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
 from cell.procedures.steps.workplace import Workplace
@@ -70,7 +70,7 @@ def require_in_place(
     if found.moved and here.job.scan.mode == "rail":
         # Steps that the rail has lost look like a surface that moved.
         check_lost_steps(here.devices, lambda _, text: context.progress(0.04, text))
-    require_unmoved(found)
+    require_surface_unmoved(found)
     tolerance = Tolerance(place.tolerance, place.tolerance_angle)
     hidden = tuple(found.hidden(pose.base_from_surface, tolerance, here.nominal.radius))
     if hidden or pose.verdict.unseen:
@@ -139,7 +139,7 @@ def require_points(cloud: Cloud) -> Cloud:
     )
 
 
-def require_unmoved(moved: SurfaceMotion) -> None:
+def require_surface_unmoved(moved: SurfaceMotion) -> None:
     """Raise `RefusedError` for a surface that lies elsewhere."""
     if not moved.moved:
         return

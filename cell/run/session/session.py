@@ -29,7 +29,7 @@ from cell.devices.simulated.mixed import Sim, simulated_of
 from cell.devices.simulated.process import SimulatedCell, Simulation, ask_truth, on_gige, with_endpoints
 from cell.procedures.arm.moves import Mover, Pace
 from cell.procedures.drive.way import Whereabouts
-from cell.run.recorded_work import Hands, RecordedWork
+from cell.run.recorded_work import RecordedWork, WorkContext
 from cell.run.runs import Run
 from drivers.errors import ConfigError, NotConnectedError
 
@@ -37,7 +37,7 @@ Made = TypeVar("Made")
 
 
 @dataclass(frozen=True, eq=False)
-class Opened:
+class OpenCell:
     """What a cell consists of; `lock` is held, `simulated` is None unless this process has started the world."""
 
     config: CellConfig
@@ -99,7 +99,7 @@ class Opened:
         return partial(ask_truth, self.config.cell.truth) if self.config.cell.truth else None
 
     def recorded(
-        self, run: Run[object], kind: str, work: Callable[[Hands], Made], info: Mapping[str, object] | None = None
+        self, run: Run[object], kind: str, work: Callable[[WorkContext], Made], info: Mapping[str, object] | None = None
     ) -> Made:
         """Do work outside a job in a run that was begun, and record it; raises what `RecordedWork.perform` does."""
         # Who puts a part into the claw opens the cell's guard, and takes as long as it takes.
@@ -128,7 +128,7 @@ class SessionRequest:
     clock: str
     truth: str | Path | None
 
-    def open(self, undo: ExitStack) -> Opened:
+    def open(self, undo: ExitStack) -> OpenCell:
         """Connect as `Cell.open` says, and raise what it says. What is to be undone if that fails goes to `undo`."""
         given = None if self.config is None else Path(self.config)
         names = simulated_of(self.sim, given)
@@ -157,7 +157,7 @@ class SessionRequest:
         lock = undo.enter_context(CellLock(loaded, needed))
         devices = connect(loaded, needed)
         undo.callback(devices.close)
-        return Opened(loaded, folder, lock, devices, world)
+        return OpenCell(loaded, folder, lock, devices, world)
 
     def _require_sense(self, whole: bool) -> None:
         """Raise `ConfigError` for arguments that do not go together; `whole` for a cell that is all simulated."""
@@ -173,12 +173,12 @@ class SessionRequest:
 
     # The world takes long to load, and real devices have none; over wires it is in another process.
 
-    def _virtual(self, loaded: CellConfig, true: CellConfig, folder: Path) -> Opened:
+    def _virtual(self, loaded: CellConfig, true: CellConfig, folder: Path) -> OpenCell:
         from cell.devices.simulated.described import Described
         from cell.devices.simulated.direct import VirtualCell
 
         virtual = VirtualCell(loaded, self.seed, self.level, Described.of(self.job), true)
-        return Opened(loaded, folder, nullcontext(), virtual.devices, virtual)
+        return OpenCell(loaded, folder, nullcontext(), virtual.devices, virtual)
 
     def _world(self, loaded: CellConfig, true: CellConfig) -> SimulatedCell:
         from cell.devices.simulated.described import Described
@@ -191,10 +191,10 @@ class SessionRequest:
 
     def _mixed(
         self, undo: ExitStack, loaded: CellConfig, folder: Path, simulated: tuple[str, ...], needed: list[str]
-    ) -> Opened:
+    ) -> OpenCell:
         from cell.devices.simulated.mixed import MixedCell
 
         if self.speed not in (None, loaded.cell.time_scale):
             raise ConfigError(f"speed={self.speed:g}: real devices keep the wall's time; leave that out")
         mixed = MixedCell(undo, loaded, self.job, seed=self.seed, level=self.level, simulated=simulated, needed=needed)
-        return Opened(mixed.config, folder, mixed.lock, mixed.devices, mixed.world)
+        return OpenCell(mixed.config, folder, mixed.lock, mixed.devices, mixed.world)

@@ -18,7 +18,7 @@ from cell.base.lateness import LATENESS
 from cell.check.fit import read_fitting
 from cell.config.calibrations.store import CalibrationEdited, CellCalibration
 from cell.config.cell_config import DEVICES, CellConfig, Confirm
-from cell.config.job import Job, each_item, load_job
+from cell.config.job import Job, item_names, load_job
 from cell.devices.devices import Devices, stop_cell
 from cell.devices.simulated.mixed import Sim
 from cell.devices.simulated.process import Injector, Simulation, is_whole
@@ -35,10 +35,10 @@ from cell.run.calibration import recorded_maintenance
 from cell.run.folder import find_run
 from cell.run.job_run import JobWork, Observer, ReadyJob, RunOutcome
 from cell.run.jogging import arm_is_ready, begin_program
-from cell.run.recorded_work import Hands
+from cell.run.recorded_work import WorkContext
 from cell.run.resumption import UnfinishedRun
 from cell.run.runs import Run, Runs
-from cell.run.session.session import Opened, SessionRequest
+from cell.run.session.session import OpenCell, SessionRequest
 from drivers.errors import CalibrationStale, ConfigError
 from statemachine.runner import NO_SCRIPT, Event, Script
 from statemachine.watch import EndSignals, SignalInterrupt, SignalWatch
@@ -48,7 +48,7 @@ HOMED = {"rail": ("rail",), "arm": ("arm", "vehicle")}
 while the vehicle is braked."""
 
 Made = TypeVar("Made")
-_OnStored = Callable[[Opened, Run[object], CellCalibration, Job], Made]
+_OnStored = Callable[[OpenCell, Run[object], CellCalibration, Job], Made]
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class Cell:
     SIGTERM and SIGHUP end the program as Ctrl-C does: through the safe stop.
     """
 
-    def __init__(self, opened: Opened) -> None:
+    def __init__(self, opened: OpenCell) -> None:
         self._here = opened
         self.config: CellConfig = opened.config
         self.folder: Path = opened.folder
@@ -263,7 +263,7 @@ class Cell:
         return self._runs.begin(kind, work, observer, stops)
 
     def perform(
-        self, kind: str, work: Callable[[Hands], Made], observer: Observer | None = None,
+        self, kind: str, work: Callable[[WorkContext], Made], observer: Observer | None = None,
         info: Mapping[str, object] | None = None, stops: int | None = None,
     ) -> Made:  # fmt: skip
         """Do work outside a job, such as a jog, as a recorded run, and wait for its end. `stops` as in `begin`."""
@@ -321,7 +321,7 @@ class Cell:
         Raises:
             CellError: What keeps the first part from being begun.
         """
-        names = each_item(job)
+        names = item_names(job)
         read_fitting(job, self.config, calibrates=is_whole(self.simulated))
         jobs = [load_job(name)[0] for name in names]
         for each in jobs if inject else ():
@@ -369,7 +369,7 @@ class Cell:
             injector = Injector.scheduled(inject, kind_of(load_job(job)[0]).names, self.simulated)
             info["injected"] = [str(injection) for injection in injector.injections]
             inline = (injector,)
-        if len(items := each_item(job)) > 1:
+        if len(items := item_names(job)) > 1:
             raise ConfigError(f"job {job} has {len(items)} items: name one, such as {items[0]}, or run all as a batch")
         self._runs.require_free()
         self._runs.require_no_late_stop()
@@ -469,7 +469,7 @@ class Cell:
         if not by.strip():
             raise ConfigError("recover needs the name of the person who has looked at the cell")
 
-        def work(hands: Hands) -> None:
+        def work(context: WorkContext) -> None:
             arm, vehicle = self.devices.arm, self.devices.vehicle
             if not arm_is_ready(arm):
                 arm.recover(confirmed=True)
@@ -493,12 +493,12 @@ class Cell:
         if device not in (None, *HOMED):
             raise ConfigError(f'"{device}" has no home; {" and ".join(HOMED)} have')
 
-        def work(hands: Hands) -> None:
+        def work(context: WorkContext) -> None:
             if device != "arm":
                 self.devices.rail.home().wait(60.0)
             if device != "rail":
                 self.devices.vehicle.recover()
                 begin_program(self.devices.arm)
-                self.mover(None, hands.safe_point).to_joints(HOME)
+                self.mover(None, context.safe_point).to_joints(HOME)
 
         self.perform("homing", work, observer, stops=stops)

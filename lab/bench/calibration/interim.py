@@ -22,7 +22,7 @@ from cell.measure.inversion import NominalSurface
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.interim import InterimCheck, interim_check
-from cell.run.recorded_work import Hands
+from cell.run.recorded_work import WorkContext
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import NoFrames, on_calibrated
 from lab.bench.over_cores import run_all
@@ -115,15 +115,15 @@ def one_world(level: str, untouched: int, seed: int) -> list[Row]:
     config, (job, mesh) = load_config(None), load_job("pot")
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
 
-    def work(cell: VirtualCell, calibration: CellCalibration, hands: Hands) -> list[Row]:
-        mover = Mover(cell.devices.arm, cell.clock, config, job, hands.safe_point)
+    def work(cell: VirtualCell, calibration: CellCalibration, context: WorkContext) -> list[Row]:
+        mover = Mover(cell.devices.arm, cell.clock, config, job, context.safe_point)
 
         def look(name: str) -> Row:
             mover.to_joints(HOME)
             begun = cell.clock.now()
             try:
                 found = interim_check(
-                    config, cell.devices, mover, calibration, job, check=hands.check, progress=lambda text: None,
+                    config, cell.devices, mover, calibration, job, check=context.check, progress=lambda text: None,
                     keep=NoFrames().keep,
                 )  # fmt: skip
             except RefusedError as error:

@@ -31,7 +31,7 @@ from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.calibration import arm_table
 from cell.run.job_run import JobRun, ReadyJob
-from cell.run.recorded_work import Hands, RecordedWork, classify
+from cell.run.recorded_work import RecordedWork, WorkContext, classify
 from cell.run.resumption import mesh_source
 from cell.run.runs import Run
 from drivers.errors import CellError
@@ -123,17 +123,17 @@ def run_whole_job(
 
 def on_calibrated(
     config: CellConfig, job: Job, nominal: NominalSurface, seed: int, level: str,
-    work: Callable[[VirtualCell, CellCalibration, Hands], Result],
+    work: Callable[[VirtualCell, CellCalibration, WorkContext], Result],
 ) -> Result:  # fmt: skip
     """Calibrate the cell of `seed` and `level`, and do `work` on it as recorded work; raises what that raises."""
     assert nominal.source is not None
     cell = VirtualCell(config, seed, level, Described(job, nominal.source))
     whole = _WholeJob(cell, config, job, nominal, JobRecord(seed, level), lambda fraction, text: None)
 
-    def done(hands: Hands) -> Result:
-        calibration = whole._calibrate(hands)
+    def done(context: WorkContext) -> Result:
+        calibration = whole._calibrate(context)
         cell.devices.interlocks.work_with(calibration.configuration)
-        return work(cell, calibration, hands)
+        return work(cell, calibration, context)
 
     with tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
 
@@ -184,11 +184,11 @@ class _WholeJob:
         if "laser_sweep" in record.results:
             record.shots = _shots(self.cell, record.results["laser_sweep"])
 
-    def _calibrate(self, hands: Hands) -> CellCalibration:
-        mover = Mover(self.cell.devices.arm, self.cell.clock, self.config, self.job, hands.safe_point)
+    def _calibrate(self, context: WorkContext) -> CellCalibration:
+        mover = Mover(self.cell.devices.arm, self.cell.clock, self.config, self.job, context.safe_point)
         self.cell.devices.vehicle.brake()
         devices, tell = self.cell.devices, self.tell
-        given, keep = (self.config, devices, mover, hands.check), NoFrames().keep
+        given, keep = (self.config, devices, mover, context.check), NoFrames().keep
         scan = collect_scan(*given, lambda f, t: tell(0.36 * f, f"calibrate: {t}"), keep)
         witness = look_at_witness(self.config, devices, keep)
         target = collect_target(*given, lambda f, t: tell(0.36 + 0.12 * f, f"calibrate: {t}"), keep)
@@ -198,7 +198,7 @@ class _WholeJob:
         identities = {device.name: device.identity().serial for device in named}
         known = identities, self.config, arm_table(self.config, self.cell.devices), witness
         made = CellCalibration.solve(scan, target, *known)
-        made = look_at_shutter(self.config, devices, mover, made, hands.check, keep)
+        made = look_at_shutter(self.config, devices, mover, made, context.check, keep)
         return with_edge(self.config, devices, keep, made)
 
     def _follow(self, event: Event) -> None:

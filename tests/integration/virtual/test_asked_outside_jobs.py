@@ -85,9 +85,9 @@ def test_a_protective_stop_is_asked_about_and_the_work_goes_on_or_ends(cell: Cel
     stop_on_the_way(cell)
     attempts: list[None] = []
 
-    def work(hands: Any) -> str:
+    def work(context: Any) -> str:
         attempts.append(None)
-        cell.mover(None, hands.safe_point).to_joints(away(cell))
+        cell.mover(None, context.safe_point).to_joints(away(cell))
         return "made"
 
     thread, ended = in_background(lambda: cell.perform(kind, work))
@@ -185,7 +185,7 @@ def test_a_pendant_that_is_switched_to_local_refuses_the_next_motion_of_a_job(ce
     cell.home("arm")
     simulated(cell).fault("arm.local_control")
     with pytest.raises(DeviceFault, match="in local control") as caught:
-        cell.perform("homing", lambda hands: cell.mover(None, hands.safe_point).to_joints(away(cell)))
+        cell.perform("homing", lambda context: cell.mover(None, context.safe_point).to_joints(away(cell)))
     assert caught.value.code == "arm.local_control"
     assert np.abs(simulated(cell).arm.model.drive.q - HOME).max() < 1e-3
 

@@ -82,7 +82,7 @@ def run(
 
     The vehicle drives only when it is known where it stands: it sees the board, or somebody says --at-start.
     """
-    from cell.config.job import each_item
+    from cell.config.job import item_names
     from cell.procedures.arm.moves import require_share
     from cell.run.session.supervisor import Cell
 
@@ -91,7 +91,7 @@ def run(
         return cell.run(job, display, at_start=at_start, until=until)
 
     require_share(pace)
-    if count is None and len(each_item(job)) > 1:
+    if count is None and len(item_names(job)) > 1:
         count = 1
     opened = partial(Cell.open, config, sim=sim, seed=seed, level=level.value, job=job)
     if elsewhere and count is None:
@@ -123,12 +123,12 @@ def dry_run(
     typer.echo(f"dry run of {job} in the simulated world {seed}: loading", err=True)
     from cell.check.fit import read_fitting
     from cell.config.cell_config import find_config, load_config
-    from cell.config.job import each_item
+    from cell.config.job import item_names
     from cell.devices.simulated.process import Injection
     from cell.procedures.steps.kinds import kind_of
     from cell.run.session.supervisor import Cell
 
-    if count is None and len(each_item(job)) > 1:
+    if count is None and len(item_names(job)) > 1:
         count = 1
     described = load_config(find_config(config, simulated=True))
     loaded, _ = read_fitting(job, described, calibrates=True)

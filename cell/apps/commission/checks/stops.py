@@ -12,7 +12,7 @@ import numpy as np
 from cell.apps.commission.check import CommissionCheck, Result, refused
 from cell.apps.commission.workplace import CommissionWorkplace
 from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line
-from cell.run.recorded_work import Hands
+from cell.run.recorded_work import WorkContext
 from drivers.errors import Aborted, InterlockError
 from drivers.interfaces import ArmSafety, Motion
 
@@ -142,12 +142,12 @@ def _by_program(desk: CommissionWorkplace, begin: Callable[[], None]) -> None:
 def _by_request(desk: CommissionWorkplace, begin: Callable[[], None]) -> None:
     """The run is asked to end, as `cell abort` asks from another shell."""
 
-    def work(hands: Hands) -> None:
+    def work(context: WorkContext) -> None:
         begin()
         run = desk.cell.current
         if run is not None:
             run.abort("the commissioning tries how a request to end ends it")
-        hands.check()
+        context.check()
 
     try:
         desk.cell.perform("commission", work, info={"check": "stops"})

@@ -25,7 +25,7 @@ from cell.config.cell_config import RailConfig
 from cell.config.job import Job
 from cell.devices.gate.gate import Gated
 from cell.run.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM, Jog, begin_program, moved
-from cell.run.recorded_work import CONFIRMED_BY_A_PERSON, Hands
+from cell.run.recorded_work import CONFIRMED_BY_A_PERSON, WorkContext
 from drivers.errors import Aborted, CellError, ConfigError, DeviceError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import ATTENDED_S, Arm, Attended, Motion, Rail
 
@@ -256,19 +256,19 @@ class Manual:
         finally:
             self._on.clear()
 
-    def _work(self, hands: Hands) -> None:
+    def _work(self, context: WorkContext) -> None:
         # Begun anew after a fault that a person has confirmed: what was asked for meanwhile is not done now.
         while not self._wanted.empty():
             self._drop(self._wanted.get())
         self._on.set()
         while not self._off.is_set():
-            hands.check()
+            context.check()
             with suppress(queue.Empty):
                 wanted = self._wanted.get(timeout=LOOK_S)
                 if isinstance(wanted, Press):
-                    self._hold(wanted, hands)
+                    self._hold(wanted, context)
                 else:
-                    self._do_step(wanted, hands)
+                    self._do_step(wanted, context)
 
     def _drop(self, wanted: _Step | Press) -> None:
         if isinstance(wanted, Press):
@@ -278,28 +278,28 @@ class Manual:
             wanted.answer.append(Aborted(NOT_DONE))
             wanted.done.set()
 
-    def _do_step(self, step: _Step, hands: Hands) -> None:
+    def _do_step(self, step: _Step, context: WorkContext) -> None:
         wish = step.wish
         try:
-            answer: dict[str, str] | BaseException = moved(self._cell, wish, self._job, hands)
+            answer: dict[str, str] | BaseException = moved(self._cell, wish, self._job, context)
         except (Aborted, CellError) as error:
             answer = error
         log.info("jog step: %s %s %+g: %s", wish.device, wish.axis, wish.amount, answer)
         step.answer.append(answer)
         step.done.set()
-        hands.check()
+        context.check()
         if _needs_person(answer):
             raise answer
 
-    def _hold(self, press: Press, hands: Hands) -> None:
+    def _hold(self, press: Press, context: WorkContext) -> None:
         if press.over() is not None:
             self._tell(press, "ended", str(press.ended))
             return
         try:
-            why = self._move(press, hands)
+            why = self._move(press, context)
         except CellError as error:
             press.end(str(error))
-            hands.check()
+            context.check()
             self._tell(press, "refused", str(error))
             log.info("hold %s %s: %s", press.device, press.axis, error)
             if _needs_person(error):
@@ -309,7 +309,7 @@ class Manual:
         self._tell(press, "ended", why)
         log.info("hold %s %s%s: %s", press.device, press.axis, "+" if press.sign > 0 else "-", why)
 
-    def _move(self, press: Press, hands: Hands) -> str:
+    def _move(self, press: Press, context: WorkContext) -> str:
         """Move until the press is over or the way ends; why it ended. The device stands then."""
         device: Any = getattr(self._cell.devices, press.device)
         bare = device.bare if isinstance(device, Gated) else device
@@ -323,7 +323,7 @@ class Manual:
             try:
                 self._tell(press, "moving", "")
                 while (why := press.over()) is None and not motion.done and not self._off.is_set():
-                    hands.check()
+                    context.check()
                     press.wait(LOOK_S)
             finally:
                 press.beat = None

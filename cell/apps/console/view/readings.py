@@ -17,7 +17,7 @@ import numpy as np
 from cell.apps.console.host.manual import HOLD_SPEED, HOLD_TURN, rail_hold_speed
 from cell.apps.console.view.scene import scene
 from cell.config.cell_config import DEVICES, CellConfig
-from cell.config.job import each_item, load_job, require_job_name, shipped_jobs
+from cell.config.job import item_names, load_job, require_job_name, shipped_jobs
 from cell.devices.devices import Devices
 from cell.devices.gate.gate import Gated
 from cell.devices.gate.rules import RULES
@@ -214,10 +214,10 @@ def jobs(own: str) -> list[str]:
         try:
             require_job_name(path.stem)
             load_job(path.stem)
-            here += each_item(path.stem)
+            here += item_names(path.stem)
         except CellError:
             continue
-    shipped = [item for name in shipped_jobs() for item in each_item(name)]
+    shipped = [item for name in shipped_jobs() for item in item_names(name)]
     return list(dict.fromkeys((own, *here, *shipped)))
 
 

@@ -145,7 +145,7 @@ def test_a_jobs_obstacle_is_met_by_no_planned_way(tmp_path: Path) -> None:
     far = from_parts((0.0, 3.0, -1.0))
     centre = beam.place_from_centre.model_copy(update={"translation": tuple(far.inverse().act(at).tolist())})
     here = beam.model_copy(update={"place_from_centre": centre})
-    mover.meet_station(far, JOB.model_copy(update={"obstacle": (here,)}), parse_board(JOB.board.spec), extent)
+    mover.avoid_station(far, JOB.model_copy(update={"obstacle": (here,)}), parse_board(JOB.board.spec), extent)
     with pytest.raises(CollisionError, match="station obstacle beam"):
         mover.plan_to(goal, "down")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.config.job import each_item, job_path, load_job, shipped_jobs
+from cell.config.job import item_names, job_path, load_job, shipped_jobs
 from drivers.errors import ConfigError
 
 
@@ -49,14 +49,14 @@ def test_what_a_batch_does_is_checked_and_no_part_of_what_runs_rest_on(tmp_path:
 
 def test_an_item_has_its_own_nest_and_surface_and_knows_where_the_others_are() -> None:
     first, third = load_job("tray4")[0], load_job("tray4#3")[0]
-    assert each_item("tray4") == [f"tray4#{k}" for k in (1, 2, 3, 4)] and each_item("tray4#2") == ["tray4#2"]
-    assert each_item("pot") == ["pot"]
+    assert item_names("tray4") == [f"tray4#{k}" for k in (1, 2, 3, 4)] and item_names("tray4#2") == ["tray4#2"]
+    assert item_names("pot") == ["pot"]
     assert third.nest is not None and third.nest.base_from_part.translation == pytest.approx((-0.7, 0.1, 0.03))
     assert third.surface.place_from_surface.translation == (0.06, -0.06, 0.0)
     assert (third.job.name, third.job.kind) == ("tray4#3", "load")
-    assert [number for number, _, _ in third.others] == [1, 2, 4]
-    assert third.others[0][1].isApprox(first.nest.base_from_part.se3()) if first.nest else False
-    assert third.others[0][2].isApprox(first.surface.place_from_surface.se3())
+    assert [number for number, _, _ in third.other_items] == [1, 2, 4]
+    assert third.other_items[0][1].isApprox(first.nest.base_from_part.se3()) if first.nest else False
+    assert third.other_items[0][2].isApprox(first.surface.place_from_surface.se3())
     assert third.of_item(1) == first, "whichever item it is asked of"
     # What an item does not say is as [nest] and [surface] have it.
     old, new = load_job("swap")[0], load_job("swap#2")[0]

@@ -85,9 +85,9 @@ def test_the_first_motion_that_chance_does_not_bring_is_the_cause(off: pin.SE3, 
 
 
 def test_a_part_is_kept_only_where_its_bound_is_inside_both_tolerances() -> None:
-    assert part(moved(0.5e-3)).kept(PLACE)
-    assert not part(moved(0.5e-3), sigma=0.1e-3).kept(PLACE), "it may lie farther"
-    assert not part(moved(turn=(0.0, 0.0, 0.007))).kept(PLACE)
+    assert part(moved(0.5e-3)).in_tolerance(PLACE)
+    assert not part(moved(0.5e-3), sigma=0.1e-3).in_tolerance(PLACE), "it may lie farther"
+    assert not part(moved(turn=(0.0, 0.0, 0.007))).in_tolerance(PLACE)
     told = str(part(moved(0.7e-3), beside=0).misplaced(PLACE, "It was not corrected: why"))
     assert "against the surface as swept before" in told and "Leave 10 mm of the surface free" in told
     assert "It was not corrected: why. See to it" in told
@@ -116,8 +116,8 @@ def test_an_edge_that_stands_too_high_is_no_part_in_its_place() -> None:
     noise = np.full(3, 0.05e-3)
     along = [Flush(np.zeros((3, 3)), np.array([0.0, 0.1e-3, top]), noise) for top in (0.64e-3, 0.66e-3, -0.66e-3)]
     kept, high, low = (replace(part(moved(0.1e-3)), flush=flush) for flush in along)
-    assert kept.kept(PLACE) and "flush +0.00 to +0.64 mm" in kept.words
-    assert not high.kept(PLACE) and not low.kept(PLACE)
+    assert kept.in_tolerance(PLACE) and "flush +0.00 to +0.64 mm" in kept.words
+    assert not high.in_tolerance(PLACE) and not low.in_tolerance(PLACE)
     refused = high.misplaced(PLACE)
     assert BENT in str(refused) and [number.kept for number in refused.numbers] == [True, True, False]
     assert BENT not in str(replace(high, seen=part(moved(0.9e-3)).seen).misplaced(PLACE)), "it also lies aside"
@@ -135,8 +135,8 @@ def test_a_feature_out_of_its_own_tolerance_is_no_part_in_its_place() -> None:
         for name, tolerance in (("wide", "0.5 mm"), ("narrow", "0.2 mm"))
     )
     found = replace(part(moved(0.3e-3)), named=named)
-    assert part(moved(0.3e-3)).kept(PLACE) and not found.kept(PLACE)
-    assert replace(part(moved(0.1e-3)), named=named).kept(PLACE)
+    assert part(moved(0.3e-3)).in_tolerance(PLACE) and not found.in_tolerance(PLACE)
+    assert replace(part(moved(0.1e-3)), named=named).in_tolerance(PLACE)
     told = found.misplaced(PLACE)
     assert "Out of tolerance: the hole narrow is 0.30 mm off" in str(told) and "hole wide" not in str(told)
     assert [number.kept for number in told.numbers] == [True, True, True, False]

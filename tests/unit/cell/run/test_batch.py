@@ -19,7 +19,7 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.run.batch import _question, perform
 from cell.run.folder import read_report
 from cell.run.job_run import RunOutcome
-from cell.run.recorded_work import Hands
+from cell.run.recorded_work import WorkContext
 from lab.bench.job.part_effects import held, motion
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from statemachine.step import Event
@@ -194,13 +194,13 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
             if asked == ["Hold", "Hold"]:
                 cell.simulated.make_ready(Described.of("own.toml"))
 
-        def work(hands: Hands) -> None:
+        def work(context: WorkContext) -> None:
             with cell.maintenance("the part is taken out", ["claw_at_contact"]):
                 claw.release()
             assert _question(here, job, "part 2 of 2", last, refill=False) is None
             question = _question(here, job, "part 2 of 2", last, refill=True)
             assert question is not None
-            question(replace(hands, ask=person))
+            question(replace(context, ask=person))
 
         cell.perform("loading", work)
     assert asked == ["Hold", "Hold", "The"]

@@ -19,7 +19,7 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.boards import collect_scan, look_for
 from cell.run import recorded_work
-from cell.run.recorded_work import Hands, RecordedWork, classify
+from cell.run.recorded_work import RecordedWork, WorkContext, classify
 from cell.run.runs import Run
 from drivers.camera.folder import read_image
 from drivers.errors import RefusedError
@@ -43,10 +43,10 @@ def test_a_refused_calibration_leaves_its_pictures_and_says_which_it_refused(tmp
     dark = CONFIG.model_copy(update={"scan_camera": CONFIG.scan_camera.model_copy(update={"photo_exposure": 20e-6})})
     cell = VirtualCell(dark, seed=4, level="ideal")
 
-    def work(hands: Hands) -> None:
+    def work(context: WorkContext) -> None:
         cell.devices.vehicle.brake()
         mover = Mover(cell.devices.arm, cell.clock, dark, load_job("pot")[0])
-        collect_scan(dark, cell.devices, mover, hands.check, hands.progress, hands.keep)
+        collect_scan(dark, cell.devices, mover, context.check, context.progress, context.keep)
 
     report, folder = recorded(tmp_path, cell, work)
     assert report["outcome"] == "refused"
@@ -61,10 +61,10 @@ def test_what_is_kept_is_the_very_picture(tmp_path: Path) -> None:
     cell = VirtualCell(CONFIG, seed=4, level="ideal")
     pictures: list[np.ndarray] = []
 
-    def work(hands: Hands) -> None:
+    def work(context: WorkContext) -> None:
         def keep(what: str, frame: Any) -> None:
             pictures.append(frame.image)
-            hands.keep(what, frame)
+            context.keep(what, frame)
 
         cell.devices.vehicle.brake()
         Mover(cell.devices.arm, cell.clock, CONFIG, None).to_joints(HOME)
@@ -79,7 +79,7 @@ def test_what_is_kept_is_the_very_picture(tmp_path: Path) -> None:
 
 
 def test_work_that_looks_at_nothing_leaves_no_folder_for_it(tmp_path: Path) -> None:
-    def work(hands: Hands) -> None:
+    def work(context: WorkContext) -> None:
         raise RefusedError("not today")
 
     report, folder = recorded(tmp_path, VirtualCell(CONFIG, seed=4, level="ideal"), work)

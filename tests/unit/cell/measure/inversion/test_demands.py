@@ -15,7 +15,7 @@ from cell.measure.inversion.demands import require_agreement, require_board, req
 from cell.measure.inversion.effects.between_sweeps import SurfaceMotion
 from cell.measure.inversion.effects.during_sweep import require_firm
 from cell.procedures.arm.photograph import _require
-from cell.procedures.sweep.second_look import require_unmoved
+from cell.procedures.sweep.second_look import require_surface_unmoved
 from cell.procedures.sweep.swath import SweepErrors, TimeBound, shift_by_times
 from drivers.errors import DeviceFault, RefusedError
 
@@ -33,8 +33,8 @@ GATES: dict[str, tuple[float, Gate]] = {
     "off the board": (0.1, lambda v: require_board(0 * ONE, Told(covariance=ONE), np.full(6, v))),
     "obliquity": (0.1, lambda v: _require(Told(obliquity=v, rms_px=0.01), PHOTO)),
     "residual": (0.01, lambda v: _require(Told(obliquity=0.1, rms_px=v), PHOTO)),
-    "motion": (0.0, lambda v: require_unmoved(SurfaceMotion(np.full(6, v), ONE, 1.0, ONE))),
-    "matched": (1.0, lambda v: require_unmoved(SurfaceMotion(0 * ONE[0], ONE, v, ONE))),
+    "motion": (0.0, lambda v: require_surface_unmoved(SurfaceMotion(np.full(6, v), ONE, 1.0, ONE))),
+    "matched": (1.0, lambda v: require_surface_unmoved(SurfaceMotion(0 * ONE[0], ONE, v, ONE))),
     "times": (1e-3, lambda v: shift_by_times([TimeBound("rail", "rail", v)], 0.01, SweepErrors(ONE, 1e-5, 1e-4))),
     "rocking": (1e-5, lambda v: require_firm(v, 1e-5, "the place")),
 }  # type: ignore[dict-item, arg-type]

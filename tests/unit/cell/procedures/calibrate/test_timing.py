@@ -17,7 +17,7 @@ from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
 from cell.procedures.steps.laser_sweep import times_known
-from cell.run.recorded_work import Hands, RecordedWork
+from cell.run.recorded_work import RecordedWork, WorkContext
 from cell.run.runs import Run
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord, run_whole_job
@@ -61,11 +61,11 @@ def measured(made: CellCalibration, seed: int, level: str, folder: Path) -> Stam
     cell = VirtualCell(CONFIG, seed, level)
     job, _ = load_job("pot")
 
-    def look(hands: Hands) -> StampTiming:
+    def look(context: WorkContext) -> StampTiming:
         cell.devices.interlocks.work_with(made.configuration)
         cell.devices.vehicle.brake()
-        mover = Mover(cell.devices.arm, cell.clock, CONFIG, job, hands.safe_point)
-        given = CONFIG, cell.devices, mover, made, hands.check, lambda f, t: None, lambda what, frame: None
+        mover = Mover(cell.devices.arm, cell.clock, CONFIG, job, context.safe_point)
+        given = CONFIG, cell.devices, mover, made, context.check, lambda f, t: None, lambda what, frame: None
         return collect_timing(*given)
 
     return Run("timing", lambda run: RecordedWork(run, "timing", cell.devices, folder, {}).perform(look)).result()

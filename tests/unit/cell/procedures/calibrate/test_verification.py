@@ -19,7 +19,7 @@ from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointi
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.verification import Verification, collect_verification, keep_confirmed
-from cell.run.recorded_work import Hands, RecordedWork
+from cell.run.recorded_work import RecordedWork, WorkContext
 from cell.run.runs import Run
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world import levels
@@ -64,11 +64,11 @@ def verified(calibration: CellCalibration, seed: int, folder: Path) -> Verificat
     cell.world.stand(STOOD_S)
     devices = cell.devices
 
-    def look(hands: Hands) -> Verification:
+    def look(context: WorkContext) -> Verification:
         devices.interlocks.work_with(calibration.configuration)
         devices.vehicle.brake()
-        mover = Mover(devices.arm, cell.clock, CONFIG, JOB, hands.safe_point)
-        given = CONFIG, devices, mover, calibration, hands.check, lambda f, t: None, lambda what, frame: None
+        mover = Mover(devices.arm, cell.clock, CONFIG, JOB, context.safe_point)
+        given = CONFIG, devices, mover, calibration, context.check, lambda f, t: None, lambda what, frame: None
         return Verification.of(calibration, JOB, collect_verification(*given))
 
     return Run(

@@ -16,7 +16,7 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.inversion import PlacePose
 from cell.measure.vision import BoardView, parse_board
 from cell.procedures.arm.photograph import APART_S, BoardFix, swing, swing_covariance
-from cell.procedures.steps.board_photo import WAIT_S, WAITS, photographed, require_unmoved, until_quiet
+from cell.procedures.steps.board_photo import WAIT_S, WAITS, photographed, require_board_unmoved, until_quiet
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord
@@ -40,7 +40,7 @@ def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
     with pytest.raises(Taken):
         photographed(here, fix.base_from_board, lambda share, text: None)
     with pytest.raises(Taken):
-        require_unmoved(here, fix, "before the sweep", lambda share, text: None)
+        require_board_unmoved(here, fix, "before the sweep", lambda share, text: None)
     assert asked == [(CONFIG.target_camera.photo_exposure, PHOTO_RATE_HZ)] * 2
 
 
@@ -154,7 +154,7 @@ def looked(record: JobRecord, further: float, folder: Path) -> str:
     """The refusal of a look at the board with the vehicle so many metres from where it stood; "" for none."""
     work = AtStation(record, folder, further=further, folded=False).work
     try:
-        require_unmoved(work, record.results["board_photo"], "before the sweep", lambda share, text: None)
+        require_board_unmoved(work, record.results["board_photo"], "before the sweep", lambda share, text: None)
     except RefusedError as refused:
         assert refused.numbers[0].name == "board moved by"
         return str(refused)

@@ -95,7 +95,7 @@ def test_what_is_in_the_way_to_the_part_ends_the_run_with_the_part_where_it_lay(
     off = moved(y=0.8e-3, z=0.35e-3)
     # One that lies in its place, and might lie better, stays where it is.
     near = LyingPart(placed_pot, tmp_path, also='corrections = 1\naccept = "0.1 mm"', changed=bolt)
-    assert near.looked(moved(y=0.2e-3, z=0.1e-3)).kept(pot()[0].place) and near.parts == []
+    assert near.looked(moved(y=0.2e-3, z=0.1e-3)).in_tolerance(pot()[0].place) and near.parts == []
     assert any("it was not corrected: the claw touched something" in note for note in near.notes)
 
     def pushed(cell: VirtualCell, text: str) -> None:

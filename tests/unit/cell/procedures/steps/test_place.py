@@ -66,7 +66,7 @@ class Site:
         world_from_base = world.world_from_base(self.cell.clock.now())
         self.base_from_surface = from_matrix(inverse(world_from_base) @ world.scene.world_from_surface)
         self.mover = Mover(self.arm, self.cell.clock, CONFIG, JOB)
-        self.mover.meet_station(
+        self.mover.avoid_station(
             self.base_from_surface * JOB.surface.place_from_surface.se3().inverse(), JOB, parse_board(JOB.board.spec),
             NOMINAL.extent,
         )  # fmt: skip

@@ -17,7 +17,7 @@ from cell.devices.lock import CellLock
 from cell.measure.geometry.poses import from_ur
 from cell.motion.kinematics import HOME
 from cell.run.jogging import jog, parse_jog
-from cell.run.session.session import Opened
+from cell.run.session.session import OpenCell
 from cell.run.session.supervisor import Cell
 from drivers.errors import Aborted, ConfigError, InterlockError
 from tests.unit.cell.devices.gate.test_interlocks import CONFIG, LASER, at_rest, refused
@@ -25,7 +25,7 @@ from tests.unit.cell.devices.gate.test_interlocks import CONFIG, LASER, at_rest,
 
 @pytest.fixture
 def cell(tmp_path: Path) -> Iterator[Cell]:
-    made = Cell(Opened(CONFIG, tmp_path, CellLock(CONFIG), at_rest().devices, None))
+    made = Cell(OpenCell(CONFIG, tmp_path, CellLock(CONFIG), at_rest().devices, None))
     yield made
     made.close()
 
@@ -92,7 +92,7 @@ def test_a_stop_that_comes_while_work_is_prepared_is_not_lost(cell: Cell) -> Non
     before = cell.stops
     cell.stop()
     with pytest.raises(Aborted, match="was stopped before the test began"):
-        cell.perform("test", lambda hands: None, stops=before)
+        cell.perform("test", lambda context: None, stops=before)
     assert np.array_equal(cell.devices.arm.state().joints, stood)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from cell.apps.console.host.controller import SOON_S, ConsoleController
 from cell.apps.console.view.readings import jobs
-from cell.config.job import each_item, job_path, load_job, shipped_jobs
+from cell.config.job import item_names, job_path, load_job, shipped_jobs
 from cell.run.runs import Run
 from cell.run.session.supervisor import Cell
 from drivers.errors import CellError, ConfigError, InterlockError, LimitError, RefusedError
@@ -165,7 +165,7 @@ def test_jobs_are_named_never_addressed(
         with pytest.raises(ConfigError) as refused:
             desk.named_job(name)
         assert "secret" not in str(refused.value)
-    shipped = [item for name in shipped_jobs() if name != "pot" for item in each_item(name)]
+    shipped = [item for name in shipped_jobs() if name != "pot" for item in item_names(name)]
     assert jobs("pot") == ["pot", "mine", *shipped]
     with pytest.raises(ConfigError, match="no regular file"):
         load_job("pipe.toml")
