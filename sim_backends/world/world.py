@@ -89,12 +89,12 @@ class World:
     def _set_up(self, found: tuple[Collision, ...] = ()) -> None:
         """Part in the claw, or those of all items where they lie at first, and bodies that may meet."""
         drawn = self.scene.drawing.station
-        self._current, self._items = 0, [self._drawn_item(k) for k in range(len(drawn.beside))]
-        if self._items:
-            own = replace(drawn, beside=()).as_json()
-            self._current = [each.as_json() for each in drawn.beside].index(own)
-        else:
-            self._items = [Item(self.scene, self.station, self._part(self.scene, self.station))]
+        items = [self._drawn_item(k) for k in range(len(drawn.beside))]
+        own = replace(drawn, beside=()).as_json()
+        # Whoever looks meanwhile, in another thread, finds an item.
+        self._current = 0
+        self._items = items or [Item(self.scene, self.station, self._part(self.scene, self.station))]
+        self._current = [each.as_json() for each in drawn.beside].index(own) if items else 0
         self._make_current(found)
         self._report_grip()
 
