@@ -21,6 +21,8 @@ from drivers.interfaces import LinkStatistics
 
 _DASHBOARD_S, _SEEN_S, _LEAST_S = 0.7, 1.9, 0.3
 """Seconds on the wall for ending the program and for switching off, and the least that another try is worth."""
+_JUST_S = 0.2
+"""So soon after an attempt that failed an output alone begins no other one: who closes a cell has stopped it."""
 
 
 class Safing:
@@ -35,7 +37,7 @@ class Safing:
         self._statistics = statistics
         self._lock = threading.Lock()
         self._attempt: threading.Thread | None = None
-        self._problem = ""
+        self._problem, self._ended = "", 0.0
 
     def begin(self) -> threading.Thread:
         """The attempt that is under way, or a new one."""
@@ -45,9 +47,12 @@ class Safing:
                 self._attempt.start()
             return self._attempt
 
-    def confirm(self) -> str:
-        """Wait for an attempt: what could not be confirmed, empty once the arm itself has shown that it is safe."""
-        self.begin().join()
+    def confirm(self, just: float = 0.0) -> str:
+        """Wait for an attempt, where none has failed within the last `just` s: what could not be confirmed, empty once
+        the arm itself has shown that it is safe.
+        """
+        if not self._problem or time.monotonic() - self._ended > just:
+            self.begin().join()
         return self._problem
 
     def join(self) -> None:
@@ -66,7 +71,7 @@ class Safing:
         if not self._seen_safe(safe_off):
             outputs = f" and outputs {', '.join(map(str, safe_off))} off" if safe_off else ""
             problems.append(f"the arm was not seen at rest{outputs}")
-        self._problem = "; ".join(problems)
+        self._problem, self._ended = "; ".join(problems), time.monotonic()
 
     def _seen_safe(self, outputs: tuple[int, ...]) -> bool:
         end = time.monotonic() + _SEEN_S
@@ -190,7 +195,7 @@ class ArmSession:
         except DeviceFault as error:
             if value or index not in self.setup.safe_off:
                 raise
-            self._require_safe_without(error)
+            self._require_safe_without(error, _JUST_S)
 
     @contextmanager
     def trying(self, index: int) -> Iterator[None]:
@@ -330,14 +335,14 @@ class ArmSession:
             self.feed.wait_for(lambda snapshot: flange_agrees(forward, snapshot), _TOOL_S)
         self.require_same_arm()
 
-    def _require_safe_without(self, error: DeviceFault) -> None:
+    def _require_safe_without(self, error: DeviceFault, just: float = 0.0) -> None:
         """After a call that failed: return once the arm is safe by the other way, else say that it is not known to be.
 
         A fault of anything but the link is raised as it is.
         """
         if error.code not in ("arm.link_lost", "arm.link_closed", "arm.not_stopped"):
             raise error
-        if problem := self._safing.confirm():
+        if problem := self._safing.confirm(just):
             raise fault(self._name, "arm.not_safe", f"{error.message} Without it: {problem}") from error
 
     def _set_output(self, index: int, value: bool) -> None:
