@@ -9,6 +9,7 @@ import pytest
 
 from cell import Cell, ConfigError
 from cell.config.cell_config import default_toml
+from cell.run.session.session import kept_speed
 
 
 @pytest.mark.parametrize(
@@ -35,3 +36,7 @@ def test_the_supervisor_script_is_held_to_the_same() -> None:
     Path("cell.toml").write_text(default_toml())
     with pytest.raises(ConfigError, match="still the example's"):
         Cell.open()
+
+
+def test_a_slower_computer_keeps_a_slower_cell_and_never_one_slower_than_the_wall() -> None:
+    assert [kept_speed(1e-3 * took) for took in (2.0, 4.4, 6.6, 8.9, 60.0)] == [3.0, 3.0, 2.0, 1.5, 1.0]
