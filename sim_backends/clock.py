@@ -76,7 +76,7 @@ Pose = NDArray[np.float64]
 class History:
     """Poses of one body over the last `keep` world seconds; safe between threads."""
 
-    def __init__(self, keep: float = 10.0) -> None:
+    def __init__(self, keep: float = 15.0) -> None:
         self._keep = keep
         self._samples: deque[tuple[float, Pose]] = deque()
         self._lock = threading.Lock()

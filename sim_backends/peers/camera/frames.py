@@ -88,8 +88,8 @@ def _read(connection: socket.socket, count: int) -> bytes | None:
 
 log = logging.getLogger(__name__)
 
-BACKLOG = 64
-"""Exposures that may wait for their rendering; a further one is dropped."""
+BACKLOG_S = 12.0
+"""World seconds for which exposures may wait for their rendering; a further one is dropped. The world remembers 15."""
 
 Render = Callable[[float, float], NDArray[np.uint8]]
 """(world time of the middle of the exposure, exposure in s) → grey image (height, width)."""
@@ -188,7 +188,7 @@ class FrameSession:
                     continue
                 self._next = None if self._period is None else begin + self._period
                 frame_id, lost = self._camera.expose()
-                if not lost and len(self._exposed) < BACKLOG:
+                if not lost and (not self._exposed or begin - self._exposed[0].begin < BACKLOG_S):
                     self._exposed.append(Exposure(frame_id, begin, duration))
                     self._wake.notify_all()
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import CameraSpec
-from sim_backends.peers.camera.frames import BACKLOG, FramePeer
+from sim_backends.peers.camera import frames as frame_peer
+from sim_backends.peers.camera.frames import FramePeer
 
 pytestmark = pytest.mark.wire
 SPEC = CameraSpec(
@@ -156,16 +157,17 @@ def test_free_running_frames_lie_on_the_grid_of_the_device_clock(client: Client,
 
 
 def test_slow_rendering_drops_exposures_beyond_the_backlog_and_says_so(
-    client: Client, scene: Scene, clock: WorldClock
+    client: Client, scene: Scene, clock: WorldClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(frame_peer, "BACKLOG_S", 63.5 / 120.0)
     scene.open.clear()
     client.ask(op="start", frame_rate=120.0)
     clock.sleep(1.5)
     scene.open.set()
-    frames = [client.frame() for _ in range(BACKLOG + 20)]
+    frames = [client.frame() for _ in range(84)]
     ids = [frame["frame_id"] for frame in frames]
-    assert ids[: BACKLOG + 1] == list(range(1, BACKLOG + 2))
-    assert ids[BACKLOG + 1] > BACKLOG + 50
+    assert ids[:65] == list(range(1, 66))
+    assert ids[65] > 114
     # A dropped exposure has taken its time all the same.
     grid = frames[0]["device_ns"] + (np.array(ids) - 1) * 1e9 / 120.0
     np.testing.assert_allclose([frame["device_ns"] for frame in frames], grid, atol=10)
