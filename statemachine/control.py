@@ -87,6 +87,8 @@ class RunControl:
         """Set by the run once it has come to an end of its own."""
         self.late = False
         """Whether somebody asked to end the run when it had come to a good end already, or was just coming to it."""
+        self.last = False
+        """Whether somebody asked that no other part of a batch is begun after this run."""
         self._lock = threading.RLock()
         self._paused = False
         self._wanted: str | None = None
@@ -141,6 +143,8 @@ class RunControl:
                     self.go_on()
                 case "confirm":
                     self.confirm(request.reason, request.number)
+                case "end-after":
+                    self.last = True
 
     # --- asked by the run ---
 

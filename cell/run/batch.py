@@ -163,8 +163,7 @@ def perform(
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()
             tell(Event("note", None, {"text": str(batch)}))
             interrupted = last.interrupted
-            if interrupted or last.stopped_after_end or not (last.outcome in GOOD or _skipped(here, job, last)):
-                why = f"part {number} {last}"
+            why = _ended_by(here, job, last, number) or f"after part {number}, as asked" * last.control.last
     except (CellError, SignalInterrupt) as error:
         if not batch.runs:
             raise
@@ -173,6 +172,12 @@ def perform(
     rest = [jobs[k % len(jobs)].job.name for k in range(len(batch.runs), count)][: len(jobs)] if len(jobs) > 1 else ()
     why += f"; not tried: {', '.join(rest)}" * bool(rest)
     return replace(batch, reason=why or "every part was tried", interrupted=interrupted).written()
+
+
+def _ended_by(here: OpenCell, job: Job, last: RunOutcome, number: int) -> str:
+    """Why no other part is begun after this end; empty where one is."""
+    ends = last.interrupted or last.stopped_after_end or not (last.outcome in GOOD or _skipped(here, job, last))
+    return f"part {number} {last}" * ends
 
 
 def _known_after(series: GraspSeries, last: RunOutcome) -> GraspSeries:

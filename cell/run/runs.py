@@ -72,6 +72,10 @@ class Run(Generic[Result]):
         """Let a paused run go on."""
         self.control.go_on()
 
+    def end_after(self) -> None:
+        """Let the run come to its end, and a batch end with it."""
+        self.control.last = True
+
     def abort(self, reason: str = "aborted by the program that began it") -> None:
         """End the run: what moves is stopped at once. `result()` then says that it was aborted."""
         self.control.abort(reason)

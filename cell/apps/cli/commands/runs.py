@@ -47,10 +47,14 @@ def abort(
     name: RunArgument = None,
     config: ConfigOption = None,
     reason: Annotated[str, typer.Option(help="Goes into the report.")] = "asked for with `cell abort`",
+    after: Annotated[bool, typer.Option("--after", help="Nothing is stopped: a batch ends after this part.")] = False,
 ) -> None:
     """End what is going on in another process (run, calibration, verification, homing, jog): the cell is stopped."""
     from cell.run.folder import list_runs, listens
 
+    if after:
+        _ask(_going(name, config), "end-after", reason, "asked {} to be the last of its batch")
+        return
     going = [run for run in list_runs(_going_folder(config)) if listens(run)] if name is None else []
     if not going:
         _ask(_going(name, config), "abort", reason, "asked {} to end")

@@ -17,11 +17,12 @@ from cell.config.job import job_path, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.run.batch import _question, perform
-from cell.run.folder import read_report
+from cell.run.folder import list_runs, read_report
 from cell.run.job_run import RunOutcome
 from cell.run.recorded_work import WorkContext
 from lab.bench.job.part_effects import held, motion
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
+from statemachine.journal import request
 from statemachine.step import Event
 from tests.support import Typed
 from tests.support.described_cells import Changes, described, pose
@@ -148,6 +149,17 @@ def test_an_abort_in_the_second_part_leaves_the_first_whole_and_tells_what_was_n
     assert [run.outcome for run in batch.runs] == ["placed", "aborted"]
     assert (batch.reason, batch.counts["not tried"], batch.exit_code) == ("part 2 aborted: seen enough", 1, 1)
     assert read_report(batch.runs[0].folder)["outcome"] == "placed"
+
+
+def test_somebody_lets_this_part_be_the_last(opened: Callable[..., Cell]) -> None:
+    with opened() as cell:
+
+        def ask(event: Event) -> None:
+            if (event.kind, event.step) == ("step_started", "board_photo"):
+                request(list_runs(cell.runs_folder)[-1], "end-after", "home time")
+
+        batch = cell.run_batch("own.toml", 2, ask)
+    assert ([run.outcome for run in batch.runs], batch.reason) == (["placed"], "after part 1, as asked")
 
 
 def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
