@@ -315,9 +315,6 @@ class FlangeTrack:
 
     def _fault(self, text: str) -> DeviceFault:
         return DeviceFault(
-            self.name,
-            "arm.states_lost",
-            text,
-            recoverable=True,
+            self.name, "arm.states_lost", text, recoverable=True,
             hint="Look at the arm's link and at what else this machine is busy with.",
-        )
+        )  # fmt: skip

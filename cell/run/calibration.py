@@ -156,14 +156,9 @@ def verify(cell: OpenCell, run: Run[object], calibration: CellCalibration, job: 
     def work(context: WorkContext) -> Verification:
         mover = _ready(cell, context, calibration, job)
         seen = collect_verification(
-            cell.config,
-            cell.devices,
-            mover,
-            calibration=calibration,
-            check=context.check,
-            progress=tell,
+            cell.config, cell.devices, mover, calibration=calibration, check=context.check, progress=tell,
             keep=context.keep,
-        )
+        )  # fmt: skip
         return Verification.of(calibration, job, seen)
 
     made = cell.recorded(run, "verification", work)

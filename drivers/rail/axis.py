@@ -311,17 +311,9 @@ class RailAxis(ABC):
                 )
             duration, _ = self._start(end, speed, issued)
             sweep = RailSweep(
-                self.name,
-                self._clock,
-                start=start,
-                stop=stop,
-                speed=speed,
-                resolution=1.0 / self._counts,
-                record=record,
-                arrived=self._arrival(end, issued, record),
-                halt=self._halt(issued),
-                duration=duration,
-            )
+                self.name, self._clock, start=start, stop=stop, speed=speed, resolution=1.0 / self._counts,
+                record=record, arrived=self._arrival(end, issued, record), halt=self._halt(issued), duration=duration,
+            )  # fmt: skip
             self._motion = sweep
             return sweep
 

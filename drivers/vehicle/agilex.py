@@ -79,18 +79,10 @@ class AgilexVehicle:
         """Those of others on the bus that this program has answered by the brake."""
         self._closed = threading.Event()
         self._open = partial(
-            AgilexLink,
-            name,
-            interface,
-            channel,
-            bitrate=bitrate,
-            options=dict(bus_options or {}),
-            database=self._database,
-            wanted=WANTED,
-            told=self._feedback.take,
-            idle=self._feedback.idle,
+            AgilexLink, name, interface, channel, bitrate=bitrate, options=dict(bus_options or {}),
+            database=self._database, wanted=WANTED, told=self._feedback.take, idle=self._feedback.idle,
             statistics=self.statistics,
-        )
+        )  # fmt: skip
         self._link = self._open()
         if not self._wait_for(self._feedback.complete, FIRST_FEEDBACK_S):
             self._link.close()

@@ -73,15 +73,9 @@ def _agilex(name: str, config: AgilexVehicleConfig, around: Surroundings) -> Agi
     from drivers.vehicle.agilex import AgilexVehicle
 
     return AgilexVehicle(
-        name,
-        config.interface,
-        config.channel,
-        bitrate=round(config.bitrate),
-        track=config.track,
-        max_speed=config.max_speed,
-        max_yaw_rate=config.max_yaw_rate,
-        clock=around.clock,
-    )
+        name, config.interface, config.channel, bitrate=round(config.bitrate), track=config.track,
+        max_speed=config.max_speed, max_yaw_rate=config.max_yaw_rate, clock=around.clock,
+    )  # fmt: skip
 
 
 def _fixed(name: str, config: FixedVehicleConfig, around: Surroundings) -> FixedVehicle:

@@ -51,12 +51,9 @@ def _draw_map(figure: Figure, axes: Axes, made: Proposal, nominal: NominalSurfac
     corners = 1e3 * nominal.vertices[nominal.triangles]
     order = np.argsort(corners[:, :, 2].mean(axis=1))
     shown = PolyCollection(
-        list(corners[order][:, :, :2]),
-        array=corners[order][:, :, 2].mean(axis=1),
-        cmap="viridis",
-        edgecolors="face",
+        list(corners[order][:, :, :2]), array=corners[order][:, :, 2].mean(axis=1), cmap="viridis", edgecolors="face",
         linewidths=0.3,
-    )
+    )  # fmt: skip
     axes.add_collection(shown)
     shares = nominal.areas[nominal.sample_triangles] / np.bincount(nominal.sample_triangles)[nominal.sample_triangles]
     drawn = np.random.default_rng(0).choice(len(nominal.samples), PLACES, p=shares / shares.sum())

@@ -238,15 +238,12 @@ def as_cloud(seen: list[SeenSurface], rail_sigma: float) -> Cloud:
     lines = [len(each.rail) for each in seen]
     points = np.concatenate([each.points for each in seen])
     return Cloud(
-        points=points,
-        stripe_spread=np.concatenate([each.spread for each in seen]).astype(np.float32),
+        points=points, stripe_spread=np.concatenate([each.spread for each in seen]).astype(np.float32),
         rail_spread=np.concatenate([np.tile(rail_sigma * each.along, (len(each.rail), 1)) for each in seen]),
-        centres=np.zeros(points.shape[:2]),
-        rail=np.concatenate([each.rail for each in seen]),
-        rejected=np.zeros(points.shape[:2], dtype=np.bool_),
-        flanges=np.concatenate([each.flanges for each in seen]),
+        centres=np.zeros(points.shape[:2]), rail=np.concatenate([each.rail for each in seen]),
+        rejected=np.zeros(points.shape[:2], dtype=np.bool_), flanges=np.concatenate([each.flanges for each in seen]),
         sweeps=np.repeat(np.arange(len(seen)), lines),
-    )
+    )  # fmt: skip
 
 
 POINTS = 600

@@ -248,9 +248,6 @@ def _summary(clouds: Sequence[Array], distances: Sequence[Array]) -> Flatness:
     spread = centred @ np.linalg.svd(centred, full_matrices=False)[2][:2].T
     per_frame = [float(np.sqrt(np.mean(d**2))) if len(d) else float("nan") for d in distances]
     return Flatness(
-        float(np.sqrt(np.mean(away**2))),
-        float(np.percentile(np.abs(away), 95)),
-        len(away),
-        np.ptp(spread, axis=0),
+        float(np.sqrt(np.mean(away**2))), float(np.percentile(np.abs(away), 95)), len(away), np.ptp(spread, axis=0),
         per_frame,
-    )
+    )  # fmt: skip

@@ -152,12 +152,9 @@ def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> ViewData:
 def start_state(staged: Staged) -> AdjustmentState:
     """The joint adjustment's start."""
     return AdjustmentState(
-        staged.camera,
-        None if staged.plane is None else staged.plane.plane,
-        staged.hand_eye.rail_direction,
-        staged.hand_eye.flange_from_camera,
-        staged.hand_eye.base_from_board,
-    )
+        staged.camera, None if staged.plane is None else staged.plane.plane, staged.hand_eye.rail_direction,
+        staged.hand_eye.flange_from_camera, staged.hand_eye.base_from_board,
+    )  # fmt: skip
 
 
 def solve_joint(

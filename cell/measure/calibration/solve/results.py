@@ -221,12 +221,9 @@ class TargetCalibration:
         """What a joint adjustment found."""
         state = joint.adjusted.state
         return cls(
-            state.camera,
-            state.flange_from_camera,
-            effective_hand_eye_covariance(joint),
-            Quality.of(joint),
+            state.camera, state.flange_from_camera, effective_hand_eye_covariance(joint), Quality.of(joint),
             Reference.of(joint.adjusted),
-        )
+        )  # fmt: skip
 
     def state(self, base_from_board: pin.SE3) -> AdjustmentState:
         """As an adjustment knows it, with the board there; no light plane, no rail."""

@@ -64,20 +64,23 @@ def shell(x: Array, y: Array) -> Array:
     return 0.010 + freeform(x, y)
 
 
-def found(moved: Callable[[Array], Array]) -> PartPose:
-    """A part 30 mm long on the middle of a surface; `moved` tells how points (n, 3) m, arm base, are displaced."""
+def nothing(points: Array) -> Array:
+    return np.zeros((len(points), 3, 1))
+
+
+def found(moved: Callable[[Array], Array], before: pin.SE3 = TRUE) -> PartPose:
+    """A part 30 mm long on the middle of a surface, which lay at `before`, base_from_surface, when it was swept first;
+    `moved` tells how points (n, 3) m, arm base, are displaced."""
     cloud = scanned(lambda x, y: np.where(np.abs(x) < 0.015, shell(x, y), freeform(x, y)), 6)
     return find_part(
-        cloud, nominal(shell, 0.015), nominal(freeform), surface=Prior(TRUE, BOARD), belongs=HERE, tolerance=TOLERANCE,
+        cloud, nominal(shell, 0.015), nominal(freeform), surface=Prior(before, 0.01 * BOARD),
+        belongs=before.inverse() * TRUE, tolerance=TOLERANCE,
         moved=lambda lines, rows: moved(cloud.points[lines, rows]), times=np.linspace(0.0, 5.0, cloud.shape[0]),
         base_from_vehicle=HERE,
     )  # fmt: skip
 
 
 def test_what_moves_part_and_surface_alike_leaves_nothing_open_and_what_moves_one_does() -> None:
-    def nothing(points: Array) -> Array:
-        return np.zeros((len(points), 3, 1))
-
     def alike(points: Array) -> Array:
         """Six motions of a rigid body, .2 mm, and .5 mrad about the arm's foot, 0.75 m away."""
         turned = 0.5e-3 * np.cross(np.eye(3)[None], points[:, None]).transpose(0, 2, 1)
@@ -94,3 +97,11 @@ def test_what_moves_part_and_surface_alike_leaves_nothing_open_and_what_moves_on
     seen = looked[1]
     assert np.abs(seen.surface_from_part.translation).max() < 0.04e-3 and seen.beside > 1000
     assert np.linalg.norm(seen.base_from_surface.translation - TRUE.translation) < 0.04e-3
+
+
+@pytest.mark.parametrize("slid", [0.0, 4e-3, 12e-3])
+def test_a_surface_that_slid_under_the_part_is_found_where_it_is(slid: float) -> None:
+    seen = found(nothing, TRUE * pin.SE3(np.eye(3), np.array([0.0, slid, 0.0])))
+    assert np.linalg.norm(seen.surface_from_part.translation) < 0.1e-3 and (seen.moved is None) == (slid == 0.0)
+    if seen.moved is not None:
+        assert np.linalg.norm(seen.moved[:3]) == pytest.approx(slid, rel=0.05)
