@@ -295,6 +295,8 @@ class Runner:
             if trouble is not None and end is not None:
                 self._teller.failed("", 0, end, "ended the run")
             self._teller.stopped(reason, trouble)
+            # Who asked since the last look was told that the run was asked.
+            self.control.obey(self.journal.take_requests())
             if end is not None:
                 self.sequence.fire(_END_TRIGGERS[end.outcome])
                 outcome, said = end.outcome, end.reason

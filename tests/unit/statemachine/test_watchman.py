@@ -88,6 +88,13 @@ def test_another_process_can_abort_through_the_journal(tmp_path):
     assert (result.outcome, result.reason) == (Outcome.ABORTED, "cell abort")
 
 
+def test_who_asks_as_the_run_comes_to_its_end_is_heard(tmp_path):
+    bench = Bench(tmp_path)
+    bench.on_stop = lambda: [request(tmp_path, kind, "cell abort") for kind in ("end-batch", "abort")]
+    assert bench.run().outcome is Outcome.PLACED
+    assert bench.control.end_batch and bench.control.late
+
+
 def test_an_abort_while_a_step_computes_ends_the_run_and_no_step_follows(tmp_path):
     def work(context):
         bench.control.abort("Cell.stop() was called")
