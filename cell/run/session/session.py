@@ -111,11 +111,13 @@ class OpenCell:
 
 
 SIM_SPEED, ADDED_S = 3.0, 4.5e-3
-"""How many times faster than the wall a simulated cell runs over wires, where 100,000 additions take so long, s."""
+"""So many times faster than the wall runs a simulated cell over wires, if 100,000 additions take at most so long, s."""
 
 
 def kept_speed(added_s: float) -> float:
-    """What a computer that takes `added_s` for those additions keeps: the devices' deadlines are on the wall."""
+    """The pace of a simulated cell on a computer that takes `added_s` for those additions: a slow one would miss the
+    devices' deadlines, which are on the wall.
+    """
     return max(1.0, min(SIM_SPEED, SIM_SPEED * ADDED_S / added_s // 0.25 * 0.25))
 
 

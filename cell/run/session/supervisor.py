@@ -90,7 +90,8 @@ class Cell:
                 follows what the real ones measure of themselves. Without it, `cell.sim` of the configuration.
             seed: Which simulated world, 0 to 999999.
             level: How far that world deviates from the drawing: "ideal", "nominal", "harsh" or "workshop".
-            speed: Of a simulated cell over wires, times the wall's, 0.1 to 20; without it 3, or what is kept here.
+            speed: How many times faster than the wall a simulated cell over wires runs, 0.1 to 20. Without it 3, or as
+                much as a slower computer keeps, 1 at least.
             job: Whose station, surface and part a simulated cell has at first.
             confirm: Instead of `cell.confirm`: who answers for a person; "simulated" in a simulated cell only.
             only: The devices to connect, and what they hang on. Others may be off: asked, they are not connected.
