@@ -87,8 +87,8 @@ class RunControl:
         """Set by the run once it has come to an end of its own."""
         self.late = False
         """Whether somebody asked to end the run when it had come to a good end already, or was just coming to it."""
-        self.last = False
-        """Whether somebody asked that no other part of a batch is begun after this run."""
+        self.end_batch = False
+        """Whether somebody asked that no other part of its batch is begun after this run."""
         self._lock = threading.RLock()
         self._paused = False
         self._wanted: str | None = None
@@ -143,8 +143,8 @@ class RunControl:
                     self.go_on()
                 case "confirm":
                     self.confirm(request.reason, request.number)
-                case "end-after":
-                    self.last = True
+                case "end-batch":
+                    self.end_batch = True
 
     # --- asked by the run ---
 

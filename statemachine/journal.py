@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 FILE_NAME = "journal.sqlite"
 """The journal's name in a run's folder."""
 
-REQUESTS = ("abort", "pause", "go-on", "confirm", "end-after")
+REQUESTS = ("abort", "pause", "go-on", "confirm", "end-batch")
 """What another process can ask of a run."""
 
 _SCHEMA = """

@@ -163,7 +163,7 @@ def perform(
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()
             tell(Event("note", None, {"text": str(batch)}))
             interrupted = last.interrupted
-            why = _ended_by(here, job, last, number) or f"after part {number}, as asked" * last.control.last
+            why = _ended_by(here, job, last, number)
     except (CellError, SignalInterrupt) as error:
         if not batch.runs:
             raise
@@ -176,8 +176,9 @@ def perform(
 
 def _ended_by(here: OpenCell, job: Job, last: RunOutcome, number: int) -> str:
     """Why no other part is begun after this end; empty where one is."""
-    ends = last.interrupted or last.stopped_after_end or not (last.outcome in GOOD or _skipped(here, job, last))
-    return f"part {number} {last}" * ends
+    if last.interrupted or last.stopped_after_end or not (last.outcome in GOOD or _skipped(here, job, last)):
+        return f"part {number} {last}"
+    return f"after part {number}, as asked" if last.control.end_batch else ""
 
 
 def _known_after(series: GraspSeries, last: RunOutcome) -> GraspSeries:

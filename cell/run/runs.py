@@ -72,9 +72,9 @@ class Run(Generic[Result]):
         """Let a paused run go on."""
         self.control.go_on()
 
-    def end_after(self) -> None:
-        """Let the run come to its end, and a batch end with it."""
-        self.control.last = True
+    def end_batch(self) -> None:
+        """Begin no other part of the batch after this run, which goes on to its own end."""
+        self.control.end_batch = True
 
     def abort(self, reason: str = "aborted by the program that began it") -> None:
         """End the run: what moves is stopped at once. `result()` then says that it was aborted."""

@@ -47,13 +47,18 @@ def abort(
     name: RunArgument = None,
     config: ConfigOption = None,
     reason: Annotated[str, typer.Option(help="Goes into the report.")] = "asked for with `cell abort`",
-    after: Annotated[bool, typer.Option("--after", help="Nothing is stopped: a batch ends after this part.")] = False,
+    after_part: Annotated[
+        bool, typer.Option("--after-part", help="Nothing is stopped: the part is placed, then its batch ends.")
+    ] = False,
 ) -> None:
     """End what is going on in another process (run, calibration, verification, homing, jog): the cell is stopped."""
-    from cell.run.folder import list_runs, listens
+    from cell.run.folder import list_runs, listens, read_report
 
-    if after:
-        _ask(_going(name, config), "end-after", reason, "asked {} to be the last of its batch")
+    if after_part:
+        folder = _going(name, config)
+        if (kind := read_report(folder)["kind"]) != "job":
+            raise ConfigError(f"{folder.name} is a {kind}, no part of a batch: end it with `cell abort` alone")
+        _ask(folder, "end-batch", reason, "asked {} to be the last of its batch")
         return
     going = [run for run in list_runs(_going_folder(config)) if listens(run)] if name is None else []
     if not going:

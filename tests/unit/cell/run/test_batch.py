@@ -156,7 +156,7 @@ def test_somebody_lets_this_part_be_the_last(opened: Callable[..., Cell]) -> Non
 
         def ask(event: Event) -> None:
             if (event.kind, event.step) == ("step_started", "board_photo"):
-                request(list_runs(cell.runs_folder)[-1], "end-after", "home time")
+                request(list_runs(cell.runs_folder)[-1], "end-batch", "home time")
 
         batch = cell.run_batch("own.toml", 2, ask)
     assert ([run.outcome for run in batch.runs], batch.reason) == (["placed"], "after part 1, as asked")
