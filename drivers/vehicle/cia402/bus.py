@@ -92,16 +92,9 @@ class CanopenBus(CanLink):
             self._clients[node] = remote.sdo
             remote.sdo.RESPONSE_TIMEOUT = ANSWER_S
         super().__init__(
-            name,
-            interface,
-            channel,
-            bitrate=bitrate,
-            options=options,
-            receive=self._take,
-            idle=idle,
-            statistics=statistics,
-            alone=alone,
-        )
+            name, interface, channel, bitrate=bitrate, options=options, receive=self._take, idle=idle,
+            statistics=statistics, alone=alone,
+        )  # fmt: skip
 
     # --- what a master sends ---
 

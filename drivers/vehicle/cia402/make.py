@@ -138,20 +138,12 @@ class CanopenVehicleConfig(CanVehicleConfig):
         from drivers.vehicle.cia402.feedback import WheelDrives
 
         return WheelDrives(
-            nodes=(self.left_node, self.right_node),
-            wheel_radius=self.wheel_radius,
-            gear=self.gear,
-            counts=self.counts_per_turn,
-            velocity_unit=self.velocity_unit,
-            reversed=(self.left_reversed, self.right_reversed),
-            track=self.track,
-            acceleration=self.acceleration,
-            deceleration=self.deceleration,
-            brake_output=self.brake_bit if self.brake == "output" else None,
-            brake_locks=self.brake_locks == "high",
-            stop_input=self.stop_input,
-            stop_active=self.stop_pressed == "high",
-        )
+            nodes=(self.left_node, self.right_node), wheel_radius=self.wheel_radius, gear=self.gear,
+            counts=self.counts_per_turn, velocity_unit=self.velocity_unit,
+            reversed=(self.left_reversed, self.right_reversed), track=self.track, acceleration=self.acceleration,
+            deceleration=self.deceleration, brake_output=self.brake_bit if self.brake == "output" else None,
+            brake_locks=self.brake_locks == "high", stop_input=self.stop_input, stop_active=self.stop_pressed == "high",
+        )  # fmt: skip
 
 
 MOST_RPM = 20_000.0
@@ -163,17 +155,10 @@ def _connect(name: str, config: CanopenVehicleConfig, around: Surroundings) -> C
     from drivers.vehicle.cia402.vehicle import CanopenVehicle
 
     return CanopenVehicle(
-        name,
-        config.interface,
-        config.channel,
-        wheels=config.wheels(),
-        watchdog=Watchdog(config.guarding, config.watchdog, config.own_node),
-        max_speed=config.max_speed,
-        max_yaw_rate=config.max_yaw_rate,
-        clock=around.clock,
-        bitrate=round(config.bitrate),
-        look=around.look,
-    )
+        name, config.interface, config.channel, wheels=config.wheels(),
+        watchdog=Watchdog(config.guarding, config.watchdog, config.own_node), max_speed=config.max_speed,
+        max_yaw_rate=config.max_yaw_rate, clock=around.clock, bitrate=round(config.bitrate), look=around.look,
+    )  # fmt: skip
 
 
 def _missing() -> str:

@@ -20,6 +20,7 @@ from tests.unit.cell.measure.inversion.test_registration import BOARD, TRUE, fre
 
 Array = NDArray[np.float64]
 HERE = pin.SE3.Identity()
+SWEPT = Prior(TRUE, BOARD)
 TOLERANCE = Tolerance(0.6e-3, 6e-3)
 JOB, MESH = load_job("pot")
 
@@ -68,13 +69,13 @@ def nothing(points: Array) -> Array:
     return np.zeros((len(points), 3, 1))
 
 
-def found(moved: Callable[[Array], Array], before: pin.SE3 = TRUE) -> PartPose:
-    """A part 30 mm long on the middle of a surface, which lay at `before`, base_from_surface, when it was swept first;
-    `moved` tells how points (n, 3) m, arm base, are displaced."""
+def found(moved: Callable[[Array], Array], before: Prior = SWEPT) -> PartPose:
+    """A part 30 mm long on the middle of a surface, which was found at `before` when it was swept first; `moved` tells
+    how points (n, 3) m, arm base, are displaced."""
     cloud = scanned(lambda x, y: np.where(np.abs(x) < 0.015, shell(x, y), freeform(x, y)), 6)
     return find_part(
-        cloud, nominal(shell, 0.015), nominal(freeform), surface=Prior(before, 0.01 * BOARD),
-        belongs=before.inverse() * TRUE, tolerance=TOLERANCE,
+        cloud, nominal(shell, 0.015), nominal(freeform), surface=before,
+        belongs=before.base_from_surface.inverse() * TRUE, tolerance=TOLERANCE,
         moved=lambda lines, rows: moved(cloud.points[lines, rows]), times=np.linspace(0.0, 5.0, cloud.shape[0]),
         base_from_vehicle=HERE,
     )  # fmt: skip
@@ -101,7 +102,8 @@ def test_what_moves_part_and_surface_alike_leaves_nothing_open_and_what_moves_on
 
 @pytest.mark.parametrize("slid", [0.0, 4e-3, 12e-3])
 def test_a_surface_that_slid_under_the_part_is_found_where_it_is(slid: float) -> None:
-    seen = found(nothing, TRUE * pin.SE3(np.eye(3), np.array([0.0, slid, 0.0])))
+    there = TRUE * pin.SE3(np.eye(3), np.array([0.0, slid, 0.0]))
+    seen = found(nothing, Prior(there, 0.01 * BOARD))
     assert np.linalg.norm(seen.surface_from_part.translation) < 0.1e-3 and (seen.moved is None) == (slid == 0.0)
     if seen.moved is not None:
         assert np.linalg.norm(seen.moved[:3]) == pytest.approx(slid, rel=0.05)
