@@ -155,7 +155,7 @@ def _facts(report: Mapping[str, object]) -> str:
     if words := simulated_words(report.get("simulated")):
         facts.append(f"{words}, seed {report.get('seed')}, level {report.get('level')}")
         if report.get("clock") == "wall" and isinstance(pace := report.get("speed"), float | int):
-            facts.append(f"{pace:g} times the wall's pace")
+            facts[-1] += f", speed {pace:g}"
     if report.get("cell_s") is None and (wall := wall_seconds(report)) is not None:
         facts.append(f"{duration(wall)} on the wall")
     if report.get("started"):
