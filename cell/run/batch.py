@@ -18,8 +18,11 @@ from cell.base.storage import sealed, write_json
 from cell.config.job import Job, job_and_item
 from cell.devices.simulated.process import is_whole
 from cell.procedures.arm.moves import PartState
-from cell.procedures.grasp import GraspSeries
+from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.placed_part import PlacedPart
+from cell.procedures.steps import board_photo, drive_to_target, verify
+from cell.procedures.steps.drive_to_target import VehicleArrival
+from cell.procedures.steps.workplace import PartsBefore
 from cell.run.folder import Report
 from cell.run.job_run import Observer, RunOutcome, each_of
 from cell.run.recorded_work import WorkContext
@@ -133,10 +136,10 @@ def require_count(count: int) -> None:
 
 
 def perform(
-    here: OpenCell, jobs: Sequence[Job], count: int, run: Callable[[int, GraspSeries], RunOutcome],
+    here: OpenCell, jobs: Sequence[Job], count: int, run: Callable[[int, PartsBefore], RunOutcome],
     between: Callable[[Callable[[WorkContext], None]], None], observer: Observer | None,
 ) -> BatchOutcome:  # fmt: skip
-    """Do a batch: `run(number, series)` a part, after those of the series; `between(work)` what a person is asked
+    """Do a batch: `run(number, parts_before)` a part; `between(work)` what a person is asked
     before the next one; both wait. The parts have these `jobs` in turn, which are `count` times begun.
 
     `observer` is told each part's end; one that fails is told nothing more. Raises what keeps the first part from being
@@ -147,7 +150,7 @@ def perform(
     name = f"batch-{time.strftime('%Y%m%dT%H%M%S')}-{secrets.token_hex(2)}.json"
     whole = job_and_item(jobs[0].job.name)[0]
     batch, why, interrupted = BatchOutcome(whole, count, here.runs_folder / name), "", False
-    series = GraspSeries()
+    before = PartsBefore()
     try:
         while not why and len(batch.runs) < count:
             number = len(batch.runs) + 1
@@ -155,10 +158,12 @@ def perform(
             # A person makes all items ready at once.
             refill = job is jobs[0]
             part = f"part {number} of {count}"
-            if number > 1 and (work := _question(here, job, part, batch.runs[-1], refill=refill)):
+            work = _question(here, job, part, batch.runs[-1], refill=refill) if number > 1 else None
+            if work is not None:
                 between(work)
-            last = run(number, series)
-            series = _known_after(series, last)
+            # Whoever was at the cell, or set its world up anew, may have moved vehicle and station.
+            last = run(number, replace(before, arrival=None) if refill or work is not None else before)
+            before = _known_after(before, last)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()
             tell(Event("note", None, {"text": str(batch)}))
@@ -181,13 +186,19 @@ def _ended_by(here: OpenCell, job: Job, last: RunOutcome, number: int) -> str:
     return f"after part {number}, as asked" if last.control.end_batch else ""
 
 
-def _known_after(series: GraspSeries, last: RunOutcome) -> GraspSeries:
-    """What parts tell of how the next one will come to lie; nothing after one that was refused, for whoever saw to it
-    may have mended the fingers, or changed the part."""
+def _known_after(before: PartsBefore, last: RunOutcome) -> PartsBefore:
+    """What parts tell of the next one; nothing after one that was refused, for whoever saw to it may have mended the
+    fingers, changed the part, or moved the station."""
     if last.outcome not in GOOD:
-        return GraspSeries()
-    seen = last.results.get("verify")
-    return series if not isinstance(seen, PlacedPart) or seen.came is None else series.after(seen.came, seen.slips)
+        return PartsBefore()
+    names = drive_to_target.STEP.name, board_photo.STEP.name, verify.STEP.name
+    arrival, photograph, seen = map(last.results.get, names)
+    series, stands = before.series, None
+    if isinstance(seen, PlacedPart) and seen.came is not None:
+        series = series.after(seen.came, seen.slips)
+    if isinstance(arrival, VehicleArrival) and isinstance(photograph, BoardFix):
+        stands = replace(arrival, shared=photograph)
+    return PartsBefore(series, stands)
 
 
 def _skipped(here: OpenCell, job: Job, last: RunOutcome) -> bool:

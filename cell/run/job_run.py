@@ -27,12 +27,11 @@ from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Pace, PartProgress, PartState
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
-from cell.procedures.grasp import GraspSeries
 from cell.procedures.sought_part import ground_below, nominal_of, sought
 from cell.procedures.steps import verify
 from cell.procedures.steps.kinds import Kind, kind_of
 from cell.procedures.steps.pick import HeldPart
-from cell.procedures.steps.workplace import Workplace
+from cell.procedures.steps.workplace import PartsBefore, Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep
 from cell.procedures.sweep.swath import SweepCollector, Sweeping
 from cell.run import calibration as sessions
@@ -143,7 +142,8 @@ class JobRun:
     `run` is the handle by which it is held. `inline` observers see each event before the run goes on: those that cause
     faults or look at the truth. `earlier` is the sweep of a run that this one resumes, `held` how that one had gripped
     a part from its nest; `script` works between steps. `truth` asks a simulated world. `pace` says how fast arm and
-    vehicle go, of what is planned. `series` is how the parts before this one of its batch came to lie.
+    vehicle go, of what is planned. `parts_before` is what the parts before this one
+    of its batch tell.
     """
 
     run: Run[object]
@@ -157,7 +157,7 @@ class JobRun:
     held: HeldPart | None = None
     truth: Callable[[], dict[str, object]] | None = None
     pace: Pace = field(default_factory=Pace)
-    series: GraspSeries = field(default_factory=GraspSeries)
+    parts_before: PartsBefore = field(default_factory=PartsBefore)
 
     def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
         """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
@@ -211,7 +211,7 @@ class JobRun:
             folder=folder, whereabouts=whereabouts, earlier=self.earlier, held=self.held,
             needs_part=kind.places and state is PartState.HELD, looks_after=verify.STEP.name in kind.names,
             sweeping=self._sweeping, registered=self._registered, pace=self.pace, ground=self.ready.ground,
-            series=self.series, part=PartProgress(state),
+            parts_before=self.parts_before, part=PartProgress(state),
         )  # fmt: skip
 
     def _runner(self, here: Workplace, journal: Journal, observer: Observer) -> Runner:
@@ -304,8 +304,8 @@ class JobWork:
     """A job, read as `ready` from `file`, for a run of this cell; `info` goes into the journal and the report.
 
     `stored` is its calibration, or why there is none: then it is calibrated first. `before` is the run that this one
-    resumes, `at_start` somebody's word that the vehicle stands at the job's start pose, for this run alone. `series` is
-    how the parts before this one of its batch came to lie.
+    resumes, `at_start` somebody's word that the vehicle stands at the job's start pose, for this run alone.
+    `parts_before` is what the parts before this one of its batch tell.
     """
 
     cell: OpenCell
@@ -316,7 +316,7 @@ class JobWork:
     before: UnfinishedRun | None
     inline: tuple[Observer, ...]
     at_start: bool
-    series: GraspSeries
+    parts_before: PartsBefore
 
     def perform(self, run: Run[RunOutcome]) -> RunOutcome:
         """Do it; raises what `JobRun.perform` raises. Ended as any run where the calibration before it ends it."""
@@ -349,7 +349,7 @@ class JobWork:
         job_run = JobRun(
             run, cell.config, cell.devices, ready=ready, calibration=calibration, info=self.info, inline=self.inline,
             earlier=earlier, held=None if self.before is None else self.before.held, truth=cell.truth, pace=cell.pace,
-            series=self.series,
+            parts_before=self.parts_before,
         )  # fmt: skip
         try:
             return job_run.perform(cell.runs_folder, cell.whereabouts)

@@ -191,6 +191,8 @@ def turn_to(vehicle: Vehicle, odometry: Located, yaw: float, clock: Clock, check
 PLAUSIBLE = 0.10
 """A sighting this far, m, from what odometry says is worth a note."""
 PLAUSIBLE_ANGLE = math.radians(5)
+STILL = 1e-3
+"""What odometry tells of a vehicle that stands is less than this, m or rad."""
 TIGHT = 0.3
 """Turns about a point nearer than this, m, count as on the spot: about half the track, the wheels go against each
 other and scrub. Wider ones are part of the way."""
@@ -274,6 +276,15 @@ class Whereabouts:
         if self._anchor is None or self._anchor.pose is None:
             raise RefusedError(f"where the vehicle stands is not known: {self._unknown}")
         return self._anchor.pose * self._anchor.reading.inverse() * self._count(state)
+
+    @property
+    def still(self) -> bool:
+        """Whether the vehicle stands, by odometry, where it was seen last."""
+        try:
+            self.pose()
+        except RefusedError:
+            return False
+        return max(self.way, self.turned) < STILL
 
     def count(self) -> None:
         """Count what it has gone since the last look; for those who drive it by other means than `pose`, all the time.

@@ -1,7 +1,8 @@
 """The board photograph: the target camera square in front of the board, several pictures, one pose.
 
 They also show whether the vehicle is quiet: while it is not, they are taken anew, up to a few seconds. Later steps look
-once more whether the board still stands there: nothing that the arm feels tells a shift to the side.
+once more whether the board still stands there: nothing that the arm feels tells a shift to the side. Several items of a
+job share a photograph, as long as the vehicle stands.
 """
 
 from __future__ import annotations
@@ -110,6 +111,8 @@ def require_board_unmoved(here: Workplace, fix: BoardFix, since: str, progress: 
 def _at(here: Workplace, context: StepContext) -> BoardFix:
     arrival, job = context.made(VehicleArrival), here.job
     here.mover.avoid_station(arrival.base_from_place, job, here.board, around(here.nominal.extent, here.ground))
+    if arrival.shared is not None:
+        return here.keep_again(arrival.shared)
     goal = photo_pose(job, here.board, arrival.fix.base_from_board, here.calibration.target.flange_from_camera)
     fix = photographed(here, goal, context.progress)
     for note in fix.notes:

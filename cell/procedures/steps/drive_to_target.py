@@ -37,7 +37,8 @@ class VehicleArrival:
     """Where the vehicle came to stand, and the last photograph that shows it. Errors in m and rad.
 
     `driven` is false for an arm on a fixed frame, which was only looked at. `head` is what the look at the fine board
-    before says of the scan head, None where nobody looked.
+    before says of the scan head, None where nobody looked. `shared` is the board's photograph that was made from there
+    for the part before this one, and holds for this one, too.
     """
 
     base_from_place: pin.SE3
@@ -48,6 +49,7 @@ class VehicleArrival:
     photographs: int
     driven: bool = True
     head: InterimCheck | None = None
+    shared: BoardFix | None = None
 
     def summary(self) -> dict[str, object]:
         """Figures for the journal."""
@@ -57,6 +59,7 @@ class VehicleArrival:
             "error_yaw_deg": round(math.degrees(self.error_yaw), 3),
             "photographs": self.photographs,
             **({} if self.driven else {"driven": False}),
+            **({} if self.shared is None else {"shared": True}),
             **({} if self.head is None else {"interim": self.head.summary()}),
         }
 
@@ -263,6 +266,10 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         context.note(text=f"the vehicle warns: {'; '.join(warnings)}")
     vehicle.recover()
     head = _checked(here, context)
+    if (stands := here.parts_before.arrival) is not None and here.whereabouts.still:
+        vehicle.brake()
+        context.note(text="the vehicle stands as for the part before: neither driven nor photographed again")
+        return replace(stands, photographs=0, head=head)
     if head is None and not here.whereabouts.anchored:
         here.mover.to_joints(HOME)
     here.whereabouts.enter(here.job)

@@ -285,7 +285,7 @@ def _at(here: Workplace, context: StepContext) -> PlaceResult:
         raise
     done = replace(done, look=look, pose=pose, mating=mating)
     if aim.allowed is not None:
-        done = replace(done, allowed=aim.allowed, parts=len(here.series.aside))
+        done = replace(done, allowed=aim.allowed, parts=len(here.parts_before.series.aside))
     for note in done.notes:
         context.note(text=note)
     return done
@@ -317,7 +317,7 @@ class AimedPlace:
         points, grasp, belongs = part_points(here.nominal), here.job.grasp, here.job.place.surface_from_part.se3()
         unsure = grasp.covariance
         noise = expected_residual(here.job, here.repeatability, pose, points, unsure)
-        allowed, slip = here.series.allowance(points, noise), here.series.slip(points, noise)
+        allowed, slip = here.parts_before.series.allowance(points, noise), here.parts_before.series.slip(points, noise)
         if allowed is None:
             return cls(here.job, None, (belongs,))
         # Held aside, it touches at its place. One that slips as the claw opens touches aside, and slips into it.
@@ -337,7 +337,7 @@ class AimedPlace:
             context.note(text=f"parts before came to lie aside alike, which is not allowed for: {refused}")
             return AimedPlace(here.job, None, (here.job.place.surface_from_part.se3(),)).fitted(here, pose, context)
         if self.allowed is not None:
-            context.note(text=aside_words(self.allowed, len(here.series.aside)))
+            context.note(text=aside_words(self.allowed, len(here.parts_before.series.aside)))
         return self, max(gaps, key=lambda gap: -np.inf if gap is None else gap.lift)
 
 

@@ -39,7 +39,7 @@ def _at(here: Workplace, context: StepContext) -> PlacedPart:
     pose, plan = placed.pose or context.made(PlacePose), here.job.place
     found, slips = _looked(here, pose, context), list[pin.SE3]()
     leaves = expected_residual(here.job, here.repeatability, pose, found.points, found.covariance)
-    slip = here.series.slip(found.points, leaves) or pin.SE3.Identity()
+    slip = here.parts_before.series.slip(found.points, leaves) or pin.SE3.Identity()
     # Along a motion that is not seen it lies where it belongs: that would confirm what was allowed for.
     came = None if found.unseen else along_surface(
         first.allowed * found.belongs.inverse() * found.seen.surface_from_part

@@ -31,6 +31,7 @@ from statemachine.runner import StepContext
 from statemachine.step import Step
 
 if TYPE_CHECKING:
+    from cell.procedures.steps.drive_to_target import VehicleArrival
     from cell.procedures.steps.pick import HeldPart
     from cell.procedures.sweep.stored_sweep import StoredSweep
 
@@ -39,6 +40,15 @@ CHANCE_SCATTER = 1.3
 """Found over configured scatter of the arm that the few views of a calibration show by chance."""
 PHOTO_RATE_HZ = 10.0
 """Frame rate while the station's board is photographed."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartsBefore:
+    """What the parts before this one of its batch tell: how they came to lie, and where the vehicle has stood since
+    the last of them, None where it or the station may have been moved."""
+
+    series: GraspSeries = field(default_factory=GraspSeries)
+    arrival: VehicleArrival | None = None
 
 
 @dataclass(eq=False)
@@ -52,7 +62,7 @@ class Workplace:
     it begins, and where the surface is by the board (base_from_surface), `registered` where it was found. `pace` is the
     share of the planned speed. `looked` says whether this run has tried to look at the fine board, `interim` what that
     said, None where nothing was to be seen. `ground` is the box around the surface below a part to be unloaded, its
-    lowest and highest corner, m, part frame. `series` is how the parts before this one of its batch came to lie.
+    lowest and highest corner, m, part frame. `parts_before` is what the parts before this one of its batch tell.
     """
 
     config: CellConfig
@@ -74,7 +84,7 @@ class Workplace:
     interim: InterimCheck | None = None
     looked: bool = False
     ground: tuple[Vector, Vector] | None = None
-    series: GraspSeries = field(default_factory=GraspSeries)
+    parts_before: PartsBefore = field(default_factory=PartsBefore)
     _photographs: int = field(default=0, init=False)
 
     @cached_property
@@ -176,6 +186,14 @@ class Workplace:
         self.frames.found = fix.frames[-1], fix.views[-1].pixels
         if self.devices.following is not None:
             self.devices.following.board_seen(fix.base_from_board)
+        return replace(fix, number=self._photographs)
+
+    def keep_again(self, fix: BoardFix) -> BoardFix:
+        """A photograph of the run before this one, its frames kept as if this one had made it."""
+        self._photographs += 1
+        for frame in fix.frames:
+            self.frames.keep(f"board-{self._photographs:02d}", frame)
+        self.frames.found = fix.frames[-1], fix.views[-1].pixels
         return replace(fix, number=self._photographs)
 
 

@@ -140,9 +140,9 @@ class Times:
 
 
 LOGGERS = ("cell", "drivers", "statemachine")
-READINGS_S, PROGRESS_S, GROWN_S = 1 / 30, 0.2, 1.0
-"""Seconds on the wall, or of the virtual clock, between two readings of a device and two words of progress; seconds of
-a sweep between two clouds that grow."""
+READINGS_S, PROGRESS_S, PICTURES_S, GROWN_S = 1 / 30, 0.2, 0.2, 1.0
+"""Seconds on the wall, or of the virtual clock, between two readings of a device, two words of progress and two
+pictures of a camera; seconds of a sweep between two clouds that grow."""
 
 log = logging.getLogger(__name__)
 _said: set[str] = set()
@@ -194,6 +194,8 @@ class Recorder(logging.Handler):
         facts = {"run": folder.name, "cell": config.cell.name, "clock": self._times.name}
         self.file = RecordFile(folder / FILE, facts, lossless=self._times.virtual)
         self._due: dict[str, float] = {}
+        self._pictured: dict[str, int] = {}
+        self._begun = self._times.now()
         self._bodies: dict[str, Body] = {}
         self._fixed = (
             *arm_bodies(config.arm.model),
@@ -276,7 +278,8 @@ class Recorder(logging.Handler):
         fits = [name for name, shape in there.items() if shape == frame.image.shape]
         named = "target_camera" if what.startswith(("board", "target")) else "scan_camera"
         camera = fits[0] if len(fits) == 1 else named
-        at = self._times.of(frame.mid_exposure)
+        # What the run before has photographed is shown as this one begins.
+        at = max(self._begun, self._times.of(frame.mid_exposure))
         told = {
             "file": picture.name, "frame_id": frame.frame_id, "exposure": frame.exposure,
             "device_time": frame.device_time, "host_time": frame.host_time, "received": frame.received,
@@ -284,7 +287,10 @@ class Recorder(logging.Handler):
         }  # fmt: skip
         self._json(f"/{camera}/frame", at, told)
         self._put(f"/{camera}/calibration", at, lambda draw: draw.lens(at, camera))
-        self._put(f"/{camera}/image", at, lambda draw: draw.image(at, camera, picture))
+        # A person looks at them; all are in frames/.
+        if not 0 <= at - self._pictured.get(camera, -math.inf) < 1e9 * PICTURES_S:
+            self._pictured[camera] = at
+            self._put(f"/{camera}/image", at, lambda draw: draw.image(at, camera, picture))
 
     def emit(self, record: logging.LogRecord) -> None:
         """See `logging.Handler.emit`."""

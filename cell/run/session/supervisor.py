@@ -26,8 +26,8 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.verification import Verification
 from cell.procedures.drive.way import Whereabouts
-from cell.procedures.grasp import GraspSeries
 from cell.procedures.steps.kinds import kind_of
+from cell.procedures.steps.workplace import PartsBefore
 from cell.run import batch as batches
 from cell.run import calibration as sessions
 from cell.run.batch import BatchOutcome
@@ -329,9 +329,9 @@ class Cell:
             Injector.scheduled(inject, kind_of(each).names, self.simulated)
         return batches.perform(
             self._here, jobs, count,
-            run=lambda number, series: self._start(
+            run=lambda number, parts_before: self._start(
                 names[(number - 1) % len(names)], observer, {}, None, inject=inject,
-                at_start=at_start and number == 1, series=series,
+                at_start=at_start and number == 1, parts_before=parts_before,
             ).result(),
             between=lambda work: self.perform("loading", work, observer), observer=observer,
         )  # fmt: skip
@@ -363,7 +363,7 @@ class Cell:
     def _start(
         self, job: str | Path, observer: Observer | None, info: dict[str, object], before: UnfinishedRun | None,
         inject: Sequence[str] = (), *, at_start: bool, until: str | None = None, script: Script = NO_SCRIPT,
-        series: GraspSeries | None = None,
+        parts_before: PartsBefore | None = None,
     ) -> Run[RunOutcome]:  # fmt: skip
         inline: tuple[Observer, ...] = ()
         if inject:
@@ -396,7 +396,7 @@ class Cell:
         info |= {**self._here.world, **ready.info}
         work = JobWork(
             self._here, job, ready, info, stored=stored, before=before, inline=inline, at_start=at_start,
-            series=series or GraspSeries(),
+            parts_before=parts_before or PartsBefore(),
         )  # fmt: skip
         return self.begin("job", work.perform, observer, stops)
 

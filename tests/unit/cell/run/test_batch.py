@@ -16,12 +16,14 @@ from cell.base.storage import read_json
 from cell.config.job import job_path, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
+from cell.procedures.steps.workplace import PartsBefore
 from cell.run.batch import _question, perform
 from cell.run.folder import list_runs, read_report
 from cell.run.job_run import RunOutcome
 from cell.run.recorded_work import WorkContext
 from lab.bench.job.part_effects import held, motion
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
+from lab.bench.job.whole_job import JobRecord
 from statemachine.journal import request
 from statemachine.step import Event
 from tests.support import Typed
@@ -162,21 +164,24 @@ def test_somebody_lets_this_part_be_the_last(opened: Callable[..., Cell]) -> Non
     assert ([run.outcome for run in batch.runs], batch.reason) == (["placed"], "after part 1, as asked")
 
 
-def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
-    opened: Callable[..., Cell], tmp_path: Path
+def test_items_are_made_ready_once_a_round_share_a_photograph_in_it_and_those_not_tried_are_named(
+    opened: Callable[..., Cell], tmp_path: Path, placed_pot: JobRecord
 ) -> None:
     jobs, asked, tried = [load_job(f"swap#{k}")[0] for k in (1, 2)], list[int](), list[int]()
+    shared: list[bool] = []
 
-    def run(number: int, series: object) -> RunOutcome:
+    def run(number: int, before: PartsBefore) -> RunOutcome:
         tried.append(number)
+        shared.append(before.arrival is not None and before.arrival.shared is placed_pot.results["board_photo"])
         how = ("placed", "in place") if number < 4 else ("aborted", "seen enough")
-        return RunOutcome(*how, tmp_path, {"cell_s": 1.0, "measured": [], "steps": []})
+        return RunOutcome(*how, tmp_path, {"cell_s": 1.0, "measured": [], "steps": []}, placed_pot.results)
 
     with opened() as cell:
         here = replace(cell._here, simulated=None)
         cell.runs_folder.mkdir()
         batch = perform(here, jobs, 3, run, between=lambda work: asked.append(len(tried)), observer=None)
     assert (tried, asked) == ([1, 2, 3, 4], [2]), "a person at a real cell makes both items ready again"
+    assert shared == [False, True, False, True]
     assert (batch.job, batch.count, batch.reason) == (
         "swap",
         6,

@@ -16,8 +16,9 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.inversion import PlacePose
 from cell.measure.vision import BoardView, parse_board
 from cell.procedures.arm.photograph import APART_S, BoardFix, swing, swing_covariance
+from cell.procedures.drive.way import Planar
 from cell.procedures.steps.board_photo import WAIT_S, WAITS, photographed, require_board_unmoved, until_quiet
-from cell.procedures.steps.workplace import PHOTO_RATE_HZ
+from cell.procedures.steps.workplace import PHOTO_RATE_HZ, PartsBefore
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord
 from tests.support.at_station import AtStation
@@ -42,6 +43,23 @@ def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
     with pytest.raises(Taken):
         require_board_unmoved(here, fix, "before the sweep", lambda share, text: None)
     assert asked == [(CONFIG.target_camera.photo_exposure, PHOTO_RATE_HZ)] * 2
+
+
+def test_items_share_a_photograph_until_odometry_tells_that_the_vehicle_moved(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    there, fix = AtStation(placed_pot, tmp_path), placed_pot.results["board_photo"]
+    there.work.whereabouts.see(Planar(0.0, 0.0, 0.0))
+    stands = replace(placed_pot.results["drive_to_target"], shared=fix)
+    there.work.parts_before = PartsBefore(arrival=stands)
+    found = there.do("drive_to_target")
+    assert (found.shared, found.photographs, found.summary()["shared"]) == (fix, 0, True)
+    assert found.head is not None and there.cell.devices.vehicle.state().braked
+    assert there.do("board_photo").base_from_board is fix.base_from_board
+    there.work.whereabouts.way += 0.01
+    again = there.do("drive_to_target")
+    assert again.shared is None and again.photographs > 0 and "shared" not in again.summary()
+    assert there.do("board_photo").number > 0
 
 
 BOARD = parse_board("chessboard:9x7:20mm")
