@@ -12,22 +12,23 @@ from contextlib import suppress
 
 BEAT, REST, ALIVE, GOODBYE = b"+", b"-", b".", b"b"
 FROZEN_S = 0.25
-"""An owner without a beat that used no processor time for so long is frozen: stopped, swapped out, in a debugger."""
+"""An owner without a beat that used no processor time for so long, nor waits for a processor, is frozen: stopped,
+swapped out, in a debugger."""
 HUNG_S = 2.0
-"""An owner without a beat for so long counts as frozen even if it computes."""
+"""An owner without a beat for so long counts as frozen even if it computes, or this computer is too busy for it."""
 LOOK_S = 0.05
 ALONE_S = 0.3
 """Processor time that a thread in real time may take without waiting once."""
 
 
 class Owner:
-    """Signs of life of the process `pid`: its beats, and the processor time that it uses.
+    """Signs of life of the process `pid`: its beats, the processor time that it uses, and that it waits for some.
 
     The time counts as well, because a process that computes may hold Python's lock and send no beat meanwhile.
     """
 
     def __init__(self, pid: int) -> None:
-        self._stat = f"/proc/{pid}/stat"
+        self._stat, self._threads = f"/proc/{pid}/stat", f"/proc/{pid}/task"
         self._beat = self._sign = float("inf")
         self._used = b""
         self._looked = time.monotonic()
@@ -44,6 +45,8 @@ class Owner:
         self._beat, self._sign = self._beat + blind, self._sign + blind
         if used != self._used and self._sign < now:
             self._used, self._sign = used, now
+        elif now - self._sign > FROZEN_S and self._waits():
+            self._sign = now
         return now - self._sign > FROZEN_S or now - self._beat > HUNG_S
 
     def _processor_time(self) -> bytes:
@@ -51,6 +54,15 @@ class Owner:
             # utime and stime, the 14th and 15th field; the name before them may contain blanks.
             return b" ".join(stat.read().rpartition(b")")[2].split()[11:13])
         return b""
+
+    def _waits(self) -> bool:
+        """Whether one of its threads could run, if this computer had a processor for it: none of a stopped process."""
+        with suppress(OSError):
+            for thread in os.listdir(self._threads):  # noqa: PTH208 (pathlib starts too slowly here)
+                with suppress(OSError), open(f"{self._threads}/{thread}/stat", "rb") as stat:  # noqa: PTH123
+                    if stat.read().rpartition(b")")[2].split()[0] == b"R":
+                        return True
+        return False
 
 
 def raise_priority() -> None:

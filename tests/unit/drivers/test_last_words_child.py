@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
+
+from drivers.last_words_child import FROZEN_S, LOOK_S, Owner
 
 pytestmark = pytest.mark.wire
 
@@ -32,3 +37,31 @@ def test_what_spins_in_real_time_loses_the_right_to_it() -> None:
     if raised == "False":
         pytest.skip("this system lets nobody run in real time")
     assert lowered == "True"
+
+
+def test_an_owner_that_waits_for_a_processor_is_late_one_that_was_stopped_is_frozen() -> None:
+    """On one core, beside a process that goes first."""
+    spin = [sys.executable, "-c", "while True: pass"]
+    core = min(os.sched_getaffinity(0))
+    with subprocess.Popen(spin) as first, subprocess.Popen(spin) as waits:
+        try:
+            for process in (first, waits):
+                os.sched_setaffinity(process.pid, {core})
+            os.sched_setscheduler(waits.pid, os.SCHED_IDLE, os.sched_param(0))
+            assert not freezes(waits.pid, 4 * FROZEN_S)
+            waits.send_signal(signal.SIGSTOP)
+            first.kill()
+            assert freezes(waits.pid, 4 * FROZEN_S)
+        finally:
+            first.kill()
+            waits.kill()
+
+
+def freezes(pid: int, seconds: float) -> bool:
+    """Whether an owner that beats no more counts as frozen within so many seconds."""
+    owner, begun, frozen = Owner(pid), time.monotonic(), False
+    owner.beat()
+    while not frozen and time.monotonic() - begun < seconds:
+        time.sleep(LOOK_S)
+        frozen = owner.frozen()
+    return frozen
