@@ -196,7 +196,7 @@ def _known_after(before: PartsBefore, last: RunOutcome) -> PartsBefore:
     series, stands = before.series, None
     if isinstance(seen, PlacedPart) and seen.came is not None:
         series = series.after(seen.came, seen.slips)
-    if isinstance(arrival, VehicleArrival) and isinstance(photograph, BoardFix):
+    if isinstance(arrival, VehicleArrival) and isinstance(photograph, BoardFix) and not photograph.swung:
         stands = replace(arrival, shared=photograph)
     return PartsBefore(series, stands)
 

@@ -96,7 +96,8 @@ class Mover:
 
     `hold` is called before each free motion, at a moment when nothing moves: a paused run waits in it. `interlocks` are
     told of the part and of the station, so that moves that nobody planned are checked against them as well. `pace` says
-    how fast, of what is planned.
+    how fast, of what is planned. Flange poses are reached with the joints nearest to `near` (6,), rad, or to where the
+    arm stands: with others its errors are others, by more than a tenth of a millimetre.
     """
 
     def __init__(
@@ -104,6 +105,7 @@ class Mover:
         interlocks: Interlocks | None = None, pace: Pace | None = None,
     ) -> None:  # fmt: skip
         self.hold = hold
+        self.near: Joints | None = None
         self._rests_at: pin.SE3 | None = None
         self.pace = pace or Pace()
         self._arm = arm
@@ -199,7 +201,11 @@ class Mover:
     def plan_to(self, base_from_flange: pin.SE3, what: str) -> Trajectory:
         """A free motion to a flange pose; raises `Unreachable` or `CollisionError` before anything moves."""
         start = self.joints
-        return self._planner.free(start, self._planner.reach(base_from_flange, start, what)).at_pace(self.pace.share)
+        if self.near is None:
+            joints = self._planner.reach(base_from_flange, start, what)
+        else:
+            joints = self.kinematics.unwound(self._planner.reach(base_from_flange, self.near, what), start)
+        return self._planner.free(start, joints).at_pace(self.pace.share)
 
     def to(self, base_from_flange: pin.SE3, what: str) -> None:
         """Move freely to a flange pose and settle."""
@@ -207,10 +213,7 @@ class Mover:
         self.follow(self.plan_to(base_from_flange, what))
 
     def to_as_from(self, near: Joints, base_from_flange: pin.SE3, what: str) -> None:
-        """Move freely to a flange pose, wherever the arm stands, with the joints in which it comes there from `near`.
-
-        With other joints the arm's errors are others, by more than a tenth of a millimetre.
-        """
+        """Move freely to a flange pose, from anywhere, with the joints with which it comes there from `near`."""
         joints = self._planner.reach(base_from_flange, near, what)
         self.to_joints(self.kinematics.unwound(joints, self.joints))
 

@@ -39,7 +39,8 @@ class BoardFix:
     """The board in the arm's base; `covariance` (6, 6) in the base, translation then rotation, m and rad.
 
     `views` are the points found in each of the `frames`; by ±`swung` m the board moved between them, 0 where that does
-    not show. `notes` are for people. `flange` (6,) is what the arm told meanwhile; `number` counts a run's photographs.
+    not show. `notes` are for people. `flange` (6,) and `joints` (6,) are what the arm told meanwhile.
+    `number` counts a run's photographs.
     """
 
     base_from_board: pin.SE3
@@ -51,6 +52,7 @@ class BoardFix:
     swung: float = 0.0
     notes: tuple[str, ...] = ()
     flange: Vector = field(default_factory=lambda: np.zeros(6))
+    joints: Vector = field(default_factory=lambda: np.zeros(6))
     number: int = 0
     by_mount: Vector = field(default_factory=lambda: np.zeros((6, 6)))
 
@@ -78,8 +80,8 @@ def photograph(
     Raises `RefusedError` with the reason: board not found, seen more obliquely than `limits.max_obliquity`, residual
     above `limits.max_residual`, or pose ambiguous; it shows the "frame" and the "view", as far as there is one.
     """
-    flange = arm.state().flange
-    base_from_flange = from_ur(flange)
+    stands = arm.state()
+    base_from_flange = from_ur(stands.flange)
     frames: list[Frame] = []
     for k in range(count):
         if k:
@@ -116,7 +118,9 @@ def photograph(
     centre = transform(camera_from_board, views[0].object_points.mean(axis=0)[None])[0]
     swung = swing(views, float(centre[2]) / calibration.camera.fx)
     seen = base_from_camera * camera_from_board, covariance, residual, obliquity
-    return BoardFix(*seen, tuple(frames), tuple(views), swung, flange=flange, by_mount=by_mount)
+    return BoardFix(
+        *seen, tuple(frames), tuple(views), swung, flange=stands.flange, joints=stands.joints, by_mount=by_mount
+    )
 
 
 # A vehicle that has just stopped, or that somebody leans on, rocks on its tyres by a tenth of a milliradian and more, a

@@ -112,6 +112,7 @@ def _at(here: Workplace, context: StepContext) -> BoardFix:
     arrival, job = context.made(VehicleArrival), here.job
     here.mover.avoid_station(arrival.base_from_place, job, here.board, around(here.nominal.extent, here.ground))
     if arrival.shared is not None:
+        here.mover.near = arrival.shared.joints
         return here.keep_again(arrival.shared)
     goal = photo_pose(job, here.board, arrival.fix.base_from_board, here.calibration.target.flange_from_camera)
     fix = photographed(here, goal, context.progress)

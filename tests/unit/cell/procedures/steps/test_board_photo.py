@@ -56,6 +56,7 @@ def test_items_share_a_photograph_until_odometry_tells_that_the_vehicle_moved(
     assert (found.shared, found.photographs, found.summary()["shared"]) == (fix, 0, True)
     assert found.head is not None and there.cell.devices.vehicle.state().braked
     assert there.do("board_photo").base_from_board is fix.base_from_board
+    assert there.work.mover.near is fix.joints and np.ptp(fix.joints) > 1.0
     there.work.whereabouts.way += 0.01
     again = there.do("drive_to_target")
     assert again.shared is None and again.photographs > 0 and "shared" not in again.summary()
