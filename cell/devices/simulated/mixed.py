@@ -71,11 +71,11 @@ def require_possible(config: CellConfig, simulated: Collection[str], needed: Col
             problems.append(f"{name} is real and hangs on the arm's output, and the arm is simulated")
         if missing := [other for other in NEEDS.get(name, ()) if other in simulated]:
             problems.append(
-                f"{name} is real: its pictures show nothing of what {_and(missing)} only simulated would do"
+                f"{name} is real: its pictures show nothing of what {', '.join(missing)} only simulated would do"
             )
     if problems:
         raise ConfigError(
-            f"these devices cannot be simulated beside the others: {_and(simulated)}\n  "
+            f"these devices cannot be simulated beside the others: {', '.join(simulated)}\n  "
             + "\n  ".join(problems)
             + "\nSimulate the first named of each line as well, or have the others real"
         )
@@ -108,10 +108,6 @@ def beware(simulated: Collection[str], needed: Collection[str]) -> list[str]:
             "opened"
         )
     return told
-
-
-def _and(names: Collection[str]) -> str:
-    return ", ".join(names)
 
 
 log = logging.getLogger(__name__)

@@ -97,8 +97,6 @@ def calibrate(
         said = _options(plan, poses, pose_field, setup, camera=camera, laser=laser)
         _from_folder(source, board, said, json, details)
         return
-    from cell.apps.cli.calibration.stored import print_examination
-    from cell.apps.cli.display import print_calibration
     from cell.apps.cli.progress import ProgressDisplay
     from cell.config.calibrations.store import archive_of, solve_observations
     from cell.measure.calibration.archive import read_archive
@@ -115,11 +113,7 @@ def calibrate(
     observations = read_archive(archive_of(where, calibration))
     examination = examine(solve_observations(observations), observations, loaded, job)
     pictures = examination.draw(where / calibration.name)
-    if json:
-        print_json({**calibration.summary(), **examination.summary, "pictures": [str(path) for path in pictures]})
-    else:
-        print_calibration(calibration.summary(), str(where))
-        print_examination(examination.summary, pictures)
+    stored.print_solved(calibration.summary(), str(where), examination.summary, pictures, json)
 
 
 def _options(

@@ -40,7 +40,6 @@ def solve(
     """
     from dataclasses import replace
 
-    from cell.apps.cli.display import print_calibration
     from cell.config.calibrations.store import gathered, solve_observations
     from cell.config.cell_config import find_config, load_config
     from cell.measure.calibration.archive import SUFFIX, read_archive
@@ -53,20 +52,21 @@ def solve(
         again = gathered(o.scan, o.target, o.identities, config=loaded, kinematics=o.kinematics, witness=o.witness)
         observations = replace(again, made=o.made)
     solved = solve_observations(observations)
-    summary = solved.calibration.summary()
     examination = examine(solved, observations, loaded, job)
     pictures = examination.draw(archive.with_name(archive.name.removesuffix(SUFFIX)))
-    if json:
-        print_json({**summary, **examination.summary, "pictures": [str(path) for path in pictures]})
-        return
-    print_calibration(summary, None)
-    print_examination(examination.summary, pictures)
+    print_solved(solved.calibration.summary(), None, examination.summary, pictures, json)
 
 
-def print_examination(figures: Summary, pictures: Sequence[Path]) -> None:
-    """For people: coverage, the parameters' influence, advice, and where pictures are."""
+def print_solved(summary: Summary, where: str | None, figures: Summary, pictures: Sequence[Path], json: bool) -> None:
+    """A calibration, stored in `where` if at all, with its coverage, the parameters' influence, advice and pictures."""
     from rich.console import Console
 
+    from cell.apps.cli.display import print_calibration
+
+    if json:
+        print_json({**summary, **figures, "pictures": [str(path) for path in pictures]})
+        return
+    print_calibration(summary, where)
     console = Console()
     _coverage(console, figures)
     influence = figures["influence"]

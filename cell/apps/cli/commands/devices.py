@@ -150,12 +150,14 @@ def find(
     Serial ports, CAN interfaces and cameras of this computer, and the addresses that are configured. No broadcast is
     sent, nothing moves, and no port is opened that is not asked.
     """
+    from dataclasses import asdict
+
     from cell.devices.diagnosis.finding import NEXT
     from cell.devices.diagnosis.finding import find as look
 
     found = look(config, ports or (), ask=ask)
     if json:
-        print_json([row.as_dict() for row in found])
+        print_json([asdict(row) for row in found])
     else:
         _print_found(found)
         local = [row for row in found if not row.what.startswith("config")]

@@ -193,10 +193,6 @@ class ConfirmedTurn:
         turn = self.turn + seen.turn - self.plate
         return Pointing(turn, float(np.hypot(seen.sigma, self.sigma)), self.turn)
 
-    def as_dict(self) -> dict[str, float]:
-        """For storage."""
-        return dict(vars(self))
-
     @classmethod
     def read(cls, data: dict[str, Any] | None) -> ConfirmedTurn | None:
         """From storage; KeyError, TypeError or ValueError when it is none."""

@@ -34,10 +34,6 @@ class Shutter:
     sigma: float
     link: dict[str, str]
 
-    def as_dict(self) -> dict[str, object]:
-        """For storage."""
-        return dict(vars(self))
-
     @classmethod
     def read(cls, data: dict[str, Any] | None) -> Shutter | None:
         """From storage; KeyError, TypeError, AttributeError or ValueError when it is none."""
@@ -71,10 +67,6 @@ class StampTiming:
     by_exposure: float
     made: float
     link: dict[str, str]
-
-    def as_dict(self) -> dict[str, object]:
-        """For storage."""
-        return dict(vars(self))
 
     @classmethod
     def read(cls, data: dict[str, Any] | None) -> StampTiming | None:

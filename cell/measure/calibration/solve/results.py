@@ -153,7 +153,7 @@ class ScanCalibration:
         found = {"confirmed": self.confirmed, "timing": self.timing, "shutter": self.shutter}
         refused = {"refused": self.refused} if self.refused else {}
         return (
-            {name: one.as_dict() for name, one in found.items() if one is not None}
+            {name: dict(vars(one)) for name, one in found.items() if one is not None}
             | refused
             | {
                 "camera": self.camera.as_dict(),

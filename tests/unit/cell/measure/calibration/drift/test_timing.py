@@ -188,7 +188,7 @@ def test_it_is_stored_with_the_calibration() -> None:
     assert ScanCalibration.from_dict(head.as_dict()).timing == FOUND
     assert "timing" not in calibration().as_dict()
     with pytest.raises(ValueError, match="time stamps"):
-        StampTiming.read(FOUND.as_dict() | {"sigma": 0.0})
+        StampTiming.read(vars(FOUND) | {"sigma": 0.0})
 
 
 SPOILT = [{"sigma": 0.0}, {"late": float("nan")}, {"late": "much"}, {"link": None}, {"made": None}]
