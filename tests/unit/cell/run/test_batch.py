@@ -164,7 +164,7 @@ def test_somebody_lets_this_part_be_the_last(opened: Callable[..., Cell]) -> Non
     assert ([run.outcome for run in batch.runs], batch.reason) == (["placed"], "after part 1, as asked")
 
 
-def test_items_are_made_ready_once_a_round_share_a_photograph_in_it_and_those_not_tried_are_named(
+def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
     opened: Callable[..., Cell], tmp_path: Path, placed_pot: JobRecord
 ) -> None:
     jobs, asked, tried = [load_job(f"swap#{k}")[0] for k in (1, 2)], list[int](), list[int]()
