@@ -24,14 +24,9 @@ def open_port(
     """
     try:
         return serial.serial_for_url(
-            url,
-            baudrate=baud,
-            timeout=timeout,
-            write_timeout=WRITE_TIMEOUT_S,
-            parity=PARITIES[parity],
-            stopbits=stop_bits,
-            exclusive=True,
-        )
+            url, baudrate=baud, timeout=timeout, write_timeout=WRITE_TIMEOUT_S, parity=PARITIES[parity],
+            stopbits=stop_bits, exclusive=True,
+        )  # fmt: skip
     except (*FAILURES, ValueError) as error:
         raise NotConnectedError(
             name, f"port {url} cannot be opened: {error}. Check the address and that nothing else has it open"

@@ -98,13 +98,11 @@ def nominal_scan(config: CellConfig) -> ScanCalibration:
     """The scan head as drawn, for planning only: its covariance is zero, its quality empty."""
     laser, size = config.laser, len(PARAMETERS)
     return ScanCalibration(
-        nominal_camera(config.scan_camera),
-        LightPlane.from_baseline(laser.baseline, float(np.arctan(laser.tan_theta))),
-        np.array([1.0, 0.0, 0.0]),
-        flange_from_camera=config.scan_camera.flange_from_camera.se3(),
+        nominal_camera(config.scan_camera), LightPlane.from_baseline(laser.baseline, float(np.arctan(laser.tan_theta))),
+        np.array([1.0, 0.0, 0.0]), flange_from_camera=config.scan_camera.flange_from_camera.se3(),
         covariance=np.zeros((size, size)),
         quality=Quality(0, 0.0, 0.0, stripe_rms=None, held_out_px=0.0, held_out_stripe=None),
-    )
+    )  # fmt: skip
 
 
 def _views(config: CellConfig) -> Iterator[Goal]:

@@ -194,9 +194,7 @@ def _require_arm(devices: Devices, *unfit: ArmSafety) -> None:
         raise
     if safety in unfit if unfit else safety is not ArmSafety.NORMAL:
         raise DeviceFault(
-            "arm",
-            f"arm.{safety.name.lower()}",
+            "arm", f"arm.{safety.name.lower()}",
             ": ".join(filter(None, (f"the arm is in {safety.value}", state.reason))),
-            recoverable=safety is ArmSafety.PROTECTIVE_STOP,
-            hint="Look for the reason and clear the way.",
-        )
+            recoverable=safety is ArmSafety.PROTECTIVE_STOP, hint="Look for the reason and clear the way.",
+        )  # fmt: skip

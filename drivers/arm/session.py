@@ -299,14 +299,9 @@ class ArmSession:
 
     def _connect(self, wanted: Callable[[], bool]) -> ArmLink:
         return ArmLink(
-            self._name,
-            self.setup,
-            self._connect_timeout,
-            on_snapshot=self._take,
-            on_ended=self._on_ended,
-            on_lost=self._on_lost,
-            wanted=wanted,
-        )
+            self._name, self.setup, self._connect_timeout, on_snapshot=self._take, on_ended=self._on_ended,
+            on_lost=self._on_lost, wanted=wanted,
+        )  # fmt: skip
 
     def _take(self, snapshot: Snapshot) -> None:
         self.statistics.traffic.received(snapshot)

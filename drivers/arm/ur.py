@@ -88,28 +88,18 @@ class UrArm:
         self._starting = threading.Lock()
         self._motion: UrMotion | None = None
         setup = ChildSetup(
-            address,
-            clock.rate,
-            tuple(_check_output(name, index) for index in safe_off_outputs),
+            address, clock.rate, tuple(_check_output(name, index) for index in safe_off_outputs),
             payload=self.limits.check_payload(name, payload[0], np.array(payload[1])),
             watchdog=_WATCHDOG_S if clock.rate <= 1.0 else _WATCHDOG_FAST_S,
-            braking=check_positive(name, "braking", braking, 20.0, "rad/s^2"),
-            control=control,
-            model=model,
-        )
+            braking=check_positive(name, "braking", braking, 20.0, "rad/s^2"), control=control, model=model,
+        )  # fmt: skip
         self.factory = read_factory_kinematics(address, min(connect_timeout, _TOLD_S))
         if forward_of is not None:
             forward = forward_of(self.factory.table)
         self._session = ArmSession(
-            name,
-            setup,
-            clock,
-            connect_timeout=connect_timeout,
-            forward=forward,
-            unknown=self.factory.missing,
-            on_ended=self._on_ended,
-            on_broken=self._end_motion,
-        )
+            name, setup, clock, connect_timeout=connect_timeout, forward=forward, unknown=self.factory.missing,
+            on_ended=self._on_ended, on_broken=self._end_motion,
+        )  # fmt: skip
         self._feed = self._session.feed
         self.statistics = self._session.statistics
 
@@ -174,19 +164,12 @@ class UrArm:
     def _state(self, snapshot: Snapshot) -> ArmState:
         safety = _SAFETY[safety_code(snapshot.safety_bits)]
         return ArmState(
-            stamp=self._clock.now() - self._feed.age(snapshot),
-            joints=np.array(snapshot.joints),
-            joint_speeds=np.array(snapshot.speeds),
-            flange=np.array(snapshot.flange),
-            wrench=np.array(snapshot.wrench),
-            safety=safety,
-            reason=late_words(snapshot.late) if safety is ArmSafety.PROTECTIVE_STOP else "",
-            moving=not snapshot.at_rest,
-            digital_inputs=snapshot.inputs,
-            digital_outputs=snapshot.outputs,
-            device_time=snapshot.device_time,
-            controlled=snapshot.mode == MODE_RUNNING and snapshot.program_running,
-        )
+            stamp=self._clock.now() - self._feed.age(snapshot), joints=np.array(snapshot.joints),
+            joint_speeds=np.array(snapshot.speeds), flange=np.array(snapshot.flange), wrench=np.array(snapshot.wrench),
+            safety=safety, reason=late_words(snapshot.late) if safety is ArmSafety.PROTECTIVE_STOP else "",
+            moving=not snapshot.at_rest, digital_inputs=snapshot.inputs, digital_outputs=snapshot.outputs,
+            device_time=snapshot.device_time, controlled=snapshot.mode == MODE_RUNNING and snapshot.program_running,
+        )  # fmt: skip
 
     # --- moving ---
 

@@ -221,14 +221,9 @@ class RecordedCamera:
         self._last = row.number
         self.lost += lost
         return Frame(
-            image,
-            row.number,
-            row.exposure,
-            device_time=row.time,
-            host_time=self._begun + row.time,
-            received=self._clock.now(),
-            lost_before=lost,
-        )
+            image, row.number, row.exposure, device_time=row.time, host_time=self._begun + row.time,
+            received=self._clock.now(), lost_before=lost,
+        )  # fmt: skip
 
     def __iter__(self) -> Iterator[Frame]:
         """Pictures until the last one or the end of the stream."""

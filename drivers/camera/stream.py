@@ -193,12 +193,9 @@ class StreamCamera:
 
     def _unusable(self, op: str, why: str) -> DeviceFault:
         return DeviceFault(
-            self.name,
-            "camera.protocol",
-            f"the answer to {op!r} cannot be used: {why}",
-            recoverable=False,
+            self.name, "camera.protocol", f"the answer to {op!r} cannot be used: {why}", recoverable=False,
             hint="Check that the peer speaks frame stream version 1 with mono8 pictures.",
-        )
+        )  # fmt: skip
 
     def _compare_clocks(self) -> None:
         def latch() -> Latch:
@@ -217,14 +214,9 @@ class StreamCamera:
     def _queue(self, most: int) -> Iterator[FrameQueue]:
         gap = _LONGEST_GAP_S + (2.0 / self._frame_rate if self._frame_rate else 0.0)
         queue = FrameQueue(
-            self.name,
-            self._clock,
-            capacity=most,
-            longest_gap=gap,
-            check=self._link.check,
-            statistics=self.statistics,
+            self.name, self._clock, capacity=most, longest_gap=gap, check=self._link.check, statistics=self.statistics,
             exposure=self._exposure,
-        )
+        )  # fmt: skip
         self._queues = (*self._queues, queue)
         try:
             yield queue
@@ -240,13 +232,10 @@ class StreamCamera:
             raise ValueError(f"a frame of {width}x{height} pixels came with {len(payload)} bytes")
         device_time = float(header["device_ns"]) * 1e-9
         frame = Frame(
-            image=np.frombuffer(payload, np.uint8).reshape(height, width),
-            frame_id=int(header["frame_id"]),
-            exposure=float(header["exposure_s"]),
-            device_time=device_time,
-            host_time=self._map.host_time(device_time),
+            image=np.frombuffer(payload, np.uint8).reshape(height, width), frame_id=int(header["frame_id"]),
+            exposure=float(header["exposure_s"]), device_time=device_time, host_time=self._map.host_time(device_time),
             received=received,
-        )
+        )  # fmt: skip
         for queue in self._queues:
             queue.put(frame)
 

@@ -226,12 +226,9 @@ class RailAxis(ABC):
                 self._homing = False
                 raise
             self._motion = RailMotion(
-                self.name,
-                self._clock,
-                arrived=self._searched(issued, length),
-                halt=self._halt(issued),
+                self.name, self._clock, arrived=self._searched(issued, length), halt=self._halt(issued),
                 duration=length / (0.5 * self._max_speed) + 0.1 * length / (0.1 * self._max_speed),
-            )
+            )  # fmt: skip
             return self._motion
 
     def move_to(self, position: float, speed: float | None = None) -> RailMotion:
@@ -243,14 +240,9 @@ class RailAxis(ABC):
             duration, least = self._start(position, speed, issued)
             readings: Samples = []
             self._motion = RailMotion(
-                self.name,
-                self._clock,
-                arrived=self._arrival(position, issued, readings),
-                halt=self._halt(issued),
-                duration=duration,
-                least=least,
-                readings=readings,
-            )
+                self.name, self._clock, arrived=self._arrival(position, issued, readings), halt=self._halt(issued),
+                duration=duration, least=least, readings=readings,
+            )  # fmt: skip
             return self._motion
 
     def nudge(self, distance: float, speed: float) -> RailMotion:
@@ -263,12 +255,9 @@ class RailAxis(ABC):
             with self._halted_if_failed(issued):
                 self._send(goal, speed, issued)
             self._motion = RailMotion(
-                self.name,
-                self._clock,
-                arrived=self._watched(self._arrival(goal, issued, [], homed=False), None),
-                halt=self._halt(issued),
-                duration=move_duration(distance, speed, self._acceleration),
-            )
+                self.name, self._clock, arrived=self._watched(self._arrival(goal, issued, [], homed=False), None),
+                halt=self._halt(issued), duration=move_duration(distance, speed, self._acceleration),
+            )  # fmt: skip
             return self._motion
 
     def _check_zero(self, switch: Callable[[], bool], forget: Callable[[], None]) -> RailMotion:

@@ -246,9 +246,6 @@ class RailSweep(EvenSweep, RailMotion):
 
     def _fault(self, message: str) -> DeviceFault:
         return DeviceFault(
-            self._name,
-            "rail.velocity",
-            message,
-            recoverable=True,
+            self._name, "rail.velocity", message, recoverable=True,
             hint="Sweep more slowly or farther; check lead, microsteps and that nothing else drives the rail.",
-        )
+        )  # fmt: skip

@@ -113,13 +113,9 @@ def _claw(name: str, config: NumatoClawConfig, around: Surroundings) -> BoardCla
     from drivers.relay.boards import BoardClaw, open_numato
 
     return BoardClaw(
-        open_numato(name, "claw", config.url, baud=config.baud),
-        config.relay,
-        config.feedback,
-        active_high=config.held_is == "high",
-        clock=around.clock,
-        control=not around.look,
-    )
+        open_numato(name, "claw", config.url, baud=config.baud), config.relay, config.feedback,
+        active_high=config.held_is == "high", clock=around.clock, control=not around.look,
+    )  # fmt: skip
 
 
 _OPTICS = frozenset(("baseline", "tan_theta"))

@@ -43,16 +43,9 @@ class AgilexLink(CanLink):
         }
         self._told = told
         super().__init__(
-            name,
-            interface,
-            channel,
-            bitrate=bitrate,
-            options=options,
-            receive=self._take,
-            idle=idle,
-            statistics=statistics,
-            alone="the vehicle stops by itself 0.5 s after the last command",
-        )
+            name, interface, channel, bitrate=bitrate, options=options, receive=self._take, idle=idle,
+            statistics=statistics, alone="the vehicle stops by itself 0.5 s after the last command",
+        )  # fmt: skip
 
     def send(self, name: str, **signals: float) -> None:
         """Send the message `name`; signals in the units of the DBC. Raises as `check` does."""

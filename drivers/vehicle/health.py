@@ -56,13 +56,9 @@ def parse_interface(name: str, text: str) -> CanInterface | None:
             data = _table(_table(row, "linkinfo"), "info_data")
             counters = _table(data, "berr_counter")
             return CanInterface(
-                name,
-                "UP" in row.get("flags", ()),
-                _table(data, "bittiming").get("bitrate"),
-                state=data.get("state"),
-                sent_errors=counters.get("tx"),
-                received_errors=counters.get("rx"),
-            )
+                name, "UP" in row.get("flags", ()), _table(data, "bittiming").get("bitrate"), state=data.get("state"),
+                sent_errors=counters.get("tx"), received_errors=counters.get("rx"),
+            )  # fmt: skip
     return None
 
 

@@ -242,11 +242,9 @@ def solve(spec: RigSpec, observations: list[ScanObservation]) -> Solved:
         joint.adjusted.covariance[:KEPT, :KEPT], Quality.of(joint),
     )  # fmt: skip
     return Solved(
-        spec.nominal(),
-        ScanGeometry(staged.camera, staged.plane.plane, hand.rail_direction, hand.flange_from_camera),
-        calibration.geometry(),
-        calibration,
-    )
+        spec.nominal(), ScanGeometry(staged.camera, staged.plane.plane, hand.rail_direction, hand.flange_from_camera),
+        calibration.geometry(), calibration,
+    )  # fmt: skip
 
 
 def in_scan_frame(geometry: ScanGeometry) -> ScanGeometry:

@@ -139,12 +139,10 @@ class RailMove:
                     hint="Home the rail again and check the configured travel.",
                 )  # fmt: skip
         return DeviceFault(
-            rail.name,
-            "rail.stalled",
-            f"{short}: the motor does not move" + (" (stall detected)" if model.stalled(now) else ""),
-            recoverable=True,
+            rail.name, "rail.stalled",
+            f"{short}: the motor does not move" + (" (stall detected)" if model.stalled(now) else ""), recoverable=True,
             hint="See whether the carriage is blocked and the motor has current, then home again.",
-        )
+        )  # fmt: skip
 
 
 class DirectSweep(EvenSweep, RailMove):

@@ -257,10 +257,9 @@ def gathered(
 ) -> Observations:  # fmt: skip
     """The observations with all else that their solution depends on, as of now."""
     priors = Priors(
-        arm_translation=config.arm.repeatability,
-        arm_rotation=config.arm.repeatability_angle,
+        arm_translation=config.arm.repeatability, arm_rotation=config.arm.repeatability_angle,
         rail=config.calibration.rail_sigma,
-    )
+    )  # fmt: skip
     cameras = nominal_camera(config.scan_camera), nominal_camera(config.target_camera)
     return Observations(
         scan, target, *cameras, priors, config.rail.lead, identities, config.calibration_hash(), time.time(),

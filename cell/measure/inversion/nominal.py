@@ -96,11 +96,10 @@ def closest(
             at[i] = min(max(int((points[n, i] - low[i]) / cell), 0), owner.shape[i] - 1)
         best = int(owner[at[0], at[1], at[2]])
         distance, foot, weights = to_triangle(
-            p,
-            (corners[best, 0, 0], corners[best, 0, 1], corners[best, 0, 2]),
+            p, (corners[best, 0, 0], corners[best, 0, 1], corners[best, 0, 2]),
             (corners[best, 1, 0], corners[best, 1, 1], corners[best, 1, 2]),
             (corners[best, 2, 0], corners[best, 2, 1], corners[best, 2, 2]),
-        )
+        )  # fmt: skip
         for _ in range(100):
             if min(weights[0], weights[1], weights[2]) > 0.0:
                 break
@@ -113,11 +112,10 @@ def closest(
                 if t == left:
                     continue
                 other, better, better_weights = to_triangle(
-                    p,
-                    (corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]),
+                    p, (corners[t, 0, 0], corners[t, 0, 1], corners[t, 0, 2]),
                     (corners[t, 1, 0], corners[t, 1, 1], corners[t, 1, 2]),
                     (corners[t, 2, 0], corners[t, 2, 1], corners[t, 2, 2]),
-                )
+                )  # fmt: skip
                 if other < distance:
                     distance, best, foot, weights = other, t, better, better_weights
             if best == left:

@@ -132,10 +132,8 @@ def read_cloud(path: Path) -> StoredCloud:
     whole = {name: records[name].astype(np.intp) for name in ("line", "row", "sweep")}
     return StoredCloud(
         points=np.column_stack([records[axis] for axis in "xyz"]).astype(np.float64),
-        sigma=records["sigma"].astype(np.float64),
-        interpolated=records["interpolated"] > 0,
-        **whole,
-    )
+        sigma=records["sigma"].astype(np.float64), interpolated=records["interpolated"] > 0, **whole,
+    )  # fmt: skip
 
 
 def deviation_colours(deviations: ArrayLike, limit: float) -> NDArray[np.uint8]:
@@ -199,11 +197,9 @@ def write_mesh(path: Path, points: Array, faces: Indices, colours: NDArray[np.ui
 
     used, numbers = np.unique(faces, return_inverse=True)
     mesh = trimesh.Trimesh(
-        points[used],
-        numbers.reshape(faces.shape),
-        vertex_colors=None if colours is None else colours[used],
+        points[used], numbers.reshape(faces.shape), vertex_colors=None if colours is None else colours[used],
         process=False,
-    )
+    )  # fmt: skip
     with replacing(path) as file:
         mesh.export(file, file_type="stl" if path.suffix.lower() == ".stl" else "ply")
     return len(faces)

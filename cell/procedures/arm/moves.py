@@ -201,11 +201,8 @@ class Mover:
     def plan_to(self, base_from_flange: pin.SE3, what: str) -> Trajectory:
         """A free motion to a flange pose; raises `Unreachable` or `CollisionError` before anything moves."""
         start = self.joints
-        if self.near is None:
-            joints = self._planner.reach(base_from_flange, start, what)
-        else:
-            joints = self.kinematics.unwound(self._planner.reach(base_from_flange, self.near, what), start)
-        return self._planner.free(start, joints).at_pace(self.pace.share)
+        joints = self._planner.reach(base_from_flange, start if self.near is None else self.near, what)
+        return self._planner.free(start, self.kinematics.unwound(joints, start)).at_pace(self.pace.share)
 
     def to(self, base_from_flange: pin.SE3, what: str) -> None:
         """Move freely to a flange pose and settle."""

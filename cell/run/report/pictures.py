@@ -292,11 +292,9 @@ def draw_run(
     more = 0 if surface is None else (surface.flush is not None) + bool(surface.features)
     waviness = textwrap.wrap(texture_words(report), TITLE_COLUMNS)
     left, *middle, right = figure.subplots(
-        1,
-        2 + scanned,
-        width_ratios=[1.0, 1.3, 1.0] if scanned else [1.5, 1.0],
+        1, 2 + scanned, width_ratios=[1.0, 1.3, 1.0] if scanned else [1.5, 1.0],
         gridspec_kw={**MARGINS, "top": MARGINS["top"] - TITLE_LINE * (len(seams) + more + len(waviness))},
-    )
+    )  # fmt: skip
     if board is None:
         empty(left, "the board", "not photographed")
     else:

@@ -41,19 +41,13 @@ class Packets:
         while True:
             self._newest = receive.getTimestamp()
             snapshot = Snapshot(
-                stamp=time.monotonic(),
-                joints=tuple(receive.getActualQ()),
-                speeds=tuple(receive.getActualQd()),
-                flange=tuple(receive.getActualTCPPose()),
-                wrench=tuple(receive.getActualTCPForce()),
-                safety_bits=receive.getSafetyStatusBits(),
-                mode=receive.getRobotMode(),
-                runtime=receive.getRuntimeState(),
-                inputs=receive.getActualDigitalInputBits(),
-                outputs=receive.getActualDigitalOutputBits(),
-                device_time=self._newest,
+                stamp=time.monotonic(), joints=tuple(receive.getActualQ()), speeds=tuple(receive.getActualQd()),
+                flange=tuple(receive.getActualTCPPose()), wrench=tuple(receive.getActualTCPForce()),
+                safety_bits=receive.getSafetyStatusBits(), mode=receive.getRobotMode(),
+                runtime=receive.getRuntimeState(), inputs=receive.getActualDigitalInputBits(),
+                outputs=receive.getActualDigitalOutputBits(), device_time=self._newest,
                 payload=(receive.getPayload(), tuple(receive.getPayloadCog())),
-            )
+            )  # fmt: skip
             if receive.getTimestamp() == self._newest:
                 return snapshot
 

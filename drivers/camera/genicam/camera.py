@@ -191,13 +191,10 @@ class GenicamCamera:
                 raise self._packets_lost()
 
         queue = FrameQueue(
-            self.name,
-            self._clock,
-            capacity=most,
-            longest_gap=_LONGEST_GAP_S + (2.0 / self._wish.frame_rate if self._wish else 0.0),
-            check=check,
+            self.name, self._clock, capacity=most,
+            longest_gap=_LONGEST_GAP_S + (2.0 / self._wish.frame_rate if self._wish else 0.0), check=check,
             statistics=self.statistics,
-        )
+        )  # fmt: skip
         base = self._count
 
         def take(picture: AcquiredPicture) -> None:

@@ -172,12 +172,9 @@ class CommandRefused(DeviceFault):
 
     def __init__(self, device: str, status: int, message: str) -> None:
         super().__init__(
-            device,
-            "tmcl.refused",
-            message,
-            recoverable=False,
+            device, "tmcl.refused", message, recoverable=False,
             hint="Check that the value is in the module's range (pulses per second) and that it has this axis.",
-        )
+        )  # fmt: skip
         self.status = status
 
 

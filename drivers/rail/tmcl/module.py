@@ -306,20 +306,14 @@ class ArrivalWatch:
         if link.get(switch):
             self._forget_zero()
             return DeviceFault(
-                link.name,
-                "rail.limit_switch",
-                f"{short}: the {side} limit switch is hit",
-                recoverable=True,
+                link.name, "rail.limit_switch", f"{short}: the {side} limit switch is hit", recoverable=True,
                 hint="Home the rail again and check the configured travel.",
-            )
+            )  # fmt: skip
         if link.get(Axis.TARGET_POSITION) != self._target:
             return DeviceFault(
-                link.name,
-                "rail.missed_target",
-                f"{short}: somebody else changed the module's target",
-                recoverable=True,
-                hint="See what else commands this module.",
-            )
+                link.name, "rail.missed_target", f"{short}: somebody else changed the module's target",
+                recoverable=True, hint="See what else commands this module.",
+            )  # fmt: skip
         self._forget_zero()
         flags = link.get(Axis.DRIVER_ERRORS)
         reasons = [text for bit, text in _DRIVER_FAULTS.items() if flags >> bit & 1]

@@ -46,26 +46,16 @@ class TmclRail(RailAxis):
 
     def __init__(self, name: str, record: TmclRailConfig, *, clock: Clock, control: bool = True) -> None:
         super().__init__(
-            name,
-            clock,
-            travel=record.travel,
-            max_speed=record.max_speed,
-            acceleration=record.acceleration,
-            counts=record.steps_per_turn * record.microsteps / record.lead,
-            control=control,
-        )
+            name, clock, travel=record.travel, max_speed=record.max_speed, acceleration=record.acceleration,
+            counts=record.steps_per_turn * record.microsteps / record.lead, control=control,
+        )  # fmt: skip
         self._resolution = record.microsteps.bit_length() - 1
         self._reference_mode = record.reference_mode
         self._reversed = record.reversed
         self._link: TmclLink = TmclLink(
-            name,
-            record.url,
-            address=record.address,
-            motor=record.motor,
-            baud=record.baud,
-            clock=clock,
+            name, record.url, address=record.address, motor=record.motor, baud=record.baud, clock=clock,
             statistics=self.statistics,
-        )
+        )  # fmt: skip
         counted = record.lead, record.steps_per_turn, record.microsteps, record.motor
         self._zero = ZeroMark(self._link, (*counted, record.reference_mode, record.reversed))
         try:
@@ -100,15 +90,11 @@ class TmclRail(RailAxis):
         counts, stamp, _ = self._link.get_stamped(Axis.POSITION)
         velocity = self._link.get(Axis.VELOCITY) / self._counts
         return RailState(
-            stamp=stamp,
-            position=counts / self._counts,
-            velocity=velocity,
-            homed=(homed := not self._homing and self._zero.held()),
-            homed_here=homed and self._zero.found_here,
-            moving=velocity != 0.0 or self._homing,
-            left_switch=bool(self._link.get(Axis.LEFT_SWITCH)),
+            stamp=stamp, position=counts / self._counts, velocity=velocity,
+            homed=(homed := not self._homing and self._zero.held()), homed_here=homed and self._zero.found_here,
+            moving=velocity != 0.0 or self._homing, left_switch=bool(self._link.get(Axis.LEFT_SWITCH)),
             right_switch=bool(self._link.get(Axis.RIGHT_SWITCH)),
-        )
+        )  # fmt: skip
 
     def check_zero(self) -> RailMotion | None:
         """See `drivers.interfaces.ChecksZero`: where the zero is a home switch that is searched leftwards."""
@@ -148,14 +134,9 @@ class TmclRail(RailAxis):
 
     def _arrival(self, position: float, issued: int, samples: Samples, *, homed: bool = True) -> ArrivalWatch:
         return ArrivalWatch(
-            self._link,
-            self._clock,
-            target=round(position * self._counts),
-            counts=self._counts,
-            issued=issued,
-            samples=samples,
-            zero=self._zero if homed else None,
-        )
+            self._link, self._clock, target=round(position * self._counts), counts=self._counts, issued=issued,
+            samples=samples, zero=self._zero if homed else None,
+        )  # fmt: skip
 
     def _set_up(self) -> None:
         """Tell the module what it forgets when it is reset."""

@@ -158,13 +158,9 @@ class DriveFeedback(Feedback):
         self.drives = tuple(SideDrive(side, node) for side, node in zip(SIDES, wheels.nodes, strict=True))
         self._by_node = {drive.node: drive for drive in self.drives}
         travel = Travel(
-            clock,
-            statistics,
-            track=wheels.track,
-            max_speed=max_speed,
-            max_yaw_rate=max_yaw_rate,
+            clock, statistics, track=wheels.track, max_speed=max_speed, max_yaw_rate=max_yaw_rate,
             unit=wheels.count_length,
-        )
+        )  # fmt: skip
         super().__init__(name, clock, travel)
         self._single: tuple[int, float] | None = None
         self._units = [UnitCheck(clock, wheels), UnitCheck(clock, wheels)]

@@ -181,15 +181,12 @@ def one_trial(seed: int, noise: Noise) -> Trial:
     errors = {frame: measured_errors(world, estimate, best, frame=frame, noise=noise, rng=rng) for frame in FRAMES}
     head = slice(0, LENS_TO_MOUNT)
     return Trial(
-        seed,
-        found.chi2_per_dof,
-        fixed.chi2_per_dof,
+        seed, found.chi2_per_dof, fixed.chi2_per_dof,
         {"dots": found.priors.dots_scale, "stripe": found.priors.stripe_scale},
         {n: float(e / s) for n, e, s in zip(_names(), error, sigma, strict=True) if s > 0},
         _whitened(error[free], covariance[np.ix_(free, free)]),
-        _whitened(best.error[head], best.covariance[head, head]),
-        errors,
-    )
+        _whitened(best.error[head], best.covariance[head, head]), errors,
+    )  # fmt: skip
 
 
 def _whitened(error: Array, covariance: Array) -> float:
@@ -231,13 +228,9 @@ def _as_world(world: HeadWorld, state: Any) -> HeadWorld:
         [state.camera.parameters[:8], state.plane.n / state.plane.distance, state.rail_direction]
     )
     return HeadWorld(
-        parameters,
-        state.flange_from_camera.homogeneous,
-        state.base_from_board.homogeneous,
-        world.flanges,
-        world.rails,
+        parameters, state.flange_from_camera.homogeneous, state.base_from_board.homogeneous, world.flanges, world.rails,
         world.spec,
-    )
+    )  # fmt: skip
 
 
 def _names() -> tuple[str, ...]:

@@ -68,15 +68,11 @@ class Truth:
         scan, target = scene.scan_lens, scene.target_lens
         return cls(
             np.array([scan.fx, scan.fy, scan.cx, scan.cy, *scan.dist]),
-            np.array([target.fx, target.fy, target.cx, target.cy, *target.dist]),
-            scene.light_plane_normal,
-            scene.light_plane_distance,
-            scene.rail_direction * (1.0 + scene.rail_lead_error),
-            scene.flange_from_scan_camera,
-            scene.flange_from_target_camera,
-            scene.base_from_fine_board,
+            np.array([target.fx, target.fy, target.cx, target.cy, *target.dist]), scene.light_plane_normal,
+            scene.light_plane_distance, scene.rail_direction * (1.0 + scene.rail_lead_error),
+            scene.flange_from_scan_camera, scene.flange_from_target_camera, scene.base_from_fine_board,
             scene.base_from_deck_board,
-        )
+        )  # fmt: skip
 
 
 @dataclass(eq=False)

@@ -151,17 +151,13 @@ def disturbances() -> list[Disturbance]:
             add(f"{camera} mount, 0.05° about {'xyz'[axis]}", mount, "turn", _posed(pose, np.zeros(3), TURN * e))
         for k, name in ((2, "cx"), (3, "cy")):
             add(
-                f"{camera} lens, 0.05° of {name}",
-                glass,
-                "principal point",
+                f"{camera} lens, 0.05° of {name}", glass, "principal point",
                 _lens(lens, TURN * np.eye(9)[k], np.zeros(9)),
-            )
+            )  # fmt: skip
         add(
-            f"{camera} lens, 0.2 mm of focus",
-            glass,
-            "focal length",
+            f"{camera} lens, 0.2 mm of focus", glass, "focal length",
             _lens(lens, np.zeros(9), SHIFT / depth * (np.arange(9) < 2)),
-        )
+        )  # fmt: skip
     laser = "laser's light plane"
     add("light plane, 0.2 mm", laser, "shift", lambda t: replace(t, plane_distance=t.plane_distance + SHIFT))
     for axis, name in ((1, "about y"), (2, "about z")):
@@ -258,12 +254,9 @@ def changed(truth: Truth, seen: Detectable) -> Truth:
     mount[:3, :3] = rotation(step[HAND][3:]) @ mount[:3, :3]
     normal = truth.plane_normal + np.column_stack(tangents(truth.plane_normal)) @ step[PLANE][:2]
     return replace(
-        truth,
-        **{pose: mount, lens: getattr(truth, lens) + step[CAMERA]},
-        plane_normal=normal / np.linalg.norm(normal),
-        plane_distance=truth.plane_distance + step[PLANE][2],
-        rail_direction=truth.rail_direction + step[RAIL],
-    )
+        truth, **{pose: mount, lens: getattr(truth, lens) + step[CAMERA]}, plane_normal=normal / np.linalg.norm(normal),
+        plane_distance=truth.plane_distance + step[PLANE][2], rail_direction=truth.rail_direction + step[RAIL],
+    )  # fmt: skip
 
 
 def _posed(name: str, shift: np.ndarray, turn: np.ndarray) -> Callable[[Truth], Truth]:

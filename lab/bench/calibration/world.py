@@ -85,11 +85,9 @@ class HeadWorld:
     def moved(self, step: Array) -> HeadWorld:
         """Another head, away by a step (26,) of the shared parameters."""
         return replace(
-            self,
-            parameters=self.parameters + step[:14],
-            hand=turned(self.hand, step[14:20]),
+            self, parameters=self.parameters + step[:14], hand=turned(self.hand, step[14:20]),
             board=turned(self.board, step[20:26]),
-        )
+        )  # fmt: skip
 
     @property
     def lens(self) -> Array:

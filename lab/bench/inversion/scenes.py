@@ -209,11 +209,9 @@ def scan(
     return Cloud(
         points=points @ TRUE.rotation.T + TRUE.translation,
         stripe_spread=np.broadcast_to(across @ TRUE.rotation.T, points.shape).astype(np.float32),
-        rail_spread=np.tile(TRUE.rotation[:, 0] * RAIL_SIGMA, (LINES, 1)),
-        centres=np.zeros((LINES, ROWS)),
-        rail=np.linspace(0.0, 2 * reach_x, LINES),
-        rejected=np.zeros((LINES, ROWS), dtype=bool),
-    )
+        rail_spread=np.tile(TRUE.rotation[:, 0] * RAIL_SIGMA, (LINES, 1)), centres=np.zeros((LINES, ROWS)),
+        rail=np.linspace(0.0, 2 * reach_x, LINES), rejected=np.zeros((LINES, ROWS), dtype=bool),
+    )  # fmt: skip
 
 
 def _cluttered(x: Array, y: Array, z: Array, inside: Mask, share: float, rng: np.random.Generator) -> Array:

@@ -96,12 +96,10 @@ def scan_errors(record: JobRecord, nominal: NominalSurface, kinematic: Vector) -
     part = _compare(record, nominal, cloud, lines[near], rows[near])
     found, true = _moved(reported[part.lines], part.found), _moved(flanges[part.lines], part.true)
     return ScanErrors(
-        scan=_length(in_camera - true_in_camera),
-        aligned=_length(aligned(in_camera, true_in_camera)),
-        own=_length(found - transform(own_from_base, true)),
-        absolute=_length(found - true),
+        scan=_length(in_camera - true_in_camera), aligned=_length(aligned(in_camera, true_in_camera)),
+        own=_length(found - transform(own_from_base, true)), absolute=_length(found - true),
         inside=np.einsum("ni,nij,nj->n", off, np.linalg.inv(stated), off) <= chi2.ppf(COVERED, 3),
-    )
+    )  # fmt: skip
 
 
 def own_base(record: JobRecord) -> pin.SE3:

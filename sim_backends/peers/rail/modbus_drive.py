@@ -138,11 +138,9 @@ class ModbusDriveServer:
         speed = self._map["speed"]
         per_turn = {"counts/s": float(self._turn), "rpm": 60.0, "0.1 rpm": 600.0, "1/240 rps": 240.0}[speed["unit"]]
         settings = dataclasses.replace(
-            self.rail.settings,
-            max_velocity=round(self._number("speed", signed=False) / per_turn * self._turn),
-            max_acceleration=round(up * self._turn),
-            max_deceleration=round(down * self._turn),
-        )
+            self.rail.settings, max_velocity=round(self._number("speed", signed=False) / per_turn * self._turn),
+            max_acceleration=round(up * self._turn), max_deceleration=round(down * self._turn),
+        )  # fmt: skip
         self.rail.configure(t, settings)
         self.rail.move_to(t, self._number("target"))
 

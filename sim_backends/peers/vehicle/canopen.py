@@ -234,11 +234,9 @@ class CanopenPeer(CanPeer):
             drive.node.tick(time.monotonic())
         left, right = (drive.wheel for drive in self.drives)
         self.model.command(
-            t,
-            0.5 * (left.demand + right.demand),
-            (right.demand - left.demand) / self.model.params.track,
+            t, 0.5 * (left.demand + right.demand), (right.demand - left.demand) / self.model.params.track,
             left.hard or right.hard,
-        )
+        )  # fmt: skip
         # One wheel that is locked holds the vehicle.
         locked = any(drive.locked for drive in self.drives)
         if locked != told.braked:

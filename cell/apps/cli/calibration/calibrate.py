@@ -65,23 +65,12 @@ def register(app: typer.Typer) -> None:
 
 
 def calibrate(
-    context: typer.Context,
-    config: ConfigOption = None,
-    sim: options.SimOption = None,
-    seed: options.SeedOption = 1,
-    level: options.LevelOption = Level.nominal,
-    job: options.JobOption = "pot",
-    source: SourceOption = None,
-    board: BoardOption = None,
-    plan: PlanOption = False,
-    poses: PosesOption = None,
-    pose_field: PoseFieldOption = None,
-    setup: SetupOption = None,
-    camera: CameraOption = None,
-    laser: LaserOption = None,
-    details: DetailsOption = False,
+    context: typer.Context, config: ConfigOption = None, sim: options.SimOption = None, seed: options.SeedOption = 1,
+    level: options.LevelOption = Level.nominal, job: options.JobOption = "pot", source: SourceOption = None,
+    board: BoardOption = None, plan: PlanOption = False, poses: PosesOption = None, pose_field: PoseFieldOption = None,
+    setup: SetupOption = None, camera: CameraOption = None, laser: LaserOption = None, details: DetailsOption = False,
     json: JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Calibrate rail, cameras, hand-eye and light plane, and store the result.
 
     Moves the cell through its own calibration poses over the boards on its deck; with --from it moves nothing.

@@ -241,10 +241,9 @@ def _predicted(joint: Joint, more: list[ViewData], priors: Priors) -> Array:
     rail = float(np.ptp([view.rail for view in joint.views])) > 1e-3
     free = shared_mask(plane=state.plane is not None, rail=rail)
     wider = replace(
-        state,
-        flanges=[*state.flanges, *(view.base_from_flange for view in more)],
+        state, flanges=[*state.flanges, *(view.base_from_flange for view in more)],
         rails=np.append(state.rails, [view.rail for view in more]),
-    )
+    )  # fmt: skip
     normal = Adjustment([*joint.views, *more], free, priors).normal_at(wider)
     return np.asarray(normal.inverse().shared * joint.adjusted.inflation**2)
 

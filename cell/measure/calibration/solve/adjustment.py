@@ -237,12 +237,11 @@ class Adjustment:
                 factors[name] = _scatter(normal, inverse, name)
         p = self.priors
         self.priors = replace(
-            p,
-            dots_scale=max(p.dots_scale * factors.get("dots", 1.0), LEAST_SCALE),
+            p, dots_scale=max(p.dots_scale * factors.get("dots", 1.0), LEAST_SCALE),
             stripe_scale=max(p.stripe_scale * factors.get("stripe", 1.0), LEAST_SCALE),
             arm_translation=float(np.clip(p.arm_translation * factors.get("shift", 1.0), *ARM_RANGE)),
             arm_rotation=float(np.clip(p.arm_rotation * factors.get("turn", 1.0), *ARM_TURN_RANGE)),
-        )
+        )  # fmt: skip
 
 
 def _scatter(normal: Normal, inverse: Inverse, name: str) -> float:

@@ -208,9 +208,8 @@ def _arm_scatter(views: Sequence[ViewData], held: Mask, staged: Staged) -> tuple
     free[PLANE] = False
     start = Priors(
         max(staged.hand_eye.scatter_m / np.sqrt(3), ARM_RANGE[0]),
-        max(staged.hand_eye.scatter_rad / np.sqrt(3), TURN_RANGE[0]),
-        estimate_arm=True,
-    )
+        max(staged.hand_eye.scatter_rad / np.sqrt(3), TURN_RANGE[0]), estimate_arm=True,
+    )  # fmt: skip
     found = Adjustment(dark, free, start).solve(replace(start_state(staged), plane=None), ARM_ROUNDS).priors
     return found.arm_translation, found.arm_rotation
 

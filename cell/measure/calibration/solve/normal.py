@@ -76,14 +76,12 @@ class AdjustmentState:
             plane = replace(plane, normal=turned.normal, distance=plane.distance + float(step[11]))
         own = step[SHARED:].reshape(-1, OWN)
         return AdjustmentState(
-            self.camera.with_parameters(self.camera.parameters + step[CAMERA]),
-            plane,
-            self.rail_direction + step[RAIL],
+            self.camera.with_parameters(self.camera.parameters + step[CAMERA]), plane, self.rail_direction + step[RAIL],
             flange_from_camera=perturbed(self.flange_from_camera, step[HAND]),
             base_from_board=perturbed(self.base_from_board, step[BOARD]),
             flanges=[perturbed(pose, d[:6]) for pose, d in zip(self.flanges, own, strict=True)],
             rails=self.rails + own[:, 6],
-        )
+        )  # fmt: skip
 
     def camera_from_board(self, flange: pin.SE3, rail: float) -> pin.SE3:
         """Pose of the board in the camera at a flange pose and a rail position."""

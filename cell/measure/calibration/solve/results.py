@@ -243,12 +243,10 @@ class TargetCalibration:
     def from_dict(cls, data: dict[str, Any]) -> TargetCalibration:
         """From storage; KeyError, TypeError or ValueError when it is not one."""
         return cls(
-            CameraModel.read(data["camera"]),
-            from_matrix(data["flange_from_camera"]),
-            np.array(data["hand_eye_covariance"], dtype=np.float64).reshape(6, 6),
-            Quality(**data["quality"]),
+            CameraModel.read(data["camera"]), from_matrix(data["flange_from_camera"]),
+            np.array(data["hand_eye_covariance"], dtype=np.float64).reshape(6, 6), Quality(**data["quality"]),
             Reference.read(data.get("reference")),
-        )
+        )  # fmt: skip
 
 
 def sigmas(covariance: Array) -> dict[str, float]:

@@ -257,11 +257,9 @@ class Creep:
         seconds = time - self.since
         unknown = seconds**2 * self.covariance
         return replace(
-            pose,
-            base_from_surface=perturbed(pose.base_from_surface, seconds * self.rate),
-            systematic=pose.systematic + unknown,
-            covariance=pose.covariance + unknown,
-        )
+            pose, base_from_surface=perturbed(pose.base_from_surface, seconds * self.rate),
+            systematic=pose.systematic + unknown, covariance=pose.covariance + unknown,
+        )  # fmt: skip
 
     def as_dict(self) -> dict[str, object]:
         """Figures for the journal."""

@@ -114,11 +114,9 @@ def _same_range(dark: Dark, picture: Picture, settings: StripeSettings) -> Pictu
         return off
     if picture.coloured:
         return Picture(
-            np.repeat(off.value[:, :, None], 3, axis=2),
-            np.repeat(off.saturated[:, :, None], 3, axis=2),
-            False,
+            np.repeat(off.value[:, :, None], 3, axis=2), np.repeat(off.saturated[:, :, None], 3, axis=2), False,
             off.full,
-        )
+        )  # fmt: skip
     return Picture(off.value.mean(axis=2), np.asarray(off.saturated.any(axis=2)), False, off.full)
 
 

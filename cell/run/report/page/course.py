@@ -169,13 +169,11 @@ def past_runs(folder: Path, report: Report) -> list[Past]:
 def _past(name: str, report: Report) -> Past:
     truth, bound = report.get("truth"), report.get("place_bound_95")
     return Past(
-        name,
-        str(report.get("started") or "")[:16].replace("T", " "),
-        str(report["outcome"]),
+        name, str(report.get("started") or "")[:16].replace("T", " "), str(report["outcome"]),
         simulated=bool(report.get("simulated")),
         true_mm=None if truth is None else float(truth["error_mm"]["d"]["max"]),
         stated_mm=None if bound is None else float(bound["d"]),
-    )
+    )  # fmt: skip
 
 
 def _ticks(end: float, steps: Sequence[float], most: int) -> list[float]:
