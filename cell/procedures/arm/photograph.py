@@ -39,7 +39,7 @@ class BoardFix:
     """The board in the arm's base; `covariance` (6, 6) in the base, translation then rotation, m and rad.
 
     `views` are the points found in each of the `frames`; by ±`swung` m the board moved between them, 0 where that does
-    not show. `notes` are for people. `flange` (6,) and `joints` (6,) are what the arm told meanwhile.
+    not show. `notes` are for people. `flange` (6,) and `joints` (6,) are what the arm told meanwhile;
     `number` counts a run's photographs.
     """
 
