@@ -16,6 +16,7 @@ from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import GraspSeries
 from cell.procedures.placed_part import PlacedPart
+from cell.procedures.steps.workplace import PartsBefore
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
@@ -61,7 +62,7 @@ class LyingPart:
         cell.devices.claw.bare.release()
         scene, now = cell.world.scene, cell.clock.now()
         cell.world.part._world_from_part = scene.world_from_surface @ off.homogeneous
-        work.series = self.series
+        work.parts_before = PartsBefore(self.series)
         work.part.state = PartState.RELEASED
         work.part.where = from_matrix(inverse(cell.world.world_from_base(now)) @ scene.world_from_surface) * off
         work.mover.leave_part(work.part.where)

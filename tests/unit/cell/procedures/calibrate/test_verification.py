@@ -51,11 +51,11 @@ def test_a_plate_that_is_knocked_after_it_was_confirmed_is_not_believed() -> Non
 
 
 def test_it_is_stored_and_what_is_no_turn_is_not_read() -> None:
-    assert ConfirmedTurn.read(json.loads(json.dumps(TURN.as_dict()))) == TURN
+    assert ConfirmedTurn.read(json.loads(json.dumps(vars(TURN)))) == TURN
     assert ConfirmedTurn.read(None) is None
     for spoilt in ({"sigma": 0.0}, {"turn": float("nan")}):
         with pytest.raises(ValueError, match="confirmed turn"):
-            ConfirmedTurn.read(TURN.as_dict() | spoilt)
+            ConfirmedTurn.read(vars(TURN) | spoilt)
 
 
 def verified(calibration: CellCalibration, seed: int, folder: Path) -> Verification:

@@ -29,7 +29,7 @@ from cell.procedures.part_error import stated_bound
 from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.place import AimedPlace, PlaceResult, Placing, _mated
-from cell.procedures.steps.workplace import Workplace
+from cell.procedures.steps.workplace import PartsBefore, Workplace
 from cell.run.report.report import place_error
 from cell.run.resumption import UnfinishedRun
 from drivers.clock import Clock
@@ -374,7 +374,7 @@ def test_what_parts_had_alike_is_aimed_beside_where_the_part_fits_there(placed_p
     pose, aside, still = placed_pot.results["invert_pose"], from_parts((0.2e-3, 0.0, 0.0)), pin.SE3.Identity()
 
     def aimed(by: pin.SE3, *slips: pin.SE3) -> AimedPlace:
-        site.work.series = GraspSeries().after(by, slips).after(by, slips)
+        site.work.parts_before = PartsBefore(GraspSeries().after(by, slips).after(by, slips))
         return AimedPlace.of(site.work, pose).fitted(site.work, pose, site.context("place"))[0]
 
     def touching(aim: AimedPlace) -> list[float]:
