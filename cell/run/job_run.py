@@ -142,8 +142,8 @@ class JobRun:
     `run` is the handle by which it is held. `inline` observers see each event before the run goes on: those that cause
     faults or look at the truth. `earlier` is the sweep of a run that this one resumes, `held` how that one had gripped
     a part from its nest; `script` works between steps. `truth` asks a simulated world. `pace` says how fast arm and
-    vehicle go, of what is planned. `parts_before` is what the
-    parts before this one of its batch tell.
+    vehicle go, of what is planned. `parts_before` is what
+    the parts before this one of its batch tell.
     """
 
     run: Run[object]

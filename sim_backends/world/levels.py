@@ -54,20 +54,26 @@ class Effects:
         "friction and play keep their state over a short way (Tuttle 1992); length assumed",
     )
     sag: float = _row(
-        3e-6, "rad/(N m)", "compliance of each joint under the weight that the flange carries",
+        3e-6,
+        "rad/(N m)",
+        "compliance of each joint under the weight that the flange carries",
         "gears of this size have 1e4 to 1e5 N m/rad (makers' catalogues); what a controller leaves of it is assumed",
-    )  # fmt: skip
+    )
     rocking: float = _row(
         0.1e-3, "rad", "amplitude of the standing vehicle's rocking at about 4 Hz", "soft tyres; assumed"
     )
     sheet_bow: float = _row(
-        0.02e-3, "m", "1 sigma of the light sheet's bow: off its plane 18 mm beside the middle, 130 mm from the laser",
+        0.02e-3,
+        "m",
+        "1 sigma of the light sheet's bow: off its plane 18 mm beside the middle, 130 mm from the laser",
         "line straightness of line lasers, 0.05 to 0.1 % of the line (makers' data sheets)",
-    )  # fmt: skip
+    )
     laser_pointing: float = _row(
-        50e-6, "rad/K", "turn of the light plane as the laser warms",
+        50e-6,
+        "rad/K",
+        "turn of the light plane as the laser warms",
         "makers' data sheets of line lasers, 10 to 100 µrad/K",
-    )  # fmt: skip
+    )
     camera_warm_up: float = _row(
         0.01,
         "px/K",
@@ -99,10 +105,12 @@ class Effects:
         option=True,
     )
     oil: float = _row(
-        0.12e-3, "m", "thickness, in its middle, of a puddle of oil on the surface, 12 to 20 mm wide",
+        0.12e-3,
+        "m",
+        "thickness, in its middle, of a puddle of oil on the surface, 12 to 20 mm wide",
         "what stands on metal at 4 degrees of contact: 2 sin 2° of its capillary length, 1.8 mm; angle assumed",
         option=True,
-    )  # fmt: skip
+    )
 
     @classmethod
     def names(cls) -> tuple[str, ...]:

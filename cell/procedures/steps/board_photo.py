@@ -1,8 +1,8 @@
 """The board photograph: the target camera square in front of the board, several pictures, one pose.
 
-They also show whether the vehicle is quiet: while it is not, they are taken anew, up to a few seconds. Later steps look
-once more whether the board still stands there: nothing that the arm feels tells a shift to the side. Several items of a
-job share a photograph, as long as the vehicle stands.
+They also show whether the vehicle is quiet: while it is not, they are taken anew, up to a few seconds. Later steps
+sweep the surface again, and look at the board again where that leaves a motion open: nothing that the arm feels tells a
+shift to the side. Several items of a job share a photograph, as long as the vehicle stands.
 """
 
 from __future__ import annotations
