@@ -14,12 +14,12 @@ from typing import Annotated, Literal, Self
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
 from cell.base.toml_file import below, read_toml, validate
 from cell.config.cell_config import StationObstacle, checked_board, once_each
-from drivers.common.addresses import Name
-from drivers.common.units import number, quantity, shown, whole
+from drivers.common.addresses import Name, checked_name
+from drivers.common.units import KEPT, number, quantity, shown, whole
 from drivers.errors import ConfigError
 from drivers.make import Exposure, Mounting, Offset, Pose, Table
 
@@ -28,17 +28,20 @@ LEAST_LINES, MOST_LINES = 10, 20_000
 LONGEST_SWEEP_S = 100.0
 """The step of the laser sweep has 120 s."""
 
-"""The kinds of job that take their part from a nest on the vehicle, and bring it into one."""
-
 Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
 Share = Annotated[float, number(-1, 1)]
 """Of a direction, along one axis."""
 
 
+def _checked_job_name(text: str, info: ValidationInfo) -> str:
+    # What a run has kept may be an item of a job.
+    return text if info.context == KEPT and job_and_item(text)[1] is not None else checked_name(text)
+
+
 class JobSection(Table):
     """The job as a whole; `kind` says which steps it has (`cell.procedures.steps.kinds`)."""
 
-    name: Annotated[str, Name]
+    name: Annotated[str, AfterValidator(_checked_job_name)]
     kind: Annotated[str, Name] = "place"
 
 

@@ -37,8 +37,7 @@ class VehicleArrival:
     """Where the vehicle came to stand, and the last photograph that shows it. Errors in m and rad.
 
     `driven` is false for an arm on a fixed frame, which was only looked at. `head` is what the look at the fine board
-    before says of the scan head, None where nobody looked. `shared` is the board's photograph that was made from there
-    for the part before this one, and holds for this one, too.
+    before says of the scan head, None where nobody looked. `shared` is the photograph from there for the part before.
     """
 
     base_from_place: pin.SE3

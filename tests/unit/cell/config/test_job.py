@@ -72,3 +72,6 @@ def test_an_item_that_is_not_there_and_items_without_a_nest_are_told(tmp_path: P
     path.write_text(f'{job_path("pot").read_text(encoding="utf-8")}\n[[item]]\nkind = "load"\n')
     with pytest.raises(ConfigError, match=r"\[\[item\]\] takes parts from nests, or to them: give \[nest\]"):
         load_job(path)
+    path.write_text(path.read_text(encoding="utf-8").replace('name = "pot"', 'name = "pot#1"'))
+    with pytest.raises(ConfigError, match='"pot#1" is no name'):
+        load_job(path)

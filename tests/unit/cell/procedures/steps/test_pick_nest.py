@@ -14,6 +14,7 @@ from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix
 from cell.motion.collision import PLACED
+from cell.run.record.replay import replay
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
 from statemachine.step import Event
@@ -88,6 +89,7 @@ def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_r
         done = cell.resume(observer=stands)
         assert standing and all(names >= {"table", "board", PLACED} for names in standing)
         assert (done.outcome, done.report["part"], done.report["job"]) == ("placed", "released", "swap#2")
+        assert all(each.same for each in replay(done.folder)), "perception, from what was kept of an item"
         old, new = (item.part for item in world._items)
         assert not (old.held or new.held) and world.collisions.found == ()
         flange = np.eye(4)
