@@ -7,12 +7,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
 
+import numpy as np
 import pinocchio as pin
 
 from cell.config.cell_config import CellConfig, deck_plates, mounted, station_obstacles, vehicle_obstacles
 from cell.config.job import Job
 from cell.devices.gate.interlocks import Interlocks
-from cell.measure.geometry.poses import from_parts, from_ur
+from cell.measure.geometry.poses import difference, from_parts, from_ur
 from cell.measure.vision import BoardSpec
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import (
@@ -34,8 +35,10 @@ from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
 from drivers.clock import Clock
 from drivers.errors import ConfigError
-from drivers.interfaces import Arm, ArmMotion, Vector
+from drivers.interfaces import Arm, ArmMotion, Motion, Vector
 
+THERE = 50e-6
+"""m and rad: so near to a flange pose the arm is left where it stands."""
 LEAST = 0.25
 """Slower than this, steps of a usual length would not end within their deadlines."""
 
@@ -204,10 +207,16 @@ class Mover:
         joints = self._planner.reach(base_from_flange, start if self.near is None else self.near, what)
         return self._planner.free(start, self.kinematics.unwound(joints, start)).at_pace(self.pace.share)
 
-    def to(self, base_from_flange: pin.SE3, what: str) -> None:
-        """Move freely to a flange pose and settle."""
+    def to(self, base_from_flange: pin.SE3, what: str, beside: Callable[[], Motion] | None = None) -> None:
+        """Move freely to a flange pose and settle, unless it stands there; what `beside` begins moves meanwhile."""
         self.hold()
-        self.follow(self.plan_to(base_from_flange, what))
+        shift = difference(from_ur(self._arm.state().flange), base_from_flange)
+        way = None if np.abs(shift).max() < THERE else self.plan_to(base_from_flange, what)
+        other = None if beside is None else beside()
+        if way is not None:
+            self.follow(way)
+        if other is not None:
+            other.wait(30.0)
 
     def to_as_from(self, near: Joints, base_from_flange: pin.SE3, what: str) -> None:
         """Move freely to a flange pose, from anywhere, with the joints with which it comes there from `near`."""

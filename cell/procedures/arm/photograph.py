@@ -196,6 +196,11 @@ class ScanPlan:
     rail_start: float
     rail_stop: float
 
+    @property
+    def back(self) -> ScanPlan:
+        """The same way in the other direction."""
+        return ScanPlan(self.base_from_flange_end, self.base_from_flange, self.rail_stop, self.rail_start)
+
 
 @dataclass(frozen=True)
 class CalibrationView:

@@ -52,8 +52,10 @@ def laser_sweep(
     sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None,
     most_lost: float = MAX_LOST_FRACTION,
     counted: bool = True,
+    back: bool = False,
 ) -> SweepRecord:
-    """Sweep the scan head over every strip of `scan`, by the rail or by the arm as `scan.mode` says.
+    """Sweep the scan head over every strip of `scan`, by the rail or by the arm as `scan.mode` says; the other way if
+    `back`.
 
     `sweeping` is told where the surface is taken to be beside who takes the frames. `check` raises when the run is to
     end. Whether the rail has lost steps is looked at unless `counted` is False: whoever says so does it.
@@ -64,7 +66,7 @@ def laser_sweep(
     home_rail(devices, progress)
     plans = scan_plans(config, here.job.model_copy(update={"scan": scan}), base_from_surface, head)
     errors = SweepErrors(
-        here.repeatability, config.calibration.rail_sigma, SHIFT_SHARE * here.job.place.tolerance,
+        here.repeatability, config.calibration.rail_sigma, (1.0 if back else SHIFT_SHARE) * here.job.place.tolerance,
         rate=devices.clock.rate, late=math.hypot(config.scan_camera.late, config.rail.late),
         timing=times_known(here.calibration.scan, config)[0], lost=most_lost,
     )  # fmt: skip
@@ -72,7 +74,7 @@ def laser_sweep(
     progress(0.01, "preparing")
     rehearse(geometry)
     swaths = []
-    for k, plan in enumerate(plans):
+    for k, plan in enumerate(plan.back if back else plan for plan in plans):
         check()
         name = f"sweep {k + 1} of {len(plans)}"
 

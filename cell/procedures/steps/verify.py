@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pinocchio as pin
@@ -10,6 +11,7 @@ from cell.config.job import Job
 from cell.measure.calibration import ScanCalibration
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
+from cell.measure.inversion.effects.part_at_rest import LEAST_M, LyingPart
 from cell.measure.inversion.flush import flush_along_edge
 from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
@@ -23,9 +25,10 @@ from cell.procedures.steps.laser_sweep import head_at, laser_sweep
 from cell.procedures.steps.place import PlaceResult, aside_words
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements, together
 from cell.procedures.steps.workplace import JobStep, Workplace
+from cell.procedures.sweep.second_look import moved_meanwhile
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.procedures.sweep.swath import FRAMES_LOST
-from drivers.errors import DeviceFault, MisplacedError, RefusedError
+from drivers.errors import DeviceFault, Measured, MisplacedError, RefusedError
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
 
@@ -106,7 +109,8 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     place, belongs = here.job.place, here.job.place.surface_from_part.se3()
     faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
     over = pose.base_from_surface * surface_from_faces(here.job, faces)
-    cloud, record = swept_part(here, head_at(here, sweep), over, context)
+    lying = LyingPart(faces, pose.base_from_surface * belongs, here.nominal, pose.base_from_surface)
+    cloud, record = swept_part(here, head_at(here, sweep), over, context, lying=lying)
     try:
         seen = find_part(
             cloud, faces, here.nominal, surface=Prior(pose.base_from_surface, pose.covariance), belongs=belongs,
@@ -131,14 +135,14 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
 
 def swept_part(
     here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, *, frames: str = "verify",
-    cloud: str = CLOUD,
+    cloud: str = CLOUD, lying: LyingPart | None = None,
 ) -> tuple[Cloud, SweepRecord]:  # fmt: skip
     """Sweep the part `over` what is in the place of the surface, base from there, look whether the rail has lost steps
-    meanwhile, and fold the arm. `frames` and `cloud` are what it is kept as."""
+    meanwhile, and fold the arm. `frames` and `cloud` are what it is kept as. With `lying` the rail's way back looks
+    whether the part is at rest: it is swept again until it is, and `MisplacedError` raised for one that is not."""
     while True:
         held = context.held_s
-        record = _swept(here, head, over, context, frames)
-        points = build_cloud(record)
+        points, record, moved = _swept_at_rest(here, head, over, context, frames, lying)
         write_cloud(here.folder / cloud, points, here.config.cell.sim)
         context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
         looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
@@ -148,7 +152,33 @@ def swept_part(
         context.safe_point()
         # Whoever has the run held may reach in, and move the part.
         if context.held_s == held:
-            return points, record
+            break
+    if moved is not None:
+        far = "too far to tell" if math.isinf(moved) else f"by {1e3 * moved:.3f} mm"
+        raise MisplacedError(
+            f"the placed part does not lie still: in each of {SWEEPS} looks it moved {far} from a sweep to the rail's "
+            "way back over it. It slides, sinks or turns: look what it lies on, and whether something pulls it. "
+            f"{NEXT_STEP}",
+            Measured("placed part moved from sweep to sweep", 1e3 * moved, "mm", most=1e3 * LEAST_M),
+        )
+    return points, record
+
+
+def _swept_at_rest(
+    here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, frames: str, lying: LyingPart | None
+) -> tuple[Cloud, SweepRecord, float | None]:
+    """The part's cloud and its sweep, made again until it is at rest; and how far, m, it moved in the last look of one
+    that never was."""
+    for left in reversed(range(SWEEPS)):
+        record = _swept(here, head, over, context, frames)
+        points = build_cloud(record)
+        if lying is None:
+            return points, record, None
+        moved = moved_meanwhile(here, head, over, (points, record), part=lying, context=context)
+        if moved is None or not left:
+            return points, record, moved
+        context.note(text=f"the part is swept again: it moved by {1e3 * moved:.3f} mm meanwhile")
+    raise AssertionError("the last sweep returns")
 
 
 def _swept(here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, frames: str) -> SweepRecord:

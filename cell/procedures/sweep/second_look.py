@@ -5,20 +5,24 @@ The surface may slide while the board stands firm. Nothing that the arm feels te
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import pinocchio as pin
 
 from cell.config.job import ScanSection
+from cell.measure.calibration import ScanCalibration
 from cell.measure.inversion import PlacePose
-from cell.measure.inversion.effects.between_sweeps import LEAST_MATCHED, Creep, SurfaceMotion, surface_motion
+from cell.measure.inversion.effects.between_sweeps import FLOOR, LEAST_MATCHED, Creep, SurfaceMotion, surface_motion
+from cell.measure.inversion.effects.part_at_rest import LyingPart
 from cell.measure.inversion.observability import Tolerance
 from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.calibrate.reference_plate import configure_fast
 from cell.procedures.steps.board_photo import require_board_unmoved
-from cell.procedures.steps.laser_sweep import check_lost_steps, head_at, laser_sweep
+from cell.procedures.steps.laser_sweep import check_lost_steps, head_at, laser_sweep, times_known
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
@@ -32,6 +36,10 @@ LINES = 32
 LEAST_POINTS = 500
 MOST_LOST = 0.5
 """Share of its frames: a comparison misses none of them, and says what is left of it."""
+HURRY = 2.0
+"""So many times as fast the rail goes back."""
+PLAY_M = 20e-6
+"""By how much a carriage stands otherwise when it comes from the other side, where that was not measured."""
 NEXT_STEP = "See what pushed it, then run the job again from its sweep"
 
 
@@ -119,12 +127,53 @@ def by_times(swath: Swath) -> Vector:
     return shared
 
 
-def sparse(scan: ScanSection, before: Swath) -> ScanSection:
-    """One strip of a scan in about `LINES` lines, no faster than it was swept `before`: a repetition is slower."""
-    ways = np.linalg.norm(before.flanges[-1, :3, 3] - before.flanges[0, :3, 3]) + abs(before.rail[-1] - before.rail[0])
-    speed = min(scan.speed, float(ways / (before.times[-1] - before.times[0])))
+def sparse(scan: ScanSection, before: Swath, strip: int = 0, hurry: float = 1.0) -> ScanSection:
+    """One strip of a scan in about `LINES` lines, `hurry` times as fast as it was swept `before`: a repetition is
+    slower."""
+    speed = hurry * min(scan.speed, pace(before))
     rate = min(scan.frame_rate, max(1.0, LINES * speed / scan.length))
-    return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": scan.swath[:1]})
+    return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": [scan.swath[strip]]})
+
+
+def pace(swath: Swath) -> float:
+    """How fast, m/s, the scan head went."""
+    ways = np.linalg.norm(swath.flanges[-1, :3, 3] - swath.flanges[0, :3, 3]) + abs(swath.rail[-1] - swath.rail[0])
+    return float(ways / (swath.times[-1] - swath.times[0]))
+
+
+def moved_meanwhile(
+    here: Workplace, head: ScanCalibration, over: pin.SE3, swept: tuple[Cloud, SweepRecord], *, part: LyingPart,
+    context: StepContext,
+) -> float | None:  # fmt: skip
+    """Sweep the last strip the other way, in few lines: how far, m, the part has moved on since; None for a part that
+    lies still. Raises what a sweep raises."""
+    cloud, sweep = swept
+    before = sweep.swaths[-1]
+    hurry = min(HURRY, here.config.rail.max_speed / here.job.scan.speed) if here.job.scan.mode == "rail" else 1.0
+    few = sparse(here.job.scan, before, -1, hurry)
+    rate = configure_fast(here.devices, few.exposure, (few.frame_rate, here.job.scan.frame_rate))
+    back = laser_sweep(
+        here, over, head, few.model_copy(update={"frame_rate": rate}), check=context.check,
+        keep_frame=lambda frame: here.frames.keep("way-back", frame),
+        progress=lambda share, text: context.progress(0.85, f"whether the part lies still: {text}"),
+        most_lost=MOST_LOST, counted=False, back=True,
+    )  # fmt: skip
+    now = back.swaths[0]
+    unsure = FLOOR + by_times(before) + by_times(now) + _other_way(here, before, now)
+    return part.moved(cloud.of_sweep(len(sweep.swaths) - 1), build_cloud(back), unsure)
+
+
+def _other_way(here: Workplace, there: Swath, back: Swath) -> Vector:
+    """Covariance (6, 6) of base_from_flange by what parts a sweep and its way back: late stamps, and the carriage's
+    play."""
+    config, timing = here.config, times_known(here.calibration.scan, here.config)[0]
+    late, play = math.hypot(config.scan_camera.late, config.rail.late) / math.sqrt(3.0), PLAY_M
+    if timing is not None:
+        late, play = timing.sigma, abs(timing.play) + timing.play_sigma
+    along = (play + late * (pace(there) + pace(back))) * there.builder.sweep_direction(there.base_from_flange)
+    unsure = np.zeros((6, 6))
+    unsure[:3, :3] = np.outer(along, along)
+    return unsure
 
 
 def require_points(cloud: Cloud) -> Cloud:

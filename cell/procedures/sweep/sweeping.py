@@ -171,8 +171,8 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     lie off by more than `errors.shift`, or the rail did not run evenly.
     """
     scan, rail, arm = collector.scan, devices.rail, devices.arm
-    mover.to(plan.base_from_flange, "the scan pose")
-    rail.move_to(rail.sweep_start(plan.rail_start, plan.rail_stop, scan.speed)).wait(30.0)
+    start = rail.sweep_start(plan.rail_start, plan.rail_stop, scan.speed)
+    mover.to(plan.base_from_flange, "the scan pose", beside=lambda: rail.move_to(start))
     devices.scan_camera.configure(scan.exposure, scan.frame_rate)
     base_from_flange = from_ur(arm.state().flange)
     sweep = _sweep_lit(plan, devices, collector)
