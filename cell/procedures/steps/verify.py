@@ -11,7 +11,7 @@ from cell.config.job import Job
 from cell.measure.calibration import ScanCalibration
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
-from cell.measure.inversion.effects.part_at_rest import LEAST_M, LyingPart
+from cell.measure.inversion.effects.part_at_rest import LEAST_M, PartOnGround
 from cell.measure.inversion.flush import flush_along_edge
 from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
@@ -109,7 +109,7 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     place, belongs = here.job.place, here.job.place.surface_from_part.se3()
     faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
     over = pose.base_from_surface * surface_from_faces(here.job, faces)
-    lying = LyingPart(faces, pose.base_from_surface * belongs, here.nominal, pose.base_from_surface)
+    lying = PartOnGround(faces, pose.base_from_surface * belongs, here.nominal, pose.base_from_surface)
     cloud, record = swept_part(here, head_at(here, sweep), over, context, lying=lying)
     try:
         seen = find_part(
@@ -135,7 +135,7 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
 
 def swept_part(
     here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, *, frames: str = "verify",
-    cloud: str = CLOUD, lying: LyingPart | None = None,
+    cloud: str = CLOUD, lying: PartOnGround | None = None,
 ) -> tuple[Cloud, SweepRecord]:  # fmt: skip
     """Sweep the part `over` what is in the place of the surface, base from there, look whether the rail has lost steps
     meanwhile, and fold the arm. `frames` and `cloud` are what it is kept as. With `lying` the rail's way back looks
@@ -165,7 +165,7 @@ def swept_part(
 
 
 def _swept_at_rest(
-    here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, frames: str, lying: LyingPart | None
+    here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, frames: str, lying: PartOnGround | None
 ) -> tuple[Cloud, SweepRecord, float | None]:
     """The part's cloud and its sweep, made again until it is at rest; and how far, m, it moved in the last look of one
     that never was."""

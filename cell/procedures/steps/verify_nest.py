@@ -10,7 +10,7 @@ import pinocchio as pin
 from cell.config.job import Job
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion import invert_pose as register
-from cell.measure.inversion.effects.part_at_rest import LyingPart
+from cell.measure.inversion.effects.part_at_rest import PartOnGround
 from cell.measure.inversion.part_pose import DEMANDS, SHIFTED, PartPose, parted
 from cell.measure.reconstruction import Cloud
 from cell.procedures.part_error import part_points
@@ -30,7 +30,7 @@ from statemachine.step import OnFailure, Step
 def _at(here: Workplace, context: StepContext) -> PlacedPart:
     job, sweep = where_seen(here.job), context.made(SweepRecord)
     belongs = job.place.surface_from_part.se3()
-    swept = swept_part(here, head_at(here, sweep), belongs, context, lying=LyingPart(here.nominal, belongs))
+    swept = swept_part(here, head_at(here, sweep), belongs, context, lying=PartOnGround(here.nominal, belongs))
     try:
         fit = part_in_base(here, job, here.nominal, swept)
     except RefusedError as error:

@@ -1,6 +1,7 @@
 """Does the surface still lie where it was swept? A few lines of it are swept once more before the part is put down.
 
-The surface may slide while the board stands firm. Nothing that the arm feels tells a shift to the side.
+The surface may slide while the board stands firm. Nothing that the arm feels tells a shift to the side. A placed part
+is looked at again on the rail's way back: it may still slide, sink or turn.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ import pinocchio as pin
 from cell.config.job import ScanSection
 from cell.measure.calibration import ScanCalibration
 from cell.measure.inversion import PlacePose
-from cell.measure.inversion.effects.between_sweeps import FLOOR, LEAST_MATCHED, Creep, SurfaceMotion, surface_motion
-from cell.measure.inversion.effects.part_at_rest import LyingPart
+from cell.measure.inversion.effects.between_sweeps import LEAST_MATCHED, Creep, SurfaceMotion, surface_motion
+from cell.measure.inversion.effects.part_at_rest import PartOnGround
 from cell.measure.inversion.observability import Tolerance
 from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix
@@ -121,9 +122,14 @@ def by_times(swath: Swath) -> Vector:
 
     How late stamps come all the time is the same in two sweeps by one device.
     """
-    along = swath.shift * swath.builder.sweep_direction(swath.base_from_flange)
+    return _shifted(swath, swath.shift / math.sqrt(3.0))
+
+
+def _shifted(swath: Swath, sigma: float) -> Vector:
+    """Covariance (6, 6) of base_from_flange for a shift along the sweep, one standard deviation in m."""
+    along = sigma * swath.builder.sweep_direction(swath.base_from_flange)
     shared = np.zeros((6, 6))
-    shared[:3, :3] = np.outer(along, along) / 3.0
+    shared[:3, :3] = np.outer(along, along)
     return shared
 
 
@@ -142,7 +148,7 @@ def pace(swath: Swath) -> float:
 
 
 def moved_meanwhile(
-    here: Workplace, head: ScanCalibration, over: pin.SE3, swept: tuple[Cloud, SweepRecord], *, part: LyingPart,
+    here: Workplace, head: ScanCalibration, over: pin.SE3, swept: tuple[Cloud, SweepRecord], *, part: PartOnGround,
     context: StepContext,
 ) -> float | None:  # fmt: skip
     """Sweep the last strip the other way, in few lines: how far, m, the part has moved on since; None for a part that
@@ -159,21 +165,20 @@ def moved_meanwhile(
         most_lost=MOST_LOST, counted=False, back=True,
     )  # fmt: skip
     now = back.swaths[0]
-    unsure = FLOOR + by_times(before) + by_times(now) + _other_way(here, before, now)
+    unsure = by_times(before) + by_times(now) + _other_way(here, before, now)
+    if part.ground is not None:
+        # A nest rides with the arm; the station does not.
+        unsure = unsure + here.settling
     return part.moved(cloud.of_sweep(len(sweep.swaths) - 1), build_cloud(back), unsure)
 
 
 def _other_way(here: Workplace, there: Swath, back: Swath) -> Vector:
-    """Covariance (6, 6) of base_from_flange by what parts a sweep and its way back: late stamps, and the carriage's
-    play."""
+    """The same by what parts a sweep from its way back: late stamps, and the carriage's play."""
     config, timing = here.config, times_known(here.calibration.scan, here.config)[0]
     late, play = math.hypot(config.scan_camera.late, config.rail.late) / math.sqrt(3.0), PLAY_M
     if timing is not None:
         late, play = timing.sigma, abs(timing.play) + timing.play_sigma
-    along = (play + late * (pace(there) + pace(back))) * there.builder.sweep_direction(there.base_from_flange)
-    unsure = np.zeros((6, 6))
-    unsure[:3, :3] = np.outer(along, along)
-    return unsure
+    return _shifted(there, play + late * (pace(there) + pace(back)))
 
 
 def require_points(cloud: Cloud) -> Cloud:

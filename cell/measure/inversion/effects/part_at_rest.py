@@ -26,7 +26,7 @@ LEAST_M = 15e-6
 
 
 @dataclass(frozen=True, eq=False)
-class LyingPart:
+class PartOnGround:
     """A part with these `faces`, about where it lies (`base_from_part`), and the `ground` beside it with
     `base_from_ground`; None for a part that lies in a nest."""
 
@@ -39,7 +39,8 @@ class LyingPart:
         """How far, m, the part's points moved on average between two clouds, arm base; None where it lies still, or
         the first one does not show it. Infinite for one that went too far to tell.
 
-        `unsure` (6, 6) is what the sweeps' times and the arm leave open where no ground is beside the part.
+        `unsure` (6, 6), base axes, is by how much the clouds may lie apart for another reason: times, the arm. Ground
+        beside the part tells it better.
         """
         (before, ground_before), (now, ground_now) = (
             parted(cloud, self.faces, self.base_from_part) for cloud in (first, second)
@@ -54,7 +55,7 @@ class LyingPart:
             covariance = covariance + unsure
         else:
             ground = _motion(ground_before, ground_now, self.ground, self.base_from_ground)
-            # Where the ground tells nothing, what is known beforehand of the sweeps stands.
+            # Where the ground tells nothing, what is known beforehand stands.
             told = unsure @ np.linalg.inv(unsure + ground.scatter)
             carried = np.eye(6)
             carried[:3, 3:] = -pin.skew(self.base_from_part.translation - self.base_from_ground.translation)

@@ -28,6 +28,8 @@ from drivers.errors import ConfigError, DeviceFault, MisplacedError
 from lab.bench.job.part_effects import motion, opened
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord, run_whole_job
+from sim_backends.models import rail
+from sim_backends.world.world import World
 from tests.support.lying_part import LyingPart, moved
 from tests.support.report_runs import CONFIG, changed
 
@@ -212,7 +214,12 @@ def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(placed_pot: JobRe
     assert found.bound["d"] > 0.2
 
 
-def test_steps_that_the_rail_lost_over_the_placed_part_are_found(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_steps_that_the_rail_lost_over_the_placed_part_are_found(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Few: with many the rail's way back ends at its limit switch.
+    monkeypatch.setattr(rail, "_LOST", 0.01)
+
     def lost(cell: VirtualCell) -> None:
         cell.devices.rail.home().wait(60.0)
         cell.fault("rail.lost_steps")
@@ -237,6 +244,52 @@ def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(placed_pot: 
     with pytest.raises(DeviceFault, match="frames came from the sweep and 12 were lost"):
         worse.looked(moved())
     assert sum(note.startswith(again) for note in worse.notes) == 2
+
+
+def creeps(cell: VirtualCell, rate: pin.SE3, until: float = math.inf) -> None:
+    """Each second the part moves on by `rate`, in its own axes, for so many seconds from the start of its sweep."""
+    part, stands, steps = cell.world.part, cell.world.part._pose, pin.log6(rate).vector
+    began: list[float] = []
+
+    def pose(flange: np.ndarray) -> np.ndarray:
+        if cell.devices.laser.is_on and not began:
+            began.append(cell.clock.now())
+        since = min(until, cell.clock.now() - began[0]) if began else 0.0
+        return stands(flange) @ pin.exp6(since * steps).homogeneous
+
+    part._pose = pose
+
+
+@pytest.mark.parametrize(
+    "rate", [moved(turn=(0.0, 0.0, 1e-3)), moved(x=0.05e-3), moved(z=-0.01e-3)], ids=["turns", "slides", "sinks"]
+)
+def test_a_part_that_does_not_come_to_rest_is_misplaced(placed_pot: JobRecord, tmp_path: Path, rate: pin.SE3) -> None:
+    """At first each lies within its tolerances, and one sweep says no more."""
+    site = LyingPart(placed_pot, tmp_path, changed=lambda cell: creeps(cell, rate))
+    with pytest.raises(MisplacedError, match=r"does not lie still: in each of 3 looks it moved by .* See to it") as met:
+        site.looked(moved())
+    assert not met.value.numbers[0].kept
+    assert sum("swept again: it moved by" in note for note in site.notes) == 2
+
+
+def test_a_part_that_comes_to_rest_is_swept_again_and_lies_where_the_last_sweep_saw_it(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    rate = moved(0.02e-3, 0.03e-3, turn=(0.0, 0.0, 0.5e-3))
+    site = LyingPart(placed_pot, tmp_path, changed=lambda cell: creeps(cell, rate, 4.0))
+    found = site.looked(moved())
+    assert sum("swept again: it moved by" in note for note in site.notes) == 1
+    require_seen(found, site.lies())
+
+
+def test_a_vehicle_that_creeps_takes_part_and_surface_along(
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stands, rate = World.world_from_base, pin.Motion(np.array([8e-6, -9e-6, 5e-6, 4e-6, 6e-6, -9e-6]))
+    monkeypatch.setattr(World, "world_from_base", lambda world, t: stands(world, t) @ pin.exp6(t * rate).homogeneous)
+    site = LyingPart(placed_pot, tmp_path)
+    assert site.looked(moved()).in_tolerance(load_job("pot")[0].place)
+    assert not any("swept again" in note for note in site.notes)
 
 
 def test_a_job_looks_at_its_part_where_it_names_one_and_does_not_say_no(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.procedures.steps.verify_nest import where_seen
@@ -16,6 +18,22 @@ def test_a_part_that_comes_to_lie_beside_its_nest_is_misplaced(placed_pot: JobRe
     done = unloaded(placed_pot, slips)
     assert (done.outcome, done.stage) == ("misplaced", "verify")
     assert "in axes of the arm base" in done.reason and "the part is already down" in done.reason
+
+
+def test_a_part_that_creeps_in_its_nest_is_misplaced(placed_pot: JobRecord) -> None:
+    def slides(cell: VirtualCell) -> None:
+        part, stands = cell.world.part, cell.world.part._pose
+
+        def pose(flange: np.ndarray) -> np.ndarray:
+            lies = stands(flange)
+            if part._base_from_part is not None and not part.held:
+                lies[1, 3] += 0.03e-3 * cell.clock.now()
+            return lies
+
+        part._pose = pose
+
+    done = unloaded(placed_pot, slides)
+    assert (done.outcome, done.stage) == ("misplaced", "verify") and "does not lie still" in done.reason
 
 
 def test_the_place_where_a_part_is_looked_at_is_its_own_or_the_nest() -> None:
