@@ -26,7 +26,7 @@ from cell.motion.kinematics import HOME, Joints
 from cell.procedures.arm.moves import Mover
 from cell.run.recorded_work import WorkContext
 from drivers.errors import CellError, DeviceFault
-from drivers.interfaces import Frame, Image, Motion
+from drivers.interfaces import Frame, Image
 from statemachine.step import Observer
 
 if TYPE_CHECKING:
@@ -91,9 +91,9 @@ class SimulatedPerson(Person):
 class SlowMover(Mover):
     """Moves that are planned anew, once, after a fault that a program may clear by itself, such as a lost program."""
 
-    def to(self, base_from_flange: pin.SE3, what: str, beside: Callable[[], Motion] | None = None) -> None:
+    def to(self, base_from_flange: pin.SE3, what: str) -> None:
         """See `Mover.to`."""
-        self._again(lambda: Mover.to(self, base_from_flange, what, beside))
+        self._again(lambda: Mover.to(self, base_from_flange, what))
 
     def to_joints(self, joints: Joints) -> None:
         """See `Mover.to_joints`."""

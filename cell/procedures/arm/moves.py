@@ -35,7 +35,7 @@ from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
 from drivers.clock import Clock
 from drivers.errors import ConfigError
-from drivers.interfaces import Arm, ArmMotion, Motion, Vector
+from drivers.interfaces import Arm, ArmMotion, Vector
 
 THERE = 50e-6
 """m and rad: so near to a flange pose the arm is left where it stands."""
@@ -207,16 +207,11 @@ class Mover:
         joints = self._planner.reach(base_from_flange, start if self.near is None else self.near, what)
         return self._planner.free(start, self.kinematics.unwound(joints, start)).at_pace(self.pace.share)
 
-    def to(self, base_from_flange: pin.SE3, what: str, beside: Callable[[], Motion] | None = None) -> None:
-        """Move freely to a flange pose and settle, unless it stands there; what `beside` begins moves meanwhile."""
+    def to(self, base_from_flange: pin.SE3, what: str) -> None:
+        """Move freely to a flange pose and settle, unless the arm stands there."""
         self.hold()
-        shift = difference(from_ur(self._arm.state().flange), base_from_flange)
-        way = None if np.abs(shift).max() < THERE else self.plan_to(base_from_flange, what)
-        other = None if beside is None else beside()
-        if way is not None:
-            self.follow(way)
-        if other is not None:
-            other.wait(30.0)
+        if np.abs(difference(from_ur(self._arm.state().flange), base_from_flange)).max() > THERE:
+            self.follow(self.plan_to(base_from_flange, what))
 
     def to_as_from(self, near: Joints, base_from_flange: pin.SE3, what: str) -> None:
         """Move freely to a flange pose, from anywhere, with the joints with which it comes there from `near`."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -29,8 +29,8 @@ from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import NO_REFERENCE, CalibrationView, interim_view
 from cell.procedures.calibrate.boards import PHOTO_RATE, Keep, look_for
 from cell.procedures.calibrate.verification import DRAWS, SHARE, SURE, at_place
-from cell.procedures.sweep.sweeping import home_rail
-from drivers.errors import CalibrationStale, CellError, Measured, RefusedError
+from cell.procedures.sweep.sweeping import beside_arm
+from drivers.errors import CalibrationStale, Measured, RefusedError
 from drivers.interfaces import Vector
 
 LOOKS = 4
@@ -167,20 +167,15 @@ def interim_check(
     what `Mover.to_view` raises where its view is out of reach.
     """
     fine, view = parse_board(config.calibration.fine.board), fine_board_view(config, calibration)
-    home_rail(devices, lambda share, text: progress(text))
+    rail = devices.rail
     devices.scan_camera.configure(config.scan_camera.photo_exposure, PHOTO_RATE)
     looks: list[ScanObservation] = []
     while True:
         check()
         progress("looking at the fine board" + (", again" if looks else ""))
-        carriage = devices.rail.move_to(view.rail_position)
-        try:
+        with beside_arm(rail, partial(rail.move_to, view.rail_position) if rail.state().homed_here else rail.home):
             mover.to_view(view.base_from_flange)
-        except BaseException:
-            with suppress(CellError):
-                devices.rail.stop()
-            raise
-        carriage.wait(30.0)
+        rail.move_to(view.rail_position).wait(30.0)
         refusals = Counter[str]()
         seen = look_for(devices.scan_camera, fine, refusals, keep, f"interim-{len(looks) + 1}")
         if seen is None:
@@ -190,7 +185,7 @@ def interim_check(
                 "where board, camera or arm were moved, run `cell calibrate` first"
             )
         flange = from_ur(devices.arm.state().flange)
-        looks.append(ScanObservation(seen, None, flange, devices.rail.state().position))
+        looks.append(ScanObservation(seen, None, flange, rail.state().position))
         found = InterimCheck.of(calibration, job, looks, 0.5 * sum(config.rail.travel))
         if len(looks) == LOOKS or found.head.changed or not found.head.suspicious:
             return found

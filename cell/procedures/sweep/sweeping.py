@@ -7,8 +7,8 @@ its time on it cannot be known.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 
 import numpy as np
@@ -23,7 +23,7 @@ from cell.procedures.arm.photograph import ScanPlan
 from cell.procedures.sweep.swath import RailPath, Swath, SweepCollector, SweepErrors, TimeBound, shift_by_times
 from drivers.clock import ClockMap
 from drivers.errors import CellError, DeviceFault
-from drivers.interfaces import ArmState, Sweep, Vector
+from drivers.interfaces import ArmState, Motion, Rail, Sweep, Vector
 
 RUN_UP_S = 0.7
 """Seconds at full speed by which the line is longer at both ends: the arm gains its speed and its wobble dies out."""
@@ -39,6 +39,19 @@ def home_rail(devices: Devices, progress: Callable[[float, str], None] = lambda 
     if not devices.rail.state().homed_here:
         progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
+
+
+@contextmanager
+def beside_arm(rail: Rail, begin: Callable[[], Motion]) -> Iterator[None]:
+    """What the rail begins, it does while the arm moves; both are still in the end."""
+    motion = begin()
+    try:
+        yield
+    except BaseException:
+        with suppress(CellError):
+            rail.stop()
+        raise
+    motion.wait(60.0)
 
 
 def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErrors, collector: SweepCollector) -> Swath:
@@ -172,7 +185,8 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     """
     scan, rail, arm = collector.scan, devices.rail, devices.arm
     start = rail.sweep_start(plan.rail_start, plan.rail_stop, scan.speed)
-    mover.to(plan.base_from_flange, "the scan pose", beside=lambda: rail.move_to(start))
+    with beside_arm(rail, lambda: rail.move_to(start)):
+        mover.to(plan.base_from_flange, "the scan pose")
     devices.scan_camera.configure(scan.exposure, scan.frame_rate)
     base_from_flange = from_ur(arm.state().flange)
     sweep = _sweep_lit(plan, devices, collector)
