@@ -162,7 +162,7 @@ def moved_meanwhile(
         here, over, head, few.model_copy(update={"frame_rate": rate}), check=context.check,
         keep_frame=lambda frame: here.frames.keep("way-back", frame),
         progress=lambda share, text: context.progress(0.85, f"whether the part lies still: {text}"),
-        most_lost=MOST_LOST, counted=False, back=True,
+        most_lost=MOST_LOST, back=True, counted=False,
     )  # fmt: skip
     now = back.swaths[0]
     unsure = by_times(before) + by_times(now) + _other_way(here, before, now)

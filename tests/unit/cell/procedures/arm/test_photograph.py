@@ -16,7 +16,7 @@ from cell.measure.geometry.poses import from_matrix, from_parts
 from cell.measure.vision import parse_board
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
-from cell.procedures.arm.photograph import BoardFix, look_pose, photograph
+from cell.procedures.arm.photograph import BoardFix, ScanPlan, look_pose, photograph
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ
 from drivers.errors import RefusedError
 from sim_backends.world.drawing import inverse
@@ -80,3 +80,8 @@ def test_a_board_that_is_seen_too_obliquely_or_not_as_it_is_is_refused_and_shown
         assert refused.value.seen["view"] is not None
     assert 4.0 < math.degrees(fix.obliquity) < 9.0
     photographed(cell, max_obliquity=1.1 * fix.obliquity, max_residual=2.0 * fix.residual_px)
+
+
+def test_a_way_back_begins_where_the_sweep_ends() -> None:
+    plan = ScanPlan(from_parts((0.1, 0.0, 0.0)), from_parts((0.2, 0.0, 0.0)), 0.018, 0.082)
+    assert plan.back == ScanPlan(plan.base_from_flange_end, plan.base_from_flange, 0.082, 0.018) and plan.back != plan
