@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pinocchio as pin
@@ -142,7 +141,7 @@ def swept_part(
     whether the part is at rest: it is swept again until it is, and `MisplacedError` raised for one that is not."""
     while True:
         held = context.held_s
-        points, record, moved = _swept_at_rest(here, head, over, context, frames, lying)
+        points, record, moved = _swept_at_rest(here, head, over, context, frames=frames, lying=lying)
         write_cloud(here.folder / cloud, points, here.config.cell.sim)
         context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
         looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
@@ -154,38 +153,24 @@ def swept_part(
         if context.held_s == held:
             break
     if moved is not None:
-        far = "too far to tell" if math.isinf(moved) else f"by {1e3 * moved:.3f} mm"
         raise MisplacedError(
-            f"the placed part does not lie still: in each of {SWEEPS} looks it moved {far} from a sweep to the rail's "
-            "way back over it. It slides, sinks or turns: look what it lies on, and whether something pulls it. "
-            f"{NEXT_STEP}",
+            f"the placed part does not lie still: in the last of {SWEEPS} looks it moved by {1e3 * moved:.3f} mm from "
+            f"a sweep to the rail's way back over it (allowed: {1e3 * LEAST_M:g} mm). It slides, sinks or turns: look "
+            f"what it lies on, and whether something pulls it. {NEXT_STEP}",
             Measured("placed part moved from sweep to sweep", 1e3 * moved, "mm", most=1e3 * LEAST_M),
         )
     return points, record
 
 
 def _swept_at_rest(
-    here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, frames: str, lying: PartOnGround | None
-) -> tuple[Cloud, SweepRecord, float | None]:
-    """The part's cloud and its sweep, made again until it is at rest; and how far, m, it moved in the last look of one
-    that never was."""
-    for left in reversed(range(SWEEPS)):
-        record = _swept(here, head, over, context, frames)
-        points = build_cloud(record)
-        if lying is None:
-            return points, record, None
-        moved = moved_meanwhile(here, head, over, (points, record), part=lying, context=context)
-        if moved is None or not left:
-            return points, record, moved
-        context.note(text=f"the part is swept again: it moved by {1e3 * moved:.3f} mm meanwhile")
-    raise AssertionError("the last sweep returns")
-
-
-def _swept(here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, frames: str) -> SweepRecord:
-    """One sweep of the part. Lost frames are swept again: nothing of the part is moved by that."""
+    here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, *, frames: str,
+    lying: PartOnGround | None,
+) -> tuple[Cloud, SweepRecord, float | None]:  # fmt: skip
+    """The part's cloud and its sweep, made again until no frames are lost and the part is at rest: nothing of it is
+    moved by that. And how far, m, one that never was moved in the last look."""
     for left in reversed(range(SWEEPS)):
         try:
-            return laser_sweep(
+            record = laser_sweep(
                 here, over, head, here.job.scan, check=context.check, counted=False,
                 keep_frame=lambda frame: here.frames.keep(frames, frame),
                 progress=lambda share, text: context.progress(0.85 * share, f"the part: {text}"),
@@ -193,7 +178,14 @@ def _swept(here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepC
         except DeviceFault as fault:
             if fault.code != FRAMES_LOST or not left:
                 raise
-            context.note(text=f"the part is swept again: {fault}")
+            why = str(fault)
+        else:
+            swept = build_cloud(record), record
+            moved = None if lying is None else moved_meanwhile(here, head, over, swept, part=lying, context=context)
+            if moved is None or not left:
+                return *swept, moved
+            why = f"it moved by {1e3 * moved:.3f} mm meanwhile"
+        context.note(text=f"the part is swept again: {why}")
     raise AssertionError("the last sweep returns or raises")
 
 

@@ -12,6 +12,7 @@ import pinocchio as pin
 from cell.measure.inversion.effects.between_sweeps import (
     CREEP_EVIDENCE,
     FLOOR,
+    GATE_M,
     LEAST_MATCHED,
     SurfaceMotion,
     surface_motion,
@@ -37,7 +38,7 @@ class PartOnGround:
 
     def moved(self, first: Cloud, second: Cloud, unsure: Array) -> float | None:
         """How far, m, the part's points moved on average between two clouds, arm base; None where it lies still, or
-        the first one does not show it. Infinite for one that went too far to tell.
+        the first one does not show it, and `GATE_M` for one that is not near any more.
 
         `unsure` (6, 6), base axes, is by how much the clouds may lie apart for another reason: times, the arm. Ground
         beside the part tells it better.
@@ -49,7 +50,7 @@ class PartOnGround:
             return None
         part = _motion(before, now, self.faces, self.base_from_part)
         if part.matched < LEAST_MATCHED:
-            return float("inf")
+            return GATE_M
         motion, covariance = part.motion, part.scatter + FLOOR
         if self.ground is None or self.base_from_ground is None or ground_before.size < LEAST_POINTS:
             covariance = covariance + unsure
