@@ -130,12 +130,16 @@ def _without_area(vertices: Array, faces: Faces, notes: list[str]) -> Faces:
     return found
 
 
-def _parts(faces: Faces, corners: int) -> list[Faces]:
-    """Triangles that share corners."""
+def joined(faces: Faces, corners: int) -> Faces:
+    """(m,) a number for each triangle, the same for those that share corners, of which there are so many."""
     first, second = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     links = coo_matrix((np.ones(len(first)), (first, second)), shape=(corners, corners))
-    _, label = connected_components(links, directed=False)
-    mine = label[faces[:, 0]]
+    return np.asarray(connected_components(links, directed=False)[1][faces[:, 0]], dtype=np.int64)
+
+
+def _parts(faces: Faces, corners: int) -> list[Faces]:
+    """Triangles that share corners."""
+    mine = joined(faces, corners)
     order = np.argsort(mine, kind="stable")
     return np.split(faces[order], np.flatnonzero(np.diff(mine[order])) + 1)
 

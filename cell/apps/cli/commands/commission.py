@@ -84,16 +84,12 @@ def commission(
         }
         print_json({"good": good, "mended": made.progress.mended, "checks": rows, "protocol": str(protocol)})
     else:
-        _print_mended(made, console)
+        for entry in made.progress.mended:
+            text = f"{entry['name']}: {entry['what']}; configured {entry['told']}, measured {entry['found']}"
+            console.print(f"found and mended: {text}", style="yellow", markup=False)
         console.print(f"protocol: {protocol}", markup=False)
     if not good:
         raise typer.Exit(1)
-
-
-def _print_mended(made: Commissioning, console: Console) -> None:
-    for entry in made.progress.mended:
-        text = f"{entry['name']}: {entry['what']}; configured {entry['told']}, measured {entry['found']}"
-        console.print(f"found and mended: {text}", style="yellow", markup=False)
 
 
 def _person(simulated: bool, console: Console) -> Person:
