@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -71,12 +72,10 @@ def commission(
         return
     if again:
         made.progress.forget([check.name for check in checks])
-    try:
+    with closing(made.desk):
         good = made.go(checks)
         protocol = write_protocol(made.progress, CHECKS, made.desk.config)
         now = made.desk.config
-    finally:
-        made.desk.close()
     if json:
         rows = {
             check.name: {"standing": made.progress.standing(check, now), **(made.progress.result(check.name) or {})}

@@ -7,7 +7,7 @@ import signal
 import socket
 import struct
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import islice
 
 import numpy as np
@@ -121,7 +121,7 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
             prompt = list(islice((latch for latch in latches if latch.bound < 0.0015 * rate), 10))
             return min(prompt, key=lambda latch: latch.host - latch.device)
 
-        try:
+        with closing(arm):
             prompt = promptly()
             bench.ask("late_states")
             assert soon(lambda: lateness(arm, prompt) > 0.08 * rate)
@@ -139,8 +139,6 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
             bench.ask("clear")
             assert soon(lambda: lateness(arm, prompt) < 0.03 * rate)
             promptly()
-        finally:
-            arm.close()
 
 
 def test_a_latch_needs_its_register(arm, bench):
