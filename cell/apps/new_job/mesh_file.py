@@ -160,7 +160,8 @@ def _turned(vertices: Array, faces: Faces, notes: list[str]) -> MeshBody:
     if over.any():
         notes.append(f"{int(over.sum())} triangles turned round: they faced against their neighbours, or into the body")
     if lone:
-        notes.append(f"open: {lone} edges belong to one triangle only" + _as_expected(lone, len(count)))
+        why = "a surface with a border, or holes in a body" if lone < 0.5 * len(count) else "triangles that do not join"
+        notes.append(f"open: {lone} edges belong to one triangle only ({why})")
     if crowded:
         notes.append(f"{crowded} edges belong to more than two triangles: bodies meet there, or walls lie inside")
     return MeshBody(corners, np.where(over[:, None], before[:, ::-1], before), lone == 0)
@@ -183,7 +184,3 @@ def _turned_over(ways: Faces, edge: Faces, count: Faces, faces: int) -> NDArray[
     whole = np.bincount(label[:faces], minlength=2 * faces)
     as_is, turned = label[:faces], label[faces:]
     return np.asarray((whole[turned] > whole[as_is]) | ((whole[turned] == whole[as_is]) & (turned < as_is)))
-
-
-def _as_expected(lone: int, edges: int) -> str:
-    return " (a surface with a border, or holes in a body)" if lone < 0.5 * edges else " (triangles that do not join)"

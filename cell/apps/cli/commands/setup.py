@@ -155,11 +155,10 @@ def new_job(
             typer.echo(text)
 
     source = find_config(config, simulated=True)
-    made = make_job(
-        Asker(given, None if yes else partial(typer.prompt, err=json), tell), load_config(source), folder, overwrite
-    )
+    asker = Asker(given, None if yes else partial(typer.prompt, err=json), tell)
+    made = make_job(asker, load_config(source), folder, overwrite)
     if json:
-        files = {"job": str(made.job), "mesh": str(made.mesh), "picture": str(made.picture)}
+        files = {name: str(getattr(made, name)) for name in ("job", "mesh", "picture")}
         known = {"seen": round(made.seen, 3), "expected": made.place.summary(), "notes": list(made.notes)}
         print_json({**files, **known, "told": told})
     else:
