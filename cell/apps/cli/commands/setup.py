@@ -158,9 +158,8 @@ def new_job(
     asker = Asker(given, None if yes else partial(typer.prompt, err=json), tell)
     made = make_job(asker, load_config(source), folder, overwrite)
     if json:
-        files = {name: str(getattr(made, name)) for name in ("job", "mesh", "picture")}
-        known = {"seen": round(made.seen, 3), "expected": made.place.summary(), "notes": list(made.notes)}
-        print_json({**files, **known, "told": told})
+        known = {"seen": round(made.seen, 3), "expected": made.place.summary(), "notes": list(made.notes), "told": told}
+        print_json({name: str(getattr(made, name)) for name in ("job", "mesh", "picture")} | known)
     else:
         _print_made(made, "" if source is None or config is None else f" -c {shlex.quote(str(config))}")
 
