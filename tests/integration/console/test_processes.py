@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.support import running, until
 from tests.support.browser.screen import Console as Going
 from tests.support.browser.screen import console_of
-from tests.support.console.server import Browser, running, until
+from tests.support.console.server import Browser
 
 
 def below(root: int) -> dict[int, str]:

@@ -184,21 +184,3 @@ def serving(runs: Path, lasting: str | None = None) -> Iterator[Served]:
     served = Served(runs, lasting)
     with closing(served.process):
         yield served
-
-
-def until(true: Any, seconds: float = 10.0) -> bool:
-    """Whether it becomes true in time."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if true():
-            return True
-        time.sleep(0.01)
-    return False
-
-
-def running(pid: int) -> bool:
-    """Whether a process lives, and is no corpse that nobody has looked at."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False

@@ -17,7 +17,8 @@ from websockets.sync.client import ClientConnection
 from cell.apps.console.host.console import Console
 from cell.run.session.supervisor import Cell
 from drivers.clock import Clock
-from tests.support.console.server import Browser, until
+from tests.support import until
+from tests.support.console.server import Browser
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 

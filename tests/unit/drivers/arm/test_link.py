@@ -17,7 +17,8 @@ from drivers.arm.link import latch_clock
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, NotConnectedError
-from tests.support.wire.arm_bench import ArmBench, gone, joints_away, keep_outputs, soon
+from tests.support import running
+from tests.support.wire.arm_bench import ArmBench, joints_away, keep_outputs, soon
 
 pytestmark = pytest.mark.wire
 
@@ -75,7 +76,7 @@ def test_an_arm_that_is_silent_or_dies_is_a_fault_in_time_and_close_does_not_han
             moving.wait(10.0)
         with in_time(6.0):
             arm.close()
-        assert gone(child)
+        assert not running(child)
         bench.process.send_signal(signal.SIGCONT)
         assert soon(lambda: not bench.ask("show")["moving"])
         arm, moving = swinging(bench)
@@ -90,7 +91,7 @@ def test_an_arm_that_is_silent_or_dies_is_a_fault_in_time_and_close_does_not_han
             with pytest.raises(DeviceFault):
                 arm.stop()
             arm.close()
-        assert gone(child)
+        assert not running(child)
 
 
 @contextmanager

@@ -14,7 +14,8 @@ from cell.apps.console.host.console import Address, Console
 from cell.apps.console.host.link import Beat
 from cell.run.session.supervisor import Cell
 from drivers.errors import ConfigError
-from tests.support.console.server import Browser, until
+from tests.support import until
+from tests.support.console.server import Browser
 
 
 def test_when_the_server_is_killed_the_program_hears_of_it_and_nobody_holds(

@@ -9,7 +9,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from tests.support.console.server import Served, until
+from tests.support import until
+from tests.support.console.server import Served
 
 
 def test_names_that_are_too_long_are_refused_in_words(server: Served) -> None:
