@@ -10,6 +10,7 @@ import ctypes
 import errno
 import hashlib
 import json
+import math
 import os
 import secrets
 import time
@@ -97,6 +98,20 @@ def write_json(path: Path, data: object) -> None:
         raise CellError(f"{path} is not written: {error}; one of its figures is no number") from error
     with replacing(path) as file:
         file.write(f"{text}\n".encode())
+
+
+def strict(data: object) -> Any:
+    """The same data as strict JSON has it: a number that is none becomes None, what JSON does not know becomes text."""
+    if isinstance(data, Mapping):
+        return {str(key): strict(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [strict(value) for value in data]
+    # An array or a number of numpy, which is slow to load.
+    if hasattr(data, "tolist"):
+        return strict(data.tolist())
+    if isinstance(data, float) and not math.isfinite(data):
+        return None
+    return data if data is None or isinstance(data, str | int | float) else str(data)
 
 
 def sealed(data: Mapping[str, object], *, parts: bool = False) -> dict[str, object]:

@@ -17,7 +17,7 @@ from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import parse_board
 from cell.procedures.arm.photograph import drawn_interim_view, look_pose
 from cell.procedures.calibrate.interim import resting_pose
-from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, turn_to
+from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, driven, turn_to
 from cell.run.recorded_work import WorkContext
 from drivers.common.units import parse_quantity
 from drivers.errors import ConfigError, DeviceFault, LimitError
@@ -179,20 +179,17 @@ def _jog_arm(cell: Cell, wish: Jog, begun: list[Begun]) -> dict[str, str]:
 
 def _jog_vehicle(cell: Cell, wish: Jog, check: Callable[[], None]) -> dict[str, str]:
     vehicle, clock = cell.devices.vehicle, cell.devices.clock
-    vehicle.enable()
-    odometry = RelativeOdometry(vehicle)
 
     def look() -> None:
         check()
         cell.whereabouts.count()
 
-    try:
+    with driven(vehicle):
+        odometry = RelativeOdometry(vehicle)
         if wish.axis == "yaw":
             turn_to(vehicle, odometry, wish.amount, clock, look)
         else:
             drive_line(vehicle, odometry, Planar(wish.amount, 0.0, 0.0), speed=JOG_SPEED, clock=clock, check=look)
-    finally:
-        vehicle.brake()
     pose = odometry.pose()
     return {
         "vehicle": f"moved {1e3 * pose.x:.1f} mm ahead, {1e3 * pose.y:.1f} mm left, {math.degrees(pose.yaw):.2f} deg"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,3 +10,34 @@ ROOT = Path(__file__).parents[2]
 """The checkout."""
 Typed = Callable[..., tuple[int, str, str]]
 """What the fixture `typed` gives: what a `cell` command comes to: exit code, output, complaints."""
+
+
+def until(true: Callable[[], object], seconds: float = 10.0) -> bool:
+    """Whether it becomes true within so many seconds of the wall."""
+    end = time.monotonic() + seconds
+    while not true():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+def running(pid: int) -> bool:
+    """Whether a process lives, and is no corpse that nobody has looked at."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+def below(root: int) -> set[int]:
+    """All processes that `root` has begun, and those that they have."""
+    parents, found = {}, {root}
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            parents[int(path.name)] = int((path / "stat").read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+    while more := {pid for pid, parent in parents.items() if parent in found} - found:
+        found |= more
+    return found - {root}

@@ -6,6 +6,7 @@ The world is built from one configuration, the product works with another: it kn
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 from cell.apps.commission.check import CommissionCheck, Result, write_protocol
@@ -52,11 +53,9 @@ def opened(folder: Path, shown: Shown, ask: Callable[[str], bool] | None = None,
 def commissioned(folder: Path, until: str, ask: Callable[[str], bool] | None = None) -> tuple[bool, Shown]:
     shown = Shown()
     made = opened(folder, shown, ask)
-    try:
+    with closing(made.desk):
         good = made.go(chosen((), until))
         write_protocol(made.progress, CHECKS, made.desk.config)
-    finally:
-        made.desk.close()
     return good, shown
 
 

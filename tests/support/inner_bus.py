@@ -12,6 +12,7 @@ import can
 from drivers.clock import Clock
 from sim_backends.clock import WorldClock
 from sim_backends.peers.vehicle.slcan import CanFrame
+from tests.support import until
 
 
 class Hand(Clock):
@@ -84,10 +85,7 @@ class Driven:
 
     def until(self, happened: Callable[[], object], timeout: float = 3.0) -> None:
         """Wait for something, at most `timeout` wall seconds."""
-        end = time.monotonic() + timeout
-        while not happened():
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        assert until(happened, timeout)
 
     def drive_until_fast(self) -> None:
         """Drive on until it goes at 0.3 m/s."""

@@ -259,7 +259,11 @@ def print_report(report: Mapping[str, Any], folder: str, *, noise: bool = False,
         return
     if seams := (report.get("scan") or {}).get("seams"):
         _print_seams(console, seams)
-    _print_noise(console, report.get("assumed_noise") or {})
+    assumed = report.get("assumed_noise") or {}
+    table = new_table(f"assumed noise, 1 sigma (level {assumed.get('level')})", "of", ">sigma", "unit")
+    for row in noise_rows(assumed):
+        table.add_row(*row)
+    console.print(table)
 
 
 def print_late(report: Mapping[str, object]) -> None:
@@ -298,7 +302,7 @@ def print_runs(rows: Sequence[Mapping[str, Any]]) -> None:
         room = console.width - len(before) - len(ended)
         console.print(before, end="", markup=False)
         console.print(ended, end="", style=COLOURS.get(str(row["outcome"])), markup=False)
-        console.print(after if len(after) <= room else after[: room - 2].rstrip() + " …", markup=False, soft_wrap=True)
+        console.print(_cut(after, room), markup=False, soft_wrap=True)
 
 
 def print_health(told: Mapping[str, Any]) -> None:
@@ -349,13 +353,6 @@ def _print_seams(console: Console, seams: Sequence[Mapping[str, Any]]) -> None:
         values = (seam[f"{key}_mm"] for key in ("mean", "expected_mean", "rms", "expected_rms", "p95"))
         first, second = (str(number + 1) for number in seam["sweeps"])
         table.add_row(f"{first} and {second}", str(seam["points"]), *(f"{value:.4f}" for value in values))
-    console.print(table)
-
-
-def _print_noise(console: Console, noise: Mapping[str, Any]) -> None:
-    table = new_table(f"assumed noise, 1 sigma (level {noise.get('level')})", "of", ">sigma", "unit")
-    for row in noise_rows(noise):
-        table.add_row(*row)
     console.print(table)
 
 

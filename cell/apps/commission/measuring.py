@@ -9,7 +9,6 @@ along the optical axis. Turns of the flange then show where the camera sits. No 
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import pinocchio as pin
+from scipy.spatial.transform import Rotation
 
 from cell.apps.commission.check import Result
 from cell.apps.commission.workplace import CommissionWorkplace
@@ -324,42 +324,31 @@ def solve_mounting(
     return RoughMounting(hand, mean(placed), float(np.sqrt((residual**2).sum(axis=1).mean())))
 
 
-@dataclass(frozen=True, eq=False)
-class Turned:
-    """What of a drawn mounting is not so: `words` say how it is turned or where it is, `pose` is what would be right.
+def against_drawing(found: pin.SE3, drawn: pin.SE3, carriage: tuple[float, float] = (0.0, 0.0)) -> tuple[str, pin.SE3]:
+    """What of a drawn flange_from_camera is not so, in words, and the pose that would be right, by a measured one.
 
-    `words` is empty where it is as drawn.
-    """
-
-    words: str
-    pose: pin.SE3
-
-
-def against_drawing(found: pin.SE3, drawn: pin.SE3, carriage: tuple[float, float] = (0.0, 0.0)) -> Turned:
-    """A measured flange_from_camera beside the drawn one: as drawn, turned by right angles, or elsewhere.
+    Without words it is as drawn; else it is turned by right angles, or elsewhere.
 
     Where right angles explain it, the drawn numbers are kept and only turned. The camera may have been carried along
     its own x axis, by a way (m) within `carriage`, from where it is drawn: a rail that nobody has homed yet.
     """
     apart = float(np.linalg.norm(pin.log3(drawn.rotation.T @ found.rotation)))
     if _near(found, drawn, carriage):
-        return Turned("", drawn)
+        return "", drawn
     if apart < SNAP_RAD:
         away = _away(found, drawn, carriage)
-        return Turned(
-            f"it sits {1e3 * np.linalg.norm(away):.0f} mm from where it is drawn",
-            from_parts(drawn.translation + away, drawn.rotation),
-        )
+        words = f"it sits {1e3 * np.linalg.norm(away):.0f} mm from where it is drawn"
+        return words, from_parts(drawn.translation + away, drawn.rotation)
     # The camera turned in its place; then the whole bracket, on other holes of the flange.
     for turn in _right_angles():
         here = from_parts(drawn.translation, drawn.rotation @ turn)
         if _near(found, here, carriage):
-            return Turned(_in_words(turn), here)
+            return _in_words(turn), here
     for quarters in (1, 2, 3):
-        bracket = from_parts(np.zeros(3), pin.exp3(np.array([0.0, 0.0, 0.5 * math.pi * quarters]))) * drawn
+        bracket = _about_z(quarters) * drawn
         if _near(found, bracket, carriage):
-            return Turned(f"its mounting is turned by {_signed(quarters)} deg about the flange's axis", bracket)
-    return Turned(f"it is turned by {math.degrees(apart):.0f} deg against the drawing", found)
+            return f"its mounting is turned by {_signed(quarters)} deg about the flange's axis", bracket
+    return f"it is turned by {math.degrees(apart):.0f} deg against the drawing", found
 
 
 def _near(found: pin.SE3, other: pin.SE3, carriage: tuple[float, float]) -> bool:
@@ -376,14 +365,8 @@ def _away(found: pin.SE3, other: pin.SE3, carriage: tuple[float, float]) -> Arra
 
 def _right_angles() -> list[Array]:
     """The 23 turns by right angles, those about the optical axis first."""
-    made = []
-    for order in itertools.permutations(range(3)):
-        for signs in itertools.product((1.0, -1.0), repeat=3):
-            turn = np.zeros((3, 3))
-            turn[range(3), order] = signs
-            if np.linalg.det(turn) > 0.0 and not np.allclose(turn, np.eye(3)):
-                made.append(turn)
-    return sorted(made, key=lambda turn: -turn[2, 2])
+    turns = np.round(Rotation.create_group("O").as_matrix()) + 0.0
+    return sorted((turn for turn in turns if not np.array_equal(turn, np.eye(3))), key=lambda turn: -turn[2, 2])
 
 
 def _in_words(turn: Array) -> str:

@@ -19,7 +19,7 @@ from cell.apps.new_job.observability import known, place_from, sight_problems, t
 from cell.apps.new_job.picture import draw_proposal
 from cell.apps.new_job.proposal import Proposal, propose
 from cell.apps.new_job.questions import Asker, choice
-from cell.apps.new_job.surface import Laid, about, written
+from cell.apps.new_job.surface import Laid, about, as_stl
 from cell.apps.new_job.sweeps import FITS, Array, rivals
 from cell.apps.new_job.text import job_text, pose_text
 from cell.check.fit import require_fit
@@ -61,8 +61,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     mesh = drawn.path
     laid, unit = laid_mesh(asker, drawn)
     name = job_name(asker, mesh)
-    targets = Path(folder / f"{name}.toml"), Path(folder / f"{name}.stl"), Path(folder / f"{name}.png")
-    targets = (targets[0], _beside(targets[1], mesh), targets[2])
+    targets = folder / f"{name}.toml", _beside(folder / f"{name}.stl", mesh), folder / f"{name}.png"
     part = _part(asker, folder, name)
     _require_room(asker, targets if part is None or part.same else (*targets, part.target), overwrite)
     job = _with_part(asker, station(asker, template(asker), name, targets[1].name, laid), part)
@@ -72,7 +71,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     heading = [*_origin(mesh, unit, targets[1], laid), *proposal.notes]
     with tempfile.TemporaryDirectory() as place:
         there = Path(place)
-        written(proposal.surface, there / targets[1].name, f"{name}: what the sweeps see, mm, z up")
+        (there / targets[1].name).write_bytes(as_stl(proposal.surface, f"{name}: what the sweeps see, mm, z up"))
         (there / targets[0].name).write_text(job_text(proposal.job, heading), encoding="utf-8")
         if part is not None:
             (there / part.target.name).write_bytes(part.given.read_bytes())

@@ -130,12 +130,16 @@ def _without_area(vertices: Array, faces: Faces, notes: list[str]) -> Faces:
     return found
 
 
-def _parts(faces: Faces, corners: int) -> list[Faces]:
-    """Triangles that share corners."""
+def joined(faces: Faces, corners: int) -> Faces:
+    """(m,) a number for each triangle, the same for those that share corners, of which there are so many."""
     first, second = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     links = coo_matrix((np.ones(len(first)), (first, second)), shape=(corners, corners))
-    _, label = connected_components(links, directed=False)
-    mine = label[faces[:, 0]]
+    return np.asarray(connected_components(links, directed=False)[1][faces[:, 0]], dtype=np.int64)
+
+
+def _parts(faces: Faces, corners: int) -> list[Faces]:
+    """Triangles that share corners."""
+    mine = joined(faces, corners)
     order = np.argsort(mine, kind="stable")
     return np.split(faces[order], np.flatnonzero(np.diff(mine[order])) + 1)
 
@@ -156,7 +160,8 @@ def _turned(vertices: Array, faces: Faces, notes: list[str]) -> MeshBody:
     if over.any():
         notes.append(f"{int(over.sum())} triangles turned round: they faced against their neighbours, or into the body")
     if lone:
-        notes.append(f"open: {lone} edges belong to one triangle only" + _as_expected(lone, len(count)))
+        why = "a surface with a border, or holes in a body" if lone < 0.5 * len(count) else "triangles that do not join"
+        notes.append(f"open: {lone} edges belong to one triangle only ({why})")
     if crowded:
         notes.append(f"{crowded} edges belong to more than two triangles: bodies meet there, or walls lie inside")
     return MeshBody(corners, np.where(over[:, None], before[:, ::-1], before), lone == 0)
@@ -179,7 +184,3 @@ def _turned_over(ways: Faces, edge: Faces, count: Faces, faces: int) -> NDArray[
     whole = np.bincount(label[:faces], minlength=2 * faces)
     as_is, turned = label[:faces], label[faces:]
     return np.asarray((whole[turned] > whole[as_is]) | ((whole[turned] == whole[as_is]) & (turned < as_is)))
-
-
-def _as_expected(lone: int, edges: int) -> str:
-    return " (a surface with a border, or holes in a body)" if lone < 0.5 * edges else " (triangles that do not join)"

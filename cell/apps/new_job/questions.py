@@ -55,39 +55,27 @@ class Asker:
             if default is None:
                 raise ConfigError(f"{question}? Nobody is asked with --yes, and there is no default: give --{option}")
             text = default
-        if text is not None:
-            try:
-                found = parse(text)
-            except ValueError as error:
-                raise ConfigError(f"--{option}: {error}") from error
-            except ConfigError as error:
-                raise ConfigError(f"--{option}: {error}") from error
-            self._keep(option, text, default)
-            return found
-        assert self.ask is not None
         while True:
-            text = self.ask(question, default)
+            answer = text
+            if answer is None:
+                assert self.ask is not None
+                answer = self.ask(question, default)
             try:
-                found = parse(text)
+                found = parse(answer)
             except (ValueError, ConfigError) as error:
+                if text is not None:
+                    raise ConfigError(f"--{option}: {error}") from error
                 self.tell(str(error))
                 continue
-            self._keep(option, text, default)
+            if answer != default:
+                self.used[option] = answer
             return found
-
-    def _keep(self, option: str, text: str, default: str | None) -> None:
-        if text != default:
-            self.used[option] = text
 
 
 def checked(record: type[BaseModel], key: str) -> Callable[[str], Any]:
     """Parses a value by the rule of the key of a job's section."""
     adapter = _rule(record, key)
-
-    def parse(text: str) -> object:
-        return _by(adapter, text.strip())
-
-    return parse
+    return lambda text: _by(adapter, text.strip())
 
 
 def three(record: type[BaseModel], key: str) -> Callable[[str], object]:

@@ -13,15 +13,12 @@ import itertools
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
-from cell.apps.new_job.mesh_file import MeshBody
+from cell.apps.new_job.mesh_file import MeshBody, joined
 from cell.apps.new_job.sweeps import ABOVE, NEAR, Array, Faces, Rays
 from cell.apps.new_job.text import METRES
 from cell.measure.geometry.poses import from_parts
@@ -76,11 +73,7 @@ def before(vertices: Array, faces: Faces) -> tuple[NDArray[np.intp], list[Rays |
 
     A place of a body that lies on one of those is there twice.
     """
-    links = coo_matrix(
-        (np.ones(2 * len(faces)), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())), shape=(len(vertices),) * 2
-    )
-    _, label = connected_components(links, directed=False)
-    body = np.unique(label[faces[:, 0]], return_inverse=True)[1].reshape(-1).astype(np.intp)
+    body = np.unique(joined(faces, len(vertices)), return_inverse=True)[1].reshape(-1).astype(np.intp)
     parts = [faces[body == k] for k in range(int(body.max(initial=-1)) + 1)]
     corners = [vertices[part.ravel()] for part in parts]
     earlier: list[Rays | None] = []
@@ -266,8 +259,3 @@ def as_stl(laid: Laid, text: str) -> bytes:
     records["normal"] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
     records["corners"] = corners
     return text.encode("ascii", "replace")[:80].ljust(80) + struct.pack("<I", len(records)) + records.tobytes()
-
-
-def written(laid: Laid, path: Path, text: str) -> None:
-    """Write it."""
-    path.write_bytes(as_stl(laid, text))

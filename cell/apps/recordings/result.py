@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 
 import numpy as np
 import pinocchio as pin
 from scipy.spatial.transform import Rotation
 
+from cell.base.storage import strict
 from cell.measure.calibration.judge.checks import QualityCheck, refused_parts
 from cell.measure.calibration.judge.plane_checks import Flatness
 from cell.measure.calibration.solve.starts import HandEye
@@ -49,7 +50,8 @@ class RecordedResult:
 
     def as_dict(self) -> Figures:
         """For the JSON: arrays as lists, None for numbers that are not finite."""
-        return {each.name: _plain(getattr(self, each.name)) for each in fields(self)}
+        told = {each.name: strict(getattr(self, each.name)) for each in fields(self)}
+        return told | {"checks": [check.as_dict() for check in self.checks]}
 
     def apply(self, checks: Sequence[QualityCheck]) -> None:
         """Keep the checks, say what is doubtful, and take out what is refused.
@@ -72,18 +74,6 @@ class RecordedResult:
             setattr(self, part, None)
         if "hand_eye" in failed or "light_plane" in failed:
             self.flatness = None
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, QualityCheck):
-        return value.as_dict()
-    if isinstance(value, Mapping):
-        return {key: _plain(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(each) for each in value]
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    return value if not isinstance(value, float) or math.isfinite(value) else None
 
 
 def camera_figures(camera: CameraModel, sigma: Array, rms_px: float, held_out: float, lens: str) -> Figures:

@@ -252,21 +252,17 @@ def _in_order(series: Sequence[Series], pictures: int) -> Iterator[Series]:
 def _match_pictures(one: Series, listing: Listing, linked: dict[str, int]) -> None:
     """Find the picture of each record: as a table `linked` files and pictures, or by what both are called."""
     single = len({r.path for r in one.records}) == len(one.records)
-    labels, times = _labels(one, listing, single), [r.time for r in one.records]
+    # A record is called after its file where it is alone in it, else as the file calls it.
+    labels = [listing.name(r.path) if single else r.label or "" for r in one.records]
     which = list(range(len(listing.pictures)))
     found = _by_table(labels, linked)
     if not single or len(found.of) < LEAST:
         beside = {r.path.parent for r in one.records if single}
         which = [k for k in which if listing.pictures[k].parent in beside] or which
-        found = _match([listing.name(listing.pictures[k]) for k in which], labels, times)
+        found = _match([listing.name(listing.pictures[k]) for k in which], labels, [r.time for r in one.records])
     one.by, one.of = found.by, {which[k]: one.records[i] for k, i in found.of.items()}
     one.alone = [one.records[i] for i in found.alone]
     one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
-
-
-def _labels(one: Series, listing: Listing, single: bool) -> list[str]:
-    """What each record is called: its file where it is alone in it, else what the file calls it."""
-    return [listing.name(r.path) if single else r.label or "" for r in one.records]
 
 
 def in_order_of_views(one: Series, frames: Sequence[RecordedFrame]) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import socket
 import struct
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from pathlib import Path
@@ -211,5 +211,5 @@ def _host_and_port(place: str) -> tuple[str, int | None]:
 
 def _held(port: str) -> str:
     place = os.path.realpath(port) if port.startswith("/") else port
-    holders: list[Callable[[], str]] = [lambda: who_holds("rail", place), lambda: who_holds("vehicle", place)]
-    return next((f"in use by {held}: wait for its end" for ask in holders if (held := ask())), "")
+    holders = (who_holds(name, place) for name in ("rail", "vehicle"))
+    return next((f"in use by {held}: wait for its end" for held in holders if held), "")

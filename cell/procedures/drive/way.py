@@ -8,7 +8,8 @@ the vehicle has gone, and turned on the spot, since then.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -36,6 +37,16 @@ MAX_HEADING = math.radians(25)
 MAX_TURN_RATE = math.radians(25)
 ARRIVED = 0.0005  # m
 FRESH_S = 0.1  # s on the wall; feedback up to this old says whether the vehicle is there, it comes every 0.02 s
+
+
+@contextmanager
+def driven(vehicle: Vehicle) -> Iterator[None]:
+    """The vehicle enabled inside this context, and braked behind it whatever happens."""
+    vehicle.enable()
+    try:
+        yield
+    finally:
+        vehicle.brake()
 
 
 @dataclass(frozen=True)

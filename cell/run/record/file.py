@@ -209,18 +209,22 @@ class RecordFile:
         return out.newest
 
 
+def begun(stream: IO[bytes]) -> Any:
+    """The library's writer on an empty file, as all records are written."""
+    # Called in the writer's thread: a job's start does not wait for these packages.
+    from mcap.writer import CompressionType, Writer
+
+    writer: Any = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE, enable_data_crcs=True)
+    writer.start(profile="", library="assembly-cell")
+    return writer
+
+
 class _Out:
     """The library's writer, and the channels that it knows by now."""
 
     def __init__(self, stream: IO[bytes], facts: dict[str, str]) -> None:
-        # Here, in the writer's thread: a job's start does not wait for these packages.
-        from mcap.writer import CompressionType, Writer
-
         self.newest = 0
-        self.writer: Any = Writer(
-            stream, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE, enable_data_crcs=True
-        )
-        self.writer.start(profile="", library="assembly-cell")
+        self.writer = begun(stream)
         self.writer.add_metadata("run", facts)
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}

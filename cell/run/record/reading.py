@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from cell.base.storage import replacing
-from cell.run.record.file import CHUNK_BYTES, message_class, require_packages
+from cell.run.record.file import begun, message_class, require_packages
 from drivers.errors import CellError, ConfigError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -307,11 +307,8 @@ class _Copy:
     """A new file with the same schemas, channels and messages."""
 
     def __init__(self, out: IO[bytes]) -> None:
-        from mcap.writer import CompressionType, Writer
-
         self.messages = 0
-        self._writer: Any = Writer(out, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE, enable_data_crcs=True)
-        self._writer.start(profile="", library="assembly-cell")
+        self._writer = begun(out)
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}
 

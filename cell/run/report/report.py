@@ -6,7 +6,6 @@ Every key is told in `docs/reference/report.md`. The report alone asks for the w
 from __future__ import annotations
 
 import logging
-import math
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.base.storage import sealed, write_json
+from cell.base.storage import sealed, strict, write_json
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.measure.geometry.poses import difference, from_matrix, to_ur, transform
@@ -85,10 +84,7 @@ class FinishedJob:
         _write(self.folder, sealed(strict(timeless(report))))
         if self.witness is not None:
             try:
-                _add_truth(
-                    report, self.job, self.nominal,
-                    repeatability=self.repeatability, result=self.result, witness=self.witness,
-                )  # fmt: skip
+                self._add_truth(report, self.witness)
             except Exception as error:
                 report["truth_missing"] = f"{type(error).__name__}: {error}"
         report["measured"] = measured(self.result, self.job, report["truth"], report["place_bound_95"])
@@ -156,6 +152,43 @@ class FinishedJob:
         covariance = self.job.grasp.covariance
         report["place_bound_95"] = stated_bound(self.job, self.nominal, pose, self.repeatability, covariance)
 
+    def _add_truth(self, report: dict[str, Any], witness: TruthRecorder) -> None:
+        """The comparison with the simulated world; raises when that does not answer any more."""
+        job, nominal, result = self.job, self.nominal, self.result
+        now = witness.ask()
+        report["assumed_noise"]["sigmas"] = now["assumed_noise"]
+        report["end_state"] = {
+            key: now[key] for key in ("laser_on", "vehicle", "arm", "rail_moving", "part", "collisions")
+        }
+        sweep, made, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
+        if isinstance(pose, PlacePose) and witness.at_sweep is not None:
+            # Arm base axes, at the sweep; also where the place was refused.
+            sought = "base_from_part" if job.unloads else "base_from_surface"
+            report["pose_error"] = _apart(difference(pose.base_from_surface, pose_of(witness.at_sweep, sought)))
+            report["pose_error_units"] = {"translation_mm": "mm", "rotation_mrad": "mrad"}
+        if report["outcome"] not in ("placed", "misplaced") or not isinstance(pose, PlacePose):
+            return
+        if job.unloads:
+            if (nested := seen_placed(result)) is not None:
+                report["nest_error"] = _apart(difference(nested.seen.surface_from_part, pose_of(now, "base_from_part")))
+            return
+        truth = place_error(job, nominal, now)
+        assert isinstance(sweep, SweepRecord)
+        truth["bound_mm"] = expected_error(
+            job,
+            nominal,
+            pose,
+            sweep.base_from_flange,
+            sweeps=len(sweep.swaths),
+            configured=self.repeatability,
+            truth=now,
+        )
+        if isinstance(made, Reconstruction) and witness.at_sweep is not None:
+            truth["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)
+        report["truth"] = truth
+        if (seen := seen_placed(result)) is not None:
+            truth["seen_error"] = _apart(difference(seen.seen.surface_from_part, pose_of(now, "surface_from_part")))
+
 
 def _write(folder: Path, report: dict[str, object]) -> None:
     """The report as a file; a disk that takes none of it does not hide how the run ended."""
@@ -164,21 +197,6 @@ def _write(folder: Path, report: dict[str, object]) -> None:
     except Exception as error:
         report["report_missing"] = f"{type(error).__name__}: {error}"
         log.error("the report could not be written: %s", error)
-
-
-def strict(data: object) -> Any:
-    """The same data as strict JSON has it: a number that is none becomes None, what JSON does not know becomes text."""
-    if isinstance(data, dict):
-        return {str(key): strict(value) for key, value in data.items()}
-    if isinstance(data, list | tuple):
-        return [strict(value) for value in data]
-    if isinstance(data, np.ndarray):
-        return strict(data.tolist())
-    if isinstance(data, np.generic):
-        return strict(data.item())
-    if isinstance(data, float) and not math.isfinite(data):
-        return None
-    return data if data is None or isinstance(data, str | int | float) else str(data)
 
 
 def _steps(result: RunResult) -> list[dict[str, object]]:
@@ -228,38 +246,6 @@ def _configured_noise(config: CellConfig) -> dict[str, object]:
             "of": "arm's angles, each time it settles", "sigma": 1e3 * arm.repeatability_angle, "unit": "mrad",
         },
     }  # fmt: skip
-
-
-def _add_truth(
-    report: dict[str, Any], job: Job, nominal: NominalSurface, repeatability: Vector, result: RunResult,
-    witness: TruthRecorder,
-) -> None:  # fmt: skip
-    """The comparison with the simulated world; raises when that does not answer any more."""
-    now = witness.ask()
-    report["assumed_noise"]["sigmas"] = now["assumed_noise"]
-    report["end_state"] = {key: now[key] for key in ("laser_on", "vehicle", "arm", "rail_moving", "part", "collisions")}
-    sweep, made, pose = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
-    if isinstance(pose, PlacePose) and witness.at_sweep is not None:
-        # Arm base axes, at the sweep; also where the place was refused.
-        sought = "base_from_part" if job.unloads else "base_from_surface"
-        report["pose_error"] = _apart(difference(pose.base_from_surface, pose_of(witness.at_sweep, sought)))
-        report["pose_error_units"] = {"translation_mm": "mm", "rotation_mrad": "mrad"}
-    if report["outcome"] not in ("placed", "misplaced") or not isinstance(pose, PlacePose):
-        return
-    if job.unloads:
-        if (nested := seen_placed(result)) is not None:
-            report["nest_error"] = _apart(difference(nested.seen.surface_from_part, pose_of(now, "base_from_part")))
-        return
-    truth = place_error(job, nominal, now)
-    assert isinstance(sweep, SweepRecord)
-    truth["bound_mm"] = expected_error(
-        job, nominal, pose, sweep.base_from_flange, sweeps=len(sweep.swaths), configured=repeatability, truth=now
-    )
-    if isinstance(made, Reconstruction) and witness.at_sweep is not None:
-        truth["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)
-    report["truth"] = truth
-    if (seen := seen_placed(result)) is not None:
-        truth["seen_error"] = _apart(difference(seen.seen.surface_from_part, pose_of(now, "surface_from_part")))
 
 
 def _apart(error: Vector) -> dict[str, list[float]]:

@@ -162,6 +162,7 @@ def one_trial(seed: int, noise: Noise) -> Trial:
     from cell.config.cell_config import load_config
     from cell.measure.calibration.solve.adjustment import Adjustment, shared_mask
     from cell.measure.calibration.solve.joint import solve_joint, solve_staged, start_state
+    from cell.measure.calibration.solve.results import PARAMETERS
 
     rng = np.random.default_rng(seed)
     world = draw_head(rng)
@@ -183,7 +184,7 @@ def one_trial(seed: int, noise: Noise) -> Trial:
     return Trial(
         seed, found.chi2_per_dof, fixed.chi2_per_dof,
         {"dots": found.priors.dots_scale, "stripe": found.priors.stripe_scale},
-        {n: float(e / s) for n, e, s in zip(_names(), error, sigma, strict=True) if s > 0},
+        {n: float(e / s) for n, e, s in zip(PARAMETERS, error, sigma, strict=True) if s > 0},
         _whitened(error[free], covariance[np.ix_(free, free)]),
         _whitened(best.error[head], best.covariance[head, head]), errors,
     )  # fmt: skip
@@ -231,12 +232,6 @@ def _as_world(world: HeadWorld, state: Any) -> HeadWorld:
         parameters, state.flange_from_camera.homogeneous, state.base_from_board.homogeneous, world.flanges, world.rails,
         world.spec,
     )  # fmt: skip
-
-
-def _names() -> tuple[str, ...]:
-    from cell.measure.calibration.solve.results import PARAMETERS
-
-    return PARAMETERS
 
 
 def _parameter_errors(state: Any, world: HeadWorld) -> Array:

@@ -106,10 +106,8 @@ def _descendants(owner: int) -> list[int]:
             parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
         except (OSError, ValueError, IndexError):
             continue
-    found, grown = {owner}, True
-    while grown:
-        more = {process for process, parent in parents.items() if parent in found} - found
-        grown = bool(more)
+    found = {owner}
+    while more := {process for process, parent in parents.items() if parent in found} - found:
         found |= more
     return sorted(found - {owner})
 

@@ -10,22 +10,15 @@ from pathlib import Path
 
 import pytest
 
+from tests.support import below, running, until
 from tests.support.browser.screen import Console as Going
 from tests.support.browser.screen import console_of
-from tests.support.console.server import Browser, running, until
+from tests.support.console.server import Browser
 
 
-def below(root: int) -> dict[int, str]:
-    """All processes that `root` has begun, and those that they have, with their arguments."""
-    parents, found = {}, {root}
-    for path in Path("/proc").glob("[0-9]*"):
-        try:
-            parents[int(path.name)] = int((path / "stat").read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue
-    while more := {pid for pid, parent in parents.items() if parent in found} - found:
-        found |= more
-    return {pid: Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ") for pid in found - {root}}
+def told(root: int) -> dict[int, str]:
+    """The processes below `root` with their arguments."""
+    return {pid: Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ") for pid in below(root)}
 
 
 @pytest.fixture
@@ -46,8 +39,8 @@ def test_a_console_that_ends_takes_its_server_and_its_dry_run_along(
         key = json.loads(page.recv(timeout=20))["key"]
         assert browser.do(do="hold", name="Ann", key=key).status == 200
         assert browser.do(do="dry_run", job="pot", key=key).status == 200
-        assert until(lambda: any("rehearsal" in words for words in below(going.process.pid).values()))
-        left = below(going.process.pid)
+        assert until(lambda: any("rehearsal" in words for words in told(going.process.pid).values()))
+        left = told(going.process.pid)
         assert browser.token not in " ".join(left.values())
         (server,) = (pid for pid, words in left.items() if "cell.apps.console.server.serve" in words)
         os.kill(server if whom == "server" else going.process.pid, number)

@@ -22,8 +22,7 @@ from cell.run.jogging import Jog, jog
 from cell.run.runs import Run
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, RefusedError
 from sim_backends.models.arm import Safety
-from tests.support import Typed
-from tests.support.console.server import until
+from tests.support import Typed, until
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import re
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +102,7 @@ class Served:
         sent |= {"x-cell-key": self._key if cookie == "" else None}
         sent |= {"content-type": "application/json"} if method == "POST" else {}
         sent |= {name.replace("_", "-"): value for name, value in headers.items()}
-        link = http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)
-        try:
+        with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=20)) as link:
             link.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
             for name, value in sent.items():
                 if value is not None:
@@ -113,8 +112,6 @@ class Served:
                 link.putheader("content-length", str(len(data)))
             link.endheaders(data)
             return Reply(link.getresponse())
-        finally:
-            link.close()
 
     def do(self, **words: Any) -> Reply:
         """A command."""
@@ -185,25 +182,5 @@ def refusal(desk: ConsoleController, client: str, **words: Any) -> CellError:
 def serving(runs: Path, lasting: str | None = None) -> Iterator[Served]:
     """A server; ended afterwards."""
     served = Served(runs, lasting)
-    try:
+    with closing(served.process):
         yield served
-    finally:
-        served.process.close()
-
-
-def until(true: Any, seconds: float = 10.0) -> bool:
-    """Whether it becomes true in time."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if true():
-            return True
-        time.sleep(0.01)
-    return False
-
-
-def running(pid: int) -> bool:
-    """Whether a process lives, and is no corpse that nobody has looked at."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False

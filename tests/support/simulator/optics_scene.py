@@ -14,7 +14,7 @@ FINE = Board.parse("marked_dots:11x9:3mm")
 LARGE = Board.parse("marked_dots:9x7:20mm")
 
 
-def pose(rotation_vector, translation):
+def pose(rotation_vector, translation=(0, 0, 0)):
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_rotvec(rotation_vector).as_matrix()
     matrix[:3, 3] = translation

@@ -13,7 +13,6 @@ import signal
 import socket
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.arm.rtde.server import RtdePeer
+from tests.support import until
 
 STIFFNESS = 2e4
 HOME = np.radians([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
@@ -73,12 +73,7 @@ class ArmBench:
 
 def soon(condition, seconds=3.0):
     """Whether something happens within so many seconds."""
-    clock = Clock()
-    while not condition():
-        if clock.now() > seconds:
-            return False
-        clock.sleep(0.005)
-    return True
+    return until(condition, seconds)
 
 
 def stand_at_home(arm):
@@ -168,14 +163,6 @@ def swing(arm, radians, seconds):
     times = np.linspace(0.0, seconds, int(seconds / 0.008) + 2)
     part = 0.5 * (1.0 - np.cos(np.pi * times / seconds))
     return times, arm.state().joints + part[:, None] * np.array([radians, 0, 0, 0, 0, 0])
-
-
-def gone(pid):
-    """True once the process is no more (or only waits to be reaped)."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] in "ZX"
-    except FileNotFoundError:
-        return True
 
 
 def snapshot(stamp, **shown):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,11 +68,8 @@ def benched(speed: float = SPEED, params: RailParams | None = None, **how: Any) 
     peer = TmclPeer(model, world)
     peer.start()
     try:
-        rail = connect(peer.url, clock, **how)
-        try:
+        with closing(connect(peer.url, clock, **how)) as rail:
             yield Bench(rail, model, peer, world, clock)
-        finally:
-            rail.close()
     finally:
         peer.stop()
 

@@ -6,14 +6,7 @@ import numpy as np
 import pytest
 
 from sim_backends.clock import History, WorldClock, interpolate
-from sim_backends.world.scene import rotation
-
-
-def turned(vector: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation(np.array(vector))
-    pose[:3, 3] = at
-    return pose
+from tests.support.simulator.optics_scene import pose as turned
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])

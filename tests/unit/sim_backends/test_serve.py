@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
 import can
@@ -157,11 +158,8 @@ def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served
 
 
 def test_it_ends_with_its_input_so_that_it_cannot_outlive_its_owner() -> None:
-    served = Served()
-    try:
+    with closing(Served()) as served:
         assert served.end() == (0, "")
-    finally:
-        served.close()
 
 
 @pytest.mark.parametrize(

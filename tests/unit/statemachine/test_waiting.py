@@ -6,6 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -40,8 +41,7 @@ def run_step(
     stop: Callable[[], object] = list,
 ) -> RunResult:  # fmt: skip
     """Run a job whose first step is `first`, which has two seconds, and whose second one does nothing."""
-    journal = Journal(folder, "here")
-    try:
+    with closing(Journal(folder, "here")) as journal:
         return Runner(
             sequence=Sequence(("first", "second"), JobState.DONE),
             steps={"first": first, "second": lambda context: None},
@@ -52,8 +52,6 @@ def run_step(
             safe_stop=lambda reason: (stop_cell(cell.devices), stop())[0],
             control=control or RunControl(),
         ).run()
-    finally:
-        journal.close()
 
 
 def test_a_step_past_its_deadline_is_ended_out_of_its_wait_with_the_arm_stopped(

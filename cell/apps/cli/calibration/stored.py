@@ -20,11 +20,9 @@ Summary = Mapping[str, Any]
 
 def register(group: typer.Typer) -> None:
     """Add the commands of this file to `cell calibrate`."""
-    for command in (solve, verify, timing):
-        group.command()(command)
-    group.command(name="list")(list_calibrations)
-    group.command()(show)
-    group.command()(accept)
+    for name, command in (("solve", solve), ("verify", verify), ("timing", timing), ("list", list_calibrations),
+                          ("show", show), ("accept", accept)):  # fmt: skip
+        group.command(name)(command)
 
 
 def solve(

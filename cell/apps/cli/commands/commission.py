@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -71,12 +72,10 @@ def commission(
         return
     if again:
         made.progress.forget([check.name for check in checks])
-    try:
+    with closing(made.desk):
         good = made.go(checks)
         protocol = write_protocol(made.progress, CHECKS, made.desk.config)
         now = made.desk.config
-    finally:
-        made.desk.close()
     if json:
         rows = {
             check.name: {"standing": made.progress.standing(check, now), **(made.progress.result(check.name) or {})}
@@ -84,16 +83,12 @@ def commission(
         }
         print_json({"good": good, "mended": made.progress.mended, "checks": rows, "protocol": str(protocol)})
     else:
-        _print_mended(made, console)
+        for entry in made.progress.mended:
+            text = f"{entry['name']}: {entry['what']}; configured {entry['told']}, measured {entry['found']}"
+            console.print(f"found and mended: {text}", style="yellow", markup=False)
         console.print(f"protocol: {protocol}", markup=False)
     if not good:
         raise typer.Exit(1)
-
-
-def _print_mended(made: Commissioning, console: Console) -> None:
-    for entry in made.progress.mended:
-        text = f"{entry['name']}: {entry['what']}; configured {entry['told']}, measured {entry['found']}"
-        console.print(f"found and mended: {text}", style="yellow", markup=False)
 
 
 def _person(simulated: bool, console: Console) -> Person:

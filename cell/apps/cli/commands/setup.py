@@ -155,21 +155,13 @@ def new_job(
             typer.echo(text)
 
     source = find_config(config, simulated=True)
-    made = make_job(
-        Asker(given, None if yes else partial(typer.prompt, err=json), tell), load_config(source), folder, overwrite
-    )
+    asker = Asker(given, None if yes else partial(typer.prompt, err=json), tell)
+    made = make_job(asker, load_config(source), folder, overwrite)
     if json:
-        print_json(_told_of(made) | {"told": told})
+        known = {"seen": round(made.seen, 3), "expected": made.place.summary(), "notes": list(made.notes), "told": told}
+        print_json({name: str(getattr(made, name)) for name in ("job", "mesh", "picture")} | known)
     else:
         _print_made(made, "" if source is None or config is None else f" -c {shlex.quote(str(config))}")
-
-
-def _told_of(made: Made) -> dict[str, object]:
-    """What was made, for programs."""
-    return {
-        "job": str(made.job), "mesh": str(made.mesh), "picture": str(made.picture), "seen": round(made.seen, 3),
-        "expected": made.place.summary(), "notes": list(made.notes),
-    }  # fmt: skip
 
 
 def _print_made(made: Made, where: str) -> None:

@@ -61,7 +61,7 @@ def _mounting(name: str, desk: CommissionWorkplace, result: Result) -> None:
     eye = eye_of(desk, name)
     axes, found = measure(desk, result, eye)
     drawn = eye.config.flange_from_camera.se3()
-    turned = against_drawing(found.flange_from_camera, drawn, _carriage(desk, name))
+    words, right = against_drawing(found.flange_from_camera, drawn, _carriage(desk, name))
     angle = np.linalg.norm(pin.log3(drawn.rotation.T @ found.flange_from_camera.rotation))
     result.measure("board by the arm's measure over its name", axes.across, "")
     result.measure("depth by the arm's measure over the picture's", axes.along, "")
@@ -73,11 +73,11 @@ def _mounting(name: str, desk: CommissionWorkplace, result: Result) -> None:
         "views disagree about the board's place, RMS", 1e3 * found.residual, "mm", most=MOST_RESIDUAL[name],
         remedy="Tighten the camera and the board, and see that nothing moved meanwhile.",
     )  # fmt: skip
-    if turned.words:
+    if words:
         result.find(
-            f"{name}.flange_from_camera", turned.words, pose_words(drawn), pose_words(found.flange_from_camera),
+            f"{name}.flange_from_camera", words, pose_words(drawn), pose_words(found.flange_from_camera),
             remedy="Have the configuration say so, or turn the camera as it is drawn.",
-            write={f"{name}.flange_from_camera": pose_toml(turned.pose)},
+            write={f"{name}.flange_from_camera": pose_toml(right)},
         )  # fmt: skip
     _board(eye, result, axes.across, axes.along, found)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from cell.apps.commission.check import CommissionCheck, Result, refused
 from cell.apps.commission.workplace import CommissionWorkplace
-from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line
+from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, driven
 from cell.run.recorded_work import WorkContext
 from drivers.errors import Aborted, InterlockError
 from drivers.interfaces import ArmSafety, Motion
@@ -116,11 +116,8 @@ def _drive_back(desk: CommissionWorkplace, stood: RelativeOdometry) -> None:
         return
     desk.fold()
     vehicle = desk.devices.vehicle
-    vehicle.enable()
-    try:
+    with driven(vehicle):
         drive_line(vehicle, stood, Planar(0.0, 0.0, 0.0), VEHICLE_SPEED, desk.devices.clock, check=desk.look_around)
-    finally:
-        vehicle.brake()
 
 
 def _place(desk: CommissionWorkplace, name: str) -> float:
@@ -163,8 +160,7 @@ def _vehicle_unrenewed(desk: CommissionWorkplace, result: Result) -> None:
         return
     desk.fold()
     vehicle, clock = desk.devices.vehicle, desk.devices.clock
-    vehicle.enable()
-    try:
+    with driven(vehicle):
         begun = clock.now()
         while clock.now() - begun < BEFORE_S:
             vehicle.drive(VEHICLE_SPEED, 0.0)
@@ -176,8 +172,6 @@ def _vehicle_unrenewed(desk: CommissionWorkplace, result: Result) -> None:
             "vehicle, commands not renewed: time to rest", clock.now() - last, "s",
             most=(KEPT_ALIVE_S + MOST_S) * max(1.0, clock.rate),
         )  # fmt: skip
-    finally:
-        vehicle.brake()
 
 
 def _laser(desk: CommissionWorkplace, result: Result) -> None:

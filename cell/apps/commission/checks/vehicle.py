@@ -15,7 +15,7 @@ from cell.apps.commission.workplace import CommissionWorkplace
 from cell.config.job import job_path, ships
 from cell.measure.vision import BoardSpec, parse_board
 from cell.procedures.arm.photograph import look_pose
-from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line
+from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, driven
 from drivers.errors import RefusedError
 from drivers.interfaces import Frame
 
@@ -38,15 +38,12 @@ def _wheels(desk: CommissionWorkplace, result: Result) -> None:
         return
     desk.fold()
     desk.confirm("vehicle", "its wheels, straight ahead", f"{1e3 * WAY:.0f} mm and back", f"{1e3 * SPEED:.0f} mm/s")
-    devices.vehicle.enable()
-    try:
+    with driven(devices.vehicle):
         odometry = RelativeOdometry(devices.vehicle)
         drive_line(devices.vehicle, odometry, Planar(WAY, 0.0, 0.0), SPEED, clock=devices.clock, check=_look(desk))
         there = odometry.pose()
         seen = desk.person.sees(f"Did the vehicle go {1e3 * WAY:.0f} mm ahead, the way it goes to the station?")
         drive_line(devices.vehicle, odometry, Planar(0.0, 0.0, 0.0), SPEED, clock=devices.clock, check=_look(desk))
-    finally:
-        devices.vehicle.brake()
     back = odometry.pose()
     low, high = 1e3 * WAY - MOST_OFF_MM, 1e3 * WAY + MOST_OFF_MM
     result.measure("ahead, by the wheels' counters", 1e3 * there.x, "mm", least=low, most=high)
@@ -134,11 +131,8 @@ def _by_board(desk: CommissionWorkplace, result: Result, odometry: RelativeOdome
 def _drive(desk: CommissionWorkplace, odometry: RelativeOdometry, ahead: float) -> None:
     """So far ahead of where the odometry began, m, and braked."""
     vehicle = desk.devices.vehicle
-    vehicle.enable()
-    try:
+    with driven(vehicle):
         drive_line(vehicle, odometry, Planar(ahead, 0.0, 0.0), STRIDE_SPEED, desk.devices.clock, check=_look(desk))
-    finally:
-        vehicle.brake()
 
 
 def _pitch(desk: CommissionWorkplace, result: Result, look: pin.SE3) -> None:

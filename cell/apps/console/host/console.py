@@ -128,11 +128,6 @@ class Console:
         self.close()
 
     @property
-    def server_pid(self) -> int:
-        """Process id of the server."""
-        return self._server.pid
-
-    @property
     def seen(self) -> bool:
         """Whether a page is open."""
         return bool(self.desk.holders.rows())

@@ -64,19 +64,19 @@ class ConsoleController:
             "clear_stop": self._clear_stop,
             "start": self._start,
             "resume": self._resume,
-            "dry_run": lambda client, words: self.rehearsals.begin(self._job(words), self._seed(words)),
+            "dry_run": lambda client, words: self.rehearsals.begin(self.named_job(words["job"]), self._seed(words)),
             "cancel_dry_run": lambda client, words: self.rehearsals.cancel(),
             "pause": lambda client, words: self._running("pause", Run.pause),
             "go_on": lambda client, words: self._running("go on", Run.go_on),
             "abort": self._abort,
             "decide": self._decide,
             "calibrate": lambda client, words: self._long(
-                client, "calibration", lambda: cell.calibrate(job=self._job(words))
+                client, "calibration", lambda: cell.calibrate(job=self.named_job(words["job"]))
             ),
             "verify": lambda client, words: self._long(
-                client, "verification", lambda: cell.verify(job=self._job(words))
+                client, "verification", lambda: cell.verify(job=self.named_job(words["job"]))
             ),
-            "home": self._home,
+            "home": lambda client, words: self._long(client, "homing", lambda: cell.home(words["device"])),
             "recover": self._recover,
             "diag": lambda client, words: self._diag(),
             "manual": self._manual,
@@ -159,7 +159,7 @@ class ConsoleController:
     # --- runs ---
 
     def _start(self, client: str, words: Words) -> str:
-        job = self._job(words)
+        job = self.named_job(words["job"])
         until, at_start = words["until"], words["at_start"]
 
         def begin() -> None:
@@ -220,9 +220,6 @@ class ConsoleController:
 
     def _resume(self, client: str, words: Words) -> str:
         return self._long(client, "resumed job", lambda: self.cell.resume(words["run"], script=self._script(self.job)))
-
-    def _home(self, client: str, words: Words) -> str:
-        return self._long(client, "homing", lambda: self.cell.home(words["device"]))
 
     def _recover(self, client: str, words: Words) -> str:
         by = self.holders.name(client) if words["by"] is None else words["by"]
@@ -317,9 +314,6 @@ class ConsoleController:
         own = None if self.cell.simulated is None else self.cell.simulated.facts["seed"]
         seed = words["seed"] if words["seed"] is not None else own
         return 1 if seed is None else int(seed)
-
-    def _job(self, words: Words) -> str:
-        return self.named_job(words["job"])
 
     def named_job(self, name: str | None) -> str:
         """One of the jobs that `/api/cell` lists; the console's own without one. `ConfigError` for any other."""

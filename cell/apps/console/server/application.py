@@ -123,14 +123,18 @@ class PageFiles(StaticFiles):
 
 
 class Application:
-    """The routes. `cell` is `/api/cell`'s answer, and `of_job` the same with another job's station."""
+    """The routes. `cell` is `/api/cell`'s answer, and `of_job` the same with another job's station.
+
+    `entered` is called whenever a link was used.
+    """
 
     def __init__(
         self, access: Access, pages: Pages, archive: Archive, *, cell: Mapping[str, object], do: Ask,
         stop: Callable[[], Awaitable[str | None]], of_job: Callable[[str], Awaitable[tuple[int, Mapping[str, object]]]],
+        entered: Callable[[], None],
     ) -> None:  # fmt: skip
         self._access, self._pages, self._archive, self._cell = access, pages, archive, cell
-        self._do, self._stop, self._of_job = do, stop, of_job
+        self._do, self._stop, self._of_job, self._entered = do, stop, of_job, entered
 
     def asgi(self) -> ASGIApp:
         """What is served."""
@@ -162,6 +166,7 @@ class Application:
         session = self._access.enter(_asked(request.scope, "token"))
         if session is None:
             return PlainTextResponse("this link was used already, or is none; `cell console` shows a new one\n", 403)
+        self._entered()
         # The key stands behind #, which no browser sends to anybody; the page takes it out of the address. A page that
         # goes on by itself, and no redirect: in a redirect that began elsewhere no browser sends this cookie.
         headers = {"set-cookie": self._access.set_cookie(session), "cache-control": "no-store"}
@@ -177,17 +182,14 @@ class Application:
         return _json(words, status)
 
     async def _runs(self, request: Request) -> Response:
-        return await self._from_archive(Archive.runs)
+        return _json(await run_in_threadpool(self._archive.runs))
 
     async def _trend(self, request: Request) -> Response:
-        return await self._from_archive(Archive.trend)
+        return _json(await run_in_threadpool(self._archive.trend))
 
     async def _health(self, request: Request) -> Response:
         told = await run_in_threadpool(self._archive.health)
         return _no("missing", "the reports could not be read: see `cell health`", 404) if told is None else _json(told)
-
-    async def _from_archive(self, what: Callable[[Archive], object]) -> Response:
-        return _json(await run_in_threadpool(what, self._archive))
 
     async def _run(self, request: Request) -> Response:
         return _found(await run_in_threadpool(self._archive.run, request.path_params["run"]))

@@ -26,7 +26,6 @@ from typing import Any
 import cv2
 import numpy as np
 import uvicorn
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from cell.apps.console.host.link import (
@@ -107,10 +106,10 @@ class Server:
             self.access, self.pages,
             Archive(Path(self._setup.runs), Path(self._setup.calibrations), self._setup.max_age_s),
             cell=self._setup.cell, do=self._do, stop=self._stop, of_job=self._of_job,
+            entered=self._renew if self._setup.lasting is None else lambda: None,
         )  # fmt: skip
         config = uvicorn.Config(
-            application.asgi() if self._setup.lasting is not None else _entering(application.asgi(), self._renew),
-            http=Patient, ws="websockets-sansio", lifespan="off", loop="asyncio",
+            application.asgi(), http=Patient, ws="websockets-sansio", lifespan="off", loop="asyncio",
             log_config=None, access_log=False, server_header=False, date_header=False, proxy_headers=False,
             ws_max_size=MOST_BYTES, ws_max_queue=8, ws_ping_interval=PING_S, ws_ping_timeout=PING_S,
             ws_per_message_deflate=False, h11_max_incomplete_event_size=16384,
@@ -232,36 +231,19 @@ class Server:
             case Say(client, words):
                 self.pages.say(client, words)
             case Answer():
-                self._answered(message)
+                future = self._waiting.get(message.number)
+                if future is not None and not future.done():
+                    future.set_result(message)
             case (str() as camera, bytes() as picture):
                 self.pages.picture(camera, picture)
             case (dict() as header, bytes() as part):
                 self.pages.cloud(header, part)
-
-    def _answered(self, message: Answer) -> None:
-        future = self._waiting.get(message.number)
-        if future is not None and not future.done():
-            future.set_result(message)
 
 
 def packed(header: Mapping[str, object], payload: bytes) -> bytes:
     """A binary message: length of the header, the header, the payload (docs/reference/console.md)."""
     words = json.dumps(header).encode()
     return struct.pack("<I", len(words)) + words + payload
-
-
-def _entering(app: ASGIApp, renew: Callable[[], None]) -> ASGIApp:
-    """Asks for a new link whenever one was used."""
-
-    async def entered(scope: Scope, receive: Receive, send: Send) -> None:
-        async def sent(message: Message) -> None:
-            if message["type"] == "http.response.start" and scope["path"] == "/enter" and message["status"] == 200:
-                renew()
-            await send(message)
-
-        await app(scope, receive, sent if scope["type"] == "http" else send)
-
-    return entered
 
 
 def _until_the_end(pipe: Connection, take: Callable[[Any], object]) -> None:

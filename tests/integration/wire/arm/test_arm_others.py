@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 import time
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -105,14 +105,11 @@ def test_a_program_that_another_client_starts_is_a_program_that_ended_and_can_be
 
 def test_reduced_mode_is_no_fault_to_connect_to_move_in_and_to_recover_in(bench):
     bench.ask("reduced_mode")
-    arm = connect(bench.address)
-    try:
+    with closing(connect(bench.address)) as arm:
         assert arm.state().safety is ArmSafety.NORMAL
         nudge(arm)
         arm.recover()
         nudge(arm)
-    finally:
-        arm.close()
 
 
 def test_a_tool_that_another_has_set_is_named_before_the_next_motion(bench):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 import threading
+from contextlib import closing
 
 import numpy as np
 import pinocchio as pin
@@ -53,22 +54,18 @@ def connect(address):
 
 
 def test_an_arm_is_moved_by_the_table_that_its_controller_tells():
-    with ArmBench(factory=FACTORY) as bench:
-        arm = connect(bench.address)
-        try:
-            np.testing.assert_array_equal(
-                arm.link_table().alpha, FACTORY[:, 2] + [np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]
-            )
-            model, drawn = arm_kinematics("UR10e", arm.link_table()), arm_kinematics("UR10e", None)
-            state = arm.state()
-            goal = pin.SE3(np.eye(3), np.array([0.0, 0.02, -0.03])) * model.fk(state.joints)
-            arm.move_joints(model.ik(goal, state.joints), 0.5, 1.0).wait(10.0)
-            reached = arm.state()
-            np.testing.assert_allclose(reached.flange, to_ur(goal), atol=1e-6)
-            off = drawn.fk(reached.joints).actInv(goal)
-            assert np.linalg.norm(off.translation) > 0.5e-3, "the maker's table would have missed"
-        finally:
-            arm.close()
+    with ArmBench(factory=FACTORY) as bench, closing(connect(bench.address)) as arm:
+        np.testing.assert_array_equal(
+            arm.link_table().alpha, FACTORY[:, 2] + [np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]
+        )
+        model, drawn = arm_kinematics("UR10e", arm.link_table()), arm_kinematics("UR10e", None)
+        state = arm.state()
+        goal = pin.SE3(np.eye(3), np.array([0.0, 0.02, -0.03])) * model.fk(state.joints)
+        arm.move_joints(model.ik(goal, state.joints), 0.5, 1.0).wait(10.0)
+        reached = arm.state()
+        np.testing.assert_allclose(reached.flange, to_ur(goal), atol=1e-6)
+        off = drawn.fk(reached.joints).actInv(goal)
+        assert np.linalg.norm(off.translation) > 0.5e-3, "the maker's table would have missed"
 
 
 def test_where_the_controller_tells_no_table_nothing_moves_unless_it_is_the_makers():

@@ -6,6 +6,7 @@ import itertools
 import struct
 import time
 from collections.abc import Callable
+from contextlib import closing
 
 import pytest
 
@@ -85,14 +86,10 @@ def test_text_messages_between_the_states_are_passed_over(bench: ArmBench) -> No
         whole = packet(kind, data)
         return [message, whole] if kind == "U" and next(count) % 25 == 0 else [whole]
 
-    with Meddler(bench.address, change) as cable:
-        arm = UrArm("arm", cable.address, clock=Clock())
-        try:
-            arm.move_joints(arm.state().joints + 0.02, 0.5, 1.0).wait(10.0)
-            arm.latch_clock()
-            assert arm.examine(0.2)
-        finally:
-            arm.close()
+    with Meddler(bench.address, change) as cable, closing(UrArm("arm", cable.address, clock=Clock())) as arm:
+        arm.move_joints(arm.state().joints + 0.02, 0.5, 1.0).wait(10.0)
+        arm.latch_clock()
+        assert arm.examine(0.2)
 
 
 def test_a_recovery_mode_is_named_with_what_to_do(bench: ArmBench) -> None:
@@ -104,11 +101,7 @@ def test_a_recovery_mode_is_named_with_what_to_do(bench: ArmBench) -> None:
             data = data[:at] + struct.pack(">I", 1 << 3) + data[at + 4 :]
         return [packet(kind, data)]
 
-    with Meddler(bench.address, change) as cable:
-        arm = UrArm("arm", cable.address, clock=Clock())
-        try:
-            with pytest.raises(DeviceFault, match=r"outside its safety limits.*At the pendant, move it back") as met:
-                arm.move_joints(arm.state().joints, 0.5, 1.0)
-            assert (met.value.code, met.value.recoverable) == ("arm.recovery_mode", False)
-        finally:
-            arm.close()
+    with Meddler(bench.address, change) as cable, closing(UrArm("arm", cable.address, clock=Clock())) as arm:
+        with pytest.raises(DeviceFault, match=r"outside its safety limits.*At the pendant, move it back") as met:
+            arm.move_joints(arm.state().joints, 0.5, 1.0)
+        assert (met.value.code, met.value.recoverable) == ("arm.recovery_mode", False)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -59,8 +60,7 @@ class TestV4l2(CameraContract):
 
 @inside
 def test_a_pictures_time_is_that_of_its_exposure_within_the_bound_that_is_stated() -> None:
-    device = camera(gain=20.0)
-    try:
+    with closing(camera(gain=20.0)) as device:
         device.configure(0.010, 25.0)
         for _ in range(4):
             frame = device.grab()
@@ -68,8 +68,6 @@ def test_a_pictures_time_is_that_of_its_exposure_within_the_bound_that_is_stated
             host = device._clock.now() - (time.monotonic() - began)
             assert abs(frame.host_time - host) <= device.time_bound
             assert frame.image[10, 10] == 100
-    finally:
-        device.close()
 
 
 @inside
@@ -82,13 +80,10 @@ def test_what_it_does_not_have_is_refused_by_name() -> None:
         camera(gain=500.0)
     with pytest.raises(NotConnectedError, match="fuser -v /dev/video78"):
         V4l2Camera("scan_camera", "/dev/video78", clock=Clock(), shape=(480, 640))
-    device = camera()
-    try:
+    with closing(camera()) as device:
         with pytest.raises(NotConnectedError, match="no other program uses it"):
             camera()
         with pytest.raises(DeviceFault, match="took frame rate 60 Hz instead of 90 Hz"):
             device.configure(0.005, 90.0)
         with pytest.raises(LimitError):
             device.configure(0.02, 60.0)
-    finally:
-        device.close()

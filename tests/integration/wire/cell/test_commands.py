@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import socket
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from cell.devices.assembly import connect
 from cell.devices.lock import CellLock
 from cell.run.jogging import jog, needed_for, parse_jog
 from drivers.errors import InterlockError, NotConnectedError
-from tests.support import Typed
+from tests.support import Typed, until
 from tests.support.packages import RAIL, install, with_acme_rail
 from tests.support.wire.cells import ask, cell, served
 
@@ -173,10 +172,7 @@ def test_an_arm_whose_program_somebody_has_ended_is_jogged_all_the_same(endpoint
         with socket.create_connection((opened.config.arm.place, 29999), timeout=5.0) as dashboard:
             dashboard.makefile("r").readline()
             dashboard.sendall(b"stop\n")
-            until = time.monotonic() + 5.0
-            while arm.state().controlled and time.monotonic() < until:
-                opened.devices.clock.sleep(0.05)
-        assert not arm.state().controlled
+            assert until(lambda: not arm.state().controlled, 5.0)
         jog(opened, wish)
         assert np.degrees(arm.state().joints - joints)[0] == pytest.approx(2.0, abs=0.01)
 

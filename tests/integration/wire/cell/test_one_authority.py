@@ -14,7 +14,7 @@ import pytest
 from cell.run.folder import is_going, list_runs, read_report
 from drivers.clock import Clock
 from statemachine.journal import request
-from tests.support import Typed
+from tests.support import Typed, until
 from tests.support.wire.cells import ask, assert_safe, served, started
 
 pytestmark = pytest.mark.wire
@@ -84,7 +84,4 @@ def test_a_signal_while_the_cell_starts_is_told_and_leaves_no_process(tmp_path: 
     assert "asked to end" in error or "interrupted from the keyboard" in error
     assert "Traceback" not in error
     # A world whose start the signal cut in two ends by itself, because its standard input has ended.
-    deadline = time.monotonic() + 20
-    while any(Path(f"/proc/{pid}").exists() for pid in children):
-        assert time.monotonic() < deadline
-        Clock().sleep(0.05)
+    assert until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children), 20.0)

@@ -17,6 +17,7 @@ from drivers.vehicle.cia402.feedback import WheelDrives
 from drivers.vehicle.cia402.make import look_at_nodes
 from drivers.vehicle.cia402.setup import Watchdog
 from drivers.vehicle.cia402.vehicle import CanopenVehicle
+from tests.support import until
 from tests.support.wire.other_drives import OtherDrives
 from tests.unit.drivers.vehicle.cia402.test_make import config
 
@@ -114,10 +115,7 @@ def test_without_our_heartbeat_they_stop_and_one_that_does_not_is_refused(bench:
     bench.drives.left.node.emcy.send(0x7305, 0x20, b"")
     with pytest.raises(DeviceFault, match="left drive: the encoder fails, 7305h: check the encoder's cable"):
         drive_for(bench.vehicle, 1.0, 0.2)
-    end = time.monotonic() + 1.0
-    while bench.drives.right.state != "disabled":
-        assert time.monotonic() < end
-        time.sleep(0.01)
+    assert until(lambda: bench.drives.right.state == "disabled", 1.0)
 
 
 def test_an_object_that_a_drive_lacks_is_named(bench: Bench) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -48,8 +49,7 @@ def sweep(rail: TmclRail) -> tuple[float, float]:
 
 @pytest.mark.parametrize("order", ["library", "sheet"])
 def test_the_ramp_is_a_trapezium_whichever_order_its_parameters_have(order: Order) -> None:
-    module = OtherModule(order)
-    try:
+    with closing(OtherModule(order)) as module:
         rail = connect(module)
         wanted = round(ACCELERATION * COUNTS)
         assert module.axis[5] == module.ramp("DMAX") == module.ramp("D1") == wanted
@@ -58,8 +58,6 @@ def test_the_ramp_is_a_trapezium_whichever_order_its_parameters_have(order: Orde
         begin, end = sweep(rail)
         assert end - begin == pytest.approx(0.025 / SPEED, rel=0.01)
         rail.close()
-    finally:
-        module.close()
 
 
 def test_a_first_acceleration_that_may_not_be_zero_is_set_to_the_acceleration(module: OtherModule) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Literal
 
 import pytest
@@ -11,6 +11,7 @@ import pytest
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, NotConnectedError
 from drivers.vehicle.agilex import AgilexVehicle
+from tests.support import until
 from tests.support.wire.other_vehicle import OtherVehicle
 
 pytestmark = pytest.mark.wire
@@ -20,13 +21,6 @@ def connect(peer: OtherVehicle) -> AgilexVehicle:
     return AgilexVehicle(
         "vehicle", peer.interface, peer.channel, track=0.58, max_speed=0.5, max_yaw_rate=0.8, clock=Clock()
     )
-
-
-def until(happened: Callable[[], object], seconds: float = 3.0) -> None:
-    end = time.monotonic() + seconds
-    while not happened():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def faulted(driver: AgilexVehicle, seconds: float = 3.0) -> DeviceFault:
@@ -81,20 +75,20 @@ def test_a_speed_that_wavers_by_three_millimetres_a_second_is_standstill(
 ) -> None:
     driver.enable()
     driver.drive(0.3, 0.0)
-    until(lambda: driver.state().speed > 0.29)
+    assert until(lambda: driver.state().speed > 0.29, 3.0)
     driver.stop()
     assert abs(driver.state().speed) <= 0.003
     for _ in range(8):
         driver.stop()
     driver.brake()
-    until(lambda: peer.braked)
+    assert until(lambda: peer.braked, 3.0)
     driver.check()
 
 
 def test_a_vehicle_that_really_creeps_does_not_stand(peer: OtherVehicle, driver: AgilexVehicle) -> None:
     driver.enable()
     peer.noisy = False
-    until(lambda: driver.state().speed == 0.0)
+    assert until(lambda: driver.state().speed == 0.0, 3.0)
     peer.lost = {0x221}
     with pytest.raises(DeadlineError, match="standstill"):
         driver.stop()
@@ -156,13 +150,13 @@ def test_an_emergency_stop_and_an_error_bit_are_faults_and_a_low_battery_is_a_wa
 ) -> None:
     driver.enable()
     peer.errors = 0x0002 | 0x0004
-    until(lambda: driver.state().warnings)
+    assert until(lambda: driver.state().warnings, 3.0)
     assert driver.state().warnings == ("the battery is low", "no signal of the remote control")
     driver.drive(0.1, 0.0)
     peer.errors = 0x0001
     assert "battery's voltage is too low" in str(faulted(driver))
     peer.errors, peer.state = 0, 1
-    until(lambda: driver.state().emergency_stop)
+    assert until(lambda: driver.state().emergency_stop, 3.0)
     with pytest.raises(DeviceFault, match="emergency stop") as met:
         driver.check()
     assert not met.value.recoverable

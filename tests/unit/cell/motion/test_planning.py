@@ -55,11 +55,20 @@ def test_the_job_is_planned_without_touching_anything(planner: Planner) -> None:
         planner.line(above, down(0.75, 0, 0.221), LineLimits(0.04))
 
 
-def test_an_obstacle_in_the_direct_way_is_avoided(arm: ArmKinematics) -> None:
-    wall = collision.block("wall", collision.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45))
-    model = CollisionModel(arm, [*collision.arm_bodies(), *collision.tool_bodies(), wall])
+WALL = collision.block("wall", collision.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45))
+
+
+def beside_wall(
+    arm: ArmKinematics, x: float, y: float, *others: collision.Body
+) -> tuple[CollisionModel, Planner, np.ndarray, np.ndarray]:
+    """A model with the wall, its planner, and the arm to the left and to the right of it."""
+    model = CollisionModel(arm, [*collision.arm_bodies(), *collision.tool_bodies(), WALL, *others])
     planner = Planner(arm, model)
-    left, right = (planner.reach(down(0.7, y, 0.25), WORKING, "beside") for y in (0.35, -0.35))
+    return model, planner, *(planner.reach(down(x, side, 0.25), WORKING, "beside") for side in (y, -y))
+
+
+def test_an_obstacle_in_the_direct_way_is_avoided(arm: ArmKinematics) -> None:
+    model, planner, left, right = beside_wall(arm, 0.7, 0.35)
     assert not all(model.free(q) for q in plan_joint(left, right, arm.limits).joints)
     motion = planner.free(left, right)
     assert all(model.free(q) for q in motion.joints)
@@ -69,13 +78,8 @@ def test_an_obstacle_in_the_direct_way_is_avoided(arm: ArmKinematics) -> None:
 
 
 def test_a_slot_that_no_simple_detour_passes_is_searched(arm: ArmKinematics) -> None:
-    solids = [
-        collision.block("wall", collision.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45)),
-        collision.block("roof", collision.BASE, (0.45, -0.6, 0.75), (1.2, 0.6, 0.80)),
-    ]
-    model = CollisionModel(arm, [*collision.arm_bodies(), *collision.tool_bodies(), *solids])
-    planner = Planner(arm, model)
-    left, right = (planner.reach(down(0.6, y, 0.25), WORKING, "beside") for y in (0.30, -0.30))
+    roof = collision.block("roof", collision.BASE, (0.45, -0.6, 0.75), (1.2, 0.6, 0.80))
+    model, planner, left, right = beside_wall(arm, 0.6, 0.30, roof)
     motion = planner.free(left, right)
     assert all(model.free(q) for q in motion.joints)
 
@@ -84,10 +88,7 @@ def test_without_ompl_ways_over_one_corner_are_tried_and_what_lacks_is_told(
     arm: ArmKinematics, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "ompl", None)
-    wall = collision.block("wall", collision.BASE, (0.45, -0.02, -0.3), (1.2, 0.02, 0.45))
-    model = CollisionModel(arm, [*collision.arm_bodies(), *collision.tool_bodies(), wall])
-    planner = Planner(arm, model)
-    left, right = (planner.reach(down(0.7, y, 0.25), WORKING, "beside") for y in (0.35, -0.35))
+    model, planner, left, right = beside_wall(arm, 0.7, 0.35)
     assert first_touch(model, np.stack([left, right])) is not None
     motion = planner.free(left, right)
     assert first_touch(model, motion.joints) is None

@@ -10,14 +10,12 @@ import pytest
 
 from cell.run.runs import Run
 from statemachine.watch import SignalInterrupt
+from tests.support import until
 
 
 def ask_to_end() -> None:
     """A SIGTERM as soon as somebody waits for it."""
-    until = time.monotonic() + 5.0
-    while signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
-        assert time.monotonic() < until
-        time.sleep(0.001)
+    assert until(lambda: signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL, 5.0)
     os.kill(os.getpid(), signal.SIGTERM)
 
 

@@ -7,7 +7,7 @@ import signal
 import socket
 import struct
 import time
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import islice
 
 import numpy as np
@@ -17,7 +17,8 @@ from drivers.arm.link import latch_clock
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, NotConnectedError
-from tests.support.wire.arm_bench import ArmBench, gone, joints_away, keep_outputs, soon
+from tests.support import running
+from tests.support.wire.arm_bench import ArmBench, joints_away, keep_outputs, soon
 
 pytestmark = pytest.mark.wire
 
@@ -75,7 +76,7 @@ def test_an_arm_that_is_silent_or_dies_is_a_fault_in_time_and_close_does_not_han
             moving.wait(10.0)
         with in_time(6.0):
             arm.close()
-        assert gone(child)
+        assert not running(child)
         bench.process.send_signal(signal.SIGCONT)
         assert soon(lambda: not bench.ask("show")["moving"])
         arm, moving = swinging(bench)
@@ -90,7 +91,7 @@ def test_an_arm_that_is_silent_or_dies_is_a_fault_in_time_and_close_does_not_han
             with pytest.raises(DeviceFault):
                 arm.stop()
             arm.close()
-        assert gone(child)
+        assert not running(child)
 
 
 @contextmanager
@@ -121,7 +122,7 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
             prompt = list(islice((latch for latch in latches if latch.bound < 0.0015 * rate), 10))
             return min(prompt, key=lambda latch: latch.host - latch.device)
 
-        try:
+        with closing(arm):
             prompt = promptly()
             bench.ask("late_states")
             assert soon(lambda: lateness(arm, prompt) > 0.08 * rate)
@@ -139,8 +140,6 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
             bench.ask("clear")
             assert soon(lambda: lateness(arm, prompt) < 0.03 * rate)
             promptly()
-        finally:
-            arm.close()
 
 
 def test_a_latch_needs_its_register(arm, bench):

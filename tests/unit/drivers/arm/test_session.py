@@ -10,7 +10,6 @@ import socket
 import threading
 import time
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +22,7 @@ from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import ArmSafety
+from tests import support
 from tests.support.wire.arm_bench import HOME, ArmBench, Shared, soon
 from tests.support.wire.cable import Cable
 
@@ -119,15 +119,7 @@ def stands_still(bench, seconds=0.3):
 
 def children():
     """Processes that this one has started and that have not ended."""
-    found = set()
-    for entry in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            state, parent = entry.read_text().rpartition(")")[2].split()[:2]
-        except OSError:
-            continue
-        if int(parent) == os.getpid() and state not in "ZX":
-            found.add(int(entry.parent.name))
-    return found
+    return set(filter(support.running, support.below(os.getpid())))
 
 
 # --- paused programs ---

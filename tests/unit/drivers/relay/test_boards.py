@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from unittest.mock import Mock
@@ -20,6 +19,7 @@ from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.relay.boards import BoardClaw, BoardLaser, LcusBoard, RelayPort, open_board, open_numato
 from sim_backends.peers.switches import LcusPeer, NumatoPeer, RelayBoard
+from tests.support import until
 
 pytestmark = pytest.mark.wire
 
@@ -76,10 +76,7 @@ def lcus_laser(url: str) -> BoardLaser:
 
 def becomes(value: bool, wired: Wired, relay: int = LASER) -> bool:
     """Whether the relay is, within half a second of the wall."""
-    until = time.monotonic() + 0.5
-    while wired.on[relay] != value and time.monotonic() < until:
-        Clock().sleep(0.005)
-    return wired.on[relay] == value
+    return until(lambda: wired.on[relay] == value, 0.5)
 
 
 def test_laser_and_claw_share_one_board_and_its_port(numato: str, wired: Wired) -> None:

@@ -6,7 +6,6 @@ import io
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ from rich.console import Console
 from cell.apps.cli.progress import ProgressDisplay, answer_here, kept_loops
 from statemachine.control import RunControl
 from statemachine.step import Event
+from tests.support import until
 
 LONG = "arm: it stopped [C153] because points came 15 ms late: this computer is too busy"
 
@@ -66,9 +66,7 @@ def test_a_first_run_shows_that_it_compiles_and_how_long_that_takes(
     with ProgressDisplay(compiles=True):
         for name in ("one", "two"):
             (tmp_path / f"{name}.{version}.nbi").touch()
-        until = time.monotonic() + 20.0
-        while not told and time.monotonic() < until:
-            time.sleep(0.01)
+        assert until(lambda: told, 20.0)
     assert told[0].startswith("compile once, about ")
     assert told[-1] == "compile 2 loops, kept"
     assert "compiling, once" in capsys.readouterr().err

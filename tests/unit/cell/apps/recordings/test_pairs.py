@@ -52,10 +52,7 @@ def test_many_pictures_of_three_stops_are_not_enough():
 
 def test_pairs_of_one_stop_count_as_one():
     pairs = given_pairs(scene(count=6, laser=False))
-    once, often = (
-        calibrate_pairs(pairs).as_dict(),
-        calibrate_pairs([pair for pair in pairs for _ in range(4)]).as_dict(),
-    )
+    once, often = (calibrate_pairs([p for p in pairs for _ in range(times)]).as_dict() for times in (1, 4))
     assert any(note.startswith("24 pairs of 6 stops") for note in often["notes"])
     np.testing.assert_allclose(often["hand_eye"]["sigma_mm"], once["hand_eye"]["sigma_mm"], rtol=1e-3)
     with pytest.raises(ConfigError, match="of 3 stops"):

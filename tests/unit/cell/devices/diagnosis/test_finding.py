@@ -8,7 +8,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from cell.config.cell_config import CellConfig, default_toml, load_config
@@ -91,11 +91,8 @@ def test_a_device_that_a_run_holds_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_module_is_asked_only_where_the_user_says_so(tmp_path: Path) -> None:
-    module = OtherModule()
-    try:
+    with closing(OtherModule()) as module:
         found = ask_module(module.url, None)
-    finally:
-        module.close()
     assert (found.ok, found.state) == (True, "version 1241V144")
     missing = ask_module("/dev/ttyNONE9", None)
     assert "plug it in" in missing.state

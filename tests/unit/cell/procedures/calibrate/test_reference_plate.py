@@ -63,32 +63,30 @@ def test_the_edge_is_where_the_world_has_it(cell) -> None:
     assert before.edge.lag == pytest.approx(scene.rail_backlash / (2 * SPEED), abs=2e-3)
 
 
-@pytest.mark.parametrize("moved", [(0.0, 0.0), (0.12e-3, 0.0), (-0.1e-3, 0.15e-3)])
-def test_a_head_that_has_slipped_is_seen_to_hundredths(cell, moved: tuple[float, float]) -> None:
-    virtual, before, since = cell
-    world, scene = virtual.world, virtual.world.scene
-    off = np.eye(4)
+def slipped(virtual: VirtualCell, moved: tuple[float, float], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The head has slipped so far, m, until the test ends."""
+    scene, off = virtual.world.scene, np.eye(4)
     off[:2, 3] = moved
-    world.scene = replace(scene, flange_from_scan_camera=scene.flange_from_scan_camera @ off)
-    try:
-        slip = since(looked(virtual, before))
-    finally:
-        world.scene = scene
+    there = scene.flange_from_scan_camera @ off
+    monkeypatch.setattr(virtual.world, "scene", replace(scene, flange_from_scan_camera=there))
+
+
+@pytest.mark.parametrize("moved", [(0.0, 0.0), (0.12e-3, 0.0), (-0.1e-3, 0.15e-3)])
+def test_a_head_that_has_slipped_is_seen_to_hundredths(
+    cell, moved: tuple[float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    virtual, before, since = cell
+    slipped(virtual, moved, monkeypatch)
+    slip = since(looked(virtual, before))
     assert slip.shift == pytest.approx(moved, abs=2.5e-5)
     assert abs(slip.lag) < 3e-3 and not slip.hidden
 
 
-def test_a_head_that_has_slipped_far_is_refused_with_the_next_step(cell) -> None:
+def test_a_head_that_has_slipped_far_is_refused_with_the_next_step(cell, monkeypatch: pytest.MonkeyPatch) -> None:
     virtual, before, _ = cell
-    world, scene = virtual.world, virtual.world.scene
-    off = np.eye(4)
-    off[0, 3] = 1e-3
-    world.scene = replace(scene, flange_from_scan_camera=scene.flange_from_scan_camera @ off)
-    try:
-        with pytest.raises(RefusedError, match=r"slipped.*cell calibrate"):
-            looked(virtual, before)
-    finally:
-        world.scene = scene
+    slipped(virtual, (1e-3, 0.0), monkeypatch)
+    with pytest.raises(RefusedError, match=r"slipped.*cell calibrate"):
+        looked(virtual, before)
 
 
 def test_auto_gain_is_no_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,28 +102,20 @@ def test_auto_gain_is_no_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
         looked(virtual, before)
 
 
-def test_a_laser_that_has_turned_is_no_slip(cell) -> None:
+def test_a_laser_that_has_turned_is_no_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
     virtual, before, since = cell
     world, scene = virtual.world, virtual.world.scene
-    shown = world._cameras._shown
     drifted = replace(scene, workshop=replace(scene.workshop, pointing=0.4e-3))
-    world._cameras._shown = drifted, *shown[1:]
+    monkeypatch.setattr(world._cameras, "_shown", (drifted, *world._cameras._shown[1:]))
     world.stand(1e5)
-    try:
-        slip = since(looked(virtual, before))
-    finally:
-        world._cameras._shown = shown
-    assert slip.size < 2.5e-5
+    assert since(looked(virtual, before)).size < 2.5e-5
 
 
-def test_pictures_that_are_paired_one_off_are_seen(cell) -> None:
+def test_pictures_that_are_paired_one_off_are_seen(cell, monkeypatch: pytest.MonkeyPatch) -> None:
     virtual, before, since = cell
-    spec = virtual.scan_camera.model.spec
-    virtual.scan_camera.model.spec = replace(spec, latency=spec.latency + 1 / 30)
-    try:
-        slip = since(looked(virtual, before))
-    finally:
-        virtual.scan_camera.model.spec = spec
+    camera = virtual.scan_camera.model
+    monkeypatch.setattr(camera, "spec", replace(camera.spec, latency=camera.spec.latency + 1 / 30))
+    slip = since(looked(virtual, before))
     assert slip.lag == pytest.approx(1 / 30, abs=3e-3)
     assert abs(slip.along) < 2.5e-5
     with pytest.raises(RefusedError, match=r"pictures come \+3\d\.\d ms later"):
@@ -159,14 +149,11 @@ def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell) -> None:
 
 
 @pytest.mark.parametrize("most_hz", [16.0, 10.0])
-def test_a_slower_camera_sees_the_edge_at_the_same_place(cell, most_hz: float) -> None:
+def test_a_slower_camera_sees_the_edge_at_the_same_place(cell, most_hz: float, monkeypatch: pytest.MonkeyPatch) -> None:
     virtual, before, _ = cell
-    spec = virtual.scan_camera.model.spec
-    virtual.scan_camera.model.spec = replace(spec, frame_rate_max=most_hz)
-    try:
-        edge = look_at_edge(CONFIG, virtual.devices, let_go, before, None)
-    finally:
-        virtual.scan_camera.model.spec = spec
+    camera = virtual.scan_camera.model
+    monkeypatch.setattr(camera, "spec", replace(camera.spec, frame_rate_max=most_hz))
+    edge = look_at_edge(CONFIG, virtual.devices, let_go, before, None)
     assert edge is not None
     assert edge.place == pytest.approx(before.edge.place, abs=1e-5)
 

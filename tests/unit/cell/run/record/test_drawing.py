@@ -25,11 +25,7 @@ def test_frames_lead_from_the_root_to_where_the_arm_itself_says_that_its_flange_
     arms = {stamp: chain for stamp, chain in chains if "flange" in chain}
     checked = 0
     for stamp, state in read["/arm/state"]:
-        chain = arms[stamp]
-        pose, name = np.eye(4), "flange"
-        while name != "tf#/":
-            step = chain[name]
-            pose, name = matrix(step) @ pose, step.parent_frame_id
+        pose = followed(arms[stamp], "flange", "tf#/")
         told = np.array(state["flange"])
         assert np.allclose(pose[:3, 3], told[:3], atol=1e-7)
         assert np.allclose(pose[:3, :3], Rotation.from_rotvec(told[3:]).as_matrix(), atol=1e-7)
@@ -93,7 +89,7 @@ def test_the_clouds_points_lie_on_the_stripe_of_the_picture_taken_then(read: Mes
     for stamp, message in sorted(read["/tf"], key=first):
         chain |= {t.child_frame_id: t for t in message.transforms}
         if "flange" in chain and any(t.child_frame_id == "scan_camera" for t in message.transforms):
-            poses.append((stamp, base_from_camera(chain)))
+            poses.append((stamp, followed(chain, "scan_camera", "base")))
     pictures = dict(read["/scan_camera/image"])
     lens = read["/scan_camera/calibration"][0][1]
     lines = read["/cloud/line"]
@@ -118,9 +114,10 @@ def test_the_clouds_points_lie_on_the_stripe_of_the_picture_taken_then(read: Mes
         assert np.median(image[rows, columns + 8]) < 0.5 * np.median(brightness)
 
 
-def base_from_camera(chain: dict[str, Any]) -> np.ndarray[Any, Any]:
-    pose, name = np.eye(4), "scan_camera"
-    while name != "base":
+def followed(chain: dict[str, Any], name: str, root: str) -> np.ndarray[Any, Any]:
+    """root_from_name."""
+    pose = np.eye(4)
+    while name != root:
         pose, name = matrix(chain[name]) @ pose, chain[name].parent_frame_id
     return pose
 

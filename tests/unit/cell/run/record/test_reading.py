@@ -21,6 +21,7 @@ from cell.run.record.recorder import as_json, wire
 from drivers.errors import CellError, ConfigError
 from drivers.interfaces import LinkStatistics
 from drivers.vehicle.can_link import CanLink
+from tests.support import until
 
 
 def test_a_record_without_a_message_is_not_whole(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -129,9 +130,7 @@ def test_a_process_that_is_killed_leaves_all_but_its_last_seconds(tmp_path: Path
     path = tmp_path / "record.mcap"
     process = subprocess.Popen([sys.executable, "-c", KILLED, str(path)], stdout=subprocess.PIPE)
     assert process.stdout is not None and process.stdout.readline() == b"on\n"
-    until = time.monotonic() + 20.0
-    while path.stat().st_size < 1000 and time.monotonic() < until:
-        time.sleep(0.05)
+    assert until(lambda: path.stat().st_size >= 1000, 20.0)
     process.kill()
     process.wait()
     process.stdout.close()

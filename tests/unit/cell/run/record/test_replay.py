@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -19,11 +18,11 @@ from tests.support import Typed
 
 
 @pytest.fixture
-def copied(folder: Path, tmp_path: Path) -> Iterator[Path]:
+def copied(folder: Path, tmp_path: Path) -> Path:
     """The run's folder, to be changed."""
     copy = tmp_path / folder.name
     shutil.copytree(folder, copy, ignore=lambda where, names: [n for n in names if n == "record.mcap"])
-    yield copy
+    return copy
 
 
 def test_perception_fed_again_gives_the_same_bits(folder: Path, placed_pot: JobRecord) -> None:

@@ -15,7 +15,8 @@ import pytest
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import NotConnectedError
-from tests.support.wire.arm_bench import gone, joints_away, keep_outputs, soon
+from tests.support import running
+from tests.support.wire.arm_bench import joints_away, keep_outputs, soon
 
 pytestmark = pytest.mark.wire
 
@@ -49,7 +50,7 @@ def test_when_the_owner_dies_the_laser_goes_off_the_arm_stops_and_the_child_ends
         owner.send_signal(way)
         assert soon(lambda: not bench.ask("show")["moving"])
         laser_and_tried_off_claw_closed(bench)
-        assert soon(lambda: gone(child))
+        assert soon(lambda: not running(child))
 
 
 def test_when_the_owner_and_its_child_die_the_controller_switches_off_what_was_tried(bench):
@@ -88,7 +89,7 @@ def test_close_leaves_the_laser_off_and_no_process_and_may_be_repeated(bench):
     arm.close()
     arm.close()
     assert not bench.ask("show")["outputs"] & 1 << LASER
-    assert gone(child)
+    assert not running(child)
     with pytest.raises(NotConnectedError, match="was closed"):
         arm.state()
     with pytest.raises(NotConnectedError, match="was closed"):

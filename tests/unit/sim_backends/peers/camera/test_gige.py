@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 import struct
-import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,6 +13,7 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.camera import CameraSpec
 from sim_backends.peers.camera import gigevision as g
 from sim_backends.peers.camera.gige import GigePeer
+from tests.support import until
 
 pytestmark = pytest.mark.wire
 SPEC = CameraSpec("SimCam", "SIM000007-SCAN", 64, 48, frame_rate_max=120.0)
@@ -60,9 +60,7 @@ def test_one_client_controls_it_and_loses_control_when_it_falls_silent(peer: Gig
     assert second.write(g.WIDTH, 16) == 0x8006
     assert second.read(g.WIDTH) == 32
     assert first.ask(0x99, b"")[0] == 0x8001
-    until = time.monotonic() + 5.0
-    while second.read(g.CONTROL) and time.monotonic() < until:
-        time.sleep(0.05)
+    assert until(lambda: not second.read(g.CONTROL), 5.0)
     assert second.write(g.CONTROL, 2) == 0
 
 

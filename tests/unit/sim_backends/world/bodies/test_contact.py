@@ -12,7 +12,7 @@ from lab.bench.job.part_jobs import body
 from sim_backends.world import drawing
 from sim_backends.world.bodies.contact import STIFFNESS, Nest, PartContact
 from sim_backends.world.bodies.surfaces import HALF_X, HALF_Y, Surface, mesh, surface, underside
-from sim_backends.world.scene import rotation
+from tests.support.simulator.optics_scene import pose as turned
 
 Floats = NDArray[np.float64]
 
@@ -32,13 +32,6 @@ def test_a_part_put_down_a_little_aside_lies_on_the_floor_of_the_steps() -> None
     part.set_claw(False, aside)
     lies = part.part_pose(aside)
     np.testing.assert_allclose(lies[:3, 3], (1.5e-4, 0.0, 0.0), atol=1e-9)
-
-
-def turned(vector: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, :3] = rotation(np.array(vector))
-    pose[:3, 3] = at
-    return pose
 
 
 def contact(

@@ -25,23 +25,15 @@ def calibrate(folder: Path, *options: str):
     return CliRunner().invoke(app, ["calibrate", "--from", str(folder), *options])
 
 
-@pytest.fixture(scope="module")
-def dot_board():
-    """What `--json` prints of the dot board, read as a script reads it."""
+def test_the_dot_board_gives_the_published_camera_as_json_without_nan():
     ran = calibrate(recording("dot_board"), "--board", "dots:6x6:34mm", "--json")
     assert ran.exit_code == 0, ran.output
 
     def refuse(constant):
         raise AssertionError(f"{constant} is no JSON")
 
-    return json.loads(ran.stdout, parse_constant=refuse)
-
-
-def test_json_goes_to_scripts_without_nan(dot_board):
+    dot_board = json.loads(ran.stdout, parse_constant=refuse)
     assert dot_board["board"] == "dots:6x6:34mm"
-
-
-def test_the_dot_board_gives_the_published_camera(dot_board):
     assert sum(f["used"] for f in dot_board["frames"]) == 5
     assert all(f["order_assumed"] for f in dot_board["frames"])
     camera = dot_board["intrinsics_without_distortion"]

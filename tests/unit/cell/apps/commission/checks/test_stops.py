@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -18,12 +19,10 @@ def test_time_and_way_until_rest_are_measured_for_each_cause(
 ) -> None:
     files(tmp_path)
     made, result = opened(tmp_path, Shown()), Result()
-    try:
+    with closing(made.desk):
         cell, stop = made.desk.cell, made.desk.cell.stop
         monkeypatch.setattr(cell, "stop", lambda: (cell.devices.clock.sleep(late_s), stop()))
         by_name("stops").work(made.desk, result)
-    finally:
-        made.desk.close()
     rows = {row.what: row for row in result.readings}
     for name in ("rail", "arm", "vehicle"):
         for cause in ("Cell.stop()", "`cell abort`"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -14,10 +15,8 @@ from tests.support.commissioning import Shown, commissioned, files, opened
 def test_every_device_answers_is_named_and_well_and_a_person_has_looked_round(tmp_path: Path, clear: bool) -> None:
     files(tmp_path)
     made = opened(tmp_path, Shown(), lambda text: clear)
-    try:
+    with closing(made.desk):
         result = made._once(by_name("links"))
-    finally:
-        made.desk.close()
     assert result.verdict == ("good" if clear else "wrong")
     assert [row.what for row in result.readings if not row.ok] == ([] if clear else ["a person has looked round"])
     assert len(result.notes) >= 7 and all("no identity" not in note for note in result.notes)

@@ -13,7 +13,8 @@ from cell.apps.console.host.console import Address, Console
 from cell.run.session.supervisor import Cell
 from drivers.errors import ConfigError
 from statemachine.step import Failure, Outcome
-from tests.support.console.server import Browser, until
+from tests.support import until
+from tests.support.console.server import Browser
 
 
 def state(page: Any, true: Any) -> dict[str, Any]:

@@ -15,7 +15,8 @@ from cell.config.job import item_names, job_path, load_job, shipped_jobs
 from cell.run.runs import Run
 from cell.run.session.supervisor import Cell
 from drivers.errors import CellError, ConfigError, InterlockError, LimitError, RefusedError
-from tests.support.console.server import refusal, until
+from tests.support import until
+from tests.support.console.server import refusal
 
 
 def test_one_holds_the_others_see(desk: ConsoleController) -> None:

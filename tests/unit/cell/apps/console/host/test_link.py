@@ -14,7 +14,8 @@ from cell.apps.console.host.console import Address, Console
 from cell.apps.console.host.link import Beat
 from cell.run.session.supervisor import Cell
 from drivers.errors import ConfigError
-from tests.support.console.server import Browser, until
+from tests.support import until
+from tests.support.console.server import Browser
 
 
 def test_when_the_server_is_killed_the_program_hears_of_it_and_nobody_holds(
@@ -26,7 +27,7 @@ def test_when_the_server_is_killed_the_program_hears_of_it_and_nobody_holds(
         ann.do(do="hold", name="Ann", key=key)
         ann.do(do="manual", on=True, key=key)
         assert console.desk.manual.on
-        os.kill(console.server_pid, signal.SIGKILL)
+        os.kill(console._server.pid, signal.SIGKILL)
         assert gone.wait(5)
         assert until(lambda: not console.desk.manual.on)
         assert console.desk.holders.holder is None
@@ -70,6 +71,6 @@ def test_a_killed_server_is_noticed_whatever_the_other_threads_do(
         browser = Browser(console.link)
         with browser.live() as page:
             page.send(json.dumps({"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1}))
-            os.kill(console.server_pid, signal.SIGKILL)
+            os.kill(console._server.pid, signal.SIGKILL)
             assert gone.wait(2.0)
         held.set()

@@ -15,7 +15,7 @@ from cell.apps.console.host.manual import LATE_S, Presses
 from cell.run.session.supervisor import Cell
 from drivers.errors import InterlockError
 from drivers.interfaces import ATTENDED_S
-from tests.support.console.server import until
+from tests.support import until
 
 Z_UP = ("arm", "z", 1)
 

@@ -12,7 +12,7 @@ from cell.run.runs import Run
 from drivers.errors import ConfigError, Measured, RefusedError
 from statemachine.runner import Again
 from statemachine.step import Failure, Outcome
-from tests.support.console.server import until
+from tests.support import until
 
 STEPS = ("board_photo", "laser_sweep", "reconstruct")
 

@@ -11,7 +11,7 @@ import pytest
 from cell.apps.console.host.rehearsal import Rehearsals
 from cell.run.session.supervisor import Cell
 from drivers.errors import InterlockError
-from tests.support.console.server import running, until
+from tests.support import running, until
 
 
 def test_a_dry_run_tells_how_far_it_is_and_can_be_cancelled(cell: Cell) -> None:

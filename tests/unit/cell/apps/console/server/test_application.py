@@ -9,7 +9,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from tests.support.console.server import Served, until
+from tests.support import until
+from tests.support.console.server import Served
 
 
 def test_names_that_are_too_long_are_refused_in_words(server: Served) -> None:
@@ -113,8 +114,8 @@ def test_a_stop_waits_for_nothing_that_is_under_way(server: Served) -> None:
 
 
 def test_two_hundred_connections_keep_nobody_out(server: Served) -> None:
-    idle = [socket.create_connection(("127.0.0.1", server.port)) for _ in range(200)]
-    try:
+    with ExitStack() as links:
+        idle = [links.enter_context(socket.create_connection(("127.0.0.1", server.port))) for _ in range(200)]
         begun = time.monotonic()
         before = server.stops
         assert server.do(do="stop").status == 200
@@ -123,9 +124,6 @@ def test_two_hundred_connections_keep_nobody_out(server: Served) -> None:
         # Those who say nothing are sent away.
         idle[0].settimeout(15.0)
         assert idle[0].recv(1) == b""
-    finally:
-        for link in idle:
-            link.close()
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import asyncio
 import json
 import socket
 import time
+from contextlib import ExitStack
 
 import pytest
 from websockets.exceptions import ConnectionClosed
@@ -73,28 +74,19 @@ def test_broken_frames_and_half_an_upgrade_hurt_nobody(server: Served) -> None:
 
 
 def test_more_pages_than_there_is_room_for_are_told_so(server: Served) -> None:
-    pages = []
-    try:
+    with ExitStack() as pages:
         for _ in range(16):
-            pages.append(server.live())
-            pages[-1].recv(timeout=10)
-        late = server.live()
-        pages.append(late)
+            pages.enter_context(server.live()).recv(timeout=10)
         with pytest.raises(ConnectionClosed) as closed:
-            late.recv(timeout=10)
+            pages.enter_context(server.live()).recv(timeout=10)
         assert closed.value.rcvd is not None and closed.value.rcvd.code == 1013
-    finally:
-        for page in pages:
-            page.close()
 
 
 def test_who_reads_slowly_sees_the_newest_and_holds_nobody_up(server: Served) -> None:
     """The state and pictures: the newest. The cloud: every increment, up to a bound."""
     big = "x" * 60_000
     # What it never reads would keep its close waiting.
-    slow = server.live(max_queue=1, close_timeout=0.1)
-    quick = server.live()
-    try:
+    with server.live(max_queue=1, close_timeout=0.1) as slow, server.live() as quick:
         for page in (slow, quick):
             page.recv(timeout=10)
         for n in range(150):
@@ -107,9 +99,6 @@ def test_who_reads_slowly_sees_the_newest_and_holds_nobody_up(server: Served) ->
         # What was on its way before it was slow, and then the newest: nothing old was kept for it.
         assert late[-1] == 149
         assert len(late) < len(seen)
-    finally:
-        slow.close()
-        quick.close()
 
 
 def _states(page: object, last: int) -> list[int]:

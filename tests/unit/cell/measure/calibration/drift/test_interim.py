@@ -57,36 +57,30 @@ def test_a_head_that_nobody_touched_is_as_uncertain_as_it_is_said(
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_shift_and_a_turn_are_found_and_told_by_how_much(
-    calibrated: tuple[ObservedCell, CellCalibration], axis: int
+    calibrated: tuple[ObservedCell, CellCalibration], axis: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cell, calibration = calibrated
     truth, mount = cell.truth, cell.truth.flange_from_scan
-    try:
-        cell.truth = replace(truth, flange_from_scan=shifted(0.3e-3 * np.eye(3)[axis]) @ mount)
-        found = look(cell, calibration, 2)
-        assert found.changed and found.looks == 2
-        expected = 0.3e-3 * np.eye(3)[axis]
-        assert np.abs(found.change[:3] - expected).max() < 4.0 * np.sqrt(np.diag(found.covariance))[:3].max()
-        turned = mount.copy()
-        turned[:3, :3] = rotation(1e-3 * np.eye(3)[axis]) @ mount[:3, :3]
-        cell.truth = replace(truth, flange_from_scan=turned)
-        found = look(cell, calibration, 2)
-        assert found.changed
-        assert found.change[3 + axis] == pytest.approx(1e-3, abs=4.0 * np.sqrt(found.covariance[3 + axis, 3 + axis]))
-    finally:
-        cell.truth = truth
+    expected = 0.3e-3 * np.eye(3)[axis]
+    monkeypatch.setattr(cell, "truth", replace(truth, flange_from_scan=shifted(expected) @ mount))
+    found = look(cell, calibration, 2)
+    assert found.changed and found.looks == 2
+    assert np.abs(found.change[:3] - expected).max() < 4.0 * np.sqrt(np.diag(found.covariance))[:3].max()
+    turned = mount.copy()
+    turned[:3, :3] = rotation(1e-3 * np.eye(3)[axis]) @ mount[:3, :3]
+    monkeypatch.setattr(cell, "truth", replace(truth, flange_from_scan=turned))
+    found = look(cell, calibration, 2)
+    assert found.changed
+    assert found.change[3 + axis] == pytest.approx(1e-3, abs=4.0 * np.sqrt(found.covariance[3 + axis, 3 + axis]))
 
 
 def test_a_board_that_was_bent_fits_badly_wherever_the_head_is(
-    calibrated: tuple[ObservedCell, CellCalibration],
+    calibrated: tuple[ObservedCell, CellCalibration], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cell, calibration = calibrated
-    try:
-        found = []
-        for cell.bend in (0.0, 0.2e-3):
-            found.append(look(cell, calibration, 1))
-    finally:
-        cell.bend = 0.0
+    found = [look(cell, calibration, 1)]
+    monkeypatch.setattr(cell, "bend", 0.2e-3)
+    found.append(look(cell, calibration, 1))
     assert [one.fits for one in found] == [True, False]
     assert 3.0 < found[1].dots < 5.5
 
