@@ -47,8 +47,7 @@ class Script:
     """`after` maps a step's name to what is called with its result before the next step begins; what it raises ends
     the run as if the step had raised it. `on_refusal` is called with the name of the step that was refused and the
     failure: it gives `Again`, or None to let the run end; after `most` decisions about one step the run ends without
-    asking. Both run with the cell at rest, for as long as they like.
-    """
+    asking. Both run with the cell at rest, for as long as they like."""
 
     after: Mapping[str, Callable[[object], None]] = field(default_factory=dict)
     on_refusal: Callable[[str, Failure], Again | None] | None = None

@@ -169,8 +169,7 @@ def verify(cell: OpenCell, run: Run[object], calibration: CellCalibration, job: 
 
 def time_stamps(cell: OpenCell, run: Run[object], calibration: CellCalibration, job: Job) -> CellCalibration:
     """Sweep to and fro over the fine board, recorded in `run`: `calibration`, stored with how late the scan camera's
-    time stamps come. `job` names the part that may be in the claw.
-    """
+    time stamps come. `job` names the part that may be in the claw."""
     tell = partial(_tell, run, "timing")
 
     def work(context: WorkContext) -> CellCalibration:

@@ -97,8 +97,7 @@ def jog(cell: Cell, wish: Jog, job: str | Path = "pot", observer: Observer | Non
 
 def moved(cell: Cell, wish: Jog, job: Job, context: WorkContext, begun: list[Begun] | None = None) -> dict[str, str]:
     """The same as part of a run that goes on. `begun` keeps where the arm began, for who does it again after a fault:
-    it then goes on to the same goal.
-    """
+    it then goes on to the same goal."""
     match wish.device:
         case "rail":
             return _jog_rail(cell, wish)

@@ -194,8 +194,7 @@ class RecordedWork:
 
     def _watched(self, work: Callable[[WorkContext], Made], journal: Journal, frames: FrameStore) -> Made:
         """Do it under the same watch as a job's step: a fault that a person may clear is asked about, then it is done
-        again from its beginning.
-        """
+        again from its beginning."""
         devices = self.devices
         safe_stop, stops, open_before = _SafeStop(devices), 0, devices.gate.is_open
 

@@ -49,8 +49,7 @@ class Safing:
 
     def confirm(self, just: float = 0.0) -> str:
         """Wait for an attempt, where none has failed within the last `just` s: what could not be confirmed, empty once
-        the arm itself has shown that it is safe.
-        """
+        the arm itself has shown that it is safe."""
         if not self._problem or time.monotonic() - self._ended > just:
             self.begin().join()
         return self._problem

@@ -121,8 +121,7 @@ class CameraModel:
 
     def _fold(self, farthest: float) -> float:
         """Squared distance from the axis, at unit distance, where the picture folds: what is farther out is seen
-        farther in. By the radial terms, infinite where they do not fold up to the squared distance `farthest`.
-        """
+        farther in. By the radial terms, infinite where they do not fold up to the squared distance `farthest`."""
         k1, k2, _, _, k3 = self.dist
         # With s the squared distance, the slope of the radius is 1 + 3 k1 s + 5 k2 s² + 7 k3 s³. Most lenses are far
         # from a fold, which costs less to see than to solve.

@@ -128,8 +128,7 @@ def scanned_gap(
     cloud: Cloud, pose: pin.SE3, nominal: NominalSurface, surface_from_part: pin.SE3, part: NominalSurface
 ) -> MatingGap | None:
     """The gap below the `part` at `surface_from_part`, of a surface that was scanned and lies at base_from_surface
-    `pose`. None where nothing scanned lies below the part.
-    """
+    `pose`. None where nothing scanned lies below the part."""
     lines, rows = np.nonzero(cloud.valid)
     local = (cloud.points[lines, rows] - pose.translation) @ pose.rotation
     return _gap(local, lines, nominal, surface_from_part, part)

@@ -38,8 +38,7 @@ def sorted_out(ways: Array, radius: float) -> list[Array]:
 
 def name(motion: Array, radius: float) -> str:
     """A motion (shift m, turn rad) in the surface frame in words, the line of a rotation by its point nearest to
-    the origin unless it passes there.
-    """
+    the origin unless it passes there."""
     shift, turn = motion[:3], motion[3:]
     angle = float(np.linalg.norm(turn))
     if angle * radius <= 0.2 * float(np.linalg.norm(shift)):
@@ -112,8 +111,7 @@ class Tolerance:
 @dataclass(frozen=True, eq=False)
 class SmallMotion:
     """A small motion of the surface: `shift` (3,) m of its origin and `turn` (3,) rad, in the surface frame, at three
-    standard deviations; `excess` is its size in units of the tolerance; `words` name it.
-    """
+    standard deviations; `excess` is its size in units of the tolerance; `words` name it."""
 
     shift: Array
     turn: Array

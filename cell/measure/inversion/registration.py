@@ -53,8 +53,7 @@ def candidates(
     level: pin.SE3, points: Array, nominal: NominalSurface, shift: float, turn: float, most: int
 ) -> list[pin.SE3]:
     """At most `most` poses base_from_surface, best first, within `shift` m across and `turn` rad about the mean normal
-    of `level`, at which many of `points` (n, 3), arm base, lie near the surface.
-    """
+    of `level`, at which many of `points` (n, 3), arm base, lie near the surface."""
     normal, sides = across(nominal)
     shift, turn = min(shift, MOST_SHIFT), min(turn, MOST_TURN)
     n_shift = int(np.ceil(shift / STEP))

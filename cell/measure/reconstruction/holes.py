@@ -93,8 +93,7 @@ def _cells(measured: NDArray[np.bool_], steps: tuple[float, float], largest: flo
 @compiled
 def _solve(normal: Array, right: Array) -> bool:
     """Solve a symmetric system, of which the lower triangle is given, into `right` by Cholesky's way; False when it is
-    not positive. Here because a compiled `np.linalg.solve` takes eight seconds to compile.
-    """
+    not positive. Here because a compiled `np.linalg.solve` takes eight seconds to compile."""
     size = len(normal)
     for a in range(size):
         for b in range(a + 1):

@@ -31,8 +31,7 @@ from statemachine.step import Step
 
 SHIFT_SHARE = 0.25
 """Share of the place's tolerance by which the unknown of its times may shift a sweep. Replies that are all late shift
-it to one side without any scatter; what else the place may be off by has the other three quarters.
-"""
+it to one side without any scatter; what else the place may be off by has the other three quarters."""
 
 UNCHECKED = (
     "whether the rail lost steps in the sweep is not seen: this make of rail, or its rail.reference_mode, does not "

@@ -10,7 +10,7 @@ from cell.config.job import Job
 from cell.measure.calibration import ScanCalibration
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
-from cell.measure.inversion.effects.part_at_rest import LEAST_M, PartOnGround
+from cell.measure.inversion.effects.between_sweeps import LEAST_M, PartOnGround
 from cell.measure.inversion.flush import flush_along_edge
 from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
@@ -108,7 +108,7 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
     place, belongs = here.job.place, here.job.place.surface_from_part.se3()
     faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
     over = pose.base_from_surface * surface_from_faces(here.job, faces)
-    lying = PartOnGround(faces, pose.base_from_surface * belongs, here.nominal, pose.base_from_surface)
+    lying = PartOnGround(faces, pose.base_from_surface * belongs, (here.nominal, pose.base_from_surface))
     cloud, record = swept_part(here, head_at(here, sweep), over, context, lying=lying)
     try:
         seen = find_part(

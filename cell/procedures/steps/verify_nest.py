@@ -10,7 +10,7 @@ import pinocchio as pin
 from cell.config.job import Job
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion import invert_pose as register
-from cell.measure.inversion.effects.part_at_rest import PartOnGround
+from cell.measure.inversion.effects.between_sweeps import PartOnGround
 from cell.measure.inversion.part_pose import DEMANDS, SHIFTED, PartPose, parted
 from cell.measure.reconstruction import Cloud
 from cell.procedures.part_error import part_points

@@ -16,8 +16,13 @@ import pinocchio as pin
 from cell.config.job import ScanSection
 from cell.measure.calibration import ScanCalibration
 from cell.measure.inversion import PlacePose
-from cell.measure.inversion.effects.between_sweeps import LEAST_MATCHED, Creep, SurfaceMotion, surface_motion
-from cell.measure.inversion.effects.part_at_rest import PartOnGround
+from cell.measure.inversion.effects.between_sweeps import (
+    LEAST_MATCHED,
+    Creep,
+    PartOnGround,
+    SurfaceMotion,
+    surface_motion,
+)
 from cell.measure.inversion.observability import Tolerance
 from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix

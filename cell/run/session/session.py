@@ -116,8 +116,7 @@ SIM_SPEED, ADDED_S = 3.0, 4.5e-3
 
 def kept_speed(added_s: float) -> float:
     """The pace of a simulated cell on a computer that takes `added_s` for those additions: a slow one would miss the
-    devices' deadlines, which are on the wall.
-    """
+    devices' deadlines, which are on the wall."""
     return max(1.0, min(SIM_SPEED, SIM_SPEED * ADDED_S / added_s // 0.25 * 0.25))
 
 

@@ -111,8 +111,7 @@ PARTS = {
 @cache
 def nominal(name: str, step: float = 0.0005) -> NominalSurface:
     """The nominal mesh of the part `name`, corners about `step` m apart, on the edges of the closed form where it has
-    any.
-    """
+    any."""
     part = PARTS[name]
     if part.round:
         x, y = _rings(0.0, 0.0, np.linspace(0.0, DISC, int(DISC / step) + 1), step)

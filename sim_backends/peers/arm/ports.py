@@ -233,8 +233,7 @@ def version_message(version: tuple[int, int, int, int]) -> bytes:
 
 def message(kind: str, words: str, time: float, line: int = 0, column: int = 0) -> bytes:
     """A message of the primary port: text, popup, started or stopped (a program by its name), failed, warning or
-    read-only; what failed has a place in its script.
-    """
+    read-only; what failed has a place in its script."""
     text = words.encode(errors="replace")
     if kind == "text":
         return _message(_TEXT, text, time)

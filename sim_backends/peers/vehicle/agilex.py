@@ -52,8 +52,7 @@ class AgilexPeer(CanPeer):
     def fault(self, name: str) -> None:
         """As `CanPeer`, and until `clear`: `can.refused_frames` is adapters that refuse every frame,
         `can.foreign_commands` somebody else who commands 0.2 m/s ahead, `can.second_vehicle` another vehicle that
-        stands and reports under the same identifiers.
-        """
+        stands and reports under the same identifiers."""
         if name == "can.refused_frames":
             self._bus.refusing = True
         elif name in (FOREIGN_COMMANDS, SECOND_VEHICLE):

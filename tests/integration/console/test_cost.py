@@ -31,8 +31,7 @@ def look():
             pass
 for _ in range(count):
     threading.Thread(target=look, daemon=True).start()
-sys.stdin.read()
-"""
+sys.stdin.read()"""
 """A program of its own that looks as so many pages do. Its input, which nobody else sees as they do its arguments, is
 a line of JSON: host, cookie, key, count."""
 

@@ -1,6 +1,5 @@
 """Pages that flood a console, in a process of their own: `python -m tests.support.console.flood HOST` with cookie and
-key of each on standard input, a line each. It prints what was said so far, ten times a second, until its input ends.
-"""
+key of each on standard input, a line each. It prints what was said so far, ten times a second, until its input ends."""
 
 from __future__ import annotations
 

@@ -22,8 +22,7 @@ class OtherVehicle:
     """Attributes change how it behaves: `lost` identifiers are not sent, `short` ones with a byte less; `mode`, `state`
     and `errors` are what 0x211 reports; `noisy` wavers at rest; `versions` is how it answers for its version. With
     `crowded` other nodes are on the bus: long identifiers of its own numbers that say it is fast, hot and in emergency
-    stop, remote requests, error frames, numbers that nobody knows; and the count in 0x211 jumps.
-    """
+    stop, remote requests, error frames, numbers that nobody knows; and the count in 0x211 jumps."""
 
     interface = "virtual"
 

@@ -24,40 +24,34 @@ from cell.devices import assembly
 from cell.config.cell_config import load_config
 from drivers.clock import Clock
 config = load_config(Path("sim.toml"))
-clock = Clock(config.cell.time_scale)
-"""
+clock = Clock(config.cell.time_scale)"""
 DRIVE = """
 vehicle = assembly.connect_one(config, "vehicle", clock)
 vehicle.enable()
 while True:
     vehicle.drive(0.3, 0.0)
-    clock.sleep(0.05)
-"""
+    clock.sleep(0.05)"""
 MOVE = """
 rail = assembly.connect_one(config, "rail", clock)
 rail.home().wait(60.0)
 rail.move_to(0.09, 0.01).wait(60.0)
-clock.sleep(1e6)
-"""
+clock.sleep(1e6)"""
 SEARCH = """
 rail = assembly.connect_one(config, "rail", clock)
 rail.home()
-clock.sleep(1e6)
-"""
+clock.sleep(1e6)"""
 LIT_ARM = """
 arm = assembly.connect_one(config, "arm", clock)
 laser = assembly.connect_one(config, "laser", clock, arm=arm)
 joints = arm.state().joints.copy()
 joints[0] += 2.0
 with laser.lit():
-    arm.move_joints(joints, 0.2, 1.0).wait(60.0)
-"""
+    arm.move_joints(joints, 0.2, 1.0).wait(60.0)"""
 LIT = """
 arm = assembly.connect_one(config, "arm", clock)
 laser = assembly.connect_one(config, "laser", clock, arm=arm)
 with laser.lit():
-    clock.sleep(1e6)
-"""
+    clock.sleep(1e6)"""
 ALL = """
 rail = assembly.connect_one(config, "rail", clock)
 vehicle = assembly.connect_one(config, "vehicle", clock)
@@ -72,8 +66,7 @@ with laser.lit():
     arm.move_joints(joints, 0.2, 1.0)
     while True:
         vehicle.drive(0.3, 0.0)
-        clock.sleep(0.05)
-"""
+        clock.sleep(0.05)"""
 FROZEN = {DRIVE: "vehicle.owner_frozen", MOVE: "rail.owner_frozen", LIT_ARM: "arm.owner_frozen"}
 """The fault that the process is told once it runs again."""
 Truth = dict[str, Any]

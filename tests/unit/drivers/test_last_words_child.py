@@ -27,8 +27,7 @@ before = os.sched_getscheduler(0)
 thread = threading.Thread(target=spin)
 thread.start()
 thread.join()
-print(before == os.SCHED_RR, os.sched_getscheduler(0) == os.SCHED_OTHER)
-"""
+print(before == os.SCHED_RR, os.sched_getscheduler(0) == os.SCHED_OTHER)"""
 
 
 def test_what_spins_in_real_time_loses_the_right_to_it() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -72,10 +71,12 @@ def commission(
         return
     if again:
         made.progress.forget([check.name for check in checks])
-    with closing(made.desk):
+    try:
         good = made.go(checks)
         protocol = write_protocol(made.progress, CHECKS, made.desk.config)
         now = made.desk.config
+    finally:
+        made.desk.close()
     if json:
         rows = {
             check.name: {"standing": made.progress.standing(check, now), **(made.progress.result(check.name) or {})}
@@ -83,12 +84,16 @@ def commission(
         }
         print_json({"good": good, "mended": made.progress.mended, "checks": rows, "protocol": str(protocol)})
     else:
-        for entry in made.progress.mended:
-            text = f"{entry['name']}: {entry['what']}; configured {entry['told']}, measured {entry['found']}"
-            console.print(f"found and mended: {text}", style="yellow", markup=False)
+        _print_mended(made, console)
         console.print(f"protocol: {protocol}", markup=False)
     if not good:
         raise typer.Exit(1)
+
+
+def _print_mended(made: Commissioning, console: Console) -> None:
+    for entry in made.progress.mended:
+        text = f"{entry['name']}: {entry['what']}; configured {entry['told']}, measured {entry['found']}"
+        console.print(f"found and mended: {text}", style="yellow", markup=False)
 
 
 def _person(simulated: bool, console: Console) -> Person:

@@ -37,8 +37,7 @@ SHOWN = re.compile(r"/api/runs/[^/]+/(pictures/[^/]+|report\.html)")
 """What a browser asks for by its address alone: there a ticket stands for the key."""
 ENTERED = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Assembly cell</title>
 <link rel="icon" href="/static/icon.svg" type="image/svg+xml">
-<meta http-equiv="refresh" content="0;url=/#key={key}"><a href="/#key={key}">To the cell</a></html>
-"""
+<meta http-equiv="refresh" content="0;url=/#key={key}"><a href="/#key={key}">To the cell</a></html>"""
 LOST = "open the link that `cell console` printed in its terminal; it works once, for one tab of the browser"
 PAGE = Path(__file__).parents[1] / "page"
 ENTER = "/enter"

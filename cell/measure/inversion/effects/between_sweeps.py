@@ -9,7 +9,7 @@ A vehicle, floor or arm that creeps: its rate from two sweeps of one strip, take
 
 An arm that has not moved between two sweeps sees the surface in one place, or something moves: vehicle, floor, table,
 or the arm itself. The rate is taken as even; half of it is counted as unknown, as it may not be
-(docs/explanation/theory.md, section 8)."""
+(docs/explanation/theory.md, section 8). A placed part may still move while what is beside it does not."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from cell.measure.geometry.poses import perturbed
 from cell.measure.inversion.nominal import Array, NominalSurface, Scan, correspondences
 from cell.measure.inversion.observability import Tolerance, name, sorted_out
+from cell.measure.inversion.part_pose import parted
 from cell.measure.inversion.place_pose import PlacePose
 from cell.measure.reconstruction.cloud import Cloud, Indices, Motions
 
@@ -276,3 +277,54 @@ class Creep:
             "or surface. Its place is carried on to the time of placing, and the stated uncertainty allows for it; "
             "see what the vehicle stands on"
         )
+
+
+LEAST_POINTS = 500
+"""Of a part or of the ground, in a sweep that tells of them."""
+LEAST_M = 15e-6
+"""A part whose points move by less than this between two sweeps, on average, counts as at rest."""
+
+
+@dataclass(frozen=True, eq=False)
+class PartOnGround:
+    """A part with these `faces`, about where it lies (`base_from_part`), and the `ground` beside it, with
+    base_from_ground; None for a part that lies in a nest. What moves arm or vehicle moves both alike."""
+
+    faces: NominalSurface
+    base_from_part: pin.SE3
+    ground: tuple[NominalSurface, pin.SE3] | None = None
+
+    def moved(self, first: Cloud, second: Cloud, unsure: Array) -> float | None:
+        """How far, m, the part's points moved on average between two clouds, arm base; None where it lies still, or
+        the first one does not show it, and `GATE_M` for one that is not near any more.
+
+        `unsure` (6, 6), base axes, is by how much the clouds may lie apart for another reason: times, the arm. Ground
+        beside the part tells it better.
+        """
+        here = self.base_from_part
+        (before, around), (now, around_now) = (parted(cloud, self.faces, here) for cloud in (first, second))
+        if before.size < LEAST_POINTS:
+            return None
+        part = surface_motion(before, now, self.faces, here, (_nothing, _nothing))
+        if part.matched < LEAST_MATCHED:
+            return GATE_M
+        motion = part.motion
+        if self.ground is not None and around.size >= LEAST_POINTS:
+            surface, there = self.ground
+            ground = surface_motion(around, around_now, surface, there, (_nothing, _nothing))
+            # Where the ground tells nothing, what is known beforehand stands.
+            told = unsure @ np.linalg.inv(unsure + ground.scatter)
+            carried = np.eye(6)
+            carried[:3, 3:] = -pin.skew(here.translation - there.translation)
+            motion = motion - carried @ told @ ground.motion
+            unsure = carried @ (unsure - told @ unsure) @ carried.T
+        if motion @ np.linalg.solve(part.scatter + FLOOR + unsure, motion) < CREEP_EVIDENCE:
+            return None
+        points = self.faces.vertices @ here.rotation.T
+        far = float(np.linalg.norm(motion[:3] + np.cross(motion[3:], points), axis=1).mean())
+        return far if far > LEAST_M else None
+
+
+def _nothing(lines: Indices, rows: Indices) -> Array:
+    """The poses move no point: what they are off by moves part and ground alike."""
+    return np.zeros((len(lines), 3, 0))

@@ -120,8 +120,7 @@ class Struct:
 
 def own(value: Value) -> tuple[Value, int]:
     """A copy of a list or struct, anything else as it is, and how many values that are: an assignment or a call gives
-    a variable a value of its own. `ValueError` for one that is too large.
-    """
+    a variable a value of its own. `ValueError` for one that is too large."""
     return _copied(value, 0)
 
 

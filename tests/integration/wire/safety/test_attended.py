@@ -55,8 +55,7 @@ for line in sys.stdin:
         arm.stop()
         rail.stop()
         clock.sleep(0.1)
-        print(*(motion.done for motion in motions), int(rail.state().homed), flush=True)
-"""
+        print(*(motion.done for motion in motions), int(rail.state().homed), flush=True)"""
 
 
 class Bench:

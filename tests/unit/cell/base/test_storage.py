@@ -23,8 +23,7 @@ resource.setrlimit(resource.RLIMIT_FSIZE, (5000, 5000))
 try:
     write_json(Path(sys.argv[1]), {"long": "x" * 10_000})
 except OSError as error:
-    print(error.errno)
-"""
+    print(error.errno)"""
 
 
 def test_a_disk_that_takes_no_more_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
@@ -84,8 +83,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from cell.apps.cli.commands.run import _perform
 from cell.run.job_run import RunOutcome
-_perform(lambda: nullcontext(), lambda cell, display: RunOutcome("placed", "", Path("r1"), {"x": 1}), True, False)
-"""
+_perform(lambda: nullcontext(), lambda cell, display: RunOutcome("placed", "", Path("r1"), {"x": 1}), True, False)"""
 
 
 def test_a_run_whose_output_nobody_reads_says_how_it_ended(tmp_path: Path) -> None:

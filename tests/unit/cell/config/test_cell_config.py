@@ -32,8 +32,7 @@ POST = """
 [[obstacle]]
 name = "post"
 base_from_centre = { translation = ["%d mm", "%d mm", "300 mm"], rotation = ["0 deg", "0 deg", "0 deg"] }
-size = ["60 mm", "60 mm", "700 mm"]
-"""
+size = ["60 mm", "60 mm", "700 mm"]"""
 CORNERS = np.array([[x, y, z] for x in (-0.125, 0.115) for y in (-0.11, 0.08) for z in (-0.03, 0.145)])
 """Around claw, scan head and target camera, in the flange frame, m."""
 TIPS = np.array([

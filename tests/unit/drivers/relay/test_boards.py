@@ -220,8 +220,7 @@ from drivers.relay.boards import BoardLaser
 laser = BoardLaser(open_board("laser", "laser", sys.argv[1], sys.argv[2], baud=9600), 2)
 with laser.lit():
     print("lit", flush=True)
-    time.sleep(60)
-"""
+    time.sleep(60)"""
 
 
 @pytest.mark.parametrize("make", ["numato", "lcus"])

@@ -14,8 +14,7 @@ from cell.base.compiled import load
 from cell.measure.inversion.nominal import closest
 load()
 print(fill_background.stats.cache_path)
-print(closest.stats.cache_path)
-"""
+print(closest.stats.cache_path)"""
 
 
 def folders(**environment: str) -> list[str]:

@@ -122,8 +122,7 @@ def _measure(
     k: int | np.intp,
 ) -> bool:  # fmt: skip
     """Start values of the peak at `place` in line `r` into start[r, k]; False when it does not stand `least_peak` above
-    both its sides. Without views of the arrays, whose bookkeeping would cost as much as the sums.
-    """
+    both its sides. Without views of the arrays, whose bookkeeping would cost as much as the sums."""
     n = image.shape[1]
     # A wide saturated core pushes the search window out, so that its ends still see the background.
     core_low, core_high = place, place

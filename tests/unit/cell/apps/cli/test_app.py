@@ -22,8 +22,7 @@ heavy = {"numpy", "cv2", "pinocchio", "scipy", "numba", "transitions"}
 atexit.register(lambda: print("loaded:", *sorted(heavy & set(sys.modules))))
 sys.argv = ["cell", *sys.argv[1:]]
 from cell.apps.cli import main
-main()
-"""
+main()"""
     run = tmp_path / "runs" / "20260101T000000-abcd"
     run.mkdir(parents=True)
     (run / "report.json").write_text('{"outcome": "placed", "simulated": ["rail"], "wall_s": 61.0}')

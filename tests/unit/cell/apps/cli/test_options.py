@@ -18,8 +18,7 @@ ASK = """
 source <(cell --show-completion bash)
 offered() { COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=(); _cell_completion cell; echo "${COMPREPLY[*]}"; }
 offered cell report ""
-offered cell dry-run --inject arm.p
-"""
+offered cell dry-run --inject arm.p"""
 
 
 @pytest.mark.skipif(not Path("/bin/bash").exists(), reason="there is no bash here")

@@ -82,8 +82,7 @@ def said(text, err=False):
 typer.echo = said
 sys.argv = ["cell", "dry-run"]
 from cell.apps.cli import main
-main()
-"""
+main()"""
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.stdout.splitlines()[0] == "dry run of pot in the simulated world 1: loading True"
 

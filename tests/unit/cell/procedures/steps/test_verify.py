@@ -266,9 +266,7 @@ def creeps(cell: VirtualCell, rate: pin.SE3, until: float = math.inf) -> None:
 def test_a_part_that_does_not_come_to_rest_is_misplaced(placed_pot: JobRecord, tmp_path: Path, rate: pin.SE3) -> None:
     """At first each lies within its tolerances, and one sweep says no more."""
     site = LyingPart(placed_pot, tmp_path, changed=lambda cell: creeps(cell, rate))
-    with pytest.raises(
-        MisplacedError, match=r"does not lie still: in the last of 3 looks it moved by"
-    ) as met:
+    with pytest.raises(MisplacedError, match=r"does not lie still: in the last of 3 looks it moved by") as met:
         site.looked(moved())
     assert not met.value.numbers[0].kept
     assert sum("swept again: it moved by" in note for note in site.notes) == 2

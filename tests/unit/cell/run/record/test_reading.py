@@ -122,8 +122,7 @@ for k in range(10_000):
     out.put("/sequence/event", k, lambda: b"{}")
     time.sleep(0.01)
     if k == 1:
-        print("on", flush=True)
-"""
+        print("on", flush=True)"""
 
 
 def test_a_process_that_is_killed_leaves_all_but_its_last_seconds(tmp_path: Path) -> None:

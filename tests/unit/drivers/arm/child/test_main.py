@@ -39,8 +39,7 @@ joints = arm.state().joints
 joints[0] += 2.0
 arm.move_joints(joints, 0.5, 2.0)
 print(json.dumps({"child": arm._session.link.pid}), flush=True)
-threading.Event().wait(60)
-"""
+threading.Event().wait(60)"""
 
 
 @pytest.mark.parametrize("way", [signal.SIGKILL, signal.SIGTERM])

@@ -138,8 +138,7 @@ rail = ModbusRail("rail", record, clock=Clock(5.0))
 rail.home().wait(60)
 motion = rail.move_to(0.09, 0.002)
 print("moves", flush=True)
-motion.wait(600)
-"""
+motion.wait(600)"""
 
 
 def test_the_rail_stands_when_its_owner_is_killed() -> None:

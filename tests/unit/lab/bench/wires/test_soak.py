@@ -39,8 +39,7 @@ sys.stdin.readline()
 threading.Thread(target=threading.Event().wait, daemon=True).start()
 opened = open(os.devnull, "rb")
 print("grown", flush=True)
-sys.stdin.readline()
-"""
+sys.stdin.readline()"""
 
 
 def test_a_thread_and_a_handle_more_are_counted() -> None:

@@ -61,8 +61,7 @@ def sweeps(
     jitter: float = 0.25e-3, bound: float = 0.25e-3,
 ) -> list[TimedSweep]:  # fmt: skip
     """Sixteen of them, as the cell makes them, of clocks that are known to ±`bound` s; each sweep's are off by anything
-    up to ±`jitter` s.
-    """
+    up to ±`jitter` s."""
     rng = np.random.default_rng(seed)
     corners = BOARD.points()
     made = []

@@ -32,8 +32,7 @@ def test_threads_share_globals_take_turns_and_are_joined_and_killed(controller: 
   sleep(0.1)
   textmsg(seen == count)
   textmsg(seen > 55 and seen < 65)
-end
-"""
+end"""
     )
     controller.cycles(200)
     assert controller.said() == ["brief ends", "joined", "True", "True"]

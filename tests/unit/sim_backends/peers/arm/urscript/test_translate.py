@@ -53,8 +53,7 @@ def test_functions_loops_branches_and_scopes(controller: Controller) -> None:
   end
   halt
   textmsg("never")
-end
-"""
+end"""
     )
     assert controller.said() == ["6", "-1", "outer 6", "[1, 2]", "six", "a line that goes on"]
     assert controller.failed() == []
