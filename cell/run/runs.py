@@ -15,8 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
-import numpy as np
-
+from cell.base.storage import strict
 from cell.run.events import Detached, Subscription
 from drivers.errors import Aborted, DeadlineError, InterlockError
 from statemachine.control import RunControl
@@ -135,7 +134,7 @@ class Run(Generic[Result]):
     def tell(self, event: Event) -> None:
         """The run's work says what happens; nobody who listens can hold it up."""
         if event.kind != "progress":
-            log.info("%s %s %s", event.step or self.kind, event.kind, json.dumps(dict(event.data), default=_plain))
+            log.info("%s %s %s", event.step or self.kind, event.kind, json.dumps(strict(event.data)))
         if (record := self.record) is not None:
             record(event)
         with self._telling:
@@ -166,11 +165,6 @@ class Run(Generic[Result]):
                 self._observer.close()
                 if self._observer.failure is not None:
                     log.warning("an observer of the run failed and was told nothing more: %s", self._observer.failure)
-
-
-def _plain(value: object) -> object:
-    """Numbers of numpy as plain ones, all else in words."""
-    return value.item() if isinstance(value, np.generic) else str(value)
 
 
 CLOSE_WAIT_S = 20.0

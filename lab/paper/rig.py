@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pinocchio as pin
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from cell.measure.calibration import ScanCalibration, ScanObservation
@@ -18,7 +18,7 @@ from cell.measure.calibration.solve.joint import solve_joint, solve_staged
 from cell.measure.calibration.solve.results import KEPT, Quality
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.geometry.poses import from_axes, from_parts, perturbed
+from cell.measure.geometry.poses import from_parts, perturbed
 from cell.measure.reconstruction import ScanGeometry
 from cell.measure.vision import BoardView, parse_board
 from cell.measure.vision.board.view import centre_of
@@ -29,8 +29,17 @@ from sim_backends.optics.laser.sheet import lit
 from sim_backends.optics.laser.stripe import crossings
 from sim_backends.world.levels import deviations
 
-Array = NDArray[np.float64]
 
+def from_axes(translation: ArrayLike, x: ArrayLike, z: ArrayLike) -> pin.SE3:
+    """Pose whose x and z axes are given in the outer frame; they must be perpendicular. Translation in m."""
+    xs, zs = np.asarray(x, dtype=np.float64), np.asarray(z, dtype=np.float64)
+    xs, zs = xs / np.linalg.norm(xs), zs / np.linalg.norm(zs)
+    if abs(xs @ zs) > 1e-6:
+        raise ValueError(f"axes must be perpendicular; x·z is {xs @ zs:.3g}")
+    return from_parts(translation, np.column_stack([xs, np.cross(zs, xs), zs]))
+
+
+Array = NDArray[np.float64]
 NOMINAL_MOUNT = from_axes((0.09, -0.05, 0.08), x=(0, 1, 0), z=(0, 0, 1))
 RIM = 64
 """Points on the rim of a dot from which its image's centre is found."""

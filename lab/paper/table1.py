@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.measure.geometry.poses import from_axes, perturbed, transform
+from cell.measure.geometry.poses import perturbed, transform
 from cell.measure.reconstruction import Cloud, ScanGeometry
 from lab.bench.over_cores import Progress, run_all
 from lab.bench.reconstruction.scenes import swept
@@ -26,6 +26,7 @@ from lab.paper.rig import (
     arm_error,
     draw_head,
     expected_length,
+    from_axes,
     in_scan_frame,
     observe,
     point_covariances,

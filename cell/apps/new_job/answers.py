@@ -11,7 +11,7 @@ import pinocchio as pin
 
 from cell.apps.new_job.mesh_file import Drawn, MeshBody
 from cell.apps.new_job.questions import Asker, checked, choice, pose, pose_words, three
-from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, overlapping, raised, turned_over
+from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, overlapping, raised
 from cell.apps.new_job.text import METRES, deg, mm, possible_units, size_words, told_by_size
 from cell.config.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
 from cell.measure.geometry.poses import from_parts
@@ -53,7 +53,7 @@ def laid_mesh(asker: Asker, drawn: Drawn) -> tuple[Laid, str]:
     if faces_down(laid):
         words = "More of the mesh faces down than up: turn its triangles round (yes), or else turn it over with --up"
         if asker.get("flip", words, None, choice("yes", "no")) == "yes":
-            laid = turned_over(laid)
+            laid = replace(laid, faces=laid.faces[:, ::-1].copy())
             asker.tell("triangles: all turned round")
     return centred(laid), unit
 

@@ -158,11 +158,6 @@ def faces_down(laid: Laid) -> bool:
     return bool(up.sum() < -0.01 * np.abs(up).sum())
 
 
-def turned_over(laid: Laid) -> Laid:
-    """The same triangles, facing the other way."""
-    return replace(laid, faces=laid.faces[:, ::-1].copy())
-
-
 def raised(laid: Laid, height: float) -> Laid:
     """The same mesh with its origin `height` m lower, the table where it is."""
     up = from_parts((0.0, 0.0, height))

@@ -250,7 +250,9 @@ def _scatter(chain: CalibrationChain) -> tuple[float, float]:
 
 def pictures_figures(found: Intrinsics) -> form.Figures:
     """A camera from pictures alone, px."""
-    figures = form.camera_figures(found.camera, found.sigma, found.point_rms_px, found.held_out_px, found.model.name)
+    figures = form.camera_figures(
+        found.camera, found.sigma, math.sqrt(2.0) * found.rms_px, found.held_out_px, found.model.name
+    )
     return figures | {"method": "pictures alone"}
 
 

@@ -56,15 +56,6 @@ def from_parts(translation: ArrayLike, rotation: ArrayLike | None = None) -> pin
     return pin.SE3(r, np.asarray(translation, dtype=np.float64).copy())
 
 
-def from_axes(translation: ArrayLike, x: ArrayLike, z: ArrayLike) -> pin.SE3:
-    """Pose whose x and z axes are given in the outer frame; they must be perpendicular. Translation in m."""
-    xs, zs = np.asarray(x, dtype=np.float64), np.asarray(z, dtype=np.float64)
-    xs, zs = xs / np.linalg.norm(xs), zs / np.linalg.norm(zs)
-    if abs(xs @ zs) > 1e-6:
-        raise ValueError(f"axes must be perpendicular; x·z is {xs @ zs:.3g}")
-    return from_parts(translation, np.column_stack([xs, np.cross(zs, xs), zs]))
-
-
 def from_ur(vector: ArrayLike) -> pin.SE3:
     """Pose of the arm controller's six numbers: x, y, z in m and a rotation vector in rad."""
     v = np.asarray(vector, dtype=np.float64)

@@ -17,13 +17,13 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from cell.measure.geometry.poses import from_axes, from_parts
+from cell.measure.geometry.poses import from_parts
 from cell.measure.reconstruction import Cloud, ScanGeometry
 from cell.measure.vision import StripeStream
 from drivers.errors import RefusedError
 from lab.bench.calibration.world import Noise
 from lab.bench.reconstruction.scenes import swept
-from lab.paper.rig import RigSpec, TrueHead, draw_head, in_scan_frame, observe, solve
+from lab.paper.rig import RigSpec, TrueHead, draw_head, from_axes, in_scan_frame, observe, solve
 from sim_backends.optics import Mesh, MeshInstance, PlaneInstance, SceneObject, render
 from sim_backends.world.levels import deviations
 

@@ -91,11 +91,6 @@ class Intrinsics:
     bend: Bend | None = None
     pull: Array = field(default_factory=lambda: np.zeros(0))
 
-    @property
-    def point_rms_px(self) -> float:
-        """RMS distance of a point in px, OpenCV's figure: √2 times that per component."""
-        return float(np.sqrt(2) * self.rms_px)
-
 
 @dataclass(frozen=True, eq=False)
 class _LensFit:

@@ -13,11 +13,12 @@ from cell.measure.calibration import Priors, ScanObservation, TargetCalibration,
 from cell.measure.calibration.solve.results import PARAMETERS, ScanCalibration, adjust_scan, adjust_target
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.geometry.poses import difference, from_axes, from_parts, perturbed
+from cell.measure.geometry.poses import difference, from_parts, perturbed
 from cell.measure.vision import BoardView, parse_board
 from cell.measure.vision.board.view import centre_of
 from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
+from lab.paper.rig import from_axes
 
 BOARD = parse_board("marked_dots:11x9:3mm")
 CAMERA = CameraModel(640, 480, 1675.0, 1668.0, 324.0, 236.0, (-0.09, 0.12, 8e-4, -6e-4, 0.0))
