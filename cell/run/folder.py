@@ -167,15 +167,11 @@ def read_report(folder: Path) -> dict[str, Any]:
             f"{path} cannot be read ({error}): it was cut off or is none of ours; what else is left of the run lies "
             "beside it"
         ) from error
-    if not isinstance(report.get("outcome"), str) or not all(
-        _rows(report.get(key)) for key in ("steps", "measured", "faults")
-    ):  # fmt: skip
+    tables = [table for key in ("steps", "measured", "faults") if (table := report.get(key)) is not None]
+    rows = all(isinstance(table, list) and all(isinstance(row, dict) for row in table) for table in tables)
+    if not rows or not isinstance(report.get("outcome"), str):
         raise CellError(f"{path} is not the report of a run: it does not tell an outcome, or not as a report does")
     return report
-
-
-def _rows(value: object) -> bool:
-    return value is None or (isinstance(value, list) and all(isinstance(row, dict) for row in value))
 
 
 def _from_journal(folder: Path) -> dict[str, Any]:

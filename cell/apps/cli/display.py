@@ -93,7 +93,8 @@ def next_step(report: Mapping[str, object], folder: Path) -> str | None:
         case "refused" if report.get("code") == "CalibrationStale":
             return f"cell calibrate{where}, then {again} -j {_job(report)}"
         case "refused":
-            return f"{_why(folder)}put that right, then {again} -j {_job(report)}"
+            why = "picture.png beside it shows why; " * (folder / "picture.png").is_file()
+            return f"{why}put that right, then {again} -j {_job(report)}"
         case "faulted" | "aborted":
             return f"{see if outcome == 'faulted' else ''}cell resume {name}{where}: go on with the job"
     return f"cell abort {name}{where}, if it is still going on; cell resume {name}{where}, if its process died"
@@ -104,10 +105,6 @@ def _where(folder: Path) -> str:
     config = folder.parent.parent / "cell.toml"
     here = folder.parent.resolve() == Path("runs").resolve() or not config.is_file()
     return "" if here else f" -c {shlex.quote(_from_here(config))}"
-
-
-def _why(folder: Path) -> str:
-    return "picture.png beside it shows why; " if (folder / "picture.png").is_file() else ""
 
 
 def _dry_run(report: Mapping[str, object]) -> str:

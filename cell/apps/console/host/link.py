@@ -15,9 +15,8 @@ import threading
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +34,7 @@ MOST_STOPS = 2
 """So many are carried out at a time: one that lasts, and one more."""
 
 
-@dataclass(frozen=True)
-class ServerSetup:
+class ServerSetup(NamedTuple):
     """How the server works; the first that it is told. `fd` is the socket that is bound for it already.
 
     `lasting` is the token of a file; `cert` and `key` are files for TLS. `cell` is what `/api/cell` answers.
@@ -58,29 +56,25 @@ class ServerSetup:
 # --- server to cell ---
 
 
-@dataclass(frozen=True)
-class Ready:
+class Ready(NamedTuple):
     """The server answers; `token` opens it once."""
 
     token: str | None
 
 
-@dataclass(frozen=True)
-class Joined:
+class Joined(NamedTuple):
     """A page was opened."""
 
     client: str
 
 
-@dataclass(frozen=True)
-class Left:
+class Left(NamedTuple):
     """A page is gone."""
 
     client: str
 
 
-@dataclass(frozen=True)
-class Do:
+class Do(NamedTuple):
     """A page asks for something; answered by `Answer` of the same number."""
 
     number: int
@@ -88,16 +82,14 @@ class Do:
     words: Mapping[str, object]
 
 
-@dataclass(frozen=True)
-class AskCell:
+class AskCell(NamedTuple):
     """What is `/api/cell` with this job's station? Answered by `Answer`."""
 
     number: int
     job: str
 
 
-@dataclass(frozen=True)
-class Beat:
+class Beat(NamedTuple):
     """A button is held; with `end` it is not any more."""
 
     client: str
@@ -108,8 +100,7 @@ class Beat:
 # --- cell to server ---
 
 
-@dataclass(frozen=True)
-class Answer:
+class Answer(NamedTuple):
     """To `Do` or `AskCell`: HTTP status and JSON."""
 
     number: int
@@ -117,38 +108,33 @@ class Answer:
     words: Mapping[str, object]
 
 
-@dataclass(frozen=True)
-class Say:
+class Say(NamedTuple):
     """To one page."""
 
     client: str
     words: Mapping[str, object]
 
 
-@dataclass(frozen=True)
-class Show:
+class Show(NamedTuple):
     """The state, as JSON; newest only."""
 
     state: str
 
 
-@dataclass(frozen=True)
-class Happened:
+class Happened(NamedTuple):
     """Something for every page's list, as JSON."""
 
     event: str
 
 
-@dataclass(frozen=True)
-class ShownPicture:
+class ShownPicture(NamedTuple):
     """A grey picture that is to be compressed and shown."""
 
     header: Mapping[str, Any]
     image: NDArray[np.uint8]
 
 
-@dataclass(frozen=True)
-class CloudPart:
+class CloudPart(NamedTuple):
     """An increment of the cloud."""
 
     header: Mapping[str, object]
@@ -158,15 +144,13 @@ class CloudPart:
 # --- on the other pipe ---
 
 
-@dataclass(frozen=True)
-class StopCell:
+class StopCell(NamedTuple):
     """Stop the cell; answered by `Stopped` of the same number."""
 
     number: int
 
 
-@dataclass(frozen=True)
-class Stopped:
+class Stopped(NamedTuple):
     """It was stopped; `trouble` is what could not be confirmed."""
 
     number: int

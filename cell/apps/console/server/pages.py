@@ -55,18 +55,16 @@ class Mailbox:
         """Something for the list; who is slow misses the oldest."""
         self._put(self._events, item)
 
-    def cloud(self, item: str | bytes) -> None:
-        """An increment of the cloud."""
+    def cloud(self, item: str | bytes, anew: bool = False) -> None:
+        """An increment of the cloud, in place of what waits of it if `anew`."""
+        if anew:
+            self._clouds.clear()
         self._put(self._clouds, item)
 
     def show(self, what: str, item: str | bytes) -> None:
         """The newest of its kind, in place of one that was not sent yet."""
         self._newest[what] = item
         self._news.set()
-
-    def clear_cloud(self) -> None:
-        """What waits of the cloud is not wanted any more."""
-        self._clouds.clear()
 
     async def take(self) -> str | bytes:
         """The next to send; waits for it."""
@@ -138,9 +136,7 @@ class Pages:
         if sum(map(len, self._cloud)) + len(packed) <= MOST_CLOUD_BYTES:
             self._cloud.append(packed)
         for mailbox in self.mailboxes:
-            if header.get("reset"):
-                mailbox.clear_cloud()
-            mailbox.cloud(packed)
+            mailbox.cloud(packed, bool(header.get("reset")))
 
     async def serve(self, socket: WebSocket, ticket: str) -> None:
         """One page's live link, until it is closed; `ticket` is its session's."""
