@@ -80,7 +80,7 @@ _KEEP = 64
 WALL_FLOOR_S = 0.5
 
 
-def patience(clock: Clock, seconds: float) -> float:
+def timeout_of(clock: Clock, seconds: float) -> float:
     """`seconds` of the clock, or half a second of the wall where that is longer."""
     return max(seconds, WALL_FLOOR_S * clock.rate)
 

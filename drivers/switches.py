@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from drivers.clock import Clock, patience
+from drivers.clock import Clock, timeout_of
 from drivers.errors import DeviceFault, InterlockError, in_the_end
 from drivers.interfaces import Identity, LinkStatistics
 
@@ -152,7 +152,7 @@ class ConfirmedClaw(ABC):
             )
 
     def _feedback_becomes(self, value: bool, timeout: float) -> bool:
-        deadline = self._clock.now() + patience(self._clock, timeout)
+        deadline = self._clock.now() + timeout_of(self._clock, timeout)
         while self.holding != value:
             if self._clock.now() >= deadline:
                 return False

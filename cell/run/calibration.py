@@ -29,7 +29,7 @@ from cell.measure.calibration.drift.timing import TimesRefused
 from cell.motion.kinematics import kinematics_name
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.boards import collect_scan, collect_target
-from cell.procedures.calibrate.reference_plate import look_at_witness, with_edge
+from cell.procedures.calibrate.reference_plate import see_reference_plate, with_edge
 from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
 from cell.procedures.calibrate.verification import Verification, collect_verification, keep_confirmed
 from cell.run.folder import REPORT, new_run, release, run_log, when
@@ -97,7 +97,7 @@ def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibrat
         devices.vehicle.recover()
         given = config, devices, mover, context.check
         scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), context.keep)
-        witness = look_at_witness(config, devices, context.keep)
+        witness = see_reference_plate(config, devices, context.keep)
         target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), context.keep)
         tell(0.96, "solving")
         observations = gathered(

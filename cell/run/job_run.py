@@ -190,7 +190,7 @@ class JobRun:
         if open_before and result.outcome in (Outcome.PLACED, Outcome.DONE):
             self._open_again()
         if result.outcome is not Outcome.PLACED:
-            result = replace(result, reason=here.part.told(result.reason))
+            result = replace(result, reason=here.part.explain(result.reason))
         elif self.ready.job.part is not None:
             result = replace(result, reason=seen_words(result))
         finished = FinishedJob(

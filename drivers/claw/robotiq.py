@@ -18,7 +18,7 @@ import time
 from collections.abc import Mapping
 
 from drivers.claw.make import RobotiqClawConfig
-from drivers.clock import Clock, patience
+from drivers.clock import Clock, timeout_of
 from drivers.errors import UNTOLD, DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import Identity, LinkStatistics, Reading
 from drivers.ports import forget_unasked
@@ -274,7 +274,7 @@ class RobotiqClaw:
         grip = self._grip
         self._link.set({"POS": position, "SPE": grip.speed, "FOR": grip.force, "GTO": 1})
         now = self._clock.now()
-        until, since = now + patience(self._clock, timeout), now
+        until, since = now + timeout_of(self._clock, timeout), now
         before = (MOVING, -1)
         while True:
             taken = self._link.get("PRE") == position

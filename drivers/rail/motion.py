@@ -12,7 +12,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 
-from drivers.clock import Clock, patience
+from drivers.clock import Clock, timeout_of
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, NotConnectedError, shown
 
 SWEEP_MARGIN_M = 0.5e-3
@@ -96,7 +96,7 @@ class RailMotion:
         self._clock = clock
         self._arrived = arrived
         self._halt = halt
-        self._limit = clock.now() + patience(clock, 2.0 * duration + 2.0)
+        self._limit = clock.now() + timeout_of(clock, 2.0 * duration + 2.0)
         self._duration = duration
         self._least = least
         self._begun = clock.now()
@@ -117,7 +117,7 @@ class RailMotion:
 
     def wait(self, timeout: float) -> None:
         """Block until the motion has arrived; see `drivers.interfaces.Motion`."""
-        if not self._clock.wait(self._ended, patience(self._clock, timeout)):
+        if not self._clock.wait(self._ended, timeout_of(self._clock, timeout)):
             self._halt()
             raise DeadlineError(
                 self._name,
@@ -245,7 +245,7 @@ class CarriageWatch:
         if self._length is None:
             return
         detected = stalled()
-        if detected or now - self._moved > patience(self._clock, SEARCH_STANDSTILL_S if self._began else BEGINS_S):
+        if detected or now - self._moved > timeout_of(self._clock, SEARCH_STANDSTILL_S if self._began else BEGINS_S):
             raise DeviceFault(
                 self._name,
                 "rail.stalled",

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 
-from drivers.clock import Clock, patience
+from drivers.clock import Clock, timeout_of
 from drivers.errors import (
     Aborted,
     CellError,
@@ -190,7 +190,7 @@ class AgilexVehicle:
                 self._feedback.interrupt("the CAN bus failed and was opened again")
             self._alarms = self._feedback.alarms
         self._feedback.acknowledge()
-        deadline = self._clock.now() + patience(self._clock, ENABLE_TIMEOUT_S)
+        deadline = self._clock.now() + timeout_of(self._clock, ENABLE_TIMEOUT_S)
         while True:
             asked = self._clock.now()
             self._link.send("ClearErrorsCommand", Which=0)

@@ -11,7 +11,7 @@ import threading
 from collections import deque
 from collections.abc import Callable
 
-from drivers.clock import WALL_FLOOR_S, Clock, patience
+from drivers.clock import WALL_FLOOR_S, Clock, timeout_of
 from drivers.errors import DeadlineError
 from drivers.interfaces import LinkStatistics, VehicleState
 from drivers.vehicle.agilex_link import ANSWERS, VersionAnswer
@@ -416,7 +416,7 @@ class MessageFeedback(Feedback):
             quiet = max(self._quiet.values())
             self.require_one()
         silent = self._clock.now() - oldest
-        if silent > patience(self._clock, SILENCE_S) if driving else quiet > QUIET_S:
+        if silent > timeout_of(self._clock, SILENCE_S) if driving else quiet > QUIET_S:
             raise vehicle_fault(
                 self._name, "vehicle.silent", f"no feedback for {silent:.2f} s ({which} came last before that)"
             )

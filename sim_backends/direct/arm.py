@@ -27,7 +27,7 @@ _SERVO_LAG_S = 0.03
 """Of a look-ahead of 0.05 s and a gain of 500."""
 _SERVO_BRAKING = 10.0
 _ARRIVED = 2e-3
-_PATIENCE_S = 3.0
+_TIMEOUT_S = 3.0
 
 
 class ArmMove:
@@ -115,7 +115,7 @@ class Streamed(ArmMove):
             self.contact = bool(np.linalg.norm(change) > self._force_limit)
         off = float(np.abs(model.drive.q - self._joints[-1]).max())
         arrived = late >= 0 and off < _ARRIVED and float(np.abs(model.drive.qd).max()) < AT_REST
-        if late > _PATIENCE_S:
+        if late > _TIMEOUT_S:
             self.fail(self._arm.fault("arm.not_arrived", f"a joint is {off:.4f} rad off"))
         elif arrived or self.contact:
             self._ending = True

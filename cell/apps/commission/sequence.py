@@ -22,7 +22,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from cell.apps.commission.check import CheckVerdict, CommissionCheck, Progress, Result
 from cell.apps.commission.checks import arm, cameras, outputs, rail, stops, vehicle, whole_cell
-from cell.apps.commission.workplace import CommissionWorkplace, Declined, Person, told
+from cell.apps.commission.workplace import CommissionWorkplace, Declined, Person, in_one_line
 from cell.base.storage import replacing
 from cell.config.cell_config import CONFIGURATION, load_config, require_confirm
 from cell.config.job import job_path
@@ -137,7 +137,7 @@ class Commissioning:
             raise
         except CellError as error:
             result.verdict = CheckVerdict.FAILED
-            result.notes.append(told(error))
+            result.notes.append(in_one_line(error))
             if isinstance(error, RefusedError) and isinstance(frame := error.seen.get("frame"), Frame):
                 desk.keep(result, f"{check.name}-refused", frame)
             if isinstance(error, DeviceFault):

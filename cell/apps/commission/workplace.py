@@ -266,6 +266,6 @@ def _shown(image: Image, marks: ArrayLike | None) -> cv2.typing.MatLike:
     return small
 
 
-def told(error: CellError) -> str:
+def in_one_line(error: CellError) -> str:
     """An error in one line."""
     return " ".join(str(error).split())

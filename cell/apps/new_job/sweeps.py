@@ -25,7 +25,7 @@ from cell.config.job import Job
 from cell.measure.geometry.light_plane import triangulate
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface
-from cell.measure.inversion.alternative_poses import settled, told
+from cell.measure.inversion.alternative_poses import observable, settled
 from cell.measure.inversion.nominal import SIGMA_FLOOR
 from cell.measure.inversion.registration import MOST_SHIFT, candidates
 from cell.measure.reconstruction.cloud import Cloud
@@ -275,7 +275,7 @@ def rivals(seen: Sequence[SeenSurface], nominal: NominalSurface, job: Job) -> li
         middle = where.act(nominal.centre) - nominal.centre
         same = np.linalg.norm(middle) < job.place.tolerance and turned < job.place.tolerance_angle
         near = np.linalg.norm(middle) <= np.sqrt(2) * shift and turned <= turn
-        if near and not same and told(where, information, nominal.radius) and _fit(where, points, nominal) > FITS:
+        if near and not same and observable(where, information, nominal.radius) and _fit(where, points, nominal) > FITS:
             found.append((np.asarray(middle), turned))
     return sorted(found, key=lambda each: float(np.linalg.norm(each[0])))
 

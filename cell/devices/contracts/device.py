@@ -106,7 +106,7 @@ class DeviceContract:
 
 
 EXPOSURE_S, RATE_HZ = 0.005, 10.0
-PATIENCE_S = 10.0
+TIMEOUT_S = 10.0
 
 
 class CameraContract(DeviceContract):
@@ -119,7 +119,7 @@ class CameraContract(DeviceContract):
         last = -1
         for _ in range(3):
             asked = bench.clock.now()
-            frame = camera.grab(PATIENCE_S)
+            frame = camera.grab(TIMEOUT_S)
             assert frame.image.shape == camera.shape
             assert frame.image.dtype == np.uint8
             assert frame.exposure == pytest.approx(EXPOSURE_S, rel=0.02)
@@ -133,16 +133,16 @@ class CameraContract(DeviceContract):
         camera = bench.device
         camera.configure(EXPOSURE_S, RATE_HZ)
         with camera.stream() as frames:
-            made = [frames.next(PATIENCE_S) for _ in range(6)]
+            made = [frames.next(TIMEOUT_S) for _ in range(6)]
             with pytest.raises(InterlockError):
-                camera.grab(PATIENCE_S)
+                camera.grab(TIMEOUT_S)
             with pytest.raises(InterlockError):
                 camera.configure(EXPOSURE_S, RATE_HZ)
         ids = np.diff([frame.frame_id for frame in made])
         assert (ids >= 1).all()
         assert [frame.lost_before for frame in made[1:]] == list(ids - 1)
         assert np.diff([frame.host_time for frame in made]) / ids == pytest.approx(1.0 / RATE_HZ, rel=0.05)
-        assert camera.grab(PATIENCE_S).frame_id > made[-1].frame_id
+        assert camera.grab(TIMEOUT_S).frame_id > made[-1].frame_id
 
     def test_limits_are_kept_before_anything_is_sent(self, bench: Bench[Camera]) -> None:
         """`LimitError`, and the settings stay."""
@@ -151,7 +151,7 @@ class CameraContract(DeviceContract):
         for exposure, rate in ((1e-9, RATE_HZ), (1e4, RATE_HZ), (EXPOSURE_S, 1e6), (0.2, RATE_HZ)):
             with pytest.raises(LimitError):
                 camera.configure(exposure, rate)
-        assert camera.grab(PATIENCE_S).exposure == pytest.approx(EXPOSURE_S, rel=0.02)
+        assert camera.grab(TIMEOUT_S).exposure == pytest.approx(EXPOSURE_S, rel=0.02)
 
 
 def shines(laser: Laser) -> bool:

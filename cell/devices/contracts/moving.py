@@ -213,7 +213,7 @@ class RailContract(DeviceContract):
 
 TURN_RAD, TURN_SPEED, ACCELERATION = 0.2, 0.2, 0.8
 """Way, speed and acceleration of the suite's motions at full motion: of the last joint alone, which moves no mass."""
-PATIENCE_S = 60.0
+TIMEOUT_S = 60.0
 FREE_OUTPUT = 7
 """A standard output that nothing hangs on."""
 
@@ -249,7 +249,7 @@ class ArmContract(DeviceContract):
         start = arm.state().joints
         for goal in (turned(start, way), start):
             with bench.timed(took):
-                arm.move_joints(goal, TURN_SPEED * bench.motion, ACCELERATION).wait(PATIENCE_S)
+                arm.move_joints(goal, TURN_SPEED * bench.motion, ACCELERATION).wait(TIMEOUT_S)
             assert arm.state().joints == pytest.approx(goal, abs=2e-3)
             assert not arm.state().moving
         assert 0.9 * TURN_RAD / TURN_SPEED <= took[0] < 2.0 * TURN_RAD / TURN_SPEED + 3.0
@@ -263,10 +263,10 @@ class ArmContract(DeviceContract):
         with pytest.raises(InterlockError):
             arm.follow(times, np.array([turned(start, 0.1 + way * s) for s in smooth]))
         motion = arm.follow(times, np.array([turned(start, way * s) for s in smooth]))
-        motion.wait(PATIENCE_S)
+        motion.wait(TIMEOUT_S)
         assert not motion.contact
         assert arm.state().joints == pytest.approx(turned(start, way), abs=2e-3)
-        arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION).wait(PATIENCE_S)
+        arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION).wait(TIMEOUT_S)
 
     def test_limits_are_kept_before_anything_is_sent(self, bench: Bench[Arm]) -> None:
         """`LimitError`, and nothing has moved."""
@@ -293,10 +293,10 @@ class ArmContract(DeviceContract):
             arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION)
         arm.stop()
         with pytest.raises(Aborted):
-            motion.wait(PATIENCE_S)
+            motion.wait(TIMEOUT_S)
         stood = arm.state().joints
         assert 0.0 < stood[5] - start[5] < way
-        arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION).wait(PATIENCE_S)
+        arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION).wait(TIMEOUT_S)
         assert arm.state().joints == pytest.approx(start, abs=2e-3)
 
     def test_a_deadline_stops_the_motion(self, bench: Bench[Arm]) -> None:
@@ -308,7 +308,7 @@ class ArmContract(DeviceContract):
             motion.wait(1.0)
         bench.clock.sleep(1.0)
         assert not arm.state().moving
-        arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION).wait(PATIENCE_S)
+        arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION).wait(TIMEOUT_S)
 
     def test_an_output_shows_once_it_was_set(self, bench: Bench[Arm]) -> None:
         """And no other changes."""
@@ -337,7 +337,7 @@ class ArmContract(DeviceContract):
             bench.clock.sleep(1.0)
             faults.cause(code)
             with pytest.raises(DeviceFault) as met:
-                motion.wait(PATIENCE_S)
+                motion.wait(TIMEOUT_S)
             assert (met.value.code, met.value.recoverable) == (code, True)
             arm.stop()
             arm.stop()
@@ -350,7 +350,7 @@ class ArmContract(DeviceContract):
                 assert again.value.code == code
             assert arm.state().joints == pytest.approx(stood.joints, abs=1e-3)
             arm.recover(confirmed=True)
-        arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION).wait(PATIENCE_S)
+        arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION).wait(TIMEOUT_S)
         assert arm.state().safety is ArmSafety.NORMAL
         assert arm.state().joints == pytest.approx(start, abs=2e-3)
 
@@ -371,15 +371,15 @@ class ArmContract(DeviceContract):
             assert arm.state().joints == pytest.approx(stood, abs=1e-3)
             assert not arm.state().moving
         arm.recover(confirmed=True)
-        arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION).wait(PATIENCE_S)
+        arm.move_joints(start, TURN_SPEED * bench.motion, ACCELERATION).wait(TIMEOUT_S)
 
     def test_recovering_an_arm_that_is_well_leaves_it_ready(self, bench: Bench[Arm]) -> None:
         """It moves afterwards."""
         arm = bench.device
         arm.recover()
         start = arm.state().joints
-        arm.move_joints(turned(start, 0.02 * bench.motion), TURN_SPEED, ACCELERATION).wait(PATIENCE_S)
-        arm.move_joints(start, TURN_SPEED, ACCELERATION).wait(PATIENCE_S)
+        arm.move_joints(turned(start, 0.02 * bench.motion), TURN_SPEED, ACCELERATION).wait(TIMEOUT_S)
+        arm.move_joints(start, TURN_SPEED, ACCELERATION).wait(TIMEOUT_S)
 
 
 DRIVE_SPEED, TIME_S, PERIOD_S = 0.1, 2.0, 0.05

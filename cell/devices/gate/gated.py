@@ -123,7 +123,7 @@ class GuardedMotion:
 
 Begun = TypeVar("Begun", bound=Motion)
 
-PATIENCE_S = 1.0
+TIMEOUT_S = 1.0
 """How old the arm's state may be that a speed rests on: the arm stands."""
 
 
@@ -172,7 +172,7 @@ class GatedArm(Gated[Arm]):
         situation = self.gate.interlocks.situation
 
         def start() -> ArmMotion:
-            slowed = situation.slowed(self.bare.state(PATIENCE_S).joints, goal, speed, situation.held)
+            slowed = situation.slowed(self.bare.state(TIMEOUT_S).joints, goal, speed, situation.held)
             return self.bare.move_joints(joints, slowed, acceleration)
 
         return self._move(DeviceCommand("arm", "move_joints", {"joints": goal}), start)

@@ -32,7 +32,7 @@ from cell.motion.trajectory import PointSpeed, carried_points
 from drivers.errors import DeadlineError
 from drivers.interfaces import Arm, ArmState, LinkTable, Vector, Vehicle, VehicleState
 
-PATIENCE_S = 1.0
+TIMEOUT_S = 1.0
 """How old a reading may be that a rule rests on: what it asks about does not change by itself."""
 STILL = 0.005
 """Speed in m/s and rad/s below which the vehicle stands: its feedback has steps of 0.001."""
@@ -71,7 +71,7 @@ def _newest(now: Situation, vehicle: Vehicle) -> VehicleState:
     until = clock.now() + LATE_S * max(1.0, clock.rate)
     while True:
         try:
-            return vehicle.state(PATIENCE_S)
+            return vehicle.state(TIMEOUT_S)
         except DeadlineError:
             if clock.now() < until:
                 clock.sleep(0.02)
@@ -101,7 +101,7 @@ def _moves(now: Situation, state: ArmState) -> str | None:
 def _still(now: Situation, command: DeviceCommand) -> str | None:
     if now.arm is None:
         return None
-    if (against := _moves(now, now.arm.state(PATIENCE_S))) is not None:
+    if (against := _moves(now, now.arm.state(TIMEOUT_S))) is not None:
         return against
     if now.last is not None and now.last.contact:
         return "the arm's last motion ended at contact, and it may still touch something. Move it away first"
@@ -186,7 +186,7 @@ def _calibrated(now: Situation, command: DeviceCommand) -> str | None:
 def _clear(now: Situation, command: DeviceCommand) -> str | None:
     if now.arm is None:
         return None
-    pairs = now.clear(now.arm.state(PATIENCE_S).joints, command, (*now.held, *now.station))
+    pairs = now.clear(now.arm.state(TIMEOUT_S).joints, command, (*now.held, *now.station))
     if not pairs:
         return None
     return f"{', '.join(f'{a} and {b}' for a, b in pairs)} would collide on the way. Go another way, or plan it"
@@ -195,7 +195,7 @@ def _clear(now: Situation, command: DeviceCommand) -> str | None:
 def _kinematics(now: Situation, command: DeviceCommand) -> str | None:
     if now.arm is None:
         return None
-    state = now.arm.state(PATIENCE_S)
+    state = now.arm.state(TIMEOUT_S)
     if _moves(now, state) is not None:
         return None
     if not state.controlled:

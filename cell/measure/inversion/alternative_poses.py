@@ -57,7 +57,7 @@ def require_alone(scan: Scan, pose: pin.SE3, nominal: NominalSurface, prior: Pri
             continue
         away = difference(other, prior.base_from_surface)
         against = float(away @ board @ away - off @ board @ off)
-        if against > TOLD_APART or not told(moved, information, nominal.radius):
+        if against > TOLD_APART or not observable(moved, information, nominal.radius):
             continue
         there = _fitting(other, some, nominal)
         if there[0] < OVER * here[0] or there[1] < AS_WELL * here[1]:
@@ -73,7 +73,7 @@ def require_alone(scan: Scan, pose: pin.SE3, nominal: NominalSurface, prior: Pri
         )
 
 
-def told(where: pin.SE3, information: Array, radius: float) -> bool:
+def observable(where: pin.SE3, information: Array, radius: float) -> bool:
     """Whether the scan tells this motion at all, by its `information` (6, 6) in the same axes."""
     length = np.array([1.0] * 3 + [radius] * 3)
     motion = np.concatenate([where.translation, pin.log3(where.rotation)]) * length

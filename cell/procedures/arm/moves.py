@@ -314,7 +314,7 @@ class PartProgress:
     where: pin.SE3 | None = None
     left: bool = False
 
-    def told(self, reason: str) -> str:
+    def explain(self, reason: str) -> str:
         """A run's reason, not to be read without what has become of the part."""
         if self.state is PartState.HELD or self.state.untaken or self.where is None:
             return reason

@@ -101,11 +101,11 @@ class InterimCheck:
             )
         if self.matters:
             at_most = Measured(MOVED, 1e3 * self.at_most, "mm", most=allowed)
-            text = f"{self.told}; allowed are {allowed:.2f} mm. See what is loose or was bumped"
+            text = f"{self.words}; allowed are {allowed:.2f} mm. See what is loose or was bumped"
             raise RefusedError(f"{text}, then run `cell calibrate`", at_most)
 
     @property
-    def told(self) -> str:
+    def words(self) -> str:
         """What has moved, for people."""
         x, y, z, *turns = 1e3 * self.head.change
         turned = ", ".join(f"{turn:+.2f}" for turn in turns)
@@ -119,7 +119,7 @@ class InterimCheck:
     def notes(self) -> tuple[str, ...]:
         """For people: a change that matters too little to end the job, or what this look could not have shown."""
         if self.head.changed:
-            return () if self.matters else (f"{self.told}: the job goes on. Run `cell calibrate` when there is time",)
+            return () if self.matters else (f"{self.words}: the job goes on. Run `cell calibrate` when there is time",)
         if self.at_most < self.allowed:
             return ()
         return (

@@ -24,7 +24,7 @@ RATES_HZ = 30.0, 15.0, 10.0
 """The first that the camera can."""
 
 
-def look_at_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> PlateLine | None:
+def see_reference_plate(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> PlateLine | None:
     """The witness now, the carriage left there; None where the cell has none or it is not in the picture."""
     position = config.laser.witness
     if position is None:
@@ -64,14 +64,14 @@ def configure_fast(devices: Devices, exposure: float, rates: Sequence[float] = R
     return rates[-1]
 
 
-def require_witness(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> PlateLine:
+def require_reference_plate(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> PlateLine:
     """The witness now, for a calibration that has seen it; `RefusedError` when there is none to see."""
     if config.laser.witness is None:
         raise RefusedError(
             "the calibration saw the laser's witness, but the configuration has no laser.witness now: put it back, or "
             "run `cell calibrate` to work without one"
         )
-    if (seen := look_at_witness(config, devices, keep)) is None:
+    if (seen := see_reference_plate(config, devices, keep)) is None:
         raise RefusedError(
             "the laser's witness, which the calibration saw, is not in the picture: see that the plate on the claw is "
             "in its place and clean, and that the laser is lit; if so, run `cell calibrate`"

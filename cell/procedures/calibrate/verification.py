@@ -49,8 +49,8 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import CalibrationView, ScanPlan, rail_ends, references, verification_views
 from cell.procedures.calibrate.boards import PHOTO_RATE, Check, Keep, Progress, look_for, move_to_view
-from cell.procedures.calibrate.reference_plate import require_witness
-from cell.procedures.sweep.swath import SweepCollector, SweepErrors, rehearse
+from cell.procedures.calibrate.reference_plate import require_reference_plate
+from cell.procedures.sweep.swath import SweepCollector, SweepErrors, warm_up
 from cell.procedures.sweep.sweeping import home_rail, rail_sweep
 from drivers.errors import RefusedError
 from drivers.interfaces import Camera, Frame
@@ -183,7 +183,7 @@ def collect_verification(
     pointing = None
     if calibration.scan.witness is not None:
         progress(0.0, "looking where the laser points")
-        head, now = calibration.scan, require_witness(config, devices, keep)
+        head, now = calibration.scan, require_reference_plate(config, devices, keep)
         pointing = turn_seen(calibration.scan.witness, now, head.camera, head.light_plane, config.laser.exit_point)
     photographs: list[list[ScanObservation]] = []
     sweep: list[ScanObservation] = []
@@ -239,7 +239,7 @@ def _sweep(
     plan = ScanPlan(view.base_from_flange, view.base_from_flange, *ends)
     errors = SweepErrors(np.zeros((6, 6)), config.calibration.rail_sigma, MAX_SHIFT, devices.clock.rate)
     collector = SweepCollector(geometry, section, keep_frame, progress, profiles.append)
-    rehearse(geometry)
+    warm_up(geometry)
     swath = rail_sweep(plan, mover, devices, errors, collector)
     return [
         ScanObservation(None, profiles[line], swath.base_from_flange, float(position))

@@ -108,7 +108,7 @@ def require_board_unmoved(here: Workplace, fix: BoardFix, since: str, progress: 
     )
 
 
-def _at(here: Workplace, context: StepContext) -> BoardFix:
+def _run_step(here: Workplace, context: StepContext) -> BoardFix:
     arrival, job = context.made(VehicleArrival), here.job
     here.mover.avoid_station(arrival.base_from_place, job, here.board, around(here.nominal.extent, here.ground))
     if arrival.shared is not None:
@@ -121,4 +121,4 @@ def _at(here: Workplace, context: StepContext) -> BoardFix:
     return fix
 
 
-STEP = JobStep(Step("board_photo", 60.0, 2, ("DeadlineError",)), _at, BoardFix, needs=(VehicleArrival,))
+STEP = JobStep(Step("board_photo", 60.0, 2, ("DeadlineError",)), _run_step, BoardFix, needs=(VehicleArrival,))

@@ -62,7 +62,7 @@ class VehicleArrival:
             **({} if self.head is None else {"interim": self.head.summary()}),
         }
 
-    def told(self) -> str:
+    def words(self) -> str:
         """What became of the step where nothing drives, in words."""
         return (
             "no vehicle: the arm stands on a fixed frame and nothing was driven. By the board the station stands "
@@ -246,7 +246,7 @@ def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, re
     ).showing(seen={"frame": fix.frames[-1], "view": fix.views[-1]} if fix.frames else None)
 
 
-def _at(here: Workplace, context: StepContext) -> VehicleArrival:
+def _run_step(here: Workplace, context: StepContext) -> VehicleArrival:
     """The arm to its looking pose first, with the vehicle braked."""
     if here.needs_part and not here.devices.claw.holding:
         raise RefusedError(
@@ -282,7 +282,7 @@ def _at(here: Workplace, context: StepContext) -> VehicleArrival:
         stand = here.config.arm.vehicle_from_base.se3()
         context.progress(0.3, "nothing to drive: looking whether the station stands where the job has it")
         arrival = stand_at_target(here.job, stand, vehicle, here.whereabouts, here.photograph)
-        context.note(text=arrival.told())
+        context.note(text=arrival.words())
         return replace(arrival, head=head)
     vehicle.enable()
     drive = TargetDrive(
@@ -321,4 +321,4 @@ def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
     return found
 
 
-STEP = JobStep(Step("drive_to_target", 300.0, 1, ("DeadlineError",)), _at, VehicleArrival)
+STEP = JobStep(Step("drive_to_target", 300.0, 1, ("DeadlineError",)), _run_step, VehicleArrival)

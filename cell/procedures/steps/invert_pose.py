@@ -126,7 +126,7 @@ def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: Boa
         raise _told_before(refused, "; ".join(notes)) from refused
 
 
-def _at(here: Workplace, context: StepContext) -> PlacePose:
+def _run_step(here: Workplace, context: StepContext) -> PlacePose:
     sweep, scan, fix = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
     found = inverted(here, sweep, scan, fix)
     for note in found.notes:
@@ -135,4 +135,4 @@ def _at(here: Workplace, context: StepContext) -> PlacePose:
     return found
 
 
-STEP = JobStep(Step("invert_pose", 60.0, on_wall=True), _at, PlacePose, needs=(BoardFix, SweepRecord, Reconstruction))
+STEP = JobStep(Step("invert_pose", 60.0, on_wall=True), _run_step, PlacePose, (BoardFix, SweepRecord, Reconstruction))

@@ -18,11 +18,11 @@ from cell.measure.calibration.drift.reference_plate import pointing as pointing_
 from cell.measure.calibration.drift.slip import Slip, slip_since
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.procedures.arm.photograph import BoardFix, scan_plans
-from cell.procedures.calibrate.reference_plate import require_edge, require_witness
+from cell.procedures.calibrate.reference_plate import require_edge, require_reference_plate
 from cell.procedures.steps.board_photo import require_board_unmoved
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord, save_sweep
-from cell.procedures.sweep.swath import MAX_LOST_FRACTION, SweepCollector, SweepErrors, rehearse
+from cell.procedures.sweep.swath import MAX_LOST_FRACTION, SweepCollector, SweepErrors, warm_up
 from cell.procedures.sweep.sweeping import arm_sweep, home_rail, rail_sweep
 from drivers.errors import CalibrationStale
 from drivers.interfaces import Frame
@@ -71,7 +71,7 @@ def laser_sweep(
     )  # fmt: skip
     sweep, geometry = arm_sweep if scan.mode == "arm" else rail_sweep, head.geometry()
     progress(0.01, "preparing")
-    rehearse(geometry)
+    warm_up(geometry)
     swaths = []
     for k, plan in enumerate(plan.back if back else plan for plan in plans):
         check()
@@ -98,7 +98,7 @@ def check_lost_steps(devices: Devices, progress: Callable[[float, str], None]) -
     return ()
 
 
-def unhurried(scan: ScanSection, attempt: int) -> ScanSection:
+def slowed_down(scan: ScanSection, attempt: int) -> ScanSection:
     """The sweep of the `attempt` (from 1): each repetition half as fast with half the frames, the lines as close.
 
     What loses frames most often is a machine that does not keep up with them.
@@ -109,7 +109,7 @@ def unhurried(scan: ScanSection, attempt: int) -> ScanSection:
     return scan.model_copy(update={"speed": share * scan.speed, "frame_rate": max(1.0, share * scan.frame_rate)})
 
 
-def _at(here: Workplace, context: StepContext) -> SweepRecord:
+def _run_step(here: Workplace, context: StepContext) -> SweepRecord:
     """Not swept again what an earlier run has swept, if the board has not moved."""
     fix = context.made(BoardFix)
     # One that is to be done again holds no more, should this run be cut short now.
@@ -145,7 +145,7 @@ def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     if pointing is not None:
         head = head.pointed(pointing, here.config.laser.exit_point)
     record = laser_sweep(
-        here, here.base_from_surface(fix), head, unhurried(here.job.scan, context.attempt), check=context.check,
+        here, here.base_from_surface(fix), head, slowed_down(here.job.scan, context.attempt), check=context.check,
         progress=context.progress, keep_frame=lambda frame: here.frames.keep("stripe", frame), sweeping=here.sweeping,
     )  # fmt: skip
     rest = here.devices.interlocks.situation.last if here.job.scan.mode == "rail" else None
@@ -204,7 +204,7 @@ def seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | Non
     if before is None:
         return None, None
     context.progress(0.0, "looking where the laser points")
-    seen = require_witness(config, devices, keep)
+    seen = require_reference_plate(config, devices, keep)
     pointing = pointing_since(
         before, seen, head.camera, plane=head.light_plane, exit_point=config.laser.exit_point, confirmed=head.confirmed
     )
@@ -217,4 +217,4 @@ def seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | Non
     return pointing, slip
 
 
-STEP = JobStep(Step("laser_sweep", 120.0, 2, ("DeadlineError",)), _at, SweepRecord, needs=(BoardFix,))
+STEP = JobStep(Step("laser_sweep", 120.0, 2, ("DeadlineError",)), _run_step, SweepRecord, needs=(BoardFix,))

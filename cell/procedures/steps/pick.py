@@ -57,7 +57,7 @@ class HeldPart:
         return cls(from_ur(np.array(told["base_from_flange"], dtype=np.float64)), covariance)
 
 
-def _at(here: Workplace, context: StepContext) -> HeldPart:
+def _run_step(here: Workplace, context: StepContext) -> HeldPart:
     fix, job, part = context.made(BoardFix), here.job, here.part
     if part.state is not PartState.LIES:
         raise RefusedError(f"the part is {part.state.value}: nothing is gripped a second time")
@@ -94,6 +94,6 @@ def _lies(here: Workplace, fix: BoardFix, base_from_part: pin.SE3) -> None:
 
 # What was interrupted with the part between the fingers is left to a person.
 STEP = JobStep(
-    Step("pick", 300.0, on_failure=OnFailure.STOP), _at, HeldPart,
+    Step("pick", 300.0, on_failure=OnFailure.STOP), _run_step, HeldPart,
     needs=(BoardFix, SweepRecord, Reconstruction, PlacePose),
 )  # fmt: skip

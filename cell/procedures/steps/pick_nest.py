@@ -22,7 +22,7 @@ from statemachine.step import OnFailure, Step
 CLOUD = "nest.ply"
 
 
-def _at(here: Workplace, context: StepContext) -> HeldPart:
+def _run_step(here: Workplace, context: StepContext) -> HeldPart:
     held = here.held if here.held is not None and here.part.state is PartState.HELD else _picked(here, context)
     here.job = job_with_grasp(here.job, here.job.grasp.flange_from_part.se3(), held.covariance)
     here.held = held
@@ -64,4 +64,4 @@ def _picked(here: Workplace, context: StepContext) -> HeldPart:
 
 
 # What was interrupted as the claw closed is left to a person.
-STEP = JobStep(Step("pick", 600.0, on_failure=OnFailure.STOP), _at, HeldPart, needs=(VehicleArrival,))
+STEP = JobStep(Step("pick", 600.0, on_failure=OnFailure.STOP), _run_step, HeldPart, needs=(VehicleArrival,))

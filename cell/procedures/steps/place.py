@@ -252,7 +252,7 @@ def require_held(part: PartProgress) -> None:
         raise RefusedError(f"the part is {part.state.value}, not held: nothing is placed a second time")
 
 
-def _at(here: Workplace, context: StepContext) -> PlaceResult:
+def _run_step(here: Workplace, context: StepContext) -> PlaceResult:
     require_held(here.part)
     while True:
         held, pose = context.held_s, context.made(PlacePose)
@@ -402,4 +402,4 @@ def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> Sec
 
 # A part that may have touched the surface is not placed a second time by itself. The second look takes as long as a
 # sweep: the step has what the one of the sweep has, and 180 s.
-STEP = JobStep(Step("place", 300.0, on_failure=OnFailure.STOP), _at, PlaceResult, needs=(BoardFix, PlacePose))
+STEP = JobStep(Step("place", 300.0, on_failure=OnFailure.STOP), _run_step, PlaceResult, needs=(BoardFix, PlacePose))

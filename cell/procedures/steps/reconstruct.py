@@ -100,11 +100,11 @@ def displacements(here: Workplace, sweep: SweepRecord, cloud: Cloud) -> tuple[Mo
     return by_calibration, by_poses
 
 
-def _at(here: Workplace, context: StepContext) -> Reconstruction:
+def _run_step(here: Workplace, context: StepContext) -> Reconstruction:
     sweep = context.made(SweepRecord)
     made = reconstructed(here, sweep)
     here.devices.gate.seen("scan_camera", TimedCloud(made.cloud, sweep.times))
     return made
 
 
-STEP = JobStep(Step("reconstruct", 60.0, on_wall=True), _at, Reconstruction, needs=(SweepRecord,))
+STEP = JobStep(Step("reconstruct", 60.0, on_wall=True), _run_step, Reconstruction, needs=(SweepRecord,))

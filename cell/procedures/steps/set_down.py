@@ -33,7 +33,7 @@ class SetDown:
         return {name: told[name] for name in ("contact", "depth_error_mm", "touch", "base_from_flange")}
 
 
-def _at(here: Workplace, context: StepContext) -> SetDown:
+def _run_step(here: Workplace, context: StepContext) -> SetDown:
     nest, part, job = here.job.nest, here.part_mesh, here.job
     assert nest is not None and part is not None
     base_from_part = nest.base_from_part.se3()
@@ -56,4 +56,4 @@ def _at(here: Workplace, context: StepContext) -> SetDown:
 
 
 # A part that may have touched its nest is not set down a second time by itself.
-STEP = JobStep(Step("set_down", 180.0, on_failure=OnFailure.STOP), _at, SetDown, needs=(PlacePose, HeldPart))
+STEP = JobStep(Step("set_down", 180.0, on_failure=OnFailure.STOP), _run_step, SetDown, needs=(PlacePose, HeldPart))

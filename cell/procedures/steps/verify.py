@@ -36,7 +36,7 @@ SWEEPS = 3
 """How often at most the part is swept until no frames are lost."""
 
 
-def _at(here: Workplace, context: StepContext) -> PlacedPart:
+def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
     first = placed = context.made(PlaceResult)
     pose, plan = placed.pose or context.made(PlacePose), here.job.place
     found, slips = _looked(here, pose, context), list[pin.SE3]()
@@ -197,6 +197,6 @@ def surface_from_faces(job: Job, faces: NominalSurface) -> pin.SE3:
 
 # What was interrupted with the part between the fingers is left to a person. A correction takes up to 300 s.
 STEP = JobStep(
-    Step("verify", 1800.0, on_failure=OnFailure.STOP), _at, PlacedPart,
+    Step("verify", 1800.0, on_failure=OnFailure.STOP), _run_step, PlacedPart,
     needs=(SweepRecord, Reconstruction, PlacePose, PlaceResult),
 )  # fmt: skip

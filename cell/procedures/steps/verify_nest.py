@@ -27,7 +27,7 @@ from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
 
 
-def _at(here: Workplace, context: StepContext) -> PlacedPart:
+def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
     job, sweep = where_seen(here.job), context.made(SweepRecord)
     belongs = job.place.surface_from_part.se3()
     swept = swept_part(here, head_at(here, sweep), belongs, context, lying=PartOnGround(here.nominal, belongs))
@@ -84,4 +84,4 @@ def at_nest(job: Job) -> Job:
     return job.model_copy(update={"place": job.place.model_copy(update=update)})
 
 
-STEP = JobStep(Step("verify", 600.0, on_failure=OnFailure.STOP), _at, PlacedPart, needs=(SweepRecord, SetDown))
+STEP = JobStep(Step("verify", 600.0, on_failure=OnFailure.STOP), _run_step, PlacedPart, needs=(SweepRecord, SetDown))

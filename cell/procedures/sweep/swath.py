@@ -169,23 +169,23 @@ class RailPath:
     samples: Vector
 
 
-_REHEARSED: set[tuple[int, int]] = set()
+_WARMED_UP: set[tuple[int, int]] = set()
 """Heights and widths of pictures that were rehearsed."""
 
 
-def rehearse(geometry: ScanGeometry) -> None:
+def warm_up(geometry: ScanGeometry) -> None:
     """Take two drawn profiles and let them go: what is loaded or compiled on first use is so before anything moves.
 
     Done under way it takes longer than the gaps that frames and the arm's states may have. Once for pictures of a size:
     a process that has read some has everything loaded.
     """
     size = geometry.camera.height, geometry.camera.width
-    if size in _REHEARSED:
+    if size in _WARMED_UP:
         return
     builder = ProfileBuilder(geometry, 2)
     for picture in drawn(*size):
         builder.see(StripeStream().extract(picture))
-    _REHEARSED.add(size)
+    _WARMED_UP.add(size)
 
 
 def frames_of(sweep: Sweep, frames: FrameStream) -> Iterator[Frame]:

@@ -109,9 +109,9 @@ def _follow_lit(line: Trajectory, mover: Mover, devices: Devices, collector: Swe
     arm, laser, camera, clock = devices.arm, devices.laser, devices.scan_camera, devices.clock
     # The laser within all else: it goes off first, however long arm and camera take to end what they send.
     with devices.interlocks.purpose("sweep"), arm.record() as states, camera.stream() as frames, laser.lit():
-        motion, patience = mover.begin(line)
+        motion, timeout = mover.begin(line)
         over: list[float] = []
-        deadline = clock.now() + patience
+        deadline = clock.now() + timeout
 
         def ended() -> float | None:
             laser.renew()

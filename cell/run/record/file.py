@@ -106,7 +106,7 @@ NEEDED = ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf")
 MOST_WAITING = 20_000
 """Messages that may wait; beyond that new ones are let go, and counted. A second of the busiest wires has a tenth."""
 CHUNK_BYTES = 128 * 1024
-FLUSH_S, LOOK_S, PATIENCE_S = 1.0, 0.05, 20.0
+FLUSH_S, LOOK_S, TIMEOUT_S = 1.0, 0.05, 20.0
 """Wall seconds: between two flushes, between two looks at what waits, and until a writer at the end counts as stuck."""
 
 Make = Callable[[], bytes | None]
@@ -160,9 +160,9 @@ class RecordFile:
     def close(self) -> None:
         """Write what waits, and the end. Idempotent."""
         self._ending.set()
-        self._thread.join(PATIENCE_S)
+        self._thread.join(TIMEOUT_S)
         if self._thread.is_alive():
-            self.failure = f"the record was still being written {PATIENCE_S:.0f} s after the end"
+            self.failure = f"the record was still being written {TIMEOUT_S:.0f} s after the end"
 
     def _run(self) -> None:
         try:

@@ -5,7 +5,7 @@ Its flag goes off when the drive loses its zero; that it stands says neither who
 
 from __future__ import annotations
 
-from drivers.clock import Clock, patience
+from drivers.clock import Clock, timeout_of
 from drivers.errors import DeviceFault, InterlockError, LimitError, shown
 from drivers.rail.axis import Samples
 from drivers.rail.modbus.link import ModbusLink
@@ -166,7 +166,7 @@ class DriveZero:
             # It was homed before: until it moves, or says that it is not any more, that is no news.
             if moving or not homed:
                 self._homed_since = None
-            elif self._clock.now() - self._homed_since > patience(self._clock, BEGINS_S):
+            elif self._clock.now() - self._homed_since > timeout_of(self._clock, BEGINS_S):
                 raise drive.fault(
                     "rail.not_begun",
                     f"the drive has not begun to search its reference switch within {BEGINS_S:g} s",
@@ -207,7 +207,7 @@ class DriveArrival:
         self._issued = issued
         self._samples = samples
         self._zero = zero
-        self._standstill = patience(clock, STANDSTILL_S)
+        self._standstill = timeout_of(clock, STANDSTILL_S)
         self._begun: float | None = None
         self._last: float | None = None
         self._moved = clock.now()

@@ -18,7 +18,7 @@ import re
 import zlib
 from dataclasses import dataclass
 
-from drivers.clock import Clock, patience
+from drivers.clock import Clock, timeout_of
 from drivers.errors import CellError, ConfigError, DeviceFault, InterlockError, shown
 from drivers.interfaces import Reading
 from drivers.rail.axis import Samples
@@ -272,7 +272,7 @@ class ArrivalWatch:
         self._issued = issued
         self._samples = samples
         self._zero = zero
-        self._standstill = patience(clock, STANDSTILL_S)
+        self._standstill = timeout_of(clock, STANDSTILL_S)
         self._last: int | None = None
         self._moved = clock.now()
 

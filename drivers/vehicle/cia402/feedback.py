@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from drivers.clock import Clock, patience
+from drivers.clock import Clock, timeout_of
 from drivers.errors import DeviceFault
 from drivers.interfaces import LinkStatistics, VehicleState
 from drivers.vehicle.cia402.drive import OPERATIONAL, STATUS, DriveState, SideDrive, may_turn
@@ -373,7 +373,7 @@ class DriveFeedback(Feedback):
             raise vehicle_fault(
                 self._name, "vehicle.silent", f"the {side} drive does not tell its state, for {untold:.2f} s"
             )
-        if driving and silent > patience(self._clock, SILENCE_S):
+        if driving and silent > timeout_of(self._clock, SILENCE_S):
             raise vehicle_fault(
                 self._name, "vehicle.silent", f"no feedback of the {late.side} drive for {silent:.2f} s"
             )

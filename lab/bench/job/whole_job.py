@@ -21,7 +21,7 @@ from cell.measure.calibration import ScanObservation, TargetObservation
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.boards import collect_scan, collect_target
-from cell.procedures.calibrate.reference_plate import look_at_witness, with_edge
+from cell.procedures.calibrate.reference_plate import see_reference_plate, with_edge
 from cell.procedures.calibrate.timing import look_at_shutter
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
@@ -190,7 +190,7 @@ class _WholeJob:
         devices, tell = self.cell.devices, self.tell
         given, keep = (self.config, devices, mover, context.check), NoFrames().keep
         scan = collect_scan(*given, lambda f, t: tell(0.36 * f, f"calibrate: {t}"), keep)
-        witness = look_at_witness(self.config, devices, keep)
+        witness = see_reference_plate(self.config, devices, keep)
         target = collect_target(*given, lambda f, t: tell(0.36 + 0.12 * f, f"calibrate: {t}"), keep)
         self.record.observations = (scan, target)
         tell(0.48, "calibrate: solving")

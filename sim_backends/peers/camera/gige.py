@@ -188,8 +188,8 @@ class GigePeer:
                 packet, client = b"", ("", 0)
             except OSError:
                 return
-            patience = 1e-3 * self._memory.word(memory.HEARTBEAT)
-            if self._controller is not None and time.monotonic() - self._heard > patience:
+            timeout = 1e-3 * self._memory.word(memory.HEARTBEAT)
+            if self._controller is not None and time.monotonic() - self._heard > timeout:
                 self._release()
             request = GvcpRequest.of(packet)
             if request is None or self.camera.silent:

@@ -178,13 +178,13 @@ def _perform_batch(
                 "--ask-elsewhere and answer with `cell confirm`"
             )
 
-        def told(event: Event) -> None:
+        def notify(event: Event) -> None:
             display(event)
             if here and event.kind == "confirm_needed" and (run := cell.current) is not None and run.kind == "loading":
                 answer_here(run.control, display.console)
 
         cell.pace = pace
-        outcome = batch(cell, count=count, observer=told)
+        outcome = batch(cell, count=count, observer=notify)
         display.end()
         print_json(outcome.as_dict()) if json else print_batch(outcome)
     raise typer.Exit(outcome.exit_code)

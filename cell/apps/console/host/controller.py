@@ -129,7 +129,7 @@ class ConsoleController:
             return None
         return {"device": press.device, "axis": press.axis, "sign": press.sign}
 
-    def told(self, last: dict[str, object] | None) -> dict[str, object] | None:
+    def with_finding(self, last: dict[str, object] | None) -> dict[str, object] | None:
         """How the last run ended; a verification with what it found."""
         if last is None or self._found is None or last["run"] != self._found[0]:
             return last

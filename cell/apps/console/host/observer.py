@@ -99,7 +99,7 @@ class CellObserver:
             "cell_s": round(self._cell.devices.clock.now(), 3),
             **readings.motion(), **self._now.as_dict(self._cell.devices.interlocks.situation), "run": told,
             "question": desk.questions.present(view if told is not None else None),
-            "last": desk.told(self._last), "faults": faults[-8:],
+            "last": desk.with_finding(self._last), "faults": faults[-8:],
             "devices": {} if self._virtual else readings.devices("" if told is None else told["kind"]),
             "safety": readings.safety(), "holder": desk.holders.holder, "clients": desk.holders.rows(),
             "starting": desk.starting,

@@ -24,7 +24,7 @@ BEAT_MS = 80
 MOST_PAGES = 16
 MOST_BYTES = 1024
 """Of a message from a page."""
-PATIENCE_S = 10.0
+TIMEOUT_S = 10.0
 """Wall seconds after which a page that takes nothing is given up."""
 MOST_CLOUD_BYTES = 8_000_000
 """Of the cloud so far, which a page that comes later is given."""
@@ -171,7 +171,7 @@ class Pages:
             while True:
                 item = await page.mailbox.take()
                 sent = socket.send_text(item) if isinstance(item, str) else socket.send_bytes(item)
-                await asyncio.wait_for(sent, PATIENCE_S)
+                await asyncio.wait_for(sent, TIMEOUT_S)
         except (TimeoutError, RuntimeError, WebSocketDisconnect):
             # One that takes nothing any more: its button is not held, either.
             self._tell(Left(page.id))

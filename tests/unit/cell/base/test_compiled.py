@@ -40,7 +40,7 @@ REHEARSED = """
 import importlib, pkgutil
 from cell.measure.vision import stripe
 from lab.bench.stripe.truth import Cell, draw
-from cell.procedures.sweep.swath import rehearse
+from cell.procedures.sweep.swath import warm_up
 from cell.measure.vision import StripeStream
 from tests.unit.cell.measure.reconstruction.test_build import GEOMETRY
 
@@ -50,7 +50,7 @@ def loaded():
     return {name: len(f.signatures) for m in modules for name, f in vars(m).items() if hasattr(f, "signatures")}
 
 before = loaded()
-rehearse(GEOMETRY)
+warm_up(GEOMETRY)
 rehearsed = loaded()
 shape = (GEOMETRY.camera.height, GEOMETRY.camera.width)
 stream = StripeStream()

@@ -14,7 +14,7 @@ from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.calibration.drift.slip import Slip, slip_since
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.procedures.calibrate.reference_plate import SPEED, look_at_edge, require_edge, require_witness
+from cell.procedures.calibrate.reference_plate import SPEED, look_at_edge, require_edge, require_reference_plate
 from cell.procedures.steps.laser_sweep import unwatched
 from drivers.errors import RefusedError
 from drivers.interfaces import Frame
@@ -27,7 +27,7 @@ def let_go(what: str, frame: Frame) -> None:
 
 
 def looked(cell: VirtualCell, before: PlateLine | None = None) -> PlateLine:
-    now = require_witness(CONFIG, cell.devices, let_go)
+    now = require_reference_plate(CONFIG, cell.devices, let_go)
     if before is not None:
         return require_edge(CONFIG, cell.devices, let_go, before, now)
     return replace(now, edge=look_at_edge(CONFIG, cell.devices, let_go, now, None))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cell.config.job import LONGEST_SWEEP_S, load_job
-from cell.procedures.steps.laser_sweep import UNCHECKED, laser_sweep, unhurried
+from cell.procedures.steps.laser_sweep import UNCHECKED, laser_sweep, slowed_down
 from cell.procedures.sweep.second_look import sparse
 from drivers.errors import DeviceFault
 from lab.bench.job.whole_job import JobRecord
@@ -18,7 +18,7 @@ from tests.support.at_station import AtStation
 @pytest.mark.parametrize(("attempt", "share"), [(1, 1.0), (2, 0.5), (3, 0.25)])
 def test_each_repetition_is_half_as_fast_with_the_lines_as_close(attempt: int, share: float) -> None:
     scan = load_job("pot")[0].scan
-    again = unhurried(scan, attempt)
+    again = slowed_down(scan, attempt)
     assert again.speed == pytest.approx(share * scan.speed)
     assert again.speed / again.frame_rate == pytest.approx(scan.speed / scan.frame_rate)
     assert again.length == scan.length
@@ -27,7 +27,7 @@ def test_each_repetition_is_half_as_fast_with_the_lines_as_close(attempt: int, s
 def test_a_repetition_is_no_slower_than_its_step_has_time_for() -> None:
     scan = load_job("pot")[0].scan
     slow = scan.model_copy(update={"speed": scan.length / 80.0})
-    assert scan.length / unhurried(slow, 3).speed == pytest.approx(LONGEST_SWEEP_S)
+    assert scan.length / slowed_down(slow, 3).speed == pytest.approx(LONGEST_SWEEP_S)
 
 
 @pytest.mark.parametrize(("fault", "mode"), [("", 5), ("rail.lost_steps", 5), ("", 1)])

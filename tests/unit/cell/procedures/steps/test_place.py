@@ -193,7 +193,7 @@ def test_a_surface_that_comes_early_is_refused_with_the_part_held_lifted_and_not
     assert site.height_above() > 0.5 * JOB.place.approach
     # 40 mm/s until 24 N is felt: far below the 150 N of a protective stop.
     assert 10.0 < max(site.forces) < 100.0
-    assert site.part.told("touched") == "touched"
+    assert site.part.explain("touched") == "touched"
 
 
 @pytest.mark.parametrize(("too_low", "side"), [(0.4e-3, "higher"), (-0.4e-3, "lower")])
@@ -308,7 +308,7 @@ def test_a_fault_after_the_release_says_that_the_part_is_down() -> None:
         site.place(note=note)
     assert not site.held
     assert site.part.state is PartState.RELEASED
-    told = site.part.told(str(caught.value))
+    told = site.part.explain(str(caught.value))
     assert told.startswith("the part is already down at (")
     assert "only the retreat failed" in told
     assert "not to be placed again" in told
@@ -320,7 +320,7 @@ def test_a_release_that_is_not_confirmed_leaves_the_part_unknown() -> None:
     with pytest.raises(DeviceFault) as caught:
         site.place(claw=miswired)
     assert site.part.state is PartState.UNKNOWN
-    assert "look whether it did" in site.part.told(str(caught.value))
+    assert "look whether it did" in site.part.explain(str(caught.value))
     assert site.noted == [PartState.UNKNOWN]
 
 
@@ -331,7 +331,7 @@ def test_nothing_is_placed_twice_and_nothing_moves_for_it() -> None:
     with pytest.raises(RefusedError, match="the part is released, not held: nothing is placed a second time"):
         site.place()
     assert np.array_equal(site.arm.state().joints, before), "nothing has moved"
-    told = site.part.told("a later step failed")
+    told = site.part.explain("a later step failed")
     assert told.startswith("the part is already down")
     assert "retreat" not in told
 

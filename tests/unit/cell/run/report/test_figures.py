@@ -45,7 +45,7 @@ def test_an_arrivals_figures(placed_pot: JobRecord) -> None:
     assert "driven" not in arrival.summary()
     still = VehicleArrival(pin.SE3.Identity(), arrival.fix, 3e-3, -2e-3, math.radians(0.5), 1, driven=False)
     assert still.summary()["driven"] is False
-    assert "3.0 mm along, -2.0 mm across and 0.50 deg" in still.told()
+    assert "3.0 mm along, -2.0 mm across and 0.50 deg" in still.words()
 
 
 def test_a_sweeps_figures(placed_pot: JobRecord) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cell.devices.contracts import Bench, CameraContract
-from cell.devices.contracts.device import EXPOSURE_S, PATIENCE_S, RATE_HZ
+from cell.devices.contracts.device import EXPOSURE_S, RATE_HZ, TIMEOUT_S
 from drivers.camera.genicam.aravis import LIBRARIES, Aravis
 from drivers.camera.genicam.camera import GenicamCamera
 from drivers.camera.genicam.make import GenicamConfig
@@ -44,8 +44,8 @@ class TestContract(CameraContract):
         camera = bench.device
         camera.configure(EXPOSURE_S, RATE_HZ)
         with camera.stream() as frames:
-            frames.next(PATIENCE_S)
-            made = [frames.next(PATIENCE_S) for _ in range(5)]
+            frames.next(TIMEOUT_S)
+            made = [frames.next(TIMEOUT_S) for _ in range(5)]
         ids = np.diff([frame.frame_id for frame in made])
         assert [frame.lost_before for frame in made[1:]] == list(ids - 1)
         # A tick that a busy machine has it miss is no exposure, and it counts none.
