@@ -14,11 +14,10 @@ import sys
 import time
 import tomllib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, packages_distributions, requires, version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from packaging.requirements import Requirement
 
@@ -32,8 +31,7 @@ from drivers.vehicle.health import CanInterface, can_interface
 State = Literal["ok", "wrong", "not needed"]
 
 
-@dataclass(frozen=True)
-class DoctorCheck:
+class DoctorCheck(NamedTuple):
     """`what` was looked at, what was `found`, and what a person types where it is wrong."""
 
     what: str

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
@@ -105,8 +105,7 @@ class Result:
         }
 
 
-@dataclass(frozen=True)
-class CommissionCheck:
+class CommissionCheck(NamedTuple):
     """One check: `moves` what, how `far`, how `fast`; `limit` what has to hold; `keys` of the configuration that it
     rests on (tables, or dotted keys); `needs` the checks that have to be good before; `work` does it.
 
@@ -241,8 +240,7 @@ def _at(tables: dict[str, object], key: str) -> Any:
 # --- the protocol ---
 
 
-@dataclass(frozen=True)
-class ProtocolRow:
+class ProtocolRow(NamedTuple):
     """A check and how it stands, with its stored `result` (None: not done); `readings` beside what is allowed."""
 
     check: CommissionCheck

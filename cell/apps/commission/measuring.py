@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -65,8 +66,7 @@ class Eye:
         return nominal_camera(self.config)
 
 
-@dataclass(frozen=True, eq=False)
-class SeenBoard:
+class SeenBoard(NamedTuple):
     """A picture of the board: `base_from_flange` as the arm told it, `camera_from_board` with the board as named."""
 
     base_from_flange: pin.SE3
@@ -258,8 +258,7 @@ SNAP_RAD, SNAP_M = math.radians(8.0), 0.020
 """A mounting that is this near to a drawn one is that one: rough views tell no more, and calibration does."""
 
 
-@dataclass(frozen=True, eq=False)
-class Axes:
+class Axes(NamedTuple):
     """How the camera's axes lie on the flange, `flange_from_camera` (3, 3), and the true length of a millimetre as the
     pictures have it: `across` and `along` the optical axis."""
 
@@ -268,8 +267,7 @@ class Axes:
     along: float
 
 
-@dataclass(frozen=True, eq=False)
-class RoughMounting:
+class RoughMounting(NamedTuple):
     """A camera on the flange and the board before it; `residual` (m, RMS) is how far apart the views put the board."""
 
     flange_from_camera: pin.SE3

@@ -10,6 +10,7 @@ import shlex
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -37,8 +38,7 @@ STEP_MM = (0.1, 2.0)
 """How far apart lines may be, mm."""
 
 
-@dataclass(frozen=True)
-class Made:
+class Made(NamedTuple):
     """The files of a new job: `job`, `mesh`, `picture`; what is known of its place beforehand, and what is not as
     usual, in words."""
 

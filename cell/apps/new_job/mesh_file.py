@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +48,7 @@ class MeshBody:
         return np.asarray(np.ptp(self.vertices, axis=0))
 
 
-@dataclass(frozen=True, eq=False)
-class Drawn:
+class Drawn(NamedTuple):
     """The bodies of a file, the largest first, the unit that the file itself states, if it does, and `notes`: what was
     wrong and was put right, or is as it is."""
 

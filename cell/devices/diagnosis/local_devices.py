@@ -10,9 +10,8 @@ import logging
 import os
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from drivers.vehicle.health import can_interface
 
@@ -25,8 +24,7 @@ _ADAPTERS = ("pcan", "kvaser", "ixxat", "vector", "gs_usb", "canalystii", "usb2c
 """Of python-can's interfaces those that look for adapters on this computer's buses; others ask the network."""
 
 
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """Something that is there or should be: what, where, how it is, whether it can be used, and what to write."""
 
     what: str

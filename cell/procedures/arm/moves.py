@@ -13,7 +13,7 @@ import pinocchio as pin
 from cell.config.cell_config import CellConfig, deck_plates, mounted, station_obstacles, vehicle_obstacles
 from cell.config.job import Job
 from cell.devices.gate.interlocks import Interlocks
-from cell.measure.geometry.poses import difference, from_parts, from_ur
+from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import BoardSpec
 from cell.measure.vision.board.view import centre_of
 from cell.motion.collision import (
@@ -38,7 +38,7 @@ from drivers.errors import ConfigError
 from drivers.interfaces import Arm, ArmMotion, Vector
 
 THERE = 50e-6
-"""m and rad: so near to a flange pose the arm is left where it stands."""
+"""With joints so near, rad, to those of a flange pose the arm is left where it stands."""
 LEAST = 0.25
 """Slower than this, steps of a usual length would not end within their deadlines."""
 
@@ -210,8 +210,9 @@ class Mover:
     def to(self, base_from_flange: pin.SE3, what: str) -> None:
         """Move freely to a flange pose and settle, unless the arm stands there."""
         self.hold()
-        if np.abs(difference(from_ur(self._arm.state().flange), base_from_flange)).max() > THERE:
-            self.follow(self.plan_to(base_from_flange, what))
+        way = self.plan_to(base_from_flange, what)
+        if np.abs(way.end - self.joints).max() > THERE:
+            self.follow(way)
 
     def to_as_from(self, near: Joints, base_from_flange: pin.SE3, what: str) -> None:
         """Move freely to a flange pose, from anywhere, with the joints with which it comes there from `near`."""

@@ -173,7 +173,8 @@ def interim_check(
     while True:
         check()
         progress("looking at the fine board" + (", again" if looks else ""))
-        with beside_arm(rail, partial(rail.move_to, view.rail_position) if rail.state().homed_here else rail.home):
+        begin = partial(rail.move_to, view.rail_position) if rail.state().homed_here else rail.home
+        with beside_arm(mover, rail, begin):
             mover.to_view(view.base_from_flange)
         rail.move_to(view.rail_position).wait(30.0)
         refusals = Counter[str]()

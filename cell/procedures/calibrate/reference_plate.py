@@ -25,7 +25,7 @@ RATES_HZ = 30.0, 15.0, 10.0
 
 
 def see_reference_plate(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> PlateLine | None:
-    """The witness now, the carriage left there; None where the cell has none or it is not in the picture."""
+    """The reference plate now, the carriage left there; None where the cell has none or it is not in the picture."""
     position = config.laser.witness
     if position is None:
         return None
@@ -65,7 +65,7 @@ def configure_fast(devices: Devices, exposure: float, rates: Sequence[float] = R
 
 
 def require_reference_plate(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> PlateLine:
-    """The witness now, for a calibration that has seen it; `RefusedError` when there is none to see."""
+    """The reference plate now, for a calibration that has seen it; `RefusedError` when there is none to see."""
     if config.laser.witness is None:
         raise RefusedError(
             "the calibration saw the laser's witness, but the configuration has no laser.witness now: put it back, or "

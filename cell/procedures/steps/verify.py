@@ -10,7 +10,7 @@ from cell.config.job import Job
 from cell.measure.calibration import ScanCalibration
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
-from cell.measure.inversion.effects.between_sweeps import LEAST_M, PartOnGround
+from cell.measure.inversion.effects.between_sweeps import GATE_M, LEAST_MOTION_M, PartOnGround
 from cell.measure.inversion.flush import flush_along_edge
 from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
@@ -20,7 +20,7 @@ from cell.procedures.grasp import FARTHEST_M, expected_residual
 from cell.procedures.part_error import part_covariance, part_points
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart, along_surface
 from cell.procedures.steps.correction import correct
-from cell.procedures.steps.laser_sweep import head_at, laser_sweep
+from cell.procedures.steps.laser_sweep import check_lost_steps, head_at, laser_sweep
 from cell.procedures.steps.place import PlaceResult, aside_words
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements, together
 from cell.procedures.steps.workplace import JobStep, Workplace
@@ -33,7 +33,7 @@ from statemachine.step import OnFailure, Step
 
 CLOUD = "placed.ply"
 SWEEPS = 3
-"""How often at most the part is swept until no frames are lost."""
+"""How often at most the part is swept until no frames are lost and it lies still."""
 
 
 def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
@@ -152,12 +152,12 @@ def swept_part(
         # Whoever has the run held may reach in, and move the part.
         if context.held_s == held:
             break
-    if moved is not None:
+    if moved:
         raise MisplacedError(
-            f"the placed part does not lie still: in the last of {SWEEPS} looks it moved by {1e3 * moved:.3f} mm from "
-            f"a sweep to the rail's way back over it (allowed: {1e3 * LEAST_M:g} mm). It slides, sinks or turns: look "
-            f"what it lies on, and whether something pulls it. {NEXT_STEP}",
-            Measured("placed part moved from sweep to sweep", 1e3 * moved, "mm", most=1e3 * LEAST_M),
+            f"the placed part does not lie still: in the last of {SWEEPS} sweeps to and fro it moved by "
+            f"{1e3 * moved:.3f} mm{' or more' * (moved >= GATE_M)}, allowed are {1e3 * LEAST_MOTION_M:g} mm. It "
+            f"slides, sinks or turns: look what it lies on, and whether something pulls it. {NEXT_STEP}",
+            Measured("placed part moved from sweep to sweep", 1e3 * moved, "mm", most=1e3 * LEAST_MOTION_M),
         )
     return points, record
 
@@ -165,9 +165,9 @@ def swept_part(
 def _swept_at_rest(
     here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, *, frames: str,
     lying: PartOnGround | None,
-) -> tuple[Cloud, SweepRecord, float | None]:  # fmt: skip
+) -> tuple[Cloud, SweepRecord, float]:  # fmt: skip
     """The part's cloud and its sweep, made again until no frames are lost and the part is at rest: nothing of it is
-    moved by that. And how far, m, one that never was moved in the last look."""
+    moved by that. And how far, m, it moved in the last look; 0 for one at rest."""
     for left in reversed(range(SWEEPS)):
         try:
             record = laser_sweep(
@@ -175,15 +175,20 @@ def _swept_at_rest(
                 keep_frame=lambda frame: here.frames.keep(frames, frame),
                 progress=lambda share, text: context.progress(0.85 * share, f"the part: {text}"),
             )  # fmt: skip
+            swept = build_cloud(record), record
+            moved = 0.0 if lying is None else moved_meanwhile(here, head, over, swept, part=lying, context=context)
+            if moved and here.job.scan.mode == "rail":
+                # Steps that the rail has lost look like a part that moved.
+                check_lost_steps(here.devices, lambda _, text: context.progress(0.85, text))
         except DeviceFault as fault:
             if fault.code != FRAMES_LOST or not left:
                 raise
             why = str(fault)
         else:
-            swept = build_cloud(record), record
-            moved = None if lying is None else moved_meanwhile(here, head, over, swept, part=lying, context=context)
-            if moved is None or not left:
-                return *swept, moved
+            if moved is None:
+                context.note(text="whether the part lies still was not seen: the last strip hardly shows it")
+            if not moved or not left:
+                return *swept, moved or 0.0
             why = f"it moved by {1e3 * moved:.3f} mm meanwhile"
         context.note(text=f"the part is swept again: {why}")
     raise AssertionError("the last sweep returns or raises")
@@ -197,6 +202,6 @@ def surface_from_faces(job: Job, faces: NominalSurface) -> pin.SE3:
 
 # What was interrupted with the part between the fingers is left to a person. A correction takes up to 300 s.
 STEP = JobStep(
-    Step("verify", 1800.0, on_failure=OnFailure.STOP), _run_step, PlacedPart,
+    Step("verify", 3600.0, on_failure=OnFailure.STOP), _run_step, PlacedPart,
     needs=(SweepRecord, Reconstruction, PlacePose, PlaceResult),
 )  # fmt: skip

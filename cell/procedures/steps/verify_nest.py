@@ -84,4 +84,4 @@ def at_nest(job: Job) -> Job:
     return job.model_copy(update={"place": job.place.model_copy(update=update)})
 
 
-STEP = JobStep(Step("verify", 600.0, on_failure=OnFailure.STOP), _run_step, PlacedPart, needs=(SweepRecord, SetDown))
+STEP = JobStep(Step("verify", 900.0, on_failure=OnFailure.STOP), _run_step, PlacedPart, needs=(SweepRecord, SetDown))

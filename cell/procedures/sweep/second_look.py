@@ -13,7 +13,7 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 
-from cell.config.job import ScanSection
+from cell.config.job import ScanSection, SwathSection
 from cell.measure.calibration import ScanCalibration
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.effects.between_sweeps import (
@@ -33,6 +33,7 @@ from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.procedures.sweep.swath import Swath
+from cell.procedures.sweep.sweeping import LATENCY_S
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext
@@ -43,7 +44,9 @@ LEAST_POINTS = 500
 MOST_LOST = 0.5
 """Share of its frames: a comparison misses none of them, and says what is left of it."""
 HURRY = 2.0
-"""So many times as fast the rail goes back."""
+"""So many times as fast the rail goes back, where it can."""
+ROOM_M = 1e-3
+"""Left of the travel beside what it takes to gain speed."""
 PLAY_M = 20e-6
 """By how much a carriage stands otherwise when it comes from the other side, where that was not measured."""
 NEXT_STEP = "See what pushed it, then run the job again from its sweep"
@@ -138,12 +141,14 @@ def _shifted(swath: Swath, sigma: float) -> Vector:
     return shared
 
 
-def sparse(scan: ScanSection, before: Swath, strip: int = 0, hurry: float = 1.0) -> ScanSection:
-    """One strip of a scan in about `LINES` lines, `hurry` times as fast as it was swept `before`: a repetition is
-    slower."""
-    speed = hurry * min(scan.speed, pace(before))
+def sparse(scan: ScanSection, before: Swath) -> ScanSection:
+    """The first strip in about `LINES` lines, no faster than it was swept `before`: a repetition is slower."""
+    return _in_few_lines(scan, scan.swath[0], min(scan.speed, pace(before)))
+
+
+def _in_few_lines(scan: ScanSection, strip: SwathSection, speed: float) -> ScanSection:
     rate = min(scan.frame_rate, max(1.0, LINES * speed / scan.length))
-    return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": [scan.swath[strip]]})
+    return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": (strip,)})
 
 
 def pace(swath: Swath) -> float:
@@ -156,13 +161,17 @@ def moved_meanwhile(
     here: Workplace, head: ScanCalibration, over: pin.SE3, swept: tuple[Cloud, SweepRecord], *, part: PartOnGround,
     context: StepContext,
 ) -> float | None:  # fmt: skip
-    """Sweep the last strip the other way, in few lines: how far, m, the part has moved on since; None for a part that
-    lies still. Raises what a sweep raises."""
-    cloud, sweep = swept
+    """Sweep the last strip the other way, in few lines: how far, m, the part has moved on since, as `part.moved` has
+    it. Raises what a sweep raises."""
+    (cloud, sweep), scan, rail = swept, here.job.scan, here.config.rail
     before = sweep.swaths[-1]
-    hurry = min(HURRY, here.config.rail.max_speed / here.job.scan.speed) if here.job.scan.mode == "rail" else 1.0
-    few = sparse(here.job.scan, before, -1, hurry)
-    rate = configure_fast(here.devices, few.exposure, (few.frame_rate, here.job.scan.frame_rate))
+    speed = min(scan.speed, pace(before))
+    if scan.mode == "rail":
+        # To gain speed there is as much room as beyond the ends of the sweep.
+        room = 0.5 * (rail.travel[1] - rail.travel[0] - scan.length) - ROOM_M
+        speed = max(speed, min(HURRY * speed, rail.max_speed, math.sqrt(2.0 * rail.acceleration * max(room, 0.0))))
+    few = _in_few_lines(scan, scan.swath[-1], min(speed, rail.max_speed))
+    rate = configure_fast(here.devices, few.exposure, (few.frame_rate, scan.frame_rate))
     back = laser_sweep(
         here, over, head, few.model_copy(update={"frame_rate": rate}), check=context.check,
         keep_frame=lambda frame: here.frames.keep("way-back", frame),
@@ -170,20 +179,20 @@ def moved_meanwhile(
         most_lost=MOST_LOST, back=True, counted=False,
     )  # fmt: skip
     now = back.swaths[0]
-    unsure = by_times(before) + by_times(now) + _other_way(here, before, now)
-    if part.ground is not None:
-        # A nest rides with the arm; the station does not.
-        unsure = unsure + here.settling
+    unsure = here.settling + by_times(before) + by_times(now) + _other_way(here, before, now)
     return part.moved(cloud.of_sweep(len(sweep.swaths) - 1), build_cloud(back), unsure)
 
 
 def _other_way(here: Workplace, there: Swath, back: Swath) -> Vector:
-    """The same by what parts a sweep from its way back: late stamps, and the carriage's play."""
+    """The same by what parts a sweep from its way back: late stamps, the carriage's play, an arm that came to rest."""
     config, timing = here.config, times_known(here.calibration.scan, here.config)[0]
-    late, play = math.hypot(config.scan_camera.late, config.rail.late) / math.sqrt(3.0), PLAY_M
+    speeds = pace(there) + pace(back)
+    if here.job.scan.mode == "arm":
+        late = math.hypot(config.scan_camera.late / math.sqrt(3.0), LATENCY_S * here.devices.clock.rate)
+        return _shifted(there, late * speeds) + 2.0 * here.repeatability
     if timing is not None:
-        late, play = timing.sigma, abs(timing.play) + timing.play_sigma
-    return _shifted(there, play + late * (pace(there) + pace(back)))
+        return _shifted(there, abs(timing.play) + timing.play_sigma + timing.sigma * speeds)
+    return _shifted(there, PLAY_M + math.hypot(config.scan_camera.late, config.rail.late) / math.sqrt(3.0) * speeds)
 
 
 def require_points(cloud: Cloud) -> Cloud:

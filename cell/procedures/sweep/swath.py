@@ -170,7 +170,7 @@ class RailPath:
 
 
 _WARMED_UP: set[tuple[int, int]] = set()
-"""Heights and widths of pictures that were rehearsed."""
+"""Heights and widths of pictures for which that was done."""
 
 
 def warm_up(geometry: ScanGeometry) -> None:

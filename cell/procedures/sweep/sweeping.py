@@ -42,8 +42,10 @@ def home_rail(devices: Devices, progress: Callable[[float, str], None] = lambda 
 
 
 @contextmanager
-def beside_arm(rail: Rail, begin: Callable[[], Motion]) -> Iterator[None]:
-    """What the rail begins, it does while the arm moves; both are still in the end."""
+def beside_arm(mover: Mover, rail: Rail, begin: Callable[[], Motion]) -> Iterator[None]:
+    """What the rail begins, it does while the arm moves; both are still in the end. Held before it, not meanwhile."""
+    mover.hold()
+    hold, mover.hold = mover.hold, lambda: None
     motion = begin()
     try:
         yield
@@ -51,6 +53,8 @@ def beside_arm(rail: Rail, begin: Callable[[], Motion]) -> Iterator[None]:
         with suppress(CellError):
             rail.stop()
         raise
+    finally:
+        mover.hold = hold
     motion.wait(60.0)
 
 
@@ -185,7 +189,7 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     """
     scan, rail, arm = collector.scan, devices.rail, devices.arm
     start = rail.sweep_start(plan.rail_start, plan.rail_stop, scan.speed)
-    with beside_arm(rail, lambda: rail.move_to(start)):
+    with beside_arm(mover, rail, lambda: rail.move_to(start)):
         mover.to(plan.base_from_flange, "the scan pose")
     devices.scan_camera.configure(scan.exposure, scan.frame_rate)
     base_from_flange = from_ur(arm.state().flange)

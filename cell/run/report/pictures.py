@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -50,8 +49,7 @@ LINE = 0.036
 """Height of a line of text in a panel."""
 
 
-@dataclass(frozen=True, eq=False)
-class BoardPanel:
+class BoardPanel(NamedTuple):
     """A photograph (h, w), 8 bit, the points found in it, and their residual in px if a pose was taken from them."""
 
     image: Image
@@ -60,8 +58,7 @@ class BoardPanel:
     refused: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class SurfacePanel:
+class SurfacePanel(NamedTuple):
     """Points (n, 3) in m in the surface's frame and their deviations (n,) in m, NaN beside the surface.
 
     `deviation` is None when no pose of the surface was found; `believed` is False for a pose that was refused. `flush`
@@ -75,8 +72,7 @@ class SurfacePanel:
     features: tuple[FeatureSeen, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class StripePanel:
+class StripePanel(NamedTuple):
     """A frame of the sweep (h, w), 8 bit, and the stripe found in it, (n, 2) px of column and row."""
 
     image: Image
@@ -288,7 +284,7 @@ def draw_run(
     seams = (report["scan"] or {}).get("seams", ())
     seen = seen_placed(result)
     if surface is not None and seen is not None and not job.unloads:
-        surface = replace(surface, flush=seen.flush, features=seen.features)
+        surface = surface._replace(flush=seen.flush, features=seen.features)
     more = 0 if surface is None else (surface.flush is not None) + bool(surface.features)
     waviness = textwrap.wrap(texture_words(report), TITLE_COLUMNS)
     left, *middle, right = figure.subplots(

@@ -150,14 +150,12 @@ def find(
     Serial ports, CAN interfaces and cameras of this computer, and the addresses that are configured. No broadcast is
     sent, nothing moves, and no port is opened that is not asked.
     """
-    from dataclasses import asdict
-
     from cell.devices.diagnosis.finding import NEXT
     from cell.devices.diagnosis.finding import find as look
 
     found = look(config, ports or (), ask=ask)
     if json:
-        print_json([asdict(row) for row in found])
+        print_json([row._asdict() for row in found])
     else:
         _print_found(found)
         local = [row for row in found if not row.what.startswith("config")]
@@ -199,13 +197,11 @@ def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
 
     Touches no device. Exit code 1 when something is wrong that the configured cell needs; what mends it is beside it.
     """
-    from dataclasses import asdict
-
     from cell.apps.doctor import examine_computer
 
     rows = examine_computer(config)
     if json:
-        print_json([asdict(row) for row in rows])
+        print_json([row._asdict() for row in rows])
     else:
         from rich.text import Text
 

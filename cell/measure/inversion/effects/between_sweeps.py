@@ -281,7 +281,7 @@ class Creep:
 
 LEAST_POINTS = 500
 """Of a part or of the ground, in a sweep that tells of them."""
-LEAST_M = 15e-6
+LEAST_MOTION_M = 30e-6
 """A part whose points move by less than this between two sweeps, on average, counts as at rest."""
 
 
@@ -295,8 +295,8 @@ class PartOnGround:
     ground: tuple[NominalSurface, pin.SE3] | None = None
 
     def moved(self, first: Cloud, second: Cloud, unsure: Array) -> float | None:
-        """How far, m, the part's points moved on average between two clouds, arm base; None where it lies still, or
-        the first one does not show it, and `GATE_M` for one that is not near any more.
+        """How far, m, the part's points moved on average between two clouds, arm base: 0 for one that lies still,
+        `GATE_M` for one that is not near any more, None where the first cloud does not show it.
 
         `unsure` (6, 6), base axes, is by how much the clouds may lie apart for another reason: times, the arm. Ground
         beside the part tells it better.
@@ -319,10 +319,10 @@ class PartOnGround:
             motion = motion - carried @ told @ ground.motion
             unsure = carried @ (unsure - told @ unsure) @ carried.T
         if motion @ np.linalg.solve(part.scatter + FLOOR + unsure, motion) < CREEP_EVIDENCE:
-            return None
+            return 0.0
         points = self.faces.vertices @ here.rotation.T
         far = float(np.linalg.norm(motion[:3] + np.cross(motion[3:], points), axis=1).mean())
-        return far if far > LEAST_M else None
+        return far if far > LEAST_MOTION_M else 0.0
 
 
 def _nothing(lines: Indices, rows: Indices) -> Array:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from cell.run.folder import Report, list_runs, read_report
 from drivers.errors import CellError
@@ -21,8 +21,7 @@ MOST_RUNS = 30
 """Runs that are shown, the newest."""
 
 
-@dataclass(frozen=True)
-class Bar:
+class Bar(NamedTuple):
     """An attempt at a step, from its begin to its end in seconds of the run."""
 
     step: str
@@ -32,8 +31,7 @@ class Bar:
     state: str
 
 
-@dataclass(frozen=True)
-class TimelineMark:
+class TimelineMark(NamedTuple):
     """Something that happened, in seconds of the run; `bad` for a fault."""
 
     at: float

@@ -7,10 +7,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 
@@ -34,24 +33,21 @@ K95 = 1.96
 AXES = "xyz"
 
 
-@dataclass(frozen=True)
-class RunVerdict:
+class RunVerdict(NamedTuple):
     """What a run came to in one line, beside the tolerance, and whether its outcome is a good one."""
 
     words: str
     good: bool
 
 
-@dataclass(frozen=True)
-class TableRow:
+class TableRow(NamedTuple):
     """A row of a table; with `kept` False its figure is outside its limit."""
 
     cells: Row
     kept: bool = True
 
 
-@dataclass(frozen=True)
-class Photograph:
+class Photograph(NamedTuple):
     """A picture as JPEG and what it shows; a `wide` one takes both columns."""
 
     caption: str
@@ -59,8 +55,7 @@ class Photograph:
     wide: bool
 
 
-@dataclass(frozen=True, eq=False)
-class RunPage:
+class RunPage(NamedTuple):
     """What `run.html.jinja` shows; what is empty or None is left out.
 
     `refused` is where, of a refused run; `unreadable` why the cloud is not shown; `left_out` counts photographs.
@@ -151,7 +146,7 @@ def _with_photographs(page: RunPage, folder: Path, report: Report, room: int) ->
             continue
         room -= size
         shown.append(made)
-    return replace(page, photographs=shown, left_out=left_out)
+    return page._replace(photographs=shown, left_out=left_out)
 
 
 def chosen(folder: Path, report: Report) -> list[tuple[Path, str]]:

@@ -7,9 +7,8 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -41,8 +40,7 @@ LEAST_IN_SQUARE = 5
 """Points in a square of the map that may be called an extreme: single ones are noise."""
 
 
-@dataclass(frozen=True, eq=False)
-class Scanned:
+class Scanned(NamedTuple):
     """Measured points (n, 3) in mm and their deviations (n,) in mm, NaN beside the surface.
 
     With deviations the points are in the surface's frame; without (None) they are about their middle, axes of the arm
@@ -54,8 +52,7 @@ class Scanned:
     why: str
 
 
-@dataclass(frozen=True, eq=False)
-class SurfaceView:
+class SurfaceView(NamedTuple):
     """What a page shows of a cloud: the `map` as PNG, and `cloud`, the points of the 3-D view for `cloud.js`.
 
     `compared` tells whether it is coloured by deviations, ± `span_mm`; else it is by height, and `why` says why.

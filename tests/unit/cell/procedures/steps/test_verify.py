@@ -248,14 +248,13 @@ def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(placed_pot: 
 
 def creeps(cell: VirtualCell, rate: pin.SE3, until: float = math.inf) -> None:
     """Each second the part moves on by `rate`, in its own axes, for so many seconds from the start of its sweep."""
-    part, stands, steps = cell.world.part, cell.world.part._pose, pin.log6(rate).vector
-    began: list[float] = []
+    part, stands, began = cell.world.part, cell.world.part._pose, list[float]()
 
     def pose(flange: np.ndarray) -> np.ndarray:
         if cell.devices.laser.is_on and not began:
             began.append(cell.clock.now())
         since = min(until, cell.clock.now() - began[0]) if began else 0.0
-        return stands(flange) @ pin.exp6(since * steps).homogeneous
+        return stands(flange) @ pin.exp6(since * pin.log6(rate).vector).homogeneous
 
     part._pose = pose
 
@@ -266,7 +265,7 @@ def creeps(cell: VirtualCell, rate: pin.SE3, until: float = math.inf) -> None:
 def test_a_part_that_does_not_come_to_rest_is_misplaced(placed_pot: JobRecord, tmp_path: Path, rate: pin.SE3) -> None:
     """At first each lies within its tolerances, and one sweep says no more."""
     site = LyingPart(placed_pot, tmp_path, changed=lambda cell: creeps(cell, rate))
-    with pytest.raises(MisplacedError, match=r"does not lie still: in the last of 3 looks it moved by") as met:
+    with pytest.raises(MisplacedError, match="does not lie still: in the last of 3 sweeps to and fro") as met:
         site.looked(moved())
     assert not met.value.numbers[0].kept
     assert sum("swept again: it moved by" in note for note in site.notes) == 2

@@ -22,12 +22,13 @@ def test_a_part_that_comes_to_lie_beside_its_nest_is_misplaced(placed_pot: JobRe
 
 def test_a_part_that_creeps_in_its_nest_is_misplaced(placed_pot: JobRecord) -> None:
     def slides(cell: VirtualCell) -> None:
-        part, stands = cell.world.part, cell.world.part._pose
+        part, stands, began = cell.world.part, cell.world.part._pose, list[float]()
 
         def pose(flange: np.ndarray) -> np.ndarray:
             lies = stands(flange)
             if part._base_from_part is not None and not part.held:
-                lies[1, 3] += 0.03e-3 * cell.clock.now()
+                began.append(cell.clock.now())
+                lies[1, 3] += 0.06e-3 * (began[-1] - began[0])
             return lies
 
         part._pose = pose

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from cell.measure.geometry.poses import difference
-from cell.measure.inversion.effects.between_sweeps import GATE_M, LEAST_M, Creep, PartOnGround
+from cell.measure.inversion.effects import between_sweeps
+from cell.measure.inversion.effects.between_sweeps import GATE_M, LEAST_MOTION_M, Creep, PartOnGround
 from cell.measure.reconstruction.cloud import Cloud
 from lab.bench.job.whole_job import JobRecord
 from tests.support.report_runs import pot
@@ -57,10 +58,12 @@ def lying(record: JobRecord) -> tuple[PartOnGround, Cloud]:
     return PartOnGround(pot()[1], record.results["invert_pose"].base_from_surface), record.results["reconstruct"].cloud
 
 
-def every_fourth(cloud: Cloud, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Cloud:
-    """A cloud of the other lines, moved."""
-    points = np.full_like(cloud.points, np.nan)
-    points[2::4] = cloud.points[2::4] + np.array(shift)
+def every_fourth(cloud: Cloud, shift: tuple[float, float, float] = (0.0, 0.0, 0.0), turn: float = 0.0) -> Cloud:
+    """A cloud of the other lines, moved, and turned about z and its middle."""
+    points, moved = np.full_like(cloud.points, np.nan), cloud.points + np.array(shift)
+    arms = cloud.points - cloud.points[cloud.valid].mean(axis=0)
+    moved += turn * np.stack([-arms[..., 1], arms[..., 0], np.zeros(arms.shape[:2])], axis=-1)
+    points[2::4] = moved[2::4]
     return replace(cloud, points=points)
 
 
@@ -69,14 +72,18 @@ def test_a_motion_comes_out_as_it_was_put_in(placed_pot: JobRecord, shift: tuple
     part, cloud = lying(placed_pot)
     found = part.moved(cloud, every_fourth(cloud, shift), KNOWN)
     assert found == pytest.approx(np.linalg.norm(shift), abs=0.01e-3)
-    assert part.moved(cloud, every_fourth(cloud), KNOWN) is None
+    assert part.moved(cloud, every_fourth(cloud), KNOWN) == 0.0
     # What the sweeps may lie apart for another reason is no motion of the part.
-    assert part.moved(cloud, every_fourth(cloud, shift), np.diag([0.1e-3**2] * 6)) is None
+    assert part.moved(cloud, every_fourth(cloud, shift), np.diag([0.1e-3**2] * 6)) == 0.0
 
 
-def test_less_than_matters_or_a_part_that_does_not_show_is_none_and_one_far_off_the_gate(placed_pot: JobRecord) -> None:
+def test_less_than_matters_is_none_and_what_does_not_show_is_not_known(
+    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
     part, cloud = lying(placed_pot)
-    nothing = every_fourth(replace(cloud, points=np.full_like(cloud.points, np.nan)))
-    assert part.moved(cloud, every_fourth(cloud, (0.0, 0.0, 0.9 * LEAST_M)), KNOWN) is None
+    nothing, little = every_fourth(replace(cloud, points=np.full_like(cloud.points, np.nan))), 1e-3
+    assert part.moved(cloud, every_fourth(cloud, turn=little), KNOWN) == 0.0
+    monkeypatch.setattr(between_sweeps, "LEAST_MOTION_M", 0.0)
+    assert 0.0 < part.moved(cloud, every_fourth(cloud, turn=little), KNOWN) < LEAST_MOTION_M
     assert part.moved(nothing, every_fourth(cloud), KNOWN) is None
     assert part.moved(cloud, nothing, KNOWN) == part.moved(cloud, every_fourth(cloud, (0, 0, 9e-3)), KNOWN) == GATE_M
