@@ -61,7 +61,7 @@ def lying(record: JobRecord) -> tuple[PartOnGround, Cloud]:
 def every_fourth(cloud: Cloud, shift: tuple[float, float, float] = (0.0, 0.0, 0.0), turn: float = 0.0) -> Cloud:
     """A cloud of the other lines, moved, and turned about z and its middle."""
     points, moved = np.full_like(cloud.points, np.nan), cloud.points + np.array(shift)
-    arms = cloud.points - cloud.points[cloud.valid].mean(axis=0)
+    arms = cloud.points - (cloud.points[cloud.valid].mean(axis=0) if cloud.size else 0.0)
     moved += turn * np.stack([-arms[..., 1], arms[..., 0], np.zeros(arms.shape[:2])], axis=-1)
     points[2::4] = moved[2::4]
     return replace(cloud, points=points)
