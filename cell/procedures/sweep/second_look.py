@@ -184,7 +184,7 @@ def moved_meanwhile(
 
 
 def _other_way(here: Workplace, there: Swath, back: Swath) -> Vector:
-    """Covariance (6, 6) of base_from_flange by which sweep and way back differ: late stamps, play, where the arm rests."""
+    """Covariance (6, 6) of base_from_flange by which sweep and way back differ: late stamps, play, the arm's rest."""
     config, timing = here.config, times_known(here.calibration.scan, here.config)[0]
     speeds = pace(there) + pace(back)
     if here.job.scan.mode == "arm":
