@@ -99,3 +99,16 @@ def moved(
 ) -> pin.SE3:
     """A motion by these, m and rad."""
     return from_parts((x, y, z), pin.exp3(np.array(turn)))
+
+
+def creeps(cell: VirtualCell, rate: pin.SE3, until: float = 1e9, nested: bool = False) -> None:
+    """Each second the part moves on by `rate`, part frame, for so many seconds of its sweep, or in its nest."""
+    part, stands, began = cell.world.part, cell.world.part._pose, list[float]()
+
+    def pose(flange: np.ndarray) -> np.ndarray:
+        if not began and (part._base_from_part is not None if nested else cell.devices.laser.is_on):
+            began.append(cell.clock.now())
+        since = min(until, cell.clock.now() - began[0]) if began else 0.0
+        return stands(flange) @ pin.exp6(since * pin.log6(rate).vector).homogeneous
+
+    part._pose = pose

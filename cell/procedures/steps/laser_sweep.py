@@ -53,8 +53,7 @@ def laser_sweep(
     counted: bool = True,
     back: bool = False,
 ) -> SweepRecord:
-    """Sweep the scan head over every strip of `scan`, by the rail or by the arm as `scan.mode` says; the other way if
-    `back`.
+    """Sweep the scan head over each strip of `scan`, by rail or arm as `scan.mode` says; the other way if `back`.
 
     `sweeping` is told where the surface is taken to be beside who takes the frames. `check` raises when the run is to
     end. Whether the rail has lost steps is looked at unless `counted` is False: whoever says so does it.

@@ -167,7 +167,7 @@ def _swept_at_rest(
     lying: PartOnGround | None,
 ) -> tuple[Cloud, SweepRecord, float]:  # fmt: skip
     """The part's cloud and its sweep, made again until no frames are lost and the part is at rest: nothing of it is
-    moved by that. And how far, m, it moved in the last look; 0 for one at rest."""
+    moved by that. And how far, m, it moved in the last look; 0 for one at rest. Lost steps look like such a motion."""
     for left in reversed(range(SWEEPS)):
         try:
             record = laser_sweep(
@@ -178,9 +178,10 @@ def _swept_at_rest(
             swept = build_cloud(record), record
             moved = 0.0 if lying is None else moved_meanwhile(here, head, over, swept, part=lying, context=context)
             if moved and here.job.scan.mode == "rail":
-                # Steps that the rail has lost look like a part that moved.
                 check_lost_steps(here.devices, lambda _, text: context.progress(0.85, text))
         except DeviceFault as fault:
+            if fault.code == "rail.limit_switch":
+                check_lost_steps(here.devices, lambda _, text: context.progress(0.85, text))
             if fault.code != FRAMES_LOST or not left:
                 raise
             why = str(fault)

@@ -45,8 +45,8 @@ def home_rail(devices: Devices, progress: Callable[[float, str], None] = lambda 
 def beside_arm(mover: Mover, rail: Rail, begin: Callable[[], Motion]) -> Iterator[None]:
     """What the rail begins, it does while the arm moves; both are still in the end. Held before it, not meanwhile."""
     mover.hold()
-    hold, mover.hold = mover.hold, lambda: None
     motion = begin()
+    hold, mover.hold = mover.hold, lambda: None
     try:
         yield
     except BaseException:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.procedures.steps.verify_nest import where_seen
 from lab.bench.job.whole_job import JobRecord
+from tests.support.lying_part import creeps, moved
 from tests.support.unloading import JOB, unloaded
 
 
@@ -21,19 +20,7 @@ def test_a_part_that_comes_to_lie_beside_its_nest_is_misplaced(placed_pot: JobRe
 
 
 def test_a_part_that_creeps_in_its_nest_is_misplaced(placed_pot: JobRecord) -> None:
-    def slides(cell: VirtualCell) -> None:
-        part, stands, began = cell.world.part, cell.world.part._pose, list[float]()
-
-        def pose(flange: np.ndarray) -> np.ndarray:
-            lies = stands(flange)
-            if part._base_from_part is not None and not part.held:
-                began.append(cell.clock.now())
-                lies[1, 3] += 0.06e-3 * (began[-1] - began[0])
-            return lies
-
-        part._pose = pose
-
-    done = unloaded(placed_pot, slides)
+    done = unloaded(placed_pot, lambda cell: creeps(cell, moved(y=0.06e-3), nested=True))
     assert (done.outcome, done.stage) == ("misplaced", "verify") and "does not lie still" in done.reason
 
 

@@ -25,8 +25,8 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import ScanPlan
 from cell.procedures.sweep.swath import Swath, SweepCollector, SweepErrors
-from cell.procedures.sweep.sweeping import JITTER_S, LATENCY_S, arm_sweep, home_rail, rail_sweep
-from drivers.errors import DeviceFault
+from cell.procedures.sweep.sweeping import JITTER_S, LATENCY_S, arm_sweep, beside_arm, home_rail, rail_sweep
+from drivers.errors import DeviceFault, LimitError
 from drivers.interfaces import Frame, Motion, Rail, RailState
 from sim_backends.direct.arm import DirectArm
 
@@ -273,3 +273,18 @@ def test_lateness_that_is_allowed_is_in_the_budget_by_the_arm(rate: float) -> No
     stated = np.sqrt(np.trace(swath.covariance[:3, :3]))
     assert stated == pytest.approx(np.hypot(swath.shift / np.sqrt(3), rate * LATENCY_S * SCAN.speed), rel=0.1)
     np.testing.assert_allclose(np.linalg.norm(swath.line_spread, axis=1), rate * JITTER_S * SCAN.speed)
+
+
+def test_a_run_is_held_before_rail_and_arm_move_together_and_not_meanwhile() -> None:
+    """Whoever is told that it is held may reach in."""
+    cell, mover, pose = ready(None)
+    rail, moves = cell.devices.rail, list[bool]()
+    mover.hold = hold = lambda: moves.append(rail.state().moving)
+    with beside_arm(mover, rail, lambda: rail.move_to(0.09)):
+        mover.to(pose * from_parts((0.0, 0.0, -0.02)), "somewhat back")
+    assert moves == [False] and rail.state().position == pytest.approx(0.09, abs=1e-5)
+    for begin, error in (lambda: rail.move_to(1.0), LimitError), (lambda: rail.move_to(0.01), ZeroDivisionError):
+        with pytest.raises(error), beside_arm(mover, rail, begin):
+            raise ZeroDivisionError
+        assert mover.hold is hold
+    assert not rail.state().moving and rail.state().position > 0.05, "stopped on its way"

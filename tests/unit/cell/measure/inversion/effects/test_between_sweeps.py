@@ -48,8 +48,6 @@ def test_a_cloud_that_crept_is_put_back_to_where_it_was_in_the_middle_of_the_swe
     assert np.abs(left).max() < 1e-6 < np.abs((crept.points - cloud.points)[cloud.valid]).max()
 
 
-# --- a part that has or has not come to rest ---
-
 KNOWN = np.diag([1e-6**2] * 6)
 
 
