@@ -213,7 +213,7 @@ def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(placed_pot: JobRe
     assert 0.05e-3 < math.sqrt(found.covariance[0, 0]) < 0.3e-3 and found.bound["d"] > 0.2
 
 
-@pytest.mark.parametrize("share", [0.01, 0.10])
+@pytest.mark.parametrize("share", [0.01, 0.10, 0.3])
 def test_steps_that_the_rail_lost_over_the_placed_part_are_found(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
 ) -> None:

@@ -278,11 +278,11 @@ def test_lateness_that_is_allowed_is_in_the_budget_by_the_arm(rate: float) -> No
 def test_a_run_is_held_before_rail_and_arm_move_together_and_not_meanwhile() -> None:
     """Whoever is told that it is held may reach in."""
     cell, mover, pose = ready(None)
-    rail, moves = cell.devices.rail, list[bool]()
-    mover.hold = hold = lambda: moves.append(rail.state().moving)
-    with beside_arm(mover, rail, lambda: rail.move_to(0.09)):
+    rail, told = cell.devices.rail, list[str]()
+    mover.hold = hold = lambda: told.append("held")
+    with beside_arm(mover, rail, lambda: told.append("rail") or rail.move_to(0.09)):
         mover.to(pose * from_parts((0.0, 0.0, -0.02)), "somewhat back")
-    assert moves == [False] and rail.state().position == pytest.approx(0.09, abs=1e-5)
+    assert told == ["held", "rail"] and rail.state().position == pytest.approx(0.09, abs=1e-5)
     for begin, error in (lambda: rail.move_to(1.0), LimitError), (lambda: rail.move_to(0.01), ZeroDivisionError):
         with pytest.raises(error), beside_arm(mover, rail, begin):
             raise ZeroDivisionError
