@@ -180,8 +180,6 @@ def _swept_at_rest(
             if moved and here.job.scan.mode == "rail":
                 check_lost_steps(here.devices, lambda _, text: context.progress(0.85, text))
         except DeviceFault as fault:
-            if fault.code == "rail.limit_switch":
-                check_lost_steps(here.devices, lambda _, text: context.progress(0.85, text))
             if fault.code != FRAMES_LOST or not left:
                 raise
             why = str(fault)
