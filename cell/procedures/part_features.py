@@ -1,6 +1,7 @@
 """Named features of a placed part: how far each flat, edge, hole or pin lies from where it belongs, as people measure.
 
-They follow from where the part was seen, which its faces tell as a whole; each has a tolerance of its own.
+They follow from where the part was seen, which its faces tell as a whole, and from what the points about them say by
+themselves; each has a tolerance of its own.
 """
 
 from __future__ import annotations
@@ -12,38 +13,49 @@ import pinocchio as pin
 
 from cell.config.job import FeatureSection
 from cell.measure.geometry.poses import transform
+from cell.measure.inversion.local_deviation import LocalDeviation, Span
 from drivers.errors import Measured
 from drivers.interfaces import Vector
+
+NOT_SEEN = LocalDeviation()
+"""Of a feature about which no points tell: the part as a whole tells where it lies."""
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureSeen:
     """A feature that is `off` its place, m, in the directions in which its kind counts; `bound` is the stated one.
 
-    `belongs` (3,), m, surface frame, is where it should be.
+    `belongs` (3,), m, surface frame, is where it should be. Its `own` points put it so far from where the part as a
+    whole has it; of that, `own_off` counts.
     """
 
     section: FeatureSection
     off: float
     bound: float
     belongs: Vector
+    own: LocalDeviation = NOT_SEEN
+    own_off: float = 0.0
 
     @classmethod
     def of(
-        cls, section: FeatureSection, seen: pin.SE3, belongs: pin.SE3, *, motions: Vector, percent: float
-    ) -> FeatureSeen:
+        cls, section: FeatureSection, seen: pin.SE3, belongs: pin.SE3, *, motions: Vector, percent: float,
+        own: LocalDeviation = NOT_SEEN,
+    ) -> FeatureSeen:  # fmt: skip
         """Of a part that was `seen`, and that `belongs` elsewhere, both surface_from_part.
 
         `motions` (n, 6), m and rad, surface axes, about the part's origin, are drawn from what is not known of it; the
-        bound holds for `percent` of them.
+        bound holds for `percent` of them, and for all that its `own` points leave open.
         """
         at = transform(seen, np.array([section.at]))[0]
         there = transform(belongs, np.array([section.at]))[0]
-        off = at - there
         errors = motions[:, :3] + np.cross(motions[:, 3:], at - seen.translation)
         counted = counting(section, belongs.rotation)
-        bound = float(np.percentile(np.linalg.norm((off + errors) @ counted, axis=1), percent))
-        return cls(section, float(np.linalg.norm(off @ counted)), bound, there)
+        moved = sum((span.off * way for span, way in own.spans), np.zeros(3))
+        more = sum(span.more * float(np.linalg.norm(way @ counted)) for span, way in own.spans)
+        off = at - there + moved
+        bound = float(np.percentile(np.linalg.norm((off + errors) @ counted, axis=1), percent)) + more
+        own_off = float(np.linalg.norm(moved @ counted))
+        return cls(section, float(np.linalg.norm(off @ counted)), bound, there, own=own, own_off=own_off)
 
     @property
     def measured(self) -> Measured:
@@ -59,6 +71,7 @@ class FeatureSeen:
         return (
             f"the {self.section.kind} {self.section.name} is {1e3 * self.off:.2f} mm off, and may be "
             f"{1e3 * self.bound:.2f} mm (allowed: at most {1e3 * self.section.tolerance:g} mm)"
+            f"{f', for the part is off its drawing there by {1e3 * self.own_off:.2f} mm' if self.own_off else ''}"
         )
 
     def as_dict(self) -> dict[str, object]:
@@ -66,7 +79,13 @@ class FeatureSeen:
         return {
             "name": self.section.name, "kind": self.section.kind, "off_mm": round(1e3 * self.off, 4),
             "bound_mm": round(1e3 * self.bound, 4), "tolerance_mm": round(1e3 * self.section.tolerance, 4),
+            "own_higher_mm": _in_mm(self.own.higher),
+            "own_farther_mm": _in_mm(self.own.rim and self.own.rim.farther),
         }  # fmt: skip
+
+
+def _in_mm(span: Span | None) -> list[float] | None:
+    return None if span is None else [round(1e3 * end, 4) for end in span]
 
 
 def counting(section: FeatureSection, surface_from_part: Vector) -> Vector:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -11,10 +12,11 @@ import pinocchio as pin
 from cell.config.job import FeatureSection, Job, PlaceSection
 from cell.measure.geometry.poses import difference, from_parts, perturbed, transform
 from cell.measure.inversion.flush import Flush
+from cell.measure.inversion.local_deviation import LocalDeviation
 from cell.measure.inversion.mating import MatingGap
 from cell.measure.inversion.part_pose import PartPose, of_part
 from cell.procedures.part_error import draws_of
-from cell.procedures.part_features import FeatureSeen
+from cell.procedures.part_features import NOT_SEEN, FeatureSeen
 from drivers.errors import Measured, MisplacedError
 from drivers.interfaces import Vector
 
@@ -28,6 +30,8 @@ ROCKED = "the vehicle rocked by {:.2f} mm in the sweep of the part, or its top h
 NO_FLUSH = "how flush its edge is was not seen: no surface shows near it, or a vehicle that rocks moves both by more"
 BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
+OFF_DRAWING = "the part itself is not as drawn there: bent, worn, cut, or another one"
+WHOLE = "where the {} {} lies follows from the part as a whole: nobody looked at it by itself"
 LIKELY = {
     "raised": "it lies on something, or is another part: look under it",
     "deep": "the part or the surface is worn, or another one",
@@ -46,7 +50,7 @@ class PlacedPart:
     nothing scanned lies below. `flush` is how its edge stands over the surface; None where nothing of that shows beside
     it. `before` is how far off, m, it lay before each correction. `came` is how it came to lie when it was first put
     down, had nothing been allowed for, `slips` how it moved in each correction as the claw opened (`GraspSeries`).
-    `named` are the features that the job names.
+    `named` are the features that the job names, `own` what the points about them say by themselves, by name.
     `axes` says, for people, whose axes the figures are in.
     """
 
@@ -62,6 +66,7 @@ class PlacedPart:
     came: pin.SE3 | None = None
     slips: tuple[pin.SE3, ...] = ()
     named: tuple[FeatureSection, ...] = ()
+    own: Mapping[str, LocalDeviation] = field(default_factory=dict)
     axes: str = "the surface's axes"
 
     @classmethod
@@ -155,8 +160,12 @@ class PlacedPart:
         """Where the features lie that the job names."""
         motions, seen = draws_of(self.covariance), self.seen.surface_from_part
         return tuple(
-            FeatureSeen.of(section, seen, self.belongs, motions=motions, percent=SURE_PERCENT) for section in self.named
-        )
+            FeatureSeen.of(
+                section, seen, self.belongs, motions=motions, percent=SURE_PERCENT,
+                own=self.own.get(section.name, NOT_SEEN),
+            )
+            for section in self.named
+        )  # fmt: skip
 
     @property
     def advice(self) -> str:
@@ -218,8 +227,10 @@ class PlacedPart:
         """The error of a part that is not known to lie within the place's tolerances."""
         measured = off, turned, *_ = self.measured(place)
         bent = off.kept and turned.kept and any(number.name == FLUSH and not number.kept for number in measured)
-        likely = BENT if bent else self.likely
-        out = "".join(f". Out of tolerance: {each.words}" for each in self.features if not each.measured.kept)
+        failed = [each for each in self.features if not each.measured.kept]
+        out = "".join(f". Out of tolerance: {each.words}" for each in failed)
+        made = off.kept and turned.kept and any(each.own_off for each in failed)
+        likely = BENT if bent else OFF_DRAWING if made else self.likely
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
         return MisplacedError(
@@ -241,6 +252,7 @@ class PlacedPart:
             *((more,) if np.abs(self._times).max() > CLEARLY else ()),
             *self.pushed,
             *(f"not seen of the placed part: {motion}" for motion in self.unseen),
+            *(WHOLE.format(each.section.kind, each.section.name) for each in self.features if not each.own.spans),
         )
 
     @property

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
-from cell.config.job import load_job
+from cell.config.job import FeatureSection, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix, from_parts
 from cell.measure.inversion import NominalSurface
@@ -29,7 +29,8 @@ class LyingPart:
     """A cell of `record` at its station, whose part was put down; `also` is of the job's [place].
 
     It is swept `faster` than shipped. `changed` changes its world before anybody looks, `heard` is called with each
-    text that is told, `series` tells of parts before. `notes` are the texts, `parts` what it noted of the part, and
+    text that is told, `series` tells of parts before, and the job names these
+    `features`. `notes` are the texts, `parts` what it noted of the part, and
     `carried` whether its moves reckoned with a part in the claw then.
     """
 
@@ -43,6 +44,7 @@ class LyingPart:
     changed: Callable[[VirtualCell], None] = lambda cell: None
     heard: Callable[[VirtualCell, str], None] = lambda cell, text: None
     series: GraspSeries = field(default_factory=GraspSeries)
+    features: tuple[FeatureSection, ...] = ()
     _site: AtStation = field(init=False)
     notes: list[str] = field(default_factory=list, init=False)
     parts: list[str] = field(default_factory=list, init=False)
@@ -53,6 +55,7 @@ class LyingPart:
         file = job_with_part(self.folder, "pot", verify=self.verify, half=self.half, flat=self.flat, also=self.also)
         job, mesh = load_job(file)
         quick = changed(job, "scan", speed=self.faster * job.scan.speed)
+        quick = changed(quick, "part", feature=self.features) if self.features else quick
         nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
         self._site = site = AtStation(
             self.record, self.folder, quick, nominal, folded=False, changed=self.changed,

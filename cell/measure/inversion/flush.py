@@ -15,7 +15,7 @@ import scipy
 
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion.disagreement import STEEPEST, spread_for_journal, spread_mm, square_of, squares
-from cell.measure.inversion.nominal import Array, NominalSurface
+from cell.measure.inversion.nominal import Array, Indices, NominalSurface
 from cell.measure.reconstruction.cloud import Cloud
 
 REACH_M = 6e-3
@@ -95,6 +95,14 @@ def flush_along_edge(
     return Flush(places, higher, noise[clear], float(clear.sum() / edge.sum()))
 
 
+class PointHeights(NamedTuple):
+    """Points at `places` (n, 3) m, surface frame, stand `higher` (n,) m than drawn, and come from `lines` (n,)."""
+
+    places: Array
+    higher: Array
+    lines: Indices
+
+
 class _Squares(NamedTuple):
     """By how much the squares at `places` (n, 3) m, surface frame, stand `higher` (n,) m than drawn, with `noise`."""
 
@@ -107,6 +115,17 @@ def _standing(
     cloud: Cloud, base_from_surface: pin.SE3, surface_from_it: pin.SE3, drawn: NominalSurface
 ) -> _Squares | None:
     """How much higher than `drawn` its points in the cloud stand, in squares of 2 mm of the surface; None for none."""
+    places, higher, lines = heights_over(cloud, base_from_surface, surface_from_it, drawn)
+    if not len(places):
+        return None
+    medians, higher, noise = squares(square_of(places), higher, lines)
+    return _Squares(places[medians], higher, noise) if len(medians) else None
+
+
+def heights_over(
+    cloud: Cloud, base_from_surface: pin.SE3, surface_from_it: pin.SE3, drawn: NominalSurface
+) -> PointHeights:
+    """How much higher than `drawn`, which lies at `surface_from_it`, its points in the cloud, arm base, stand."""
     lines, rows = np.nonzero(cloud.valid)
     places = (cloud.points[lines, rows] - base_from_surface.translation) @ base_from_surface.rotation
     index, feet = drawn.feet((places - surface_from_it.translation) @ surface_from_it.rotation, REACH_M)
@@ -117,7 +136,4 @@ def _standing(
     upright = places[index] - np.outer(higher, [0.0, 0.0, 1.0])
     near, feet = drawn.feet((upright - surface_from_it.translation) @ surface_from_it.rotation, UPRIGHT_M)
     index, higher = index[near][feet.inner], higher[near][feet.inner]
-    if not len(index):
-        return None
-    medians, higher, noise = squares(square_of(places[index]), higher, lines[index])
-    return _Squares(places[index[medians]], higher, noise) if len(medians) else None
+    return PointHeights(places[index], higher, lines[index])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pinocchio as pin
 
 from cell.config.job import Job
@@ -12,6 +13,7 @@ from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion.effects.between_sweeps import GATE_M, LEAST_MOTION_M, PartOnGround
 from cell.measure.inversion.flush import flush_along_edge
+from cell.measure.inversion.local_deviation import local_deviation
 from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
 from cell.measure.reconstruction import Cloud, write_cloud
@@ -129,7 +131,15 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         on_part, around, seen.base_from_surface, nominal=here.nominal, faces=faces, belongs=belongs,
         lies=seen.surface_from_part, tolerance=place.tolerance, rocks=seen.rocked,
     )  # fmt: skip
-    return replace(PlacedPart.of(here.job, seen, part_points(here.nominal), stated), gap=gap, flush=flush)
+    own = {
+        feature.name: local_deviation(
+            on_part, seen.base_from_surface, seen.surface_from_part, faces=faces, at=np.array(feature.at),
+            edge=np.array(feature.axis) if feature.kind == "edge" else None, rocks=seen.rocked,
+        )
+        for feature in (here.job.part.feature if here.job.part else ())
+        if feature.kind in ("flat", "edge")
+    }  # fmt: skip
+    return replace(PlacedPart.of(here.job, seen, part_points(here.nominal), stated), gap=gap, flush=flush, own=own)
 
 
 def swept_part(

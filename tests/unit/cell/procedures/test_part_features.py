@@ -16,6 +16,7 @@ from cell.check.fit import require_fit
 from cell.config.cell_config import load_config
 from cell.config.job import FeatureSection, PartSection, load_job
 from cell.measure.geometry.poses import from_parts
+from cell.measure.inversion.local_deviation import LocalDeviation, Rim, Span
 from cell.procedures.part_features import FeatureSeen, counting
 from drivers.errors import ConfigError
 from lab.bench.job.part_jobs import job_with_part
@@ -77,6 +78,26 @@ def test_the_bound_of_a_feature_is_what_chance_adds_at_its_arm() -> None:
     assert lifted.measured.kept and lifted.measured.most == pytest.approx(0.3)
     assert not replace(lifted, bound=0.31e-3).measured.kept
     assert json.loads(json.dumps(lifted.as_dict()))["bound_mm"] == round(1e3 * lifted.bound, 4)
+
+
+def test_what_the_points_about_a_feature_say_by_themselves_counts_where_the_drawing_does_not_explain_it() -> None:
+    here, still = pin.SE3.Identity(), np.zeros((10, 6))
+    worn, inside = Span(-0.25e-3, -0.15e-3), Span(-0.05e-3, 0.05e-3)
+
+    def of(kind: str, axis: tuple[float, ...], own: LocalDeviation) -> FeatureSeen:
+        return FeatureSeen.of(feature(kind, axis), here, here, motions=still, percent=PERCENT, own=own)
+
+    flat = of("flat", (0, 0, 1), LocalDeviation(worn))
+    assert flat.off == flat.own_off == pytest.approx(0.15e-3) and flat.bound == pytest.approx(0.25e-3)
+    assert "the part is off its drawing there by 0.15 mm" in flat.words
+    assert flat.as_dict()["own_higher_mm"] == [-0.25, -0.15] and flat.as_dict()["own_farther_mm"] is None
+    assert of("hole", (0, 0, 1), LocalDeviation(worn)).bound == 0.0, "along its direction nothing counts"
+    kept = of("flat", (0, 0, 1), LocalDeviation(inside))
+    assert kept.off == kept.bound == kept.own_off == 0.0 and "drawing" not in kept.words
+    # An edge along y: it is .15 mm low, and ends .4 to .6 mm farther along x.
+    edge = of("edge", (0, 1, 0), LocalDeviation(worn, Rim(Span(0.4e-3, 0.6e-3), np.array([1.0, 0.0, 0.0]))))
+    assert edge.off == pytest.approx(np.hypot(0.15e-3, 0.4e-3)) and edge.bound == pytest.approx(edge.off + 0.3e-3)
+    assert not edge.measured.kept and edge.as_dict()["own_farther_mm"] == [0.4, 0.6]
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,10 @@ from cell.config.job import FeatureSection, load_job
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.flush import Flush
+from cell.measure.inversion.local_deviation import LocalDeviation, Span
 from cell.measure.inversion.observability import SmallMotion
 from cell.measure.inversion.part_pose import PartPose
-from cell.procedures.placed_part import BENT, LIKELY, UNCLEAR, PlacedPart, along_surface
+from cell.procedures.placed_part import BENT, LIKELY, OFF_DRAWING, UNCLEAR, WHOLE, PlacedPart, along_surface
 from drivers.errors import MisplacedError
 from tests.support.lying_part import moved
 
@@ -143,6 +144,20 @@ def test_a_feature_out_of_its_own_tolerance_is_no_part_in_its_place() -> None:
     assert BENT not in str(told)
     features = cast(list[dict[str, object]], found.summary()["features"])
     assert [each["name"] for each in features] == ["wide", "narrow"]
+
+
+def test_a_part_that_is_off_its_drawing_about_a_feature_is_told_as_that() -> None:
+    """As a whole it lies in its place; one that lies aside as well is told by where it lies."""
+    table = {"kind": "flat", "at": ["0 mm", "0 mm", "0 mm"], "axis": [0, 0, 1], "tolerance": "0.3 mm"}
+    named = tuple(FeatureSection.model_validate({**table, "name": name}) for name in ("worn", "top"))
+    worn = {"worn": LocalDeviation(Span(-0.5e-3, -0.4e-3))}
+    found = replace(part(moved(0.1e-3)), named=named, own=worn)
+    told = str(found.misplaced(PLACE))
+    assert not found.in_tolerance(PLACE) and not found.not_aside.in_tolerance(PLACE)
+    assert OFF_DRAWING in told and "flat worn is 0.40 mm off" in told and "flat top" not in told
+    assert OFF_DRAWING not in str(replace(found, seen=part(moved(0.9e-3)).seen).misplaced(PLACE))
+    # Of what nobody saw by itself, that is said.
+    assert WHOLE.format("flat", "top") in found.notes and WHOLE.format("flat", "worn") not in found.notes
 
 
 def test_moved_to_where_it_belongs_along_the_surface_it_is_as_high_and_as_tilted() -> None:

@@ -15,11 +15,11 @@ import scipy
 import trimesh
 
 from cell import Cell
-from cell.config.job import load_job
+from cell.config.job import FeatureSection, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, from_parts, transform
 from cell.measure.inversion import NominalSurface
-from cell.procedures.placed_part import LIKELY, NO_FLUSH, PlacedPart
+from cell.procedures.placed_part import LIKELY, NO_FLUSH, OFF_DRAWING, PlacedPart
 from cell.procedures.steps.kinds import PLACE, kind_of
 from cell.procedures.steps.verify import CLOUD
 from cell.run.record.replay import replay
@@ -29,10 +29,13 @@ from lab.bench.job.part_effects import motion, opened
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.models import rail
+from sim_backends.optics.mesh import Mesh
 from sim_backends.world.world import World
 from tests.support.lying_part import LyingPart, creeps, moved
 from tests.support.report_runs import CONFIG, changed
 
+FRONT = ["0 mm", "18 mm", "26.3 mm"]
+"""On the front rim of the top of the part that `job_with_part` draws on `pot`."""
 OFF = moved(0.2e-3, -0.1e-3, 0.2e-3, turn=(0.002, -0.003, 0.003))
 
 
@@ -198,6 +201,34 @@ def test_a_part_out_of_its_place_is_told_with_where_it_lies_and_why(
     assert np.abs(difference(found.seen.surface_from_part, off))[:3].max() < 0.03e-3
 
 
+def test_a_part_that_is_not_as_drawn_about_its_features_is_told_though_it_lies_in_its_place(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    """Of its top 12 mm are .5 mm lower, and its front ends .5 mm sooner."""
+
+    def other(cell: VirtualCell) -> None:
+        [item] = cell.world._items
+        drawn = item.station.part_seen
+        assert drawn is not None
+        corners, triangles = trimesh.remesh.subdivide_to_size(drawn.vertices, drawn.triangles, 2e-3)
+        top = corners[:, 2] > 0.012
+        corners[top & (np.hypot(*corners[:, :2].T) < 6e-3), 2] -= 0.5e-3
+        corners[top & (corners[:, 1] > 17.9e-3), 1] -= 0.5e-3
+        cell.world._items = [replace(item, station=replace(item.station, part_seen=Mesh(corners, triangles)))]
+
+    named = [
+        {"name": "front", "kind": "edge", "at": FRONT, "axis": [1, 0, 0], "tolerance": "0.3 mm"},
+        {"name": "top", "kind": "flat", "at": ["0 mm", "0 mm", "27 mm"], "axis": [0, 0, 1], "tolerance": "0.3 mm"},
+        {"name": "pin", "kind": "pin", "at": ["9 mm", "0 mm", "27 mm"], "axis": [0, 0, 1], "tolerance": "0.3 mm"},
+    ]
+    features = tuple(map(FeatureSection.model_validate, named))
+    with pytest.raises(MisplacedError, match=r"lies 0.0\d ± 0.0\d mm off") as told:
+        LyingPart(placed_pot, tmp_path, changed=other, features=features).looked(pin.SE3.Identity())
+    for out in ("edge front is 0.2", "flat top is 0.4", OFF_DRAWING):
+        assert out in str(told.value)
+    assert str(told.value).count("Out of tolerance") == 2
+
+
 def test_another_part_or_none_is_not_found(placed_pot: JobRecord, tmp_path: Path) -> None:
     with pytest.raises(MisplacedError, match="is not where it was put down, or is not the part as drawn"):
         LyingPart(placed_pot, tmp_path).looked(moved(0.05, 0.03, 0.02))
@@ -296,8 +327,7 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replaye
     job = job_with_part(calibrated_folder, "pot", verify="all", half=MIDDLE)
     text = job.read_text(encoding="utf-8").replace('speed = "15 mm/s"', 'speed = "30 mm/s"')
     job.write_text(
-        f'{text}[[part.feature]]\nname = "left"\nkind = "edge"\nat = ["-15 mm", "0 mm", "5 mm"]\naxis = [0, 1, 0]\n'
-        'tolerance = "0.4 mm"\n',
+        f'{text}[[part.feature]]\nname = "left"\nkind = "edge"\nat = {FRONT}\naxis = [1, 0, 0]\ntolerance = "0.4 mm"\n',
         encoding="utf-8",
     )
     with Cell.open(sim="all", seed=2, clock="virtual", job=job) as cell:
@@ -316,6 +346,8 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replaye
     assert rows["placed part off its place, stated bound"]["kept"]
     (feature,) = told["result"]["features"]
     assert feature["off_mm"] < feature["bound_mm"] < feature["tolerance_mm"]
+    for own in (feature["own_higher_mm"], feature["own_farther_mm"]):
+        assert -0.4 < own[0] < 0.0 < own[1] < 0.4
     assert rows["edge left, stated bound"]["value"] == pytest.approx(feature["bound_mm"], abs=1e-3)
     assert "place error, stated 95 % bound" not in rows
     assert report["part_mesh"]["file"] == str(calibrated_folder / "pot-part.ply")

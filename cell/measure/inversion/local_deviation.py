@@ -1,0 +1,158 @@
+"""How far a placed part is off its own drawing about one feature: bent, worn or cut there.
+
+The part's pose follows from all of its faces, and passes over the few points that do not fit it. So the points about a
+feature are asked by themselves: how much higher they stand than drawn at that pose, and where the part ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pinocchio as pin
+
+from cell.measure.inversion.disagreement import squares
+from cell.measure.inversion.flush import heights_over
+from cell.measure.inversion.nominal import Array, NominalSurface
+from cell.measure.reconstruction.cloud import Cloud
+
+NEAR_M = 3e-3
+"""The points within this of a feature are asked."""
+LEVEL_M = 1.5e-3
+"""So far above or below a drawn face at most is a point that counts as on it."""
+RIM_M, STEP_M = 2e-3, 0.02e-3
+"""So far from an edge at most its rim is drawn, and in such steps it is looked for in the drawing."""
+STRETCH_M = (-6e-3, 3.5e-3)
+"""Outward of the drawn rim, where the part's last points are looked for."""
+BAND_M, LEAST_BANDS = 1e-3, 4
+"""They are looked for in bands across the rim, so wide, of which so many have to tell."""
+BLUR_M = 0.15e-3
+"""Half a stripe, of which a rim leaves the inner side: the last point is off by less."""
+INSIDE_M = 0.75e-3
+"""So far inside of the rim its face is asked whether a point beyond is on its level."""
+STEEP = 1.0
+"""Rise over distance from which on what stands higher beside a rim may hide it from camera or laser."""
+
+
+class Span(NamedTuple):
+    """Between what the points about a feature say that something is off, m."""
+
+    least: float
+    most: float
+
+    @property
+    def off(self) -> float:
+        """The least that explains the points; 0 where the drawing does."""
+        return float(np.clip(0.0, self.least, self.most))
+
+    @property
+    def more(self) -> float:
+        """By how much more it may be off; 0 where the drawing explains the points."""
+        return self.most - self.least if self.off else 0.0
+
+
+class Rim(NamedTuple):
+    """A part ends by `farther` along `outward` (3,) than drawn, square to its edge and to the surface's z axis.
+
+    A rim that may be hidden is never told to end too soon.
+    """
+
+    farther: Span
+    outward: Array
+
+
+@dataclass(frozen=True)
+class LocalDeviation:
+    """The points about a feature stand `higher` than drawn at the part's pose, along the surface's z axis, give or take
+    four standard deviations. About an edge they show the part's `rim`, surface axes. None is what too few of them tell.
+    """
+
+    higher: Span | None = None
+    rim: Rim | None = None
+
+    @property
+    def spans(self) -> tuple[tuple[Span, Array], ...]:
+        """Each span that is seen, with its direction (3,), surface axes."""
+        up = () if self.higher is None else ((self.higher, np.array([0.0, 0.0, 1.0])),)
+        return up if self.rim is None else (*up, self.rim)
+
+
+def local_deviation(
+    part: Cloud, base_from_surface: pin.SE3, lies: pin.SE3, *, faces: NominalSurface, at: Array,
+    edge: Array | None = None, rocks: float = 0.0,
+) -> LocalDeviation:  # fmt: skip
+    """Of the part with these `faces`, which `lies` at surface_from_part, about `at` (3,) m, part frame.
+
+    `part` is what a sweep shows of it, arm base. `edge` (3,) is the direction of an edge, part frame. The vehicle
+    `rocks` by so much, m, up and down: the points about a feature are swept together, at one end of that.
+    """
+    rim = None
+    if edge is not None:
+        rim = _seen_rim(part, base_from_surface * lies, lies.rotation[2], faces=faces, at=at, edge=edge)
+        rim = rim and rim._replace(outward=lies.rotation @ rim.outward)
+    seen = heights_over(part, base_from_surface, lies, faces)
+    near = np.linalg.norm(seen.places - lies.act(at), axis=1) < NEAR_M
+    if not near.any():
+        return LocalDeviation(rim=rim)
+    _, middle, noise = squares(np.zeros(near.sum(), dtype=np.intp), seen.higher[near], seen.lines[near])
+    unsure = noise + 2.0 * rocks
+    told = [Span(float(least), float(most)) for least, most in zip(middle - unsure, middle + unsure, strict=True)]
+    return LocalDeviation(told[0] if told else None, rim)
+
+
+def _seen_rim(
+    part: Cloud, base_from_part: pin.SE3, upward: Array, *, faces: NominalSurface, at: Array, edge: Array
+) -> Rim | None:
+    """Where the part ends at this edge, all in its own frame; `upward` (3,) is the surface's z axis there.
+
+    None where no rim is drawn there, where level ground goes on beyond it, and where too few points show.
+    """
+    along = edge / np.linalg.norm(edge)
+    across = np.cross(along, upward)
+    if not (length := float(np.linalg.norm(across))) > 0.5:
+        return None
+    ends = [(out, _drawn_end(faces, at, out)) for out in (across / length, -across / length)]
+    drawn = [(out, end) for out, end in ends if end is not None]
+    if len(drawn) != 1:
+        return None
+    [(outward, end)] = drawn
+    beside = (part.points[part.valid] - base_from_part.translation) @ base_from_part.rotation - at
+    out, aside = beside @ outward - end, beside @ along
+    kept = (np.abs(aside) < NEAR_M) & (out > STRETCH_M[0]) & (out < STRETCH_M[1])
+    beside, out, aside = beside[kept], out[kept], aside[kept]
+    level, feet = faces.feet(at + beside - np.outer(np.maximum(0.0, out + INSIDE_M), outward), LEVEL_M)
+    out, band = out[level][feet.inner], np.floor(aside[level][feet.inner] / BAND_M)
+    found = [_end(np.sort(out[band == each])) for each in np.unique(band)]
+    told = np.array([end for end in found if end is not None])
+    if len(told) < LEAST_BANDS:
+        return None
+    last, beyond = map(float, np.median(told, axis=0))
+    if beyond > STRETCH_M[1]:
+        return None
+    hidden = _hidden(faces.samples - at - end * outward, upward)
+    return Rim(Span(last - BLUR_M, max(beyond + BLUR_M, 0.0 if hidden else -np.inf)), outward)
+
+
+def _drawn_end(faces: NominalSurface, at: Array, outward: Array) -> float | None:
+    """How far `outward` of `at` the faces end, m; None where they do not, or end elsewhere."""
+    steps = np.arange(-RIM_M, RIM_M, STEP_M)
+    index, feet = faces.feet(at + np.outer(steps, outward), LEVEL_M)
+    if not len(index) or index[0] != 0 or not feet.inner[0]:
+        return None
+    # Beyond the rim the nearest point of the faces is on it.
+    end = float(((feet.points - at) @ outward).max())
+    return end if end < RIM_M - 2.0 * STEP_M else None
+
+
+def _end(out: Array) -> tuple[float, float] | None:
+    """Between what the part ends in one band: its last point, and where the next one would have been."""
+    last = out[out > out[-1] - NEAR_M] if len(out) else out
+    return (float(last[-1]), float(last[-1] + np.diff(last).max())) if len(last) > 2 else None
+
+
+def _hidden(beside: Array, upward: Array) -> bool:
+    """Whether something of the part, (n, 3) m from its rim, rises steeply over it."""
+    up = beside @ upward
+    level = np.linalg.norm(beside - np.outer(up, upward), axis=1)
+    return bool((up > np.maximum(LEVEL_M, STEEP * level)).any())

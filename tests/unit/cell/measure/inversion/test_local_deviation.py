@@ -1,0 +1,125 @@
+"""What the points about a feature say by themselves, in scans whose truth is known; a part in the world: `verify`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from numpy.typing import NDArray
+
+from cell.measure.geometry.poses import from_parts
+from cell.measure.inversion import NominalSurface
+from cell.measure.inversion.local_deviation import BLUR_M, LocalDeviation, Span, local_deviation
+from cell.measure.reconstruction import Cloud
+from tests.unit.cell.measure.inversion.test_flush import BELONGS, HALF, THICK, TOP, swept
+from tests.unit.cell.measure.inversion.test_registration import TRUE, scanned
+
+Array = NDArray[np.float64]
+MIDDLE, RIGHT, LEFT, FRONT = ([0.0, 0.0, 0.0], [HALF, 0.0, 0.0], [-HALF, 0.0, 0.0], [0.0, 0.018, 0.0])
+ACROSS, ALONG = [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]
+LINES_M, ROWS_M = 0.072 / 159, 0.04 / 239
+
+
+def ends(right: float, seed: int = 5) -> Cloud:
+    """A part whose right end is `right` of where it is drawn, m."""
+    return scanned(lambda x, y: np.where((x > -HALF) & (x < HALF + right), THICK, 0.0 * y), seed)
+
+
+def about(
+    at: list[float], cloud: Cloud, edge: list[float] | None = None, faces: NominalSurface = TOP
+) -> LocalDeviation:
+    direction = None if edge is None else np.array(edge)
+    return local_deviation(cloud, TRUE, BELONGS, faces=faces, at=np.array(at), edge=direction)
+
+
+def rim(at: list[float], cloud: Cloud, edge: list[float] = ACROSS, faces: NominalSurface = TOP) -> Span:
+    found = about(at, cloud, edge, faces).rim
+    assert found is not None
+    return found.farther
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_of_a_part_as_drawn_the_points_about_each_feature_say_no_more_than_its_pose(seed: int) -> None:
+    shifted = partial(scanned, shift=(0.0015 + 0.1 * seed * LINES_M, -0.001 + 0.1 * seed * ROWS_M))
+    cloud = shifted(lambda x, y: np.where(np.abs(x) < HALF, THICK, 0.0 * y), seed)
+    for at, edge, apart in ((RIGHT, ACROSS, LINES_M), (LEFT, ACROSS, LINES_M), (FRONT, ALONG, ROWS_M)):
+        found = about(at, cloud, edge)
+        assert found.higher is not None and found.rim is not None
+        assert found.higher.off == 0.0 and found.higher.more == 0.0 and found.higher.most < 0.1e-3
+        farther, outward = found.rim
+        assert farther.off == 0.0 and farther.most - farther.least < 2.0 * BLUR_M + 1.3 * apart
+        assert np.allclose(outward, np.sign(at))
+        assert [way.tolist() for _, way in found.spans] == [[0.0, 0.0, 1.0], outward.tolist()]
+
+
+def test_a_flat_that_is_worn_about_a_feature_is_so_much_lower_there_and_nowhere_else() -> None:
+    cloud = swept(0.0)
+    local = (cloud.points - TRUE.translation) @ TRUE.rotation
+    local[np.hypot(local[..., 0], local[..., 1]) < 5e-3, 2] -= 0.3e-3
+    worn = replace(cloud, points=local @ TRUE.rotation.T + TRUE.translation)
+    found = about(MIDDLE, worn).higher
+    assert found is not None and found.least < -0.3e-3 < found.most < -0.25e-3
+    assert found.off == found.most and found.more == pytest.approx(found.most - found.least)
+    beside = about([0.012, 0.0, 0.0], worn).higher
+    assert beside is not None and beside.off == 0.0
+
+
+@pytest.mark.parametrize("right", [0.9e-3, -0.9e-3])
+def test_a_part_that_was_cut_or_grew_ends_so_much_sooner_or_later(right: float) -> None:
+    cloud = ends(right)
+    found = rim(RIGHT, cloud)
+    assert found.least < right < found.most
+    assert np.sign(found.off) == np.sign(right) and abs(right) < abs(found.off) + found.more
+    assert rim(LEFT, cloud).off == 0.0
+
+
+def test_an_edge_at_an_angle_to_the_lines_is_looked_for_square_to_itself() -> None:
+    turn = pin.exp3(np.array([0.0, 0.0, 0.5]))
+    square = NominalSurface(np.array([[-8, -8, 0], [8, -8, 0], [8, 8, 0], [-8, 8, 0]]) * 1e-3 @ turn.T, TOP.triangles)
+
+    def turned(x: Array, y: Array, farther: float = 0.0) -> Array:
+        u, v = turn.T[:2, :2] @ np.stack([x.ravel(), y.ravel()])
+        inside = (np.abs(u) < 8e-3 + farther * (u > 0.0)) & (np.abs(v) < 8e-3)
+        return np.where(inside.reshape(x.shape), THICK, 0.0)
+
+    at, edge = (turn @ [8e-3, 0.0, 0.0]).tolist(), turn[:, 1].tolist()
+    assert rim(at, scanned(turned, 5), edge, square).off == 0.0
+    longer = about(at, scanned(partial(turned, farther=0.8e-3), 5), edge, square).rim
+    assert longer is not None and longer.farther.least < 0.8e-3 < longer.farther.most
+    assert longer.farther.off > 0.3e-3 and np.allclose(longer.outward, turn[:, 0])
+
+
+def test_what_is_no_rim_in_the_drawing_or_does_not_show_says_nothing() -> None:
+    cloud = swept(0.0)
+    assert about(MIDDLE, cloud, ACROSS).rim is None, "the face goes on"
+    assert about([HALF + 5e-3, 0.0, 0.0], cloud, ACROSS).rim is None, "drawn elsewhere"
+    assert about([HALF, 0.0, -6e-3], cloud, ACROSS).spans == (), "below the rim"
+    assert about(RIGHT, cloud, [0.0, 0.0, 1.0]).rim is None, "upright"
+    thin = from_parts((0.0, 0.0, 1e-3))
+    level = local_deviation(
+        swept(0.0, thick=1e-3), TRUE, thin, faces=TOP, at=np.array(RIGHT), edge=np.array(ACROSS)
+    ).rim
+    assert level is None, "the ground beside it is as high"
+    nothing = replace(cloud, points=np.full_like(cloud.points, np.nan))
+    assert about(RIGHT, nothing, ACROSS).spans == ()
+
+
+def test_a_rim_that_something_higher_may_hide_is_not_told_to_end_too_soon() -> None:
+    tower = np.array([[5, -4, 12], [12, -4, 12], [12, 4, 12], [5, 4, 12]]) * 1e-3
+    both = NominalSurface(np.concatenate([TOP.vertices, tower]), [*TOP.triangles, [4, 5, 6], [4, 6, 7]])
+    assert rim(RIGHT, ends(-0.9e-3)).off < 0.0
+    assert rim(RIGHT, ends(-0.9e-3), faces=both) == Span(rim(RIGHT, ends(-0.9e-3)).least, 0.0)
+    assert rim(RIGHT, ends(0.9e-3), faces=both).off > 0.0
+
+
+def test_a_vehicle_that_rocks_hides_as_much_of_a_height() -> None:
+    cloud = swept(0.0)
+    still, rocked = (
+        local_deviation(cloud, TRUE, BELONGS, faces=TOP, at=np.array(MIDDLE), rocks=rocks).higher
+        for rocks in (0.0, 0.1e-3)
+    )
+    assert still is not None and rocked is not None
+    assert rocked.most == pytest.approx(still.most + 0.2e-3) and rocked.least == pytest.approx(still.least - 0.2e-3)
