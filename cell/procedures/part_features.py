@@ -11,9 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio as pin
 
-from cell.config.job import FeatureSection
+from cell.config.job import FeatureSection, Job
 from cell.measure.geometry.poses import transform
-from cell.measure.inversion.local_deviation import LocalDeviation, Span
+from cell.measure.inversion import NominalSurface
+from cell.measure.inversion.local_deviation import LocalDeviation, Span, local_deviation
+from cell.measure.inversion.part_pose import PartPose
+from cell.measure.reconstruction import Cloud
 from drivers.errors import Measured
 from drivers.interfaces import Vector
 
@@ -86,6 +89,19 @@ class FeatureSeen:
 
 def _in_mm(span: Span | None) -> list[float] | None:
     return None if span is None else [round(1e3 * end, 4) for end in span]
+
+
+def by_themselves(job: Job, cloud: Cloud, seen: PartPose, faces: NominalSurface) -> dict[str, LocalDeviation]:
+    """What the points of a part in its cloud, arm base, say about each flat and edge that the job names, by name. The
+    part has these `faces`, and was `seen` so."""
+    return {
+        feature.name: local_deviation(
+            cloud, seen.base_from_surface, seen.surface_from_part, faces=faces, at=np.array(feature.at),
+            edge=np.array(feature.axis) if feature.kind == "edge" else None, rocks=seen.rocked,
+        )
+        for feature in (() if job.part is None else job.part.feature)
+        if feature.kind in ("flat", "edge")
+    }  # fmt: skip
 
 
 def counting(section: FeatureSection, surface_from_part: Vector) -> Vector:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pinocchio as pin
 
 from cell.config.job import Job
@@ -13,13 +12,13 @@ from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion.effects.between_sweeps import GATE_M, LEAST_MOTION_M, PartOnGround
 from cell.measure.inversion.flush import flush_along_edge
-from cell.measure.inversion.local_deviation import local_deviation
 from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
 from cell.measure.reconstruction import Cloud, write_cloud
 from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import FARTHEST_M, expected_residual
 from cell.procedures.part_error import part_covariance, part_points
+from cell.procedures.part_features import by_themselves
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart, along_surface
 from cell.procedures.steps.correction import correct
 from cell.procedures.steps.laser_sweep import check_lost_steps, head_at, laser_sweep
@@ -131,14 +130,7 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         on_part, around, seen.base_from_surface, nominal=here.nominal, faces=faces, belongs=belongs,
         lies=seen.surface_from_part, tolerance=place.tolerance, rocks=seen.rocked,
     )  # fmt: skip
-    own = {
-        feature.name: local_deviation(
-            on_part, seen.base_from_surface, seen.surface_from_part, faces=faces, at=np.array(feature.at),
-            edge=np.array(feature.axis) if feature.kind == "edge" else None, rocks=seen.rocked,
-        )
-        for feature in (here.job.part.feature if here.job.part else ())
-        if feature.kind in ("flat", "edge")
-    }  # fmt: skip
+    own = by_themselves(here.job, on_part, seen, faces)
     return replace(PlacedPart.of(here.job, seen, part_points(here.nominal), stated), gap=gap, flush=flush, own=own)
 
 

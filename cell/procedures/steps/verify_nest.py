@@ -14,6 +14,7 @@ from cell.measure.inversion.effects.between_sweeps import PartOnGround
 from cell.measure.inversion.part_pose import DEMANDS, SHIFTED, PartPose, parted
 from cell.measure.reconstruction import Cloud
 from cell.procedures.part_error import part_points
+from cell.procedures.part_features import by_themselves
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart
 from cell.procedures.sought_part import pose_record
 from cell.procedures.steps.laser_sweep import head_at
@@ -38,9 +39,9 @@ def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
     stated = context.made(SetDown).covariance
     # The arm's base takes the place of a surface here.
     seen = PartPose(pin.SE3.Identity(), fit.base_from_surface, fit.covariance, fit, beside=fit.n_points)
-    found = replace(
-        PlacedPart.of(job, seen, part_points(here.nominal), stated), axes="axes of the arm base, in its nest"
-    )
+    own = by_themselves(job, parted(swept[0], here.nominal, belongs)[0], seen, here.nominal)
+    axes = "axes of the arm base, in its nest"
+    found = replace(PlacedPart.of(job, seen, part_points(here.nominal), stated), own=own, axes=axes)
     for note in found.notes:
         context.note(text=f"in its nest: {note}")
     if not found.in_tolerance(job.place):
