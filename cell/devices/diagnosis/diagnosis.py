@@ -137,7 +137,8 @@ def diagnose(
 
     Raises only for a wrong configuration, an unknown device, or devices that another process holds.
     """
-    _require_known(only)
+    if unknown := [name for name in only if name not in DEVICES]:
+        raise ConfigError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
     names = simulated_of(sim, path)
     whole = set(names) == set(DEVICES)
     _, config = config_to_open(path, simulated=whole)
@@ -163,11 +164,6 @@ def diagnose(
         if row.device in on_arm:
             row.state = f"{row.state}; what is shown is the real arm's output, the {row.device} is to be simulated"
     return rows
-
-
-def _require_known(only: Collection[str]) -> None:
-    if unknown := [name for name in only if name not in DEVICES]:
-        raise ConfigError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
 
 
 def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:
