@@ -34,7 +34,7 @@ from cell.motion.kinematics import HOME, JointLimits, Joints, Unreachable, arm_k
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
 from drivers.clock import Clock
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, DeviceFault
 from drivers.interfaces import Arm, ArmMotion, Vector
 
 THERE = 50e-6
@@ -282,6 +282,20 @@ class Mover:
         motion.wait(3.0 * trajectory.duration + GRACE_WALL_S * self._clock.rate)
         self._clock.sleep(self._settle_time)
         return motion.contact
+
+
+def moved_once_more(arm: Arm, move: Callable[[], None]) -> None:
+    """Do `move`; once more after a fault of the arm that a program may clear by itself, such as a lost program.
+
+    After a protective stop this is refused: a person has to look first.
+    """
+    try:
+        move()
+    except DeviceFault as fault:
+        if fault.device != arm.name or not fault.recoverable:
+            raise
+        arm.recover()
+        move()
 
 
 class PartState(Enum):
