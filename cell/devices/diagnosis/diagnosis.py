@@ -137,8 +137,7 @@ def diagnose(
 
     Raises only for a wrong configuration, an unknown device, or devices that another process holds.
     """
-    if unknown := [name for name in only if name not in DEVICES]:
-        raise ConfigError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
+    _require_known(only)
     names = simulated_of(sim, path)
     whole = set(names) == set(DEVICES)
     _, config = config_to_open(path, simulated=whole)
@@ -164,6 +163,11 @@ def diagnose(
         if row.device in on_arm:
             row.state = f"{row.state}; what is shown is the real arm's output, the {row.device} is to be simulated"
     return rows
+
+
+def _require_known(only: Collection[str]) -> None:
+    if unknown := [name for name in only if name not in DEVICES]:
+        raise ConfigError(f"there is no device {', '.join(unknown)}; the devices are {', '.join(DEVICES)}")
 
 
 def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:

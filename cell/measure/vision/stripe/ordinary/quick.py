@@ -183,9 +183,7 @@ def read_quickly(
     double = choose(start) if several else np.zeros(len(start), np.bool_)
     low, high = settings.width_range_px
     found, widths = survey(start, low, high)
-    # Looked at closely only where hardly a line shows a stripe.
-    if len(found) <= 0.2 * len(start):
-        refuse_white(image >= settings.saturation_dn)
+    _refuse_blinded(image, start, found, settings.saturation_dn)
     fitted = np.full((fit.FITTED, len(work)), np.nan)
 
     def run(which: NDArray[np.intp], contrast: float, rho: Floats) -> None:
@@ -207,7 +205,7 @@ def read_quickly(
         widths = np.minimum(np.maximum(widths * widening, low), high)
         contrast = seen_contrast if contrast is None else contrast
         grain = seen_grain if grain is None else grain
-    run(found, contrast, correlation(grain) if contrast > 0 and grain else NO_LAGS)
+    run(found, contrast, _lags(contrast, grain))
     saturated, excess = np.empty(len(work), np.bool_), 1 + SECOND_ORDER * contrast**2
     believe(
         fitted, start, work.shape[1], low, high, least=0.5 * least, excess=excess, double=double, saturated=saturated
@@ -243,6 +241,11 @@ def _is_ordinary(fitted: Array, start: Array, work: Image, *, shade: Image, seen
     )
 
 
+def _lags(contrast: float, grain: float | None) -> NDArray[np.float32]:
+    """The speckle's correlation by lag; none where there is no speckle."""
+    return correlation(grain) if contrast > 0 and grain else NO_LAGS
+
+
 def _is_like(profile: StripeProfile, like: StripeProfile | None) -> bool:
     """Whether it is to be taken as the one before it was: that one was measured, or both show hardly a line."""
     if like is None:
@@ -269,6 +272,13 @@ def _above(work: Image, shade: Shade) -> Image:
     """What lies above the dark frame, for the search; where both are saturated nothing does."""
     flat = shade if shade.dtype == np.uint8 else np.clip(np.rint(shade), 0, 255).astype(np.uint8)
     return np.asarray(cv2.subtract(work, flat), dtype=np.uint8)
+
+
+def _refuse_blinded(image: Image, start: Array, found: NDArray[np.intp], saturation: int) -> None:
+    """Refuse a picture that is mostly white; looked at closely only where hardly a line shows a stripe."""
+    if len(found) > 0.2 * len(start):
+        return
+    refuse_white(image >= saturation)
 
 
 def refuse_white(saturated: NDArray[np.bool_]) -> None:
