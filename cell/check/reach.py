@@ -31,15 +31,8 @@ from cell.motion.collision import (
 )
 from cell.motion.kinematics import HOME, Unreachable, arm_kinematics
 from cell.motion.planning import Planner
+from cell.procedures.arm import photograph
 from cell.procedures.arm.moves import ROOM_ABOVE, nested_parts, placed_parts
-from cell.procedures.arm.photograph import (
-    base_from_place_at_target,
-    look_pose,
-    photo_pose,
-    scan_calibration_views,
-    scan_plans,
-    target_calibration_views,
-)
 from cell.procedures.steps.verify import surface_from_faces
 from cell.procedures.sweep.sweeping import RUN_UP_S
 from drivers.errors import ConfigError
@@ -79,18 +72,18 @@ def station_planner(job: Job, config: CellConfig, extent: tuple[Vector, Vector])
     board = job.place_from_board * from_parts(centre_of(parse_board(job.board.spec)))
     x, y, z = extent[1].tolist()
     station = station_bodies(
-        base_from_place_at_target(config, job), board, job.surface.place_from_surface.se3(),
+        photograph.base_from_place_at_target(config, job), board, job.surface.place_from_surface.se3(),
         (extent[0].tolist(), (x, y, z + ROOM_ABOVE)),
     )  # fmt: skip
-    station += station_obstacles(job.obstacle, base_from_place_at_target(config, job))
-    others = [*nested_parts(job), *placed_parts(job, base_from_place_at_target(config, job))]
+    station += station_obstacles(job.obstacle, photograph.base_from_place_at_target(config, job))
+    others = [*nested_parts(job), *placed_parts(job, photograph.base_from_place_at_target(config, job))]
     bodies = [*arm_bodies(config.arm.model), *part, *deck, *station, *others]
     return Planner(kinematics, CollisionModel(kinematics, bodies))
 
 
 def sweep_problems(job: Job, config: CellConfig, extent: tuple[Vector, Vector]) -> Iterator[str]:
     """The same for the ends of the job's sweeps alone."""
-    surface = base_from_place_at_target(config, job) * job.surface.place_from_surface.se3()
+    surface = photograph.base_from_place_at_target(config, job) * job.surface.place_from_surface.se3()
     yield from _unreached(station_planner(job, config, extent), _sweeps(job, config, surface))
 
 
@@ -107,19 +100,19 @@ def nominal_scan(config: CellConfig) -> ScanCalibration:
 
 def _views(config: CellConfig) -> Iterator[Goal]:
     deck = config.calibration
-    for k, view in enumerate(scan_calibration_views(config, parse_board(deck.fine.board))):
+    for k, view in enumerate(photograph.scan_calibration_views(config, parse_board(deck.fine.board))):
         yield f"calibration view {k + 1} of calibration.fine", view.base_from_flange, ()
-    for k, view in enumerate(target_calibration_views(config, parse_board(deck.large.board))):
+    for k, view in enumerate(photograph.target_calibration_views(config, parse_board(deck.large.board))):
         yield f"calibration view {k + 1} of calibration.large", view.base_from_flange, ()
 
 
 def _goals(job: Job, config: CellConfig) -> Iterator[Goal]:
     """The poses of a job in their order, with the vehicle at its target."""
     board = parse_board(job.board.spec)
-    base_from_place = base_from_place_at_target(config, job)
+    base_from_place = photograph.base_from_place_at_target(config, job)
     camera = config.target_camera.flange_from_camera.se3()
-    yield "the looking pose (photo.look_down, photo.stand_off)", look_pose(config, job, board, camera), ()
-    photo = photo_pose(job, board, base_from_place * job.place_from_board, camera)
+    yield "the looking pose (photo.look_down, photo.stand_off)", photograph.look_pose(config, job, board, camera), ()
+    photo = photograph.photo_pose(job, board, base_from_place * job.place_from_board, camera)
     yield "the photograph's pose (board.place_from_board, photo.stand_off)", photo, ()
     surface = base_from_place * job.surface.place_from_surface.se3()
     yield from _sweeps(job, config, surface)
@@ -160,7 +153,7 @@ def seen_faces(job: Job) -> NominalSurface | None:
 
 def _sweeps(job: Job, config: CellConfig, base_from_surface: pin.SE3, over: str = "scan, surface") -> Iterator[Goal]:
     """Where each sweep begins and ends, run-ups included."""
-    for k, plan in enumerate(scan_plans(config, job, base_from_surface, nominal_scan(config))):
+    for k, plan in enumerate(photograph.scan_plans(config, job, base_from_surface, nominal_scan(config))):
         way = plan.base_from_flange_end.translation - plan.base_from_flange.translation
         run_up = RUN_UP_S * job.scan.speed * way / max(float(np.linalg.norm(way)), 1e-9)
         yield f"the begin of sweep {k + 1} ({over})", from_parts(-run_up) * plan.base_from_flange, ()

@@ -132,7 +132,6 @@ def _holder(name: str) -> str:
 
 
 def _remedy(name: str) -> str:
-    """How to go on."""
     peer = _peer(name)
     if peer is not None and peer[1] == os.getuid():
         return (

@@ -309,9 +309,7 @@ def _array(joints: Joints) -> NDArray[np.float64]:
 
 
 def _shape(body: Body) -> coal.ShapeBase:
-    if body.radius is None:
-        return coal.Box(*body.size)
-    return coal.Capsule(body.radius, body.size[2])
+    return coal.Box(*body.size) if body.radius is None else coal.Capsule(body.radius, body.size[2])
 
 
 def _may_touch(first: Body, second: Body) -> bool:

@@ -11,16 +11,9 @@ from functools import partial
 from pathlib import Path
 
 from cell.base.storage import sealed, write_json
+from cell.config.calibrations import store
 from cell.config.calibrations.finding import find_calibration
-from cell.config.calibrations.store import (
-    CellCalibration,
-    gathered,
-    read_calibration,
-    require_as_configured,
-    save_calibration,
-    save_with_observations,
-    solve_observations,
-)
+from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, load_job
 from cell.devices.devices import Devices
@@ -49,14 +42,9 @@ def serial_numbers(devices: Devices) -> dict[str, str]:
     One that is simulated beside real ones says so: what was calibrated with it never passes for a real one's, nor the
     other way round.
     """
-    owners: dict[str, Device] = {
-        "arm": devices.arm,
-        "rail": devices.rail,
-        "scan_camera": devices.scan_camera,
-        "target_camera": devices.target_camera,
-    }
+    owners: tuple[Device, ...] = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
     simulated = () if devices.following is None else devices.following.simulated
-    return marked({name: device.identity().serial for name, device in owners.items()}, simulated)
+    return marked({device.name: device.identity().serial for device in owners}, simulated)
 
 
 def marked(serials: dict[str, str], simulated: Collection[str]) -> dict[str, str]:
@@ -76,7 +64,7 @@ def stored(cell: OpenCell) -> CellCalibration:
         max_age=cell.config.calibration.max_age, kinematics=arm_table(cell.config, cell.devices),
         untold=why_untold(cell.devices.arm),
     )  # fmt: skip
-    require_as_configured(found, cell.config)
+    store.require_as_configured(found, cell.config)
     return found
 
 
@@ -100,10 +88,10 @@ def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibrat
         witness = see_reference_plate(config, devices, context.keep)
         target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), context.keep)
         tell(0.96, "solving")
-        observations = gathered(
+        observations = store.gathered(
             scan, target, serial_numbers(devices), config=config, kinematics=arm_table(config, devices), witness=witness
         )
-        made = solve_observations(observations).calibration
+        made = store.solve_observations(observations).calibration
         tell(0.98, "looking at the scan camera's shutter")
         with kept_if_refused(cell.calibrations_folder, made.name):
             made = look_at_shutter(config, devices, mover, calibration=made, check=context.check, keep=context.keep)
@@ -112,7 +100,7 @@ def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibrat
 
     info = {"for_job": str(job)} if run.kind == "job" else None
     observations, calibration = cell.recorded(run, "calibration", work, info)
-    save_with_observations(calibration, observations, cell.calibrations_folder)
+    store.save_with_observations(calibration, observations, cell.calibrations_folder)
     tell(1.0, "stored")
     return calibration
 
@@ -129,8 +117,8 @@ def kept_if_refused(folder: Path, name: str) -> Iterator[None]:
         path = folder / f"{name}.json"
         # One that cannot be read, or was edited, is not used anyway.
         with suppress(CalibrationStale):
-            old = read_calibration(path)
-            save_calibration(replace(old, scan=replace(old.scan, refused=str(refused))), path)
+            old = store.read_calibration(path)
+            store.save_calibration(replace(old, scan=replace(old.scan, refused=str(refused))), path)
         raise
 
 
@@ -181,7 +169,7 @@ def time_stamps(cell: OpenCell, run: Run[object], calibration: CellCalibration, 
         return replace(calibration, scan=replace(calibration.scan, timing=timing))
 
     made = cell.recorded(run, "timing", work)
-    save_calibration(made, cell.calibrations_folder / f"{made.name}.json")
+    store.save_calibration(made, cell.calibrations_folder / f"{made.name}.json")
     tell(1.0, "stored")
     return made
 

@@ -163,7 +163,9 @@ class JobRun:
         """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
         try:
             folder = new_run(root)
-            self._keep_inputs(folder)
+            write_json(folder / "configuration.json", self.config.model_dump(mode="json"))
+            write_json(folder / "job.json", self.ready.job.model_dump(mode="json"))
+            save_calibration(self.calibration, folder / "calibration.json")
             journal = Journal(folder, folder.name, self._facts())
         except (OSError, JournalError) as error:
             raise CellError(f"no run can be recorded in {root}: {error}") from error
@@ -263,11 +265,6 @@ class JobRun:
             "calibration_date": self.calibration.date,
             **({"calibration_edits": list(self.calibration.edits)} if self.calibration.edits else {}),
         }  # fmt: skip
-
-    def _keep_inputs(self, folder: Path) -> None:
-        write_json(folder / "configuration.json", self.config.model_dump(mode="json"))
-        write_json(folder / "job.json", self.ready.job.model_dump(mode="json"))
-        save_calibration(self.calibration, folder / "calibration.json")
 
     def _in_the_gate(self, script: Script) -> Script:
         """The script, whose calls enter the gate as work of this run: what they begin ends with the run, not before."""

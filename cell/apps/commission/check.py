@@ -193,9 +193,7 @@ class Progress:
         stored = self.result(check.name)
         if stored is None:
             return "open"
-        if stored["rests_on"] != self._rests_on(check, config):
-            return "stale"
-        return str(stored["verdict"])
+        return str(stored["verdict"]) if stored["rests_on"] == self._rests_on(check, config) else "stale"
 
     def keep(self, check: CommissionCheck, config: CellConfig, result: Result, seconds: float, run: str) -> None:
         """Store a result, and write the file."""

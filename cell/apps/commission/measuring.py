@@ -456,9 +456,6 @@ def _turned(eye: Eye, first: SeenBoard, hand: pin.SE3, scale: float, turn: float
     centre = at.rotation @ centre_of(eye.board) * scale + scale * at.translation
     depth = float(np.linalg.norm(centre))
     middle = first.base_from_flange * hand * from_parts(centre)
-    made = []
-    for axis in range(3):
-        for sign in (1.0, -1.0):
-            rotation = pin.exp3(sign * turn * np.eye(3)[axis])
-            made.append(middle * from_parts(np.zeros(3), rotation) * from_parts((0.0, 0.0, -depth)) * hand.inverse())
-    return made
+    turns = [pin.exp3(sign * turn * np.eye(3)[axis]) for axis in range(3) for sign in (1.0, -1.0)]
+    back = from_parts((0.0, 0.0, -depth))
+    return [middle * from_parts(np.zeros(3), rotation) * back * hand.inverse() for rotation in turns]

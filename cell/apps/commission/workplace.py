@@ -23,9 +23,9 @@ from cell.config.job import Job, load_job
 from cell.devices.devices import Devices
 from cell.devices.simulated.process import cause_fault, make_ready
 from cell.motion.kinematics import HOME, Joints
-from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.moves import Mover, moved_once_more
 from cell.run.recorded_work import WorkContext
-from drivers.errors import CellError, DeviceFault
+from drivers.errors import CellError
 from drivers.interfaces import Frame, Image
 from statemachine.step import Observer
 
@@ -93,21 +93,11 @@ class SlowMover(Mover):
 
     def to(self, base_from_flange: pin.SE3, what: str) -> None:
         """See `Mover.to`."""
-        self._again(lambda: Mover.to(self, base_from_flange, what))
+        moved_once_more(self._arm, lambda: Mover.to(self, base_from_flange, what))
 
     def to_joints(self, joints: Joints) -> None:
         """See `Mover.to_joints`."""
-        self._again(lambda: Mover.to_joints(self, joints))
-
-    def _again(self, move: Callable[[], None]) -> None:
-        try:
-            move()
-        except DeviceFault as fault:
-            if fault.device != self._arm.name or not fault.recoverable:
-                raise
-            # A protective stop is refused here: a person has to look first.
-            self._arm.recover()
-            move()
+        moved_once_more(self._arm, lambda: Mover.to_joints(self, joints))
 
 
 class Declined(Exception):

@@ -17,6 +17,7 @@ from cell.config.job import BoardSection, GraspSection, Job, JobSection, PlaceSe
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision import parse_board
 from cell.measure.vision.board.view import centre_of
+from cell.procedures.sought_part import pose_record
 from drivers.common.addresses import checked_name
 from drivers.common.units import parse_quantity, shown
 from drivers.errors import ConfigError
@@ -128,7 +129,7 @@ def station(asker: Asker, like: Job, name: str, mesh: str, laid: Laid) -> Job:
     stands = asker.get(
         "place", "Where the middle of the mesh stands on the table, in the place frame", "0 mm, 0 mm, 0 mm", pose(Pose)
     )
-    on_place = as_pose(stands.se3() * from_parts((0.0, 0.0, laid.foot)))
+    on_place = pose_record(stands.se3() * from_parts((0.0, 0.0, laid.foot)))
     prior = asker.get("prior", "How exactly the board tells where the surface is, 1 sigma",
                       _bare(mm(like.surface.prior_sigma)), checked(SurfaceSection, "prior_sigma"))  # fmt: skip
     angle = _bare(deg(like.surface.prior_sigma_angle))
@@ -184,14 +185,7 @@ def _same_centre(like: Job, spec: str) -> Pose:
         return like.board.place_from_board
     moved = from_parts(centre_of(parse_board(like.board.spec)) - centre_of(parse_board(spec)))
     where: pin.SE3 = like.place_from_board * moved
-    return as_pose(where)
-
-
-def as_pose(where: pin.SE3) -> Pose:
-    """A pose as a job's record has it."""
-    roll, pitch, yaw = (float(angle) for angle in pin.rpy.matrixToRpy(where.rotation))
-    x, y, z = (float(value) for value in where.translation)
-    return Pose.model_construct(translation=(x, y, z), rotation=(roll, pitch, yaw))
+    return pose_record(where)
 
 
 def job_name(asker: Asker, mesh: Path) -> str:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from cell.apps.new_job.answers import as_pose, job_name, laid_mesh, station, template
+from cell.apps.new_job.answers import job_name, laid_mesh, station, template
 from cell.apps.new_job.mesh_file import read_drawing
 from cell.apps.new_job.observability import known, place_from, sight_problems, told_by_few
 from cell.apps.new_job.picture import draw_proposal
@@ -31,6 +31,7 @@ from cell.devices.simulated.described import Described
 from cell.measure.inversion import NominalSurface, PlacePose, Tolerance
 from cell.measure.inversion.nominal import read_mesh
 from cell.measure.inversion.part_pose import seen_from_above, shown_by
+from cell.procedures.sought_part import pose_record
 from drivers.common.units import parse_quantity
 from drivers.errors import CellError, ConfigError, NotObservable, RefusedError
 
@@ -105,7 +106,7 @@ def _origin(mesh: Path, unit: str, seen: Path, laid: Laid) -> tuple[str, ...]:
     return (
         f"Place onto the surface of {mesh.name}. Written by `cell new-job`; change what is not as it is.",
         f"Of the mesh, in {unit}, what the sweeps see is in {seen.name}: surface_from_mesh =",
-        "  " + pose_text(as_pose(laid.surface_from_mesh)),
+        "  " + pose_text(pose_record(laid.surface_from_mesh)),
     )
 
 

@@ -226,7 +226,6 @@ def _and_tilted(scan: ScanSection, roll: float, pitch: float) -> ScanSection:
 
 
 def _words(roll: float, pitch: float) -> str:
-    """A tilt."""
     return " and ".join(
         f"{name} {math.degrees(angle):.0f} deg" for name, angle in (("roll", roll), ("pitch", pitch)) if angle
     )

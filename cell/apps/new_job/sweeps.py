@@ -284,6 +284,4 @@ def _fit(pose: pin.SE3, points: Array, nominal: NominalSurface) -> float:
     """Share of the points over the surface that lie on it; 0 where too few are over it."""
     _, feet = nominal.feet((points - pose.translation) @ pose.rotation, GATE)
     over = feet.inner
-    if over.sum() < OVER * len(points):
-        return 0.0
-    return float((np.abs(feet.heights[over]) < ON).mean())
+    return 0.0 if over.sum() < OVER * len(points) else float((np.abs(feet.heights[over]) < ON).mean())

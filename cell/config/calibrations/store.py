@@ -337,12 +337,8 @@ def accept_calibration(path: Path, who: str, why: str) -> CellCalibration:
     made, changed, intact = _read(path)
     if intact:
         raise ConfigError(f"{path} is as it was written; there is no edit to accept")
-    edit = {
-        "who": who,
-        "when": time.strftime("%Y-%m-%d %H:%M:%S"),
-        "why": why,
-        "changed": list(changed) or ["it had no digest"],
-    }
+    when, parts = time.strftime("%Y-%m-%d %H:%M:%S"), list(changed) or ["it had no digest"]
+    edit = {"who": who, "when": when, "why": why, "changed": parts}
     accepted = replace(made, edits=(*made.edits, edit), sealed=True)
     save_calibration(accepted, path)
     return accepted

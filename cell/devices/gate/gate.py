@@ -100,13 +100,12 @@ class Gate:
 
     def asked(self, command: DeviceCommand | None, refused: str | None = None) -> None:
         """Tell the listener that a command is passed on, or was refused."""
-        if self.listener is not None and command is not None:
+        if command is not None:
             self._tell(lambda listener: listener.command(command, refused))
 
     def seen(self, device: str, reading: object) -> None:
         """Tell the listener what was read of a device."""
-        if self.listener is not None:
-            self._tell(lambda listener: listener.reading(device, reading))
+        self._tell(lambda listener: listener.reading(device, reading))
 
     def _tell(self, tell: Callable[[Listener], None]) -> None:
         try:

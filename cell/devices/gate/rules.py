@@ -224,57 +224,42 @@ def _own_switch(now: Situation, command: DeviceCommand) -> str | None:
 RULES = (
     Rule("vehicle_parked", (*MOVES, "laser.lit"), "the vehicle stands and its brake is locked", _parked),
     Rule(
-        "arm_stowed",
-        ("vehicle.drive",),
-        "the arm is at rest in a transport pose: HOME, over the fine board, or a job's looking pose",
-        _stowed,
+        "arm_stowed", ("vehicle.drive",),
+        "the arm is at rest in a transport pose: HOME, over the fine board, or a job's looking pose", _stowed,
     ),
     Rule(
-        "arm_still",
-        ("vehicle.enable",),
-        "the arm, where it is connected, is at rest, and its last motion did not end at contact",
-        _still,
+        "arm_still", ("vehicle.enable",),
+        "the arm, where it is connected, is at rest, and its last motion did not end at contact", _still,
     ),
     Rule("laser_off_to_drive", ("vehicle.enable", "vehicle.drive"), "the laser is off", _dark),
     Rule("laser_purpose", ("laser.lit",), f"it was said what for: {', '.join(PURPOSES)}", _purpose),
     Rule(
-        "claw_at_contact",
-        ("claw.release",),
+        "claw_at_contact", ("claw.release",),
         "the arm still stands where its last motion ended at contact, or the claw shows no part; else a person's word",
         _contact,
     ),
     Rule(
-        "calibration_fits",
-        ("rail.sweep", "arm.follow"),
-        "a calibration of this cell as configured is in use (of `arm.follow`: with a force limit)",
-        _calibrated,
+        "calibration_fits", ("rail.sweep", "arm.follow"),
+        "a calibration of this cell as configured is in use (of `arm.follow`: with a force limit)", _calibrated,
     ),
     Rule(
-        "same_kinematics",
-        MOVES,
+        "same_kinematics", MOVES,
         "the arm at rest reports its flange where the cell's model of it has it, to 0.05 mm and 0.1 mrad",
-        _kinematics,
-        liftable=False,
+        _kinematics, liftable=False,
     ),
     Rule(
-        "way_clear",
-        MOVES,
+        "way_clear", MOVES,
         "arm, tool, vehicle, boards on the deck, and part and station where a run has told of them, stay apart all the "
-        "way; what is near at the beginning may part, but not come nearer",
-        _clear,
+        "way; what is near at the beginning may part, but not come nearer", _clear,
     ),
     Rule(
-        "own_switch",
-        ("arm.set_digital_output",),
-        "the output belongs to no other device; the laser's may be switched off",
-        _own_switch,
+        "own_switch", ("arm.set_digital_output",),
+        "the output belongs to no other device; the laser's may be switched off", _own_switch,
     ),
     Rule(
-        "laser_attended",
-        ("laser.lit",),
+        "laser_attended", ("laser.lit",),
         f"its owner renews it at least every {UNATTENDED_S:.0f} s on the wall; else it goes off by itself",
-        None,
-        liftable=False,
+        None, liftable=False,
     ),
     Rule(
         "after_a_stop",
@@ -283,8 +268,7 @@ RULES = (
          "claw.grip", "claw.release"),
         "it belongs to a run that began later, or a person has said `Cell.clear_stop(by)`; work that was going on "
         "begins nothing more; the laser's output may be switched off, and one that a commissioning is trying",
-        None,
-        liftable=False,
+        None, liftable=False,
     ),
 )  # fmt: skip
 

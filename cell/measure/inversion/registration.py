@@ -19,16 +19,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.base.compiled import compiled_fast
+from cell.measure.geometry.camera import Array
 from cell.measure.geometry.poses import difference, perturbed
-from cell.measure.inversion.nominal import (
-    Array,
-    NominalSurface,
-    Rows,
-    Scan,
-    correspondences,
-    robust_scale,
-    sigmas_along,
-)
+from cell.measure.inversion.nominal import NominalSurface, Rows, Scan, correspondences, robust_scale, sigmas_along
 from drivers.errors import Measured, RefusedError
 
 REACH = 0.0015

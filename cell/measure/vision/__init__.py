@@ -13,15 +13,9 @@ if TYPE_CHECKING:
     from cell.measure.vision.board.board import BoardPose, board_pose, find_board
     from cell.measure.vision.board.view import BoardSpec, BoardView, parse_board
     from cell.measure.vision.pictures import PictureRefused, Reason, check_picture, read_picture
-    from cell.measure.vision.stripe.extract import (
-        LaserChannel,
-        Mark,
-        StripeProfile,
-        StripeSettings,
-        StripeStream,
-        extract,
-    )
-    from cell.measure.vision.stripe.planes import read_colours
+    from cell.measure.vision.stripe.extract import StripeStream, extract
+    from cell.measure.vision.stripe.planes import LaserChannel, read_colours
+    from cell.measure.vision.stripe.profile import Mark, StripeProfile, StripeSettings
 
 __all__ = [
     "BoardPose", "BoardSpec", "BoardView", "LaserChannel", "Mark", "PictureRefused", "Reason", "StripeProfile",
@@ -33,8 +27,9 @@ _ROOMS = {
     "board.board": "BoardPose board_pose find_board",
     "board.view": "BoardSpec BoardView parse_board",
     "pictures": "PictureRefused Reason check_picture read_picture",
-    "stripe.extract": "LaserChannel Mark StripeProfile StripeSettings StripeStream extract",
-    "stripe.planes": "read_colours",
+    "stripe.extract": "StripeStream extract",
+    "stripe.planes": "LaserChannel read_colours",
+    "stripe.profile": "Mark StripeProfile StripeSettings",
 }
 
 

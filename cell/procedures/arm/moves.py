@@ -16,25 +16,13 @@ from cell.devices.gate.interlocks import Interlocks
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision import BoardSpec
 from cell.measure.vision.board.view import centre_of
-from cell.motion.collision import (
-    BASE,
-    PLACED,
-    TOUCHES,
-    Body,
-    CollisionError,
-    CollisionModel,
-    Pair,
-    arm_bodies,
-    box,
-    station_bodies,
-    tool_bodies,
-    vehicle_bodies,
-)
+from cell.motion import collision
+from cell.motion.collision import BASE, PLACED, TOUCHES, Body, CollisionError, CollisionModel, Pair, box
 from cell.motion.kinematics import HOME, JointLimits, Joints, Unreachable, arm_kinematics
 from cell.motion.planning import Planner
 from cell.motion.trajectory import LineLimits, Trajectory
 from drivers.clock import Clock
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, DeviceFault
 from drivers.interfaces import Arm, ArmMotion, Vector
 
 THERE = 50e-6
@@ -127,8 +115,8 @@ class Mover:
         grasp = None if job is None else job.grasp
         self._interlocks = interlocks
         held, at = (None, None) if grasp is None else (grasp.size, grasp.flange_from_part.se3())
-        tool = tool_bodies(held, at, mounted(config))
-        self._moving = [*arm_bodies(config.arm.model), *tool, *vehicle_bodies(deck_plates(config))]
+        tool = collision.tool_bodies(held, at, mounted(config))
+        self._moving = [*collision.arm_bodies(config.arm.model), *tool, *collision.vehicle_bodies(deck_plates(config))]
         self._planner = self._plan_among(self._station)
         if interlocks is not None and grasp is not None:
             interlocks.carry([body for body in self._moving if body.name == "part"])
@@ -143,7 +131,7 @@ class Mover:
         centre = job.place_from_board * from_parts(centre_of(board))
         on_place = job.surface.place_from_surface.se3()
         low, (x, y, z) = (corner.tolist() for corner in surface_extent)
-        station = station_bodies(base_from_place, centre, on_place, (low, (x, y, z + ROOM_ABOVE)))
+        station = collision.station_bodies(base_from_place, centre, on_place, (low, (x, y, z + ROOM_ABOVE)))
         others = placed_parts(job, base_from_place)
         self._stand_before([*station, *station_obstacles(job.obstacle, base_from_place), *others])
 
@@ -175,7 +163,7 @@ class Mover:
 
     def hold_part(self, flange_from_part: pin.SE3, size: Sequence[float]) -> None:
         """From now on the claw holds a part of this size, m, there."""
-        part = [body for body in tool_bodies(size, flange_from_part) if body.name == "part"]
+        part = [body for body in collision.tool_bodies(size, flange_from_part) if body.name == "part"]
         self._moving = [*self._moving, *part]
         if self._interlocks is not None:
             self._interlocks.carry(part)
@@ -282,6 +270,20 @@ class Mover:
         motion.wait(3.0 * trajectory.duration + GRACE_WALL_S * self._clock.rate)
         self._clock.sleep(self._settle_time)
         return motion.contact
+
+
+def moved_once_more(arm: Arm, move: Callable[[], None]) -> None:
+    """Do `move`; once more after a fault of the arm that a program may clear by itself, such as a lost program.
+
+    After a protective stop this is refused: a person has to look first.
+    """
+    try:
+        move()
+    except DeviceFault as fault:
+        if fault.device != arm.name or not fault.recoverable:
+            raise
+        arm.recover()
+        move()
 
 
 class PartState(Enum):

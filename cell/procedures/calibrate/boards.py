@@ -22,10 +22,10 @@ from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.poses import from_parts, from_ur, mean
 from cell.measure.vision import BoardSpec, BoardView, board_pose, extract, find_board, parse_board
 from cell.motion.kinematics import HOME
-from cell.procedures.arm.moves import Mover
+from cell.procedures.arm.moves import Mover, moved_once_more
 from cell.procedures.arm.photograph import CalibrationView, scan_calibration_views, target_calibration_views
 from cell.procedures.sweep.sweeping import home_rail
-from drivers.errors import DeviceFault, RefusedError
+from drivers.errors import RefusedError
 from drivers.interfaces import Camera, Frame
 
 SEARCH_M = 0.009
@@ -198,13 +198,7 @@ def collect_target(
 
 def move_to_view(devices: Devices, mover: Mover, view: CalibrationView, k: int) -> None:
     """To a view; after a stop that a program may clear, once more."""
-    try:
-        mover.to(view.base_from_flange, f"calibration view {k + 1}")
-    except DeviceFault as fault:
-        if fault.device != devices.arm.name or not fault.recoverable:
-            raise
-        devices.arm.recover()
-        mover.to(view.base_from_flange, f"calibration view {k + 1}")
+    moved_once_more(devices.arm, lambda: mover.to(view.base_from_flange, f"calibration view {k + 1}"))
 
 
 def _can_move(devices: Devices, mover: Mover, view: CalibrationView, k: int) -> bool:

@@ -15,16 +15,16 @@ from cell.devices.devices import Devices
 from cell.measure.calibration.drift.reference_plate import LEAST_ROWS, Edge, PlateLine
 from cell.measure.geometry.camera import Array
 from cell.measure.vision import extract
+from cell.procedures.calibrate.boards import Keep
 from cell.procedures.sweep.swath import frames_of
 from drivers.errors import DeviceFault, LimitError, Measured, RefusedError
-from drivers.interfaces import Frame
 
 PICTURES = 12
 RATES_HZ = 30.0, 15.0, 10.0
 """The first that the camera can."""
 
 
-def see_reference_plate(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> PlateLine | None:
+def see_reference_plate(config: CellConfig, devices: Devices, keep: Keep) -> PlateLine | None:
     """The reference plate now, the carriage left there; None where the cell has none or it is not in the picture."""
     position = config.laser.witness
     if position is None:
@@ -64,7 +64,7 @@ def configure_fast(devices: Devices, exposure: float, rates: Sequence[float] = R
     return rates[-1]
 
 
-def require_reference_plate(config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None]) -> PlateLine:
+def require_reference_plate(config: CellConfig, devices: Devices, keep: Keep) -> PlateLine:
     """The reference plate now, for a calibration that has seen it; `RefusedError` when there is none to see."""
     if config.laser.witness is None:
         raise RefusedError(
@@ -125,9 +125,7 @@ PASSES = 3
 """So often the rail takes the line over the edge when pictures are lost there."""
 
 
-def with_edge(
-    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], calibration: CellCalibration
-) -> CellCalibration:
+def with_edge(config: CellConfig, devices: Devices, keep: Keep, calibration: CellCalibration) -> CellCalibration:
     """A new `calibration` whose witness has the plate's edge, where there is one to find."""
     scan = calibration.scan
     if scan.witness is None:
@@ -138,9 +136,7 @@ def with_edge(
     return replace(calibration, scan=replace(scan, witness=replace(scan.witness, edge=edge), notes=notes))
 
 
-def require_edge(
-    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], before: PlateLine, now: PlateLine
-) -> PlateLine:
+def require_edge(config: CellConfig, devices: Devices, keep: Keep, before: PlateLine, now: PlateLine) -> PlateLine:
     """`now` with the edge that the calibration saw `before`; `RefusedError` where it is not about there."""
     assert before.edge is not None
     edge = look_at_edge(config, devices, keep, now, before.edge.place)
@@ -155,7 +151,7 @@ def require_edge(
 
 
 def look_at_edge(
-    config: CellConfig, devices: Devices, keep: Callable[[str, Frame], None], witness: PlateLine, near: float | None
+    config: CellConfig, devices: Devices, keep: Keep, witness: PlateLine, near: float | None
 ) -> Edge | None:
     """The plate's edge by the rail, m, as both ways over it show it; it is searched where no place `near` is given.
 
@@ -200,7 +196,7 @@ def _whole(passed: Callable[[], tuple[Array, Array]]) -> tuple[Array, Array]:
 
 
 def _passed(
-    devices: Devices, keep: Callable[[str, Frame], None], witness: PlateLine, ends: tuple[float, float], speed: float
+    devices: Devices, keep: Keep, witness: PlateLine, ends: tuple[float, float], speed: float
 ) -> tuple[Array, Array]:
     """Places (n,) of the rail, m, rising, and the share (n,) of the line's light on the plate."""
     rail, camera, laser = devices.rail, devices.scan_camera, devices.laser

@@ -457,9 +457,7 @@ class Way:
 
 def distance(first: Vector, second: Vector) -> float:
     """Between two convex outlines, corners (n, 2) in order, m; 0 when they overlap."""
-    if _overlap(first, second):
-        return 0.0
-    return min(_to_edges(first, second), _to_edges(second, first))
+    return 0.0 if _overlap(first, second) else min(_to_edges(first, second), _to_edges(second, first))
 
 
 def _overlap(first: Vector, second: Vector) -> bool:

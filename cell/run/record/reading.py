@@ -399,9 +399,7 @@ def _other(told: dict[str, Any]) -> str:
         return f"{_spaced(told['data'])}  |{shown}|"
     if "text" in told:
         return f"dashboard {told['text']!r}"
-    if "request" in told:
-        return f"{told['request']} {told['arguments']}"
-    return f"state {told['state']}"
+    return f"{told['request']} {told['arguments']}" if "request" in told else f"state {told['state']}"
 
 
 def _spaced(data: str) -> str:

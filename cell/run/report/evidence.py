@@ -83,9 +83,7 @@ def seen_words(result: RunResult) -> str:
 
 def last_frames(result: RunResult, frames: FrameStore) -> list[str]:
     """Files of the frames that the step looked at in which a run ended, the newest last; none when it placed."""
-    if result.outcome is Outcome.PLACED:
-        return []
-    return [f"frames/{name}" for name in frames.recent]
+    return [] if result.outcome is Outcome.PLACED else [f"frames/{name}" for name in frames.recent]
 
 
 def texture_of(result: RunResult, nominal: NominalSurface) -> Texture | None:

@@ -13,15 +13,8 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TypeVar
 
-from cell.config.cell_config import (
-    DEVICES,
-    CellConfig,
-    Confirm,
-    beside,
-    config_to_open,
-    load_config,
-    require_real_addresses,
-)
+from cell.config.cell_config import CellConfig, Confirm, config_to_open, load_config, require_real_addresses
+from cell.config.files import DEVICES, beside
 from cell.config.job import Job
 from cell.devices.assembly import connect, connected_for
 from cell.devices.devices import Devices, require_healthy, require_no_emergency_stop

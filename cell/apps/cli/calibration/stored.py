@@ -121,10 +121,8 @@ def verify(
 
     with Cell.open(config, sim=sim, seed=seed, level=level.value, job=job) as cell, ProgressDisplay() as display:
         verification = cell.verify(display, job)
-    if json:
-        print_json(verification.summary())
-    else:
-        print_verification(verification.summary())
+    tell = print_json if json else print_verification
+    tell(verification.summary())
     if not verification.good:
         raise typer.Exit(1)
 

@@ -105,7 +105,6 @@ def _person(simulated: bool, console: Console) -> Person:
 
 
 def _show(console: Console, check: CommissionCheck, verdict: str, result: Result | None) -> None:
-    """Show a check on the console once it has ended."""
     from rich.text import Text
 
     from cell.apps.commission.check import bounds

@@ -138,11 +138,8 @@ def runs(config: ConfigOption = None, json: JsonOption = False) -> None:
     from cell.apps.cli.display import print_runs
     from cell.run.folder import list_runs, run_row
 
-    rows = [run_row(folder) for folder in list_runs(folder_of_runs(config))]
-    if json:
-        print_json(rows)
-    else:
-        print_runs(rows)
+    show = print_json if json else print_runs
+    show([run_row(folder) for folder in list_runs(folder_of_runs(config))])
 
 
 def health(config: ConfigOption = None, json: JsonOption = False) -> None:
@@ -160,10 +157,8 @@ def health(config: ConfigOption = None, json: JsonOption = False) -> None:
     loaded = load_config(path)
     calibrations = beside(path) / loaded.cell.calibrations
     told = found(folder_of_runs(config), calibrations, loaded.calibration.max_age, dt.datetime.now().astimezone())
-    if json:
-        print_json(told.as_dict())
-    else:
-        print_health(told.as_dict())
+    show = print_json if json else print_health
+    show(told.as_dict())
     if told.due_now:
         raise typer.Exit(1)
 

@@ -226,7 +226,6 @@ class ConsoleController:
         return self._long(client, "recovery", lambda: self.cell.recover(by))
 
     def _long(self, client: str, what: str, work: Callable[[], object]) -> str:
-        """Begin work that lasts."""
         return self._soon(client, what, lambda: self._begin_long(what, work))
 
     def _begin_long(self, what: str, work: Callable[[], object]) -> None:

@@ -143,11 +143,11 @@ class Application:
             Route("/", self._index, middleware=small),
             Route(ENTER, self._enter),
             Route("/api/cell", self._tell_cell, middleware=small),
-            Route("/api/runs", self._runs, middleware=small),
-            Route("/api/trend", self._trend, middleware=small),
+            Route("/api/runs", _told(self._archive.runs), middleware=small),
+            Route("/api/trend", _told(self._archive.trend), middleware=small),
             Route("/api/health", self._health, middleware=small),
-            Route("/api/runs/{run}", self._run, middleware=small),
-            Route("/api/runs/{run}/replay", self._replay, middleware=small),
+            Route("/api/runs/{run}", _told(self._archive.run), middleware=small),
+            Route("/api/runs/{run}/replay", _told(self._archive.replay), middleware=small),
             Route("/api/runs/{run}/report.html", self._report),
             Route("/api/runs/{run}/pictures/{name}", self._picture),
             Route("/api/do", self._command, methods=["POST"]),
@@ -180,21 +180,9 @@ class Application:
         status, words = await self._of_job(job)
         return _json(words, status)
 
-    async def _runs(self, request: Request) -> Response:
-        return _json(await run_in_threadpool(self._archive.runs))
-
-    async def _trend(self, request: Request) -> Response:
-        return _json(await run_in_threadpool(self._archive.trend))
-
     async def _health(self, request: Request) -> Response:
         told = await run_in_threadpool(self._archive.health)
         return _no("missing", "the reports could not be read: see `cell health`", 404) if told is None else _json(told)
-
-    async def _run(self, request: Request) -> Response:
-        return _found(await run_in_threadpool(self._archive.run, request.path_params["run"]))
-
-    async def _replay(self, request: Request) -> Response:
-        return _found(await run_in_threadpool(self._archive.replay, request.path_params["run"]))
 
     async def _report(self, request: Request) -> Response:
         page = await run_in_threadpool(self._archive.page, request.path_params["run"])
@@ -263,6 +251,15 @@ def _no(kind: str, text: str, status: int) -> Response:
 
 def _found(words: object) -> Response:
     return _no("missing", "there is no such run, or it left none of this", 404) if words is None else _json(words)
+
+
+def _told(find: Callable[..., object]) -> Callable[[Request], Awaitable[Response]]:
+    """Answers with what `find` gives, of the run that the address names if it names one."""
+
+    async def answer(request: Request) -> Response:
+        return _found(await run_in_threadpool(find, *request.path_params.values()))
+
+    return answer
 
 
 async def _refused(request: Request, error: Exception) -> Response:

@@ -73,8 +73,7 @@ class Mailbox:
                 if queue:
                     return queue.popleft()
             if self._newest:
-                what = next(iter(self._newest))
-                return self._newest.pop(what)
+                return self._newest.pop(next(iter(self._newest)))
             if self._clouds:
                 return self._clouds.popleft()
             self._news.clear()

@@ -28,22 +28,7 @@ import numpy as np
 import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from cell.apps.console.host.link import (
-    MOST_STOPS,
-    Answer,
-    AskCell,
-    CloudPart,
-    Do,
-    Happened,
-    Left,
-    Ready,
-    Say,
-    ServerSetup,
-    Show,
-    ShownPicture,
-    StopCell,
-    Stopped,
-)
+from cell.apps.console.host import link
 from cell.apps.console.server.access import Access
 from cell.apps.console.server.application import Application
 from cell.apps.console.server.pages import MOST_BYTES, Pages
@@ -89,10 +74,10 @@ class Patient(H11Protocol):
 class Server:
     """The two pipes, and the event loop between them and the pages."""
 
-    def __init__(self, pipe: Connection, stops: Connection, setup: ServerSetup) -> None:
+    def __init__(self, pipe: Connection, stops: Connection, setup: link.ServerSetup) -> None:
         self._pipe, self._stops, self._setup = pipe, stops, setup
         self._numbers = itertools.count(1)
-        self._waiting: dict[int, asyncio.Future[Answer]] = {}
+        self._waiting: dict[int, asyncio.Future[link.Answer]] = {}
         self._unsent: queue.SimpleQueue[object] = queue.SimpleQueue()
         self.access = Access(setup.hosts, setup.port, secure=setup.cert is not None, lasting=setup.lasting)
         self.pages = Pages(self._tell, self._begin_stop)
@@ -105,7 +90,8 @@ class Server:
         application = Application(
             self.access, self.pages,
             Archive(Path(self._setup.runs), Path(self._setup.calibrations), self._setup.max_age_s),
-            cell=self._setup.cell, do=self._do, stop=self._stop, of_job=self._of_job,
+            cell=self._setup.cell, do=self._do, stop=self._stop,
+            of_job=lambda job: self._ask(lambda number: link.AskCell(number, job)),
             entered=self._renew if self._setup.lasting is None else lambda: None,
         )  # fmt: skip
         config = uvicorn.Config(
@@ -127,13 +113,13 @@ class Server:
 
     def _renew(self) -> None:
         """A new link for the next page."""
-        self._tell(Ready(None if self._setup.lasting is not None else self.access.link()))
+        self._tell(link.Ready(None if self._setup.lasting is not None else self.access.link()))
 
     # --- to the cell ---
 
     def _tell(self, message: object) -> bool:
         """Never waits; False when too much waits already. What ends something is sent in any case."""
-        if self._unsent.qsize() >= MOST_UNSENT and not isinstance(message, Left | Ready):
+        if self._unsent.qsize() >= MOST_UNSENT and not isinstance(message, link.Left | link.Ready):
             return False
         self._unsent.put(message)
         return True
@@ -145,7 +131,7 @@ class Server:
 
     async def _ask(self, make: Callable[[int], object]) -> tuple[int, Mapping[str, object]]:
         number = next(self._numbers)
-        answer: asyncio.Future[Answer] = self._loop.create_future()
+        answer: asyncio.Future[link.Answer] = self._loop.create_future()
         if not self._tell(make(number)):
             return BUSY, {"ok": False, "error": "busy", "text": "too much is being asked at once; wait a moment"}
         self._waiting[number] = answer
@@ -158,10 +144,7 @@ class Server:
         return told.status, told.words
 
     async def _do(self, client: str, words: Mapping[str, object]) -> tuple[int, Mapping[str, object]]:
-        return await self._ask(lambda number: Do(number, client, words))
-
-    async def _of_job(self, job: str) -> tuple[int, Mapping[str, object]]:
-        return await self._ask(lambda number: AskCell(number, job))
+        return await self._ask(lambda number: link.Do(number, client, words))
 
     async def _stop(self) -> str | None:
         """On its own pipe, whatever else is under way; what could not be confirmed."""
@@ -187,15 +170,15 @@ class Server:
         if self._next is None:
             return
         ages = [self._loop.time() - begun for begun, _ in self._stopping.values()]
-        if not ages or (len(ages) < MOST_STOPS and min(ages) >= LASTS_S):
+        if not ages or (len(ages) < link.MOST_STOPS and min(ages) >= LASTS_S):
             number = next(self._numbers)
             self._stopping[number] = self._loop.time(), self._next
             self._next = None
-            self._stops.send(StopCell(number))
-        elif len(ages) < MOST_STOPS:
+            self._stops.send(link.StopCell(number))
+        elif len(ages) < link.MOST_STOPS:
             self._loop.call_later(max(0.01, LASTS_S - min(ages)), self._send_next)
 
-    def _stopped(self, message: Stopped) -> None:
+    def _stopped(self, message: link.Stopped) -> None:
         _, asked = self._stopping.pop(message.number)
         if not asked.done():
             asked.set_result(message.trouble)
@@ -212,25 +195,25 @@ class Server:
     def _take(self, message: object) -> None:
         """In the pipe's thread: compressing is done here, beside the event loop."""
         match message:
-            case ShownPicture(header, image):
+            case link.ShownPicture(header, image):
                 done, jpeg = cv2.imencode(".jpg", image, JPEG)
                 if done:
                     message = header["camera"], packed(header, np.asarray(jpeg).tobytes())
-            case CloudPart(header, payload):
+            case link.CloudPart(header, payload):
                 message = header, packed(header, payload)
         self._loop.call_soon_threadsafe(self._pass_on, message)
 
     def _pass_on(self, message: object) -> None:
         match message:
-            case Show(state):
+            case link.Show(state):
                 for mailbox in self.pages.mailboxes:
                     mailbox.show("state", state)
-            case Happened(event):
+            case link.Happened(event):
                 for mailbox in self.pages.mailboxes:
                     mailbox.event(event)
-            case Say(client, words):
+            case link.Say(client, words):
                 self.pages.say(client, words)
-            case Answer():
+            case link.Answer():
                 future = self._waiting.get(message.number)
                 if future is not None and not future.done():
                     future.set_result(message)
@@ -270,7 +253,7 @@ def main(pipe: int, stops: int) -> None:
     logging.getLogger("uvicorn.error").addFilter(lambda record: "graceful shutdown" not in str(record.msg))
     cv2.setNumThreads(1)
     ends = Connection(pipe), Connection(stops)
-    setup: ServerSetup = ends[0].recv()
+    setup: link.ServerSetup = ends[0].recv()
     asyncio.run(Server(*ends, setup).run())
 
 

@@ -14,18 +14,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from cell.measure.calibration.drift.evidence import (
-    SCAN_DEPTH,
-    SHIFT,
-    TARGET_DEPTH,
-    TURN,
-    DriftEvidence,
-    Hypothesis,
-    hypotheses,
-    log_factor,
-    log_mean,
-    quadratic,
-)
+from cell.measure.calibration.drift import evidence
+from cell.measure.calibration.drift.evidence import DriftEvidence, Hypothesis
 from cell.measure.calibration.solve.normal import BOARD, CAMERA, HAND, PLANE, RAIL, SHARED, AdjustmentState, tangents
 from cell.measure.calibration.solve.results import PARAMETERS, ScanCalibration, TargetCalibration
 from cell.measure.geometry.camera import Array
@@ -106,15 +96,15 @@ class DriftVerdict:
 
 def verdict(evidences: Mapping[str, DriftEvidence], states: Mapping[str, AdjustmentState]) -> DriftVerdict:
     """Decide, by chain ("scan", "target"), from the evidence and the calibrated states that it was weighed against."""
-    tests = [(name, h) for name in evidences for h in hypotheses(name, states[name].camera.fx)]
-    found = np.array([log_factor(evidences[name], h, evidences[name].score[None])[0] for name, h in tests])
+    tests = [(name, h) for name in evidences for h in evidence.hypotheses(name, states[name].camera.fx)]
+    found = np.array([evidence.log_factor(evidences[name], h, evidences[name].score[None])[0] for name, h in tests])
     rng = np.random.default_rng(0)
     scores = {}
     for name, weighed in evidences.items():
         root = covariance_root(weighed.information)
         scores[name] = rng.normal(size=(DRAWS, root.shape[1])) @ root.T
-    drawn = np.stack([log_factor(evidences[name], h, scores[name]) for name, h in tests], axis=1)
-    threshold = float(np.quantile(log_mean(drawn), 1 - FALSE_ALARMS))
+    drawn = np.stack([evidence.log_factor(evidences[name], h, scores[name]) for name, h in tests], axis=1)
+    threshold = float(np.quantile(evidence.log_mean(drawn), 1 - FALSE_ALARMS))
     fit = {}
     for name, weighed in evidences.items():
         fit[f"{name} dots"] = weighed.dots
@@ -123,7 +113,7 @@ def verdict(evidences: Mapping[str, DriftEvidence], states: Mapping[str, Adjustm
     figures = [figure for name in evidences for figure in _figures(name, evidences[name], states[name])]
     seen = detectable(evidences, states, tests, scores=scores, factors=drawn, threshold=threshold)
     return DriftVerdict(
-        float(log_mean(found[None])[0]), threshold, fit, _all_suspects(evidences, tests, threshold), figures,
+        float(evidence.log_mean(found[None])[0]), threshold, fit, _all_suspects(evidences, tests, threshold), figures,
         detectable=seen,
     )  # fmt: skip
 
@@ -137,8 +127,8 @@ def _all_suspects(
     """
     made, left = list[Suspect](), dict(evidences)
     while True:
-        found = np.array([log_factor(left[name], h, left[name].score[None])[0] for name, h in tests])
-        if made and not float(log_mean(found[None])[0]) > threshold:
+        found = np.array([evidence.log_factor(left[name], h, left[name].score[None])[0] for name, h in tests])
+        if made and not float(evidence.log_mean(found[None])[0]) > threshold:
             return made
         rounds = made[-1].round + 1 if made else 0
         named = {(s.chain, s.part) for s in made}
@@ -322,8 +312,8 @@ def _shown(size: float, unit: str) -> float:
 def changes(chain: str, state: AdjustmentState) -> list[Change]:
     """Every kind of change of the "scan" or the "target" chain, for its calibrated state."""
     unit = np.eye(SHARED)
-    mount, lens, *others = dict.fromkeys(h.part for h in hypotheses(chain, state.camera.fx))
-    depth = SCAN_DEPTH if chain == "scan" else TARGET_DEPTH
+    mount, lens, *others = dict.fromkeys(h.part for h in evidence.hypotheses(chain, state.camera.fx))
+    depth = evidence.SCAN_DEPTH if chain == "scan" else evidence.TARGET_DEPTH
     focal = unit[:, CAMERA][:, :4] * state.camera.fx
     kinds = [
         (mount, "shift", unit[:, HAND][:, :3], ""),
@@ -342,9 +332,9 @@ def changes(chain: str, state: AdjustmentState) -> list[Change]:
             (rail, "turn", unit[:, RAIL] @ across * length, ""),
             (rail, "lead", unit[:, RAIL] @ along[:, None] / LEAD_WAY, f" in {1e3 * LEAD_WAY:.0f} mm"),
         ]
-    sizes = {"turn": (TURN, "rad"), "principal point": (TURN, "rad")}
+    sizes = {"turn": (evidence.TURN, "rad"), "principal point": (evidence.TURN, "rad")}
     return [
-        Change(chain, part, kind, *sizes.get(kind, (SHIFT, "m")), directions, where)
+        Change(chain, part, kind, *sizes.get(kind, (evidence.SHIFT, "m")), directions, where)
         for part, kind, directions, where in kinds
     ]
 
@@ -370,7 +360,7 @@ def detectable(
             for k, (name, h) in enumerate(tests):
                 if name == chain:
                     index = list(h.index)
-                    pulled = quadratic(weighed, h)[0] @ added[index]
+                    pulled = evidence.quadratic(weighed, h)[0] @ added[index]
                     linear[:, k], square[k] = scores[chain][:, index] @ pulled, 0.5 * added[index] @ pulled
             size = _smallest(factors, linear, square, threshold, change.wanted)
             made.append(Detectable(change, size, size * least if np.isfinite(size) else np.zeros(SHARED)))
@@ -381,7 +371,7 @@ def _smallest(factors: Array, linear: Array, square: Array, threshold: float, st
     """The size x at which factors + x linear + x² square (n, k) exceed the threshold in `DETECTED` of the n draws."""
 
     def found(size: float) -> bool:
-        exceeding = log_mean(factors + size * linear + size**2 * square) > threshold
+        exceeding = evidence.log_mean(factors + size * linear + size**2 * square) > threshold
         return float(np.mean(exceeding)) >= DETECTED
 
     high = start / 16

@@ -84,7 +84,6 @@ def _carefully(
     picture: Picture, dark: Dark | None, axis: Axis, settings: StripeSettings, laser: LaserChannel,
     like: StripeProfile | None, starts: Array | None,
 ) -> StripeProfile:  # fmt: skip
-    """The profile of a picture by the careful way."""
     refuse_white(picture.saturated)
     off = None if dark is None else _same_range(dark, picture, settings)
     if axis == "columns":

@@ -17,22 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.vision.stripe.careful.follow import (
-    ALONG,
-    BINNED_WIDTH,
-    CANDIDATES,
-    FAINTEST,
-    SCALES,
-    SURE,
-    Candidates,
-    StripeChain,
-    candidates,
-    choose_mix,
-    coarse,
-    difference,
-    follow,
-    without_line,
-)
+from cell.measure.vision.stripe.careful import follow
+from cell.measure.vision.stripe.careful.follow import Candidates, StripeChain
 from cell.measure.vision.stripe.careful.learning import FREE_SCALE, learn_profile
 from cell.measure.vision.stripe.careful.shaped_fit import Fitted, Noise, Plane, Shape, binned, fit_shape
 from cell.measure.vision.stripe.careful.surroundings import around, carried, surrounded, wander
@@ -164,8 +150,8 @@ def _of_one_width(
 ) -> StripeProfile:  # fmt: skip
     """`read_carefully` without what differs in width from the rest by more than twice."""
     lines = picture.value.shape[0]
-    mix = like.mix if like is not None else choose_mix(picture, off, laser)
-    value, usable, shade = difference(picture, off, mix)
+    mix = like.mix if like is not None else follow.choose_mix(picture, off, laser)
+    value, usable, shade = follow.difference(picture, off, mix)
     rival = np.zeros(lines)
     if starts is None:
         found, chain, scale, along = _follow(value, like)
@@ -176,9 +162,9 @@ def _of_one_width(
         rival = _rivals(found, chain)
         place = _bridge(place)
     else:
-        place, scale, along = starts, like.scale if like is not None else SCALES[2], ALONG
+        place, scale, along = starts, like.scale if like is not None else follow.SCALES[2], follow.ALONG
     rows = np.flatnonzero(np.isfinite(place))
-    k = like.binned if like is not None else max(1, int(scale / BINNED_WIDTH))
+    k = like.binned if like is not None else max(1, int(scale / follow.BINNED_WIDTH))
     plane = binned(Plane(value, usable, shade, _albedo(shade, usable)), k)
     at = (place[rows] - 0.5 * (k - 1)) / k
     noise = Noise(settings.read_noise_dn**2 / k, settings.gain_dn / k * float(np.abs(MIXES[mix]).sum()))
@@ -205,18 +191,18 @@ def _of_one_width(
 
 def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidates, StripeChain, float, float]:
     """Candidates and chain in all rows, the scale in px that answers most, and by how many px rows were blurred."""
-    scales = np.asarray(SCALES)
-    typical, along = (like.scale, like.along) if like is not None else (0.0, ALONG)
+    scales = np.asarray(follow.SCALES)
+    typical, along = (like.scale, like.along) if like is not None else (0.0, follow.ALONG)
     if not typical:
-        found, chain, along = coarse(value)
-        if not len(chain.rows) or chain.score < FAINTEST:
+        found, chain, along = follow.coarse(value)
+        if not len(chain.rows) or chain.score < follow.FAINTEST:
             return found, StripeChain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0, along
         # What a shrunken picture answers at may be wider than any stripe that is looked for.
         typical = float(np.median(found.scale[chain.rows, chain.which]))
-    typical = min(typical, SCALES[-1])
+    typical = min(typical, follow.SCALES[-1])
     near = scales[np.abs(np.log(scales / typical)) < 0.75]
-    found = candidates(value, np.arange(len(value)), tuple(near), along)
-    chain = follow(found)
+    found = follow.candidates(value, np.arange(len(value)), tuple(near), along)
+    chain = follow.follow(found)
     if not len(chain.rows):
         return found, chain, typical, along
     return found, chain, float(np.median(found.scale[chain.rows, chain.which])), along
@@ -242,14 +228,14 @@ def _rivals(found: Candidates, chain: StripeChain) -> Array:
     own = found.response[chain.rows, chain.which]
     away = np.abs(found.place[chain.rows] - found.place[chain.rows, chain.which][:, None])
     beside = (away > 3 * found.scale[chain.rows, chain.which][:, None]) & (found.clear[chain.rows] > 6)
-    beside &= np.arange(CANDIDATES) != chain.which[:, None]
+    beside &= np.arange(follow.CANDIDATES) != chain.which[:, None]
     rival[chain.rows] = np.where(beside, found.response[chain.rows], 0.0).max(axis=1) / np.maximum(own, 1e-6)
     return np.maximum(rival, _second_line(found, chain))
 
 
 def _second_line(found: Candidates, chain: StripeChain) -> Array:
     """Response of a second line that runs beside the chain over the chain's (m,): its mean in rows where it hides."""
-    other = follow(without_line(found, chain))
+    other = follow.follow(follow.without_line(found, chain))
     rival = np.zeros(len(found.rows))
     height = float(np.median(found.response[chain.rows, chain.which]))
     for one in np.unique(other.piece):
@@ -280,7 +266,7 @@ def _believed(
     width = shape.width
     # Speckle makes a stripe's height uncertain, not that there is one.
     clear = np.minimum(fitted.amplitude_sigma, np.sqrt(noise.floor))
-    keep = fitted.good & (fitted.amplitude > SURE * clear)
+    keep = fitted.good & (fitted.amplitude > follow.SURE * clear)
     keep &= np.abs(fitted.centre - at) < np.maximum(2.0, 1.5 * width)
     keep &= sigma < np.maximum(1.0, 0.7 * width)
     if keep.any():

@@ -80,7 +80,6 @@ def around(plane: Plane, lines: NDArray[np.intp], centres: Array, reach: float) 
 
 
 def _running_median(values: Array) -> Array:
-    """Median over SMOOTHED neighbours."""
     if len(values) < 3:
         return values
     size = min(SMOOTHED, len(values) - 1 + len(values) % 2)
