@@ -25,19 +25,7 @@ from cell.procedures.frame_store import FrameStore
 from cell.run.folder import REPORT, new_run, release, run_log, timeless, when
 from cell.run.record.recorder import begin_record
 from cell.run.runs import Run
-from drivers.errors import (
-    Aborted,
-    CalibrationStale,
-    CellError,
-    ConfigError,
-    DeadlineError,
-    DeviceError,
-    DeviceFault,
-    Interrupted,
-    MisplacedError,
-    NotConnectedError,
-    RefusedError,
-)
+from drivers import errors
 from drivers.interfaces import Frame
 from statemachine.control import CancelToken
 from statemachine.journal import Journal, JournalError
@@ -62,8 +50,8 @@ def classify(error: BaseException, following: DeviceFollowing | None = None) -> 
     failure = _classify(error)
     if notes := getattr(error, "__notes__", ()):
         failure = replace(failure, reason="; ".join([failure.reason, *notes]))
-    unheard = isinstance(error, DeadlineError | NotConnectedError) or failure.code in UNHEARD
-    hurried = LATENESS.rate > 1.0 and isinstance(error, RefusedError | DeviceFault)
+    unheard = isinstance(error, errors.DeadlineError | errors.NotConnectedError) or failure.code in UNHEARD
+    hurried = LATENESS.rate > 1.0 and isinstance(error, errors.RefusedError | errors.DeviceFault)
     if (unheard or hurried) and (late := LATENESS.worst) > MOST_S and BUSY not in failure.reason:
         said = f"{failure.reason.rstrip('.')}. {BUSY.capitalize()}: it woke up {1e3 * late:.0f} ms late."
         if LATENESS.rate > 1.0:
@@ -80,16 +68,16 @@ def classify(error: BaseException, following: DeviceFollowing | None = None) -> 
 
 def _classify(error: BaseException) -> Failure:
     match error:
-        case MisplacedError():
+        case errors.MisplacedError():
             return Failure(Outcome.MISPLACED, str(error), type(error).__name__, error=error)
-        case RefusedError() | CalibrationStale() | ConfigError():
+        case errors.RefusedError() | errors.CalibrationStale() | errors.ConfigError():
             return Failure(Outcome.REFUSED, str(error), type(error).__name__, error=error)
-        case Aborted():
+        case errors.Aborted():
             return Failure(Outcome.ABORTED, str(error), "aborted")
-        case DeviceFault():
+        case errors.DeviceFault():
             person = error.code in CONFIRMED_BY_A_PERSON
             return Failure(Outcome.FAULTED, str(error), error.code, error.recoverable, person)
-        case CellError():
+        case errors.CellError():
             return Failure(Outcome.FAULTED, str(error), type(error).__name__)
     return Failure(Outcome.FAULTED, f"unexpected {type(error).__name__}: {error}", "internal")
 
@@ -98,9 +86,9 @@ def clear(devices: Devices, error: BaseException, token: CancelToken, confirmed:
     """Clear the fault of a device, as far as a program may; a camera or the rail only needs its work done again."""
     with devices.gate.entered(token):
         token.check()
-        if isinstance(error, DeviceError) and error.device in ("arm", "laser", "claw"):
+        if isinstance(error, errors.DeviceError) and error.device in ("arm", "laser", "claw"):
             devices.arm.recover(confirmed=confirmed)
-        elif isinstance(error, DeviceError) and error.device == "vehicle":
+        elif isinstance(error, errors.DeviceError) and error.device == "vehicle":
             devices.vehicle.recover()
 
 
@@ -159,7 +147,7 @@ class RecordedWork:
             facts = {"kind": self.kind, "pid": os.getpid(), **self.info}
             journal = Journal(folder, folder.name, facts)
         except (OSError, JournalError) as error:
-            raise CellError(f"no run can be recorded in {self.root}: {error}") from error
+            raise errors.CellError(f"no run can be recorded in {self.root}: {error}") from error
         outer, self.run.folder = self.run.folder, folder
         outcome, reason = "done", f"{self.kind} done"
         ended: BaseException | None = None
@@ -234,13 +222,13 @@ class RecordedWork:
         unconfirmed = f"; not confirmed: {'; '.join(problems)}" if problems else ""
         if (asked := control.token.reason) is not None:
             text = f"{self.kind} {asked}" if control.signal is not None else f"{self.kind} ended: {asked}"
-            kind = Interrupted if control.signal is not None else Aborted
+            kind = errors.Interrupted if control.signal is not None else errors.Aborted
             return kind(f"{text}; the cell was stopped{unconfirmed}")
         if problems or error is None:
             fault = stop_not_confirmed(f"{self.kind}: {end.reason}{unconfirmed}")
             fault.__cause__ = error
             return fault
-        if isinstance(error, CellError) and result.judged is not None and end.reason != result.judged.reason:
+        if isinstance(error, errors.CellError) and result.judged is not None and end.reason != result.judged.reason:
             # Nobody confirmed it, or it could not be cleared.
             error.args = (end.reason,)
         return error
@@ -275,7 +263,7 @@ def _last(action: Callable[[], object], ended: BaseException | None) -> None:
     """Do `action` at the end; should it fail, that is noted on what the work `ended` with, and replaces nothing."""
     try:
         action()
-    except (JournalError, OSError, CellError) as error:
+    except (JournalError, OSError, errors.CellError) as error:
         log.warning("the end could not be recorded: %s", error)
         if ended is not None:
             ended.add_note(f"and the end could not be recorded: {error}")
@@ -283,6 +271,6 @@ def _last(action: Callable[[], object], ended: BaseException | None) -> None:
 
 def outcome_of(error: BaseException) -> str:
     """How a run ended that this error ended, in the report's word."""
-    if isinstance(error, Aborted):
+    if isinstance(error, errors.Aborted):
         return "aborted"
-    return "refused" if isinstance(error, RefusedError) else "faulted"
+    return "refused" if isinstance(error, errors.RefusedError) else "faulted"

@@ -17,21 +17,9 @@ from cell.devices import assembly
 from cell.devices.lock import CellLock
 from cell.devices.simulated.mixed import Sim, simulated_of
 from cell.devices.simulated.process import SimulatedCell, on_gige, with_endpoints
+from drivers import interfaces
 from drivers.clock import Clock
 from drivers.errors import CellError, ConfigError, InterlockError
-from drivers.interfaces import (
-    Arm,
-    Camera,
-    Device,
-    Examined,
-    Frame,
-    Laser,
-    Rail,
-    Reading,
-    SaysHowKnown,
-    Vehicle,
-    why_untold,
-)
 
 WATCHED_S = 1.0
 LONGEST_TRIP_MS = {"arm": 100.0, "rail": 50.0, "vehicle": 100.0, "camera": 20.0, "laser": 100.0, "claw": 100.0}
@@ -47,7 +35,7 @@ _FRAMES_MISSED = (
 )
 
 
-def examine(kind: str, device: Device, trips_s: Sequence[float], clock: Clock) -> list[Reading]:
+def examine(kind: str, device: interfaces.Device, trips_s: Sequence[float], clock: Clock) -> list[interfaces.Reading]:
     """Figures of a device of this kind whose round trips took `trips_s`, wall seconds. It is only looked at.
 
     On a clock that is not the wall's, times have no limits: a simulated cell in a hurry is no measure.
@@ -55,22 +43,22 @@ def examine(kind: str, device: Device, trips_s: Sequence[float], clock: Clock) -
     median, p99 = (1e3 * float(value) for value in np.percentile(trips_s, [50, 99]))
     judged = clock.rate <= 1.0
     found = [
-        Reading("round trip, median", median, "ms"),
-        Reading(
+        interfaces.Reading("round trip, median", median, "ms"),
+        interfaces.Reading(
             "round trip, p99", p99, "ms", most=LONGEST_TRIP_MS[kind] if judged else None,
             remedy="Look at cable and adapter, and end programs that keep this computer busy.",
         ),
     ]  # fmt: skip
-    if isinstance(device, Examined):
+    if isinstance(device, interfaces.Examined):
         found += device.examine(WATCHED_S)
     if kind == "camera":
-        found += _camera_figures(cast(Camera, device), clock, judged)
+        found += _camera_figures(cast(interfaces.Camera, device), clock, judged)
     return found
 
 
-def _camera_figures(camera: Camera, clock: Clock, judged: bool) -> list[Reading]:
+def _camera_figures(camera: interfaces.Camera, clock: Clock, judged: bool) -> list[interfaces.Reading]:
     """Of a short stream at the rate that the camera has; none of one that has to be set before it gives pictures."""
-    frames: list[Frame] = []
+    frames: list[interfaces.Frame] = []
     try:
         with camera.stream() as stream:
             begun = clock.now()
@@ -82,19 +70,21 @@ def _camera_figures(camera: Camera, clock: Clock, judged: bool) -> list[Reading]
     return stream_figures([frame.device_time for frame in frames], lost, camera.time_bound, judged)
 
 
-def stream_figures(device_times: Sequence[float], lost: int, time_bound: float, judged: bool) -> list[Reading]:
+def stream_figures(
+    device_times: Sequence[float], lost: int, time_bound: float, judged: bool
+) -> list[interfaces.Reading]:
     """Figures of frames with these device times, s, of which `lost` more were missed."""
     gaps = np.diff(device_times)
     median = float(np.median(gaps))
     uneven = float(np.percentile(gaps, 99)) / median if median > 0 else np.nan
     return [
-        Reading("frame rate by its clock", 1.0 / median if median > 0 else np.nan, "Hz"),
-        Reading(
+        interfaces.Reading("frame rate by its clock", 1.0 / median if median > 0 else np.nan, "Hz"),
+        interfaces.Reading(
             "longest frame period over the median, p99", uneven, "", most=MOST_UNEVEN if judged else None,
             remedy=_FRAMES_MISSED,
         ),
-        Reading("frames lost", float(lost), "", most=0.0 if judged else None, remedy=_FRAMES_MISSED),
-        Reading(
+        interfaces.Reading("frames lost", float(lost), "", most=0.0 if judged else None, remedy=_FRAMES_MISSED),
+        interfaces.Reading(
             "clock known to", 1e3 * time_bound, "ms", most=1e3 * LARGEST_TIME_BOUND_S if judged else None,
             remedy="Use a cable of its own, and end programs that keep this computer busy.",
         ),
@@ -119,7 +109,7 @@ class Diagnosis:
     errors: dict[str, int] = field(default_factory=dict)
     state: str = ""
     simulated: bool = False
-    readings: list[Reading] = field(default_factory=list)
+    readings: list[interfaces.Reading] = field(default_factory=list)
 
     def as_dict(self) -> dict[str, object]:
         """For JSON."""
@@ -176,7 +166,7 @@ def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:
     needed = assembly.connected_for(config, wanted)
     rows: list[Diagnosis] = []
     with CellLock(config, needed), ExitStack() as opened:
-        arm: Arm | None = None
+        arm: interfaces.Arm | None = None
         for name in (name for name in STATES if name in needed):
             record = config.device(name)
             if config.make(name).on_arm and arm is None:
@@ -193,7 +183,9 @@ def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:
     return rows
 
 
-def _open_and_ask(name: str, address: str, build: Callable[[], Device], clock: Clock) -> tuple[Diagnosis, Any]:
+def _open_and_ask(
+    name: str, address: str, build: Callable[[], interfaces.Device], clock: Clock
+) -> tuple[Diagnosis, Any]:
     try:
         device = build()
     except CellError as error:
@@ -201,7 +193,7 @@ def _open_and_ask(name: str, address: str, build: Callable[[], Device], clock: C
     return ask(name, address, device, clock), device
 
 
-def ask(name: str, address: str, device: Device, clock: Clock) -> Diagnosis:
+def ask(name: str, address: str, device: interfaces.Device, clock: Clock) -> Diagnosis:
     """The row of a device that is connected; not behind a gate."""
     row = Diagnosis(name, False, address)
     try:
@@ -218,19 +210,19 @@ def ask(name: str, address: str, device: Device, clock: Clock) -> Diagnosis:
     return row
 
 
-def _arm_state(arm: Arm) -> str:
+def _arm_state(arm: interfaces.Arm) -> str:
     state, table = arm.state(), arm.link_table()
-    why = f" ({reason})" if (reason := why_untold(arm)) else ""
+    why = f" ({reason})" if (reason := interfaces.why_untold(arm)) else ""
     own = f"own kinematics not told{why}" if table is None else f"own kinematics {table.hash()}"
     return f"{state.safety.value}, joints {', '.join(f'{math.degrees(q):.1f}' for q in state.joints)} deg, {own}"
 
 
-def _rail_state(rail: Rail) -> str:
+def _rail_state(rail: interfaces.Rail) -> str:
     state = rail.state()
     return f"{'homed' if state.homed else 'not homed'}, at {1e3 * state.position:.2f} mm"
 
 
-def _vehicle_state(vehicle: Vehicle) -> str:
+def _vehicle_state(vehicle: interfaces.Vehicle) -> str:
     state = vehicle.state()
     if state.emergency_stop:
         return "emergency stop"
@@ -241,7 +233,7 @@ def _vehicle_state(vehicle: Vehicle) -> str:
     return f"{brake}, {volts}{errors}"
 
 
-def _camera_state(camera: Camera) -> str:
+def _camera_state(camera: interfaces.Camera) -> str:
     try:
         frame = camera.grab()
     except InterlockError:
@@ -250,8 +242,8 @@ def _camera_state(camera: Camera) -> str:
     return f"frame {frame.frame_id}, {camera.shape[1]}×{camera.shape[0]}, mean {frame.image.mean():.0f} DN"
 
 
-def _laser_state(laser: Laser) -> str:
-    how = laser.how_known if isinstance(laser, SaysHowKnown) else ""
+def _laser_state(laser: interfaces.Laser) -> str:
+    how = laser.how_known if isinstance(laser, interfaces.SaysHowKnown) else ""
     # What nobody can ask, a look that sends nothing cannot know.
     return f"not known now; {how}" if how else "ON" if laser.is_on else "off"
 

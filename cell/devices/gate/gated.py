@@ -16,29 +16,9 @@ from numpy.typing import ArrayLike
 
 from cell.devices.gate.gate import Gate, Gated
 from cell.devices.gate.interlocks import DeviceCommand
+from drivers import interfaces
 from drivers.clock import Clock, Latch
 from drivers.errors import CellError, DeadlineError, InterlockError, LimitError, check_range
-from drivers.interfaces import (
-    Arm,
-    ArmMotion,
-    ArmState,
-    Camera,
-    ChecksZero,
-    Claw,
-    Frame,
-    FrameStream,
-    Laser,
-    LinkTable,
-    Motion,
-    Nudged,
-    Rail,
-    RailState,
-    Sweep,
-    Vector,
-    Vehicle,
-    VehicleState,
-    why_untold,
-)
 
 if TYPE_CHECKING:
     from cell.devices.simulated.mixed import SimulatedTouch
@@ -52,7 +32,7 @@ FAR_M = 3.0
 """No arm of this kind reaches further from its base."""
 
 
-def checked_joints(device: str, joints: ArrayLike) -> Vector:
+def checked_joints(device: str, joints: ArrayLike) -> interfaces.Vector:
     """Joint angles (6,) in rad, else `LimitError`."""
     array = _numbers(device, "joint angles", joints)
     if array.shape != (6,):
@@ -60,7 +40,7 @@ def checked_joints(device: str, joints: ArrayLike) -> Vector:
     return _turns(device, array)
 
 
-def checked_way(device: str, joints: ArrayLike) -> Vector:
+def checked_way(device: str, joints: ArrayLike) -> interfaces.Vector:
     """Joint angles (n, 6) in rad of at least one point, else `LimitError`."""
     array = _numbers(device, "a trajectory's joint angles", joints)
     if array.ndim != 2 or array.shape[1] != 6 or not len(array):
@@ -70,7 +50,7 @@ def checked_way(device: str, joints: ArrayLike) -> Vector:
     return _turns(device, array)
 
 
-def checked_pose(device: str, flange: ArrayLike) -> Vector:
+def checked_pose(device: str, flange: ArrayLike) -> interfaces.Vector:
     """The flange's pose (6,) in the base, m and rotation vector in rad, else `LimitError`."""
     array = _numbers(device, "flange pose", flange)
     if array.shape != (6,):
@@ -79,7 +59,7 @@ def checked_pose(device: str, flange: ArrayLike) -> Vector:
     return array
 
 
-def _numbers(device: str, what: str, values: ArrayLike) -> Vector:
+def _numbers(device: str, what: str, values: ArrayLike) -> interfaces.Vector:
     try:
         array = np.array(values, dtype=float)
     except (TypeError, ValueError) as error:
@@ -89,7 +69,7 @@ def _numbers(device: str, what: str, values: ArrayLike) -> Vector:
     return array
 
 
-def _turns(device: str, joints: Vector) -> Vector:
+def _turns(device: str, joints: interfaces.Vector) -> interfaces.Vector:
     for value in (joints.min(), joints.max()):
         check_range(device, "joint angle", float(value), low=-TURN_RAD, high=TURN_RAD, unit="rad")
     return joints
@@ -98,8 +78,8 @@ def _turns(device: str, joints: Vector) -> Vector:
 class GuardedMotion:
     """`motion` of `arm`; see `drivers.interfaces.ArmMotion`."""
 
-    def __init__(self, motion: ArmMotion, arm: Arm) -> None:
-        self.rest: Vector | None = None
+    def __init__(self, motion: interfaces.ArmMotion, arm: interfaces.Arm) -> None:
+        self.rest: interfaces.Vector | None = None
         """Joint angles (6,) in rad after it had ended at contact, when that was first seen."""
         self._motion = motion
         self._arm = arm
@@ -121,13 +101,13 @@ class GuardedMotion:
             self.rest = self._arm.state().joints
 
 
-Begun = TypeVar("Begun", bound=Motion)
+Begun = TypeVar("Begun", bound=interfaces.Motion)
 
 TIMEOUT_S = 1.0
 """How old the arm's state may be that a speed rests on: the arm stands."""
 
 
-class GatedArm(Gated[Arm]):
+class GatedArm(Gated[interfaces.Arm]):
     """The arm, its motions and its recovery begun through a gate.
 
     `touch` adds what it would feel of a simulated station; None where the station is as real as the arm.
@@ -135,16 +115,16 @@ class GatedArm(Gated[Arm]):
 
     touch: SimulatedTouch | None = None
 
-    def link_table(self) -> LinkTable | None:
+    def link_table(self) -> interfaces.LinkTable | None:
         """See `Arm.link_table`."""
         return self.bare.link_table()
 
     @property
     def untold(self) -> str:
         """See `SaysWhyUntold.untold`."""
-        return why_untold(self.bare)
+        return interfaces.why_untold(self.bare)
 
-    def state(self, max_age: float = 0.1) -> ArmState:
+    def state(self, max_age: float = 0.1) -> interfaces.ArmState:
         """See `Arm.state`."""
         state = self.bare.state(max_age)
         if self.touch is not None:
@@ -153,7 +133,7 @@ class GatedArm(Gated[Arm]):
         return state
 
     @contextmanager
-    def record(self) -> Iterator[list[ArmState]]:
+    def record(self) -> Iterator[list[interfaces.ArmState]]:
         """See `Arm.record`."""
         with self.bare.record() as states:
             yield states
@@ -166,30 +146,32 @@ class GatedArm(Gated[Arm]):
         """See `Arm.latch_clock`."""
         return self.bare.latch_clock()
 
-    def move_joints(self, joints: Vector, speed: float, acceleration: float) -> ArmMotion:
+    def move_joints(self, joints: interfaces.Vector, speed: float, acceleration: float) -> interfaces.ArmMotion:
         """See `Arm.move_joints`; slower where the tool, or the part in it, would exceed the arm's tool speed."""
         goal = checked_joints(self.name, joints)
         situation = self.gate.interlocks.situation
 
-        def start() -> ArmMotion:
+        def start() -> interfaces.ArmMotion:
             slowed = situation.slowed(self.bare.state(TIMEOUT_S).joints, goal, speed, situation.held)
             return self.bare.move_joints(joints, slowed, acceleration)
 
         return self._move(DeviceCommand("arm", "move_joints", {"joints": goal}), start)
 
-    def move_linear(self, flange: Vector, speed: float, acceleration: float) -> ArmMotion:
+    def move_linear(self, flange: interfaces.Vector, speed: float, acceleration: float) -> interfaces.ArmMotion:
         """See `Arm.move_linear`."""
         command = DeviceCommand("arm", "move_linear", {"flange": checked_pose(self.name, flange)})
         return self._move(command, lambda: self.bare.move_linear(flange, speed, acceleration))
 
-    def follow(self, times: Vector, joints: Vector, force_limit: float | None = None) -> ArmMotion:
+    def follow(
+        self, times: interfaces.Vector, joints: interfaces.Vector, force_limit: float | None = None
+    ) -> interfaces.ArmMotion:
         """See `Arm.follow`."""
         way = checked_way(self.name, joints)
         command = DeviceCommand("arm", "follow", {"joints": way, "force_limit": force_limit})
         if force_limit is None:
             return self._move(command, lambda: self.bare.follow(times, joints))
 
-        def start() -> ArmMotion:
+        def start() -> interfaces.ArmMotion:
             motion = self.bare.follow(times, joints, force_limit)
             if self.touch is not None:
                 motion = self.touch.guard(motion, force_limit, self.bare.stop)
@@ -197,10 +179,10 @@ class GatedArm(Gated[Arm]):
 
         return self._move(command, start)
 
-    def _move(self, command: DeviceCommand, start: Callable[[], ArmMotion]) -> ArmMotion:
+    def _move(self, command: DeviceCommand, start: Callable[[], interfaces.ArmMotion]) -> interfaces.ArmMotion:
         situation = self.gate.interlocks.situation
 
-        def begin() -> ArmMotion:
+        def begin() -> interfaces.ArmMotion:
             # Should the start fail, the arm may move all the same: what its motion before ended with holds no more.
             situation.last = None
             situation.way = command.arguments.get("joints") if command.name == "follow" else None
@@ -216,7 +198,7 @@ class GatedArm(Gated[Arm]):
         if self.touch is not None:
             self.touch.zero()
 
-    def set_payload(self, mass: float, centre: Vector) -> None:
+    def set_payload(self, mass: float, centre: interfaces.Vector) -> None:
         """See `Arm.set_payload`."""
         self.gate.require(DeviceCommand("arm", "set_payload"))
         self.bare.set_payload(mass, centre)
@@ -242,48 +224,48 @@ class GatedArm(Gated[Arm]):
         self.gate.begin(DeviceCommand("arm", "recover"), begin, self.bare.stop)
 
 
-class GatedRail(Gated[Rail]):
+class GatedRail(Gated[interfaces.Rail]):
     """The rail, its motions begun through a gate."""
 
-    def __init__(self, bare: Rail, gate: Gate) -> None:
+    def __init__(self, bare: interfaces.Rail, gate: Gate) -> None:
         super().__init__(bare, gate)
         self.travel = bare.travel
-        self.motion: Motion | None = None
+        self.motion: interfaces.Motion | None = None
         """The newest motion that was begun, also one that has ended."""
 
-    def state(self) -> RailState:
+    def state(self) -> interfaces.RailState:
         """See `Rail.state`."""
         state = self.bare.state()
         self.gate.seen("rail", state)
         return state
 
-    def home(self) -> Motion:
+    def home(self) -> interfaces.Motion:
         """See `Rail.home`."""
         return self._begin(DeviceCommand("rail", "home"), self.bare.home)
 
-    def move_to(self, position: float, speed: float | None = None) -> Motion:
+    def move_to(self, position: float, speed: float | None = None) -> interfaces.Motion:
         """See `Rail.move_to`."""
         command = DeviceCommand("rail", "move_to", {"position": position})
         return self._begin(command, lambda: self.bare.move_to(position, speed))
 
-    def nudge(self, distance: float, speed: float) -> Motion:
+    def nudge(self, distance: float, speed: float) -> interfaces.Motion:
         """See `Nudged.nudge`; `InterlockError` for a rail that does not offer it."""
         bare = self.bare
-        if not isinstance(bare, Nudged):
+        if not isinstance(bare, interfaces.Nudged):
             raise InterlockError(self.name, "this make of rail moves only when it is homed; home it first")
         command = DeviceCommand("rail", "nudge", {"distance": distance})
         return self.gate.begin(command, lambda: bare.nudge(distance, speed), self.bare.stop)
 
-    def check_zero(self) -> Motion | None:
+    def check_zero(self) -> interfaces.Motion | None:
         """See `ChecksZero`; None also for a make that does not offer it."""
         bare = self.bare
-        if not isinstance(bare, ChecksZero):
+        if not isinstance(bare, interfaces.ChecksZero):
             return None
         motion = self.gate.begin(DeviceCommand("rail", "move_to", {"position": 0.0}), bare.check_zero, bare.stop)
         self.motion = motion or self.motion
         return motion
 
-    def sweep(self, start: float, stop: float, speed: float) -> Sweep:
+    def sweep(self, start: float, stop: float, speed: float) -> interfaces.Sweep:
         """See `Rail.sweep`."""
         command = DeviceCommand("rail", "sweep", {"start": start, "stop": stop})
         return self._begin(command, lambda: self.bare.sweep(start, stop, speed))
@@ -298,10 +280,10 @@ class GatedRail(Gated[Rail]):
         return motion
 
 
-class GatedVehicle(Gated[Vehicle]):
+class GatedVehicle(Gated[interfaces.Vehicle]):
     """The vehicle, taken into command and driven through a gate."""
 
-    def state(self, max_age: float = 0.2) -> VehicleState:
+    def state(self, max_age: float = 0.2) -> interfaces.VehicleState:
         """See `Vehicle.state`."""
         state = self.bare.state(max_age)
         self.gate.seen("vehicle", state)
@@ -341,7 +323,7 @@ class GatedVehicle(Gated[Vehicle]):
         self.bare.brake()
 
 
-class GatedClaw(Gated[Claw]):
+class GatedClaw(Gated[interfaces.Claw]):
     """The claw, closed and opened through a gate; what it did is not undone, because that could drop the part."""
 
     def grip(self, timeout: float = 2.0) -> None:
@@ -372,12 +354,12 @@ TRIES = 3
 may take."""
 
 
-class GatedCamera(Gated[Camera]):
+class GatedCamera(Gated[interfaces.Camera]):
     """A camera whose commands are told at the gate. `tries`: how often at most a picture is asked for."""
 
     tries = 1
 
-    def __init__(self, bare: Camera, gate: Gate) -> None:
+    def __init__(self, bare: interfaces.Camera, gate: Gate) -> None:
         super().__init__(bare, gate)
         self.shape = bare.shape
 
@@ -391,7 +373,7 @@ class GatedCamera(Gated[Camera]):
         self.gate.asked(DeviceCommand(self.name, "configure", {"exposure": exposure, "frame_rate": frame_rate}))
         self.bare.configure(exposure, frame_rate)
 
-    def grab(self, timeout: float = 2.0) -> Frame:
+    def grab(self, timeout: float = 2.0) -> interfaces.Frame:
         """See `Camera.grab`; with more `tries` than one the last one's `DeadlineError`."""
         self.gate.asked(DeviceCommand(self.name, "grab"))
         for k in range(1, self.tries):
@@ -403,7 +385,7 @@ class GatedCamera(Gated[Camera]):
         return self.bare.grab(timeout)
 
     @contextmanager
-    def stream(self) -> Iterator[FrameStream]:
+    def stream(self) -> Iterator[interfaces.FrameStream]:
         """See `Camera.stream`."""
         self.gate.asked(DeviceCommand(self.name, "stream"))
         try:
@@ -419,10 +401,10 @@ RETRY_S = 0.5
 """Seconds on the wall after which a laser that could not be switched off is switched off again."""
 
 
-class GatedLaser(Gated[Laser]):
+class GatedLaser(Gated[interfaces.Laser]):
     """The laser, lit through a gate and for as long as its owner renews it."""
 
-    def __init__(self, bare: Laser, gate: Gate, clock: Clock) -> None:
+    def __init__(self, bare: interfaces.Laser, gate: Gate, clock: Clock) -> None:
         super().__init__(bare, gate)
         self._clock = clock
         self._renewed = 0.0

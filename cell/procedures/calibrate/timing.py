@@ -11,16 +11,7 @@ import pinocchio as pin
 from cell.config.calibrations.store import CellCalibration, link_of, most_late
 from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
-from cell.measure.calibration.drift.timing import (
-    StampTiming,
-    TimedFrame,
-    TimedSweep,
-    find_shutter,
-    find_timing,
-    refuse_late,
-    refuse_rolling,
-    roughly_late,
-)
+from cell.measure.calibration.drift import timing
 from cell.measure.geometry.poses import from_ur
 from cell.measure.vision import BoardSpec, find_board, parse_board
 from cell.motion.kinematics import HOME
@@ -51,7 +42,7 @@ MOST_MOVED_M = 1e-4
 def collect_timing(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration, check: Check,
     progress: Progress, keep: Keep,
-) -> StampTiming:  # fmt: skip
+) -> timing.StampTiming:  # fmt: skip
     """Sweep over the fine board to and fro, fast and slowly, and say how late the stamps are.
 
     Raises what `find_timing` raises, and `RefusedError` when the board is not seen.
@@ -69,7 +60,7 @@ def collect_timing(
 
     base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs=pairs, tell=tell, keep=keep)
     given = most_late(config), config.rail.lead, link_of(config)
-    return find_timing(calibration.scan, base_from_flange, sweeps, *given)
+    return timing.find_timing(calibration.scan, base_from_flange, sweeps, *given)
 
 
 def look_at_shutter(
@@ -88,20 +79,20 @@ def look_at_shutter(
         base_from_flange, sweeps = _sweeps(
             config, devices, mover, calibration=calibration, pairs=pairs, tell=lambda k, count: check(), keep=keep
         )
-        shutter = find_shutter(scan, base_from_flange, sweeps, link_of(config))
-        late, sigma = roughly_late(scan, base_from_flange, sweeps)
+        shutter = timing.find_shutter(scan, base_from_flange, sweeps, link_of(config))
+        late, sigma = timing.roughly_late(scan, base_from_flange, sweeps)
     except (RefusedError, LimitError) as unseen:
         note = f"whether the scan camera has a rolling shutter was not seen: {unseen}"
         return replace(calibration, scan=replace(scan, notes=(*scan.notes, note)))
-    refuse_rolling(shutter.readout, shutter.sigma)
-    refuse_late(late, sigma, most_late(config))
+    timing.refuse_rolling(shutter.readout, shutter.sigma)
+    timing.refuse_late(late, sigma, most_late(config))
     return replace(calibration, scan=replace(scan, shutter=shutter))
 
 
 def _sweeps(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration,
     pairs: Sequence[tuple[float, float]], tell: Callable[[int, int], None], keep: Keep,
-) -> tuple[pin.SE3, list[TimedSweep]]:  # fmt: skip
+) -> tuple[pin.SE3, list[timing.TimedSweep]]:  # fmt: skip
     """Where the flange stood, and sweeps to and fro for each of `pairs` of speed in m/s and exposure in s.
 
     `tell` is given each sweep's number and how many there are.
@@ -137,7 +128,7 @@ def _sweeps(
 
 def _swept(
     devices: Devices, board: BoardSpec, ends: Sequence[float], speed: float, exposure: float, keep: Keep, what: str
-) -> TimedSweep:
+) -> timing.TimedSweep:
     """One sweep from end to end, and what its pictures show of the board."""
     rail, camera = devices.rail, devices.scan_camera
     start, stop = ends
@@ -155,7 +146,7 @@ def _swept(
         if not begin <= frame.mid_exposure <= end:
             continue
         try:
-            made.append(TimedFrame(find_board(frame.image, board), sweep.position_at(frame.mid_exposure)))
+            made.append(timing.TimedFrame(find_board(frame.image, board), sweep.position_at(frame.mid_exposure)))
         except RefusedError as error:
             refused = str(error)
     if not made:
@@ -163,4 +154,4 @@ def _swept(
             f"no picture of a sweep over the fine board shows it ({refused or 'none came'}); clean it, see that it is "
             "lit, and that scan_camera.photo_exposure is enough for a quarter of it"
         )
-    return TimedSweep(speed if stop > start else -speed, exposure, camera.time_bound, made, sweep.time_bound)
+    return timing.TimedSweep(speed if stop > start else -speed, exposure, camera.time_bound, made, sweep.time_bound)

@@ -6,17 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.measure.reconstruction import (
-    Cloud,
-    Seam,
-    calibration_motions,
-    fill_holes,
-    find_seams,
-    flange_motions,
-    lean_motions,
-    merge,
-    write_cloud,
-)
+from cell.measure import reconstruction
 from cell.measure.reconstruction.cloud import Array, Indices, Motions
 from cell.procedures.steps.laser_sweep import head_at
 from cell.procedures.steps.workplace import JobStep, Workplace
@@ -32,8 +22,8 @@ class Reconstruction:
     """The cloud, how its sweeps agree where they overlap, and how its points move by one standard deviation of each
     independent parameter of the calibration, and by what each sweep's flange pose and the vehicle's lean are off."""
 
-    cloud: Cloud
-    seams: tuple[Seam, ...]
+    cloud: reconstruction.Cloud
+    seams: tuple[reconstruction.Seam, ...]
     by_calibration: Motions
     by_poses: Motions
 
@@ -46,13 +36,13 @@ class Reconstruction:
 class TimedCloud:
     """A cloud, and the host `times` (lines,) in s at which its lines were taken."""
 
-    cloud: Cloud
+    cloud: reconstruction.Cloud
     times: Vector
 
 
-def build_cloud(sweep: SweepRecord) -> Cloud:
+def build_cloud(sweep: SweepRecord) -> reconstruction.Cloud:
     """The sweeps' points in the arm base, outliers removed: all that lies between the last frame and the cloud."""
-    return merge([s.builder.place(s.lines, s.flanges, s.rail, s.line_spread) for s in sweep.swaths])
+    return reconstruction.merge([s.builder.place(s.lines, s.flanges, s.rail, s.line_spread) for s in sweep.swaths])
 
 
 def reconstructed(here: Workplace, sweep: SweepRecord) -> Reconstruction:
@@ -66,14 +56,14 @@ def reconstructed(here: Workplace, sweep: SweepRecord) -> Reconstruction:
     path.unlink(missing_ok=True)
     built = build_cloud(sweep)
     try:
-        cloud = fill_holes(built.require(), here.job.scan.largest_hole)
+        cloud = reconstruction.fill_holes(built.require(), here.job.scan.largest_hole)
     except RefusedError as refused:
-        write_cloud(path, built, simulated)
+        reconstruction.write_cloud(path, built, simulated)
         refused.showing(seen={"cloud": built})
         raise
     by_calibration, by_poses = displacements(here, sweep, cloud)
-    seams = tuple(find_seams(cloud, together(by_calibration, by_poses)))
-    write_cloud(path, cloud, simulated)
+    seams = tuple(reconstruction.find_seams(cloud, together(by_calibration, by_poses)))
+    reconstruction.write_cloud(path, cloud, simulated)
     return Reconstruction(cloud, seams, by_calibration, by_poses)
 
 
@@ -82,7 +72,7 @@ def together(*motions: Motions) -> Motions:
     return lambda lines, rows: np.concatenate([each(lines, rows) for each in motions], axis=2)
 
 
-def displacements(here: Workplace, sweep: SweepRecord, cloud: Cloud) -> tuple[Motions, Motions]:
+def displacements(here: Workplace, sweep: SweepRecord, cloud: reconstruction.Cloud) -> tuple[Motions, Motions]:
     """How the points of a sweep's cloud move by what is not known of the calibration, and of the arm's poses."""
     # The same for all sweeps: what the calibration found, with the laser where it pointed before them.
     geometry, variants = sweep.swaths[0].builder.geometry, head_at(here, sweep).variants()
@@ -91,11 +81,13 @@ def displacements(here: Workplace, sweep: SweepRecord, cloud: Cloud) -> tuple[Mo
     vehicle, lean = here.config.arm.vehicle_from_base.se3().inverse(), here.config.vehicle.lean_sigma
 
     def by_calibration(lines: Indices, rows: Indices) -> Array:
-        return calibration_motions(cloud, lines, rows, base_from_flange=None, geometry=geometry, variants=variants)
+        return reconstruction.calibration_motions(
+            cloud, lines, rows, base_from_flange=None, geometry=geometry, variants=variants
+        )
 
     def by_poses(lines: Indices, rows: Indices) -> Array:
-        leaning = lean_motions(cloud, lines, rows, vehicle, lean)
-        return np.concatenate([flange_motions(cloud, lines, rows, covariances), leaning], axis=2)
+        leaning = reconstruction.lean_motions(cloud, lines, rows, vehicle, lean)
+        return np.concatenate([reconstruction.flange_motions(cloud, lines, rows, covariances), leaning], axis=2)
 
     return by_calibration, by_poses
 

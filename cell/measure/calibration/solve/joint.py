@@ -12,28 +12,9 @@ from numpy.typing import NDArray
 
 from cell.measure.calibration.archive import ScanObservation
 from cell.measure.calibration.judge.scale import BoardSize
+from cell.measure.calibration.solve import normal, starts
 from cell.measure.calibration.solve.adjustment import Adjusted, Adjustment, Priors, rms_of, shared_mask
 from cell.measure.calibration.solve.bow import with_bow
-from cell.measure.calibration.solve.normal import (
-    CAMERA,
-    COLUMNS,
-    HAND,
-    AdjustmentState,
-    ViewData,
-    dots_block,
-    rests_of,
-    stripe_block,
-)
-from cell.measure.calibration.solve.starts import (
-    HandEye,
-    PlaneStart,
-    paper_plane,
-    plane_from_board,
-    solve_hand_eye,
-    stripe_means,
-    stripe_pixels,
-    zhang,
-)
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision.board.board import board_pose
@@ -58,8 +39,8 @@ class Staged:
 
     camera: CameraModel
     camera_from_board: list[pin.SE3]
-    hand_eye: HandEye
-    plane: PlaneStart | None
+    hand_eye: starts.HandEye
+    plane: starts.PlaneStart | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +53,7 @@ class Joint:
 
     staged: Staged
     adjusted: Adjusted
-    views: list[ViewData]
+    views: list[normal.ViewData]
     held_out_px: float
     held_out_stripe_m: float
     free: NDArray[np.bool_]
@@ -90,10 +71,10 @@ def solve_staged(
     every, observations = observations, [o for o in observations if not o.same_rest]
     views = [o.view for o in observations if o.view is not None]
     if camera is None:
-        camera = zhang(views, nominal)
+        camera = starts.zhang(views, nominal)
     poses = [board_pose(view, camera).camera_from_board for view in views]
     with_view = [o for o in observations if o.view is not None]
-    hand_eye = solve_hand_eye(
+    hand_eye = starts.solve_hand_eye(
         [o.base_from_flange for o in with_view], poses, [o.rail_position for o in with_view], rail_direction
     )
     lit = stripe and any(o.profile is not None for o in observations)
@@ -101,17 +82,17 @@ def solve_staged(
 
 
 def _light_plane(
-    camera: CameraModel, hand_eye: HandEye, poses: Sequence[pin.SE3], every: Sequence[ScanObservation]
-) -> PlaneStart:
+    camera: CameraModel, hand_eye: starts.HandEye, poses: Sequence[pin.SE3], every: Sequence[ScanObservation]
+) -> starts.PlaneStart:
     """From the stripes of `every` observation, and the board's poses at those that see it; with the paper's plane."""
     observations = [o for o in every if not o.same_rest]
     seen = iter(poses)
     everywhere = [_expected(hand_eye, o) if o.view is None else next(seen) for o in observations]
     first = next(o.view for o in observations if o.view is not None)
     views, profiles = [o.view or first for o in observations], [o.profile for o in observations]
-    plane = plane_from_board(camera, everywhere, views, profiles)
+    plane = starts.plane_from_board(camera, everywhere, views, profiles)
     with suppress(RefusedError):
-        paper, rms = paper_plane(camera, _crossed(observations, everywhere, plane.rows))
+        paper, rms = starts.paper_plane(camera, _crossed(observations, everywhere, plane.rows))
         plane = replace(plane, plane=paper, rms=rms)
     rows, nothing = iter(plane.rows), np.empty(0, dtype=np.intp)
     return replace(plane, rows=[nothing if o.same_rest else next(rows) for o in every])
@@ -122,25 +103,25 @@ def _crossed(
 ) -> list[tuple[pin.SE3, BoardView, Array]]:
     """Pose and view of the board, and the stripe's pixels, of the observations that show both."""
     return [
-        (pose, o.view, stripe_pixels(o.profile, r))
+        (pose, o.view, starts.stripe_pixels(o.profile, r))
         for o, pose, r in zip(observations, poses, rows, strict=True)
         if o.view is not None and o.profile is not None and len(r)
     ]
 
 
-def _expected(hand_eye: HandEye, o: ScanObservation) -> pin.SE3:
+def _expected(hand_eye: starts.HandEye, o: ScanObservation) -> pin.SE3:
     """camera_from_board of an observation that does not see it."""
     flange_from_camera = hand_eye.flange_from_camera * from_parts(o.rail_position * hand_eye.rail_direction)
     return (o.base_from_flange * flange_from_camera).inverse() * hand_eye.base_from_board
 
 
-def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> ViewData:
+def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> normal.ViewData:
     """Measurements of one observation, the stripe as about `STRIPE_POINTS` means of neighbouring rows."""
     view, profile = observation.view, observation.profile
     stripe, sigma = np.zeros((0, 2)), np.zeros(0)
     if profile is not None and len(rows):
-        stripe, sigma = stripe_means(profile, rows, STRIPE_POINTS)
-    return ViewData(
+        stripe, sigma = starts.stripe_means(profile, rows, STRIPE_POINTS)
+    return normal.ViewData(
         points=np.zeros((0, 3)) if view is None else view.object_points,
         pixels=np.zeros((0, 2)) if view is None else view.pixels, sigma=np.zeros(0) if view is None else view.sigma,
         dot_radius=0.0 if view is None else view.dot_radius, stripe=stripe, stripe_sigma=sigma,
@@ -149,9 +130,9 @@ def view_data(observation: ScanObservation, rows: NDArray[np.intp]) -> ViewData:
     )  # fmt: skip
 
 
-def start_state(staged: Staged) -> AdjustmentState:
+def start_state(staged: Staged) -> normal.AdjustmentState:
     """The joint adjustment's start."""
-    return AdjustmentState(
+    return normal.AdjustmentState(
         staged.camera, None if staged.plane is None else staged.plane.plane, staged.hand_eye.rail_direction,
         staged.hand_eye.flange_from_camera, staged.hand_eye.base_from_board,
     )  # fmt: skip
@@ -173,10 +154,10 @@ def solve_joint(
     return Joint(staged, adjusted, views, held_out_px=px, held_out_stripe_m=stripe, free=free)
 
 
-def _held_out(views: list[ViewData], free: NDArray[np.bool_], adjusted: Adjusted) -> tuple[float, float]:
+def _held_out(views: list[normal.ViewData], free: NDArray[np.bool_], adjusted: Adjusted) -> tuple[float, float]:
     """RMS in px and m of the views of the rests that each fold leaves out, at the flange poses that the arm reports."""
     dots, stripe = [np.zeros(0)], [np.zeros(0)]
-    folds = rests_of(views) % FOLDS
+    folds = normal.rests_of(views) % FOLDS
     for fold in range(FOLDS):
         kept = [v for v, of in zip(views, folds, strict=True) if of != fold]
         result = Adjustment(kept, free, adjusted.priors).solve(adjusted.state, variance_rounds=0)
@@ -187,13 +168,13 @@ def _held_out(views: list[ViewData], free: NDArray[np.bool_], adjusted: Adjusted
     return rms_of(np.concatenate(dots)), rms_of(np.concatenate(stripe))
 
 
-def residuals_as_reported(state: AdjustmentState, view: ViewData) -> tuple[Array, Array]:
+def residuals_as_reported(state: normal.AdjustmentState, view: normal.ViewData) -> tuple[Array, Array]:
     """Residuals of the dots (n, 2) in px and of the stripe (m,) in m at the flange pose that the arm reports."""
     off, away = np.zeros((0, 2)), np.zeros(0)
     if len(view.points):
-        off = dots_block(state, view, view.base_from_flange, view.rail)[0]
+        off = normal.dots_block(state, view, view.base_from_flange, view.rail)[0]
     if len(view.stripe) and state.plane is not None:
-        away = stripe_block(state, view, view.base_from_flange, view.rail)[0]
+        away = normal.stripe_block(state, view, view.base_from_flange, view.rail)[0]
     return off, away
 
 
@@ -205,20 +186,20 @@ def effective_hand_eye_covariance(joint: Joint) -> Array:
     hand-eye's alone, as the mean over the calibration's views.
     """
     state, covariance = joint.adjusted.state, joint.adjusted.covariance
-    both = np.r_[np.arange(CAMERA.start, CAMERA.stop), np.arange(HAND.start, HAND.stop)]
+    both = np.r_[np.arange(normal.CAMERA.start, normal.CAMERA.stop), np.arange(normal.HAND.start, normal.HAND.stop)]
     known = covariance[np.ix_(both, both)]
     parts = []
     for view, flange, rail in zip(joint.views, state.flanges, state.rails, strict=True):
         if len(view.points) < 6:
             continue
-        jacobian = dots_block(state, view, flange, float(rail))[1].reshape(-1, COLUMNS)
+        jacobian = normal.dots_block(state, view, flange, float(rail))[1].reshape(-1, normal.COLUMNS)
         # A move of the hand-eye moves all pixels as a move of the board in the camera would: the picture's six
         # degrees of freedom, in the hand-eye's own terms.
-        by_hand, by_camera = jacobian[:, HAND], jacobian[:, CAMERA]
+        by_hand, by_camera = jacobian[:, normal.HAND], jacobian[:, normal.CAMERA]
         absorbed = np.linalg.lstsq(by_hand, by_camera, rcond=None)[0]
         to_hand = np.hstack([absorbed, np.eye(6)])
         parts.append(to_hand @ known @ to_hand.T)
     if not parts:
-        return np.asarray(covariance[HAND, HAND], dtype=np.float64)
+        return np.asarray(covariance[normal.HAND, normal.HAND], dtype=np.float64)
     mean = np.mean(parts, axis=0)
     return np.asarray(0.5 * (mean + mean.T), dtype=np.float64)
