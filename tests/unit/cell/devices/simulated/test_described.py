@@ -16,10 +16,11 @@ import trimesh
 
 from cell import Cell
 from cell.check.fit import require_fit
-from cell.config.cell_config import load_config
+from cell.config.cell_config import load_config, mounted
 from cell.config.job import load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
+from cell.motion.collision import tool_bodies
 from drivers.errors import ConfigError
 from sim_backends.world import drawing as nominal
 from sim_backends.world.bodies.surfaces import own_surface
@@ -350,9 +351,6 @@ def test_a_part_that_the_calibration_would_bring_to_the_deck_is_refused_before_a
 
 def test_the_collision_bodies_of_the_cell_hang_where_the_cameras_are(tmp_path: Path) -> None:
     """A turned tool: what the planner keeps clear is where the world has cameras, laser and rail."""
-    from cell.config.cell_config import mounted
-    from cell.motion.collision import tool_bodies
-
     config: dict[str, dict[str, Any]] = {
         "scan_camera": {"flange_from_camera": pose((-50.0, -90.0, 80.0), (0.0, 5.0, 30.0))},
         "laser": {"baseline": '"60 mm"'},
