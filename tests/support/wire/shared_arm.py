@@ -34,15 +34,16 @@ class Shared:
             self._arm = None
 
 
-def shared_arm(connect):
+def shared_arm(connect, table=None):
     """Fixtures `running`, `shared`, `bench` and `arm` for the tests of a file; `connect` opens a driver at an address.
 
-    `arm` is the driver, connected. `bench` is the arm as after switching on, in use by nobody without `arm`.
+    `arm` is the driver, connected. `bench` is the arm as after switching on, in use by nobody without `arm`; it stands
+    above a table if asked.
     """
 
     @pytest.fixture(scope="module")
     def running():
-        with ArmBench() as bench:
+        with ArmBench(table=table) as bench:
             yield bench
 
     @pytest.fixture(scope="module")

@@ -23,7 +23,8 @@ from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import ArmSafety
-from tests import support
+from lab.bench.wires.soak import descendants
+from tests.support import running as running_process
 from tests.support.simulator.ur_client import flange
 from tests.support.wire.arm_bench import HOME, ArmBench, dashboard, soon
 from tests.support.wire.cable import Cable
@@ -78,7 +79,7 @@ def stands_still(bench, seconds=0.3):
 
 def children():
     """Processes that this one has started and that have not ended."""
-    return set(filter(support.running, support.below(os.getpid())))
+    return set(filter(running_process, descendants(os.getpid())))
 
 
 # --- paused programs ---
