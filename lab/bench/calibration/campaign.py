@@ -15,7 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from cell.measure.calibration.archive import ScanObservation
+from cell.config.calibrations.store import nominal_camera
+from cell.config.cell_config import load_config
+from cell.measure.calibration import ScanObservation
+from cell.measure.calibration.solve.adjustment import Adjustment, shared_mask
+from cell.measure.calibration.solve.joint import solve_joint, solve_staged, start_state
+from cell.measure.calibration.solve.normal import tangents
+from cell.measure.calibration.solve.results import PARAMETERS
+from cell.measure.geometry.poses import difference, from_matrix
+from cell.measure.vision.board.view import BoardView
+from cell.measure.vision.stripe.extract import StripeProfile
 from lab.bench.calibration.world import (
     HEIGHT,
     OWN,
@@ -30,6 +39,7 @@ from lab.bench.calibration.world import (
     seen_rows,
 )
 from lab.bench.over_cores import run_all
+from sim_backends.optics.camera import project_points
 
 STEPS = np.array(
     [1e-2, 1e-2, 1e-2, 1e-2, 1e-4, 1e-3, 1e-5, 1e-5] + [1e-4] * 3 + [1e-5] * 3 + [1e-6] * 12  # lens, plane, rail, poses
@@ -158,12 +168,6 @@ def campaign(seeds: Sequence[int], noise: Noise, tell: Callable[[int], None]) ->
 
 def one_trial(seed: int, noise: Noise) -> Trial:
     """Draw, calibrate, measure."""
-    from cell.config.calibrations.store import nominal_camera
-    from cell.config.cell_config import load_config
-    from cell.measure.calibration.solve.adjustment import Adjustment, shared_mask
-    from cell.measure.calibration.solve.joint import solve_joint, solve_staged, start_state
-    from cell.measure.calibration.solve.results import PARAMETERS
-
     rng = np.random.default_rng(seed)
     world = draw_head(rng)
     observations = observe(world, noise, rng)
@@ -199,11 +203,6 @@ def _whitened(error: Array, covariance: Array) -> float:
 
 def observe(world: HeadWorld, noise: Noise, rng: np.random.Generator) -> list[Any]:
     """What the head sees and its devices report, as `ScanObservation`s with noise; the flange is said to be as sent."""
-    from cell.measure.calibration import ScanObservation
-    from cell.measure.geometry.poses import from_matrix
-    from cell.measure.vision.board.view import BoardView
-    from cell.measure.vision.stripe.extract import StripeProfile
-
     made = []
     for view in range(len(world.rails)):
         own = noise.own * rng.normal(size=7)
@@ -236,9 +235,6 @@ def _as_world(world: HeadWorld, state: Any) -> HeadWorld:
 
 def _parameter_errors(state: Any, world: HeadWorld) -> Array:
     """Errors (21,) of the estimate in the order and the terms of the calibration's covariance."""
-    from cell.measure.calibration.solve.normal import tangents
-    from cell.measure.geometry.poses import difference, from_matrix
-
     length = np.linalg.norm(world.plane)
     normal, distance = world.plane / length, 1 / length
     if state.plane.distance < 0:
@@ -325,8 +321,6 @@ def measured_errors(
 
 def sweep_points(world: HeadWorld, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
     """Stripe pixels (n, 2) and rail positions (n,) in m of points spread over a 70 × 36 × 15 mm place under a sweep."""
-    from sim_backends.optics.camera import project_points
-
     middle = 0.05
     points = np.column_stack(
         [rng.uniform(-0.035, 0.035, count), rng.uniform(-0.0165, 0.0165, count), STAND_OFF - RELIEF * rng.random(count)]

@@ -70,7 +70,7 @@ def _job(cell: Cell, job: str) -> tuple[str, str]:
 def counted(owner: int) -> dict[str, dict[str, float]]:
     """Memory (resident, MB), threads and open handles of a process and of all that it has started, by what they are."""
     found: dict[str, dict[str, float]] = {}
-    for process in [owner, *_descendants(owner)]:
+    for process in [owner, *descendants(owner)]:
         folder = Path(f"/proc/{process}")
         try:
             status = dict(line.split(":", 1) for line in (folder / "status").read_text().splitlines())
@@ -99,7 +99,8 @@ def _name(folder: Path) -> str:
     )
 
 
-def _descendants(owner: int) -> list[int]:
+def descendants(owner: int) -> list[int]:
+    """All processes that `owner` has started, and those that they have."""
     parents: dict[int, int] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support import below, running, until
+from lab.bench.wires.soak import descendants
+from tests.support import running, until
 from tests.support.browser.screen import Console as Going
 from tests.support.browser.screen import console_of
 from tests.support.console.server import Browser
@@ -18,7 +19,7 @@ from tests.support.console.server import Browser
 
 def told(root: int) -> dict[int, str]:
     """The processes below `root` with their arguments."""
-    return {pid: Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ") for pid in below(root)}
+    return {pid: Path(f"/proc/{pid}/cmdline").read_text().replace("\0", " ") for pid in descendants(root)}
 
 
 @pytest.fixture

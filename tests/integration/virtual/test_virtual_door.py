@@ -155,7 +155,6 @@ def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
         ("vehicle.emergency_stop@drive_to_target:40%", "vehicle.emergency_stop"),
         ("vehicle.motor_fault@drive_to_target:40%", "vehicle.error"),
         ("arm.emergency_stop@board_photo", "arm.emergency_stop"),
-        ("target_camera.silent@drive_to_target", "DeadlineError"),
         ("arm.protective_stop@place:40%", "arm.protective_stop"),
         ("vehicle.motor_fault@place:40%", "vehicle.error"),
         ("rail.lost_steps@place:2%", "rail.lost_steps"),
@@ -168,9 +167,12 @@ def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe
     require_safe(dict(outcome.report))
 
 
-def test_a_drive_that_is_done_again_does_not_look_at_the_fine_board_again() -> None:
+def test_a_drive_that_is_done_again_in_vain_does_not_look_at_the_fine_board_again() -> None:
     """The vehicle may stand before a station that the arm does not know yet."""
     outcome = done(("target_camera.silent@drive_to_target",), confirm="simulated")
+    assert (outcome.outcome, outcome.report["code"]) == ("faulted", "DeadlineError")
+    assert outcome.reason.startswith("target_camera")
+    require_safe(dict(outcome.report))
     step = outcome.report["steps"][0]
     assert (step["name"], step["state"], step["retries"]) == ("drive_to_target", "failed", 1)
     assert len(list((outcome.folder / "frames").glob("interim-1-*.png"))) == 1

@@ -6,7 +6,6 @@ ur_rtde's constructors hold the interpreter's lock, and it does not survive the 
 from __future__ import annotations
 
 import math
-import socket
 from collections.abc import Callable
 
 import numpy as np
@@ -17,7 +16,7 @@ from rtde_io import RTDEIOInterface
 from rtde_receive import RTDEReceiveInterface
 
 from drivers.clock import Clock
-from tests.support.wire.arm_bench import HOME, ArmBench, soon
+from tests.support.wire.arm_bench import HOME, ArmBench, dashboard, soon
 
 SPEED = 5.0
 CLOCK = Clock()
@@ -70,13 +69,3 @@ class Client:
         until(lambda: bool(self.control.isProgramRunning()))
         assert self.control.moveJ(HOME.tolist(), 2.0, 20.0)
         assert self.control.setTcp([0.0] * 6)
-
-
-def dashboard(address: str, *commands: str) -> list[str]:
-    with socket.create_connection((address, 29999), timeout=5.0) as connection:
-        lines = connection.makefile("r")
-        answers = [lines.readline().strip()]
-        for command in commands:
-            connection.sendall(command.encode() + b"\n")
-            answers.append(lines.readline().strip())
-    return answers[1:] if commands else answers

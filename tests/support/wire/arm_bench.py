@@ -18,7 +18,6 @@ import numpy as np
 
 from drivers.arm.feed import Snapshot
 from drivers.clock import Clock
-from drivers.errors import CellError
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
@@ -81,30 +80,15 @@ def stand_at_home(arm):
     arm.move_joints(HOME, 1.0, 1.0).wait(5.0)
 
 
-class Shared:
-    """The one connection that tests share as long as the arm can be moved over it: most leave one behind that can."""
-
-    def __init__(self, connect):
-        self._connect = connect
-        self._arm = None
-
-    def ready(self):
-        """The driver, connected, with a program that moves the arm, which stands where it began."""
-        if self._arm is not None:
-            try:
-                stand_at_home(self._arm)
-            except CellError:
-                self.close()
-        if self._arm is None:
-            self._arm = self._connect()
-            stand_at_home(self._arm)
-        return self._arm
-
-    def close(self):
-        """Let others have the arm."""
-        if self._arm is not None:
-            self._arm.close()
-            self._arm = None
+def dashboard(address, *commands):
+    """The answers of the arm's dashboard, or its greeting where nothing is asked."""
+    with socket.create_connection((address, 29999), timeout=5.0) as connection:
+        lines = connection.makefile("r")
+        answers = [lines.readline().strip()]
+        for command in commands:
+            connection.sendall(command.encode() + b"\n")
+            answers.append(lines.readline().strip())
+    return answers[1:] if commands else answers
 
 
 def _table(height: float):

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from cell.config.cell_config import default_toml
 from drivers.clock import Clock
 from statemachine.journal import JournalError, read
@@ -74,6 +76,18 @@ def served(folder: Path, *arguments: str) -> Iterator[dict[str, Any]]:
         if sim.poll() is None:
             sim.send_signal(signal.SIGINT)
             assert sim.wait(10) == 0
+
+
+def serving(*arguments: str) -> Any:
+    """A fixture for a test file: a folder with the configuration of a cell served for it, `sim.toml`; its endpoints."""
+
+    @pytest.fixture(scope="module")
+    def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, Any]]]:
+        folder = tmp_path_factory.mktemp("cell")
+        with served(folder, *arguments) as endpoints:
+            yield folder, endpoints
+
+    return made
 
 
 BRAKE_FRAME_S = 0.25

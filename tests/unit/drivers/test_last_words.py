@@ -5,15 +5,16 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from drivers.clock import Clock
-from tests.support.wire.cells import ask, served
+from tests.support import until
+from tests.support.wire import cells
+from tests.support.wire.cells import ask
 
 pytestmark = pytest.mark.wire
 
@@ -84,15 +85,8 @@ def lit_arm_moves(truth: Truth) -> bool:
     return bool(truth["arm"]["moving"] and truth["laser_on"])
 
 
-@pytest.fixture(scope="module")
-def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """A folder with the configuration of a served cell, and its endpoints.
-
-    At the wall's speed: the vehicle's own watchdog would only begin to stop it after half a second.
-    """
-    folder = tmp_path_factory.mktemp("cell")
-    with served(folder, "--seed", "3", "--speed", "1") as endpoints:
-        yield folder, endpoints
+serving = cells.serving("--seed", "3", "--speed", "1")
+"""At the wall's speed: the vehicle's own watchdog would only begin to stop it after half a second."""
 
 
 @pytest.mark.parametrize(
@@ -118,11 +112,8 @@ def test_half_a_second_after_the_last_sign_of_life_all_is_safe(
     assert not moving(ask(endpoints, op="truth")["truth"])
     owner = subprocess.Popen([sys.executable, "-c", OPEN + script], cwd=folder, stderr=subprocess.PIPE, text=True)
     try:
-        deadline = time.monotonic() + 60
-        while not moving(ask(endpoints, op="truth")["truth"]):
-            assert owner.poll() is None
-            assert time.monotonic() < deadline
-            Clock().sleep(0.02)
+        assert until(lambda: owner.poll() is not None or moving(ask(endpoints, op="truth")["truth"]), 60.0)
+        assert owner.poll() is None
         owner.send_signal(how)
         Clock().sleep(0.5)
         truth = ask(endpoints, op="truth")["truth"]

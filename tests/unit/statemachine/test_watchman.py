@@ -66,28 +66,6 @@ def test_past_its_deadline_a_step_has_no_time_left():
 # --- who asks for the end ---
 
 
-def test_an_abort_from_another_thread_stops_the_moving_step(tmp_path):
-    def work(context):
-        bench.control.abort("the operator has seen enough")
-        assert bench.stopped.wait(5), "the cell is stopped while the step still runs"
-        raise OSError("the motion was stopped")
-
-    bench = Bench(tmp_path, laser_sweep=work)
-    result = bench.run()
-    assert (result.outcome, result.reason) == (Outcome.ABORTED, "the operator has seen enough")
-    assert "reconstruct" not in bench.log
-
-
-def test_another_process_can_abort_through_the_journal(tmp_path):
-    def work(context):
-        request(tmp_path, "abort", "cell abort")
-        bench.stopped.wait(5)
-
-    bench = Bench(tmp_path, board_photo=work)
-    result = bench.run()
-    assert (result.outcome, result.reason) == (Outcome.ABORTED, "cell abort")
-
-
 def test_who_asks_as_the_run_comes_to_its_end_is_heard(tmp_path):
     bench = Bench(tmp_path)
     bench.on_stop = lambda: [request(tmp_path, kind, "cell abort") for kind in ("end-batch", "abort")]
@@ -116,16 +94,26 @@ def outlived(number):
         signal.signal(number, before)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_to_end_stops_the_moving_step(tmp_path, number):
+@pytest.mark.parametrize(
+    ("ask", "reason", "number"),
+    [
+        (lambda bench: bench.control.abort("seen enough"), "seen enough", None),
+        (lambda bench: request(bench.folder, "abort", "cell abort"), "cell abort", None),
+        (lambda bench: os.kill(os.getpid(), signal.SIGTERM), "asked to end (SIGTERM)", signal.SIGTERM),
+        (lambda bench: os.kill(os.getpid(), signal.SIGHUP), "asked to end (SIGHUP)", signal.SIGHUP),
+    ],
+    ids=["another thread", "another process", "SIGTERM", "SIGHUP"],
+)
+def test_whoever_asks_for_the_end_stops_the_moving_step(tmp_path, ask, reason, number):
     def work(context):
-        os.kill(os.getpid(), number)
+        ask(bench)
         assert bench.stopped.wait(5), "the cell is stopped while the step still runs"
+        raise OSError("the motion was stopped")
 
     bench = Bench(tmp_path, laser_sweep=work)
-    with outlived(number):
+    with outlived(signal.SIGTERM), outlived(signal.SIGHUP):
         result = bench.run()
-    assert (result.outcome, result.signal) == (Outcome.ABORTED, number)
+    assert (result.outcome, result.reason, result.signal) == (Outcome.ABORTED, reason, number)
     assert "reconstruct" not in bench.log
 
 

@@ -18,8 +18,9 @@ from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, NotConnectedError
 from drivers.interfaces import ArmSafety
-from tests.support.wire.arm_bench import ArmBench, Shared, soon
+from tests.support.wire.arm_bench import soon
 from tests.support.wire.cable import Cable
+from tests.support.wire.shared_arm import shared_arm
 
 pytestmark = pytest.mark.wire
 
@@ -32,33 +33,7 @@ def connect(address, **options):
     return UrArm("arm", address, payload=PAYLOAD, clock=Clock(), **options)
 
 
-@pytest.fixture(scope="module")
-def running():
-    with ArmBench() as bench:
-        yield bench
-
-
-@pytest.fixture(scope="module")
-def shared(running):
-    shared = Shared(lambda: connect(running.address))
-    yield shared
-    running.ask("clear")
-    shared.close()
-
-
-@pytest.fixture
-def bench(request, running, shared):
-    """The arm as after switching on; in use by nobody where the test does not take it with `arm`."""
-    running.ask("clear")
-    if "arm" not in request.fixturenames:
-        shared.close()
-    running.ask("reset")
-    return running
-
-
-@pytest.fixture
-def arm(bench, shared):
-    return shared.ready()
+running, shared, bench, arm = shared_arm(connect)
 
 
 def send(address, script):

@@ -1,11 +1,11 @@
-"""Single commands on one served cell: they connect what they need, move, refuse, and look without touching."""
+"""Single commands on one served cell: they connect what they need, move, refuse, look without touching, and recover."""
 
 from __future__ import annotations
 
 import json
 import re
+import signal
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,23 +16,22 @@ from cell import Cell
 from cell.config.cell_config import default_toml, load_config
 from cell.devices.assembly import connect
 from cell.devices.lock import CellLock
+from cell.run.folder import awaited_word
 from cell.run.jogging import jog, needed_for, parse_jog
-from drivers.errors import InterlockError, NotConnectedError
+from drivers.clock import Clock
+from drivers.errors import DeviceFault, InterlockError, NotConnectedError
+from statemachine.journal import request
 from tests.support import Typed, until
 from tests.support.packages import RAIL, install, with_acme_rail
-from tests.support.wire.cells import ask, cell, served
+from tests.support.wire import cells
+from tests.support.wire.cells import ask, cell, started, wait_for_step
 
 pytestmark = pytest.mark.wire
 
 STAYS = ("laser_on", "digital_outputs", "rail_moving", "vehicle", "arm", "part")
 
 
-@pytest.fixture(scope="module")
-def serving(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, dict[str, Any]]]:
-    """A folder with the configuration of a served cell, and its endpoints."""
-    folder = tmp_path_factory.mktemp("cell")
-    with served(folder, "--seed", "3", "--level", "ideal") as endpoints:
-        yield folder, endpoints
+serving = cells.serving("--seed", "3", "--level", "ideal")
 
 
 @pytest.fixture
@@ -200,3 +199,43 @@ def test_a_rail_of_another_maker_is_jogged_from_the_command_line(
     done = cell("jog", "rail", "+5mm", "--json", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["rail"] == "0.000 mm → 5.000 mm"
+
+
+# --- out of a fault ---
+
+
+def test_an_idle_protective_stop_is_unlocked_by_a_person_who_is_named(endpoints: dict[str, Any], typed: Typed) -> None:
+    ask(endpoints, op="fault", name="arm.protective_stop")
+    code, _, error = typed("recover")
+    assert code == 2 and "--by NAME" in error
+    assert truth(endpoints)["arm"]["safety"] == "protective_stop"
+    code, _, error = typed("recover", "--by", "Ann")
+    assert (code, truth(endpoints)["arm"]["safety"]) == (0, "normal"), error
+
+
+def test_a_homing_that_stopped_goes_on_after_cell_confirm(endpoints: dict[str, Any], here: Path) -> None:
+    with started("home", "arm", folder=here) as homing:
+        run = wait_for_step(here, "homing", homing)
+        ask(endpoints, op="fault", name="arm.protective_stop")
+        while (asked := awaited_word(run)) is None:
+            assert homing.poll() is None
+            Clock().sleep(0.05)
+        request(run, "confirm", "Ann", asked.number)
+        assert homing.wait(60.0) == 0
+        assert homing.stderr is not None and "waiting for a person, question 1" in homing.stderr.read()
+
+
+def test_an_arm_that_froze_is_used_again_by_the_same_program(tmp_path: Path) -> None:
+    """Its link is lost after 1.5 s of silence: a person's word connects it again."""
+    with started("sim", "serve", "--json", "--speed", "1", "--config-out", "cell.toml", folder=tmp_path) as sim:
+        assert sim.stdout is not None
+        sim.stdout.readline()
+        with Cell.open(tmp_path / "cell.toml", only=("arm", "vehicle")) as opened:
+            sim.send_signal(signal.SIGSTOP)
+            Clock().sleep(4.0)
+            with pytest.raises(DeviceFault, match="was lost"):
+                opened.devices.arm.state()
+            sim.send_signal(signal.SIGCONT)
+            opened.recover("Ann")
+            opened.home("arm")
+            assert opened.devices.arm.state().controlled

@@ -35,27 +35,24 @@ def test_the_supervisor_script_of_the_readme_runs_as_printed(supervised: Supervi
     assert "mean D" in supervised.printed
 
 
-def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound(placed: dict[str, Any]) -> None:
+def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound_and_ends_safe(placed: dict[str, Any]) -> None:
     assert placed["outcome"] == "placed"
     assert placed["truth"]["error_mm"]["d"]["mean"] <= 0.60
     assert placed["truth"]["sensor_mm"]["p85"] <= 0.15
+    end = placed["end_state"]
+    assert not end["laser_on"]
+    assert end["vehicle"]["braked"]
+    assert not end["arm"]["moving"]
+    assert not end["part"]["held"]
 
 
 @pytest.mark.campaign
 def test_a_first_run_over_the_wires_calibrates_and_places_within_the_same_bounds(tmp_path: Path) -> None:
     first = supervise(tmp_path)
     assert first.printed.startswith("placed")
-    test_a_run_over_the_wires_places_the_part_within_the_nominal_bound(first.report)
+    test_a_run_over_the_wires_places_the_part_within_the_nominal_bound_and_ends_safe(first.report)
     kinds = [read_report(run)["kind"] for run in list_runs(tmp_path / "runs")]
     assert kinds == ["calibration", "job"]
-
-
-def test_the_placed_part_ends_a_safe_cell(placed: dict[str, Any]) -> None:
-    end = placed["end_state"]
-    assert not end["laser_on"]
-    assert end["vehicle"]["braked"]
-    assert not end["arm"]["moving"]
-    assert not end["part"]["held"]
 
 
 def test_the_run_folder_holds_everything(place: Path, placed: dict[str, Any]) -> None:

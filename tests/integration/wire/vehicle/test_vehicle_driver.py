@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
 
 import can
 import pytest
@@ -13,21 +12,13 @@ from cell.config.job import load_job
 from cell.procedures.drive.way import Whereabouts
 from drivers.errors import DeviceFault, InterlockError, RefusedError
 from sim_backends.models.vehicle import Mode
-from tests.support.wire.vehicle_bench import SPEED, STANDSTILL, Bench, benched
+from tests.support.wire.vehicle_bench import STANDSTILL, Bench, benched
+from tests.unit.drivers.vehicle import conftest
 
 pytestmark = pytest.mark.wire
 
 
-@pytest.fixture
-def bench() -> Iterator[Bench]:
-    with benched(SPEED) as made:
-        yield made
-
-
-@pytest.fixture
-def enabled(bench: Bench) -> Bench:
-    bench.vehicle.enable()
-    return bench
+bench, enabled = conftest.bench, conftest.enabled
 
 
 def test_it_starts_in_standby_and_does_not_move_before_it_is_enabled(bench: Bench) -> None:

@@ -98,9 +98,10 @@ def test_the_figures_are_those_of_the_runs_and_what_the_parts_have_alike_is_allo
     assert [line for line in lines if line.startswith("part 3 of 3  placed: ") and line.endswith("3 placed")]
 
 
-@pytest.mark.parametrize(("rule", "refused"), [("", 1), ("end", 1), ("skip", 2)])
+@pytest.mark.parametrize(("rule", "refused"), [("", 1), ("skip", 2)])
 def test_after_a_refusal_the_job_decides(opened: Callable[..., Cell], rule: str, refused: int) -> None:
     with opened(rule, moved=True) as cell:
+        assert load_job("own.toml")[0].batch.on_refusal == (rule or "end")
         batch = cell.run_batch("own.toml", 2)
     assert (batch.counts["refused"], batch.counts["not tried"], batch.exit_code) == (refused, 2 - refused, 1)
     assert batch.figures == ()
@@ -126,13 +127,6 @@ def test_where_the_job_asks_a_person_goes_on_or_ends_it(opened: Callable[..., Ce
     assert "after part 2: loading ended: Ann ends it" in batch.reason
 
 
-def test_a_fault_ends_it_whatever_the_job_says_of_refusals(opened: Callable[..., Cell]) -> None:
-    with opened("skip") as cell:
-        batch = cell.run_batch("own.toml", 2, inject=["arm.emergency_stop@drive_to_target:40%"])
-    assert (batch.counts["faulted"], batch.counts["not tried"], batch.exit_code) == (1, 1, 1)
-    assert batch.reason.startswith("part 1 faulted: ")
-
-
 def test_an_abort_in_the_second_part_leaves_the_first_whole_and_tells_what_was_not_tried(
     opened: Callable[..., Cell],
 ) -> None:
@@ -154,14 +148,15 @@ def test_an_abort_in_the_second_part_leaves_the_first_whole_and_tells_what_was_n
 
 
 def test_somebody_lets_this_part_be_the_last(opened: Callable[..., Cell]) -> None:
-    with opened() as cell:
+    """One that is refused by a job that goes on after refusals: none takes less time."""
+    with opened("skip", moved=True) as cell:
 
         def ask(event: Event) -> None:
-            if (event.kind, event.step) == ("step_started", "board_photo"):
+            if (event.kind, event.step) == ("step_started", "drive_to_target"):
                 request(list_runs(cell.runs_folder)[-1], "end-batch", "home time")
 
         batch = cell.run_batch("own.toml", 2, ask)
-    assert ([run.outcome for run in batch.runs], batch.reason) == (["placed"], "after part 1, as asked")
+    assert ([run.outcome for run in batch.runs], batch.reason) == (["refused"], "after part 1, as asked")
 
 
 def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
@@ -224,12 +219,18 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
     assert _question(cell._here, job, "part 2 of 2", last, refill=True) is None
 
 
-def test_the_command_line_shows_what_came_of_it(opened: Callable[..., Cell], typed: Typed) -> None:
-    opened().close()
+def test_a_fault_ends_it_whatever_the_job_says_of_refusals_and_the_command_line_shows_it(
+    opened: Callable[..., Cell], typed: Typed
+) -> None:
+    opened("skip").close()
     words = ("dry-run", "-c", "cell.toml", "-j", "own.toml", "--clock", "virtual", "--seed", "2", "--count", "2")
     code, out, error = typed(*words, "--inject", "arm.emergency_stop@drive_to_target:40%")
     shown = ("0 placed, 0 corrected" in out, "1 faulted" in out, "part 1 of 2  faulted" in error)
     assert (code, shown) == (1, (True, True, True)), (out, error)
+    (file,) = Path("runs").glob("batch-*.json")
+    told = read_json(file).require()
+    assert (told["counts"]["faulted"], told["counts"]["not tried"]) == (1, 1)
+    assert told["reason"].startswith("part 1 faulted: ")
     assert typed(*words, "--until", "board_photo")[0] == 2
 
 

@@ -118,19 +118,14 @@ def test_a_creeping_head_is_due_before_its_calibration_is_old(tmp_path: Path) ->
     assert found.due == "a calibration is due in 9.0 days: head, joints or board creeps 0.010 mm a day"
 
 
-def test_what_was_refused_because_it_moved_is_due_now(tmp_path: Path) -> None:
+def test_what_was_refused_because_it_moved_is_due_now_until_a_job_passes_its_look_again(tmp_path: Path) -> None:
     job(tmp_path, 0.0, [0.0, 0.0, 0.0])
     refusal = {"numbers": [{"name": MOVED, "value": 0.4}]}
     refused = job(tmp_path, 1.0, outcome="refused", refusal=refusal, steps=[])
     found = health(tmp_path, tmp_path / "calibrations", MAX_AGE_S, MADE + dt.timedelta(days=2))
     assert (found.moved, found.days_left) == (refused, 0.0)
     assert found.due == f"a calibration is due now: run {refused} was refused, for something has moved"
-
-
-def test_a_job_that_passes_its_look_again_clears_it(tmp_path: Path) -> None:
-    refusal = {"numbers": [{"name": MOVED, "value": 0.4}]}
-    job(tmp_path, 0.0, outcome="refused", refusal=refusal, steps=[])
-    job(tmp_path, 1.0, [0.0, 0.0, 0.0])
+    job(tmp_path, 1.5, [0.0, 0.0, 0.0])
     found = health(tmp_path, tmp_path / "calibrations", MAX_AGE_S, MADE + dt.timedelta(days=2))
     assert (found.moved, found.due_now) == ("", False)
 

@@ -9,8 +9,7 @@ import pytest
 
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
-from drivers.errors import CellError
-from tests.support.wire.arm_bench import ArmBench, stand_at_home
+from tests.support.wire.shared_arm import shared_arm
 
 
 @pytest.fixture
@@ -28,34 +27,8 @@ def server():
     listener.close()
 
 
-LASER = 0
+def connect(address):
+    return UrArm("arm", address, safe_off_outputs=(0,), payload=(1.5, (0.0, 0.0, 0.06)), clock=Clock())
 
 
-@pytest.fixture(scope="module")
-def running():
-    with ArmBench(table=0.5) as bench:
-        yield bench
-
-
-@pytest.fixture
-def bench(running):
-    running.ask("reset")
-    return running
-
-
-@pytest.fixture(scope="module")
-def connected(running):
-    arm = UrArm("arm", running.address, safe_off_outputs=(LASER,), payload=(1.5, (0.0, 0.0, 0.06)), clock=Clock())
-    yield arm
-    arm.close()
-
-
-@pytest.fixture
-def arm(bench, connected):
-    """The driver, connected and ready, with the arm back where it began."""
-    try:
-        stand_at_home(connected)
-    except CellError:
-        connected.recover(confirmed=True)
-        stand_at_home(connected)
-    return connected
+running, shared, bench, arm = shared_arm(connect, table=0.5)

@@ -18,62 +18,30 @@ import pytest
 from cell.devices.devices import Devices, require_healthy
 from cell.devices.gate.gate import Gate
 from cell.devices.gate.interlocks import Interlocks
+from cell.measure.geometry.poses import to_ur
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import Aborted, CellError, DeviceFault, InterlockError, NotConnectedError
 from drivers.interfaces import ArmSafety
-from tests import support
-from tests.support.wire.arm_bench import HOME, ArmBench, Shared, soon
+from lab.bench.wires.soak import descendants
+from tests.support import running as running_process
+from tests.support.simulator.ur_client import flange
+from tests.support.wire.arm_bench import HOME, ArmBench, dashboard, soon
 from tests.support.wire.cable import Cable
+from tests.support.wire.shared_arm import shared_arm
 
 pytestmark = pytest.mark.wire
 
 LASER = 0
 SAFE_STOP_S = 5.0
 """What a cell's safe stop has for everything."""
-UR10E = [
-    (0.0, 0.1807, np.pi / 2),
-    (-0.6127, 0.0, 0.0),
-    (-0.57155, 0.0, 0.0),
-    (0.0, 0.17415, np.pi / 2),
-    (0.0, 0.11985, -np.pi / 2),
-    (0.0, 0.11655, 0.0),
-]
-"""a, d, alpha as the maker publishes them."""
-
-
-@pytest.fixture(scope="module")
-def running():
-    with ArmBench() as bench:
-        yield bench
-
-
-@pytest.fixture(scope="module")
-def shared(running):
-    shared = Shared(lambda: connect(running.address))
-    yield shared
-    running.ask("clear")
-    shared.close()
-
-
-@pytest.fixture
-def bench(request, running, shared):
-    """The arm back where it began; in use by nobody where the test does not take it with `arm`."""
-    running.ask("clear")
-    if "arm" not in request.fixturenames:
-        shared.close()
-        dashboard(running, "stop")
-    running.ask("reset")
-    return running
 
 
 def connect(address, **options):
     return UrArm("arm", address, safe_off_outputs=(LASER,), clock=Clock(), **options)
 
 
-@pytest.fixture
-def arm(bench, shared):
-    return shared.ready()
+running, shared, bench, arm = shared_arm(connect)
 
 
 @pytest.fixture
@@ -81,14 +49,6 @@ def closes(shared):
     """For a test that closes the driver."""
     yield
     shared.close()
-
-
-def dashboard(bench, command):
-    with socket.create_connection((bench.address, 29999), timeout=5.0) as connection:
-        lines = connection.makefile("r")
-        lines.readline()
-        connection.sendall(command.encode() + b"\n")
-        return lines.readline().strip()
 
 
 def swinging(arm, bench, kind="joints", speed=0.5):
@@ -119,7 +79,7 @@ def stands_still(bench, seconds=0.3):
 
 def children():
     """Processes that this one has started and that have not ended."""
-    return set(filter(support.running, support.below(os.getpid())))
+    return set(filter(running_process, descendants(os.getpid())))
 
 
 # --- paused programs ---
@@ -133,14 +93,14 @@ def children():
 def test_after_a_stop_nothing_goes_on_whatever_the_program_was_doing(arm, bench, kind, state):
     moving = swinging(arm, bench, kind)
     if state != "playing":
-        assert dashboard(bench, "pause") == "Pausing program"
+        assert dashboard(bench.address, "pause") == ["Pausing program"]
     if state in ("paused", "resuming"):
         assert soon(lambda: not bench.ask("show")["moving"])
     if state == "resuming":
-        dashboard(bench, "play")
+        dashboard(bench.address, "play")
     arm.stop()
     assert not bench.ask("show")["moving"], "the arm stands when the stop returns"
-    dashboard(bench, "play")
+    dashboard(bench.address, "play")
     assert stands_still(bench)
     with pytest.raises((Aborted, DeviceFault)):
         moving.wait(5.0)
@@ -150,15 +110,19 @@ def test_after_a_stop_nothing_goes_on_whatever_the_program_was_doing(arm, bench,
     assert np.abs(np.array(bench.ask("show")["q"]) - target).max() < 1e-6
 
 
-@pytest.mark.parametrize("stopped", [True, False])
-def test_an_arm_that_a_safeguard_held_does_not_go_on_when_it_is_closed(arm, bench, stopped):
+@pytest.mark.parametrize(
+    ("held", "stopped"), [("safeguard_stop", True), ("safeguard_stop", False), ("protective_stop", False)]
+)
+def test_an_arm_that_was_held_does_not_go_on_when_it_is_let_go_by_hand(arm, bench, held, stopped):
     moving = swinging(arm, bench)
-    bench.ask("safeguard_stop")
+    bench.ask(held)
     if stopped:
         arm.stop()
-    with pytest.raises((Aborted, DeviceFault)):
+    with pytest.raises((Aborted, DeviceFault), match="protective stop" if held == "protective_stop" else None):
         moving.wait(5.0)
+    assert soon(lambda: not bench.ask("show")["moving"])
     bench.ask("clear")
+    dashboard(bench.address, "play")
     assert stands_still(bench)
     arm.recover()
     arm.move_joints(HOME, 1.0, 2.0).wait(5.0)
@@ -254,7 +218,7 @@ def test_a_pulled_cable_stops_the_arm_in_a_fifth_of_a_second_and_the_laser_stays
 def test_the_laser_goes_off_with_the_program_and_cannot_be_lit_without_one(arm, bench):
     arm.set_digital_output(LASER, True)
     arm.set_digital_output(LASER + 1, True)
-    dashboard(bench, "stop")
+    dashboard(bench.address, "stop")
     assert soon(lambda: bench.ask("show")["outputs"] & 0b11 == 0b10), "the claw keeps its part"
     with pytest.raises(CellError, match="kept low"):
         arm.set_digital_output(LASER, True)
@@ -268,7 +232,7 @@ def test_an_owner_that_computes_and_does_not_read_for_a_while_does_not_stop_the_
         arm.set_digital_output(LASER, True)
         with arm._session.feed._news:
             Clock().sleep(1.6)
-        assert dashboard(bench, "running") == "Program running: true"
+        assert dashboard(bench.address, "running") == ["Program running: true"]
         assert bench.ask("show")["outputs"] & 1 << LASER
         arm.move_joints(arm.state().joints + 0.1, 1.0, 2.0).wait(10.0)
         arm.close()
@@ -298,7 +262,7 @@ def test_a_recovery_ends_the_old_program_before_it_unlocks_even_if_its_process_h
         arm.recover()
     assert soon(lambda: not bench.ask("show")["moving"])
     bench.ask("clear")
-    dashboard(bench, "play")
+    dashboard(bench.address, "play")
     assert stands_still(bench)
     os.kill(arm._session.link.pid, signal.SIGCONT)
     arm.recover()
@@ -310,7 +274,7 @@ def test_a_program_that_a_person_pauses_as_it_has_been_recovered_is_not_begun_on
 
     def person(snapshot):
         if not said and threading.current_thread() is not before:
-            said.append(dashboard(bench, "pause"))
+            said.extend(dashboard(bench.address, "pause"))
             Clock().sleep(0.3)
 
     with arm._session.feed.listening(person), pytest.raises(DeviceFault) as caught:
@@ -318,18 +282,6 @@ def test_a_program_that_a_person_pauses_as_it_has_been_recovered_is_not_begun_on
     assert said == ["Pausing program"]
     assert caught.value.code == "arm.program_stopped"
     assert "started again" not in arm.statistics.errors
-    arm.recover()
-
-
-def test_a_motion_that_a_protective_stop_ended_does_not_go_on_when_it_is_unlocked_by_hand(arm, bench):
-    moving = swinging(arm, bench)
-    bench.ask("protective_stop")
-    with pytest.raises(DeviceFault, match="protective stop"):
-        moving.wait(5.0)
-    assert soon(lambda: not bench.ask("show")["moving"])
-    bench.ask("clear")
-    dashboard(bench, "play")
-    assert stands_still(bench)
     arm.recover()
 
 
@@ -353,8 +305,8 @@ def test_a_recovery_that_is_stopped_neither_unlocks_nor_starts_anything(arm, ben
     getattr(arm, ended_by)()
     recovery.join(5.0)
     assert [type(failure) for failure in failures] == [Aborted]
-    assert dashboard(bench, "safetystatus") == "Safetystatus: PROTECTIVE_STOP"
-    assert dashboard(bench, "running") == "Program running: false"
+    assert dashboard(bench.address, "safetystatus") == ["Safetystatus: PROTECTIVE_STOP"]
+    assert dashboard(bench.address, "running") == ["Program running: false"]
 
 
 def test_a_recovery_that_is_stopped_while_it_connects_leaves_no_program_and_no_process(arm, bench):
@@ -382,7 +334,7 @@ def test_a_recovery_that_is_stopped_while_it_connects_leaves_no_program_and_no_p
                 arm.state()
             assert soon(lambda: children() <= before)
             assert stands_still(bench)
-            assert dashboard(bench, "running") == "Program running: false"
+            assert dashboard(bench.address, "running") == ["Program running: false"]
         arm.recover()
         arm.move_joints(HOME, 1.0, 2.0).wait(5.0)
 
@@ -392,14 +344,10 @@ def test_a_recovery_that_is_stopped_while_it_connects_leaves_no_program_and_no_p
 FOREIGN = "def foreign():\n  movej([1.5, -1.57, -1.57, -1.57, 1.57, 0.0], a=1.0, v=0.2)\nend\n"
 
 
-def foreign_program(bench):
+def test_who_only_looks_leaves_a_running_program_and_its_outputs_alone_also_as_it_dies(bench):
     with socket.create_connection((bench.address, 30003), timeout=5.0) as connection:
         connection.sendall(FOREIGN.encode())
         assert soon(lambda: bench.ask("show")["moving"])
-
-
-def test_who_only_looks_leaves_a_running_program_and_its_outputs_alone(bench):
-    foreign_program(bench)
     looking = connect(bench.address, control=False)
     assert looking.state().moving
     assert looking.identity().model == "UR10e"
@@ -414,20 +362,15 @@ def test_who_only_looks_leaves_a_running_program_and_its_outputs_alone(bench):
         with pytest.raises(InterlockError, match="only to be looked at"):
             act()
     looking.close()
+    dying = connect(bench.address, control=False)
+    os.kill(dying._session.link.pid, signal.SIGKILL)
+    assert soon(lambda: dying._session.link.lost is not None)
+    dying.close()
+    Clock().sleep(0.3)
     shown = bench.ask("show")
     assert shown["moving"]
     assert shown["outputs"] & 1 << LASER
-    assert dashboard(bench, "running") == "Program running: true"
-
-
-def test_who_only_looks_and_dies_leaves_it_alone_as_well(bench):
-    foreign_program(bench)
-    looking = connect(bench.address, control=False)
-    os.kill(looking._session.link.pid, signal.SIGKILL)
-    assert soon(lambda: looking._session.link.lost is not None)
-    looking.close()
-    Clock().sleep(0.3)
-    assert bench.ask("show")["moving"]
+    assert dashboard(bench.address, "running") == ["Program running: true"]
 
 
 def test_a_connection_that_is_refused_leaves_the_one_that_has_the_arm_alone(arm, bench):
@@ -463,13 +406,9 @@ def test_a_storm_of_signals_does_not_end_the_child_before_it_has_switched_off(be
 # --- the wrong arm ---
 
 
-def forward(joints):
-    """base_from_flange of a UR10e as (x, y, z, rx, ry, rz)."""
-    pose = pin.SE3.Identity()
-    for (a, d, alpha), angle in zip(UR10E, joints, strict=True):
-        pose = pose * pin.SE3(pin.utils.rotate("z", angle), np.zeros(3))
-        pose = pose * pin.SE3(pin.utils.rotate("x", alpha), np.array([a, 0.0, d]))
-    return np.concatenate((pose.translation, pin.log3(pose.rotation)))
+def drawn(joints):
+    """base_from_flange of a UR10e by the maker's table, as (x, y, z, rx, ry, rz)."""
+    return to_ur(flange(joints))
 
 
 def test_a_dead_link_to_the_arm_ends_what_another_device_does(arm, closes):
@@ -492,14 +431,14 @@ def test_a_dead_link_to_the_arm_ends_what_another_device_does(arm, closes):
 
 def test_an_arm_of_another_model_is_refused_when_it_connects_and_nothing_moves():
     with ArmBench(model="UR5e") as bench:
-        assert dashboard(bench, "get robot model") == "UR5e"
+        assert dashboard(bench.address, "get robot model") == ["UR5e"]
         before = bench.ask("show")["q"]
         with pytest.raises(DeviceFault, match=r"mm and .* mrad away from where the cell's model") as caught:
-            connect(bench.address, forward=forward)
+            connect(bench.address, forward=drawn)
         assert caught.value.code == "arm.wrong_kinematics"
         assert not caught.value.recoverable
         assert bench.ask("show")["q"] == before
-        assert dashboard(bench, "running") == "Program running: false"
+        assert dashboard(bench.address, "running") == ["Program running: false"]
 
 
 @pytest.mark.parametrize("error", [[60e-6, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0.12e-3]])
@@ -507,7 +446,7 @@ def test_the_model_is_compared_before_every_motion(bench, error):
     pose_error = np.zeros(6)
 
     def model(joints):
-        pose = forward(joints)
+        pose = drawn(joints)
         turn = pin.log3(pin.exp3(pose_error[3:]) @ pin.exp3(pose[3:]))
         return np.concatenate((pose[:3] + pose_error[:3], turn))
 

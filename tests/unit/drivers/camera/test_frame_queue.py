@@ -56,34 +56,28 @@ def test_a_frame_whose_times_cannot_be_true_ends_the_acquisition(wrong: dict[str
         assert (met.value.code, met.value.recoverable) == (code, False)
 
 
-def test_each_gap_in_the_numbers_is_lost_frames_the_first_one_too() -> None:
+@pytest.mark.parametrize(
+    ("first", "come", "handed_out", "lost_before"),
+    [
+        (10, (12, 13, 17), [12, 13, 17], [2, 0, 3]),
+        (None, (12,), [12], [0]),
+        # Those of before are never handed out, nor one that comes a second time, or out of its turn.
+        (10, (9, 10, 10, 9, 11), [10, 11], [0, 0]),
+    ],
+)
+def test_each_gap_in_the_numbers_is_lost_frames_the_first_one_too_if_its_number_is_told(
+    first: int | None, come: tuple[int, ...], handed_out: list[int], lost_before: list[int]
+) -> None:
     frames = queue()
-    frames.expect(10)
-    for number in (12, 13, 17):
+    frames.expect(first)
+    for number in come:
         frames.put(frame(number))
-    taken = [frames.next(0.1) for _ in range(3)]
-    assert [one.frame_id for one in taken] == [12, 13, 17]
-    assert [one.lost_before for one in taken] == [2, 0, 3]
-    assert frames.lost == 5
-
-
-def test_where_the_first_number_is_not_told_the_first_frame_is_no_loss() -> None:
-    frames = queue()
-    frames.expect(None)
-    frames.put(frame(12))
-    assert (frames.next(0.1).lost_before, frames.lost) == (0, 0)
-
-
-def test_a_frame_of_before_is_never_handed_out() -> None:
-    """Nor one that comes a second time, or out of its turn."""
-    frames = queue()
-    frames.expect(10)
-    for number in (9, 10, 10, 9, 11):
-        frames.put(frame(number))
-    assert [frames.next(0.1).frame_id for _ in range(2)] == [10, 11]
+    taken = [frames.next(0.1) for _ in handed_out]
+    assert [one.frame_id for one in taken] == handed_out
+    assert [one.lost_before for one in taken] == lost_before
     with pytest.raises(DeadlineError, match="no frame within"):
         frames.next(0.01)
-    assert frames.lost == 0
+    assert frames.lost == sum(lost_before)
 
 
 def test_frames_that_find_it_full_are_lost_and_the_earlier_ones_kept() -> None:

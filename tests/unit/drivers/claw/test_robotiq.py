@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pytest
@@ -14,6 +14,7 @@ from drivers.claw.make import RobotiqClawConfig
 from drivers.claw.robotiq import RobotiqClaw
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
+from sim_backends.peers.server import TcpServer
 from sim_backends.peers.switches import RobotiqPeer
 from sim_backends.world.drawing import STOCK
 from sim_backends.world.world import World
@@ -41,8 +42,6 @@ class Bench:
 @pytest.fixture
 def bench() -> Iterator[Bench]:
     """The gripper of an ideal world whose arm lives on."""
-    from dataclasses import replace
-
     cell = replace(STOCK.cell, claw_output=None, grip_input=None)
     world = World(1, "ideal", SPEED, replace(STOCK, cell=cell))
     peer = RobotiqPeer(world, world.clock)
@@ -137,8 +136,6 @@ def test_who_only_looks_moves_no_finger(bench: Bench) -> None:
 
 
 def test_what_is_no_gripper_is_told(bench: Bench) -> None:
-    from sim_backends.peers.server import TcpServer
-
     silly = TcpServer("silly", lambda link: [link.sendall(b"hello") for _ in iter(lambda: link.recv(99), b"")])  # type: ignore[arg-type, return-value]
     silly.start()
     with pytest.raises(DeadlineError, match="b'hello' came"):

@@ -34,6 +34,11 @@ class Bench:
         return state.interruptions, state.interruption
 
 
+@pytest.fixture
+def bench() -> Bench:
+    return Bench()
+
+
 @pytest.mark.parametrize(
     ("bits", "words"),
     [
@@ -56,9 +61,8 @@ def test_error_bits_are_told_in_the_makers_words(bits: int, words: tuple[str, ..
     assert caught.value.code == "vehicle.error"
 
 
-def test_an_error_that_came_while_driving_is_for_a_person_to_look_at() -> None:
+def test_an_error_that_came_while_driving_is_for_a_person_to_look_at(bench: Bench) -> None:
     """It may be a collision; one that came while it stood is cleared by a program."""
-    bench = Bench()
     for driven in (True, False):
         if driven:
             bench.feedback.commanded_to_move()
@@ -81,8 +85,7 @@ def test_a_motor_drivers_overload_is_a_fault_and_being_enabled_is_none() -> None
         bench.feedback.check(in_command=False, driving=False)
 
 
-def test_whoever_took_command_away_is_for_a_person_to_find_out() -> None:
-    bench = Bench()
+def test_whoever_took_command_away_is_for_a_person_to_find_out(bench: Bench) -> None:
     bench.tell(0, 0, mode=0)
     bench.feedback.check(in_command=False, driving=False)
     with pytest.raises(DeviceFault, match="left CAN command") as caught:
@@ -91,8 +94,7 @@ def test_whoever_took_command_away_is_for_a_person_to_find_out() -> None:
     assert bench.interruption()[0] == 1
 
 
-def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_one_who_stands() -> None:
-    bench = Bench()
+def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_one_who_stands(bench: Bench) -> None:
     bench.clock.time += 0.6
     with pytest.raises(DeviceFault, match=r"no feedback for 0\.60 s") as caught:
         bench.feedback.check(in_command=True, driving=True)
@@ -106,8 +108,7 @@ def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_o
         bench.feedback.check(in_command=True, driving=False)
 
 
-def test_a_message_that_stopped_is_missed_though_the_others_go_on() -> None:
-    bench = Bench()
+def test_a_message_that_stopped_is_missed_though_the_others_go_on(bench: Bench) -> None:
     for _ in range(25):
         bench.feedback.idle(0.1)
         bench.feedback.take("Odometry", {"Left": 0, "Right": 0})
@@ -118,8 +119,7 @@ def test_a_message_that_stopped_is_missed_though_the_others_go_on() -> None:
 
 
 @pytest.mark.parametrize("late", ["Odometry", "MotionState", "SystemState"])
-def test_a_reading_is_as_old_as_the_oldest_of_what_it_is_made_of(late: str) -> None:
-    bench = Bench()
+def test_a_reading_is_as_old_as_the_oldest_of_what_it_is_made_of(bench: Bench, late: str) -> None:
     kept = bench.feedback.get(late)
     bench.clock.time += 0.5
     bench.tell(0, 0)
@@ -131,8 +131,7 @@ def test_a_reading_is_as_old_as_the_oldest_of_what_it_is_made_of(late: str) -> N
 
 
 @pytest.mark.parametrize(("speed", "yaw_rate"), [(0.1, 0.0), (-0.1, 0.0), (0.0, 0.1), (0.0, -0.1)])
-def test_a_vehicle_that_rolls_back_or_turns_does_not_stand(speed: float, yaw_rate: float) -> None:
-    bench = Bench()
+def test_a_vehicle_that_rolls_back_or_turns_does_not_stand(bench: Bench, speed: float, yaw_rate: float) -> None:
     asked = bench.clock.time
     assert not bench.feedback.stands(asked)  # what was told before says nothing
     for _ in range(STILL_FRAMES):
@@ -144,9 +143,10 @@ def test_a_vehicle_that_rolls_back_or_turns_does_not_stand(speed: float, yaw_rat
 
 
 @pytest.mark.parametrize(("speeds", "way"), [((0.0, 0.2), 0), ((0.0, 0.0, 0.0, 0.2), 0), ((0.0,), 3), ((0.0,), -3)])
-def test_a_stop_is_confirmed_by_feedback_that_agrees_with_itself(speeds: tuple[float, ...], way: int) -> None:
+def test_a_stop_is_confirmed_by_feedback_that_agrees_with_itself(
+    bench: Bench, speeds: tuple[float, ...], way: int
+) -> None:
     """Not by frames of standstill between others, and not while the wheels count on."""
-    bench = Bench()
     bench.feedback.commanded_to_move()
     bench.tell(0, 0, speed=0.2)
     for k in range(24):
@@ -159,9 +159,8 @@ def test_a_stop_is_confirmed_by_feedback_that_agrees_with_itself(speeds: tuple[f
 
 @pytest.mark.parametrize("every", [1, 2, 5])
 @pytest.mark.parametrize(("other", "step"), [(12_000, 0), (0, 6), (-40, 6), (12_000, 6)])
-def test_two_series_of_counts_are_two_vehicles(other: int, step: int, every: int) -> None:
+def test_two_series_of_counts_are_two_vehicles(bench: Bench, other: int, step: int, every: int) -> None:
     """Whether one stands beside the other or far off, and however seldom the second tells: within 0.5 s."""
-    bench = Bench()
     bench.feedback.commanded_to_move()
     with pytest.raises(DeviceFault, match="two vehicles report under the same identifiers") as met:
         for k in range(25):
@@ -180,8 +179,7 @@ def test_two_series_of_counts_are_two_vehicles(other: int, step: int, every: int
     bench.feedback.check(in_command=True, driving=True)
 
 
-def test_command_is_taken_only_once_the_vehicle_says_so_afterwards_and_without_a_fault() -> None:
-    bench = Bench()
+def test_command_is_taken_only_once_the_vehicle_says_so_afterwards_and_without_a_fault(bench: Bench) -> None:
     asked = bench.clock.time
     assert not bench.feedback.commanded(asked)
     for wrong in ({"mode": 0}, {"state": 1}, {"state": 2}, {"bits": 0x0100}):
@@ -209,8 +207,9 @@ def test_an_emergency_stop_is_told_whoever_is_in_command_and_no_program_clears_i
         ("BrakeCommand", {"Locked": 0}),
     ],
 )
-def test_whoever_else_commands_it_is_noticed_and_takes_its_place_along(message: str, signals: dict[str, float]) -> None:
-    bench = Bench()
+def test_whoever_else_commands_it_is_noticed_and_takes_its_place_along(
+    bench: Bench, message: str, signals: dict[str, float]
+) -> None:
     bench.feedback.take("MotionCommand", {"Speed": 0.0, "YawRate": 0.0})
     bench.feedback.take("BrakeCommand", {"Locked": 1})
     bench.feedback.check(in_command=True, driving=False)
@@ -222,15 +221,13 @@ def test_whoever_else_commands_it_is_noticed_and_takes_its_place_along(message: 
 
 
 @pytest.mark.parametrize("pushed", [(-6, 0), (0, 6), (0, -6)])
-def test_each_wheel_tells_of_a_push_either_way(pushed: tuple[int, int]) -> None:
-    bench = Bench()
+def test_each_wheel_tells_of_a_push_either_way(bench: Bench, pushed: tuple[int, int]) -> None:
     bench.tell(0, 0)
     bench.tell(*pushed)
     assert bench.interruption() == (1, "it moved by 6 mm without a command")
 
 
-def test_odometry_that_jumps_or_stays_away_no_longer_tells_the_place() -> None:
-    bench = Bench()
+def test_odometry_that_jumps_or_stays_away_no_longer_tells_the_place(bench: Bench) -> None:
     for count in range(50):
         bench.feedback.commanded_to_move()
         bench.tell(10 * count, 10 * count)
@@ -246,8 +243,7 @@ def test_odometry_that_jumps_or_stays_away_no_longer_tells_the_place() -> None:
     assert bench.interruption() == (2, "nothing was heard of it for 2.2 s")
 
 
-def test_a_vehicle_that_is_pushed_while_nobody_commands_it_is_noticed() -> None:
-    bench = Bench()
+def test_a_vehicle_that_is_pushed_while_nobody_commands_it_is_noticed(bench: Bench) -> None:
     for _ in range(10):
         bench.tell(0, 0)
     bench.tell(4, 3)
@@ -261,9 +257,8 @@ def test_a_vehicle_that_is_pushed_while_nobody_commands_it_is_noticed() -> None:
 
 
 @pytest.mark.parametrize("after", [0.02, 1.0, 1.9, 60.0])
-def test_a_restart_is_noticed_however_long_its_feedback_stayed_away(after: float) -> None:
+def test_a_restart_is_noticed_however_long_its_feedback_stayed_away(bench: Bench, after: float) -> None:
     """It counts from zero again; while it was away it cannot have driven, since nobody commanded it."""
-    bench = Bench()
     for count in range(50):
         bench.feedback.commanded_to_move()
         bench.tell(10 * count, 10 * count)
@@ -287,8 +282,7 @@ def test_in_a_gap_it_can_have_driven_until_it_rests_after_its_last_command() -> 
         assert bench.interruption()[0] >= 1 or not lost
 
 
-def test_what_moves_by_our_own_command_is_no_push() -> None:
-    bench = Bench()
+def test_what_moves_by_our_own_command_is_no_push(bench: Bench) -> None:
     bench.feedback.commanded_to_move()
     for count in range(150):
         bench.tell(8 * count, 8 * count)

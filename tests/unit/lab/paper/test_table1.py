@@ -9,7 +9,7 @@ import pytest
 from cell.measure.geometry.poses import from_parts
 from lab.bench.over_cores import run_all
 from lab.paper import rig
-from lab.paper.rig import RigSpec, dot_centres, draw_head
+from lab.paper.rig import RigSpec, Sweep, dot_centres, draw_head
 from lab.paper.table1 import SPEC, one_seed, spoil
 from sim_backends.optics import Board
 
@@ -44,8 +44,6 @@ def test_outliers_of_every_kind_are_found(run) -> None:
 
 
 def test_outliers_are_put_in_at_the_share_asked_for() -> None:
-    from lab.paper.rig import Sweep
-
     centres = np.full((60, 480), 300.0)
     sweep = Sweep(centres, np.zeros(60), np.zeros((60, 480, 3)))
     spoiled = spoil(sweep, SPEC, 0.03, np.random.default_rng(0))

@@ -16,10 +16,11 @@ import trimesh
 
 from cell import Cell
 from cell.check.fit import require_fit
-from cell.config.cell_config import load_config
+from cell.config.cell_config import load_config, mounted
 from cell.config.job import load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
+from cell.motion.collision import tool_bodies
 from drivers.errors import ConfigError
 from sim_backends.world import drawing as nominal
 from sim_backends.world.bodies.surfaces import own_surface
@@ -47,6 +48,18 @@ def about(axis: str, degrees: float) -> np.ndarray:
         "z": [[c, -s, 0], [s, c, 0], [0, 0, 1]],
     }
     return np.array(turns[axis])
+
+
+def light_on(world: World, place: tuple[float, float, float]) -> np.ndarray:
+    """The picture of the stripe alone that the scan camera takes looking straight down at `place`, from 130 mm."""
+    looking = nominal.pose((*place[:2], place[2] + 0.130), (1, 0, 0), (0, 0, -1))
+    far = nominal.pose((-2.0, 0.0, 0.55), (1, 0, 0), (0, 0, 1))
+    lit, dark = (
+        world._cameras.picture("scan", looking, far, laser=on, exposure=0.002).astype(float) for on in (True, False)
+    )
+    light: np.ndarray = lit - dark
+    light[light < 4] = 0.0
+    return light
 
 
 def true(cell: VirtualCell, name: str) -> np.ndarray:
@@ -126,15 +139,7 @@ def test_the_stripe_of_a_described_head_is_where_the_closed_form_puts_it(tmp_pat
     """x' = f (cot θ − l/Z), docs/explanation/theory.md, section 2, on the bare table at Z = 130 mm."""
     camera = {"focal_length": '"6 mm"', "pixel": '"3.45 um"', "width": "800", "height": "600"}
     laser = {"baseline": '"45 mm"', "tan_theta": "2.8"}
-    cell = ideal(tmp_path, {"scan_camera": camera, "laser": laser})
-    looking = nominal.pose((0.15, 0.0, 0.60 + 0.130), (1, 0, 0), (0, 0, -1))
-    far = nominal.pose((-2.0, 0.0, 0.55), (1, 0, 0), (0, 0, 1))
-    lit, dark = (
-        cell.world._cameras.picture("scan", looking, far, laser=on, exposure=0.002).astype(float)
-        for on in (True, False)
-    )
-    light = (lit - dark)[100:500]
-    light[light < 4] = 0.0
+    light = light_on(ideal(tmp_path, {"scan_camera": camera, "laser": laser}).world, (0.15, 0.0, 0.60))[100:500]
     centres = (light * np.arange(800)).sum(axis=1) / light.sum(axis=1)
     assert np.median(centres) == pytest.approx(399.5 + 0.006 / 3.45e-6 * (1 / 2.8 - 0.045 / 0.130), abs=0.1)
 
@@ -239,13 +244,7 @@ def test_the_camera_sees_an_own_surface_where_it_stands(tmp_path: Path) -> None:
     write_saddle(tmp_path / "saddle.ply")
     own = {"surface": {"mesh": '"saddle.ply"', "mesh_unit": '"mm"'}, "grasp": {"size": '["60 mm", "30 mm", "20 mm"]'}}
     world = World(1, "ideal", drawing=drawing(tmp_path, None, own))
-    looking = nominal.pose((0.0, 0.0, 0.60 + 0.130), (1, 0, 0), (0, 0, -1))
-    far = nominal.pose((-2.0, 0.0, 0.55), (1, 0, 0), (0, 0, 1))
-    lit, dark = (
-        world._cameras.picture("scan", looking, far, laser=on, exposure=0.002).astype(float) for on in (True, False)
-    )
-    light = lit - dark
-    light[light < 4] = 0.0
+    light = light_on(world, (0.0, 0.0, 0.60))
     rows = np.arange(200, 281, 10)
     u = (light * np.arange(640)).sum(axis=1)[rows] / light.sum(axis=1)[rows]
     per_px = 4.8e-6 / 0.008
@@ -352,9 +351,6 @@ def test_a_part_that_the_calibration_would_bring_to_the_deck_is_refused_before_a
 
 def test_the_collision_bodies_of_the_cell_hang_where_the_cameras_are(tmp_path: Path) -> None:
     """A turned tool: what the planner keeps clear is where the world has cameras, laser and rail."""
-    from cell.config.cell_config import mounted
-    from cell.motion.collision import tool_bodies
-
     config: dict[str, dict[str, Any]] = {
         "scan_camera": {"flange_from_camera": pose((-50.0, -90.0, 80.0), (0.0, 5.0, 30.0))},
         "laser": {"baseline": '"60 mm"'},

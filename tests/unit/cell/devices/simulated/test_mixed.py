@@ -6,6 +6,7 @@ import pytest
 
 from cell import Cell
 from cell.config.cell_config import DEVICES, default_toml, load_config
+from cell.devices.simulated.described import Described
 from cell.devices.simulated.mixed import beware, followed, named, require_possible
 from cell.run.report.figures import following_words
 from drivers.errors import ConfigError
@@ -100,8 +101,6 @@ def test_an_unknown_device_in_the_configuration_is_refused(tmp_path) -> None:
 
 
 def test_real_devices_of_any_make_can_be_drawn_beside_simulated_ones() -> None:
-    from cell.devices.simulated.described import Described
-
     camera = CONFIG.target_camera.model_copy(update={"driver": "v4l2"})
     bought, pot = CONFIG.model_copy(update={"target_camera": camera}), Described.of("pot")
     with pytest.raises(ConfigError, match="nothing simulates this make"):

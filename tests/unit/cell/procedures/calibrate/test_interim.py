@@ -47,8 +47,15 @@ def looked(
     return found, kept
 
 
-def test_a_cell_that_nobody_touched_passes_and_says_what_it_saw(placed_pot: JobRecord) -> None:
-    found, kept = looked(placed_pot)
+@pytest.fixture(scope="module")
+def untouched(placed_pot: JobRecord) -> tuple[InterimCheck, list[str]]:
+    return looked(placed_pot)
+
+
+def test_a_cell_that_nobody_touched_passes_and_says_what_it_saw(
+    placed_pot: JobRecord, untouched: tuple[InterimCheck, list[str]]
+) -> None:
+    found, kept = untouched
     assert not found.head.changed and found.notes == ()
     found.require()
     assert kept == [f"interim-{k + 1}" for k in range(found.head.looks)]
@@ -80,10 +87,12 @@ def test_a_lens_that_moved_looks_like_a_head_that_moved(placed_pot: JobRecord) -
     assert found.head.changed
 
 
-def test_what_may_be_chance_is_looked_at_again_and_all_looks_count(placed_pot: JobRecord) -> None:
+def test_what_may_be_chance_is_looked_at_again_and_all_looks_count(
+    placed_pot: JobRecord, untouched: tuple[InterimCheck, list[str]]
+) -> None:
     found = [looked(placed_pot, SHIFTS[f"scan head, .1 mm along {axis}"].put_in)[0].head for axis in "xyz"]
     assert all(head.changed or not head.suspicious or head.looks == LOOKS for head in found)
-    seen = [*found, looked(placed_pot)[0].head, looked(placed_pot, SHIFTS["fine board, .2 mm"].put_in)[0].head]
+    seen = [*found, untouched[0].head, looked(placed_pot, SHIFTS["fine board, .2 mm"].put_in)[0].head]
     once, more = ([np.diag(head.covariance)[:3] for head in seen if (head.looks == 1) == one] for one in (True, False))
     assert once and more and all((many < 0.8 * once[0]).all() for many in more)
 

@@ -180,6 +180,11 @@ class Site:
         self.vehicle.brake()
 
 
+@pytest.fixture
+def site() -> Site:
+    return Site()
+
+
 def moved(before: Planar, after: Planar) -> float:
     return math.hypot(after.x - before.x, after.y - before.y)
 
@@ -229,8 +234,7 @@ def test_a_vehicle_stands_where_it_may_have_arrived_until_newer_feedback_tells(s
     assert wrap(site.truth().yaw - heading) == pytest.approx(0.1, abs=0.01)
 
 
-def test_a_word_about_the_start_of_one_job_does_not_hold_for_the_next() -> None:
-    site = Site()
+def test_a_word_about_the_start_of_one_job_does_not_hold_for_the_next(site: Site) -> None:
     site.whereabouts.say_at_start()
     site.whereabouts.forget_word()
     site.whereabouts.enter(JOB)
@@ -242,8 +246,9 @@ def test_a_word_about_the_start_of_one_job_does_not_hold_for_the_next() -> None:
 
 
 @pytest.mark.parametrize("seen", [True, False])
-def test_the_anchor_is_lost_with_an_interruption_and_says_which(seen: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    site = Site()
+def test_the_anchor_is_lost_with_an_interruption_and_says_which(
+    site: Site, seen: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     site.whereabouts.enter(JOB)
     site.whereabouts.see(Planar.of(JOB.approach.start.se3())) if seen else site.whereabouts.say_at_start()
     told = site.vehicle.state
@@ -257,8 +262,7 @@ def test_the_anchor_is_lost_with_an_interruption_and_says_which(seen: bool, monk
         site.whereabouts.pose()
 
 
-def test_the_board_is_believed_over_odometry_and_a_contradiction_is_told() -> None:
-    site = Site()
+def test_the_board_is_believed_over_odometry_and_a_contradiction_is_told(site: Site) -> None:
     site.whereabouts.say_at_start()
     site.whereabouts.enter(JOB)
     start = site.whereabouts.pose()
@@ -272,8 +276,7 @@ def test_the_board_is_believed_over_odometry_and_a_contradiction_is_told() -> No
     assert site.whereabouts.see(turned) is None, "it stands where it was seen before, turned by as much"
 
 
-def test_another_jobs_board_tells_nothing_about_this_place() -> None:
-    site = Site()
+def test_another_jobs_board_tells_nothing_about_this_place(site: Site) -> None:
     site.whereabouts.say_at_start()
     site.whereabouts.enter(JOB)
     board = JOB.board.model_copy(update={"spec": "marked_dots:9x7:25mm"})
@@ -288,8 +291,7 @@ def seen_at(site: Site, pose: Planar) -> Way:
     return Way(JOB, VEHICLE_FROM_BASE, site.whereabouts)
 
 
-def test_a_way_through_the_table_is_refused_and_the_planned_one_is_not() -> None:
-    site = Site()
+def test_a_way_through_the_table_is_refused_and_the_planned_one_is_not(site: Site) -> None:
     target, staging = Planar.of(JOB.approach.target.se3()), Planar.of(JOB.approach.staging.se3())
     way = seen_at(site, staging)
     way.require_line(target)
@@ -302,8 +304,7 @@ def test_a_way_through_the_table_is_refused_and_the_planned_one_is_not() -> None
         near.require_turn(math.radians(45))
 
 
-def test_the_longer_it_was_not_seen_the_more_room_it_needs() -> None:
-    site = Site()
+def test_the_longer_it_was_not_seen_the_more_room_it_needs(site: Site) -> None:
     close = Planar(-0.95, -0.2, 0.0)  # its front 100 mm before the table
     way = seen_at(site, Planar(-1.2, -0.2, 0.0))
     way.require_line(close)
@@ -312,8 +313,7 @@ def test_the_longer_it_was_not_seen_the_more_room_it_needs() -> None:
         way.require_line(close)
 
 
-def test_turns_on_the_spot_are_counted_and_need_room_too() -> None:
-    site = Site()
+def test_turns_on_the_spot_are_counted_and_need_room_too(site: Site) -> None:
     close = Planar(-0.95, -0.2, 0.0)
     way = seen_at(site, Planar(-1.2, -0.2, 0.0))
     way.require_line(close)
@@ -330,8 +330,7 @@ def test_turns_on_the_spot_are_counted_and_need_room_too() -> None:
     way.require_line(close)
 
 
-def test_a_turn_is_refused_for_what_it_adds_to_what_is_not_known() -> None:
-    site = Site()
+def test_a_turn_is_refused_for_what_it_adds_to_what_is_not_known(site: Site) -> None:
     way = seen_at(site, Planar(-1.2, -0.2, 0.0))
     way.require_turn(math.radians(20))
     site.whereabouts.turned = 4.0
@@ -352,8 +351,7 @@ def test_the_heading_is_off_by_no_more_than_is_reckoned_with_in_a_harsh_cell(see
     assert off < TURN_DRIFT * site.whereabouts.turned
 
 
-def test_a_curve_is_way_and_no_turn_on_the_spot() -> None:
-    site = Site()
+def test_a_curve_is_way_and_no_turn_on_the_spot(site: Site) -> None:
     site.whereabouts.enter(JOB)
     site.whereabouts.see(Planar(-3.0, 0.0, 0.0))
     site.vehicle.enable()
@@ -365,8 +363,7 @@ def test_a_curve_is_way_and_no_turn_on_the_spot() -> None:
     assert site.whereabouts.turned < 0.02
 
 
-def test_it_goes_no_further_unseen_than_the_jobs_way_to_its_staging_pose() -> None:
-    site = Site()
+def test_it_goes_no_further_unseen_than_the_jobs_way_to_its_staging_pose(site: Site) -> None:
     way = seen_at(site, Planar(-3.05, -0.6, 0.0))
     way.require_line(Planar(-1.85, -0.6, 0.0))
     far = seen_at(site, Planar(-4.5, -0.6, 0.0))

@@ -13,7 +13,7 @@ import pytest
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix
 from cell.motion.collision import PLACED
-from cell.procedures.grasp import GraspSeries, best_expected, job_with_grasp
+from cell.procedures.grasp import GraspSeries, best_expected
 from cell.procedures.steps import verify
 from drivers.errors import MisplacedError, RefusedError
 from lab.bench.job.part_effects import motion, opened
@@ -125,15 +125,6 @@ def test_a_part_that_lies_too_far_aside_is_not_gripped(placed_pot: JobRecord, tm
     with pytest.raises(MisplacedError):
         site.looked(moved(3e-3, z=1e-3))
     assert site.parts == [] and any("farther than 2 mm" in note for note in site.notes)
-
-
-def test_the_grasp_that_was_seen_takes_the_place_of_the_stated_one() -> None:
-    job, _ = pot()
-    flange_from_part = job.grasp.flange_from_part.se3() * moved(1e-3, -2e-3, 0.5e-3, turn=(0.01, 0.02, -0.03))
-    held = job_with_grasp(job, flange_from_part, np.diag([9e-12] * 3 + [1e-10] * 3)).grasp
-    assert np.allclose(held.flange_from_part.se3().homogeneous, flange_from_part.homogeneous, atol=1e-12)
-    assert held.size == job.grasp.size
-    assert (held.sigma, held.sigma_angle) == (pytest.approx(20e-6, rel=0.02), pytest.approx(0.2e-3, rel=0.02))
 
 
 def test_the_more_corrections_are_left_the_less_is_one_content_with() -> None:

@@ -22,6 +22,7 @@ from cell.procedures.steps.laser_sweep import STEP, SweepRecord
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep import stored_sweep
 from cell.procedures.sweep.stored_sweep import FILE, UNSEALED, StoredSweep, save_sweep
+from cell.procedures.sweep.swath import Swath
 from drivers.errors import CalibrationStale, InterlockError, RefusedError
 from drivers.interfaces import Frame
 from lab.bench.job.whole_job import NoFrames
@@ -40,8 +41,13 @@ def fix(base_from_board: pin.SE3) -> BoardFix:
 
 
 @pytest.fixture(scope="module")
-def stored() -> StoredSweep:
-    return StoredSweep(Path("run"), SweepRecord((sweep(),)), BOARD, SEEN)
+def taken() -> Swath:
+    return sweep()
+
+
+@pytest.fixture(scope="module")
+def stored(taken: Swath) -> StoredSweep:
+    return StoredSweep(Path("run"), SweepRecord((taken,)), BOARD, SEEN)
 
 
 @pytest.mark.parametrize("away", [0.0, 2.0])
@@ -121,9 +127,8 @@ def test_a_sweep_that_a_fault_ended_is_repeated_only_after_another_look_at_the_b
 
 
 def test_a_sweep_is_not_read_once_a_figure_was_edited_or_two_of_its_frames_are_exchanged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    taken: Swath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    taken = sweep()
     with FrameStore(tmp_path / "frames") as frames:
         for frame_id in taken.seen.tolist():
             frames.keep("stripe", Frame(np.full((9, 9), frame_id % 200, np.uint8), frame_id, 0.0, 0.0, 0.0, 0.0))
@@ -153,8 +158,9 @@ def test_a_sweep_is_not_read_once_a_figure_was_edited_or_two_of_its_frames_are_e
 
 
 @pytest.mark.parametrize("name", ["rail", "times", "flanges", "line_spread", "covariance"])
-def test_a_sweep_with_a_figure_that_is_no_number_is_refused_whoever_wrote_it(tmp_path: Path, name: str) -> None:
-    taken = sweep()
+def test_a_sweep_with_a_figure_that_is_no_number_is_refused_whoever_wrote_it(
+    taken: Swath, tmp_path: Path, name: str
+) -> None:
     values = getattr(taken, name).copy()
     values.flat[1] = np.nan
     save_sweep(tmp_path, SweepRecord((replace(taken, **{name: values}),)), fix(BOARD))
@@ -164,9 +170,8 @@ def test_a_sweep_with_a_figure_that_is_no_number_is_refused_whoever_wrote_it(tmp
 
 @pytest.mark.parametrize("wrong", [np.zeros((6, 6)), -np.eye(6)], ids=["zero", "negative"])
 def test_a_sweep_whose_board_has_no_covariance_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: np.ndarray
+    taken: Swath, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wrong: np.ndarray
 ) -> None:
-    taken = sweep()
     save_sweep(tmp_path, SweepRecord((taken,)), replace(fix(BOARD), covariance=wrong))
     monkeypatch.setattr(stored_sweep, "_swath", lambda *given: taken)
     with pytest.raises(RefusedError, match="board_covariance"):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cell.run.record.replay import FILE as PERCEPTION
-from cell.run.record.replay import replay
+from cell.run.record.replay import _pictures, replay
 from drivers.errors import CellError, ConfigError
 from lab.bench.job.whole_job import JobRecord
 from tests.support import Typed
@@ -53,8 +53,6 @@ def test_a_pixel_or_a_reading_that_changed_is_found_and_exits_1(copied: Path, ty
 
 def test_a_picture_of_the_record_that_is_not_the_file_is_found(folder: Path, tmp_path: Path) -> None:
     """Without the rest of perception: the run's folder has no pictures here."""
-    from cell.run.record.replay import _pictures
-
     (tmp_path / "frames").mkdir()
     shutil.copy(folder / "record.mcap", tmp_path)
     for path in (folder / "frames").iterdir():

@@ -9,6 +9,7 @@ import pytest
 
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, InterlockError
+from drivers.interfaces import Rail
 from tests.support.wire.rail_bench import ACCELERATION, Bench, connect, reply, telegram
 
 pytestmark = pytest.mark.wire
@@ -91,24 +92,17 @@ def test_a_rail_that_somebody_left_at_a_limit_switch_is_not_homed_any_more(bench
     again.close()
 
 
-def test_a_reset_between_two_motions_is_told_before_anything_moves(homed: Bench) -> None:
+@pytest.mark.parametrize("ask", [lambda rail: rail.move_to(0.01), lambda rail: rail.state()], ids=["move", "state"])
+def test_a_reset_is_told_to_who_asks_next_and_the_rail_is_not_homed(homed: Bench, ask: Callable[[Rail], None]) -> None:
     homed.rail.move_to(0.03).wait(10.0)
     homed.peer.fault("rail.reset")
     with pytest.raises(DeviceFault, match="lost its zero") as caught:
-        homed.rail.move_to(0.01)
+        ask(homed.rail)
     assert caught.value.code == "rail.reset"
+    assert not homed.rail.state().homed
     with pytest.raises(InterlockError, match="home"):
         homed.rail.move_to(0.01)
     assert homed.carriage() == pytest.approx(0.03, abs=1e-6)
-
-
-def test_a_position_read_after_a_reset_is_a_fault_and_then_that_of_a_rail_not_homed(homed: Bench) -> None:
-    homed.rail.move_to(0.03).wait(10.0)
-    homed.peer.fault("rail.reset")
-    with pytest.raises(DeviceFault) as caught:
-        homed.rail.state()
-    assert caught.value.code == "rail.reset"
-    assert not homed.rail.state().homed
 
 
 def test_a_reset_on_the_way_to_0_is_never_an_arrival(homed: Bench) -> None:
