@@ -17,6 +17,7 @@ from cell.measure.geometry.camera import Array
 from cell.measure.vision import extract
 from cell.procedures.calibrate.boards import Keep
 from cell.procedures.sweep.swath import frames_of
+from cell.procedures.sweep.sweeping import check_lost_steps
 from drivers.errors import DeviceFault, LimitError, Measured, RefusedError
 
 PICTURES = 12
@@ -137,10 +138,11 @@ def with_edge(config: CellConfig, devices: Devices, keep: Keep, calibration: Cel
 
 
 def require_edge(config: CellConfig, devices: Devices, keep: Keep, before: PlateLine, now: PlateLine) -> PlateLine:
-    """`now` with the edge that the calibration saw `before`; `RefusedError` where it is not about there."""
+    """`now` with the edge that the calibration saw `before`. Raises `RefusedError` where it is not about there."""
     assert before.edge is not None
     edge = look_at_edge(config, devices, keep, now, before.edge.place)
     if edge is None:
+        check_lost_steps(devices)  # A fault of its own.
         raise RefusedError(
             f"the edge of the plate on the claw is not within {1e3 * BESIDE_M:g} mm of where the calibration saw it, "
             f"with the rail at {1e3 * before.edge.place:.2f} mm: the scan head or the plate has slipped, the rail "

@@ -16,6 +16,7 @@ from cell.procedures.arm.photograph import BoardFix, look_pose
 from cell.procedures.calibrate.interim import InterimCheck, interim_check
 from cell.procedures.drive.way import BACK_UP, Planar, Way, Whereabouts, drive_line, next_step, turn_to, wrap
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
+from cell.procedures.sweep.sweeping import check_lost_steps
 from drivers.clock import Clock
 from drivers.errors import CalibrationStale, Measured, RefusedError
 from drivers.interfaces import Vehicle
@@ -298,7 +299,8 @@ def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
     """Whether the scan head is where its calibration has it; None where that is not wanted or, with a note, not seen.
 
     Once in a run: when the step is done again, the vehicle may stand before a station that the arm does not know yet.
-    Raises `RefusedError` where the head has moved too far for this job, or the board is not seen.
+    Raises `RefusedError` where the head has moved too far for this job, or the board is not seen, and `DeviceFault`
+    where the rail has lost steps.
     """
     if here.looked or not here.config.calibration.each_job:
         return here.interim
@@ -312,6 +314,9 @@ def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
         context.note(text=f"{text}. Until it is, `cell calibrate verify` tells")
         here.looked = True
         return None
+    if found.matters:
+        # A carriage that lost steps has the camera aside as well.
+        check_lost_steps(here.devices)
     found.require()
     here.interim, here.looked = found, True
     # Whatever ends the step from here on, these pictures do not show it.

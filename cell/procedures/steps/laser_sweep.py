@@ -11,7 +11,6 @@ import pinocchio as pin
 from cell.config.calibrations.store import changed, doubt_of, link_of
 from cell.config.cell_config import CellConfig
 from cell.config.job import LONGEST_SWEEP_S, ScanSection
-from cell.devices.devices import Devices
 from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.drift.reference_plate import PlateLine, Pointing
 from cell.measure.calibration.drift.reference_plate import pointing as pointing_since
@@ -23,7 +22,7 @@ from cell.procedures.steps.board_photo import require_board_unmoved
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord, save_sweep
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION, SweepCollector, SweepErrors, warm_up
-from cell.procedures.sweep.sweeping import arm_sweep, home_rail, rail_sweep
+from cell.procedures.sweep.sweeping import arm_sweep, check_lost_steps, home_rail, rail_sweep
 from drivers.errors import CalibrationStale
 from drivers.interfaces import Frame
 from statemachine.runner import StepContext
@@ -32,11 +31,6 @@ from statemachine.step import Step
 SHIFT_SHARE = 0.25
 """Share of the place's tolerance by which the unknown of its times may shift a sweep. Replies that are all late shift
 it to one side without any scatter; what else the place may be off by has the other three quarters."""
-
-UNCHECKED = (
-    "whether the rail lost steps in the sweep is not seen: this make of rail, or its rail.reference_mode, does not "
-    "show its reference switch"
-)
 
 
 def laser_sweep(
@@ -85,16 +79,6 @@ def laser_sweep(
         swaths.append(sweep(plan, here.mover, devices, errors, collector))
     looked = counted and scan.mode == "rail"
     return SweepRecord(tuple(swaths), doubts=check_lost_steps(devices, progress) if looked else ())
-
-
-def check_lost_steps(devices: Devices, progress: Callable[[float, str], None]) -> tuple[str, ...]:
-    """Look whether the rail has lost steps, which its readings do not show: they are its counter's. For people, that
-    this cannot be seen. Raises `DeviceFault` (rail.lost_steps)."""
-    progress(0.99, "looking whether the rail has lost steps")
-    if (check := devices.rail.check_zero()) is None:
-        return (UNCHECKED,)
-    check.wait(30.0)
-    return ()
 
 
 def slowed_down(scan: ScanSection, attempt: int) -> ScanSection:

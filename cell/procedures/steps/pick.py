@@ -15,12 +15,12 @@ from cell.procedures.arm.moves import PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.grasp import GRIPPED
 from cell.procedures.steps.gripping import take
-from cell.procedures.steps.laser_sweep import check_lost_steps
 from cell.procedures.steps.place import carried_on
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.second_look import require_in_place
 from cell.procedures.sweep.stored_sweep import SweepRecord
+from cell.procedures.sweep.sweeping import check_lost_steps
 from drivers.errors import RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext

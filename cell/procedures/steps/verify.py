@@ -21,13 +21,14 @@ from cell.procedures.part_error import part_covariance, part_points
 from cell.procedures.part_features import by_themselves
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart, along_surface
 from cell.procedures.steps.correction import correct
-from cell.procedures.steps.laser_sweep import check_lost_steps, head_at, laser_sweep
+from cell.procedures.steps.laser_sweep import head_at, laser_sweep
 from cell.procedures.steps.place import PlaceResult, aside_words
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements, together
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.second_look import moved_meanwhile
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.procedures.sweep.swath import FRAMES_LOST
+from cell.procedures.sweep.sweeping import check_lost_steps
 from drivers.errors import DeviceFault, Measured, MisplacedError, RefusedError
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step

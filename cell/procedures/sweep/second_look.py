@@ -28,12 +28,12 @@ from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.calibrate.reference_plate import configure_fast
 from cell.procedures.steps.board_photo import require_board_unmoved
-from cell.procedures.steps.laser_sweep import check_lost_steps, head_at, laser_sweep, times_known
+from cell.procedures.steps.laser_sweep import head_at, laser_sweep, times_known
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.procedures.sweep.swath import Swath
-from cell.procedures.sweep.sweeping import LATENCY_S
+from cell.procedures.sweep.sweeping import LATENCY_S, check_lost_steps
 from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext

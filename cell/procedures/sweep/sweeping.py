@@ -32,6 +32,10 @@ LATENCY_S = 0.002
 since nothing tells where in it the joints were read."""
 JITTER_S = 0.0003
 """The same from one line to the next."""
+UNCHECKED = (
+    "whether the rail lost steps in the sweep is not seen: this make of rail, or its rail.reference_mode, does not "
+    "show its reference switch"
+)
 
 
 def home_rail(devices: Devices, progress: Callable[[float, str], None] = lambda share, text: None) -> None:
@@ -39,6 +43,18 @@ def home_rail(devices: Devices, progress: Callable[[float, str], None] = lambda 
     if not devices.rail.state().homed_here:
         progress(0.0, "homing the rail")
         devices.rail.home().wait(60.0)
+
+
+def check_lost_steps(
+    devices: Devices, progress: Callable[[float, str], None] = lambda share, text: None
+) -> tuple[str, ...]:
+    """Look whether the rail has lost steps, which its readings do not show: they are its counter's. For people, that
+    this cannot be seen. Raises `DeviceFault` (rail.lost_steps)."""
+    progress(0.99, "looking whether the rail has lost steps")
+    if (check := devices.rail.check_zero()) is None:
+        return (UNCHECKED,)
+    check.wait(30.0)
+    return ()
 
 
 @contextmanager

@@ -157,6 +157,8 @@ def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
         ("arm.emergency_stop@board_photo", "arm.emergency_stop"),
         ("arm.protective_stop@place:40%", "arm.protective_stop"),
         ("vehicle.motor_fault@place:40%", "vehicle.error"),
+        ("rail.lost_steps@drive_to_target:0%", "rail.lost_steps"),
+        ("rail.lost_steps@laser_sweep:1%", "rail.lost_steps"),
         ("rail.lost_steps@place:2%", "rail.lost_steps"),
     ],
 )
