@@ -29,10 +29,11 @@ def ends(right: float, seed: int = 5) -> Cloud:
 
 
 def about(
-    at: list[float], cloud: Cloud, edge: list[float] | None = None, faces: NominalSurface = TOP
-) -> LocalDeviation:
+    at: list[float], cloud: Cloud, edge: list[float] | None = None, faces: NominalSurface = TOP,
+    lies: pin.SE3 = BELONGS, rocks: float = 0.0,
+) -> LocalDeviation:  # fmt: skip
     direction = None if edge is None else np.array(edge)
-    return local_deviation(cloud, TRUE, BELONGS, faces=faces, at=np.array(at), edge=direction)
+    return local_deviation(cloud, TRUE, lies, faces=faces, at=np.array(at), edge=direction, rocks=rocks)
 
 
 def rim(at: list[float], cloud: Cloud, edge: list[float] = ACROSS, faces: NominalSurface = TOP) -> Span:
@@ -43,8 +44,8 @@ def rim(at: list[float], cloud: Cloud, edge: list[float] = ACROSS, faces: Nomina
 
 @pytest.mark.parametrize("seed", range(8))
 def test_of_a_part_as_drawn_the_points_about_each_feature_say_no_more_than_its_pose(seed: int) -> None:
-    shifted = partial(scanned, shift=(0.0015 + 0.1 * seed * LINES_M, -0.001 + 0.1 * seed * ROWS_M))
-    cloud = shifted(lambda x, y: np.where(np.abs(x) < HALF, THICK, 0.0 * y), seed)
+    shift = 0.0015 + 0.1 * seed * LINES_M, -0.001 + 0.1 * seed * ROWS_M
+    cloud = scanned(lambda x, y: np.where(np.abs(x) < HALF, THICK, 0.0 * y), seed, shift=shift)
     for at, edge, apart in ((RIGHT, ACROSS, LINES_M), (LEFT, ACROSS, LINES_M), (FRONT, ALONG, ROWS_M)):
         found = about(at, cloud, edge)
         assert found.higher is not None and found.rim is not None
@@ -69,11 +70,10 @@ def test_a_flat_that_is_worn_about_a_feature_is_so_much_lower_there_and_nowhere_
 
 @pytest.mark.parametrize("right", [0.9e-3, -0.9e-3])
 def test_a_part_that_was_cut_or_grew_ends_so_much_sooner_or_later(right: float) -> None:
-    cloud = ends(right)
-    found = rim(RIGHT, cloud)
+    found = rim(RIGHT, ends(right))
     assert found.least < right < found.most
     assert np.sign(found.off) == np.sign(right) and abs(right) < abs(found.off) + found.more
-    assert rim(LEFT, cloud).off == 0.0
+    assert rim(LEFT, ends(right)).off == 0.0
 
 
 def test_an_edge_at_an_angle_to_the_lines_is_looked_for_square_to_itself() -> None:
@@ -98,11 +98,8 @@ def test_what_is_no_rim_in_the_drawing_or_does_not_show_says_nothing() -> None:
     assert about([HALF + 5e-3, 0.0, 0.0], cloud, ACROSS).rim is None, "drawn elsewhere"
     assert about([HALF, 0.0, -6e-3], cloud, ACROSS).spans == (), "below the rim"
     assert about(RIGHT, cloud, [0.0, 0.0, 1.0]).rim is None, "upright"
-    thin = from_parts((0.0, 0.0, 1e-3))
-    level = local_deviation(
-        swept(0.0, thick=1e-3), TRUE, thin, faces=TOP, at=np.array(RIGHT), edge=np.array(ACROSS)
-    ).rim
-    assert level is None, "the ground beside it is as high"
+    thin = about(RIGHT, swept(0.0, thick=1e-3), ACROSS, lies=from_parts((0.0, 0.0, 1e-3)))
+    assert thin.rim is None, "the ground beside it is as high"
     nothing = replace(cloud, points=np.full_like(cloud.points, np.nan))
     assert about(RIGHT, nothing, ACROSS).spans == ()
 
@@ -117,9 +114,6 @@ def test_a_rim_that_something_higher_may_hide_is_not_told_to_end_too_soon() -> N
 
 def test_a_vehicle_that_rocks_hides_as_much_of_a_height() -> None:
     cloud = swept(0.0)
-    still, rocked = (
-        local_deviation(cloud, TRUE, BELONGS, faces=TOP, at=np.array(MIDDLE), rocks=rocks).higher
-        for rocks in (0.0, 0.1e-3)
-    )
+    still, rocked = (about(MIDDLE, cloud, rocks=rocks).higher for rocks in (0.0, 0.1e-3))
     assert still is not None and rocked is not None
     assert rocked.most == pytest.approx(still.most + 0.2e-3) and rocked.least == pytest.approx(still.least - 0.2e-3)

@@ -32,9 +32,30 @@ def lowering(arm, depth, seconds):
     return times, np.array(joints)
 
 
-def test_a_guarded_descent_ends_at_rest_on_the_table_and_waits_for_an_arm_that_reports_late(arm, bench):
+def test_a_guarded_descent_ends_at_rest_on_the_table(arm):
+    above = arm.state().flange
+    above[2] = 0.53
+    arm.move_linear(above, 0.5, 2.0).wait(5.0)
+    arm.zero_force()
+    # What the descent would do: 25 mm into the table of 20 N/mm, from 30 mm above it.
+    top = arm.state()
+    times, joints = lowering(arm, 0.029, 1.0)
+    slope = (joints[-1] - joints[-4]) / (times[-1] - times[-4])
+    longer = np.append(times, times[-1] + 0.5)
+    through = np.vstack([joints, joints[-1] + 0.5 * slope])
+    moving = arm.follow(longer, through, force_limit=15.0)
+    moving.wait(5.0)
+    assert moving.contact
+    state = arm.state()
+    assert not state.moving
+    assert top.flange[2] - 0.033 < state.flange[2] < 0.5
+    assert state.safety is ArmSafety.NORMAL
+    arm.move_linear(top.flange, 0.2, 1.0).wait(5.0)
+
+
+def test_a_guarded_descent_waits_for_an_arm_that_reports_late(arm, bench):
     """Held up for 80 ms again and again, the arm goes at most as far as in 40 ms deeper than otherwise."""
-    ended = []
+    depths = []
     for held_up in (0.0, 0.08):
         times, joints = descent_to_the_table(arm)
         top = arm.state().flange
@@ -48,12 +69,9 @@ def test_a_guarded_descent_ends_at_rest_on_the_table_and_waits_for_an_arm_that_r
             Clock().sleep(0.03)
         moving.wait(10.0)
         assert moving.contact
-        ended.append(arm.state())
+        depths.append(0.5 - arm.state().flange[2])
         arm.move_linear(top, 0.2, 1.0).wait(5.0)
-    assert (ended[0].moving, ended[0].safety) == (False, ArmSafety.NORMAL)
-    first, late = (0.5 - state.flange[2] for state in ended)
-    assert 0.0 < first < 0.003
-    assert late - first < 0.03 * 0.04
+    assert depths[1] - depths[0] < 0.03 * 0.04
 
 
 def test_a_descent_that_meets_nothing_arrives_without_contact(arm):
