@@ -14,20 +14,13 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 
+from cell.apps.recordings import solution
 from cell.apps.recordings.agreement import UNITS, Decision, decide, scale_problem
 from cell.apps.recordings.conventions import check_reading, why_not
 from cell.apps.recordings.frames import RecordedFrame, near, read_frames
 from cell.apps.recordings.pairs import calibrate_pairs, read_pose_pairs
 from cell.apps.recordings.result import Figures, RecordedResult
 from cell.apps.recordings.series import Listing, Series, in_order_of_views, list_folder, match_series, read_series
-from cell.apps.recordings.solution import (
-    CameraChanged,
-    agreeing,
-    camera_of,
-    note_perhaps_no_laser,
-    rough_camera,
-    solve_frames,
-)
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.poses import difference, from_parts
 from cell.measure.vision.board.board import board_pose
@@ -121,8 +114,8 @@ def _from_frames(
 ) -> None:
     cameras = None
     try:
-        cameras = (rough_camera if options.plan else camera_of)(frames, options.camera)
-    except CameraChanged as error:
+        cameras = (solution.rough_camera if options.plan else solution.camera_of)(frames, options.camera)
+    except solution.CameraChanged as error:
         result.refused["intrinsics"] = f"no intrinsics: {error}"
     except RefusedError as error:
         result.notes.append(f"no intrinsics: {error}")
@@ -132,12 +125,12 @@ def _from_frames(
     if understood.refused:
         result.refused["hand_eye"] = understood.refused
     if cameras is not None and options.plan:
-        agreeing(frames, cameras[0].camera)
+        solution.agreeing(frames, cameras[0].camera)
     elif cameras is not None:
         hold, setup = options.hold_camera, understood.setup
-        solve_frames(frames, cameras, result, setup=setup, given=options.camera, hold_camera=hold)
+        solution.solve_frames(frames, cameras, result, setup=setup, given=options.camera, hold_camera=hold)
         if options.laser is LaserChannel.AUTO:
-            note_perhaps_no_laser(frames, result)
+            solution.note_perhaps_no_laser(frames, result)
 
 
 @dataclass

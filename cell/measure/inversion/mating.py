@@ -11,15 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pinocchio as pin
 
-from cell.measure.inversion.disagreement import (
-    ALLOWED,
-    REACH_M,
-    STEEPEST,
-    spread_for_journal,
-    spread_mm,
-    square_of,
-    squares,
-)
+from cell.measure.inversion import disagreement
 from cell.measure.inversion.nominal import Array, Indices, NominalSurface
 from cell.measure.inversion.place_pose import PlacePose
 from cell.measure.reconstruction.cloud import Cloud
@@ -75,13 +67,13 @@ class MatingGap:
     @property
     def words(self) -> str:
         """For people."""
-        _, middle, _ = spread_mm(self.gaps, 2)
+        _, middle, _ = disagreement.spread_mm(self.gaps, 2)
         return f"gap {self.span} mm, {middle:.2f} mm in the middle; {100 * self.seen:.0f} % of it seen"
 
     @property
     def span(self) -> str:
         """The least and the largest gap, mm, for people."""
-        least, _, most = spread_mm(self.gaps, 2)
+        least, _, most = disagreement.spread_mm(self.gaps, 2)
         return f"{least:.2f} to {most:.2f}"
 
     @property
@@ -96,15 +88,15 @@ class MatingGap:
 
     def as_dict(self) -> dict[str, float]:
         """For the journal."""
-        return spread_for_journal(self.gaps, self.seen)
+        return disagreement.spread_for_journal(self.gaps, self.seen)
 
     def measured(self, tolerance: float) -> Measured:
         """How far the part would interfere with the surface, beside what is allowed at this `tolerance`, m."""
-        return Measured("part into the surface", 1e3 * self.overlap, "mm", most=1e3 * ALLOWED * tolerance)
+        return Measured("part into the surface", 1e3 * self.overlap, "mm", most=1e3 * disagreement.ALLOWED * tolerance)
 
     def problem(self, tolerance: float) -> str | None:
         """Why the part does not fit the place of this `tolerance`, m; None where it does."""
-        allowed = ALLOWED * tolerance
+        allowed = disagreement.ALLOWED * tolerance
         if self.overlap > allowed:
             x, y, z = 1e3 * self.places[np.argmax(-self.gaps - self.noise)]
             return (
@@ -149,27 +141,29 @@ def _gap(
 ) -> MatingGap | None:
     """Of `points` (n, 3) m of the surface, surface frame, taken in the lines (n,)."""
     # Where the drawn surface has its other side, or a wall, a part meets nothing.
-    index, feet = nominal.feet(points, REACH_M)
-    up = feet.normals @ surface_from_part.rotation[:, 2] > STEEPEST
+    index, feet = nominal.feet(points, disagreement.REACH_M)
+    up = feet.normals @ surface_from_part.rotation[:, 2] > disagreement.STEEPEST
     index = index[feet.inner & up & (feet.heights > -DEEPEST_M)]
     below = (points[index] - surface_from_part.translation) @ surface_from_part.rotation
-    over, feet = part.feet(below, REACH_M)
+    over, feet = part.feet(below, disagreement.REACH_M)
     down = -feet.normals[:, 2]
-    mates = feet.inner & (down > STEEPEST)
+    mates = feet.inner & (down > disagreement.STEEPEST)
     if not mates.any():
         return None
     over, gaps = over[mates], feet.heights[mates] / down[mates]
-    medians, middle, noise = squares(square_of(below[over]), gaps, lines[index[over]])
+    medians, middle, noise = disagreement.squares(disagreement.square_of(below[over]), gaps, lines[index[over]])
     if not len(medians):
         return None
     face = _mating_face(nominal, surface_from_part, part)
-    seen = np.isin(face, np.unique(square_of(below[over[medians]]))).mean() if len(face) else 0.0
+    seen = np.isin(face, np.unique(disagreement.square_of(below[over[medians]]))).mean() if len(face) else 0.0
     return MatingGap(points[index[over[medians]]], middle, noise, float(seen))
 
 
 def _mating_face(nominal: NominalSurface, surface_from_part: pin.SE3, part: NominalSurface) -> Indices:
     """The squares of the part's underside that have the drawn surface below them."""
-    facing = part.normals[part.sample_triangles][:, 2] < -STEEPEST
+    facing = part.normals[part.sample_triangles][:, 2] < -disagreement.STEEPEST
     under = _thinned(part.samples[facing])
-    found, feet = nominal.feet(under @ surface_from_part.rotation.T + surface_from_part.translation, REACH_M)
-    return np.unique(square_of(under[found[feet.inner]]))
+    found, feet = nominal.feet(
+        under @ surface_from_part.rotation.T + surface_from_part.translation, disagreement.REACH_M
+    )
+    return np.unique(disagreement.square_of(under[found[feet.inner]]))

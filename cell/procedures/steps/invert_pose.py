@@ -68,8 +68,7 @@ def invert_pose(
             raise
         # Never accepted for it: the next likely looks much the same, and the pose would be wrong.
         text = likeliest(find_causes(scan.cloud, nominal, pose, taken.times, taken.base_from_vehicle))
-        told = type(refused)(f"{refused}{text and '. '}{text}".replace("?.", "?"), *refused.numbers)
-        raise told.showing(seen=refused.seen) from refused
+        raise _retold(refused, f"{refused}{text and '. '}{text}".replace("?.", "?")) from refused
     droop = None if taken.head is None else find_droop(scan.cloud, nominal, found.base_from_surface, taken.head)
     by_calibration = scan.by_calibration
     if droop is not None:
@@ -77,7 +76,7 @@ def invert_pose(
         try:
             found = registered(systematic=unknown, calibration=by_calibration, sweeps=scan.by_poses)
         except NotObservable as refused:
-            raise _told_before(refused, droop.words) from refused
+            raise _retold(refused, f"{refused}. Before: {droop.words}") from refused
         found = replace(found, notes=(droop.words,))
     if (rocking := find_rocking(scan.cloud, nominal, found.base_from_surface, taken.times)) is None:
         return found
@@ -96,10 +95,9 @@ def _prior(fix: BoardFix, job: Job) -> Prior:
     return Prior(fix.base_from_board * board_from_surface, spread)
 
 
-def _told_before(refused: NotObservable, before: str) -> NotObservable:
-    """The refusal with what is known of the scan already."""
-    told = NotObservable(f"{refused}. Before: {before}", *refused.numbers)
-    return told.showing(seen=refused.seen)
+def _retold(refused: RefusedError, text: str) -> RefusedError:
+    """The refusal in other words, with its numbers and what was seen."""
+    return type(refused)(text, *refused.numbers).showing(seen=refused.seen)
 
 
 def _slipped(here: Workplace, sweep: SweepRecord) -> Vector:
@@ -123,12 +121,19 @@ def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: Boa
         if not (notes := (*fix.notes, *sweep.notes)):
             raise
         # What is known too little may be where the laser points, or how the vehicle rocks: no more scanning mends it.
-        raise _told_before(refused, "; ".join(notes)) from refused
+        raise _retold(refused, f"{refused}. Before: {'; '.join(notes)}") from refused
 
 
 def _run_step(here: Workplace, context: StepContext) -> PlacePose:
     sweep, scan, fix = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
-    found = inverted(here, sweep, scan, fix)
+    try:
+        found = inverted(here, sweep, scan, fix)
+    except RefusedError as refused:
+        if not here.job.unloads:
+            raise
+        # What is looked for is the part itself.
+        why = str(refused).replace("nominal surface", "drawing of the part").replace("right surface", "right part")
+        raise _retold(refused, f"the part to be unloaded is not seen where it belongs: {why}") from refused
     for note in found.notes:
         context.note(text=note)
     here.registered(found.base_from_surface)

@@ -71,7 +71,7 @@ def hold(cell: VirtualCell) -> None:
 @pytest.mark.parametrize(
     ("change", "stage", "told"),
     [
-        (take_away, "invert_pose", "surface"),
+        (take_away, "invert_pose", "the part to be unloaded is not seen where it belongs: 0 of "),
         (hold, "drive_to_target", "the claw holds a part, and job unload takes one that is at the station"),
     ],
 )
