@@ -74,7 +74,8 @@ class FeatureSeen:
         return (
             f"the {self.section.kind} {self.section.name} is {1e3 * self.off:.2f} mm off, and may be "
             f"{1e3 * self.bound:.2f} mm (allowed: at most {1e3 * self.section.tolerance:g} mm)"
-            f"{f', for the part is off its drawing there by {1e3 * self.own_off:.2f} mm or more' if self.own_off else ''}"
+            + f", for the part is off its drawing there by {1e3 * self.own_off:.2f} mm or more"
+            * (self.own_off > 0.0)
         )
 
     def as_dict(self) -> dict[str, object]:
