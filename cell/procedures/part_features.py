@@ -20,6 +20,8 @@ from cell.measure.reconstruction import Cloud
 from drivers.errors import Measured
 from drivers.interfaces import Vector
 
+LEAST_COUNTED = 0.3
+"""Share of a direction that has to count for a feature if what its points say along that is to."""
 NOT_SEEN = LocalDeviation()
 """Of a feature about which no points tell: the part as a whole tells where it lies."""
 
@@ -29,7 +31,7 @@ class FeatureSeen:
     """A feature that is `off` its place, m, in the directions in which its kind counts; `bound` is the stated one.
 
     `belongs` (3,), m, surface frame, is where it should be. Its `own` points put it so far from where the part as a
-    whole has it; of that, `own_off` counts.
+    whole has it; of that, `own_off` counts. `asked` is whether they tell anything in those directions.
     """
 
     section: FeatureSection
@@ -38,6 +40,7 @@ class FeatureSeen:
     belongs: Vector
     own: LocalDeviation = NOT_SEEN
     own_off: float = 0.0
+    asked: bool = False
 
     @classmethod
     def of(
@@ -53,12 +56,21 @@ class FeatureSeen:
         there = transform(belongs, np.array([section.at]))[0]
         errors = motions[:, :3] + np.cross(motions[:, 3:], at - seen.translation)
         counted = counting(section, belongs.rotation)
-        moved = sum((span.off * way for span, way in own.spans), np.zeros(3))
-        more = sum(span.more * float(np.linalg.norm(way @ counted)) for span, way in own.spans)
+        told = [(span, way) for span, way in own.spans if np.linalg.norm(way @ counted) > LEAST_COUNTED]
+        # What the part's pose may be off by explains as much of what they say.
+        unsure = [float(np.percentile(np.abs(errors @ way), percent)) for _, way in told]
+        wider = [Span(least - more, most + more) for ((least, most), _), more in zip(told, unsure, strict=True)]
+        moved = sum((span.off * way for span, (_, way) in zip(wider, told, strict=True)), np.zeros(3))
         off = at - there + moved
-        bound = float(np.percentile(np.linalg.norm((off + errors) @ counted, axis=1), percent)) + more
-        own_off = float(np.linalg.norm(moved @ counted))
-        return cls(section, float(np.linalg.norm(off @ counted)), bound, there, own=own, own_off=own_off)
+        bound = float(np.percentile(np.linalg.norm((off + errors) @ counted, axis=1), percent))
+        bound += sum(span.more for span in wider)
+        off_by, own_off = (float(np.linalg.norm(each @ counted)) for each in (off, moved))
+        return cls(section, off_by, bound, there, own=own, own_off=own_off, asked=bool(told))
+
+    @property
+    def not_as_drawn(self) -> bool:
+        """Whether it is off its place because the part is off its drawing there."""
+        return self.own_off > 0.5 * self.off
 
     @property
     def measured(self) -> Measured:
@@ -75,7 +87,7 @@ class FeatureSeen:
             f"the {self.section.kind} {self.section.name} is {1e3 * self.off:.2f} mm off, and may be "
             f"{1e3 * self.bound:.2f} mm (allowed: at most {1e3 * self.section.tolerance:g} mm)"
             + f", for the part is off its drawing there by {1e3 * self.own_off:.2f} mm or more"
-            * (self.own_off > 0.0)
+            * self.not_as_drawn
         )
 
     def as_dict(self) -> dict[str, object]:

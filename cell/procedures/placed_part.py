@@ -229,7 +229,7 @@ class PlacedPart:
         bent = off.kept and turned.kept and any(number.name == FLUSH and not number.kept for number in measured)
         failed = [each for each in self.features if not each.measured.kept]
         out = "".join(f". Out of tolerance: {each.words}" for each in failed)
-        made = off.kept and turned.kept and any(each.own_off for each in failed)
+        made = off.kept and turned.kept and any(each.not_as_drawn for each in failed)
         likely = BENT if bent else OFF_DRAWING if made else self.likely
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
@@ -252,7 +252,7 @@ class PlacedPart:
             *((more,) if np.abs(self._times).max() > CLEARLY else ()),
             *self.pushed,
             *(f"not seen of the placed part: {motion}" for motion in self.unseen),
-            *(WHOLE.format(each.section.kind, each.section.name) for each in self.features if not each.own.spans),
+            *(WHOLE.format(each.section.kind, each.section.name) for each in self.features if not each.asked),
         )
 
     @property

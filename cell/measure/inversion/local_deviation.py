@@ -19,8 +19,8 @@ from cell.measure.reconstruction.cloud import Cloud
 
 NEAR_M = 3e-3
 """The points within this of a feature are asked."""
-LEVEL_M = 1.5e-3
-"""So far above or below a drawn face at most is a point that counts as on it."""
+LEVEL_M = (-0.3e-3, 1.5e-3)
+"""So far below or above the nearest drawn point at most is one of the face, and not of the part's side."""
 RIM_M, STEP_M = 2e-3, 0.02e-3
 """So far from an edge at most its rim is drawn, and in such steps it is looked for in the drawing."""
 STRETCH_M = (-6e-3, 3.5e-3)
@@ -29,8 +29,8 @@ BAND_M, LEAST_BANDS = 1e-3, 4
 """They are looked for in bands across the rim, so wide, of which so many have to tell."""
 BLUR_M = 0.15e-3
 """Half a stripe, of which a rim leaves the inner side: the last point is off by less."""
-INSIDE_M = 0.75e-3
-"""So far inside of the rim its face is asked whether a point beyond is on its level."""
+PAST_M = 0.5e-3
+"""A sweep that sees anything so far beyond the rim has not ended before it."""
 STEEP = 1.0
 """Rise over distance from which on what stands higher beside a rim may hide it from camera or laser."""
 
@@ -84,7 +84,7 @@ def local_deviation(
 ) -> LocalDeviation:  # fmt: skip
     """Of the part with these `faces`, which `lies` at surface_from_part, about `at` (3,) m, part frame.
 
-    `part` is what a sweep shows of it, arm base. `edge` (3,) is the direction of an edge, part frame. The vehicle
+    `part` is the cloud of a sweep over it, arm base. `edge` (3,) is the direction of an edge, part frame. The vehicle
     `rocks` by so much, m, up and down: the points about a feature are swept together, at one end of that.
     """
     rim = None
@@ -92,7 +92,8 @@ def local_deviation(
         rim = _seen_rim(part, base_from_surface * lies, lies.rotation[2], faces=faces, at=at, edge=edge)
         rim = rim and rim._replace(outward=lies.rotation @ rim.outward)
     seen = heights_over(part, base_from_surface, lies, faces)
-    near = np.linalg.norm(seen.places - lies.act(at), axis=1) < NEAR_M
+    drawn = seen.places - np.outer(seen.higher, [0.0, 0.0, 1.0])
+    near = np.linalg.norm(drawn - lies.act(at), axis=1) < NEAR_M
     if not near.any():
         return LocalDeviation(rim=rim)
     _, middle, noise = squares(np.zeros(near.sum(), dtype=np.intp), seen.higher[near], seen.lines[near])
@@ -112,37 +113,41 @@ def _seen_rim(
     across = np.cross(along, upward)
     if not (length := float(np.linalg.norm(across))) > 0.5:
         return None
-    ends = [(out, _drawn_end(faces, at, out)) for out in (across / length, -across / length)]
-    drawn = [(out, end) for out, end in ends if end is not None]
-    if len(drawn) != 1:
+    across /= length
+    ways = [out for out in (across, -across) if _drawn_end(faces, at, out) is not None]
+    if len(ways) != 1:
         return None
-    [(outward, end)] = drawn
+    [outward] = ways
     beside = (part.points[part.valid] - base_from_part.translation) @ base_from_part.rotation - at
-    out, aside = beside @ outward - end, beside @ along
-    kept = (np.abs(aside) < NEAR_M) & (out > STRETCH_M[0]) & (out < STRETCH_M[1])
-    beside, out, aside = beside[kept], out[kept], aside[kept]
-    level, feet = faces.feet(at + beside - np.outer(np.maximum(0.0, out + INSIDE_M), outward), LEVEL_M)
-    out, band = out[level][feet.inner], np.floor(aside[level][feet.inner] / BAND_M)
-    found = [_end(np.sort(out[band == each])) for each in np.unique(band)]
-    told = np.array([end for end in found if end is not None])
+    out, aside = beside @ outward, beside @ along
+    told = []
+    for low in np.arange(-NEAR_M, NEAR_M - 0.5 * BAND_M, BAND_M):
+        end = _drawn_end(faces, at + (low + 0.5 * BAND_M) * along, outward)
+        if end is None:
+            continue
+        band = (aside >= low) & (aside < low + BAND_M) & (out > end + STRETCH_M[0]) & (out < end + STRETCH_M[1])
+        index, feet = faces.feet(at + beside[band], STRETCH_M[1])
+        higher = (at + beside[band][index] - feet.points) @ upward
+        level = (higher > LEVEL_M[0]) & (higher < LEVEL_M[1])
+        if (found := _end(np.sort(out[band][index][level]))) is not None:
+            told.append([found[0] - end, found[1] - end])
     if len(told) < LEAST_BANDS:
         return None
     last, beyond = map(float, np.median(told, axis=0))
     if beyond > STRETCH_M[1]:
         return None
-    hidden = _hidden(faces.samples - at - end * outward, upward)
+    past = (np.abs(aside) < NEAR_M) & (out > PAST_M)
+    hidden = not past.any() or _hidden(faces.samples - at, upward)
     return Rim(Span(last - BLUR_M, max(beyond + BLUR_M, 0.0 if hidden else -np.inf)), outward)
 
 
 def _drawn_end(faces: NominalSurface, at: Array, outward: Array) -> float | None:
     """How far `outward` of `at` the faces end, m; None where they do not, or end elsewhere."""
-    steps = np.arange(-RIM_M, RIM_M, STEP_M)
-    index, feet = faces.feet(at + np.outer(steps, outward), LEVEL_M)
-    if not len(index) or index[0] != 0 or not feet.inner[0]:
-        return None
+    _, feet = faces.feet(at + np.outer(np.arange(-RIM_M, RIM_M, STEP_M), outward))
     # Beyond the rim the nearest point of the faces is on it.
-    end = float(((feet.points - at) @ outward).max())
-    return end if end < RIM_M - 2.0 * STEP_M else None
+    reach = (feet.points - at) @ outward
+    drawn = feet.inner[0] and abs(feet.heights[0]) < LEVEL_M[1] and reach[-1] - reach[-2] < 0.1 * STEP_M
+    return float(reach.max()) if drawn else None
 
 
 def _end(out: Array) -> tuple[float, float] | None:
@@ -155,4 +160,4 @@ def _hidden(beside: Array, upward: Array) -> bool:
     """Whether something of the part, (n, 3) m from its rim, rises steeply over it."""
     up = beside @ upward
     level = np.linalg.norm(beside - np.outer(up, upward), axis=1)
-    return bool((up > np.maximum(LEVEL_M, STEEP * level)).any())
+    return bool((up > np.maximum(LEVEL_M[1], STEEP * level)).any())

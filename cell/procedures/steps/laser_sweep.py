@@ -14,7 +14,7 @@ from cell.config.job import LONGEST_SWEEP_S, ScanSection
 from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.drift.reference_plate import PlateLine, Pointing
 from cell.measure.calibration.drift.reference_plate import pointing as pointing_since
-from cell.measure.calibration.drift.slip import Slip, slip_since
+from cell.measure.calibration.drift.slip import LARGEST_M, Slip, slip_since
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.procedures.arm.photograph import BoardFix, scan_plans
 from cell.procedures.calibrate.reference_plate import require_edge, require_reference_plate
@@ -196,6 +196,8 @@ def seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | Non
     context.progress(0.005, "looking whether the scan head has slipped")
     seen = require_edge(config, devices, keep, before, seen)
     slip = slip_since(before, seen, head.camera, head.light_plane, head.rail_direction)
+    if slip.size > LARGEST_M:
+        check_lost_steps(devices, context.progress)
     slip.require()
     return pointing, slip
 

@@ -131,8 +131,8 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         on_part, around, seen.base_from_surface, nominal=here.nominal, faces=faces, belongs=belongs,
         lies=seen.surface_from_part, tolerance=place.tolerance, rocks=seen.rocked,
     )  # fmt: skip
-    own = by_themselves(here.job, on_part, seen, faces)
-    return replace(PlacedPart.of(here.job, seen, part_points(here.nominal), stated), gap=gap, flush=flush, own=own)
+    found = PlacedPart.of(here.job, seen, part_points(here.nominal), stated)
+    return replace(found, gap=gap, flush=flush, own=by_themselves(here.job, cloud, found.seen, faces))
 
 
 def swept_part(

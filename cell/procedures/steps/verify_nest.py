@@ -39,9 +39,9 @@ def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
     stated = context.made(SetDown).covariance
     # The arm's base takes the place of a surface here.
     seen = PartPose(pin.SE3.Identity(), fit.base_from_surface, fit.covariance, fit, beside=fit.n_points)
-    own = by_themselves(job, parted(swept[0], here.nominal, belongs)[0], seen, here.nominal)
-    axes = "axes of the arm base, in its nest"
-    found = replace(PlacedPart.of(job, seen, part_points(here.nominal), stated), own=own, axes=axes)
+    found = PlacedPart.of(job, seen, part_points(here.nominal), stated)
+    own = by_themselves(job, swept[0], found.seen, here.nominal)
+    found = replace(found, own=own, axes="axes of the arm base, in its nest")
     for note in found.notes:
         context.note(text=f"in its nest: {note}")
     if not found.in_tolerance(job.place):
