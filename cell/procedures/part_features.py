@@ -56,16 +56,16 @@ class FeatureSeen:
         there = transform(belongs, np.array([section.at]))[0]
         errors = motions[:, :3] + np.cross(motions[:, 3:], at - seen.translation)
         counted = counting(section, belongs.rotation)
-        told = [(span, way) for span, way in own.spans if np.linalg.norm(way @ counted) > LEAST_COUNTED]
-        # What the part's pose may be off by explains as much of what they say.
-        unsure = [float(np.percentile(np.abs(errors @ way), percent)) for _, way in told]
-        wider = [Span(least - more, most + more) for ((least, most), _), more in zip(told, unsure, strict=True)]
-        moved = sum((span.off * way for span, (_, way) in zip(wider, told, strict=True)), np.zeros(3))
-        off = at - there + moved
-        bound = float(np.percentile(np.linalg.norm((off + errors) @ counted, axis=1), percent))
-        bound += sum(span.more for span in wider)
-        off_by, own_off = (float(np.linalg.norm(each @ counted)) for each in (off, moved))
-        return cls(section, off_by, bound, there, own=own, own_off=own_off, asked=bool(told))
+        off, moved, more, asked = at - there, np.zeros(3), 0.0, False
+        for (least, most), way in own.spans:
+            if np.linalg.norm(way @ counted) > LEAST_COUNTED:
+                # What the part's pose may be off by explains as much of what they say.
+                unsure = float(np.percentile(np.abs(errors @ way), percent))
+                span, asked = Span(least - unsure, most + unsure), True
+                moved, more = moved + span.off * way, more + span.more
+        bound = float(np.percentile(np.linalg.norm((off + moved + errors) @ counted, axis=1), percent)) + more
+        off_by, own_off = (float(np.linalg.norm(each @ counted)) for each in (off + moved, moved))
+        return cls(section, off_by, bound, there, own=own, own_off=own_off, asked=asked)
 
     @property
     def not_as_drawn(self) -> bool:

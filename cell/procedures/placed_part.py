@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import pinocchio as pin
@@ -158,14 +158,10 @@ class PlacedPart:
     @cached_property
     def features(self) -> tuple[FeatureSeen, ...]:
         """Where the features lie that the job names."""
-        motions, seen = draws_of(self.covariance), self.seen.surface_from_part
-        return tuple(
-            FeatureSeen.of(
-                section, seen, self.belongs, motions=motions, percent=SURE_PERCENT,
-                own=self.own.get(section.name, NOT_SEEN),
-            )
-            for section in self.named
-        )  # fmt: skip
+        motions, lies, own = draws_of(self.covariance), self.seen.surface_from_part, self.own
+        told = [(each, own.get(each.name, NOT_SEEN)) for each in self.named]
+        where = partial(FeatureSeen.of, seen=lies, belongs=self.belongs, motions=motions, percent=SURE_PERCENT)
+        return tuple(where(each, own=points) for each, points in told)
 
     @property
     def advice(self) -> str:

@@ -113,32 +113,27 @@ def _seen_rim(
     across = np.cross(along, upward)
     if not (length := float(np.linalg.norm(across))) > 0.5:
         return None
-    across /= length
-    ways = [out for out in (across, -across) if _drawn_end(faces, at, out) is not None]
+    ways = [way for way in (across / length, -across / length) if _drawn_end(faces, at, way) is not None]
     if len(ways) != 1:
         return None
-    [outward] = ways
     beside = (part.points[part.valid] - base_from_part.translation) @ base_from_part.rotation - at
-    out, aside = beside @ outward, beside @ along
+    out, aside = beside @ ways[0], beside @ along
     told = []
     for low in np.arange(-NEAR_M, NEAR_M - 0.5 * BAND_M, BAND_M):
-        end = _drawn_end(faces, at + (low + 0.5 * BAND_M) * along, outward)
-        if end is None:
-            continue
-        band = (aside >= low) & (aside < low + BAND_M) & (out > end + STRETCH_M[0]) & (out < end + STRETCH_M[1])
-        index, feet = faces.feet(at + beside[band], STRETCH_M[1])
-        higher = (at + beside[band][index] - feet.points) @ upward
-        level = (higher > LEVEL_M[0]) & (higher < LEVEL_M[1])
-        if (found := _end(np.sort(out[band][index][level]))) is not None:
-            told.append([found[0] - end, found[1] - end])
+        end = _drawn_end(faces, at + (low + 0.5 * BAND_M) * along, ways[0])
+        if end is not None:
+            band = (aside >= low) & (aside < low + BAND_M) & (out > end + STRETCH_M[0]) & (out < end + STRETCH_M[1])
+            index, feet = faces.feet(at + beside[band], STRETCH_M[1])
+            higher = (at + beside[band][index] - feet.points) @ upward
+            level = (higher > LEVEL_M[0]) & (higher < LEVEL_M[1])
+            told += _ends(np.sort(out[band][index][level] - end))
     if len(told) < LEAST_BANDS:
         return None
     last, beyond = map(float, np.median(told, axis=0))
     if beyond > STRETCH_M[1]:
         return None
-    past = (np.abs(aside) < NEAR_M) & (out > PAST_M)
-    hidden = not past.any() or _hidden(faces.samples - at, upward)
-    return Rim(Span(last - BLUR_M, max(beyond + BLUR_M, 0.0 if hidden else -np.inf)), outward)
+    hidden = not (out[np.abs(aside) < NEAR_M] > PAST_M).any() or _hidden(faces.samples - at, upward)
+    return Rim(Span(last - BLUR_M, max(beyond + BLUR_M, 0.0 if hidden else -np.inf)), ways[0])
 
 
 def _drawn_end(faces: NominalSurface, at: Array, outward: Array) -> float | None:
@@ -150,10 +145,10 @@ def _drawn_end(faces: NominalSurface, at: Array, outward: Array) -> float | None
     return float(reach.max()) if drawn else None
 
 
-def _end(out: Array) -> tuple[float, float] | None:
-    """Between what the part ends in one band: its last point, and where the next one would have been."""
-    last = out[out > out[-1] - NEAR_M] if len(out) else out
-    return (float(last[-1]), float(last[-1] + np.diff(last).max())) if len(last) > 2 else None
+def _ends(out: Array) -> list[tuple[float, float]]:
+    """Between what the part ends in one band, if that shows: its last point, and where the next one would have been."""
+    last = out[out > out.max(initial=-np.inf) - NEAR_M]
+    return [(float(last[-1]), float(last[-1] + np.diff(last).max()))] if len(last) > 2 else []
 
 
 def _hidden(beside: Array, upward: Array) -> bool:

@@ -16,13 +16,7 @@ import pinocchio as pin
 from cell.config.job import ScanSection, SwathSection
 from cell.measure.calibration import ScanCalibration
 from cell.measure.inversion import PlacePose
-from cell.measure.inversion.effects.between_sweeps import (
-    LEAST_MATCHED,
-    Creep,
-    PartOnGround,
-    SurfaceMotion,
-    surface_motion,
-)
+from cell.measure.inversion.effects import between_sweeps
 from cell.measure.inversion.observability import Tolerance
 from cell.measure.reconstruction import Cloud, flange_motions
 from cell.procedures.arm.photograph import BoardFix
@@ -57,9 +51,9 @@ class SecondLook:
     """By how much the surface seemed to have `moved`, and in words what is `hidden`: motions that could be larger than
     the place's tolerance unseen. `creep` is how it moves on, where that shows."""
 
-    moved: SurfaceMotion
+    moved: between_sweeps.SurfaceMotion
     hidden: tuple[str, ...]
-    creep: Creep | None = None
+    creep: between_sweeps.Creep | None = None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -97,7 +91,7 @@ def require_in_place(
 
 def _swept_again(
     here: Workplace, fix: BoardFix, sweep: SweepRecord, scan: Reconstruction, pose: PlacePose, context: StepContext
-) -> tuple[SurfaceMotion, Creep | None]:
+) -> tuple[between_sweeps.SurfaceMotion, between_sweeps.Creep | None]:
     # The arm is not moved from where it stands already.
     stood = sweep.rest is not None and sweep.rest is here.devices.interlocks.situation.last and len(sweep.swaths) == 1
     few = sparse(here.job.scan, sweep.swaths[0])
@@ -117,12 +111,12 @@ def _swept_again(
     by_poses = [
         partial(flange_motions, cloud, covariances=[each]) for cloud, each in ((before, spread), (now, spread_now))
     ]
-    moved = surface_motion(before, now, here.nominal, pose.base_from_surface, (by_poses[0], by_poses[1]))
+    moved = between_sweeps.surface_motion(before, now, here.nominal, pose.base_from_surface, (by_poses[0], by_poses[1]))
     if not stood:
         return moved, None
     unsure = by_times(sweep.swaths[0]) + by_times(again.swaths[0])
     middles = float(sweep.times.mean()), float(again.times.mean())
-    return moved, Creep.of(moved, unsure, pose.base_from_surface.translation, *middles)
+    return moved, between_sweeps.Creep.of(moved, unsure, pose.base_from_surface.translation, *middles)
 
 
 def by_times(swath: Swath) -> Vector:
@@ -158,8 +152,8 @@ def pace(swath: Swath) -> float:
 
 
 def moved_meanwhile(
-    here: Workplace, head: ScanCalibration, over: pin.SE3, swept: tuple[Cloud, SweepRecord], *, part: PartOnGround,
-    context: StepContext,
+    here: Workplace, head: ScanCalibration, over: pin.SE3, swept: tuple[Cloud, SweepRecord], *,
+    part: between_sweeps.PartOnGround, context: StepContext,
 ) -> float | None:  # fmt: skip
     """Sweep the last strip the other way, in few lines: how far, m, the part has moved on since, as `part.moved` has
     it. Raises what a sweep raises."""
@@ -207,15 +201,16 @@ def require_points(cloud: Cloud) -> Cloud:
     )
 
 
-def require_surface_unmoved(moved: SurfaceMotion) -> None:
+def require_surface_unmoved(moved: between_sweeps.SurfaceMotion) -> None:
     """Raise `RefusedError` for a surface that lies elsewhere."""
     if not moved.moved:
         return
-    if moved.matched < LEAST_MATCHED:
+    if moved.matched < between_sweeps.LEAST_MATCHED:
         raise RefusedError(
             f"the surface does not lie any more where it was swept: of its second sweep {100 * moved.matched:.0f} % as "
-            f"many points lie on it as of the first, allowed are {100 * LEAST_MATCHED:.0f} %. {NEXT_STEP}",
-            Measured("second sweep on the surface", 100 * moved.matched, "%", least=100 * LEAST_MATCHED),
+            f"many points lie on it as of the first, allowed are {100 * between_sweeps.LEAST_MATCHED:.0f} %. "
+            f"{NEXT_STEP}",
+            Measured("second sweep on the surface", 100 * moved.matched, "%", least=100 * between_sweeps.LEAST_MATCHED),
         )
     if moved.found is None:
         far = "by some millimetres or degrees, too far to tell how much,"

