@@ -92,6 +92,9 @@ def test_what_the_points_about_a_feature_say_by_themselves_counts_where_the_draw
     assert "the part is off its drawing there by 0.15 mm" in flat.words
     assert flat.as_dict()["own_higher_mm"] == [-0.25, -0.15] and flat.as_dict()["own_farther_mm"] is None
     assert of("hole", (0, 0, 1), LocalDeviation(worn)).bound == 0.0, "along its direction nothing counts"
+    lower, own = still + 0.2e-3 * np.eye(6)[2], LocalDeviation(worn)
+    unsure = FeatureSeen.of(feature("flat", (0, 0, 1)), here, here, motions=lower, percent=PERCENT, own=own)
+    assert unsure.own_off == 0.0 and unsure.asked, "the part may lie as much lower"
     kept = of("flat", (0, 0, 1), LocalDeviation(inside))
     assert kept.off == kept.bound == kept.own_off == 0.0 and "drawing" not in kept.words
     # An edge along y: it is .15 mm low, and ends .4 to .6 mm farther along x.

@@ -122,10 +122,10 @@ def test_a_side_that_leans_outward_is_no_part_of_the_face_above_it(seed: int) ->
 
 def test_a_rim_that_is_drawn_round_is_looked_for_where_it_is_drawn() -> None:
     turns = np.linspace(0.0, 2.0 * np.pi, 73)[:-1]
-    corners = 6e-3 * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
+    corners = 3e-3 * np.stack([np.cos(turns), np.sin(turns), 0.0 * turns], axis=1)
     disc = NominalSurface(np.vstack([corners, np.zeros(3)]), [[k, (k + 1) % 72, 72] for k in range(72)])
-    cloud = scanned(lambda x, y: np.where(np.hypot(x, y) < 6e-3, THICK, 0.0), 5)
-    assert rim([6e-3, 0.0, 0.0], cloud, ACROSS, disc).off == 0.0
+    cloud = scanned(lambda x, y: np.where(np.hypot(x, y) < 3e-3, THICK, 0.0), 5)
+    assert rim([0.0, 3e-3, 0.0], cloud, ALONG, disc).off == 0.0
 
 
 def test_a_rim_that_something_higher_may_hide_is_not_told_to_end_too_soon() -> None:
