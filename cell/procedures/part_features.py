@@ -14,7 +14,8 @@ import pinocchio as pin
 from cell.config.job import FeatureSection, Job
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion import NominalSurface
-from cell.measure.inversion.local_deviation import LocalDeviation, Span, local_deviation
+from cell.measure.inversion.flush import heights_over
+from cell.measure.inversion.local_deviation import LocalDeviation, Span, higher_about, seen_rim
 from cell.measure.inversion.part_pose import PartPose
 from cell.measure.reconstruction import Cloud
 from drivers.errors import Measured
@@ -107,14 +108,17 @@ def _in_mm(span: Span | None) -> list[float] | None:
 def by_themselves(job: Job, cloud: Cloud, seen: PartPose, faces: NominalSurface) -> dict[str, LocalDeviation]:
     """What the points of a part in its cloud, arm base, say about each flat and edge that the job names, by name. The
     part has these `faces`, and was `seen` so."""
-    return {
-        feature.name: local_deviation(
-            cloud, seen.base_from_surface, seen.surface_from_part, faces=faces, at=np.array(feature.at),
-            edge=np.array(feature.axis) if feature.kind == "edge" else None, rocks=seen.rocked,
-        )
-        for feature in (() if job.part is None else job.part.feature)
-        if feature.kind in ("flat", "edge")
-    }  # fmt: skip
+    asked = [] if job.part is None else [each for each in job.part.feature if each.kind in ("flat", "edge")]
+    if not asked:
+        return {}
+    base_from_surface, lies, made = seen.base_from_surface, seen.surface_from_part, {}
+    heights = heights_over(cloud, base_from_surface, lies, faces)
+    for feature in asked:
+        at, rim = np.array(feature.at), None
+        if feature.kind == "edge":
+            rim = seen_rim(cloud, base_from_surface, lies, faces=faces, at=at, edge=np.array(feature.axis))
+        made[feature.name] = LocalDeviation(higher_about(heights, lies.act(at), seen.rocked), rim)
+    return made
 
 
 def counting(section: FeatureSection, surface_from_part: Vector) -> Vector:

@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.inversion.disagreement import squares
-from cell.measure.inversion.flush import heights_over
+from cell.measure.inversion.flush import PointHeights
 from cell.measure.inversion.nominal import Array, NominalSurface
 from cell.measure.reconstruction.cloud import Cloud
 
@@ -78,37 +78,29 @@ class LocalDeviation:
         return up if self.rim is None else (*up, self.rim)
 
 
-def local_deviation(
-    part: Cloud, base_from_surface: pin.SE3, lies: pin.SE3, *, faces: NominalSurface, at: Array,
-    edge: Array | None = None, rocks: float = 0.0,
-) -> LocalDeviation:  # fmt: skip
-    """Of the part with these `faces`, which `lies` at surface_from_part, about `at` (3,) m, part frame.
+def higher_about(seen: PointHeights, at: Array, rocks: float = 0.0) -> Span | None:
+    """How much higher than drawn the points `seen` stand about `at` (3,) m, surface frame; None where too few show.
 
-    `part` is the cloud of a sweep over it, arm base. `edge` (3,) is the direction of an edge, part frame. The vehicle
-    `rocks` by so much, m, up and down: the points about a feature are swept together, at one end of that.
+    The vehicle `rocks` by so much, m, up and down: the points about a feature are swept together, at one end of that.
     """
-    rim = None
-    if edge is not None:
-        rim = _seen_rim(part, base_from_surface * lies, lies.rotation[2], faces=faces, at=at, edge=edge)
-        rim = rim and rim._replace(outward=lies.rotation @ rim.outward)
-    seen = heights_over(part, base_from_surface, lies, faces)
     drawn = seen.places - np.outer(seen.higher, [0.0, 0.0, 1.0])
-    near = np.linalg.norm(drawn - lies.act(at), axis=1) < NEAR_M
+    near = np.linalg.norm(drawn - at, axis=1) < NEAR_M
     if not near.any():
-        return LocalDeviation(rim=rim)
+        return None
     _, middle, noise = squares(np.zeros(near.sum(), dtype=np.intp), seen.higher[near], seen.lines[near])
     unsure = noise + 2.0 * rocks
-    told = [Span(float(least), float(most)) for least, most in zip(middle - unsure, middle + unsure, strict=True)]
-    return LocalDeviation(told[0] if told else None, rim)
+    return Span(float(middle[0] - unsure[0]), float(middle[0] + unsure[0])) if len(middle) else None
 
 
-def _seen_rim(
-    part: Cloud, base_from_part: pin.SE3, upward: Array, *, faces: NominalSurface, at: Array, edge: Array
+def seen_rim(
+    cloud: Cloud, base_from_surface: pin.SE3, lies: pin.SE3, *, faces: NominalSurface, at: Array, edge: Array
 ) -> Rim | None:
-    """Where the part ends at this edge, all in its own frame; `upward` (3,) is the surface's z axis there.
+    """Where a part with these `faces`, which `lies` at surface_from_part, ends at its edge through `at` (3,) m along
+    `edge` (3,), part frame, by the cloud of a sweep over it, arm base.
 
     None where no rim is drawn there, where level ground goes on beyond it, and where too few points show.
     """
+    base_from_part, upward = base_from_surface * lies, lies.rotation[2]
     along = edge / np.linalg.norm(edge)
     across = np.cross(along, upward)
     if not (length := float(np.linalg.norm(across))) > 0.5:
@@ -116,7 +108,7 @@ def _seen_rim(
     ways = [way for way in (across / length, -across / length) if _drawn_end(faces, at, way) is not None]
     if len(ways) != 1:
         return None
-    beside = (part.points[part.valid] - base_from_part.translation) @ base_from_part.rotation - at
+    beside = (cloud.points[cloud.valid] - base_from_part.translation) @ base_from_part.rotation - at
     out, aside = beside @ ways[0], beside @ along
     told = []
     for low in np.arange(-NEAR_M, NEAR_M - 0.5 * BAND_M, BAND_M):
@@ -133,7 +125,7 @@ def _seen_rim(
     if beyond > STRETCH_M[1]:
         return None
     hidden = not (out[np.abs(aside) < NEAR_M] > PAST_M).any() or _hidden(faces.samples - at, upward)
-    return Rim(Span(last - BLUR_M, max(beyond + BLUR_M, 0.0 if hidden else -np.inf)), ways[0])
+    return Rim(Span(last - BLUR_M, max(beyond + BLUR_M, 0.0 if hidden else -np.inf)), lies.rotation @ ways[0])
 
 
 def _drawn_end(faces: NominalSurface, at: Array, outward: Array) -> float | None:

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface
-from cell.measure.inversion.local_deviation import BLUR_M, LocalDeviation, Span, local_deviation
+from cell.measure.inversion.flush import heights_over
+from cell.measure.inversion.local_deviation import BLUR_M, LocalDeviation, Span, higher_about, seen_rim
 from cell.measure.reconstruction import Cloud
 from tests.unit.cell.measure.inversion.test_flush import BELONGS, HALF, THICK, TOP, swept
 from tests.unit.cell.measure.inversion.test_registration import TRUE, scanned
@@ -32,8 +33,10 @@ def about(
     at: list[float], cloud: Cloud, edge: list[float] | None = None, faces: NominalSurface = TOP,
     lies: pin.SE3 = BELONGS, rocks: float = 0.0,
 ) -> LocalDeviation:  # fmt: skip
-    direction = None if edge is None else np.array(edge)
-    return local_deviation(cloud, TRUE, lies, faces=faces, at=np.array(at), edge=direction, rocks=rocks)
+    where, rim = np.array(at), None
+    if edge is not None:
+        rim = seen_rim(cloud, TRUE, lies, faces=faces, at=where, edge=np.array(edge))
+    return LocalDeviation(higher_about(heights_over(cloud, TRUE, lies, faces), lies.act(where), rocks), rim)
 
 
 def rim(at: list[float], cloud: Cloud, edge: list[float] = ACROSS, faces: NominalSurface = TOP) -> Span:
