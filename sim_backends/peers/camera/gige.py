@@ -21,20 +21,9 @@ from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.camera import CameraSpec, CameraState
+from sim_backends.peers.camera import gigevision
 from sim_backends.peers.camera import gigevision as memory
 from sim_backends.peers.camera.frames import Exposure, FrameSession, Rejected, Render
-from sim_backends.peers.camera.gigevision import (
-    ENCODERS,
-    PORT,
-    GigeMemory,
-    GvcpCommand,
-    GvcpRefused,
-    GvcpRequest,
-    GvcpStatus,
-    Leader,
-    packets,
-    test_packet,
-)
 
 _KEPT = 8
 """Pictures whose packets can be asked for again."""
@@ -49,7 +38,7 @@ class GigeStream:
     `lost(number of a packet in its picture)` decides which packets get lost on their first way.
     """
 
-    def __init__(self, host: str, read: GigeMemory) -> None:
+    def __init__(self, host: str, read: gigevision.GigeMemory) -> None:
         self.lost: Callable[[int], bool] = lambda number: False
         self._read = read
         self._sent: OrderedDict[int, list[bytes]] = OrderedDict()
@@ -68,7 +57,7 @@ class GigeStream:
 
     def test(self) -> None:
         """One packet of the size that is set, to see whether it arrives."""
-        self._put(test_packet(self._packet_size))
+        self._put(gigevision.test_packet(self._packet_size))
 
     def send(self, image: NDArray[np.uint8], block_id: int, timestamp: int) -> None:
         """Send the region of the sensor's `image` (height, width); `timestamp` in ticks of the device's clock."""
@@ -78,9 +67,9 @@ class GigeStream:
         part = image[top : top + height, left : left + width]
         if gain := read.real(memory.GAIN):
             part = np.minimum(part * 10.0 ** (gain / 20.0), 255.0).astype(np.uint8)
-        pixels = ENCODERS[code][2](np.ascontiguousarray(part))
-        leader = Leader(timestamp, code, width, height=height, left=left, top=top)
-        made = list(packets(block_id, leader, pixels, self._packet_size))
+        pixels = gigevision.ENCODERS[code][2](np.ascontiguousarray(part))
+        leader = gigevision.Leader(timestamp, code, width, height=height, left=left, top=top)
+        made = list(gigevision.packets(block_id, leader, pixels, self._packet_size))
         with self._keeping:
             self._sent[block_id] = made
             while len(self._sent) > _KEPT:
@@ -131,7 +120,7 @@ class GigePeer:
         self.camera = CameraState(spec)
         self._clock = clock
         self._control, self.address = _bound()
-        self._memory = GigeMemory(spec, self.address)
+        self._memory = gigevision.GigeMemory(spec, self.address)
         self._stream = GigeStream(self.address, self._memory)
         self._session = FrameSession(name, self.camera, clock, render, self._send)
         self._controller: Address | None = None
@@ -191,14 +180,14 @@ class GigePeer:
             timeout = 1e-3 * self._memory.word(memory.HEARTBEAT)
             if self._controller is not None and time.monotonic() - self._heard > timeout:
                 self._release()
-            request = GvcpRequest.of(packet)
+            request = gigevision.GvcpRequest.of(packet)
             if request is None or self.camera.silent:
                 continue
             if client == self._controller:
                 self._heard = time.monotonic()
             try:
                 answer = request.reply(self._answer(request, client))
-            except GvcpRefused as refused:
+            except gigevision.GvcpRefused as refused:
                 answer = request.reply(status=refused.status)
             if request.answered:
                 with contextlib.suppress(OSError):
@@ -210,23 +199,23 @@ class GigePeer:
         for address in (memory.CONTROL, memory.CONTROLLER_PORT, memory.CONTROLLER_ADDRESS):
             self._memory.set_word(address, 0)
 
-    def _answer(self, request: GvcpRequest, client: Address) -> bytes:
-        if request.command == GvcpCommand.DISCOVERY:
+    def _answer(self, request: gigevision.GvcpRequest, client: Address) -> bytes:
+        if request.command == gigevision.GvcpCommand.DISCOVERY:
             return self._memory.read(0, 0xF8)
-        if request.command == GvcpCommand.READ_REGISTERS:
+        if request.command == gigevision.GvcpCommand.READ_REGISTERS:
             return b"".join(self._memory.read(address, 4) for address in request.words())
-        if request.command == GvcpCommand.READ_MEMORY:
+        if request.command == gigevision.GvcpCommand.READ_MEMORY:
             address, size = struct.unpack(">II", request.data)
             return request.data[:4] + self._memory.read(address, size & 0xFFFF)
-        if request.command == GvcpCommand.RESEND:
+        if request.command == gigevision.GvcpCommand.RESEND:
             _, block_id, first, last = struct.unpack_from(">HHII", request.data)
             self._stream.send_again(block_id, first & 0xFFFFFF, last & 0xFFFFFF)
             return b""
-        if request.command not in (GvcpCommand.WRITE_REGISTERS, GvcpCommand.WRITE_MEMORY):
-            raise GvcpRefused(GvcpStatus.NOT_IMPLEMENTED)
+        if request.command not in (gigevision.GvcpCommand.WRITE_REGISTERS, gigevision.GvcpCommand.WRITE_MEMORY):
+            raise gigevision.GvcpRefused(gigevision.GvcpStatus.NOT_IMPLEMENTED)
         if self._controller not in (None, client):
-            raise GvcpRefused(GvcpStatus.ACCESS_DENIED)
-        if request.command == GvcpCommand.WRITE_REGISTERS:
+            raise gigevision.GvcpRefused(gigevision.GvcpStatus.ACCESS_DENIED)
+        if request.command == gigevision.GvcpCommand.WRITE_REGISTERS:
             words = request.words()
             for address, value in zip(words[::2], words[1::2], strict=True):
                 self._write(address, struct.pack(">I", value), client)
@@ -236,9 +225,9 @@ class GigePeer:
 
     def _write(self, address: int, data: bytes, client: Address) -> None:
         if self._controller is None and address != memory.CONTROL:
-            raise GvcpRefused(GvcpStatus.ACCESS_DENIED)
+            raise gigevision.GvcpRefused(gigevision.GvcpStatus.ACCESS_DENIED)
         if self._session.running and address in (memory.WIDTH, memory.HEIGHT, memory.PIXEL_FORMAT):
-            raise GvcpRefused(GvcpStatus.WRITE_PROTECT)
+            raise gigevision.GvcpRefused(gigevision.GvcpStatus.WRITE_PROTECT)
         value = struct.unpack(">I", data)[0] if len(data) == 4 else 0
         if address == memory.PACKET_SIZE and value & _FIRE:
             value &= ~_FIRE
@@ -293,10 +282,10 @@ def _bound() -> tuple[socket.socket, str]:
     for candidate in (f"127.1.{net}.{i}" for i in range(2, 255)):
         bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            bound.bind((candidate, PORT))
+            bound.bind((candidate, gigevision.PORT))
         except OSError as error:
             bound.close()
             problem = error
             continue
         return bound, candidate
-    raise OSError(f"UDP port {PORT} is not free on 127.1.{net}.2 …: stop the other simulator ({problem})")
+    raise OSError(f"UDP port {gigevision.PORT} is not free on 127.1.{net}.2 …: stop the other simulator ({problem})")

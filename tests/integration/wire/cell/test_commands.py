@@ -225,6 +225,12 @@ def test_a_homing_that_stopped_goes_on_after_cell_confirm(endpoints: dict[str, A
         assert homing.stderr is not None and "waiting for a person, question 1" in homing.stderr.read()
 
 
+def word(cell: Cell) -> None:
+    """A controller that was held up may stop itself as it goes on: a person looks, and lets it."""
+    if cell.current is not None:
+        cell.current.confirm("Ann")
+
+
 def test_an_arm_that_froze_is_used_again_by_the_same_program(tmp_path: Path) -> None:
     """Its link is lost after 1.5 s of silence: a person's word connects it again."""
     with started("sim", "serve", "--json", "--speed", "1", "--config-out", "cell.toml", folder=tmp_path) as sim:
@@ -237,5 +243,5 @@ def test_an_arm_that_froze_is_used_again_by_the_same_program(tmp_path: Path) -> 
                 opened.devices.arm.state()
             sim.send_signal(signal.SIGCONT)
             opened.recover("Ann")
-            opened.home("arm")
+            opened.home("arm", lambda event: event.kind == "confirm_needed" and word(opened))
             assert opened.devices.arm.state().controlled
