@@ -158,10 +158,9 @@ class PlacedPart:
     @cached_property
     def features(self) -> tuple[FeatureSeen, ...]:
         """Where the features lie that the job names."""
-        motions, lies, own = draws_of(self.covariance), self.seen.surface_from_part, self.own
-        told = [(each, own.get(each.name, NOT_SEEN)) for each in self.named]
+        motions, lies = draws_of(self.covariance), self.seen.surface_from_part
         where = partial(FeatureSeen.of, seen=lies, belongs=self.belongs, motions=motions, percent=SURE_PERCENT)
-        return tuple(where(each, own=points) for each, points in told)
+        return tuple(where(each, own=self.own.get(each.name, NOT_SEEN)) for each in self.named)
 
     @property
     def advice(self) -> str:

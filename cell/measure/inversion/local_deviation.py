@@ -104,7 +104,7 @@ def seen_rim(
     along = edge / np.linalg.norm(edge)
     across = np.cross(along, upward)
     if not (length := float(np.linalg.norm(across))) > 0.5:
-        return None
+        return None  # It stands upright.
     ways = [way for way in (across / length, -across / length) if _drawn_end(faces, at, way) is not None]
     if len(ways) != 1:
         return None

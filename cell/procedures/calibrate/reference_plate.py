@@ -142,7 +142,7 @@ def require_edge(config: CellConfig, devices: Devices, keep: Keep, before: Plate
     assert before.edge is not None
     edge = look_at_edge(config, devices, keep, now, before.edge.place)
     if edge is None:
-        check_lost_steps(devices)  # A fault of its own.
+        check_lost_steps(devices)  # Lost steps are told as such.
         raise RefusedError(
             f"the edge of the plate on the claw is not within {1e3 * BESIDE_M:g} mm of where the calibration saw it, "
             f"with the rail at {1e3 * before.edge.place:.2f} mm: the scan head or the plate has slipped, the rail "
