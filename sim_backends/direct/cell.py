@@ -114,10 +114,14 @@ class VirtualClock(Clock):
                 self._alarms[ring] = self.now() + again
         return True
 
+    def ring_in(self, seconds: float, ring: Ring) -> None:
+        """Have `ring` called then, by whoever lets the time pass; again after as many seconds as it returns."""
+        self._alarms[ring] = self.now() + seconds
+
     @contextmanager
     def alarm(self, seconds: float, ring: Ring) -> Iterator[None]:
         """See `Clock.alarm`; rung by whoever lets the time pass, after the tick that brings it there."""
-        self._alarms[ring] = self.now() + seconds
+        self.ring_in(seconds, ring)
         try:
             yield
         finally:
@@ -167,6 +171,7 @@ class DirectCell:
         self.scan_camera = DirectCamera("scan_camera", "scan", self.world, self.clock, wire=wire)
         self.target_camera = DirectCamera("target_camera", "target", self.world, self.clock, wire=wire)
         self._ticking: tuple[Ticking, ...] = (self.arm, self.vehicle)
+        self.clock.ring_in(0.0, self.rail.look)
 
     def truth(self) -> dict[str, object]:
         """Everything true about the world now; see `sim_backends.world.world`."""

@@ -202,6 +202,7 @@ class DirectRail(DirectDevice):
         self.lost_zero = False
         """Whether the module was reset and nobody was told yet."""
         self._motion: RailMove | None = None
+        self._checking: RailMove | None = None
         self._set_up()
 
     def identity(self) -> Identity:
@@ -277,8 +278,14 @@ class DirectRail(DirectDevice):
             self.name, begin, lambda: self.counted(clock.now()), lambda: model.home_switch(clock.now()),
             forget=self.forget_zero, speed=self.setup.max_speed,
         )  # fmt: skip
-        self._motion = RailMove(self, None, asked=check)
+        self._motion = self._checking = RailMove(self, None, asked=check)
         return self._motion
+
+    def look(self) -> float:
+        """Begin the next leg of a check beside what else goes on, as a driver's thread does; when to look again, s."""
+        if self._checking is not None and self._checking.done:
+            self._checking = None
+        return POLL_S
 
     def sweep_start(self, start: float, stop: float, speed: float) -> float:
         """Where the rail has to stand before `sweep`."""

@@ -95,9 +95,9 @@ class SlowMover(Mover):
         """See `Mover.to`."""
         moved_once_more(self._arm, lambda: Mover.to(self, base_from_flange, what))
 
-    def to_joints(self, joints: Joints) -> None:
+    def to_joints(self, joints: Joints, settle: bool = True) -> None:
         """See `Mover.to_joints`."""
-        moved_once_more(self._arm, lambda: Mover.to_joints(self, joints))
+        moved_once_more(self._arm, lambda: Mover.to_joints(self, joints, settle))
 
 
 class Declined(Exception):

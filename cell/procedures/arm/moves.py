@@ -207,12 +207,12 @@ class Mover:
         joints = self._planner.reach(base_from_flange, near, what)
         self.to_joints(self.kinematics.unwound(joints, self.joints))
 
-    def to_joints(self, joints: Joints) -> None:
-        """Move freely to joint angles and settle."""
+    def to_joints(self, joints: Joints, settle: bool = True) -> None:
+        """Move freely to joint angles, and `settle` where something is measured there."""
         self.hold()
         self._rise()
         start = self.joints
-        self.follow(self._planner.free(start, joints, self._leaving(start)).at_pace(self.pace.share))
+        self.follow(self._planner.free(start, joints, self._leaving(start)).at_pace(self.pace.share), settle=settle)
 
     def _leaving(self, start: Joints) -> tuple[Pair, ...]:
         """What may be near the part that was just put down: only what is so already."""
@@ -240,16 +240,18 @@ class Mover:
         """Bring the arm to where it rests between jobs: as `rest_at` has it, else HOME."""
         if self._rests_at is not None:
             with suppress(Unreachable, CollisionError):
-                return self.to_as_from(HOME, self._rests_at, "where the arm rests between jobs")
-        return self.to_joints(HOME)
+                joints = self._planner.reach(self._rests_at, HOME, "where the arm rests between jobs")
+                return self.to_joints(self.kinematics.unwound(joints, self.joints), settle=False)
+        return self.to_joints(HOME, settle=False)
 
     def line(
-        self, base_from_flange: pin.SE3, speed: float, allowed: Sequence[Pair] = (), force_limit: float | None = None
-    ) -> bool:
+        self, base_from_flange: pin.SE3, speed: float, allowed: Sequence[Pair] = (), *,
+        force_limit: float | None = None, settle: bool = True,
+    ) -> bool:  # fmt: skip
         """Move the flange in a straight line; True when it ended early in contact, at `force_limit` N."""
         limits = LineLimits(speed=min(speed, self._tool_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
         line = self._planner.line(self.joints, base_from_flange, limits, allowed)
-        return self.follow(line.at_pace(self.pace.share), force_limit)
+        return self.follow(line.at_pace(self.pace.share), force_limit, settle)
 
     def plan_line(
         self, base_from_start: pin.SE3, base_from_end: pin.SE3, speed: float
@@ -264,11 +266,12 @@ class Mover:
         motion = self._arm.follow(trajectory.times, trajectory.joints)
         return motion, 3.0 * trajectory.duration + GRACE_WALL_S * self._clock.rate
 
-    def follow(self, trajectory: Trajectory, force_limit: float | None = None) -> bool:
-        """Have the arm follow a trajectory to its end and settle; True when it ended early in contact."""
+    def follow(self, trajectory: Trajectory, force_limit: float | None = None, settle: bool = True) -> bool:
+        """Have the arm follow a trajectory to its end, and `settle`; True when it ended early in contact."""
         motion = self._arm.follow(trajectory.times, trajectory.joints, force_limit)
         motion.wait(3.0 * trajectory.duration + GRACE_WALL_S * self._clock.rate)
-        self._clock.sleep(self._settle_time)
+        if settle:
+            self._clock.sleep(self._settle_time)
         return motion.contact
 
 

@@ -143,7 +143,7 @@ class Placing:
 
     def _lift(self) -> None:
         plan = self.job.place
-        self.mover.line(self._flange_at(plan.approach), plan.speed, TOUCHES)
+        self.mover.line(self._flange_at(plan.approach), plan.speed, TOUCHES, settle=False)
         require_in_claw(self.claw, self.part, self.note, "on its way down; it may lie on its place")
 
     def _approach(self) -> None:

@@ -38,7 +38,7 @@ LEAST_POINTS = 500
 MOST_LOST = 0.5
 """Share of its frames: a comparison misses none of them, and says what is left of it."""
 HURRY = 2.0
-"""So many times as fast the rail goes back, where it can."""
+"""So many times as fast as in the sweep the rail goes, where it can: few lines need few pictures."""
 ROOM_M = 1e-3
 """Left of the travel beside what it takes to gain speed."""
 PLAY_M = 20e-6
@@ -94,7 +94,7 @@ def _swept_again(
 ) -> tuple[between_sweeps.SurfaceMotion, between_sweeps.Creep | None]:
     # The arm is not moved from where it stands already.
     stood = sweep.rest is not None and sweep.rest is here.devices.interlocks.situation.last and len(sweep.swaths) == 1
-    few = sparse(here.job.scan, sweep.swaths[0])
+    few = sparse(here, here.job.scan.swath[0], sweep.swaths[0])
     # A camera of a few frame rates takes all the lines.
     rate = configure_fast(here.devices, few.exposure, (few.frame_rate, here.job.scan.frame_rate))
     again = laser_sweep(
@@ -105,16 +105,18 @@ def _swept_again(
     )  # fmt: skip
     # What lens and light plane are off by cancels in the same strip only.
     before, now = scan.cloud.of_sweep(0), require_points(build_cloud(again))
-    spread, spread_now = sweep.swaths[0].covariance, again.swaths[0].covariance
+    there, once_more = sweep.swaths[0], again.swaths[0]
+    faster = _by_lateness(here, there, pace(once_more) - pace(there))
+    spread, spread_now = there.covariance, once_more.covariance
     if stood:
-        spread, spread_now = by_times(sweep.swaths[0]), here.settling + by_times(again.swaths[0])
+        spread, spread_now = by_times(there), here.settling + by_times(once_more) + faster
     by_poses = [
         partial(flange_motions, cloud, covariances=[each]) for cloud, each in ((before, spread), (now, spread_now))
     ]
     moved = between_sweeps.surface_motion(before, now, here.nominal, pose.base_from_surface, (by_poses[0], by_poses[1]))
     if not stood:
         return moved, None
-    unsure = by_times(sweep.swaths[0]) + by_times(again.swaths[0])
+    unsure = by_times(there) + by_times(once_more) + faster
     middles = float(sweep.times.mean()), float(again.times.mean())
     return moved, between_sweeps.Creep.of(moved, unsure, pose.base_from_surface.translation, *middles)
 
@@ -135,12 +137,16 @@ def _shifted(swath: Swath, sigma: float) -> Vector:
     return shared
 
 
-def sparse(scan: ScanSection, before: Swath) -> ScanSection:
-    """The first strip in about `LINES` lines, no faster than it was swept `before`: a repetition is slower."""
-    return _in_few_lines(scan, scan.swath[0], min(scan.speed, pace(before)))
-
-
-def _in_few_lines(scan: ScanSection, strip: SwathSection, speed: float) -> ScanSection:
+def sparse(here: Workplace, strip: SwathSection, before: Swath) -> ScanSection:
+    """The `strip` that was swept `before`, in about `LINES` lines: by the rail faster, where there is room to gain
+    speed; by the arm no faster, since a repetition is slower."""
+    scan, rail = here.job.scan, here.config.rail
+    speed = min(scan.speed, pace(before))
+    if scan.mode == "rail":
+        # As much room as beyond the ends of the sweep.
+        room = 0.5 * (rail.travel[1] - rail.travel[0] - scan.length) - ROOM_M
+        speed = max(speed, min(HURRY * speed, rail.max_speed, math.sqrt(2.0 * rail.acceleration * max(room, 0.0))))
+    speed = min(speed, rail.max_speed)
     rate = min(scan.frame_rate, max(1.0, LINES * speed / scan.length))
     return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": (strip,)})
 
@@ -157,14 +163,9 @@ def moved_meanwhile(
 ) -> float | None:  # fmt: skip
     """Sweep the last strip the other way, in few lines: how far, m, the part has moved on since, as `part.moved` has
     it. Raises what a sweep raises."""
-    (cloud, sweep), scan, rail = swept, here.job.scan, here.config.rail
+    (cloud, sweep), scan = swept, here.job.scan
     before = sweep.swaths[-1]
-    speed = min(scan.speed, pace(before))
-    if scan.mode == "rail":
-        # To gain speed there is as much room as beyond the ends of the sweep.
-        room = 0.5 * (rail.travel[1] - rail.travel[0] - scan.length) - ROOM_M
-        speed = max(speed, min(HURRY * speed, rail.max_speed, math.sqrt(2.0 * rail.acceleration * max(room, 0.0))))
-    few = _in_few_lines(scan, scan.swath[-1], min(speed, rail.max_speed))
+    few = sparse(here, scan.swath[-1], before)
     rate = configure_fast(here.devices, few.exposure, (few.frame_rate, scan.frame_rate))
     back = laser_sweep(
         here, over, head, few.model_copy(update={"frame_rate": rate}), check=context.check,
@@ -179,14 +180,23 @@ def moved_meanwhile(
 
 def _other_way(here: Workplace, there: Swath, back: Swath) -> Vector:
     """Covariance (6, 6) of base_from_flange by which sweep and way back differ: late stamps, play, the arm's rest."""
+    late = _by_lateness(here, there, pace(there) + pace(back))
+    if here.job.scan.mode == "arm":
+        return late + 2.0 * here.repeatability
+    timing = times_known(here.calibration.scan, here.config)[0]
+    return late + _shifted(there, PLAY_M if timing is None else abs(timing.play) + timing.play_sigma)
+
+
+def _by_lateness(here: Workplace, swath: Swath, faster: float) -> Vector:
+    """Covariance (6, 6) of base_from_flange by which two sweeps differ, of which one goes by so much `faster`, m/s:
+    what comes late shifts the faster one farther."""
     config, timing = here.config, times_known(here.calibration.scan, here.config)[0]
-    speeds = pace(there) + pace(back)
     if here.job.scan.mode == "arm":
         late = math.hypot(config.scan_camera.late / math.sqrt(3.0), LATENCY_S * here.devices.clock.rate)
-        return _shifted(there, late * speeds) + 2.0 * here.repeatability
-    if timing is not None:
-        return _shifted(there, abs(timing.play) + timing.play_sigma + timing.sigma * speeds)
-    return _shifted(there, PLAY_M + math.hypot(config.scan_camera.late, config.rail.late) / math.sqrt(3.0) * speeds)
+    else:
+        late = math.hypot(config.scan_camera.late, config.rail.late) / math.sqrt(3.0)
+        late = late if timing is None else timing.sigma
+    return _shifted(swath, late * faster)
 
 
 def require_points(cloud: Cloud) -> Cloud:

@@ -62,7 +62,7 @@ def test_how_a_part_slips_each_time_the_claw_opens_is_seen_and_allowed_for(
 ) -> None:
     slips = opened(motion(0.5, turn=(0, 0, 3)))
     site = LyingPart(
-        placed_pot, tmp_path, also='corrections = 2\naccept = "0.1 mm"', changed=lambda cell: slips(cell.world)
+        placed_pot, tmp_path, also='corrections = 2\naccept = "0.2 mm"', changed=lambda cell: slips(cell.world)
     )
     found = site.looked(moved(0.5e-3, z=0.2e-3))
     assert [round(1e3 * off, 1) for off in found.before] == [pytest.approx(0.5, abs=0.15)] * 2, "as far off again"

@@ -162,7 +162,7 @@ def test_a_straight_line_gains_its_speed_gently() -> None:
     """At most by its speed in a third of a second, planned beforehand or not."""
     mover, speed = Site().mover, 0.05
     lines: list[Trajectory] = []
-    mover.follow = lambda line, force_limit=None: bool(lines.append(line))  # type: ignore[method-assign]
+    mover.follow = lambda line, *_: bool(lines.append(line))  # type: ignore[method-assign]
     start = mover.kinematics.fk(mover.joints)
     goal = from_parts((0.0, 0.0, 0.03)) * start
     mover.line(goal, speed)

@@ -124,16 +124,39 @@ def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(
     assert set(rates) == {30.0}
 
 
-def test_a_second_look_takes_few_lines_of_one_strip_no_faster_than_before(placed_pot: JobRecord) -> None:
-    scan, (swath,) = pot()[0].scan, placed_pot.results["laser_sweep"].swaths
-    few = sparse(scan, swath)
-    assert few.speed == pytest.approx(scan.speed, rel=0.01) and len(few.swath) == 1
-    assert few.length / few.speed * few.frame_rate == pytest.approx(LINES)
-    slow = scan.model_copy(update={"frame_rate": 5.0, "speed": 0.02})
-    assert sparse(slow, swath).frame_rate == 5.0
+def test_a_second_look_takes_few_lines_of_one_strip_twice_as_fast_where_there_is_room(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    here, (swath,) = AtStation(placed_pot, tmp_path).work, placed_pot.results["laser_sweep"].swaths
+    scan = here.job.scan
+    few = sparse(here, scan.swath[0], swath)
+    assert few.speed == pytest.approx(min(second_look.HURRY * scan.speed, here.config.rail.max_speed), rel=0.01)
+    assert few.length / few.speed * few.frame_rate == pytest.approx(LINES) and len(few.swath) == 1
     # A sweep that was repeated went half as fast.
-    again = sparse(scan, replace(swath, times=2.0 * swath.times))
-    assert again.speed == pytest.approx(0.5 * scan.speed, rel=0.01)
+    slow = replace(swath, times=2.0 * swath.times)
+    assert sparse(here, scan.swath[0], slow).speed == pytest.approx(second_look.HURRY * second_look.pace(slow))
+    # The arm repeats it slower rather than faster; a camera that is slow stays so.
+    here.job = changed(here.job, "scan", mode="arm", frame_rate=5.0, speed=0.02)
+    by_arm = sparse(here, scan.swath[0], swath)
+    assert (by_arm.speed, by_arm.frame_rate) == (0.02, 5.0)
+
+
+def test_stamps_that_come_late_shift_the_faster_look_farther(placed_pot: JobRecord, tmp_path: Path) -> None:
+    site = AtStation(placed_pot, tmp_path)
+    sweep, here = site.made["laser_sweep"], site.work
+    look_again(site)
+    site.made["laser_sweep"] = replace(sweep, rest=site.cell.devices.interlocks.situation.last)
+    here.calibration = replace(here.calibration, scan=replace(here.calibration.scan, timing=None))
+    (swath,), spread = sweep.swaths, []
+    along = swath.builder.sweep_direction(swath.base_from_flange)
+    faster = sparse(here, here.job.scan.swath[0], swath).speed - here.job.scan.speed
+    for late in (0.0, 0.02):
+        config, by = here.config, {"rail": 0.0, "scan_camera": late}
+        here.config = config.model_copy(
+            update={name: getattr(config, name).model_copy(update={"late": seconds}) for name, seconds in by.items()}
+        )
+        spread.append(float(along @ look_again(site).moved.covariance[:3, :3] @ along))
+    assert spread[1] - spread[0] == pytest.approx((0.02 / math.sqrt(3.0) * faster) ** 2, rel=0.2)
 
 
 def test_a_look_that_loses_frames_tells_as_much(placed_pot: JobRecord, tmp_path: Path) -> None:
