@@ -91,6 +91,7 @@ GROUPS = (
         "unit/cell/measure/inversion/test_disagreement.py",
         "unit/cell/measure/inversion/test_mating.py",
         "unit/drivers/vehicle/test_fixed.py",
+        "unit/lab/bench/job/test_cycle.py",
         "unit/cell/run/record",
     ),
     # Each worker gets two groups at first: a short one for the first, the screens for that of the arm.

@@ -114,6 +114,19 @@ def calibration(
 
 
 @bench.command()
+def cycle(
+    job: JobOption = "shell", seed: SeedOption = 1, level: LevelOption = Level.nominal, json: JsonOption = False
+) -> None:
+    """Where the time of a job goes, cold and repeated: each motion of arm and vehicle beside its least time."""
+    from lab.bench.job.cycle import cycle as campaign
+
+    with bar() as told:
+        told(0, "the first run is on its way")
+        result = campaign(str(job), seed, level.value, counted(told, 2))
+    show(result, json)
+
+
+@bench.command()
 def endings(
     count: Annotated[int, typer.Option(min=1, max=1000, help="How many kills, and how many signals and aborts.")] = 40,
     seed: SeedOption = 3,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from cell.run.folder import Report, list_runs, read_report
+from cell.run.report.page.lanes import Span, idle, spans
 from drivers.errors import CellError
 from statemachine.journal import JournalError, JournalRecord, read
 
@@ -47,11 +48,22 @@ class Timeline:
     marks: tuple[TimelineMark, ...]
     length: float
     clock: str
+    spans: tuple[Span, ...] = ()
 
     @property
     def steps(self) -> list[str]:
         """Names of the steps, in the order in which they began."""
         return list(dict.fromkeys(bar.step for bar in self.bars))
+
+    @property
+    def devices(self) -> list[str]:
+        """Names of the devices that did something, in their order."""
+        return list(dict.fromkeys(span.device for span in self.spans))
+
+    @property
+    def idle_s(self) -> float:
+        """How long nothing moved, was lit or took pictures, s."""
+        return sum(end - begin for begin, end in idle(self.spans, self.length))
 
     @property
     def ticks(self) -> list[float]:
@@ -71,7 +83,11 @@ def timeline(folder: Path, report: Report) -> Timeline | None:
         return None
     if not record.steps:
         return None
-    return _virtual(record, report) if report.get("clock") == "virtual" else _wall(record, report)
+    course = _virtual(record, report) if report.get("clock") == "virtual" else _wall(record, report)
+    # The record's time begins with the first step.
+    first = min(bar.begin for bar in course.bars)
+    moved = [one._replace(begin=one.begin + first, end=one.end + first) for one in spans(folder)]
+    return replace(course, spans=tuple(one for one in moved if first <= one.begin < one.end <= course.length))
 
 
 def _wall(record: JournalRecord, report: Report) -> Timeline:

@@ -1,0 +1,94 @@
+"""`cell bench cycle`: where the time of a job goes, motion by motion, beside the least that each could take.
+
+A job on the virtual clock, cold (the arm stands at HOME, the rail is not homed) and repeated (as the run before left
+the cell). What a device did comes from the run's record, as the report's drawing shows it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from cell import Cell
+from cell.config.cell_config import CellConfig, load_config, mounted
+from cell.config.job import Job, load_job
+from cell.devices.devices import Devices
+from cell.motion.collision import tool_bodies
+from cell.motion.kinematics import JointLimits
+from cell.motion.trajectory import PointSpeed, carried_points, plan_joint
+from cell.procedures.arm.moves import Mover
+from cell.run.report.page.lanes import Span, idle, spans
+
+MOVED = ("vehicle", "arm")
+"""Devices of which the least time is told: what else is done takes as long as the job or a device's limits have it."""
+
+
+def cycle(job: str, seed: int, level: str, done: Callable[[str], None]) -> dict[str, object]:
+    """Both runs: their motions, and what their time is made of, s."""
+    config, loaded = load_config(None), load_job(job)[0]
+    result: dict[str, object] = {}
+    with Cell.open(sim="all", seed=seed, level=level, clock="virtual", job=job) as cell:
+        limits = LeastTimes.of(cell.devices, config, loaded)
+        for name in ("cold", "repeated"):
+            run = cell.run(job=job)
+            done(f"{name}: {run.outcome}")
+            result[name] = {"outcome": run.outcome, **told(spans(run.folder), float(run.report["cell_s"]), limits)}
+    return result
+
+
+@dataclass(frozen=True)
+class LeastTimes:
+    """The least time that a motion takes: straight, from rest to rest, at the limits, with nothing in the way."""
+
+    joints: JointLimits
+    points: PointSpeed
+    vehicle_speed: float
+
+    @classmethod
+    def of(cls, devices: Devices, config: CellConfig, job: Job) -> LeastTimes:
+        """With the job's part in the claw."""
+        mover = Mover(devices.arm, devices.clock, config, None)
+        tool = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3(), mounted(config))
+        points = PointSpeed(mover.kinematics, carried_points(tool), config.arm.max_tool_speed)
+        return cls(mover.kinematics.limits, points, job.approach.speed)
+
+    def __call__(self, span: Span) -> float:
+        """In s; of a device whose states are not told, what it took."""
+        if span.first is None or span.last is None:
+            return span.end - span.begin
+        if span.device == "vehicle":
+            (x, y), (there_x, there_y) = (np.array([state["x"], state["y"]]) for state in (span.first, span.last))
+            return math.hypot(there_x - x, there_y - y) / self.vehicle_speed
+        start, end = (np.array(state["joints"], dtype=np.float64) for state in (span.first, span.last))
+        return plan_joint(start, end, self.joints, points=self.points).duration
+
+
+def told(found: Sequence[Span], length: float, least: Callable[[Span], float]) -> dict[str, object]:
+    """What the `found` spans of a run of `length` s add up to, and each of the motions beside its least time."""
+    motions = [
+        {
+            "device": span.device, "from_s": round(span.begin, 2), "lasts_s": round(span.end - span.begin, 2),
+            "least_s": round(least(span), 2),
+            "meanwhile": ", ".join(dict.fromkeys(other.device for other in found if _beside(span, other))),
+        }
+        for span in sorted(found, key=lambda one: one.begin)
+        if span.device in MOVED
+    ]  # fmt: skip
+    lit = sum(span.end - span.begin for span in found if span.device == "laser")
+    lasts, leasts = (sum(float(str(one[key])) for one in motions) for key in ("lasts_s", "least_s"))
+    return {
+        "length_s": round(length, 2),
+        "arm_and_vehicle_s": round(lasts, 2),
+        "their_least_s": round(leasts, 2),
+        "laser_lit_s": round(lit, 2),
+        "nothing_done_s": round(sum(end - begin for begin, end in idle(found, length)), 2),
+        "of_the_least": round(length / max(leasts + lit, 1e-9), 3),
+        "motions": motions,
+    }
+
+
+def _beside(span: Span, other: Span) -> bool:
+    return other.device != span.device and min(span.end, other.end) - max(span.begin, other.begin) > 0.05
