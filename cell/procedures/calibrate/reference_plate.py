@@ -73,6 +73,7 @@ def require_reference_plate(config: CellConfig, devices: Devices, keep: Keep) ->
             "run `cell calibrate` to work without one"
         )
     if (seen := see_reference_plate(config, devices, keep)) is None:
+        check_lost_steps(devices)  # A carriage that stands elsewhere sees it elsewhere.
         raise RefusedError(
             "the laser's witness, which the calibration saw, is not in the picture: see that the plate on the claw is "
             "in its place and clean, and that the laser is lit; if so, run `cell calibrate`"

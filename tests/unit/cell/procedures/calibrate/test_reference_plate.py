@@ -16,7 +16,7 @@ from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.procedures.calibrate.reference_plate import SPEED, look_at_edge, require_edge, require_reference_plate
 from cell.procedures.steps.laser_sweep import unwatched
-from drivers.errors import RefusedError
+from drivers.errors import DeviceFault, RefusedError
 from drivers.interfaces import Frame
 
 CONFIG = load_config(None)
@@ -177,3 +177,15 @@ def test_it_is_kept_with_the_calibration(cell) -> None:
     before = cell[1]
     again = PlateLine.read(before.as_dict())
     assert again is not None and again.edge == before.edge
+
+
+def test_a_rail_that_lost_so_many_steps_that_the_plate_is_out_of_sight_is_told_as_such() -> None:
+    cell = VirtualCell(CONFIG, 3, "nominal")
+    cell.devices.vehicle.brake()
+    cell.devices.rail.home().wait(60.0)
+    cell.devices.interlocks.work_with(CONFIG.calibration_hash())
+    # The carriage stands 30 mm farther out than it counts.
+    cell.devices.rail.move_to(0.03).wait(10.0)
+    cell.world.rail.set_position(cell.clock.now(), 0)
+    with pytest.raises(DeviceFault, match="lost steps"):
+        looked(cell)
