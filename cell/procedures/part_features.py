@@ -6,7 +6,7 @@ themselves; each has a tolerance of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -15,7 +15,7 @@ from cell.config.job import FeatureSection, Job
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.flush import heights_over
-from cell.measure.inversion.local_deviation import LocalDeviation, Span, higher_about, seen_rim
+from cell.measure.inversion.local_deviation import LocalDeviation, Span, higher_about, seen_middle, seen_rim
 from cell.measure.inversion.part_pose import PartPose
 from cell.measure.reconstruction import Cloud
 from drivers.errors import Measured
@@ -98,6 +98,7 @@ class FeatureSeen:
             "bound_mm": round(1e3 * self.bound, 4), "tolerance_mm": round(1e3 * self.section.tolerance, 4),
             "own_higher_mm": _in_mm(self.own.higher),
             "own_farther_mm": _in_mm(self.own.rim and self.own.rim.farther),
+            "own_aside_mm": [_in_mm(span) for span, _ in self.own.middle],
         }  # fmt: skip
 
 
@@ -106,18 +107,20 @@ def _in_mm(span: Span | None) -> list[float] | None:
 
 
 def by_themselves(job: Job, cloud: Cloud, seen: PartPose, faces: NominalSurface) -> dict[str, LocalDeviation]:
-    """What the points of a part in its cloud, arm base, say about each flat and edge that the job names, by name. The
-    part has these `faces`, and was `seen` so."""
-    asked = [] if job.part is None else [each for each in job.part.feature if each.kind in ("flat", "edge")]
-    if not asked:
+    """What the points of a part in its cloud, arm base, say about each feature that the job names, by name. The part
+    has these `faces`, and was `seen` so."""
+    if job.part is None or not job.part.feature:
         return {}
     base_from_surface, lies, made = seen.base_from_surface, seen.surface_from_part, {}
     heights = heights_over(cloud, base_from_surface, lies, faces)
-    for feature in asked:
-        at, rim = np.array(feature.at), None
+    for feature in job.part.feature:
+        at, axis = np.array(feature.at), np.array(feature.axis)
+        own = LocalDeviation(higher_about(heights, lies.act(at), seen.rocked))
         if feature.kind == "edge":
-            rim = seen_rim(cloud, base_from_surface, lies, faces=faces, at=at, edge=np.array(feature.axis))
-        made[feature.name] = LocalDeviation(higher_about(heights, lies.act(at), seen.rocked), rim)
+            own = replace(own, rim=seen_rim(cloud, base_from_surface, lies, faces=faces, at=at, edge=axis))
+        elif feature.kind != "flat":
+            own = replace(own, middle=seen_middle(cloud, base_from_surface, lies, faces=faces, at=at, axis=axis))
+        made[feature.name] = own
     return made
 
 

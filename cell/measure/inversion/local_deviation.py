@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
+from numpy.typing import NDArray
 
 from cell.measure.inversion.disagreement import squares
 from cell.measure.inversion.flush import PointHeights
@@ -29,6 +30,10 @@ BAND_M, LEAST_BANDS = 1e-3, 4
 """They are looked for in bands across the rim, so wide, of which so many have to tell."""
 BLUR_M = 0.15e-3
 """Half a stripe, of which a rim leaves the inner side: the last point is off by less."""
+SECTORS, LEAST_SECTORS = 16, 12
+"""The rim of a hole or a pin is looked for in so many sectors, of which so many have to tell."""
+WIDE_M, NARROW_M = 15e-3, 1.5e-3
+"""Radii between which such a rim is looked for."""
 PAST_M = 0.5e-3
 """A sweep that sees anything so far beyond the rim has not ended before it."""
 STEEP = 1.0
@@ -65,17 +70,19 @@ class Rim(NamedTuple):
 @dataclass(frozen=True)
 class LocalDeviation:
     """The points about a feature stand `higher` than drawn at the part's pose, along the surface's z axis, give or take
-    four standard deviations. About an edge they show the part's `rim`, surface axes. None is what too few of them tell.
+    four standard deviations. About an edge they show the part's `rim`, about a hole or a pin how far its `middle` lies
+    aside in two directions; surface axes. None, or nothing, is what too few of them tell.
     """
 
     higher: Span | None = None
     rim: Rim | None = None
+    middle: tuple[tuple[Span, Array], ...] = ()
 
     @property
     def spans(self) -> tuple[tuple[Span, Array], ...]:
         """Each span that is seen, with its direction (3,), surface axes."""
         up = () if self.higher is None else ((self.higher, np.array([0.0, 0.0, 1.0])),)
-        return up if self.rim is None else (*up, self.rim)
+        return (*up, *(() if self.rim is None else (self.rim,)), *self.middle)
 
 
 def higher_about(seen: PointHeights, at: Array, rocks: float = 0.0) -> Span | None:
@@ -115,10 +122,7 @@ def seen_rim(
         end = _drawn_end(faces, at + (low + 0.5 * BAND_M) * along, ways[0])
         if end is not None:
             band = (aside >= low) & (aside < low + BAND_M) & (out > end + STRETCH_M[0]) & (out < end + STRETCH_M[1])
-            index, feet = faces.feet(at + beside[band], STRETCH_M[1])
-            higher = (at + beside[band][index] - feet.points) @ upward
-            level = (higher > LEVEL_M[0]) & (higher < LEVEL_M[1])
-            told += _ends(np.sort(out[band][index][level] - end))
+            told += _ends(np.sort(out[band][_level(faces, at + beside[band], at, upward)] - end))
     if len(told) < LEAST_BANDS:
         return None
     last, beyond = map(float, np.median(told, axis=0))
@@ -126,6 +130,91 @@ def seen_rim(
         return None
     hidden = not (out[np.abs(aside) < NEAR_M] > PAST_M).any() or _hidden(faces.samples - at, upward)
     return Rim(Span(last - BLUR_M, max(beyond + BLUR_M, 0.0 if hidden else -np.inf)), lies.rotation @ ways[0])
+
+
+def seen_middle(
+    cloud: Cloud, base_from_surface: pin.SE3, lies: pin.SE3, *, faces: NominalSurface, at: Array, axis: Array
+) -> tuple[tuple[Span, Array], ...]:
+    """How far aside the middle of a hole or a pin lies, in two directions (3,) square to its `axis` (3,) and to each
+    other, surface axes; as `seen_rim`. `at` (3,) m is drawn in the middle of a hole's mouth or of a pin's top.
+
+    Nothing where no rim is drawn about it, where something rises over it, and where too little of its rim shows.
+    """
+    base_from_part, upward = base_from_surface * lies, lies.rotation[2]
+    along = axis / np.linalg.norm(axis)
+    if abs(along @ upward) < 0.5 or _hidden(faces.samples - at, upward):
+        return ()
+    one = np.cross(along, np.eye(3)[int(np.argmin(np.abs(along)))])
+    ways = np.array([one, np.cross(along, one)]) / np.linalg.norm(one)
+    places = (cloud.points[cloud.valid] - base_from_part.translation) @ base_from_part.rotation
+    flat = (places - at) @ ways.T
+    turn = np.arctan2(flat[:, 1], flat[:, 0])
+    rows, ends = [], []
+    for angle in 2.0 * np.pi * np.arange(SECTORS) / SECTORS:
+        side = np.array([np.cos(angle), np.sin(angle)])
+        beside = np.abs(np.angle(np.exp(1j * (turn - angle)))) < np.pi / SECTORS
+        if (end := _end_in_sector(faces, places[beside], at, side @ ways, upward)) is not None:
+            rows.append([*side, 1.0])
+            ends.append(end)
+    if len(rows) < LEAST_SECTORS:
+        return ()
+    # One that is wider moves its rim apart, and not its middle.
+    aside = np.linalg.lstsq(np.array(rows), np.array([0.5 * sum(end) for end in ends]))[0][:2]
+    half = float(np.mean([0.5 * (most - least) for least, most in ends]))
+    return tuple(
+        (Span(float(by) - half, float(by) + half), lies.rotation @ way) for by, way in zip(aside, ways, strict=True)
+    )
+
+
+def _end_in_sector(
+    faces: NominalSurface, places: Array, at: Array, way: Array, upward: Array
+) -> tuple[float, float] | None:
+    """Between how much farther along `way` (3,) than drawn, m, the rim about `at` lies by the points (n, 3) there."""
+    if (drawn := _drawn_radius(faces, at, way)) is None:
+        return None
+    radius, outward = drawn
+    flat = (places - at) - np.outer((places - at) @ upward, upward)
+    out, most = outward * (np.linalg.norm(flat, axis=1) - radius), STRETCH_M[1]
+    if outward < 0.0:
+        most = min(most, radius)
+    near = (out > STRETCH_M[0]) & (out < most)
+    # A mouth or a top is level: what lies deeper is a floor, or what the pin stands on.
+    level = _level(faces, places[near], at + radius * way, upward, slope=0.0)
+    ends = _ends(np.sort(out[near][level]))
+    if not ends or ends[0][1] > most:
+        return None
+    least, beyond = ends[0][0] - BLUR_M, ends[0][1] + BLUR_M
+    return (least, beyond) if outward > 0.0 else (-beyond, -least)
+
+
+def _level(
+    faces: NominalSurface, places: Array, rim: Array, upward: Array, *, slope: float = STEEP
+) -> NDArray[np.bool_]:
+    """Which of the points (n, 3), part frame, lie on the face that ends at the `rim` (3,): not on its side, nor on a
+    face below it, to which it does not fall off by this `slope`."""
+    index, feet = faces.feet(places, STRETCH_M[1])
+    higher, beside = (places[index] - feet.points) @ upward, feet.points - rim
+    below = -beside @ upward
+    far = np.linalg.norm(beside + np.outer(below, upward), axis=1)
+    level = np.zeros(len(places), dtype=np.bool_)
+    level[index] = (higher > LEVEL_M[0]) & (higher < LEVEL_M[1]) & (below < LEVEL_M[1] + slope * far)
+    return level
+
+
+def _drawn_radius(faces: NominalSurface, at: Array, way: Array) -> tuple[float, float] | None:
+    """How far from `at` along `way` (3,) a hole or a pin's top ends in the faces, m, and 1 for a pin, -1 for a hole;
+    None where neither is drawn there."""
+    out = np.arange(0.0, WIDE_M, STEP_M)
+    places = at + np.outer(out, way)
+    _, feet = faces.feet(places)
+    on_face = np.linalg.norm(feet.points - places, axis=1) < BLUR_M
+    changes = np.flatnonzero(on_face != on_face[0])
+    if not len(changes):
+        return None
+    # Seen from beside it the nearest point of the faces is on the rim, a little sooner than it counts as off them.
+    beside, outward = (changes[0], 1.0) if on_face[0] else (changes[0] - 1, -1.0)
+    radius = float((feet.points[beside] - at) @ way)
+    return (radius, outward) if radius > NARROW_M else None
 
 
 def _drawn_end(faces: NominalSurface, at: Array, outward: Array) -> float | None:

@@ -20,7 +20,7 @@ from cell.motion.collision import tool_bodies
 from cell.motion.kinematics import JointLimits
 from cell.motion.trajectory import PointSpeed, carried_points, plan_joint
 from cell.procedures.arm.moves import Mover
-from cell.run.report.page.lanes import Span, idle, spans
+from cell.run.report.page.lanes import Activity, activities, idle
 
 MOVED = ("vehicle", "arm")
 """Devices of which the least time is told: what else is done takes as long as the job or a device's limits have it."""
@@ -35,7 +35,7 @@ def cycle(job: str, seed: int, level: str, done: Callable[[str], None]) -> dict[
         for name in ("cold", "repeated"):
             run = cell.run(job=job)
             done(f"{name}: {run.outcome}")
-            result[name] = {"outcome": run.outcome, **told(spans(run.folder), float(run.report["cell_s"]), limits)}
+            result[name] = {"outcome": run.outcome, **told(activities(run.folder), float(run.report["cell_s"]), limits)}
     return result
 
 
@@ -55,29 +55,31 @@ class LeastTimes:
         points = PointSpeed(mover.kinematics, carried_points(tool), config.arm.max_tool_speed)
         return cls(mover.kinematics.limits, points, job.approach.speed)
 
-    def __call__(self, span: Span) -> float:
+    def __call__(self, activity: Activity) -> float:
         """In s; of a device whose states are not told, what it took."""
-        if span.first is None or span.last is None:
-            return span.end - span.begin
-        if span.device == "vehicle":
-            (x, y), (there_x, there_y) = (np.array([state["x"], state["y"]]) for state in (span.first, span.last))
+        if activity.first is None or activity.last is None:
+            return activity.end - activity.begin
+        if activity.device == "vehicle":
+            (x, y), (there_x, there_y) = (
+                np.array([state["x"], state["y"]]) for state in (activity.first, activity.last)
+            )
             return math.hypot(there_x - x, there_y - y) / self.vehicle_speed
-        start, end = (np.array(state["joints"], dtype=np.float64) for state in (span.first, span.last))
+        start, end = (np.array(state["joints"], dtype=np.float64) for state in (activity.first, activity.last))
         return plan_joint(start, end, self.joints, points=self.points).duration
 
 
-def told(found: Sequence[Span], length: float, least: Callable[[Span], float]) -> dict[str, object]:
-    """What the `found` spans of a run of `length` s add up to, and each of the motions beside its least time."""
+def told(found: Sequence[Activity], length: float, least: Callable[[Activity], float]) -> dict[str, object]:
+    """What the `found` activities of a run of `length` s add up to, and each of the motions beside its least time."""
     motions = [
         {
-            "device": span.device, "from_s": round(span.begin, 2), "lasts_s": round(span.end - span.begin, 2),
-            "least_s": round(least(span), 2),
-            "meanwhile": ", ".join(dict.fromkeys(other.device for other in found if _beside(span, other))),
+            "device": activity.device, "from_s": round(activity.begin, 2),
+            "lasts_s": round(activity.end - activity.begin, 2), "least_s": round(least(activity), 2),
+            "meanwhile": ", ".join(dict.fromkeys(other.device for other in found if _beside(activity, other))),
         }
-        for span in sorted(found, key=lambda one: one.begin)
-        if span.device in MOVED
+        for activity in sorted(found, key=lambda one: one.begin)
+        if activity.device in MOVED
     ]  # fmt: skip
-    lit = sum(span.end - span.begin for span in found if span.device == "laser")
+    lit = sum(activity.end - activity.begin for activity in found if activity.device == "laser")
     lasts, leasts = (sum(float(str(one[key])) for one in motions) for key in ("lasts_s", "least_s"))
     return {
         "length_s": round(length, 2),
@@ -90,5 +92,5 @@ def told(found: Sequence[Span], length: float, least: Callable[[Span], float]) -
     }
 
 
-def _beside(span: Span, other: Span) -> bool:
-    return other.device != span.device and min(span.end, other.end) - max(span.begin, other.begin) > 0.05
+def _beside(activity: Activity, other: Activity) -> bool:
+    return other.device != activity.device and min(activity.end, other.end) - max(activity.begin, other.begin) > 0.05

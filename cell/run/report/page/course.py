@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cell.run.folder import Report, list_runs, read_report
-from cell.run.report.page.lanes import Span, idle, spans
+from cell.run.report.page.lanes import Activity, activities, idle
 from drivers.errors import CellError
 from statemachine.journal import JournalError, JournalRecord, read
 
@@ -48,7 +48,7 @@ class Timeline:
     marks: tuple[TimelineMark, ...]
     length: float
     clock: str
-    spans: tuple[Span, ...] = ()
+    activities: tuple[Activity, ...] = ()
 
     @property
     def steps(self) -> list[str]:
@@ -58,12 +58,12 @@ class Timeline:
     @property
     def devices(self) -> list[str]:
         """Names of the devices that did something, in their order."""
-        return list(dict.fromkeys(span.device for span in self.spans))
+        return list(dict.fromkeys(activity.device for activity in self.activities))
 
     @property
     def idle_s(self) -> float:
         """How long nothing moved, was lit or took pictures, s."""
-        return sum(end - begin for begin, end in idle(self.spans, self.length))
+        return sum(end - begin for begin, end in idle(self.activities, self.length))
 
     @property
     def ticks(self) -> list[float]:
@@ -86,8 +86,8 @@ def timeline(folder: Path, report: Report) -> Timeline | None:
     course = _virtual(record, report) if report.get("clock") == "virtual" else _wall(record, report)
     # The record's time begins with the first step.
     first = min(bar.begin for bar in course.bars)
-    moved = [one._replace(begin=one.begin + first, end=one.end + first) for one in spans(folder)]
-    return replace(course, spans=tuple(one for one in moved if first <= one.begin < one.end <= course.length))
+    moved = [one._replace(begin=one.begin + first, end=one.end + first) for one in activities(folder)]
+    return replace(course, activities=tuple(one for one in moved if first <= one.begin < one.end <= course.length))
 
 
 def _wall(record: JournalRecord, report: Report) -> Timeline:

@@ -33,7 +33,7 @@ SHORTEST_S = 0.02
 State: TypeAlias = Mapping[str, object]
 
 
-class Span(NamedTuple):
+class Activity(NamedTuple):
     """A device was busy from `begin` to `end`, s since the first step began. `first` and `last` are its states then."""
 
     device: str
@@ -56,28 +56,18 @@ class _Told:
     state: State
 
 
-def spans(folder: Path) -> list[Span]:
+def activities(folder: Path) -> list[Activity]:
     """What the devices did in the run in `folder`, in the order of the devices and of the time; empty where no record
     tells it."""
     if missing() or not (folder / FILE).is_file():
         return []
-    told: dict[str, list[_Told]] = {}
-    begun: float | None = None
-    topics = tuple(f"/{device}/" for device in LANES)
     try:
-        for topic, at, message in messages(folder / FILE, ("/sequence/event", *topics)):
-            if begun is None and topic == "/sequence/event" and message["kind"] == "step_started":
-                begun = 1e-9 * at
-            elif isinstance(message, dict):
-                told.setdefault(topic, []).append(_Told(1e-9 * at, message))
+        begun, told = _read(folder / FILE)
     except (CellError, KeyError):
         return []
-    if begun is None:
-        return []
-    found: list[Span] = []
+    found: list[Activity] = []
     for device in LANES:
-        states, commands = (told.get(f"/{device}/{what}", []) for what in ("state", "command"))
-        frames = told.get(f"/{device}/frame", [])
+        states, commands, frames = (told.get(f"/{device}/{what}", []) for what in ("state", "command", "frame"))
         if device in CAMERAS:
             found += _looks(device, frames)
         elif device in ("laser", "claw"):
@@ -89,28 +79,40 @@ def spans(folder: Path) -> list[Span]:
     return [one._replace(begin=one.begin - begun, end=one.end - begun) for one in found]
 
 
-def idle(busy: Iterable[Span], length: float) -> list[tuple[float, float]]:
+def _read(record: Path) -> tuple[float, dict[str, list[_Told]]]:
+    """When the first step began, s, and what was told from then on, by topic; nothing where none began."""
+    told: dict[str, list[_Told]] = {}
+    begun: float | None = None
+    for topic, at, message in messages(record, ("/sequence/event", *(f"/{device}/" for device in LANES))):
+        if begun is None and topic == "/sequence/event" and message["kind"] == "step_started":
+            begun = 1e-9 * at
+        elif isinstance(message, dict):
+            told.setdefault(topic, []).append(_Told(1e-9 * at, message))
+    return (0.0, {}) if begun is None else (begun, told)
+
+
+def idle(busy: Iterable[Activity], length: float) -> list[tuple[float, float]]:
     """From when to when, s, no device moves, is lit or takes pictures, in a run of `length` s."""
     gaps, until = list[tuple[float, float]](), 0.0
-    for span in sorted(busy, key=lambda one: one.begin):
-        if span.begin > until:
-            gaps.append((until, span.begin))
-        until = max(until, span.end)
+    for activity in sorted(busy, key=lambda one: one.begin):
+        if activity.begin > until:
+            gaps.append((until, activity.begin))
+        until = max(until, activity.end)
     return [*gaps, (until, length)] if length > until else gaps
 
 
-def _moves(device: str, states: Sequence[_Told], moving: Callable[[State], bool]) -> list[Span]:
+def _moves(device: str, states: Sequence[_Told], moving: Callable[[State], bool]) -> list[Activity]:
     """Of a device whose states come all the time: from the last state at rest to the next one."""
-    found: list[Span] = []
+    found: list[Activity] = []
     begun: _Told | None = None
     for before, now in pairwise(sorted(states, key=lambda told: told.at)):
         if moving(now.state):
             begun = begun or before
         elif begun is not None:
-            found.append(Span(device, begun.at, before.at, first=begun.state, last=before.state))
+            found.append(Activity(device, begun.at, before.at, first=begun.state, last=before.state))
             begun = None
     if begun is not None:
-        found.append(Span(device, begun.at, now.at, first=begun.state, last=now.state))
+        found.append(Activity(device, begun.at, now.at, first=begun.state, last=now.state))
     return found
 
 
@@ -128,11 +130,11 @@ def _vehicle_moves(state: State) -> bool:
     return max(abs(_number(state, name)) for name in ("speed", "yaw_rate")) > MOVING
 
 
-def _rail_moves(states: Sequence[_Told], commands: Sequence[_Told]) -> list[Span]:
+def _rail_moves(states: Sequence[_Told], commands: Sequence[_Told]) -> list[Activity]:
     """From each command until its way is done, or something newer is told: at rest the rail is asked now and then."""
     sent = [one for one in commands if one.state.get("name") in ("home", "move_to", "sweep")]
     rests = [one.at for one in states if "homed" in one.state]
-    found: list[Span] = []
+    found: list[Activity] = []
     stands = 0.0
     for k, command in enumerate(sent):
         given = command.state.get("arguments")
@@ -142,32 +144,32 @@ def _rail_moves(states: Sequence[_Told], commands: Sequence[_Told]) -> list[Span
         longest = abs(goal - stands) / (_number(given, "speed") or RAIL_M_S) + (SHORTEST_S if goal else SWITCH_S)
         newer = [at for at in rests if at > command.at + SHORTEST_S][:1] + [one.at for one in sent[k + 1 : k + 2]]
         until = min(newer, default=command.at + longest)
-        found.append(Span("rail", command.at, until if "stop" in given else min(until, command.at + longest)))
+        found.append(Activity("rail", command.at, until if "stop" in given else min(until, command.at + longest)))
         stands = goal
     return found
 
 
-def _looks(device: str, frames: Sequence[_Told]) -> list[Span]:
-    found: list[Span] = []
+def _looks(device: str, frames: Sequence[_Told]) -> list[Activity]:
+    found: list[Activity] = []
     for frame in frames:
         if found and frame.at - found[-1].end < APART_S:
             found[-1] = found[-1]._replace(end=frame.at, pictures=found[-1].pictures + 1)
         else:
-            found.append(Span(device, frame.at, frame.at + SHORTEST_S, pictures=1))
+            found.append(Activity(device, frame.at, frame.at + SHORTEST_S, pictures=1))
     return found
 
 
-def _switched(device: str, commands: Sequence[_Told]) -> list[Span]:
+def _switched(device: str, commands: Sequence[_Told]) -> list[Activity]:
     """The laser from each time it is lit until it is off; of a claw each command."""
     if device == "claw":
-        return [Span(device, command.at, command.at + SHORTEST_S) for command in commands]
-    found: list[Span] = []
+        return [Activity(device, command.at, command.at + SHORTEST_S) for command in commands]
+    found: list[Activity] = []
     lit: float | None = None
     for command in commands:
         on = command.state.get("name") == "lit"
         if on and lit is None:
             lit = command.at
         elif not on and lit is not None:
-            found.append(Span(device, lit, command.at))
+            found.append(Activity(device, lit, command.at))
             lit = None
     return found

@@ -92,6 +92,11 @@ def test_what_the_points_about_a_feature_say_by_themselves_counts_where_the_draw
     assert "the part is off its drawing there by 0.15 mm" in flat.words
     assert flat.as_dict()["own_higher_mm"] == [-0.25, -0.15] and flat.as_dict()["own_farther_mm"] is None
     assert of("hole", (0, 0, 1), LocalDeviation(worn)).bound == 0.0, "along its direction nothing counts"
+    # A hole along z: its middle lies .3 to .5 mm aside along x, and may lie where it is drawn along y.
+    aside = ((Span(0.3e-3, 0.5e-3), np.array([1.0, 0.0, 0.0])), (inside, np.array([0.0, 1.0, 0.0])))
+    hole = of("hole", (0, 0, 1), LocalDeviation(middle=aside))
+    assert hole.off == pytest.approx(0.3e-3) and hole.bound == pytest.approx(0.5e-3) and hole.asked
+    assert hole.as_dict()["own_aside_mm"] == [[0.3, 0.5], [-0.05, 0.05]] and not hole.measured.kept
     lower, own = still + 0.2e-3 * np.eye(6)[2], LocalDeviation(worn)
     unsure = FeatureSeen.of(feature("flat", (0, 0, 1)), here, here, motions=lower, percent=PERCENT, own=own)
     assert unsure.own_off == 0.0 and unsure.asked, "the part may lie as much lower"

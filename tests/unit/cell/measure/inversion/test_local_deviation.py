@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.flush import heights_over
-from cell.measure.inversion.local_deviation import BLUR_M, LocalDeviation, Span, higher_about, seen_rim
+from cell.measure.inversion.local_deviation import BLUR_M, LocalDeviation, Span, higher_about, seen_middle, seen_rim
 from cell.measure.reconstruction import Cloud
 from tests.unit.cell.measure.inversion.test_flush import BELONGS, HALF, THICK, TOP, swept
 from tests.unit.cell.measure.inversion.test_registration import TRUE, scanned
@@ -144,3 +144,82 @@ def test_a_vehicle_that_rocks_hides_as_much_of_a_height() -> None:
     still, rocked = (about(MIDDLE, cloud, rocks=rocks).higher for rocks in (0.0, 0.1e-3))
     assert still is not None and rocked is not None
     assert rocked.most == pytest.approx(still.most + 0.2e-3) and rocked.least == pytest.approx(still.least - 0.2e-3)
+
+
+# --- holes and pins ---
+
+RADIUS, PLACE = 4e-3, np.array([6e-3, -3e-3])
+
+
+def ring(inner: float, height: float, top: bool) -> NominalSurface:
+    """A plate about a circle at `PLACE`, `height` lower than it, m; with the circle itself where there is a `top`."""
+    turns = np.linspace(0.0, 2.0 * np.pi, 97)[:-1]
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    # From the middle to the plate's sides, as far as they are in each direction.
+    sides = np.sign(circle) * [HALF, 0.018] - PLACE
+    reach = np.min(sides / np.where(np.abs(circle) < 1e-9, 1e-9 * np.sign(sides), circle), axis=1)
+    rings = [PLACE + circle * inner, PLACE + circle * reach[:, None]]
+    plate = np.vstack([np.column_stack([one, np.full(96, -height)]) for one in rings])
+    pairs = [(k, (k + 1) % 96) for k in range(96)]
+    faces = [[k, n, 96 + k] for k, n in pairs] + [[n, 96 + n, 96 + k] for k, n in pairs]
+    if top:
+        plate = np.vstack([plate, np.column_stack([rings[0], np.zeros(96)]), [[*PLACE, 0.0]]])
+        faces += [[192 + k, 192 + (k + 1) % 96, 288] for k in range(96)]
+    return NominalSurface(plate, faces)
+
+
+def pierced(x: Array, y: Array, *, by: tuple[float, float] = (0.0, 0.0), wider: float = 0.0) -> Array:
+    """A plate with a hole through it that lies aside `by` so much, m, and is `wider` in its radius."""
+    away = np.hypot(x - PLACE[0] - by[0], y - PLACE[1] - by[1])
+    return np.where((np.abs(x) < HALF) & (away > RADIUS + wider), THICK, 0.0)
+
+
+def pinned(x: Array, y: Array, *, by: tuple[float, float] = (0.0, 0.0), wider: float = 0.0) -> Array:
+    """The same with a pin of 3 mm."""
+    away = np.hypot(x - PLACE[0] - by[0], y - PLACE[1] - by[1])
+    return np.where(np.abs(x) < HALF, np.where(away < RADIUS + wider, THICK, THICK - 3e-3), 0.0)
+
+
+HOLE, PIN = ring(RADIUS, 0.0, False), ring(RADIUS, 3e-3, True)
+KINDS = [(pierced, HOLE), (pinned, PIN)]
+
+
+def middle(cloud: Cloud, faces: NominalSurface, at: tuple[float, float, float] = (*PLACE, 0.0)) -> list[Span]:
+    """What shows along x and along y."""
+    found = seen_middle(cloud, TRUE, BELONGS, faces=faces, at=np.array(at), axis=np.array([0.0, 0.0, 1.0]))
+    order = {int(np.argmax(np.abs(way))): (span, float(way[np.argmax(np.abs(way))])) for span, way in found}
+    assert all(abs(sign) == pytest.approx(1.0) for _, sign in order.values())
+    return [Span(*sorted((sign * span.least, sign * span.most))) for _, (span, sign) in sorted(order.items())]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(("drawn", "faces"), KINDS, ids=["hole", "pin"])
+def test_a_hole_and_a_pin_as_drawn_lie_in_their_place(drawn: partial[Array], faces: NominalSurface, seed: int) -> None:
+    shift = 0.0015 + 0.1 * seed * LINES_M, -0.001 + 0.1 * seed * ROWS_M
+    spans = middle(scanned(drawn, seed, shift=shift), faces)
+    assert len(spans) == 2
+    for span in spans:
+        assert span.off == 0.0 and span.most - span.least < 2.0 * BLUR_M + 1.3 * LINES_M
+
+
+@pytest.mark.parametrize("by", [(0.8e-3, 0.0), (0.0, -0.8e-3)])
+@pytest.mark.parametrize(("drawn", "faces"), KINDS, ids=["hole", "pin"])
+def test_one_that_lies_aside_is_told_so_and_one_that_is_wider_is_not(
+    drawn: partial[Array], faces: NominalSurface, by: tuple[float, float]
+) -> None:
+    spans = middle(scanned(partial(drawn, by=by), 5), faces)
+    for span, true in zip(spans, by, strict=True):
+        assert span.least < true < span.most
+        assert np.sign(span.off) == np.sign(true) and abs(true) <= abs(span.off) + span.more
+    assert [span.off for span in middle(scanned(partial(drawn, wider=0.5e-3), 5), faces)] == [0.0, 0.0]
+
+
+def test_where_no_hole_is_drawn_or_too_little_of_it_shows_nothing_is_told() -> None:
+    cloud = scanned(pierced, 5)
+    assert middle(cloud, TOP) == [], "the plate goes on"
+    assert middle(cloud, HOLE, (-0.012, 0.0, 0.0)) == [], "the rim is too far away"
+    half = ((cloud.points - TRUE.translation) @ TRUE.rotation)[..., 0] > PLACE[0]
+    assert middle(replace(cloud, points=np.where(half[..., None], np.nan, cloud.points)), HOLE) == []
+    tower = np.array([[12, -6, 12], [14, -6, 12], [14, 2, 12], [12, 2, 12]]) * 1e-3
+    beside = NominalSurface(np.concatenate([HOLE.vertices, tower]), [*HOLE.triangles, [192, 193, 194], [192, 194, 195]])
+    assert middle(cloud, beside) == [], "something rises over it"

@@ -99,7 +99,8 @@ def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(
         "refusal.placed", "truth.seen_error.translation_mm", "truth.seen_error.rotation_mrad",
         *(f"verify.{key}" for key in (
             "off_mm", "unsure_mm", "shift_mm", "turn_mrad", "sigma_mm", "sigma_mrad", "points", "beside", "unseen",
-            "before_mm", "came_mm", "came_mrad", "features", "features.own_farther_mm", "features.own_higher_mm",
+            "before_mm", "came_mm", "came_mrad", "features", "features.own_aside_mm", "features.own_farther_mm",
+            "features.own_higher_mm",
             "gap", "gap.least_mm", "gap.median_mm", "gap.largest_mm", "gap.seen",
             "flush", "flush.least_mm", "flush.median_mm", "flush.largest_mm", "flush.seen",
         )),

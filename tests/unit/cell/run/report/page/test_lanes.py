@@ -8,20 +8,20 @@ from pathlib import Path
 import pytest
 
 from cell.run.record.file import RecordFile
-from cell.run.report.page.lanes import RAIL_M_S, SWITCH_S, Span, idle, spans
+from cell.run.report.page.lanes import RAIL_M_S, SWITCH_S, Activity, activities, idle
 from lab.bench.job.whole_job import JobRecord
 
 BEGUN = 100.0
 
 
-def recorded(folder: Path, *told: tuple[str, float, dict[str, object]]) -> list[Span]:
-    """What the spans are of messages at these times, s since the first step began."""
+def recorded(folder: Path, *told: tuple[str, float, dict[str, object]]) -> list[Activity]:
+    """What the activities are of messages at these times, s since the first step began."""
     out = RecordFile(folder / "record.mcap", {}, lossless=True)
     begin = ("/sequence/event", 0.0, {"kind": "step_started", "step": "place", "data": {}})
     for topic, at, message in (begin, *told):
         out.put(topic, round(1e9 * (BEGUN + at)), lambda message=message: json.dumps(message).encode())
     out.close()
-    return spans(folder)
+    return activities(folder)
 
 
 def arm(at: float, speed: float) -> tuple[str, float, dict[str, object]]:
@@ -65,7 +65,7 @@ def test_a_laser_is_lit_until_it_is_off_and_pictures_close_together_are_one_look
 
 def test_of_a_whole_job_the_arm_and_the_vehicle_never_move_at_once(placed_pot: JobRecord) -> None:
     assert placed_pot.folder is not None
-    found = spans(placed_pot.folder)
+    found = activities(placed_pot.folder)
     moves = {name: [one for one in found if one.device == name] for name in ("arm", "vehicle", "rail", "laser")}
     assert all(moves.values())
     for one in moves["vehicle"]:
@@ -76,6 +76,6 @@ def test_of_a_whole_job_the_arm_and_the_vehicle_never_move_at_once(placed_pot: J
 
 
 def test_without_a_record_there_are_none(tmp_path: Path) -> None:
-    assert spans(tmp_path) == []
+    assert activities(tmp_path) == []
     (tmp_path / "record.mcap").write_bytes(b"no record")
-    assert spans(tmp_path) == []
+    assert activities(tmp_path) == []
