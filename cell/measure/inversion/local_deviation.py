@@ -170,16 +170,17 @@ def _end_in_sector(
     faces: NominalSurface, places: Array, at: Array, way: Array, upward: Array
 ) -> tuple[float, float] | None:
     """Between how much farther along `way` (3,) than drawn, m, the rim about `at` lies by the points (n, 3) there."""
-    if (drawn := _drawn_radius(faces, at, way)) is None:
+    if (drawn := _drawn_rim(faces, at, way, upward)) is None:
         return None
-    radius, outward = drawn
+    rim, outward = drawn
+    radius = float((rim - at) @ way)
     flat = (places - at) - np.outer((places - at) @ upward, upward)
     out, most = outward * (np.linalg.norm(flat, axis=1) - radius), STRETCH_M[1]
     if outward < 0.0:
         most = min(most, radius)
     near = (out > STRETCH_M[0]) & (out < most)
     # A mouth or a top is level: what lies deeper is a floor, or what the pin stands on.
-    level = _level(faces, places[near], at + radius * way, upward, slope=0.0)
+    level = _level(faces, places[near], rim, upward, slope=0.0)
     ends = _ends(np.sort(out[near][level]))
     if not ends or ends[0][1] > most:
         return None
@@ -201,20 +202,23 @@ def _level(
     return level
 
 
-def _drawn_radius(faces: NominalSurface, at: Array, way: Array) -> tuple[float, float] | None:
-    """How far from `at` along `way` (3,) a hole or a pin's top ends in the faces, m, and 1 for a pin, -1 for a hole;
+def _drawn_rim(faces: NominalSurface, at: Array, way: Array, upward: Array) -> tuple[Array, float] | None:
+    """Where along `way` (3,) from `at` a hole or a pin's top ends in the faces, (3,) m, and 1 for a pin, -1 for a hole;
     None where neither is drawn there."""
-    out = np.arange(0.0, WIDE_M, STEP_M)
-    places = at + np.outer(out, way)
+    places = at + np.outer(np.arange(0.0, WIDE_M, STEP_M), way)
     _, feet = faces.feet(places)
-    on_face = np.linalg.norm(feet.points - places, axis=1) < BLUR_M
+    apart = feet.points - places
+    up = apart @ upward
+    aside = np.linalg.norm(apart - np.outer(up, upward), axis=1)
+    # The face about a mouth need not be level: above one that is inclined, the nearest point of it lies aside.
+    on_face = (np.abs(up) < LEVEL_M[1]) & (aside < BLUR_M + STEEP * np.abs(up))
     changes = np.flatnonzero(on_face != on_face[0])
     if not len(changes):
         return None
-    # Seen from beside it the nearest point of the faces is on the rim, a little sooner than it counts as off them.
+    # Seen from beside it the nearest point of the faces is on the rim.
     beside, outward = (changes[0], 1.0) if on_face[0] else (changes[0] - 1, -1.0)
-    radius = float((feet.points[beside] - at) @ way)
-    return (radius, outward) if radius > NARROW_M else None
+    rim = feet.points[beside]
+    return (rim, outward) if (rim - at) @ way > NARROW_M else None
 
 
 def _drawn_end(faces: NominalSurface, at: Array, outward: Array) -> float | None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pinocchio as pin
@@ -17,9 +19,12 @@ from cell.config.cell_config import load_config
 from cell.config.job import FeatureSection, PartSection, load_job
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion.local_deviation import LocalDeviation, Rim, Span
-from cell.procedures.part_features import FeatureSeen, counting
+from cell.procedures.part_features import FeatureSeen, by_themselves, counting
 from drivers.errors import ConfigError
 from lab.bench.job.part_jobs import job_with_part
+from tests.unit.cell.measure.inversion.test_flush import BELONGS
+from tests.unit.cell.measure.inversion.test_local_deviation import HOLE, PLACE, pierced
+from tests.unit.cell.measure.inversion.test_registration import TRUE, scanned
 
 PERCENT = 99.9
 
@@ -106,6 +111,21 @@ def test_what_the_points_about_a_feature_say_by_themselves_counts_where_the_draw
     edge = of("edge", (0, 1, 0), LocalDeviation(worn, Rim(Span(0.4e-3, 0.6e-3), np.array([1.0, 0.0, 0.0]))))
     assert edge.off == pytest.approx(np.hypot(0.15e-3, 0.4e-3)) and edge.bound == pytest.approx(edge.off + 0.3e-3)
     assert not edge.measured.kept and edge.as_dict()["own_farther_mm"] == [0.4, 0.6]
+
+
+def test_each_kind_of_feature_is_asked_for_what_its_points_tell() -> None:
+    """A plate with a hole that lies .8 mm aside."""
+    at = tuple(f"{1e3 * value} mm" for value in (*PLACE, 0.0))
+    named = (feature("hole", (0, 0, 1), at), feature("edge", (0, 1, 0), ("20 mm", "0 mm", "0 mm")))
+    named = tuple(one.model_copy(update={"name": one.kind}) for one in named)
+    job = SimpleNamespace(part=SimpleNamespace(feature=named))
+    seen = SimpleNamespace(base_from_surface=TRUE, surface_from_part=BELONGS, rocked=0.0)
+    found = by_themselves(job, scanned(partial(pierced, by=(0.8e-3, 0.0)), 5), seen, HOLE)  # type: ignore[arg-type]
+    assert found["hole"].rim is None and len(found["hole"].middle) == 2
+    assert max(abs(span.off) for span, _ in found["hole"].middle) > 0.5e-3
+    assert found["edge"].middle == () and found["edge"].rim is not None and found["edge"].rim.farther.off == 0.0
+    job.part = None
+    assert by_themselves(job, None, seen, HOLE) == {}  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -214,6 +214,18 @@ def test_one_that_lies_aside_is_told_so_and_one_that_is_wider_is_not(
     assert [span.off for span in middle(scanned(partial(drawn, wider=0.5e-3), 5), faces)] == [0.0, 0.0]
 
 
+@pytest.mark.parametrize("by", [0.0, 0.8e-3])
+def test_the_face_about_a_hole_may_be_inclined(by: float) -> None:
+    slope = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.25, 0.0, 1.0]])
+    inclined = NominalSurface(HOLE.vertices @ slope.T, HOLE.triangles)
+
+    def height(x: Array, y: Array) -> Array:
+        return np.where(pierced(x, y, by=(by, 0.0)) > 0.0, THICK + 0.25 * x, 0.0)
+
+    spans = middle(scanned(height, 5), inclined, (*PLACE, 0.25 * PLACE[0]))
+    assert spans[0].least < by < spans[0].most and np.sign(spans[0].off) == np.sign(by) and spans[1].off == 0.0
+
+
 def test_where_no_hole_is_drawn_or_too_little_of_it_shows_nothing_is_told() -> None:
     cloud = scanned(pierced, 5)
     assert middle(cloud, TOP) == [], "the plate goes on"
