@@ -122,7 +122,11 @@ def seen_rim(
         end = _drawn_end(faces, at + (low + 0.5 * BAND_M) * along, ways[0])
         if end is not None:
             band = (aside >= low) & (aside < low + BAND_M) & (out > end + STRETCH_M[0]) & (out < end + STRETCH_M[1])
-            told += _ends(np.sort(out[band][_level(faces, at + beside[band], at, upward)] - end))
+            places = at + beside[band]
+            ends = _ends(np.sort(out[band][_level(faces, places, at, upward)] - end))
+            # Where the sweep sees what is below the face there is none of it.
+            gone = not ends and _seen_below(faces, places[out[band] < end - PAST_M], upward)
+            told += [(STRETCH_M[0], STRETCH_M[0])] if gone else ends
     if len(told) < LEAST_BANDS:
         return None
     last, beyond = map(float, np.median(told, axis=0))
@@ -200,6 +204,12 @@ def _level(
     level = np.zeros(len(places), dtype=np.bool_)
     level[index] = (higher > LEVEL_M[0]) & (higher < LEVEL_M[1]) & (below < LEVEL_M[1] + slope * far)
     return level
+
+
+def _seen_below(faces: NominalSurface, places: Array, upward: Array) -> bool:
+    """Whether enough of the points (n, 3), part frame, lie far below the drawn face."""
+    _, feet = faces.feet(places)
+    return int(((feet.points - places) @ upward > LEVEL_M[1]).sum()) > 2
 
 
 def _drawn_rim(faces: NominalSurface, at: Array, way: Array, upward: Array) -> tuple[Array, float] | None:

@@ -79,6 +79,15 @@ def test_a_part_that_was_cut_or_grew_ends_so_much_sooner_or_later(right: float) 
     assert rim(LEFT, ends(right)).off == 0.0
 
 
+def test_an_end_that_is_cut_off_farther_than_is_looked_is_gone() -> None:
+    found = rim(RIGHT, ends(-9e-3))
+    assert found.most < -5e-3 and found.off == found.most
+    # Where the sweep shows nothing at all, nobody knows.
+    cloud = ends(-9e-3)
+    over = ((cloud.points - TRUE.translation) @ TRUE.rotation)[..., 0] > HALF - 9e-3
+    assert about(RIGHT, replace(cloud, points=np.where(over[..., None], np.nan, cloud.points)), ACROSS).rim is None
+
+
 def test_an_edge_at_an_angle_to_the_lines_is_looked_for_square_to_itself() -> None:
     turn = pin.exp3(np.array([0.0, 0.0, 0.5]))
     square = NominalSurface(np.array([[-8, -8, 0], [8, -8, 0], [8, 8, 0], [-8, 8, 0]]) * 1e-3 @ turn.T, TOP.triangles)
