@@ -15,6 +15,7 @@ from cell.measure.inversion.flush import Flush
 from cell.measure.inversion.local_deviation import LocalDeviation
 from cell.measure.inversion.mating import MatingGap
 from cell.measure.inversion.part_pose import PartPose, of_part
+from cell.measure.inversion.whole_face import MOST_UNLIKE, FacePatch
 from cell.procedures.part_error import draws_of
 from cell.procedures.part_features import NOT_SEEN, FeatureSeen
 from drivers.errors import Measured, MisplacedError
@@ -31,6 +32,7 @@ NO_FLUSH = "how flush its edge is was not seen: no surface shows near it, or a v
 BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 OFF_DRAWING = "the part itself is not as drawn there: bent, worn, cut, or another one"
+COVERED = "something was left on the part: look at its face"
 WHOLE = "where the {} {} lies follows from the part as a whole: nobody looked at it by itself"
 LIKELY = {
     "raised": "it lies on something, or is another part: look under it",
@@ -50,8 +52,8 @@ class PlacedPart:
     nothing scanned lies below. `flush` is how its edge stands over the surface; None where nothing of that shows beside
     it. `before` is how far off, m, it lay before each correction. `came` is how it came to lie when it was first put
     down, had nothing been allowed for, `slips` how it moved in each correction as the claw opened (`GraspSeries`).
-    `named` are the features that the job names, `own` what the points about them say by themselves, by name.
-    `axes` says, for people, whose axes the figures are in.
+    `named` are the features that the job names, `own` what the points about them say by themselves, by name. `unlike`
+    is what of its face is not there, or covered. `axes` says, for people, whose axes the figures are in.
     """
 
     seen: PartPose
@@ -67,6 +69,7 @@ class PlacedPart:
     slips: tuple[pin.SE3, ...] = ()
     named: tuple[FeatureSection, ...] = ()
     own: Mapping[str, LocalDeviation] = field(default_factory=dict)
+    unlike: FacePatch | None = None
     axes: str = "the surface's axes"
 
     @classmethod
@@ -205,12 +208,16 @@ class PlacedPart:
         """What it is judged by, beside its limits: as a whole, along its edge where that shows, and each feature."""
         most = 1e3 * place.tolerance
         flush = () if self.flush is None else (Measured(FLUSH, self.flush.beyond, "mm", most=most),)
+        face = () if self.unlike is None else (
+            Measured("placed part's face, not there or covered", 1e6 * self.unlike.area, "mm²", most=1e6 * MOST_UNLIKE),
+        )  # fmt: skip
         return (
             Measured("placed part off its place, stated bound", self.bound["d"], "mm", most=most),
             Measured(
                 "placed part turned, stated bound", 1e3 * self.turn_bound, "mrad", most=1e3 * place.tolerance_angle
             ),
             *flush,
+            *face,
             *(feature.measured for feature in self.features),
         )
 
@@ -226,6 +233,9 @@ class PlacedPart:
         out = "".join(f". Out of tolerance: {each.words}" for each in failed)
         made = off.kept and turned.kept and any(each.not_as_drawn for each in failed)
         likely = BENT if bent else OFF_DRAWING if made else self.likely
+        if self.unlike is not None:
+            out += f". {self.unlike.words}"
+            likely = OFF_DRAWING if self.unlike.gone else COVERED
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
         return MisplacedError(
@@ -276,6 +286,7 @@ class PlacedPart:
             "gap": None if self.gap is None else self.gap.as_dict(),
             "flush": None if self.flush is None else self.flush.as_dict(),
             "features": [feature.as_dict() for feature in self.features],
+            "unlike": None if self.unlike is None else self.unlike.as_dict(),
             "before_mm": [round(1e3 * off, 4) for off in self.before],
         }  # fmt: skip
 

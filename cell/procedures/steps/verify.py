@@ -14,6 +14,7 @@ from cell.measure.inversion.effects.between_sweeps import GATE_M, LEAST_MOTION_M
 from cell.measure.inversion.flush import flush_along_edge
 from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
+from cell.measure.inversion.whole_face import unlike_patch
 from cell.measure.reconstruction import Cloud, write_cloud
 from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import FARTHEST_M, expected_residual
@@ -132,7 +133,9 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         lies=seen.surface_from_part, tolerance=place.tolerance, rocks=seen.rocked,
     )  # fmt: skip
     found = PlacedPart.of(here.job, seen, part_points(here.nominal), stated)
-    return replace(found, gap=gap, flush=flush, own=by_themselves(here.job, cloud, found.seen, faces))
+    unlike = unlike_patch(cloud, seen.base_from_surface, found.seen.surface_from_part, faces)
+    own = by_themselves(here.job, cloud, found.seen, faces)
+    return replace(found, gap=gap, flush=flush, own=own, unlike=unlike)
 
 
 def swept_part(

@@ -12,6 +12,7 @@ from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion import invert_pose as register
 from cell.measure.inversion.effects.between_sweeps import PartOnGround
 from cell.measure.inversion.part_pose import DEMANDS, SHIFTED, PartPose, parted
+from cell.measure.inversion.whole_face import unlike_patch
 from cell.measure.reconstruction import Cloud
 from cell.procedures.part_error import part_points
 from cell.procedures.part_features import by_themselves
@@ -41,7 +42,8 @@ def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
     seen = PartPose(pin.SE3.Identity(), fit.base_from_surface, fit.covariance, fit, beside=fit.n_points)
     found = PlacedPart.of(job, seen, part_points(here.nominal), stated)
     own = by_themselves(job, swept[0], found.seen, here.nominal)
-    found = replace(found, own=own, axes="axes of the arm base, in its nest")
+    unlike = unlike_patch(swept[0], pin.SE3.Identity(), found.seen.surface_from_part, here.nominal)
+    found = replace(found, own=own, unlike=unlike, axes="axes of the arm base, in its nest")
     for note in found.notes:
         context.note(text=f"in its nest: {note}")
     if not found.in_tolerance(job.place):

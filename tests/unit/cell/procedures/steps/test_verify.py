@@ -19,7 +19,7 @@ from cell.config.job import FeatureSection, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, from_parts, transform
 from cell.measure.inversion import NominalSurface
-from cell.procedures.placed_part import LIKELY, NO_FLUSH, OFF_DRAWING, PlacedPart
+from cell.procedures.placed_part import COVERED, LIKELY, NO_FLUSH, OFF_DRAWING, PlacedPart
 from cell.procedures.steps.kinds import PLACE, kind_of
 from cell.procedures.steps.verify import CLOUD
 from cell.run.record.replay import replay
@@ -227,6 +227,34 @@ def test_a_part_that_is_not_as_drawn_about_its_features_is_told_though_it_lies_i
     for out in ("edge front is 0.2", "flat top is 0.4", OFF_DRAWING):
         assert out in str(told.value)
     assert str(told.value).count("Out of tolerance") == 2
+
+
+@pytest.mark.parametrize("covered", [False, True])
+def test_a_part_of_which_a_piece_broke_off_or_that_is_covered_is_told_though_the_rest_lies_in_its_place(
+    placed_pot: JobRecord, tmp_path: Path, covered: bool
+) -> None:
+    """The job names no feature: a robust fit passes over a corner of 10 mm, and over what lies there."""
+
+    def other(cell: VirtualCell) -> None:
+        [item] = cell.world._items
+        drawn = item.station.part_seen
+        assert drawn is not None
+        corners, triangles = trimesh.remesh.subdivide_to_size(drawn.vertices, drawn.triangles, 1e-3)
+        middle = corners[triangles].mean(axis=1)
+        there = (middle[:, 2] > 0.012) & (middle[:, 0] > 5e-3) & (middle[:, 1] > 5e-3)
+        if covered:
+            corners = corners + np.isin(np.arange(len(corners)), triangles[there])[:, None] * [0.0, 0.0, 4e-3]
+        else:
+            triangles = triangles[~there]
+        cell.world._items = [replace(item, station=replace(item.station, part_seen=Mesh(corners, triangles)))]
+
+    with pytest.raises(MisplacedError, match=r"lies 0.\d\d ± 0.0\d mm off") as told:
+        LyingPart(placed_pot, tmp_path, changed=other).looked(pin.SE3.Identity())
+    assert (COVERED if covered else OFF_DRAWING) in str(told.value), str(told.value)
+    assert re.search(r"\d+ mm² of its face about \(\d+, \d+, \d+\) mm in its own frame is", str(told.value))
+    assert [number.name for number in told.value.numbers if not number.kept] == [
+        "placed part's face, not there or covered"
+    ]
 
 
 def test_another_part_or_none_is_not_found(placed_pot: JobRecord, tmp_path: Path) -> None:

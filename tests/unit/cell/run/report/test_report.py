@@ -100,7 +100,7 @@ def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(
         *(f"verify.{key}" for key in (
             "off_mm", "unsure_mm", "shift_mm", "turn_mrad", "sigma_mm", "sigma_mrad", "points", "beside", "unseen",
             "before_mm", "came_mm", "came_mrad", "features", "features.own_aside_mm", "features.own_farther_mm",
-            "features.own_higher_mm",
+            "features.own_higher_mm", "unlike", "unlike.at_mm", "unlike.gone", "unlike.mm2",
             "gap", "gap.least_mm", "gap.median_mm", "gap.largest_mm", "gap.seen",
             "flush", "flush.least_mm", "flush.median_mm", "flush.largest_mm", "flush.seen",
         )),
