@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 
@@ -228,14 +228,10 @@ class PlacedPart:
     def misplaced(self, place: PlaceSection, more: str = "") -> MisplacedError:
         """The error of a part that is not known to lie within the place's tolerances."""
         measured = off, turned, *_ = self.measured(place)
-        bent = off.kept and turned.kept and any(number.name == FLUSH and not number.kept for number in measured)
         failed = [each for each in self.features if not each.measured.kept]
         out = "".join(f". Out of tolerance: {each.words}" for each in failed)
-        made = off.kept and turned.kept and any(each.not_as_drawn for each in failed)
-        likely = BENT if bent else OFF_DRAWING if made else self.likely
-        if self.unlike is not None:
-            out += f". {self.unlike.words}"
-            likely = OFF_DRAWING if self.unlike.gone else COVERED
+        out += "" if self.unlike is None else f". {self.unlike.words}"
+        likely = self._cause(measured, failed)
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
         return MisplacedError(
@@ -245,6 +241,17 @@ class PlacedPart:
             f"{more}{more and '. '}{NEXT_STEP}",
             *measured,
         ).showing(seen={"placed": self})  # fmt: skip
+
+    def _cause(self, measured: Sequence[Measured], failed: Sequence[FeatureSeen]) -> str:
+        """What has most likely happened to a part that was `measured` so, and of which these features failed."""
+        off, turned, *_ = measured
+        if self.unlike is not None:
+            return OFF_DRAWING if self.unlike.gone else COVERED
+        if off.kept and turned.kept and any(number.name == FLUSH and not number.kept for number in measured):
+            return BENT
+        if off.kept and turned.kept and any(each.not_as_drawn for each in failed):
+            return OFF_DRAWING
+        return self.likely
 
     @property
     def notes(self) -> tuple[str, ...]:
