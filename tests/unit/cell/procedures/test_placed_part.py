@@ -178,7 +178,7 @@ def test_its_figures_are_those_of_its_points() -> None:
         "off_mm": pytest.approx(1e3 * mean, abs=1e-4), "unsure_mm": round(1e3 * found.unsure, 4),
         "shift_mm": pytest.approx((1e3 * apart.mean(axis=0)).tolist(), abs=1e-4),
         "turn_mrad": pytest.approx([1.0, -2.0, 3.0], abs=1e-4), "sigma_mm": [0.02] * 3, "sigma_mrad": [1.0] * 3,
-        "points": 1000, "beside": 900, "unseen": [], "gap": None, "flush": None, "features": [],
+        "points": 1000, "beside": 900, "unseen": [], "gap": None, "flush": None, "features": [], "unlike": None,
             "before_mm": [0.9, 0.7],
     }  # fmt: skip
     assert found.words == f"{1e3 * mean:.2f} ± {1e3 * found.unsure:.2f} mm off"
