@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -48,7 +47,7 @@ def make_well(virtual: VirtualCell) -> None:
 
 
 class Computer:
-    """The computer of the cell: its disk may be full, its clock be set. Inside its context; afterwards all is as before.
+    """The computer of the cell: its disk may be full, its clock be set; only inside its context.
 
     A full disk is the process's limit of a file's size: nothing that is written makes a file longer.
     """

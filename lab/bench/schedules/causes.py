@@ -25,12 +25,13 @@ CAUSES = {
     "surface_moved": r"moved|surface|touch|contact|where it|observable|edge|found|points|lies|standing|claw lost",
     "part_taken": r"claw|part|nest|hold|grip|nothing|placed",
     "full_disk": r"disk|written|recorded|too large|I/O",
+    "resume": r"where the vehicle stands is not known",
     "clock_step": r"clock|calibration.*(old|age|date)|future",
 }
-"""By act: what a reason may say that this has caused."""
+"""By act, and by a resume, which finds the vehicle anywhere: what a reason may say that this has caused."""
 NATURAL = {
     "nominal": r"$^",
-    "workshop": r"observable|calibrat|agree|explain|fits|rocking|sway|creep|known|sigma|tolerance|apart|gloss|points|edge",
+    "workshop": r"observable|calibrat|agree|explain|fits|rock|sway|creep|known|sigma|tolerance|apart|points|edge",
 }
 """By level: what a reason may say in a cell to which nothing was done."""
 UNRESUMABLE = (

@@ -1,4 +1,4 @@
-"""One schedule on one virtual cell: the product's own runs, what happens to them, and the judge that looks at all of it.
+"""One schedule on one virtual cell: the product's own runs, what happens to them, and the judge of it.
 
 Everything happens in the thread of the run, after a tick of the virtual clock or where the run tells an event, so the
 same schedule takes the same course. People ask through the journal, as another process would.
@@ -79,6 +79,13 @@ class _Session(Cell):
         return super().begin(kind, heard, observer, stops)
 
 
+class _OneWorld(VirtualCell):
+    """A cell whose station nobody sets up anew for a resumed run: it finds the part where the run before left it."""
+
+    def make_ready(self, described: Described) -> None:
+        """All was ready when the world was drawn."""
+
+
 def configuration(folder: Path) -> CellConfig:
     """The cell as it ships, of a folder of its own."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -106,11 +113,12 @@ class Day:
         self._config = configuration(folder)
         shutil.copytree(calibrations, folder / self._config.cell.calibrations, dirs_exist_ok=True)
         self._job = load_job(schedule.job)[0]
-        self._virtual = VirtualCell(self._config, schedule.seed, schedule.level, Described.of(schedule.job))
+        self._virtual = _OneWorld(self._config, schedule.seed, schedule.level, Described.of(schedule.job))
         self._clock = self._virtual.clock
         home = PartState.first(self._job).value
         self.oracle = Oracle(self._virtual.world, self._virtual.scan_camera.model, schedule.level, home)
         self._computer = Computer()
+        self._start = self._planar()
         self._waiting = list(schedule.entries)
         self._pauses: list[Entry] = []
         self._met: list[tuple[str, str]] = []
@@ -144,6 +152,10 @@ class Day:
             raise self._failure
         return DayRecord(self._schedule, tuple(ends), tuple(met), tuple(self.oracle.violations))
 
+    def _planar(self) -> tuple[float, float, float]:
+        """Where the vehicle truly stands."""
+        return self._virtual.world.vehicle.planar(self._clock.now())
+
     def _rung(self, call: Callable[[], None]) -> AbstractContextManager[None]:
         """Inside this context `call` is called after each tick."""
 
@@ -168,9 +180,10 @@ class Day:
                 if before is None:
                     outcome = cell.run(self._schedule.job, at_start=True)
                 else:
-                    # The world goes on: the vehicle stands where the run before left it, and nobody gives his word.
+                    # The world goes on: the vehicle stands where the run before left it.
                     cell.whereabouts.forget_word()
-                    outcome = cell.resume(before.name)
+                    self.oracle.did("resume")
+                    outcome = cell.resume(before.name, at_start=self._planar() == self._start)
             except CellError as error:
                 if before is not None and self._run is None:
                     self.oracle.unresumed(str(error), self._torn(before))
@@ -186,12 +199,12 @@ class Day:
             # What a process would have written after its death is not there.
             self._left.restore()
             return self._left.act, "", outcome.folder
-        bound = outcome.report.get("place_bound_95") or {}
+        bound, nest = outcome.report.get("place_bound_95") or {}, self._job.nest
+        place = nest if self._job.unloads and nest is not None else self._job.place
         self.oracle.ended(
             RunEnd(
                 outcome.outcome, outcome.reason, self._told_of_part(outcome.folder),
-                tolerance=self._job.nest.tolerance if self._job.unloads and self._job.nest else self._job.place.tolerance,
-                bound=1e-3 * bound["d"] if "d" in bound else None,
+                tolerance=place.tolerance, bound=1e-3 * bound["d"] if "d" in bound else None,
             )
         )  # fmt: skip
         return outcome.outcome, outcome.reason, outcome.folder if outcome.outcome in ("aborted", "faulted") else None

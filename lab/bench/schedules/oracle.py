@@ -194,7 +194,9 @@ class Oracle:
         if told == "unknown" or self.taken:
             return
         if held != (told == "held"):
-            self.broken("journal", f"it tells that the part is {told}; in truth the claw holds {'it' if held else 'none'}")
+            self.broken(
+                "journal", f"it tells that the part is {told}; in truth the claw holds {'it' if held else 'none'}"
+            )
 
     def _judge_place(self, end: RunEnd) -> None:
         if self.world.part.held:
