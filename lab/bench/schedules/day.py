@@ -27,7 +27,7 @@ from cell.run.session.supervisor import Cell
 from drivers.errors import CellError
 from lab.bench.schedules.acts import Computer, LeftRun, do_to_world, make_well
 from lab.bench.schedules.oracle import Oracle, RunEnd, Violation
-from lab.bench.schedules.schedule import WORLD_ACTS, Entry, Schedule
+from lab.bench.schedules.schedule import CLAW, WORLD_ACTS, Entry, Schedule
 from statemachine.journal import JournalError, read, request
 from statemachine.step import Event, Observer
 
@@ -234,10 +234,10 @@ class Day:
             run.abort(f"the day itself failed: {error}")
 
     def _hear(self, run: Run[object], event: Event) -> None:
-        if self._cut is not None and event.kind != "progress":
-            self._leave(run, self._cut)
         if self._left is None:
             self._follow(run, event)
+        if self._cut is not None and event.kind != "progress":
+            self._leave(run, self._cut)
         if event.kind == "run_ended":
             self.oracle.stopped()
 
@@ -254,6 +254,9 @@ class Day:
             case "step_done":
                 for entry in [entry for entry in self._waiting if entry.step == step and entry.act != "late_word"]:
                     self._do(run, entry)
+            case "note" if event.data.get("part") == PartState.UNKNOWN.value:
+                self._begun[CLAW] = self._clock.now()
+                self._look()
             case "paused":
                 held, self._pauses = self._pauses, []
                 self._hold(run, held)

@@ -6,6 +6,7 @@ told to the oracle is only what people did, when a run ended, and with which wor
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,12 +24,14 @@ LIMIT_S = 0.5
 """Seconds after an end from which on nothing may move or shine."""
 DROP_M = 1.5e-3
 """A part falls at most so far when it is let go."""
-UNSEEN_S = 1.0
-"""The laser is on at most so long without an exposure of the scan camera."""
+UNSEEN_S = 2.5
+"""The laser is on at most so long without an exposure of the scan camera: its silence is noticed after 2 s."""
 MOST_FORCE_N = 60.0
 """Between part and place: what the fast part of a descent ends at, and its way to brake."""
 FINGERS_N = 1.0
 """An empty claw touches nothing harder."""
+BLIND_S = 15.0
+"""For so long before the part is let go the surface is looked at no more: what is moved then, nobody can know."""
 CROWDED = 20
 """So many violations are enough."""
 
@@ -78,6 +81,10 @@ class Oracle:
     """How often the present part was let go."""
     taken: bool = False
     """Whether a person has taken the part away."""
+    blind: bool = False
+    """Whether something was moved too late to be seen before the part was let go."""
+    unseen: float = -math.inf
+    """When something was moved last that only a look shows."""
     _ended: float | None = None
     _held: Pose | None = None
     _part: PartContact | None = None
@@ -141,6 +148,7 @@ class Oracle:
         elif self._held is not None and not self.taken:
             before, self._held = self._held, None
             self.released += 1
+            self.blind = self.world.clock.now() - self.unseen < BLIND_S
             drop = float(before[2, 3] - pose[2, 3])
             if abs(drop) > DROP_M:
                 self.broken("let go in the air", f"the part fell {1e3 * drop:.2f} mm")
@@ -150,6 +158,8 @@ class Oracle:
     def did(self, act: str) -> None:
         """Something was done to the cell by its surroundings."""
         self.acts.append(act)
+        if act in ("vehicle_bumped", "surface_moved"):
+            self.unseen = self.world.clock.now()
         if act == "part_taken":
             self.taken = True
 
@@ -203,6 +213,8 @@ class Oracle:
             self.broken("placed", "the claw still holds the part")
             return
         off = self.part_off()
+        if self.blind:
+            return
         if off > end.tolerance:
             self.broken("placed", f"the part lies {1e3 * off:.2f} mm off, tolerance {1e3 * end.tolerance:.2f} mm")
         if end.bound is not None and off > 2.0 * end.bound:

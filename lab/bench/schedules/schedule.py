@@ -20,9 +20,11 @@ ACTS = (*PERSON_ACTS, *WORLD_ACTS, *COMPUTER_ACTS)
 MEANWHILE = ("", *WORLD_ACTS, "arm.protective_stop", "arm.emergency_stop", "vehicle.emergency_stop")
 """What may happen while a run is held, or waits for a person."""
 
+CLAW = "claw"
+"""The time in which the claw opens or closes on a part, from its note in the journal on; an instant like a step."""
 LASTS_S = {
-    "": 90.0, "drive_to_target": 15.0, "board_photo": 1.3, "laser_sweep": 14.0, "reconstruct": 0.1, "invert_pose": 0.1,
-    "place": 18.0, "verify": 15.0, "pick": 12.0, "pick_nest": 20.0, "set_down": 12.0, "verify_nest": 15.0,
+    "": 90.0, CLAW: 0.5, "drive_to_target": 15.0, "board_photo": 1.3, "laser_sweep": 14.0, "reconstruct": 0.1,
+    "invert_pose": 0.1, "place": 18.0, "verify": 15.0, "pick": 12.0, "pick_nest": 20.0, "set_down": 12.0, "verify_nest": 15.0,
 }  # fmt: skip
 """About how long each step lasts, s of the cell; "" is the whole run."""
 AMOUNTS: dict[str, Callable[[np.random.Generator], float]] = {
@@ -100,7 +102,7 @@ def draw(
     rng = np.random.default_rng([seed, 26])
     job, steps = jobs[int(rng.integers(len(jobs)))]
     level, world = str(rng.choice(list(levels))), int(rng.choice(list(seeds)))
-    places = [(step, act) for step in ("", *steps) for act in (*FAULTS, *ACTS)]
+    places = [(step, act) for step in ("", CLAW, *steps) for act in (*FAULTS, *ACTS)]
     weights = np.array([wanted(*place) for place in places])
     count = min(int(rng.integers(1, 5)), len(places))
     chosen = rng.choice(len(places), size=count, replace=False, p=weights / weights.sum())

@@ -80,7 +80,7 @@ def test_a_laser_that_shines_for_nobody(cell: VirtualCell, oracle: Oracle) -> No
     cell.arm.set_digital_output(LASER, True)
     cell.clock.sleep(0.5)
     assert rules(oracle) == set()
-    cell.clock.sleep(1.0)
+    cell.clock.sleep(2.5)
     assert rules(oracle) == {"laser"}
 
 
@@ -193,3 +193,11 @@ def test_a_part_that_lies_beside_its_place(
     assert oracle.part_off() == pytest.approx(off, rel=1e-6)
     oracle.ended(end("placed", part="released", bound=bound))
     assert rules(oracle) == broken
+
+
+@pytest.mark.parametrize("act", ["rail.reset", "surface_moved"])
+def test_what_is_pushed_as_the_part_comes_down_is_nobodys_fault(cell: VirtualCell, oracle: Oracle, act: str) -> None:
+    oracle.did(act)
+    cell.arm.set_digital_output(CLAW, False)
+    oracle.ended(end("placed", part="released"))
+    assert ("placed" in rules(oracle)) is (act == "rail.reset")
