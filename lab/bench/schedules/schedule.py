@@ -24,7 +24,8 @@ CLAW = "claw"
 """The time in which the claw opens or closes on a part, from its note in the journal on; an instant like a step."""
 LASTS_S = {
     "": 90.0, CLAW: 0.5, "drive_to_target": 15.0, "board_photo": 1.3, "laser_sweep": 14.0, "reconstruct": 0.1,
-    "invert_pose": 0.1, "place": 18.0, "verify": 15.0, "pick": 12.0, "pick_nest": 20.0, "set_down": 12.0, "verify_nest": 15.0,
+    "invert_pose": 0.1, "place": 18.0, "verify": 15.0, "pick": 12.0, "pick_nest": 20.0, "set_down": 12.0,
+    "verify_nest": 15.0,
 }  # fmt: skip
 """About how long each step lasts, s of the cell; "" is the whole run."""
 AMOUNTS: dict[str, Callable[[np.random.Generator], float]] = {
