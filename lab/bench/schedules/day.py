@@ -210,9 +210,7 @@ class Day:
         return outcome.outcome, outcome.reason, outcome.folder if outcome.outcome in ("aborted", "faulted") else None
 
     def _told_of_part(self, folder: Path) -> str | None:
-        """What the journal tells last of the part; "unknown" of one that could not be written to its end."""
-        if self._torn(folder):
-            return PartState.UNKNOWN.value
+        """What the journal tells last of the part."""
         return next((str(e.data["part"]) for e in reversed(read(folder).events) if "part" in e.data), None)
 
     def _torn(self, folder: Path) -> bool:

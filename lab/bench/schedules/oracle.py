@@ -201,6 +201,8 @@ class Oracle:
 
     def _judge_part(self, end: RunEnd) -> None:
         told, held = end.part or self.home, self.world.part.held
+        if end.outcome == "placed" and told == "unknown":
+            self.broken("journal", "it does not tell what has become of the part that was placed")
         if told == "unknown" or self.taken:
             return
         if held != (told == "held"):
