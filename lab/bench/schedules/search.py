@@ -55,6 +55,8 @@ def campaign(
         drawn = [draw(first_seed + n, drawn_of, levels, seeds, partial(_wanted, reached)) for n in numbers]
         records += days(drawn, stored, workers, told)
     broken = [(record.schedule, record.violations[0]) for record in records if record.violations]
+    for schedule, violation in broken:
+        told(f"schedules; to be shrunk: {violation}; {command(schedule)}", len(records), count)
     smallest = _each([(_shrink, *each, stored) for each in broken], workers, partial(told, "shrunk"))
     return {**summary(records, drawn_of), "violations": smallest}
 

@@ -9,7 +9,7 @@ from lab.bench.schedules.schedule import Entry, Schedule
 
 Breaks = Callable[[Schedule], bool]
 """Whether a schedule breaks the rule that is looked for."""
-MOST_TRIES = 40
+MOST_TRIES = 20
 
 
 def shrunk(schedule: Schedule, breaks: Breaks, tries: int = MOST_TRIES) -> Schedule:
