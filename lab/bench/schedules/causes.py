@@ -34,11 +34,6 @@ NATURAL = {
     "workshop": r"observable|calibrat|agree|explain|fits|rock|sway|creep|known|sigma|tolerance|apart|points|edge",
 }
 """By level: what a reason may say in a cell to which nothing was done."""
-UNRESUMABLE = (
-    r"has ended|put its part down already|releasing or gripping|cannot be resumed|is not known|was resumed already|"
-    r"tells of its part"
-)
-"""What a run that cannot be resumed is refused with."""
 
 
 def named(reason: str, acts: Iterable[str], level: str) -> bool:

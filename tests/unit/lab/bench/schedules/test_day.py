@@ -49,7 +49,7 @@ def test_what_breaks_a_rule_is_shrunk_to_what_it_takes() -> None:
         return any(entry.act == "kill" and entry.share >= 0.2 for entry in schedule.entries)
 
     entries = Entry("abort"), Entry("kill", "place", 0.9, 8.0, "part_taken"), Entry("rail.reset")
-    smallest = shrunk(Schedule("pot", 1, "workshop", entries), breaks)
+    smallest = shrunk(Schedule("pot", 1, "workshop", entries), breaks, tries=40)
     assert smallest == Schedule("pot", 1, "nominal", (Entry("kill", "place", 0.23, 1.0),))
     assert len(asked) < 40
 
