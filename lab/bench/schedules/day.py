@@ -210,8 +210,10 @@ class Day:
         return outcome.outcome, outcome.reason, outcome.folder if outcome.outcome in ("aborted", "faulted") else None
 
     def _told_of_part(self, folder: Path) -> str | None:
-        """What the journal tells last of the part."""
-        return next((str(e.data["part"]) for e in reversed(read(folder).events) if "part" in e.data), None)
+        """What the journal tells last of the part; a resumed run may begin with it in the claw."""
+        record = read(folder)
+        begun = PartState.HELD.value if "held" in record.run.info else None
+        return next((str(e.data["part"]) for e in reversed(record.events) if "part" in e.data), begun)
 
     def _torn(self, folder: Path) -> bool:
         """Whether the journal may lack something: it is damaged, or the disk was full."""

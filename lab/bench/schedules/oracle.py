@@ -174,7 +174,7 @@ class Oracle:
 
     def resumed(self) -> None:
         """A run is resumed that was cut short: what it has done is not to be done again."""
-        if self.put_down and self.home != "in its nest" and not self.taken:
+        if self.put_down and not self.taken:
             self.broken("done twice", "a run is resumed whose part was put down already")
 
     def unresumed(self, reason: str, torn: bool) -> None:
