@@ -30,6 +30,8 @@ MOST_FORCE_N = 60.0
 """Between part and place: what the fast part of a descent ends at, and its way to brake."""
 FINGERS_N = 1.0
 """An empty claw touches nothing harder."""
+SWITCHING_S = 0.8
+"""After so long it is known what has become of a part that the claw opened or closed on."""
 BLIND_S = 15.0
 """For so long before the part is let go the surface is looked at no more: what is moved then, nobody can know."""
 CROWDED = 20
@@ -81,6 +83,8 @@ class Oracle:
     """How often the present part was let go."""
     taken: bool = False
     """Whether a person has taken the part away."""
+    switched: float = -math.inf
+    """When the claw took or let go the part last."""
     blind: bool = False
     """Whether something was moved too late to be seen before the part was let go."""
     unseen: float = -math.inf
@@ -143,6 +147,8 @@ class Oracle:
         if part is not self._part:
             self._part, self._held, self.released, self.taken = part, None, 0, False
         pose = part.part_pose(world_from_flange)
+        if part.held is not (self._held is not None):
+            self.switched = self.world.clock.now()
         if part.held:
             self._held = pose
         elif self._held is not None and not self.taken:
@@ -182,6 +188,9 @@ class Oracle:
         untouched = self.released == 0 and self.world.part.untouched and not self.taken
         if untouched and not torn and "releasing or gripping" not in reason:
             self.broken("forgotten", f"nothing was done with the part, and the run is not resumed: {reason}")
+        long_ago = self._ended is not None and self._ended - self.switched > SWITCHING_S
+        if long_ago and not torn and "releasing or gripping" in reason:
+            self.broken("journal", f"the claw has switched more than {SWITCHING_S} s before the end: {reason}")
 
     def stopped(self) -> None:
         """A run has come to its end: `tick` looks what still moves."""

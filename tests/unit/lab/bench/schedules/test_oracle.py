@@ -158,6 +158,18 @@ def test_a_run_with_its_part_in_the_claw_that_is_not_resumed(oracle: Oracle) -> 
     assert rules(oracle) == {"forgotten"}
 
 
+def test_a_journal_that_lags_behind_the_claw(cell: VirtualCell, oracle: Oracle) -> None:
+    cell.arm.set_digital_output(CLAW, False)
+    oracle.violations.clear()
+    oracle.stopped()
+    oracle.unresumed("it ended while the claw was releasing or gripping its part", torn=False)
+    assert rules(oracle) == set()
+    cell.clock.sleep(1.0)
+    oracle.stopped()
+    oracle.unresumed("it ended while the claw was releasing or gripping its part", torn=False)
+    assert rules(oracle) == {"journal"}
+
+
 def test_a_journal_that_tells_otherwise_than_the_world(oracle: Oracle) -> None:
     oracle.did("abort")
     for part in (None, "held", "unknown"):
