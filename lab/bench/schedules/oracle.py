@@ -90,6 +90,7 @@ class Oracle:
     unseen: float = -math.inf
     """When something was moved last that only a look shows."""
     _ended: float | None = None
+    _cut: float = -math.inf
     _held: Pose | None = None
     _part: PartContact | None = None
     _exposures: int = 0
@@ -188,13 +189,12 @@ class Oracle:
         untouched = self.released == 0 and self.world.part.untouched and not self.taken
         if untouched and not torn and "releasing or gripping" not in reason:
             self.broken("forgotten", f"nothing was done with the part, and the run is not resumed: {reason}")
-        long_ago = self._ended is not None and self._ended - self.switched > SWITCHING_S
-        if long_ago and not torn and "releasing or gripping" in reason:
+        if self._cut - self.switched > SWITCHING_S and not torn and "releasing or gripping" in reason:
             self.broken("journal", f"the claw has switched more than {SWITCHING_S} s before the end: {reason}")
 
     def stopped(self) -> None:
         """A run has come to its end: `tick` looks what still moves."""
-        self._ended = self.world.clock.now()
+        self._ended = self._cut = self.world.clock.now()
 
     def ended(self, end: RunEnd) -> None:
         """How a run ended in its own words."""

@@ -166,6 +166,7 @@ def test_a_journal_that_lags_behind_the_claw(cell: VirtualCell, oracle: Oracle) 
     assert rules(oracle) == set()
     cell.clock.sleep(1.0)
     oracle.stopped()
+    oracle.begun()
     oracle.unresumed("it ended while the claw was releasing or gripping its part", torn=False)
     assert rules(oracle) == {"journal"}
 
