@@ -31,7 +31,7 @@ CAUSES = {
 """By act, and by a resume, which finds the vehicle anywhere: what a reason may say that this has caused."""
 NATURAL = {
     "nominal": r"$^",
-    "workshop": r"moved|observable|calibrat|agree|explain|fits|rock|sway|creep|known|sigma|tolerance|apart|points|edge",
+    "workshop": r"observable|calibrat|agree|explain|fits|rock|sway|creep|known|sigma|tolerance|apart|points|edge",
 }
 """By level: what a reason may say in a cell to which nothing was done."""
 
