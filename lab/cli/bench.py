@@ -244,6 +244,50 @@ def reconstruction(seed: SeedOption = 1, json: JsonOption = False) -> None:
 
 
 @bench.command()
+def schedules(
+    job: Annotated[list[str] | None, typer.Option("--job", "-j", help="A job; may be repeated.")] = None,
+    level: Annotated[list[Level] | None, typer.Option("--level", help="Of the worlds; may be repeated.")] = None,
+    count: Annotated[int, typer.Option("--count", min=1, max=100_000, help="How many schedules are drawn.")] = 50,
+    first_seed: Annotated[int, typer.Option("--first-seed", min=0, help="The first is drawn from this seed.")] = 1,
+    schedule: Annotated[
+        str | None, typer.Option("--schedule", help="This one as JSON, or a file of them, instead of drawn ones.")
+    ] = None,
+    workers: WorkersOption = 0,
+    json: JsonOption = False,
+) -> None:
+    """Draw schedules of faults and people's acts, run whole jobs by them, and judge them by the world's truth.
+
+    Exit code 1 when a rule was broken; the smallest schedule that breaks it is shown with the command that repeats it.
+    """
+    import tempfile
+    from pathlib import Path
+
+    from drivers.errors import ConfigError
+    from lab.bench.schedules.schedule import Schedule
+    from lab.bench.schedules.search import campaign, repeated
+
+    levels = [each.value for each in level or [Level.nominal]]
+    try:
+        text = Path(schedule).read_text(encoding="utf-8") if schedule and schedule[0] != "{" else schedule or ""
+        given = [Schedule.from_json(line) for line in text.splitlines() if line.strip()]
+    except (ValueError, OSError) as error:
+        raise ConfigError(f"--schedule: {error}") from error
+    with tempfile.TemporaryDirectory(prefix="cell-schedules-") as folder, bar() as told:
+
+        def progress(text: str, done: int, total: int) -> None:
+            told(done, f"{done} of {total} {text}", total)
+
+        if given:
+            result = repeated(given, Path(folder), workers, progress)
+        else:
+            jobs = job or ["pot"]
+            result = campaign(jobs, levels, count, first_seed, folder=Path(folder), workers=workers, told=progress)
+    show(result, json, without=("schedule",))
+    if result["violations"]:
+        raise typer.Exit(1)
+
+
+@bench.command()
 def servo(
     seconds: Annotated[float, typer.Option(min=2.0, max=600.0, help="How long each of the two streams is.")] = 20.0,
     seed: SeedOption = 1,

@@ -210,6 +210,13 @@ class VehicleModel:
                 self._errors |= MOTOR_FAULT
                 self._drivers[0] |= DRIVER_FAULT
 
+    def push(self, t: float, x: float, y: float, yaw: float) -> None:
+        """As when somebody bumps into it: by so many m and rad, wheels and odometry do not turn."""
+        with self._lock:
+            self._advance(t)
+            self._x, self._y, self._yaw = self._x + x, self._y + y, self._yaw + yaw
+            self._history.append(self._t, self._pose())
+
     def clear(self, t: float) -> None:
         """Take away all causes of faults: the emergency stop button is released, motors are well again."""
         with self._lock:

@@ -161,6 +161,14 @@ class World:
         self.scene, self.station = scene, station
         self._set_up(self.collisions.found)
 
+    def slide(self, by: Pose) -> None:
+        """As when a person pushes the surface over its table, with what lies on it: `by` (4, 4) in its own frame."""
+        item = self._items[self._current]
+        pushed = item.scene.world_from_surface @ by
+        item.part.slide(pushed)
+        self._items[self._current] = replace(item, scene=replace(item.scene, world_from_surface=pushed))
+        self._make_current(self.collisions.found)
+
     # --- where things are ---
 
     def world_from_base(self, t: float) -> Pose:

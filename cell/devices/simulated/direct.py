@@ -48,10 +48,14 @@ class VirtualCell(DirectCell):
         self.arm.set_payload(config.arm.payload, np.array(config.arm.payload_centre))
         self.simulated = tuple(DEVICES)
         self.facts = {"simulated": True, "seed": seed, "level": level, "clock": "virtual"}
+        self.devices: Devices = self.connected()
+
+    def connected(self) -> Devices:
+        """The devices as a program finds them that has just connected to them."""
         laser, claw = self._switch("laser", DirectLaser), self._switch("claw", DirectClaw)
-        vehicle = self.vehicle if config.vehicle.DRIVES else connect_one(config, "vehicle", self.clock)
-        self.devices: Devices = behind_gate(
-            config, self.clock, self.arm, rail=self.rail, vehicle=vehicle, scan_camera=self.scan_camera,
+        vehicle = self.vehicle if self._config.vehicle.DRIVES else connect_one(self._config, "vehicle", self.clock)
+        return behind_gate(
+            self._config, self.clock, self.arm, rail=self.rail, vehicle=vehicle, scan_camera=self.scan_camera,
             target_camera=self.target_camera, laser=laser, claw=claw,
         )  # fmt: skip
 

@@ -40,6 +40,8 @@ SETTLING, TIPS = 20, 5e-3
 """Steps in which a part settles, and how far it tilts in one, rad: the ground below it is another one then."""
 _LEAN = 0.015
 """How much higher than drawn, m, a point of a leaning table's surface may be."""
+_TAKEN = 5.0
+"""How far aside, m, a person puts a part that is taken away."""
 _BESIDE, _FLOOR = 1.5 * drawing.TABLE_HALF, 0.1
 """Farther than that, m, from the table's middle the floor is the ground, and what is higher, m, is above it."""
 
@@ -150,6 +152,20 @@ class PartContact:
                 self._grip(world_from_flange)
             elif self._world_from_part is None:
                 self._let_go(self._pose(world_from_flange) @ self.opening)
+
+    def slide(self, world_from_surface: Pose) -> None:
+        """From now on the surface lies there, and what lies on it has gone along; its table stays."""
+        with self._lock:
+            if self._world_from_part is not None and self._base_from_part is None:
+                self._world_from_part = world_from_surface @ self._surface_from_world @ self._world_from_part
+            self._world_from_surface = world_from_surface
+            self._surface_from_world = inverse(world_from_surface)
+
+    def take_away(self) -> None:
+        """A person takes the part, from the claw or from where it lies, and puts it down far away."""
+        with self._lock:
+            self._world_from_part = self._world_from_surface @ drawing.pose((_TAKEN, 0.0, 0.0), (1, 0, 0), (0, 1, 0))
+            self._base_from_part, self._lying = None, False
 
     def _let_go(self, world_from_part: Pose) -> None:
         """The part comes to rest where it is let go: in the nest, with which it rides, where that is below it."""

@@ -21,6 +21,14 @@ def drive(model: VehicleModel, begin: float, end: float, speed: float, yaw_rate:
     model.tick(end)
 
 
+def test_one_that_is_bumped_into_stands_elsewhere_and_its_wheels_do_not_tell() -> None:
+    model = vehicle()
+    model.push(1.0, 0.01, -0.02, 0.003)
+    assert model.planar(1.0) == pytest.approx((-3.04, -0.02, 0.003))
+    assert (model.feedback(1.0).left, model.feedback(1.0).right, model.feedback(1.0).speed) == (0.0, 0.0, 0.0)
+    assert model.world_from_vehicle(1.0)[:2, 3] == pytest.approx((-3.04, -0.02))
+
+
 def test_power_on_is_standby_where_commands_are_ignored() -> None:
     model = vehicle()
     drive(model, 0.0, 2.0, 0.5)

@@ -45,6 +45,20 @@ def test_pressing_the_part_down_is_felt_upward_in_base_axes() -> None:
     assert 5.0 < wrench[2] < 10.0
 
 
+def test_a_surface_that_is_pushed_lies_elsewhere_and_is_touched_there() -> None:
+    world = StandingWorld()
+    before = world.scene.world_from_surface.copy()
+    by = np.eye(4)
+    by[0, 3] = 0.01
+    world.slide(by)
+    assert world.scene.world_from_surface == pytest.approx(before @ by)
+    assert world.part.held
+    pressed = by.copy()
+    pressed[2, 3] = -0.0005
+    there = drawing.inverse(world.base) @ before @ pressed @ drawing.inverse(drawing.FLANGE_FROM_PART)
+    assert 5.0 < world.arm.contact(there)[2] < 10.0
+
+
 def test_the_body_leans_towards_where_the_arm_reaches() -> None:
     world = World(seed=2, level="nominal")
     world.arm.tick(0.5)

@@ -11,14 +11,16 @@ from typing import Any, cast
 
 import pytest
 
+from cell.config.job import load_job
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.steps import kinds
-from cell.procedures.steps.kinds import PLACE, Kind, find_kind
+from cell.procedures.steps.kinds import BUILT_IN, PLACE, Kind, find_kind, kind_of
 from cell.procedures.steps.place import PlaceResult
 from cell.procedures.steps.workplace import JobStep, Workplace
 from drivers.clock import Clock
 from drivers.errors import ConfigError
 from statemachine.runner import StepContext
+from statemachine.sequence import JobState, JobTrigger, Sequence, SequenceError, Transition, TransitionGuard
 from statemachine.step import Step
 
 
@@ -119,3 +121,73 @@ def test_a_kind_that_ends_the_program_as_it_is_loaded_is_refused(
     monkeypatch.setattr(kinds, "entry_points", lambda group: installed)
     with pytest.raises(ConfigError, match="ends_the_program:KIND cannot be used: 3"):
         find_kind("ends")
+
+
+ENDS = (JobState.REFUSED, JobState.MISPLACED, JobState.ABORTED, JobState.PLACED, JobState.DONE)
+ALL_KINDS = {**BUILT_IN, "place and verify": kind_of(load_job("shell")[0]), "until": PLACE.until("board_photo")}
+
+
+def allow(sequence: Sequence, row: Transition) -> None:
+    """Make the guard of a transition hold, and nothing else."""
+    facts = sequence.facts
+    match row.guard:
+        case TransitionGuard.DONE:
+            facts.done.add(row.source)
+        case TransitionGuard.RETRIES_LEFT:
+            facts.retries_left = 1
+        case TransitionGuard.RECOVERABLE:
+            facts.recoverable, facts.retries_left, facts.interrupted = True, 1, sequence.steps[0]
+        case TransitionGuard.INTERRUPTED:
+            facts.interrupted = row.target
+        case TransitionGuard.CHOSEN:
+            facts.chosen = row.target
+
+
+def taken(kind: Kind, path: tuple[Transition, ...]) -> Sequence:
+    """The kind's sequence after these transitions, each of which leads where the table says."""
+    sequence = kind.sequence()
+    for row in path:
+        allow(sequence, row)
+        assert sequence.fire(row.trigger) == row.target
+    return sequence
+
+
+def ways(kind: Kind) -> dict[str, tuple[Transition, ...]]:
+    """A way to each state that can be reached, the shortest, along the sequence's own transitions."""
+    found: dict[str, tuple[Transition, ...]] = {JobState.IDLE: ()}
+    waiting: list[str] = [JobState.IDLE]
+    while waiting:
+        state = waiting.pop(0)
+        for row in kind.sequence().table:
+            if row.source == state and row.target not in found:
+                found[row.target] = (*found[state], row)
+                waiting.append(row.target)
+    return found
+
+
+@pytest.mark.parametrize("name", ALL_KINDS)
+def test_of_each_kind_every_transition_is_legal_where_it_stands_and_no_other(name: str) -> None:
+    kind = ALL_KINDS[name]
+    found, rows = ways(kind), kind.sequence().table
+    assert set(found) == {row.source for row in rows}, "a state that nothing leads to"
+    for state, way in found.items():
+        for row in (row for row in rows if row.source == state):
+            taken(kind, (*way, row))
+        for trigger in set(JobTrigger) - {row.trigger for row in rows if row.source == state}:
+            with pytest.raises(SequenceError, match="leads nowhere"):
+                taken(kind, way).fire(trigger)
+
+
+@pytest.mark.parametrize("name", ALL_KINDS)
+def test_of_each_kind_no_state_is_a_dead_end_and_each_can_be_aborted_and_fail(name: str) -> None:
+    kind = ALL_KINDS[name]
+    sequence = kind.sequence()
+    for state, way in ways(kind).items():
+        assert taken(kind, way).fire(JobTrigger.FAULT) == JobState.FAULTED
+        assert taken(kind, way).fire(JobTrigger.ABORT) == JobState.ABORTED
+        reached, before = {state}, set[str]()
+        while reached != before:
+            before = set(reached)
+            outside = (JobTrigger.FAULT, JobTrigger.ABORT)
+            reached |= {row.target for row in sequence.table if row.source in before and row.trigger not in outside}
+        assert state in ENDS or sequence.success in reached, f"from {state} the job cannot be finished"

@@ -115,6 +115,25 @@ def test_released_above_the_surface_the_part_falls_straight_down_onto_it() -> No
     assert part.part_pose(np.eye(4)) == pytest.approx(target, abs=1e-7)
 
 
+def test_a_surface_that_is_pushed_takes_along_what_lies_on_it_and_nothing_that_is_held() -> None:
+    part, target = contact()
+    held = part.part_pose(flange_for(raised(target, dz=0.2)))
+    part.slide(raised(target, dx=0.005))
+    assert part.part_pose(flange_for(raised(target, dz=0.2))) == pytest.approx(held)
+    part.set_claw(False, flange_for(raised(target, dx=0.005)))
+    part.slide(raised(target, dx=0.02))
+    assert part.part_pose(np.eye(4)) == pytest.approx(raised(target, dx=0.02), abs=1e-8)
+
+
+def test_a_part_that_a_person_takes_is_neither_in_the_claw_nor_near() -> None:
+    part, target = contact()
+    part.take_away()
+    assert not part.held and not part.untouched
+    assert np.linalg.norm(part.part_pose(flange_for(target))[:3, 3] - target[:3, 3]) == pytest.approx(5.0)
+    part.set_claw(True, flange_for(target))
+    assert not part.held
+
+
 def test_a_part_that_was_pressed_in_springs_back_to_touch_the_surface() -> None:
     part, target = contact()
     part.set_claw(False, flange_for(raised(target, dz=-0.0004)))

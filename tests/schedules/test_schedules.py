@@ -1,0 +1,39 @@
+"""Kept schedules of faults and people's acts on whole virtual jobs: none breaks a rule, and each ends as it is told to.
+
+`kept.jsonl` has a line for each schedule that once broke a rule, or stands for a kind that matters: `ends` are the
+outcomes of its runs, and `why` says what it is about. `cell bench schedules` finds more.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from lab.bench.schedules.day import perform
+from lab.bench.schedules.schedule import Schedule
+from lab.bench.schedules.search import campaign
+
+KEPT = [json.loads(line) for line in (Path(__file__).parent / "kept.jsonl").read_text(encoding="utf-8").splitlines()]
+
+
+def check(kept: dict[str, Any], calibrations: Path) -> None:
+    record = perform(Schedule.from_json(json.dumps(kept["schedule"])), calibrations)
+    assert [str(violation) for violation in record.violations] == []
+    assert [outcome for outcome, _ in record.ends] == kept["ends"], record.ends
+
+
+@pytest.mark.parametrize(
+    "kept", [pytest.param(k, id=k["why"], marks=[pytest.mark.campaign] if k.get("long") else []) for k in KEPT]
+)
+def test_a_kept_schedule_breaks_no_rule(kept: dict[str, Any], calibrated_folder: Path) -> None:
+    check(kept, calibrated_folder / "calibrations")
+
+
+@pytest.mark.campaign
+def test_drawn_schedules_break_no_rule(tmp_path: Path) -> None:
+    found = campaign(["pot", "load"], ["nominal"], 40, 1000, tmp_path, workers=2, told=lambda *_: None)
+    assert found["violations"] == []
+    assert found["schedules"] == 40
