@@ -18,7 +18,7 @@ from drivers.interfaces import Vector
 
 BAD = ("refused", "misplaced", "faulted", "aborted", "error")
 NEAREST = 5
-"""Placed worlds that are told as the worst, by the figure nearest its limit."""
+"""Figures whose worst world is told."""
 NUMBER = re.compile(r"[-+±]?\d[\d.,]*")
 FEW = 5
 """Values below which a Cpk says nothing."""
@@ -28,7 +28,7 @@ FEW = 5
 class FigureSpread:
     """How a figure of the report lies beside its limit, over the `n` worlds that have it; the limit is the tightest.
 
-    `p95` lies nearer to the limit than 95 % of the values do; `worst` uses most of its limit.
+    `p95` lies nearer to the limit than 95 % of the values do. `worst` uses most of its limit, the share `worst_used`.
     """
 
     name: str
@@ -40,6 +40,7 @@ class FigureSpread:
     sd: float
     p95: float
     worst: float
+    worst_used: float
     worst_seed: int
     cpk: float | None
 
@@ -119,11 +120,12 @@ class JobAnswer:
         shares |= {name: Share(counts[name], len(rows)) for name in BAD if counts[name] or name in BAD[:3]}
         true = [row for row in good if "true_error_max_mm" in row]
         outside = sum(number(row.get("true_error_max_mm")) > number(row.get("tolerance_mm")) for row in true)
+        figures = figures_of(rows)
         covered = [number(row.get("points_covered")) for row in rows if "points_covered" in row]
         return cls(
-            of, level, first, worlds=len(rows), date=date, shares=shares, figures=figures_of(rows), cycle=_cycle(good),
+            of, level, first, worlds=len(rows), date=date, shares=shares, figures=figures, cycle=_cycle(good),
             steps=_steps(good), covered=Share(sum(covered), len(covered)) if covered else None,
-            unnoticed=Share(outside, len(true)), reasons=_reasons(rows), worst=_worst(rows, command),
+            unnoticed=Share(outside, len(true)), reasons=_reasons(rows), worst=_worst(rows, figures, command),
         )  # fmt: skip
 
     @property
@@ -175,7 +177,7 @@ def figures_of(rows: Sequence[Row]) -> list[FigureSpread]:
     for name, end in limited(rows).items():
         values, limits, seeds = values_of(rows, name, end)
         at_least = end == BOUNDS["at least"]
-        near = np.array([used(value, limit, end) for value, limit in zip(values, limits, strict=True)])
+        near = np.array([used(name, value, limit, end) for value, limit in zip(values, limits, strict=True)])
         worst = int(near.argmax())
         words, unit = shown(name)
         found.append(
@@ -184,20 +186,11 @@ def figures_of(rows: Sequence[Row]) -> list[FigureSpread]:
                 limit=float(limits.max() if at_least else limits.min()), n=len(values), mean=float(values.mean()),
                 sd=float(values.std(ddof=1)) if len(values) > 1 else 0.0,
                 p95=float(np.percentile(values, 5) if at_least else np.percentile(np.abs(values), 95)),
-                worst=float(values[worst]), worst_seed=seeds[worst],
+                worst=float(values[worst]), worst_used=float(near[worst]), worst_seed=seeds[worst],
                 cpk=cpk(values.tolist(), limits.tolist(), at_least=at_least) if len(values) >= FEW else None,
             )
         )  # fmt: skip
     return sorted(found, key=lambda figure: np.inf if figure.cpk is None else figure.cpk)
-
-
-def nearest(row: Row) -> tuple[str, float] | None:
-    """The figure of a world that uses most of its limit, and which share of it."""
-    found = [
-        (name, used(number(row.get(name)), number(row.get(name + end)), end))
-        for name, end in limited([row]).items() if name in row
-    ]  # fmt: skip
-    return max(found, key=lambda one: one[1], default=None)
 
 
 def repeat_command(row: Row, job: str, config: str) -> str:
@@ -233,16 +226,16 @@ def _reasons(rows: Sequence[Row]) -> list[WorldReason]:
     return [WorldReason(*why, count=count, seed=first[why]) for why, count in counted.most_common()]
 
 
-def _worst(rows: Sequence[Row], command: Callable[[Row], str]) -> list[WorstWorld]:
-    """Each world that did not place, then those placed ones that came nearest to a limit."""
-    bad = [row for row in rows if row["outcome"] not in GOOD]
-    near = [(row, found) for row in rows if row["outcome"] in GOOD and (found := nearest(row)) is not None]
-    near = sorted(near, key=lambda one: -one[1][1])[:NEAREST]
-    worlds = [(row, nearest(row)) for row in bad] + [(row, found) for row, found in near]
-    return [
-        WorstWorld(
-            int(number(row.get("seed"))), str(row["outcome"]), str(row["reason"]),
-            figure=shown(found[0])[0] if found else "", used=found[1] if found else None, command=command(row),
-        )
-        for row, found in worlds
+def _worst(rows: Sequence[Row], figures: Sequence[FigureSpread], command: Callable[[Row], str]) -> list[WorstWorld]:
+    """Each world that did not place, then the worst one of each of the figures that are nearest to their limits."""
+    bad = [
+        WorstWorld(int(number(row["seed"])), str(row["outcome"]), str(row["reason"]), "", None, command=command(row))
+        for row in rows if row["outcome"] not in GOOD
     ]  # fmt: skip
+    by_seed = {row["seed"]: row for row in rows}
+    for figure in figures[:NEAREST]:
+        row = by_seed[figure.worst_seed]
+        if row["outcome"] in GOOD:
+            told = figure.worst_seed, str(row["outcome"]), ""
+            bad.append(WorstWorld(*told, figure.name, figure.worst_used, command=command(row)))
+    return bad

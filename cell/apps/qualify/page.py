@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from cell.apps.qualify.answer import FigureSpread, JobAnswer, limited, values_of
 from cell.apps.qualify.rows import Row, number, shown
@@ -26,6 +27,8 @@ COLOURS = {
     "placed": "#4d8f4d", "corrected": "#8fbf6f", "refused": "#d0a000", "misplaced": "#c0392b", "faulted": "#c0392b",
     "aborted": "#888888", "error": "#7d3c98",
 }  # fmt: skip
+FAR = 6.0
+"""A limit is drawn up to so many times the largest value."""
 VALUES, LIMIT, DPI = "#2c5f9e", "#c0392b", 110
 
 
@@ -105,11 +108,14 @@ def _histogram(axes: Axes, values: np.ndarray[tuple[int], np.dtype[np.float64]],
         low, high = low - 0.5 * max(abs(low), 1e-3), high + 0.5 * max(abs(high), 1e-3)
     axes.hist(values, bins=min(30, max(8, len(values) // 8)), range=(low, high), color=VALUES)
     limits = [-spread.limit, spread.limit] if spread.bound == "at most" and low < 0 else [spread.limit]
-    span = high - low
     for limit in limits:
-        # A limit far away would squeeze the values into one bar.
-        if low - 3 * span <= limit <= high + 3 * span:
+        # One far away would squeeze the values into one bar; it stands in the title.
+        if abs(limit) <= FAR * max(abs(low), abs(high)):
             axes.axvline(limit, color=LIMIT, linestyle="--", linewidth=1.2)
+    if low >= 0 and spread.bound == "at most":
+        axes.set_xlim(left=0)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
     words = spread.name if len(spread.name) <= 38 else f"{spread.name[:37]}…"
     sign = "≤" if spread.bound == "at most" else "≥"
     told = "" if spread.cpk is None else f", Cpk {spread.cpk:.2f}"
@@ -127,6 +133,7 @@ def _cycle_times(times: Sequence[float]) -> Figure:
     axes.legend(fontsize=8, frameon=False)
     axes.set_xlabel("s of the cell's clock")
     axes.set_ylabel("worlds")
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
     return _tidy(figure)
 
 

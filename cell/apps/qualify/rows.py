@@ -17,10 +17,8 @@ from drivers.errors import MeasuredRow
 Value = str | int | float | bool | None
 Row = dict[str, Value]
 """A row by the names of its columns; what is not known of a world is missing, or None."""
-BOUNDS = {"at most": "_at_most", "at least": "_at_least"}
+BOUNDS = {"at most": " at most", "at least": " at least"}
 """What a figure is held against, and how the column of its limit ends, after the figure's own name."""
-UNITS = {"mm": "mm", "mrad": "mrad", "px": "px", "s": "s", "n": "N", "percent": "%", "deg": "deg"}
-"""Units of figures, by how they end the name of a column."""
 NOT_COMPARED = ("wall_s", "ended_s")
 """Columns that are others each time: seconds on the wall, and when the world ended, in seconds since 1970."""
 TEXTS = ("key", "job", "job_hash", "configuration_hash", "code_hash", "level", "schedule", "outcome", "step", "code")
@@ -104,26 +102,33 @@ def _keep_nearer(row: Row, figure: MeasuredRow) -> None:
         row.setdefault(name, float(value))
         return
     before, was = row.get(name), row.get(name + end)
-    if before is None or was is None or used(value, limit, end) > used(number(before), number(was), end):
+    if before is None or was is None or used(name, value, limit, end) > used(name, number(before), number(was), end):
         row |= {name: float(value), name + end: float(limit)}
 
 
-def used(value: float, limit: float, end: str) -> float:
-    """The share of its limit that a value uses, 1 at the limit; `end` is one of `BOUNDS`' columns' ends."""
-    return abs(value) / limit if end == BOUNDS["at most"] else limit / max(value, 1e-12)
+def used(name: str, value: float, limit: float, end: str) -> float:
+    """The share of its limit that a value of this column uses, 1 at the limit; `end` is that of the limit's column.
+
+    A share in % that has to be large is as good as can be at 100.
+    """
+    if end == BOUNDS["at most"]:
+        return abs(value) / limit if limit else float(value != 0.0)
+    if shown(name)[1] == "%" and limit < 100.0:
+        return (100.0 - value) / (100.0 - limit)
+    return limit / max(value, 1e-12)
 
 
 def column(name: str, unit: str) -> str:
-    """The name of a figure's column: words joined by `_`, then the unit."""
-    return re.sub(r"\W+", "_", f"{name} {'percent' if unit == '%' else unit}").strip("_").lower()
+    """The name of a figure's column: its own, and its unit."""
+    return f"{name} [{unit or 1}]"
 
 
 def shown(name: str) -> tuple[str, str]:
-    """A figure's column for people: its words, and its unit."""
+    """A column for people: its words, and its unit."""
+    if (figure := re.fullmatch(r"(.*) \[(.*)\]", name)) is not None:
+        return figure[1], "" if figure[2] == "1" else figure[2]
     words, _, unit = name.rpartition("_")
-    if unit not in UNITS:
-        words, unit = name, ""
-    return words.replace("_", " "), UNITS.get(unit, "")
+    return words.replace("_", " "), unit
 
 
 def compared(row: Mapping[str, object]) -> dict[str, object]:

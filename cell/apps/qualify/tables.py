@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from cell.apps.qualify.answer import BAD, JobAnswer, WorstWorld
 from cell.apps.qualify.compare import PairedComparison
+from cell.apps.qualify.intervals import Share
 from cell.run.batch import GOOD
 
 MOST_WORLDS, MOST_CHANGED = 20, 30
@@ -25,15 +26,13 @@ def tables_of(answer: JobAnswer) -> Iterator[TextTable]:
     """All that the answer says, the most asked for first; what there is nothing of is left out."""
     names = {"placed": "placed", "corrected": "  of which corrected", **{name: name for name in BAD}}
     shares = [
-        (names[name], f"{share.count:.0f}", f"{100 * share.share:.1f} %", _ends(share.low, share.high))
+        (names[name], *_share(share))
         for name, share in answer.shares.items()
     ]  # fmt: skip
-    out = answer.unnoticed
-    shares.append(("placed outside the tolerance, unnoticed", *_share(out.count, out.share, out.low, out.high)))
-    if (covered := answer.covered) is not None:
-        told = _share(covered.count, covered.share, covered.low, covered.high)
-        shares.append(("true place within the stated 95 % bound", *told))
-    title = f"{answer.of.job}: {answer.worlds} worlds of {answer.level}"
+    shares.append(("placed outside the tolerance, unnoticed", *_share(answer.unnoticed)))
+    if answer.covered is not None:
+        shares.append(("true place within the stated 95 % bound", *_share(answer.covered)))
+    title = f"how {answer.worlds} worlds of {answer.level} ended"
     yield TextTable(title, ("outcome", ">worlds", ">share", ">95 % interval"), shares)
     yield _figures(answer)
     if answer.cycle is not None:
@@ -84,9 +83,5 @@ def _world(world: WorstWorld) -> tuple[str, str, str]:
     return str(world.seed), world.outcome, near if world.outcome in GOOD else world.reason
 
 
-def _share(count: float, share: float, low: float, high: float) -> tuple[str, str, str]:
-    return f"{count:.4g}", f"{100 * share:.1f} %", _ends(low, high)
-
-
-def _ends(low: float, high: float) -> str:
-    return f"[{100 * low:.1f}, {100 * high:.1f}] %"
+def _share(share: Share) -> tuple[str, str, str]:
+    return f"{share.count:.4g}", f"{100 * share.share:.1f} %", f"[{100 * share.low:.1f}, {100 * share.high:.1f}] %"

@@ -163,12 +163,15 @@ def _answer(campaign: Campaign, rows: Sequence[Row], job: str) -> JobAnswer:
 
 
 def _print(tables: Sequence[TextTable], answer: JobAnswer, page: Path, line: Path) -> None:
+    from rich.markup import escape
+
     console = wide_console(100)
     for table in tables:
-        shown = new_table(table.title, *table.columns, title_justify="left")
+        console.print(table.title, style="bold", markup=False, highlight=False, soft_wrap=True)
+        shown = new_table(None, *table.columns)
         for row in table.rows:
-            shown.add_row(*row)
-        console.print(shown, markup=False)
+            shown.add_row(*map(escape, row))
+        console.print(shown)
     for world in answer.worst[:3]:
         console.print(f"repeat    {world.command}", markup=False, highlight=False, soft_wrap=True)
     console.print(f"page      {_near(page)}", markup=False, highlight=False, soft_wrap=True)
