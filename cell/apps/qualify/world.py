@@ -85,32 +85,25 @@ def run_world(task: WorldTask) -> Row | None:
 
 
 def _row(task: WorldTask, scratch: Path) -> Row | None:
+    calibrated = False
     try:
         config = _config(task, scratch)
         _calibrate(task, config)
+        calibrated = True
+        runs, covered = _run(task, config)
     except Aborted:
         raise
-    except CellError as error:
-        failure = classify(error)
-        return error_row(
-            task.of, task.level, task.seed, outcome=failure.outcome.value, step=CALIBRATING, code=failure.code,
-            reason=_plain(failure.reason, scratch, task),
-        )  # fmt: skip
     except Exception as error:
-        return _raised(task, error, scratch)
-    try:
-        runs, covered = _run(task, config)
-    except Exception as error:
-        return _raised(task, error, scratch)
+        outcome, step, code, reason = "error", "", type(error).__name__, f"{type(error).__name__}: {error}"
+        if isinstance(error, CellError) and not calibrated:
+            failure = classify(error)
+            outcome, step, code, reason = failure.outcome.value, CALIBRATING, failure.code, failure.reason
+        reason = _plain(reason, scratch, task)
+        return error_row(task.of, task.level, task.seed, outcome=outcome, step=step, code=code, reason=reason)
     if any(run.interrupted for run in runs):
         return None
     row = row_of(task.of, task.level, task.seed, reports=[run.report for run in runs], covered=covered)
     return row | {"reason": _plain(str(row["reason"]), scratch, task)}
-
-
-def _raised(task: WorldTask, error: Exception, scratch: Path) -> Row:
-    reason = _plain(f"{type(error).__name__}: {error}", scratch, task)
-    return error_row(task.of, task.level, task.seed, outcome="error", step="", code=type(error).__name__, reason=reason)
 
 
 def _plain(text: str, scratch: Path, task: WorldTask) -> str:
