@@ -156,20 +156,21 @@ class Campaign:
             return prefix
 
     def _run(self, store: RowStore, workers: Workers, prefix: Prefix, shown: Callable[[Prefix], None]) -> None:
-        missing, again, died = self._missing(prefix), deque[WorldTask](), Counter[str]()
+        missing, again, died = self._missing(prefix), deque[WorldTask](), set[str]()
         begun = 0
         while prefix.end is None:
-            while begun < workers.room and (task := again.popleft() if again else next(missing, None)) is not None:
+            # Tried again alone, so that it takes the blame for no other world that kills its worker.
+            room = workers.room if not again else 1 if begun == 0 else 0
+            while begun < room and (task := again.popleft() if again else next(missing, None)) is not None:
                 workers.begin(task)
                 begun += 1
             for task, row in workers.ended():
                 begun -= 1
-                if row is None:
-                    died[task.key] += 1
-                    if died[task.key] < workers.tries:
-                        again.append(task)
-                        continue
-                    row = self._died(task)
+                if row is None and task.key not in died:
+                    died.add(task.key)
+                    again.append(task)
+                    continue
+                row = row or self._died(task)
                 store.append(row)
                 prefix.take(task.seed, str(row["outcome"]))
                 shown(prefix)

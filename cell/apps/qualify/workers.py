@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
 Ended = tuple[WorldTask, Row | None]
-"""A world and its row; None where its worker died, or was ended by a signal."""
+"""A world and its row; None where its worker died, in this world or one that waited there, or was ended by a signal."""
 World = Callable[[WorldTask], Row | None]
 MOST_WORKERS = 1024
 WAITING = 4
@@ -36,16 +36,9 @@ LOOK_S, ANSWER_S = 0.5, "20s"
 class Workers(Protocol):
     """Runs worlds."""
 
-    tries: int
-    """How often a world may come back without a row before that is its row."""
-
     @property
     def room(self) -> int:
         """How many worlds may be begun at a time."""
-
-    @property
-    def names(self) -> str:
-        """What they are, in words."""
 
     def begin(self, task: WorldTask) -> None:
         """Hand a world over."""
@@ -63,6 +56,12 @@ def require_workers(count: int) -> None:
         raise ConfigError(f"{count} workers are none (allowed: 1 to {MOST_WORKERS}); give another number")
 
 
+def _on_one_thread() -> None:
+    """Before any process starts, which inherits it."""
+    for name in ONE_THREAD:
+        os.environ.setdefault(name, "1")
+
+
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0))
@@ -77,18 +76,9 @@ class Processes:
     _running: dict[Future[Row | None], tuple[WorldTask, ProcessPoolExecutor]] = field(default_factory=dict)
     _free: list[ProcessPoolExecutor] = field(default_factory=list)
 
-    tries = 2
-
     def __post_init__(self) -> None:
         require_workers(self.room)
-        # Before any process starts, which inherits it.
-        for name in ONE_THREAD:
-            os.environ.setdefault(name, "1")
-
-    @property
-    def names(self) -> str:
-        """See `Workers`."""
-        return f"{self.room} process{'es' * (self.room > 1)} of this machine"
+        _on_one_thread()
 
     def begin(self, task: WorldTask) -> None:
         """See `Workers`."""
@@ -147,24 +137,13 @@ class Cluster:
     work: World = run_world
     _running: dict[Future[Row | None], WorldTask] = field(default_factory=dict)
 
-    tries = 1
-
     def __post_init__(self) -> None:
         self._executor: Executor = self.client.get_executor(pure=False)
 
     @property
-    def _count(self) -> int:
-        return len(self.client.scheduler_info(n_workers=-1)["workers"])
-
-    @property
     def room(self) -> int:
         """See `Workers`; it grows with workers that come later."""
-        return WAITING * max(1, self._count)
-
-    @property
-    def names(self) -> str:
-        """See `Workers`."""
-        return f"{self._count} workers of {self.client.scheduler_info(n_workers=0)['address']}"
+        return WAITING * max(1, len(self.client.scheduler_info(n_workers=-1)["workers"]))
 
     def begin(self, task: WorldTask) -> None:
         """See `Workers`."""
@@ -215,33 +194,33 @@ def open_workers(count: int | None, scheduler: str | None, cluster: str | None) 
 
     Raises `ConfigError` for what is none of these, for a missing package, and where no scheduler answers.
     """
-    if scheduler is None and cluster is None:
-        return Processes(cores() if count is None else count)
-    if count is not None or (scheduler is not None and cluster is not None):
+    if [count, scheduler, cluster].count(None) < 2:
         raise ConfigError("--workers, --scheduler and --cluster exclude each other; give one of them")
-    if scheduler is not None and not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d{1,5}", scheduler):
-        raise ConfigError(f"--scheduler {scheduler} is no address (allowed: tcp://HOST:PORT or tls://HOST:PORT)")
-    local = None if cluster is None else re.fullmatch(r"local:(\d{1,4})", cluster)
-    if cluster is not None and local is None:
-        raise ConfigError(f"--cluster {cluster} is not offered (allowed: local:N, N workers of this machine)")
-    if local is not None:
-        require_workers(int(local[1]))
+    if scheduler is not None:
+        if not re.fullmatch(r"(tcp|tls)://[^/\s]+:\d{1,5}", scheduler):
+            raise ConfigError(f"--scheduler {scheduler} is no address (allowed: tcp://HOST:PORT or tls://HOST:PORT)")
+        return _connected(scheduler)
+    if cluster is not None:
+        if not re.fullmatch(r"local:\d{1,4}", cluster):
+            raise ConfigError(f"--cluster {cluster} is not offered (allowed: local:N, N workers of this machine)")
+        return _local(int(cluster.removeprefix("local:")))
+    return Processes(cores() if count is None else count)
+
+
+def _prepare() -> None:
+    """`ConfigError` without Dask, which then leaves it to the campaign to try a world again whose worker died."""
     if find_spec("distributed") is None:
         raise ConfigError("a cluster needs Dask; install: pip install -e '.[cluster]'")
-    return _connected(scheduler) if scheduler is not None else _local(int(local[1]) if local else 1)
-
-
-def _settings() -> None:
-    """A world whose worker died is tried by one more; that the second died as well is told."""
     import dask
 
-    dask.config.set({"distributed.scheduler.allowed-failures": 1, "distributed.comm.timeouts.connect": ANSWER_S})
+    dask.config.set({"distributed.scheduler.allowed-failures": 0, "distributed.comm.timeouts.connect": ANSWER_S})
+    _on_one_thread()
 
 
 def _connected(scheduler: str) -> Cluster:
+    _prepare()
     from distributed import Client
 
-    _settings()
     try:
         return Cluster(Client(scheduler, timeout=ANSWER_S), own=False)
     except (OSError, ValueError) as error:
@@ -250,11 +229,10 @@ def _connected(scheduler: str) -> Cluster:
 
 def _local(count: int) -> Cluster:
     """A scheduler and workers on the loopback alone."""
+    require_workers(count)
+    _prepare()
     from distributed import Client, LocalCluster
 
-    _settings()
-    for name in ONE_THREAD:
-        os.environ.setdefault(name, "1")
     started = LocalCluster(
         n_workers=count, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
         silence_logs=50, memory_limit=None,

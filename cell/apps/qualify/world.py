@@ -76,18 +76,18 @@ def run_world(task: WorldTask) -> Row | None:
     _on_one_thread()
     begun = time.monotonic()
     try:
-        _require_same(task)
         with tempfile.TemporaryDirectory(prefix="cell-qualify-") as scratch:
-            row = _row(task, Path(scratch))
+            config = _config(task, Path(scratch))
+            _require_same(task, config)
+            row = _row(task, config, Path(scratch))
     except Aborted:
         return None
     return None if row is None else row | {"wall_s": round(time.monotonic() - begun, 3), "ended_s": time.time()}
 
 
-def _row(task: WorldTask, scratch: Path) -> Row | None:
+def _row(task: WorldTask, config: CellConfig, scratch: Path) -> Row | None:
     calibrated = False
     try:
-        config = _config(task, scratch)
         _calibrate(task, config)
         calibrated = True
         runs, covered = _run(task, config)
@@ -162,10 +162,10 @@ def points_covered(report: Report, job: Job, nominal: NominalSurface, truth: dic
     return float(np.mean(off <= float(bound["d"])))
 
 
-def _require_same(task: WorldTask) -> None:
+def _require_same(task: WorldTask, config: CellConfig) -> None:
     """Raise `ConfigError` unless this worker has what the campaign is of."""
     try:
-        here = QualifiedCode.of(task.job, _parsed(task.configuration))
+        here = QualifiedCode.of(task.job, config)
     except ConfigError as error:
         raise ConfigError(f"a worker cannot read what this campaign is of: {error}") from error
     if here != task.of:
@@ -173,13 +173,6 @@ def _require_same(task: WorldTask) -> None:
             f"a worker has another code, job or configuration ({here}) than this campaign ({task.of}); install the "
             "same release there and give all machines the same files, then run the same command again"
         )
-
-
-def _parsed(text: str) -> CellConfig:
-    with tempfile.TemporaryDirectory(prefix="cell-qualify-") as folder:
-        path = Path(folder) / "cell.toml"
-        path.write_text(text, encoding="utf-8")
-        return load_config(path)
 
 
 def _on_one_thread() -> None:

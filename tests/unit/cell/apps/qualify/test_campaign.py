@@ -22,17 +22,17 @@ pytest.importorskip("pyarrow")
 class Here:
     """Runs worlds in this process, mostly the newest first; `dies` names how often a seed's worker dies."""
 
-    tries = 2
-    names = "this process"
-
     def __init__(self, room: int = 1, dies: dict[int, int] | None = None) -> None:
         self.room = room
         self.dies = dies or {}
         self.begun: list[int] = []
+        self.alone: list[int] = []
         self.closed = False
         self._waiting: list[WorldTask] = []
 
     def begin(self, task: WorldTask) -> None:
+        if task.seed in self.begun and not self._waiting:
+            self.alone.append(task.seed)
         self.begun.append(task.seed)
         self._waiting.append(task)
         assert len(self._waiting) <= self.room
@@ -115,9 +115,10 @@ def test_a_prefix_waits_for_its_first_seeds() -> None:
 
 
 def test_a_worker_that_dies_is_tried_again_and_then_is_a_row(tmp_path: Path) -> None:
-    workers = Here(dies={2: 1, 3: 2})
+    workers = Here(2, dies={2: 1, 3: 2})
     run(tmp_path, Target(4), workers)
     assert (workers.begun.count(2), workers.begun.count(3)) == (2, 2)
+    assert workers.alone == [2, 3], "whose worker died is tried again with nothing beside it"
     rows = {one["seed"]: one for one in RowStore(tmp_path).rows()}
     assert [rows[seed]["outcome"] for seed in (1, 2, 3, 4)] == ["placed", "placed", "error", "placed"]
     assert rows[3]["code"] == "WorkerDied"

@@ -23,7 +23,7 @@ pytest.importorskip("pyarrow")
 class Quick:
     """Runs worlds in this process; `ends_at` is a seed at which Ctrl-C is pressed."""
 
-    room, tries, names = 1, 1, "this process"
+    room = 1
 
     def __init__(self, ends_at: int | None = None, error_mm: float = 0.1) -> None:
         self.ends_at = ends_at
