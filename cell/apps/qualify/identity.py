@@ -18,7 +18,7 @@ PACKAGES = ("cell", "drivers", "statemachine", "sim_backends")
 SOURCES = (".py", ".toml", ".dbc", ".ply", ".urdf")
 DIGITS = 16
 HIGHEST_SEED = 999_999
-WITHOUT = {"cell": {"runs", "calibrations", "record", "meshes", "sim", "confirm"}}
+WITHOUT = {"cell": {"runs", "calibrations", "record", "frames", "meshes", "sim", "confirm"}}
 """What of a configuration changes nothing in a simulated world: where files go, and who answers."""
 
 

@@ -112,14 +112,14 @@ def _plain(text: str, scratch: Path, task: WorldTask) -> str:
 
 
 def _config(task: WorldTask, scratch: Path) -> CellConfig:
-    """The configuration from the world's folder, as a dry run has it; its runs go to `scratch`, without records."""
+    """The configuration from the world's folder, as a dry run has it; its runs leave only reports, in `scratch`."""
     file = task.config_file
     if not file.is_file():
         file.parent.mkdir(parents=True, exist_ok=True)
         with replacing(file) as out:
             out.write(task.configuration.encode())
     config = load_config(file)
-    changed = {"runs": str(scratch), "record": False, "sim": tuple(DEVICES), "confirm": "simulated"}
+    changed = {"runs": str(scratch), "record": False, "frames": False, "sim": tuple(DEVICES), "confirm": "simulated"}
     return config.model_copy(update={"cell": config.cell.model_copy(update=changed)})
 
 
