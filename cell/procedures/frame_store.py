@@ -56,7 +56,7 @@ Listener = Callable[[str, Frame, FrameFile], None]
 
 
 class FrameStore:
-    """Writes frames into `folder`, made with the first of them, as `<what>-<frame id>.png`, lossless; or none are `kept`.
+    """Writes frames into `folder`, made with the first of them, as `<what>-<frame id>.png`, lossless, or none.
 
     `recent` names the newest frames of the present step, `last` is the very last with its kind: what a run that ends
     there was looking at. `found` is where the board was seen last: the frame, and its points (n, 2) in px.
