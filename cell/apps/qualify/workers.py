@@ -82,8 +82,12 @@ class Processes:
 
     def begin(self, task: WorldTask) -> None:
         """See `Workers`."""
-        pool = self._free.pop() if self._free else _new_process()
-        self._running[pool.submit(self.work, task)] = task, pool
+        while True:
+            pool = self._free.pop() if self._free else _new_process()
+            # One that died while it waited is left out.
+            with suppress(BrokenProcessPool):
+                self._running[pool.submit(self.work, task)] = task, pool
+                return
 
     def ended(self) -> Iterator[Ended]:
         """See `Workers`."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from multiprocessing import active_children
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,23 @@ def require_same(found: dict[int, Row], folder: Path) -> None:
 
 def test_a_process_that_dies_takes_no_other_world_with_it(tmp_path: Path) -> None:
     require_same(rows(tmp_path, Processes(2, deadly), 4), tmp_path)
+
+
+def test_a_process_that_died_while_it_waited_is_replaced(tmp_path: Path) -> None:
+    workers, wanted = Processes(1, quick), campaign(tmp_path, Target(2))
+    workers.begin(wanted.task(1))
+    assert [row and row["seed"] for _, row in workers.ended()] == [1]
+    for process in active_children():
+        process.kill()
+        process.join()
+    found: list[Row] = []
+    # At once after its death nobody knows of it yet: the world comes back without a row.
+    while not found:
+        workers.begin(wanted.task(2))
+        found = [row for _, row in workers.ended() if row is not None]
+    assert [row["seed"] for row in found] == [2]
+    workers.close()
+    assert not active_children()
 
 
 def test_a_worker_with_other_files_ends_the_campaign(tmp_path: Path) -> None:
