@@ -66,16 +66,18 @@ def comparison_tables(compared: PairedComparison) -> Iterator[TextTable]:
 def _figures(answer: JobAnswer) -> TextTable:
     rows = []
     for figure in answer.figures:
-        numbers = (figure.mean, figure.sd, figure.p95, figure.worst, figure.limit)
+        numbers = (figure.mean, figure.sd, figure.p95, figure.worst)
         told = "" if figure.cpk is None else f"{figure.cpk:.2f}"
-        limit = ("≤ " if figure.bound == "at most" else "≥ ") + f"{figure.limit:.3g}"
-        rows.append(
-            (figure.name, *(f"{number:.3g}" for number in numbers[:4]), limit, figure.unit, told, str(figure.n))
-        )
+        limit = ("≤ " if figure.bound == "at most" else "≥ ") + _digits(figure.limit)
+        rows.append((figure.name, *map(_digits, numbers), limit, figure.unit, told, str(figure.n)))
     return TextTable(
         "figures beside their limits, the lowest Cpk first",
         ("figure", ">mean", ">σ", ">95 %", ">worst", ">limit", "unit", ">Cpk", ">worlds"), rows,
     )  # fmt: skip
+
+
+def _digits(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 1000 else f"{value:.0f}"
 
 
 def _world(world: WorstWorld) -> tuple[str, str, str]:

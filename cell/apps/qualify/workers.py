@@ -8,6 +8,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -27,6 +28,8 @@ Ended = tuple[WorldTask, Row | None]
 """A world and its row; None where its worker died, in this world or one that waited there, or was ended by a signal."""
 World = Callable[[WorldTask], Row | None]
 MOST_WORKERS = 1024
+RENEWED = 100
+"""Worlds after which a process is replaced by a new one: each world leaves some 3 MB that nothing gives back."""
 WAITING = 4
 """Worlds that are handed to a cluster for each of its workers: one runs, the others are on their way."""
 LOOK_S, ANSWER_S = 0.5, "20s"
@@ -75,6 +78,7 @@ class Processes:
     work: World = run_world
     _running: dict[Future[Row | None], tuple[WorldTask, ProcessPoolExecutor]] = field(default_factory=dict)
     _free: list[ProcessPoolExecutor] = field(default_factory=list)
+    _ran: Counter[ProcessPoolExecutor] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
         require_workers(self.room)
@@ -100,7 +104,12 @@ class Processes:
                 pool.shutdown(wait=True)
                 yield task, None
                 continue
-            self._free.append(pool)
+            self._ran[pool] += 1
+            if self._ran[pool] < RENEWED:
+                self._free.append(pool)
+            else:
+                pool.shutdown(wait=True)
+                del self._ran[pool]
             yield task, row
 
     def close(self) -> None:

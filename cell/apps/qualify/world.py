@@ -6,6 +6,7 @@ there. Nothing else of a run is kept.
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import tempfile
@@ -82,6 +83,9 @@ def run_world(task: WorldTask) -> Row | None:
             row = _row(task, config, Path(scratch))
     except Aborted:
         return None
+    finally:
+        # A world is large, and full of circles: not every one would be gone before the next.
+        gc.collect()
     return None if row is None else row | {"wall_s": round(time.monotonic() - begun, 3), "ended_s": time.time()}
 
 

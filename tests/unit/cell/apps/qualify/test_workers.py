@@ -36,8 +36,8 @@ def test_a_process_that_dies_takes_no_other_world_with_it(tmp_path: Path) -> Non
     require_same(rows(tmp_path, Processes(2, deadly), 4), tmp_path)
 
 
-def test_a_process_that_died_while_it_waited_is_replaced(tmp_path: Path) -> None:
-    workers, wanted = Processes(1, quick), campaign(tmp_path, Target(2))
+def test_a_process_that_died_or_has_run_enough_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    workers, wanted = Processes(1, quick), campaign(tmp_path, Target(3))
     workers.begin(wanted.task(1))
     assert [row and row["seed"] for _, row in workers.ended()] == [1]
     for process in active_children():
@@ -49,6 +49,10 @@ def test_a_process_that_died_while_it_waited_is_replaced(tmp_path: Path) -> None
         workers.begin(wanted.task(2))
         found = [row for _, row in workers.ended() if row is not None]
     assert [row["seed"] for row in found] == [2]
+    monkeypatch.setattr(module, "RENEWED", 1)
+    workers.begin(wanted.task(3))
+    assert [row and row["seed"] for _, row in workers.ended()] == [3]
+    assert not active_children(), "after so many worlds a process is replaced"
     workers.close()
     assert not active_children()
 
