@@ -50,7 +50,8 @@ class RowStore:
     @contextmanager
     def writing(self) -> Iterator[None]:
         """Hold the folder, and fold its small files at the end. `ConfigError` while another campaign holds it."""
-        with (self.folder / "lock").open("w") as lock:
+        # Beside the rows: others read all files among them as Parquet.
+        with (self.folder.parent / "lock").open("w") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:

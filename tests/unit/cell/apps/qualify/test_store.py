@@ -76,11 +76,10 @@ def test_small_files_are_folded_now_and_then(tmp_path: Path, monkeypatch: pytest
 
 def test_columns_of_all_rows_are_there_for_others(tmp_path: Path) -> None:
     store = RowStore(tmp_path)
-    for one in (row(1, "refused"), row(2), row(3, note_mm=1.5)):
-        store.append(one)
-    store.fold()
-    (file,) = store.folder.glob("*.parquet")
-    table = pyarrow.read_table(file)
+    with store.writing():
+        for one in (row(1, "refused"), row(2), row(3, note_mm=1.5)):
+            store.append(one)
+    table = pyarrow.read_table(store.folder)
     assert {"seed", "outcome", "note_mm", "true_error_max_mm"} <= set(table.column_names)
     assert table.num_rows == 3
 
