@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from importlib.resources import files
 from io import BytesIO
-from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,7 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from cell.apps.qualify.answer import FigureSpread, JobAnswer, limited, values_of
 from cell.apps.qualify.rows import Row, number, shown
-from cell.apps.qualify.tables import TextTable, tables_of
+from cell.apps.qualify.tables import MOST_WORLDS, TextTable, tables_of
 from cell.base.storage import replacing
 from cell.run.batch import GOOD
 from cell.run.report.page import render
@@ -47,7 +46,7 @@ def write_page(folder: Path, answer: JobAnswer, rows: Sequence[Row], more: Seque
     good = answer.unnoticed.count == 0 and answer.yields.count == answer.yields.of
     text = render(
         __package__, "qualify.html.jinja", answer=answer, style=style, tables=tables, plots=plots, good=good,
-        commands=[world.command for world in islice(answer.worst, 20)],
+        commands=list(dict.fromkeys(world.command for world in answer.worst[:MOST_WORLDS])),
     )  # fmt: skip
     with replacing(folder / PAGE) as file:
         file.write(text.encode("utf-8"))

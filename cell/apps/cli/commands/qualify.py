@@ -172,8 +172,8 @@ def _print(tables: Sequence[TextTable], answer: JobAnswer, page: Path, line: Pat
         for row in table.rows:
             shown.add_row(*map(escape, row))
         console.print(shown)
-    for world in answer.worst[:3]:
-        console.print(f"repeat    {world.command}", markup=False, highlight=False, soft_wrap=True)
+    for command in list(dict.fromkeys(world.command for world in answer.worst))[:3]:
+        console.print(f"repeat    {command}", markup=False, highlight=False, soft_wrap=True)
     console.print(f"page      {_near(page)}", markup=False, highlight=False, soft_wrap=True)
     console.print(f"kept      {_near(line)}", markup=False, highlight=False, soft_wrap=True)
     console.print(answer.line, markup=False, highlight=False, soft_wrap=True)
