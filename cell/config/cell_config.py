@@ -143,6 +143,8 @@ class CellSection(Table):
     confirm: Confirm = "person"
     record: bool = True
     """Whether runs leave `record.mcap`."""
+    frames: bool = True
+    """Whether runs keep the pictures that they look at. Without them no sweep is used again after a resume."""
     meshes: Annotated[str, AfterValidator(lambda text: text and checked_folder(text))] = ""
     """A folder of the links' meshes for the 3-D scene, beside this file; empty for none."""
     sim: Annotated[tuple[str, ...], AfterValidator(lambda names: _devices(names))] = ()

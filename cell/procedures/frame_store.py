@@ -56,17 +56,18 @@ Listener = Callable[[str, Frame, FrameFile], None]
 
 
 class FrameStore:
-    """Writes frames into `folder`, made with the first of them, as `<what>-<frame id>.png`, lossless.
+    """Writes frames into `folder`, made with the first of them, as `<what>-<frame id>.png`, lossless, or none.
 
     `recent` names the newest frames of the present step, `last` is the very last with its kind: what a run that ends
     there was looking at. `found` is where the board was seen last: the frame, and its points (n, 2) in px.
     """
 
-    def __init__(self, folder: Path, listener: Listener | None = None) -> None:
+    def __init__(self, folder: Path, listener: Listener | None = None, *, kept: bool = True) -> None:
         self.begin()
         self.found: tuple[Frame, Vector] | None = None
         self._folder = folder
         self._listener = listener
+        self._kept = kept
         self._waiting: queue.Queue[tuple[FrameFile, Frame] | threading.Event | None] = queue.Queue(CAPACITY)
         self._failure: str | None = None
         self._digests: dict[str, str] = {}
@@ -82,9 +83,11 @@ class FrameStore:
         """Queue a frame; raises `CellError` when an earlier one could not be written."""
         if self._failure is not None:
             raise CellError(f"frames cannot be kept: {self._failure}; make room in {self._folder}")
+        self.last = what, frame
+        if not self._kept:
+            return
         name = f"{what}-{frame.frame_id:06d}.png"
         self.recent.append(name)
-        self.last = what, frame
         picture = FrameFile(name)
         if self._listener is not None:
             self._listener(what, frame, picture)

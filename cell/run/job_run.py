@@ -184,7 +184,8 @@ class JobRun:
         open_before = self.devices.gate.is_open
         witness = None if self.truth is None else TruthRecorder(self.truth)
         observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
-        with FrameStore(folder / "frames", None if record is None else record.frame) as frames:
+        listener = None if record is None else record.frame
+        with FrameStore(folder / "frames", listener, kept=self.config.cell.frames) as frames:
             self.run.frames = frames
             here = self._workplace(folder, whereabouts, frames)
             result = self._runner(here, journal, each_of(observers)).run()

@@ -152,7 +152,8 @@ class RecordedWork:
         outcome, reason = "done", f"{self.kind} done"
         ended: BaseException | None = None
         record = None if self.config is None else begin_record(folder, self.run, self.config, self.devices)
-        frames = self.run.frames = FrameStore(folder / FRAMES, None if record is None else record.frame)
+        kept = self.config is None or self.config.cell.frames
+        frames = self.run.frames = FrameStore(folder / FRAMES, None if record is None else record.frame, kept=kept)
         try:
             with run_log(folder), frames:
                 return self._watched(work, journal, frames)

@@ -13,7 +13,7 @@ import typer
 
 from cell.apps.cli import EXIT_USAGE
 from cell.apps.cli.calibration import calibrate
-from cell.apps.cli.commands import commission, console, devices, run, runs, setup
+from cell.apps.cli.commands import commission, console, devices, qualify, run, runs, setup
 from drivers.errors import CellError, ConfigError
 
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
@@ -89,7 +89,7 @@ def _cell(
 
 
 for command in (
-    run.run, run.dry_run, run.resume,
+    run.run, run.dry_run, run.resume, qualify.qualify,
     runs.abort, runs.pause, runs.go_on, runs.confirm, runs.runs, runs.health, runs.report, runs.export, runs.replay,
     devices.jog, devices.home, devices.recover, devices.diag, devices.find, devices.devices, devices.doctor,
     setup.init, setup.check, setup.new_job, commission.commission, console.console,

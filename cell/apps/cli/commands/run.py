@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
@@ -91,6 +92,7 @@ def run(
         return cell.run(job, display, at_start=at_start, until=until)
 
     require_share(pace)
+    _say_qualified(job, config)
     if count is None and len(item_names(job)) > 1:
         count = 1
     opened = partial(Cell.open, config, sim=sim, seed=seed, level=level.value, job=job)
@@ -137,6 +139,7 @@ def dry_run(
     kind_of(loaded).until(until)
     for text in inject or ():
         Injection.parse(text, kind_of(loaded).names)
+    _say_qualified(job, config)
     opened = partial(
         Cell.open, config, sim="all", seed=seed, level=level.value, speed=speed, job=job,
         confirm=None if confirm is None else confirm.value, clock=(clock or CellClock.wall).value,
@@ -152,6 +155,14 @@ def dry_run(
         watched = partial(run_shown, job=job, inject=inject or (), until=until, port=port, open_page=not no_open)
         _perform(opened, watched, json, noise)
     _perform(opened, lambda cell, display: cell.run(job, display, inject or (), until=until), json, noise)
+
+
+def _say_qualified(job: str, config: Path | None) -> None:
+    """Tell in a line how well `cell qualify` found this job to work, where it did."""
+    from cell.apps.qualify.kept import kept_line
+
+    if (line := kept_line(job, config)) is not None:
+        typer.echo(line, err=True)
 
 
 def _perform_batch(

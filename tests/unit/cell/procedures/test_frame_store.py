@@ -28,6 +28,15 @@ def test_a_frame_is_kept_to_the_last_bit_and_its_digest_is_that_of_its_file(tmp_
     assert digests == {path.name: hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
+def test_where_no_frames_are_kept_the_last_one_is_still_known(tmp_path: Path) -> None:
+    with FrameStore(tmp_path / "frames", kept=False) as store:
+        store.keep("stripe", frame(7))
+        assert store.settle() == {}
+        assert store.last is not None
+        assert list(store.recent) == []
+    assert not (tmp_path / "frames").exists()
+
+
 def test_frames_that_cannot_be_written_are_told_at_the_next_one(tmp_path: Path) -> None:
     (tmp_path / "frames").write_text("a file where the folder should be")
     with FrameStore(tmp_path / "frames") as store:

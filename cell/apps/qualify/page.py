@@ -1,0 +1,150 @@
+"""The page of a campaign: one HTML file with its tables and plots, for a browser and for paper."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from importlib.resources import files
+from io import BytesIO
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from cell.apps.qualify.answer import FigureSpread, JobAnswer, limited, values_of
+from cell.apps.qualify.rows import Row, number, shown
+from cell.apps.qualify.tables import MOST_WORLDS, TextTable, tables_of
+from cell.base.storage import replacing
+from cell.run.batch import GOOD
+from cell.run.report.page import render
+
+PAGE = "qualify.html"
+MOST_HISTOGRAMS = 9
+COLOURS = {
+    "placed": "#4d8f4d", "corrected": "#8fbf6f", "refused": "#d0a000", "misplaced": "#c0392b", "faulted": "#c0392b",
+    "aborted": "#888888", "error": "#7d3c98",
+}  # fmt: skip
+FAR = 6.0
+"""A limit is drawn up to so many times the largest value."""
+VALUES, LIMIT, DPI = "#2c5f9e", "#c0392b", 110
+
+
+class PagePlot(NamedTuple):
+    """A plot as PNG, and what it shows."""
+
+    title: str
+    png: bytes
+
+
+def write_page(folder: Path, answer: JobAnswer, rows: Sequence[Row], more: Sequence[TextTable] = ()) -> Path:
+    """Write the page of an answer and the rows behind it, with `more` tables at its end; gives its file."""
+    style = files("cell.run.report.page").joinpath("page.css").read_text(encoding="utf-8")
+    tables = [*tables_of(answer), *more]
+    plots = list(plots_of(answer, rows))
+    good = answer.unnoticed.count == 0 and answer.yields.count == answer.yields.of
+    text = render(
+        __package__, "qualify.html.jinja", answer=answer, style=style, tables=tables, plots=plots, good=good,
+        commands=list(dict.fromkeys(world.command for world in answer.worst[:MOST_WORLDS])),
+    )  # fmt: skip
+    with replacing(folder / PAGE) as file:
+        file.write(text.encode("utf-8"))
+    return folder / PAGE
+
+
+def plots_of(answer: JobAnswer, rows: Sequence[Row]) -> Iterator[PagePlot]:
+    """The yield with its intervals, the figures beside their limits, and the cycle times."""
+    yield PagePlot("Outcomes, with the 95 % intervals of their shares", _png(_outcomes(answer)))
+    if answer.figures:
+        yield PagePlot("Figures beside their limits", _png(_histograms(answer, rows)))
+    if times := [number(row.get("cycle_s")) for row in rows if row["outcome"] in GOOD]:
+        yield PagePlot("Cycle time of good worlds", _png(_cycle_times(times)))
+
+
+def _outcomes(answer: JobAnswer) -> Figure:
+    names = list(answer.shares)
+    figure = Figure(figsize=(8.6, 0.7 + 0.36 * len(names)), dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    for k, name in enumerate(names):
+        share = answer.shares[name]
+        value, low, high = 100 * share.share, 100 * share.low, 100 * share.high
+        axes.barh(k, value, 0.62, color=COLOURS.get(name, VALUES))
+        axes.errorbar(value, k, xerr=[[value - low], [high - value]], color="black", capsize=3, linewidth=1)
+        # Inside a long bar there is room before its end, beside a short one after it.
+        inside = value > 60
+        axes.text(
+            low - 1.5 if inside else high + 1.5, k, str(share), va="center", ha="right" if inside else "left",
+            color="white" if inside else "black", fontsize=9,
+        )  # fmt: skip
+    axes.set_yticks(range(len(names)), names)
+    axes.invert_yaxis()
+    axes.set_xlim(0, 103)
+    axes.set_xlabel(f"% of {answer.worlds} worlds")
+    return _tidy(figure)
+
+
+def _histograms(answer: JobAnswer, rows: Sequence[Row]) -> Figure:
+    columns = limited(rows)
+    by_name = {shown(name): name for name in columns}
+    told = answer.figures[:MOST_HISTOGRAMS]
+    across = 3
+    down = -(-len(told) // across)
+    figure = Figure(figsize=(8.6, 2.1 * down), dpi=DPI, layout="constrained")
+    panels = np.atleast_1d(figure.subplots(down, across, squeeze=False)).ravel()
+    for axes, spread in zip(panels, told, strict=False):
+        name = by_name[spread.name, spread.unit]
+        values, _, _ = values_of(rows, name, columns[name])
+        _histogram(axes, values, spread)
+    for axes in panels[len(told) :]:
+        axes.set_axis_off()
+    return _tidy(figure)
+
+
+def _histogram(axes: Axes, values: np.ndarray[tuple[int], np.dtype[np.float64]], spread: FigureSpread) -> None:
+    low, high = float(values.min()), float(values.max())
+    if high - low < 1e-9:
+        low, high = low - 0.5 * max(abs(low), 1e-3), high + 0.5 * max(abs(high), 1e-3)
+    axes.hist(values, bins=min(30, max(8, len(values) // 8)), range=(low, high), color=VALUES)
+    limits = [-spread.limit, spread.limit] if spread.bound == "at most" and low < 0 else [spread.limit]
+    for limit in limits:
+        # One far away would squeeze the values into one bar; it stands in the title.
+        if abs(limit) <= FAR * max(abs(low), abs(high)):
+            axes.axvline(limit, color=LIMIT, linestyle="--", linewidth=1.2)
+    if low >= 0 and spread.bound == "at most":
+        axes.set_xlim(left=0)
+    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    words = spread.name if len(spread.name) <= 38 else f"{spread.name[:37]}…"
+    sign = "≤" if spread.bound == "at most" else "≥"
+    told = "" if spread.cpk is None else f", Cpk {spread.cpk:.2f}"
+    axes.set_title(f"{words}\n{sign} {spread.limit:.3g} {spread.unit}{told}", fontsize=8)
+    axes.set_xlabel(spread.unit, fontsize=8)
+
+
+def _cycle_times(times: Sequence[float]) -> Figure:
+    figure = Figure(figsize=(8.6, 2.2), dpi=DPI, layout="constrained")
+    axes = figure.subplots()
+    axes.hist(times, bins=min(40, max(8, len(times) // 5)), color=VALUES)
+    p95 = float(np.percentile(times, 95))
+    axes.axvline(float(np.mean(times)), color="black", linewidth=1.2, label=f"mean {np.mean(times):.1f} s")
+    axes.axvline(p95, color=LIMIT, linestyle="--", linewidth=1.2, label=f"95 % below {p95:.1f} s")
+    axes.legend(fontsize=8, frameon=False)
+    axes.set_xlabel("s of the cell's clock")
+    axes.set_ylabel("worlds")
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+    return _tidy(figure)
+
+
+def _tidy(figure: Figure) -> Figure:
+    for axes in figure.axes:
+        axes.tick_params(labelsize=8)
+        for side in ("top", "right"):
+            axes.spines[side].set_visible(False)
+    return figure
+
+
+def _png(figure: Figure) -> bytes:
+    file = BytesIO()
+    figure.savefig(file, format="png")
+    return file.getvalue()

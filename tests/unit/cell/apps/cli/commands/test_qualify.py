@@ -1,0 +1,111 @@
+"""`cell qualify` as it is typed, with worlds that cost nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cell.apps.qualify import workers
+from cell.apps.qualify.rows import Row
+from cell.apps.qualify.workers import Ended
+from cell.apps.qualify.world import WorldTask
+from tests.support import Typed
+from tests.support.qualified import row
+
+pytest.importorskip("pyarrow")
+
+
+class Quick:
+    """Runs worlds in this process; `ends_at` is a seed at which Ctrl-C is pressed."""
+
+    room = 1
+
+    def __init__(self, ends_at: int | None = None, error_mm: float = 0.1) -> None:
+        self.ends_at = ends_at
+        self.error_mm = error_mm
+        self.task: WorldTask | None = None
+
+    def begin(self, task: WorldTask) -> None:
+        self.task = task
+
+    def ended(self) -> Iterator[Ended]:
+        assert self.task is not None
+        if self.task.seed == self.ends_at:
+            os.kill(os.getpid(), signal.SIGINT)
+        yield self.task, self._row(self.task)
+
+    def _row(self, task: WorldTask) -> Row:
+        return row(task.seed, "placed", self.error_mm, of=task.of)
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def quick(here: Path, monkeypatch: pytest.MonkeyPatch) -> Quick:
+    made = Quick()
+    monkeypatch.setattr(workers, "open_workers", lambda *_: made)
+    return made
+
+
+def test_it_prints_the_answer_and_leaves_page_rows_and_line(quick: Quick, here: Path, typed: Typed) -> None:
+    code, out, _ = typed("qualify", "pot", "--seeds", "6")
+    assert code == 0
+    for words in ("how 6 worlds of nominal ended", "[54.1, 100.0] %", "place error, largest", "≤ 0.6", "cycle time"):
+        assert words in out
+    assert "cell dry-run -c qualify/pot/worlds/" in out
+    assert (here / "qualify" / "pot" / "qualify.html").is_file()
+    assert (here / "calibrations" / "qualified" / "pot.qualified.json").is_file()
+
+
+def test_more_seeds_are_added_and_json_says_the_same(quick: Quick, here: Path, typed: Typed) -> None:
+    typed("qualify", "pot", "--seeds", "6")
+    code, out, _ = typed("qualify", "pot", "--seeds", "10", "--json")
+    told = json.loads(out)
+    assert (code, told["worlds"], told["shares"]["placed"]["count"]) == (0, 10, 10)
+    assert told["line"].endswith("10 worlds of nominal, yield 100.0 % [69.2, 100.0]")
+
+
+def test_ctrl_c_keeps_the_rows(quick: Quick, here: Path, typed: Typed) -> None:
+    quick.ends_at = 4
+    code, out, complaints = typed("qualify", "pot", "--seeds", "6")
+    assert (code, out) == (130, "")
+    assert "interrupted: 3 worlds are kept in qualify/pot; the same command goes on" in complaints
+
+
+def test_a_part_outside_its_tolerance_that_nobody_noticed_fails(quick: Quick, typed: Typed) -> None:
+    quick.error_mm = 0.7
+    code, out, _ = typed("qualify", "--seeds", "2", "--json")
+    assert (code, json.loads(out)["unnoticed"]["count"]) == (1, 2)
+
+
+def test_campaigns_are_compared(quick: Quick, here: Path, typed: Typed) -> None:
+    typed("qualify", "--seeds", "3", "--out", "before")
+    quick.error_mm = 0.2
+    code, out, _ = typed("qualify", "--seeds", "4", "--compare", "before", "--json")
+    told = json.loads(out)["compared"]
+    assert (code, told["pairs"], told["yields"][0], told["changed"]) == (0, 3, 0.0, [])
+    assert {one["name"]: round(one["mean"], 3) for one in told["figures"]}["true error max"] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--seeds", "0"), "allowed: 1 or more"),
+        (("--seeds", "5", "--first-seed", "999998"), "allowed: 0 to 999999"),
+        (("--until", "yield:±60%"), "allowed: yield:±0.05% to yield:±50%"),
+        (("--seeds", "5", "--most", "7"), "--seeds excludes --until and --most"),
+        (("--compare", "nothing"), "it holds no campaign"),
+        (("--level", "calm"), "nominal"),
+        (("nothing",), "neither a file"),
+    ],
+)
+def test_what_cannot_be_is_told(quick: Quick, typed: Typed, words: tuple[str, ...], told: str) -> None:
+    code, out, complaints = typed("qualify", *words)
+    assert (code, out) == (2, "")
+    assert told in complaints

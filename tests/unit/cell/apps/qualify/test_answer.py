@@ -1,0 +1,92 @@
+"""What rows say: shares, figures beside their limits, reasons, the worst worlds and the commands that repeat them."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from cell.apps.qualify.answer import JobAnswer, repeat_command
+from cell.apps.qualify.rows import Row
+from tests.support.qualified import COVERED, ERROR, OF, row
+
+
+def answer(*rows: Row) -> JobAnswer:
+    return JobAnswer.of_rows(
+        OF, "nominal", first=1, rows=rows, command=lambda one: f"repeat {one['seed']}", date="2026-11-30"
+    )
+
+
+def some() -> JobAnswer:
+    return answer(
+        *(row(seed, error_mm=0.05 * seed, corrections=int(seed == 4)) for seed in range(1, 7)),
+        row(7, "refused", step="invert_pose", reason="the fit is 0.31 mm off, allowed are 0.3 mm"),
+        row(8, "refused", step="invert_pose", reason="the fit is 0.42 mm off, allowed are 0.3 mm"),
+        row(9, "error", code="KeyError", reason="KeyError: 'x'"), row(10, "misplaced", reason="it lies askew"),
+    )  # fmt: skip
+
+
+def test_shares_count_how_worlds_ended() -> None:
+    counts = {name: share.count for name, share in some().shares.items()}
+    assert counts == {"placed": 6, "corrected": 1, "refused": 2, "misplaced": 1, "faulted": 0, "error": 1}
+    assert some().yields.of == 10
+    assert some().line == "qualified 2026-11-30, 10 worlds of nominal, yield 60.0 % [26.2, 87.8]"
+
+
+def test_a_figure_lies_beside_its_limit() -> None:
+    told = {figure.name: figure for figure in some().figures}
+    figure = told["place error, largest of 45 points"]
+    assert (figure.unit, figure.bound, figure.limit, figure.n) == ("mm", "at most", 0.6, 6)
+    assert (figure.mean, figure.worst, figure.worst_seed) == pytest.approx((0.175, 0.3, 6))
+    assert figure.worst_used == pytest.approx(0.5)
+    # By hand: the values are 0.05 to 0.30 by 0.05, whose σ is 0.0935.
+    assert figure.cpk == pytest.approx((0.6 - 0.175) / (3 * 0.09354), rel=1e-3)
+    covered = told["surface covered"]
+    assert (covered.bound, covered.worst, covered.worst_seed) == ("at least", 89.0, 6)
+
+
+def test_parts_outside_the_tolerance_that_nobody_noticed_are_counted() -> None:
+    assert some().unnoticed.count == 0
+    out = answer(row(1), row(2, error_mm=0.61), row(3, "misplaced", true_error_max_mm=0.9))
+    assert (out.unnoticed.count, out.unnoticed.of) == (1, 2)
+
+
+def test_the_stated_bounds_are_held_against_the_truth() -> None:
+    covered = answer(row(1, points_covered=1.0), row(2, points_covered=0.8), row(3, "refused")).covered
+    assert covered is not None
+    assert (covered.count, covered.of) == pytest.approx((1.8, 2))
+    assert answer(row(3, "refused")).covered is None
+
+
+def test_reasons_are_counted_without_their_numbers() -> None:
+    first, *others = some().reasons
+    assert (first.outcome, first.step, first.count, first.seed) == ("refused", "invert_pose", 2, 7)
+    assert first.reason == "the fit is … mm off, allowed are … mm"
+    assert [one.outcome for one in others] == ["error", "misplaced"]
+
+
+def test_the_worst_worlds_are_those_that_failed_then_those_nearest_a_limit() -> None:
+    worst = some().worst
+    assert [world.seed for world in worst] == [7, 8, 9, 10, 6, 6]
+    assert worst[0].command == "repeat 7"
+    assert worst[4].figure in (ERROR.partition(" [")[0], COVERED.partition(" [")[0])
+
+
+def test_times_are_of_good_worlds() -> None:
+    told = some()
+    assert told.cycle is not None
+    assert (told.cycle.n, told.cycle.mean_s) == (6, pytest.approx(53.5))
+    assert [(step.name, round(step.share, 3)) for step in told.steps] == [("place", 0.667), ("laser_sweep", 0.333)]
+
+
+def test_a_world_is_repeated_by_a_command() -> None:
+    told = repeat_command(row(7), "my job.toml", "qualify/w/cell.toml")
+    wanted = "cell dry-run -c qualify/w/cell.toml -j 'my job.toml' --clock virtual --level nominal --seed 7"
+    assert told == wanted
+    assert repeat_command(row(7, faults=1), "pot", "c").endswith("--confirm simulated")
+
+
+def test_it_is_json() -> None:
+    told = json.loads(json.dumps(some().as_dict(), allow_nan=False))
+    assert told["shares"]["placed"] == {**told["shares"]["placed"], "count": 6, "of": 10, "share": 0.6}
+    assert json.dumps(answer(row(1, "refused")).as_dict(), allow_nan=False)
