@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -36,7 +34,7 @@ class Quick:
     def ended(self) -> Iterator[Ended]:
         assert self.task is not None
         if self.task.seed == self.ends_at:
-            os.kill(os.getpid(), signal.SIGINT)
+            raise KeyboardInterrupt
         yield self.task, self._row(self.task)
 
     def _row(self, task: WorldTask) -> Row:
