@@ -28,6 +28,8 @@ COLOURS = {
 }  # fmt: skip
 FAR = 6.0
 """A limit is drawn up to so many times the largest value."""
+NARROWEST = 0.12
+"""Share of a plot's width that all bars together take at least."""
 VALUES, LIMIT, DPI = "#2c5f9e", "#c0392b", 110
 
 
@@ -103,15 +105,16 @@ def _histograms(answer: JobAnswer, rows: Sequence[Row]) -> Figure:
 
 def _histogram(axes: Axes, values: np.ndarray[tuple[int], np.dtype[np.float64]], spread: FigureSpread) -> None:
     low, high = float(values.min()), float(values.max())
-    if high - low < 1e-9:
-        low, high = low - 0.5 * max(abs(low), 1e-3), high + 0.5 * max(abs(high), 1e-3)
-    axes.hist(values, bins=min(30, max(8, len(values) // 8)), range=(low, high), color=VALUES)
     limits = [-spread.limit, spread.limit] if spread.bound == "at most" and low < 0 else [spread.limit]
+    # One far away would squeeze the values into one bar; it stands in the title.
+    limits = [limit for limit in limits if abs(limit) <= FAR * max(abs(low), abs(high))]
+    ends = [low, high, *limits, *([0.0] if low >= 0 and spread.bound == "at most" else [])]
+    # Bars of values that are all but the same would be too narrow to see.
+    pad = max(0.0, 0.5 * (NARROWEST * max(max(ends) - min(ends), 1e-6) - (high - low)))
+    axes.hist(values, bins=min(30, max(8, len(values) // 8)), range=(low - pad, high + pad), color=VALUES)
     for limit in limits:
-        # One far away would squeeze the values into one bar; it stands in the title.
-        if abs(limit) <= FAR * max(abs(low), abs(high)):
-            axes.axvline(limit, color=LIMIT, linestyle="--", linewidth=1.2)
-    if low >= 0 and spread.bound == "at most":
+        axes.axvline(limit, color=LIMIT, linestyle="--", linewidth=1.2)
+    if 0.0 in ends:
         axes.set_xlim(left=0)
     axes.xaxis.set_major_locator(MaxNLocator(5))
     axes.yaxis.set_major_locator(MaxNLocator(4, integer=True))
