@@ -19,7 +19,7 @@ from cell.measure.calibration.drift.timing import StampTiming
 from cell.procedures.arm.photograph import BoardFix, scan_plans
 from cell.procedures.calibrate.reference_plate import require_edge, require_reference_plate
 from cell.procedures.steps.board_photo import require_board_unmoved
-from cell.procedures.steps.workplace import JobStep, PlateLook, Workplace
+from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord, save_sweep
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION, SweepCollector, SweepErrors, warm_up
 from cell.procedures.sweep.sweeping import arm_sweep, check_lost_steps, home_rail, rail_sweep
@@ -31,9 +31,6 @@ from statemachine.step import Step
 SHIFT_SHARE = 0.25
 """Share of the place's tolerance by which the unknown of its times may shift a sweep. Replies that are all late shift
 it to one side without any scatter; what else the place may be off by has the other three quarters."""
-PLATE_HOLDS_S = 60.0
-"""For so long a look at the plate on the claw holds, where the placed part is looked at: a laser that warms turns by
-less than 0.1 mrad meanwhile."""
 
 
 def laser_sweep(
@@ -189,25 +186,19 @@ def seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | Non
     before = head.witness
     if before is None:
         return None, None
-    last, now = here.on_plate, devices.clock.now()
-    # Whoever has the run held may reach in.
-    fresh = last is not None and now - last.at <= PLATE_HOLDS_S and last.held_s == context.held_s
-    if last is not None and fresh and here.looks_after and context.attempt == 1:
-        return last.pointing, last.slip
     context.progress(0.0, "looking where the laser points")
-    line = require_reference_plate(config, devices, keep)
+    seen = require_reference_plate(config, devices, keep)
     pointing = pointing_since(
-        before, line, head.camera, plane=head.light_plane, exit_point=config.laser.exit_point, confirmed=head.confirmed
+        before, seen, head.camera, plane=head.light_plane, exit_point=config.laser.exit_point, confirmed=head.confirmed
     )
-    slip = None
-    if before.edge is not None:
-        context.progress(0.005, "looking whether the scan head has slipped")
-        line = require_edge(config, devices, keep, before, line)
-        slip = slip_since(before, line, head.camera, head.light_plane, head.rail_direction)
-        if slip.size > LARGEST_M:
-            check_lost_steps(devices, context.progress)
-        slip.require()
-    here.on_plate = PlateLook(pointing, slip, now, context.held_s)
+    if before.edge is None:
+        return pointing, None
+    context.progress(0.005, "looking whether the scan head has slipped")
+    seen = require_edge(config, devices, keep, before, seen)
+    slip = slip_since(before, seen, head.camera, head.light_plane, head.rail_direction)
+    if slip.size > LARGEST_M:
+        check_lost_steps(devices, context.progress)
+    slip.require()
     return pointing, slip
 
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pinocchio as pin
@@ -16,8 +16,6 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.devices.devices import Devices
-from cell.measure.calibration.drift.reference_plate import Pointing
-from cell.measure.calibration.drift.slip import Slip
 from cell.measure.inversion import NominalSurface
 from cell.measure.vision import BoardSpec, parse_board
 from cell.procedures.arm.moves import Mover, Pace, PartProgress, PartState
@@ -53,15 +51,6 @@ class PartsBefore:
     arrival: VehicleArrival | None = None
 
 
-class PlateLook(NamedTuple):
-    """What the plate on the claw told `at` this time, s, after the run was held for `held_s`."""
-
-    pointing: Pointing
-    slip: Slip | None
-    at: float
-    held_s: float
-
-
 @dataclass(eq=False)
 class Workplace:
     """What every step of a job may use.
@@ -74,7 +63,6 @@ class Workplace:
     share of the planned speed. `looked` says whether this run has tried to look at the fine board, `interim` what that
     said, None where nothing was to be seen. `ground` is the box around the surface below a part to be unloaded, its
     lowest and highest corner, m, part frame. `parts_before` is what the parts before this one of its batch tell.
-    `on_plate` is the last look at the plate on the claw.
     """
 
     config: CellConfig
@@ -97,7 +85,6 @@ class Workplace:
     looked: bool = False
     ground: tuple[Vector, Vector] | None = None
     parts_before: PartsBefore = field(default_factory=PartsBefore)
-    on_plate: PlateLook | None = None
     _photographs: int = field(default=0, init=False)
 
     @cached_property

@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 
 from cell.config.job import LONGEST_SWEEP_S, load_job
-from cell.procedures.steps.laser_sweep import PLATE_HOLDS_S, laser_sweep, seen_on_plate, slowed_down
+from cell.procedures.steps.laser_sweep import laser_sweep, slowed_down
 from cell.procedures.sweep.second_look import sparse
 from cell.procedures.sweep.sweeping import UNCHECKED
 from drivers.errors import DeviceFault
 from lab.bench.job.whole_job import JobRecord
-from statemachine.runner import StepContext
 from tests.support.at_station import AtStation
 
 
@@ -55,28 +54,3 @@ def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
         assert (met.value.code, met.value.recoverable) == ("rail.lost_steps", True)
         assert not rail.state().homed_here
     assert "looking whether the rail has lost steps" in told
-
-
-def test_a_look_at_the_plate_holds_for_a_minute_where_the_placed_part_is_looked_at(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
-    told: list[str] = []
-    site = AtStation(placed_pot, tmp_path, tell=lambda event: told.append(str(event.data.get("text"))))
-    site.cell.devices.rail.home().wait(60.0)
-    context = site.context("laser_sweep")
-
-    def looks(context: StepContext = context) -> int:
-        before = told.count("looking where the laser points")
-        seen_on_plate(site.work, context)
-        return told.count("looking where the laser points") - before
-
-    assert (looks(), looks()) == (1, 1), "nobody looks at the placed part of this job"
-    site.work.looks_after = True
-    assert looks() == 0 and site.work.on_plate is not None
-    again = site.context("laser_sweep")
-    again.attempt = 2
-    assert looks(again) == 1, "after a fault"
-    site.cell.clock.sleep(PLATE_HOLDS_S + 1.0)
-    assert looks() == 1
-    site.work.on_plate = site.work.on_plate._replace(held_s=-1.0)
-    assert looks() == 1, "somebody may have reached in"
