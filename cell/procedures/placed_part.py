@@ -32,6 +32,7 @@ NO_FLUSH = "how flush its edge is was not seen: no surface shows near it, or a v
 BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 OFF_DRAWING = "the part itself is not as drawn there: bent, worn, cut, or another one"
+ASIDE_UNSEEN = "it lies aside where its faces do not show that, or a piece of it is missing"
 COVERED = "something was left on the part: look at its face"
 WHOLE = "where the {} {} lies follows from the part as a whole: nobody looked at it by itself"
 LIKELY = {
@@ -245,6 +246,8 @@ class PlacedPart:
     def _cause(self, measured: Sequence[Measured], failed: Sequence[FeatureSeen]) -> str:
         """What has most likely happened to a part that was `measured` so, and of which these features failed."""
         off, turned, *_ = measured
+        if self.unlike is not None and self.unlike.gone and self.unseen:
+            return ASIDE_UNSEEN
         if self.unlike is not None:
             return OFF_DRAWING if self.unlike.gone else COVERED
         if off.kept and turned.kept and any(number.name == FLUSH and not number.kept for number in measured):

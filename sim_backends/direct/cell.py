@@ -109,9 +109,16 @@ class VirtualClock(Clock):
                 return False
             self._tick(until)
         for ring in [ring for ring, due in self._alarms.items() if due <= self._time.now()]:
-            self._alarms.pop(ring, None)
-            if (again := ring()) is not None:
-                self._alarms[ring] = self.now() + again
+            # One that waits lets others ring.
+            if self._alarms.pop(ring, None) is None:
+                continue
+            again: float | None = 0.0
+            try:
+                again = ring()
+            finally:
+                # Whoever rings may be ended by what another one finds.
+                if again is not None:
+                    self._alarms[ring] = self.now() + again
         return True
 
     def ring_in(self, seconds: float, ring: Ring) -> None:

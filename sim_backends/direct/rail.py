@@ -104,8 +104,9 @@ class RailMove:
                 if self._asked():
                     self._end(None)
             except CellError as error:
-                rail.stop()
+                # First: whoever waits while it stops may be ended by that.
                 self._end(error)
+                rail.stop()
         elif self._target is None:
             if not model.searching(now) and model.velocity(now) == 0:
                 rail.homed = True

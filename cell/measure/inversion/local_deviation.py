@@ -32,6 +32,8 @@ BLUR_M = 0.15e-3
 """Half a stripe, of which a rim leaves the inner side: the last point is off by less."""
 SECTORS, LEAST_SECTORS = 16, 12
 """The rim of a hole or a pin is looked for in so many sectors, of which so many have to tell."""
+STRAY = 4.5
+"""Median deviations from all sectors' middle, beside half a stripe, from which on one tells nothing."""
 WIDE_M, NARROW_M = 15e-3, 1.5e-3
 """Radii between which such a rim is looked for."""
 PAST_M = 0.5e-3
@@ -160,11 +162,18 @@ def seen_middle(
         if (end := _end_in_sector(faces, places[beside], at, side @ ways, upward)) is not None:
             rows.append([*side, 1.0])
             ends.append(end)
-    if len(rows) < LEAST_SECTORS:
+    if not rows:
         return ()
     # One that is wider moves its rim apart, and not its middle.
-    aside = np.linalg.lstsq(np.array(rows), np.array([0.5 * sum(end) for end in ends]))[0][:2]
-    half = float(np.mean([0.5 * (most - least) for least, most in ends]))
+    sides, told = np.array(rows), np.array(ends)
+    left = told.mean(axis=1) - sides @ np.linalg.lstsq(sides, told.mean(axis=1))[0]
+    # A glint beside the rim is in one sector or another.
+    kept = np.abs(left) <= BLUR_M + STRAY * float(np.median(np.abs(left)))
+    if kept.sum() < LEAST_SECTORS:
+        return ()
+    aside = np.linalg.lstsq(sides[kept], told[kept].mean(axis=1))[0][:2]
+    # As far as all sectors together may put it aside.
+    half = 4.0 / np.pi * float(np.mean(0.5 * np.diff(told[kept], axis=1)))
     return tuple(
         (Span(float(by) - half, float(by) + half), lies.rotation @ way) for by, way in zip(aside, ways, strict=True)
     )
@@ -176,12 +185,10 @@ def _end_in_sector(
     """Between how much farther along `way` (3,) than drawn, m, the rim about `at` lies by the points (n, 3) there."""
     if (drawn := _drawn_rim(faces, at, way, upward)) is None:
         return None
-    rim, outward = drawn
+    rim, outward, room = drawn
     radius = float((rim - at) @ way)
     flat = (places - at) - np.outer((places - at) @ upward, upward)
-    out, most = outward * (np.linalg.norm(flat, axis=1) - radius), STRETCH_M[1]
-    if outward < 0.0:
-        most = min(most, radius)
+    out, most = outward * (np.linalg.norm(flat, axis=1) - radius), min(STRETCH_M[1], room)
     near = (out > STRETCH_M[0]) & (out < most)
     # A mouth or a top is level: what lies deeper is a floor, or what the pin stands on.
     level = _level(faces, places[near], rim, upward, slope=0.0)
@@ -212,9 +219,9 @@ def _seen_below(faces: NominalSurface, places: Array, upward: Array) -> bool:
     return int(((feet.points - places) @ upward > LEVEL_M[1]).sum()) > 2
 
 
-def _drawn_rim(faces: NominalSurface, at: Array, way: Array, upward: Array) -> tuple[Array, float] | None:
-    """Where along `way` (3,) from `at` a hole or a pin's top ends in the faces, (3,) m, and 1 for a pin, -1 for a hole;
-    None where neither is drawn there."""
+def _drawn_rim(faces: NominalSurface, at: Array, way: Array, upward: Array) -> tuple[Array, float, float] | None:
+    """Where along `way` (3,) from `at` a hole or a pin's top ends in the faces, (3,) m, 1 for a pin and -1 for a hole,
+    and half of how far beyond the rim the next face as high is drawn, m; None where neither is drawn there."""
     places = at + np.outer(np.arange(0.0, WIDE_M, STEP_M), way)
     _, feet = faces.feet(places)
     apart = feet.points - places
@@ -228,7 +235,12 @@ def _drawn_rim(faces: NominalSurface, at: Array, way: Array, upward: Array) -> t
     # Seen from beside it the nearest point of the faces is on the rim.
     beside, outward = (changes[0], 1.0) if on_face[0] else (changes[0] - 1, -1.0)
     rim = feet.points[beside]
-    return (rim, outward) if (rim - at) @ way > NARROW_M else None
+    if not (radius := float((rim - at) @ way)) > NARROW_M:
+        return None
+    if outward < 0.0:
+        return rim, outward, radius  # Beyond it is its other side.
+    again = np.flatnonzero(on_face[beside:])
+    return rim, outward, 0.5 * STEP_M * float(again[0]) if len(again) else np.inf
 
 
 def _drawn_end(faces: NominalSurface, at: Array, outward: Array) -> float | None:

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pinocchio as pin
+import scipy.ndimage
 from numpy.typing import NDArray
 
-from cell.measure.inversion.disagreement import ROWS, SQUARE_M, square_of
+from cell.measure.inversion.disagreement import SQUARE_M
 from cell.measure.inversion.nominal import Array, Indices, NominalSurface
 from cell.measure.reconstruction.cloud import Cloud
 
@@ -21,9 +22,12 @@ FAR_M = 1.5e-3
 LEAST_POINTS = 3
 """Such points that a square needs, with none of the face itself."""
 MOST_UNLIKE = 3 * SQUARE_M**2
-"""So much of a face, m², may be a reflection."""
-BESIDE = np.array([0, 1, -1, 2 * ROWS, -2 * ROWS, 2 * ROWS + 1, 2 * ROWS - 1, -2 * ROWS + 1, -2 * ROWS - 1])
-"""From the number of a square to those of itself and the eight about it."""
+"""So much of a face in one piece, m², may be a reflection."""
+SAMPLES, MOST_SAMPLES = 32, 3_000_000
+"""Of the drawn faces for each square, and at most in all: above a third of a square metre they lie farther apart."""
+DRAWN = 0.5
+"""Share of its samples from which on a square counts as drawn: one that a slot leaves a sliver of does not."""
+ALL_ABOUT = np.ones((3, 3), dtype=np.bool_)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,39 +58,55 @@ def unlike_patch(cloud: Cloud, base_from_surface: pin.SE3, lies: pin.SE3, faces:
 
     A square of 2 mm counts that is drawn together with the eight about it: rims are for the part's named edges.
     """
-    upward = lies.rotation.T[:, 2]
-    drawn, low, high = _drawn_heights(faces, lies, upward)
-    inside = np.logical_and.reduce(np.isin(drawn[:, None] + BESIDE, drawn), axis=1)
+    drawn = _samples(faces) @ lies.rotation.T
+    corner = np.floor(drawn[:, :2].min(axis=0) / SQUARE_M).astype(np.intp) - 1
+    shape = np.floor(drawn[:, :2].max(axis=0) / SQUARE_M).astype(np.intp) - corner + 2
+    low, high, inside = _drawn_heights(drawn, corner, shape)
     base_from_part = base_from_surface * lies
-    places = (cloud.points[cloud.valid] - base_from_part.translation) @ base_from_part.rotation
-    square = square_of(places @ lies.rotation.T)
-    at = np.minimum(np.searchsorted(drawn, square), len(drawn) - 1)
-    known = (drawn[at] == square) & inside[at]
-    at, up = at[known], (places @ upward)[known]
-    below, above = up < low[at] - FAR_M, up > high[at] + FAR_M
-    own = np.bincount(at[~below & ~above], minlength=len(drawn))
+    places = (cloud.points[cloud.valid] - base_from_part.translation) @ base_from_part.rotation @ lies.rotation.T
+    column, row = (np.floor(places[:, :2] / SQUARE_M).astype(np.intp) - corner).T
+    near = (column >= 0) & (row >= 0) & (column < shape[0]) & (row < shape[1])
+    column, row, up = column[near], row[near], places[near, 2]
+    below, above = up < low[column, row] - FAR_M, up > high[column, row] + FAR_M
+
+    def counted(which: NDArray[np.bool_]) -> Indices:
+        found = np.zeros(tuple(shape), dtype=np.intp)
+        np.add.at(found, (column[which], row[which]), 1)
+        return found
+
+    bare = inside & (counted(~below & ~above) == 0)
     patches = []
     for far, gone in ((below, True), (above, False)):
-        found = np.flatnonzero((np.bincount(at[far], minlength=len(drawn)) >= LEAST_POINTS) & (own == 0))
-        if len(found) * SQUARE_M**2 > 1.01 * MOST_UNLIKE:
-            middle = np.median(_middles(drawn[found], high[found]), axis=0) @ lies.rotation
-            patches.append(FacePatch(len(found) * SQUARE_M**2, middle, gone))
+        pieces, number = scipy.ndimage.label(bare & (counted(far) >= LEAST_POINTS), ALL_ABOUT)
+        sizes = np.bincount(pieces.ravel(), minlength=number + 1)[1:]
+        if number and sizes.max() * SQUARE_M**2 > 1.01 * MOST_UNLIKE:
+            squares = np.argwhere(pieces == 1 + int(sizes.argmax()))
+            middle = np.append(SQUARE_M * (squares.mean(axis=0) + corner + 0.5), np.median(high[tuple(squares.T)]))
+            patches.append(FacePatch(len(squares) * SQUARE_M**2, middle @ lies.rotation, gone))
     return max(patches, key=lambda patch: patch.area, default=None)
 
 
-def _drawn_heights(faces: NominalSurface, lies: pin.SE3, upward: Array) -> tuple[Indices, Array, Array]:
-    """The squares in which the faces are drawn, in order, and from where to where they go up in each, m."""
-    square = square_of(faces.samples @ lies.rotation.T)
-    drawn, owner = np.unique(square, return_inverse=True)
-    up = faces.samples @ upward
-    low, high = np.full(len(drawn), np.inf), np.full(len(drawn), -np.inf)
-    np.minimum.at(low, owner, up)
-    np.maximum.at(high, owner, up)
-    return drawn, low, high
+def _drawn_heights(drawn: Array, corner: Indices, shape: Indices) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """From where to where, m, the samples (n, 3) go up in each square, and which squares are drawn with all about."""
+    column, row = (np.floor(drawn[:, :2] / SQUARE_M).astype(np.intp) - corner).T
+    low: Array = np.full(tuple(shape), np.inf)
+    high: Array = np.full(tuple(shape), -np.inf)
+    count = np.zeros(tuple(shape), dtype=np.intp)
+    np.minimum.at(low, (column, row), drawn[:, 2])
+    np.maximum.at(high, (column, row), drawn[:, 2])
+    np.add.at(count, (column, row), 1)
+    usual = np.median(count[count > 0])
+    return low, high, np.asarray(scipy.ndimage.binary_erosion(count >= DRAWN * usual, ALL_ABOUT))
 
 
-def _middles(square: NDArray[np.intp], up: Array) -> Array:
-    """The middles (n, 3) m of squares by their numbers, as high as told."""
-    row = (square + ROWS) % (2 * ROWS) - ROWS
-    column = (square - row) // (2 * ROWS)
-    return np.column_stack([SQUARE_M * (column + 0.5), SQUARE_M * (row + 0.5), up])
+def _samples(faces: NominalSurface) -> Array:
+    """Points (n, 3) of the faces, part frame, as dense everywhere, whatever their triangles are like."""
+    number = min(MOST_SAMPLES, max(1, round(SAMPLES * float(faces.areas.sum()) / SQUARE_M**2)))
+    until = np.cumsum(faces.areas)
+    owner = np.searchsorted(until, (np.arange(number) + 0.5) / number * until[-1])
+    # A sequence that fills each triangle evenly (Roberts, 2018), folded from the square onto it.
+    along, across = np.mod(np.outer([0.7548776662466927, 0.5698402909980532], np.arange(1, number + 1)), 1.0)
+    folded = along + across > 1.0
+    along, across = np.where(folded, 1.0 - along, along), np.where(folded, 1.0 - across, across)
+    a, b, c = (faces.vertices[faces.triangles[owner, k]] for k in range(3))
+    return np.asarray(a + along[:, None] * (b - a) + across[:, None] * (c - a))

@@ -88,7 +88,9 @@ def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left:
     known = here.job, here.repeatability, pose, found.points, found.covariance
     hope = expected_residual(*known, corrections=left)
     why = f"placed again it would be {1e3 * hope:.2f} mm off"
-    if found.seen.moved is not None:
+    if found.unlike is not None:
+        why = found.unlike.words
+    elif found.seen.moved is not None:
         why = "surface or vehicle does not stand where it was swept, and nobody looked where the claw would go"
     elif found.aside >= FARTHEST_M:
         why = f"farther than {1e3 * FARTHEST_M:g} mm the claw may not find it"

@@ -86,7 +86,8 @@ def timeline(folder: Path, report: Report) -> Timeline | None:
     course = _virtual(record, report) if report.get("clock") == "virtual" else _wall(record, report)
     # The record's time begins with the first step.
     first = min(bar.begin for bar in course.bars)
-    moved = [one._replace(begin=one.begin + first, end=one.end + first) for one in activities(folder)]
+    rate = 1.0 if report.get("clock") == "virtual" else float(report.get("speed") or 1.0)
+    moved = [one._replace(begin=one.begin + first, end=one.end + first) for one in activities(folder, rate)]
     return replace(course, activities=tuple(one for one in moved if first <= one.begin < one.end <= course.length))
 
 

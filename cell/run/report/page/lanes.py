@@ -56,9 +56,9 @@ class _Told:
     state: State
 
 
-def activities(folder: Path) -> list[Activity]:
+def activities(folder: Path, rate: float = 1.0) -> list[Activity]:
     """What the devices did in the run in `folder`, in the order of the devices and of the time; empty where no record
-    tells it."""
+    tells it. The cell went `rate` times as fast as the record's time."""
     if missing() or not (folder / FILE).is_file():
         return []
     try:
@@ -66,14 +66,15 @@ def activities(folder: Path) -> list[Activity]:
     except (CellError, KeyError):
         return []
     found: list[Activity] = []
+    last = max((one.at for each in told.values() for one in each), default=begun)
     for device in LANES:
         states, commands, frames = (told.get(f"/{device}/{what}", []) for what in ("state", "command", "frame"))
         if device in CAMERAS:
             found += _looks(device, frames)
         elif device in ("laser", "claw"):
-            found += _switched(device, commands)
+            found += _switched(device, commands, last)
         elif device == "rail":
-            found += _rail_moves(states, commands)
+            found += _rail_moves(states, commands, rate)
         else:
             found += _moves(device, states, _arm_moves if device == "arm" else _vehicle_moves)
     return [one._replace(begin=one.begin - begun, end=one.end - begun) for one in found]
@@ -84,9 +85,11 @@ def _read(record: Path) -> tuple[float, dict[str, list[_Told]]]:
     told: dict[str, list[_Told]] = {}
     begun: float | None = None
     for topic, at, message in messages(record, ("/sequence/event", *(f"/{device}/" for device in LANES))):
-        if begun is None and topic == "/sequence/event" and message["kind"] == "step_started":
+        if not isinstance(message, dict):
+            continue
+        if begun is None and topic == "/sequence/event" and message.get("kind") == "step_started":
             begun = 1e-9 * at
-        elif isinstance(message, dict):
+        elif not message.get("refused"):
             told.setdefault(topic, []).append(_Told(1e-9 * at, message))
     return (0.0, {}) if begun is None else (begun, told)
 
@@ -123,14 +126,14 @@ def _number(state: State, name: str) -> float:
 
 def _arm_moves(state: State) -> bool:
     speeds = state.get("joint_speeds")
-    return isinstance(speeds, list) and bool(np.abs(np.array(speeds, dtype=np.float64)).max() > MOVING)
+    return isinstance(speeds, list) and bool(np.abs(np.array(speeds, dtype=np.float64)).max(initial=0.0) > MOVING)
 
 
 def _vehicle_moves(state: State) -> bool:
     return max(abs(_number(state, name)) for name in ("speed", "yaw_rate")) > MOVING
 
 
-def _rail_moves(states: Sequence[_Told], commands: Sequence[_Told]) -> list[Activity]:
+def _rail_moves(states: Sequence[_Told], commands: Sequence[_Told], rate: float) -> list[Activity]:
     """From each command until its way is done, or something newer is told: at rest the rail is asked now and then."""
     sent = [one for one in commands if one.state.get("name") in ("home", "move_to", "sweep")]
     rests = [one.at for one in states if "homed" in one.state]
@@ -141,7 +144,8 @@ def _rail_moves(states: Sequence[_Told], commands: Sequence[_Told]) -> list[Acti
         given = given if isinstance(given, dict) else {}
         goal = _number(given, "stop" if "stop" in given else "position")
         # A look for the reference switch is told as a way to 0.
-        longest = abs(goal - stands) / (_number(given, "speed") or RAIL_M_S) + (SHORTEST_S if goal else SWITCH_S)
+        way = abs(goal - stands) / (_number(given, "speed") or RAIL_M_S)
+        longest = (way + (SHORTEST_S if goal else SWITCH_S)) / rate
         newer = [at for at in rests if at > command.at + SHORTEST_S][:1] + [one.at for one in sent[k + 1 : k + 2]]
         until = min(newer, default=command.at + longest)
         found.append(Activity("rail", command.at, until if "stop" in given else min(until, command.at + longest)))
@@ -159,8 +163,8 @@ def _looks(device: str, frames: Sequence[_Told]) -> list[Activity]:
     return found
 
 
-def _switched(device: str, commands: Sequence[_Told]) -> list[Activity]:
-    """The laser from each time it is lit until it is off; of a claw each command."""
+def _switched(device: str, commands: Sequence[_Told], last: float) -> list[Activity]:
+    """The laser from each time it is lit until it is off, or until the record's `last` time; of a claw each command."""
     if device == "claw":
         return [Activity(device, command.at, command.at + SHORTEST_S) for command in commands]
     found: list[Activity] = []
@@ -172,4 +176,4 @@ def _switched(device: str, commands: Sequence[_Told]) -> list[Activity]:
         elif not on and lit is not None:
             found.append(Activity(device, lit, command.at))
             lit = None
-    return found
+    return found if lit is None else [*found, Activity(device, lit, last)]

@@ -235,6 +235,29 @@ def test_the_face_about_a_hole_may_be_inclined(by: float) -> None:
     assert spans[0].least < by < spans[0].most and np.sign(spans[0].off) == np.sign(by) and spans[1].off == 0.0
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_glint_or_a_drawn_neighbour_beside_a_pin_moves_its_middle_by_nothing(seed: int) -> None:
+    for spans in (middle(scanned(pinned, seed, outliers=0.03), PIN), middle(*beside_a_bar(seed))):
+        assert all(span.off == 0.0 for span in spans), spans
+
+
+def beside_a_bar(seed: int) -> tuple[Cloud, NominalSurface]:
+    """The pin, and a bar as high 2.4 mm beside its rim, both as drawn."""
+    low, high = (PLACE + np.array(corner) for corner in ((RADIUS + 2.4e-3, -1.5e-3), (RADIUS + 3.2e-3, 1.5e-3)))
+    corners = np.array([[*low, 0.0], [high[0], low[1], 0.0], [*high, 0.0], [low[0], high[1], 0.0]])
+    count = len(PIN.vertices)
+    faces = NominalSurface(
+        np.vstack([PIN.vertices, corners]),
+        [*PIN.triangles, [count, count + 1, count + 2], [count, count + 2, count + 3]],
+    )
+
+    def height(x: Array, y: Array) -> Array:
+        on_bar = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+        return np.where(on_bar, THICK, pinned(x, y))
+
+    return scanned(height, seed), faces
+
+
 def test_where_no_hole_is_drawn_or_too_little_of_it_shows_nothing_is_told() -> None:
     cloud = scanned(pierced, 5)
     assert middle(cloud, TOP) == [], "the plate goes on"

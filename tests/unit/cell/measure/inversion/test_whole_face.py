@@ -76,6 +76,43 @@ def test_a_part_that_is_turned_and_shifted_is_told_in_its_own_frame() -> None:
     assert found is not None and np.linalg.norm((found.at - there.translation)[:2]) < 3e-3, faces
 
 
+@pytest.mark.parametrize("wide", [1.2e-3, 1.8e-3, 2.3e-3])
+def test_a_slot_through_the_part_is_no_face_that_is_gone(wide: float) -> None:
+    """Of which a sliver of a square is left to either side."""
+    for k in range(8):
+        left = 0.25e-3 * k + 0.1e-3
+        right = left + wide
+        x, y = [-HALF, left, right, HALF], [-0.018, -0.012, 0.012, 0.018]
+        corners = np.array([[a, b, 0.0] for a in x for b in y])
+        cells = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+        faces = [[4 * i + j, 4 * i + j + 4, 4 * i + j + 5] for i, j in cells]
+        faces += [[4 * i + j, 4 * i + j + 5, 4 * i + j + 1] for i, j in cells]
+
+        def slot(x: Array, y: Array, left: float = left, right: float = right) -> Array:
+            return np.where((x > left) & (x < right) & (np.abs(y) < 0.012), 0.0, part(x, y))
+
+        assert looked(scanned(slot, k), NominalSurface(corners, faces)) is None, left
+
+
+def test_spots_far_apart_are_no_patch_and_the_largest_piece_tells_where() -> None:
+    def spotted(x: Array, y: Array) -> Array:
+        spots = [np.hypot(x - a, y - b) < 2.2e-3 for a in (-15e-3, 15e-3) for b in (-11e-3, 11e-3)]
+        return np.where(np.any(spots, axis=0), THICK + 3e-3, part(x, y))
+
+    assert looked(scanned(spotted, 5)) is None
+    found = looked(scanned(lambda x, y: np.where(corner(x, y) > 0.0, spotted(x, y), 0.0), 5))
+    assert found is not None and found.gone and np.hypot(*(found.at[:2] - (HALF - 5e-3, 12e-3))) < 3e-3
+
+
+def test_long_thin_triangles_are_asked_as_closely_as_others() -> None:
+    """A plate of 400 strips of its whole width, each two triangles."""
+    x = np.linspace(-HALF, HALF, 401)
+    corners = np.column_stack([np.tile(x, 2), np.repeat([-0.018, 0.018], 401), np.zeros(802)])
+    strips = [[k, k + 1, 401 + k] for k in range(400)] + [[k + 1, 402 + k, 401 + k] for k in range(400)]
+    found = looked(scanned(corner, 5), NominalSurface(corners, strips))
+    assert found is not None and found.gone and 1e6 * found.area > 60.0
+
+
 def test_what_the_sweep_does_not_show_is_not_told_as_gone() -> None:
     cloud = scanned(corner, 5)
     local = (cloud.points - TRUE.translation) @ TRUE.rotation

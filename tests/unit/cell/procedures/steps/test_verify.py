@@ -229,32 +229,41 @@ def test_a_part_that_is_not_as_drawn_about_its_features_is_told_though_it_lies_i
     assert str(told.value).count("Out of tolerance") == 2
 
 
+def spoiled(cell: VirtualCell, covered: bool) -> None:
+    """Have a corner of 10 mm broken off the part, or something stand on it there."""
+    [item] = cell.world._items
+    drawn = item.station.part_seen
+    assert drawn is not None
+    corners, triangles = trimesh.remesh.subdivide_to_size(drawn.vertices, drawn.triangles, 1e-3)
+    middle = corners[triangles].mean(axis=1)
+    there = (middle[:, 2] > 0.012) & (middle[:, 0] > 5e-3) & (middle[:, 1] > 5e-3)
+    if covered:
+        corners = corners + np.isin(np.arange(len(corners)), triangles[there])[:, None] * [0.0, 0.0, 4e-3]
+    else:
+        triangles = triangles[~there]
+    cell.world._items = [replace(item, station=replace(item.station, part_seen=Mesh(corners, triangles)))]
+
+
 @pytest.mark.parametrize("covered", [False, True])
 def test_a_part_of_which_a_piece_broke_off_or_that_is_covered_is_told_though_the_rest_lies_in_its_place(
     placed_pot: JobRecord, tmp_path: Path, covered: bool
 ) -> None:
     """The job names no feature: a robust fit passes over a corner of 10 mm, and over what lies there."""
-
-    def other(cell: VirtualCell) -> None:
-        [item] = cell.world._items
-        drawn = item.station.part_seen
-        assert drawn is not None
-        corners, triangles = trimesh.remesh.subdivide_to_size(drawn.vertices, drawn.triangles, 1e-3)
-        middle = corners[triangles].mean(axis=1)
-        there = (middle[:, 2] > 0.012) & (middle[:, 0] > 5e-3) & (middle[:, 1] > 5e-3)
-        if covered:
-            corners = corners + np.isin(np.arange(len(corners)), triangles[there])[:, None] * [0.0, 0.0, 4e-3]
-        else:
-            triangles = triangles[~there]
-        cell.world._items = [replace(item, station=replace(item.station, part_seen=Mesh(corners, triangles)))]
-
+    site = LyingPart(placed_pot, tmp_path, changed=lambda cell: spoiled(cell, covered))
     with pytest.raises(MisplacedError, match=r"lies 0.\d\d ± 0.0\d mm off") as told:
-        LyingPart(placed_pot, tmp_path, changed=other).looked(pin.SE3.Identity())
+        site.looked(pin.SE3.Identity())
     assert (COVERED if covered else OFF_DRAWING) in str(told.value), str(told.value)
     assert re.search(r"\d+ mm² of its face about \(\d+, \d+, \d+\) mm in its own frame is", str(told.value))
     assert [number.name for number in told.value.numbers if not number.kept] == [
         "placed part's face, not there or covered"
     ]
+
+
+def test_a_part_with_something_on_it_is_not_gripped_again(placed_pot: JobRecord, tmp_path: Path) -> None:
+    site = LyingPart(placed_pot, tmp_path, also="corrections = 2", changed=lambda cell: spoiled(cell, True))
+    with pytest.raises(MisplacedError, match="something stands on it"):
+        site.looked(moved(0.8e-3))
+    assert site.parts == [] and any("something stands on it" in note for note in site.notes)
 
 
 def test_another_part_or_none_is_not_found(placed_pot: JobRecord, tmp_path: Path) -> None:

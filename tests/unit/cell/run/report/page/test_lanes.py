@@ -63,6 +63,15 @@ def test_a_laser_is_lit_until_it_is_off_and_pictures_close_together_are_one_look
     assert idle(found, 6.0) == [(0.0, pytest.approx(1.0)), (3.0, pytest.approx(5.0)), (pytest.approx(5.02), 6.0)]
 
 
+def test_what_was_refused_is_not_drawn_and_a_laser_that_nobody_put_out_is(tmp_path: Path) -> None:
+    lit = {"name": "lit", "arguments": {}}
+    refused = "/laser/command", 1.0, {**lit, "refused": "the vehicle drives"}
+    found = recorded(
+        tmp_path, refused, ("/laser/command", 4.0, lit), arm(5.0, 0.0), ("/arm/state", 6.5, {"joint_speeds": []})
+    )
+    assert [(one.device, one.begin, one.end) for one in found] == [("laser", pytest.approx(4.0), pytest.approx(6.5))]
+
+
 def test_of_a_whole_job_the_arm_and_the_vehicle_never_move_at_once(placed_pot: JobRecord) -> None:
     assert placed_pot.folder is not None
     found = activities(placed_pot.folder)
