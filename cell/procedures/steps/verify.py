@@ -35,8 +35,10 @@ from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
 
 CLOUD = "placed.ply"
+SWEPT_AGAIN = (FRAMES_LOST, "rail.late_readings", "arm.late_readings", "camera.late_readings")
+"""Faults of a sweep that the next one may not have."""
 SWEEPS = 3
-"""How often at most the part is swept until no frames are lost and it lies still."""
+"""How often at most the part is swept until no frames are lost, no replies come too late, and it lies still."""
 
 
 def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
@@ -174,8 +176,8 @@ def _swept_at_rest(
     here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, *, frames: str,
     lying: PartOnGround | None,
 ) -> tuple[Cloud, SweepRecord, float]:  # fmt: skip
-    """The part's cloud and its sweep, made again until no frames are lost and the part is at rest: nothing of it is
-    moved by that. And how far, m, it moved in the last look; 0 for one at rest. Lost steps look like such a motion."""
+    """The part's cloud and its sweep, made again until it is whole and the part is at rest: nothing of it is moved by
+    that. And how far, m, it moved in the last look; 0 for one at rest. Lost steps look like such a motion."""
     for left in reversed(range(SWEEPS)):
         try:
             record = laser_sweep(
@@ -188,7 +190,7 @@ def _swept_at_rest(
             if moved and here.job.scan.mode == "rail":
                 check_lost_steps(here.devices, lambda _, text: context.progress(0.85, text))
         except DeviceFault as fault:
-            if fault.code != FRAMES_LOST or not left:
+            if fault.code not in SWEPT_AGAIN or not left:
                 raise
             why = str(fault)
         else:

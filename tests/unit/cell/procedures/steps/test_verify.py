@@ -314,6 +314,21 @@ def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(placed_pot: 
     assert sum(note.startswith(again) for note in worse.notes) == 2
 
 
+def test_a_sweep_over_the_part_whose_replies_came_too_late_is_done_again(placed_pot: JobRecord, tmp_path: Path) -> None:
+    def late(cell: VirtualCell) -> None:
+        cell.rail.late = 0.05
+
+    def in_time(cell: VirtualCell, text: str) -> None:
+        if text.startswith("the part is swept again: rail: replies come so late"):
+            cell.rail.late = 0.0
+
+    site = LyingPart(placed_pot, tmp_path, changed=late, heard=in_time)
+    assert site.looked(moved()).seen.beside > 1000
+    assert sum("replies come so late" in note for note in site.notes) == 1
+    with pytest.raises(DeviceFault, match="replies come so late"):
+        LyingPart(placed_pot, tmp_path, changed=late).looked(moved())
+
+
 @pytest.mark.parametrize(
     "rate", [moved(turn=(0.0, 0.0, 1e-3)), moved(x=0.05e-3), moved(z=-0.02e-3)], ids=["turns", "slides", "sinks"]
 )
