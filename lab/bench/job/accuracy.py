@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import pinocchio as pin
-from scipy.special import betaincinv
 from scipy.stats import chi2
 
+from cell.apps.qualify.intervals import Share
 from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import difference, transform
@@ -39,7 +39,6 @@ LIMITS: dict[str, dict[str, float]] = {
 
 WANTED = (0.90, 0.98)
 """True coverage that a stated 95 % ellipsoid may have."""
-CONFIDENCE = 0.95
 
 
 def campaign(
@@ -227,7 +226,7 @@ def _covered(runs: Sequence[dict[str, Any]], name: str) -> float | None:
 
 
 def _between(runs: Sequence[dict[str, Any]], name: str) -> tuple[float, float] | None:
-    return interval(sum(run["covered"][name] for run in runs), len(runs)) if runs else None
+    return Share(sum(run["covered"][name] for run in runs), len(runs)).between if runs else None
 
 
 def _average(values: Sequence[float] | Vector) -> float | None:
@@ -236,17 +235,3 @@ def _average(values: Sequence[float] | Vector) -> float | None:
 
 def _mm(distances: Vector) -> list[float]:
     return [round(1e3 * float(d), 5) for d in distances]
-
-
-def interval(inside: float, worlds: int) -> tuple[float, float]:
-    """Lowest and highest true share that explain `inside` of `worlds` (Clopper and Pearson, Biometrika 26, 1934).
-
-    Few worlds leave a wide interval: of 20, true shares of 90 % and more explain 15 inside. Too many inside show from
-    183 worlds on. A mean share of points counts as that share of the worlds: a world's points are not independent.
-    """
-    if worlds == 0:
-        return 0.0, 1.0
-    tail = 0.5 * (1.0 - CONFIDENCE)
-    low = float(betaincinv(inside, worlds - inside + 1.0, tail)) if inside > 0 else 0.0
-    high = float(betaincinv(inside + 1.0, worlds - inside, 1.0 - tail)) if inside < worlds else 1.0
-    return low, high

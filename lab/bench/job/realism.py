@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
+from cell.apps.qualify.intervals import Share
 from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import PlacePose
 from cell.procedures.part_error import part_covariance
 from cell.run.report.report import pose_of
-from lab.bench.job.accuracy import WANTED, figures, interval
+from lab.bench.job.accuracy import WANTED, figures
 from lab.bench.job.scan_errors import COVERED
 from lab.bench.job.whole_job import JobRecord, job_and_surface, run_whole_job
 from lab.bench.over_cores import over_cores
@@ -130,7 +131,7 @@ def summed_up(effect: str, runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "size": noise.get(effect),
         "worlds": len(runs),
         **count,
-        "between": interval(count["inside"] + count["named"], len(runs)),
+        "between": Share(count["inside"] + count["named"], len(runs)).between,
         "pose_inside": _mean(runs, "pose_inside"),
         "part_inside": _mean(runs, "part_inside"),
         "outside_tolerance": sum(run["within_tolerance"] is False for run in runs),
@@ -146,14 +147,14 @@ def pooled(by_effect: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """What was placed in all effects together. The effects share their seeds, so this is no more than a hint."""
     placed = [run for entry in by_effect.values() for run in entry["runs"] if run["outcome"] == "placed"]
     inside = sum(run["verdict"] == "inside" for run in placed)
-    return {"worlds": len(placed), "inside": inside, "between": interval(inside, len(placed))}
+    return {"worlds": len(placed), "inside": inside, "between": Share(inside, len(placed)).between}
 
 
 def is_well(entry: dict[str, Any]) -> bool:
     """Whether true shares of 90 % and more explain how many of an effect's worlds told nothing wrong and were not
     refused without its name, and none was placed outside the tolerance."""
     good = int(entry["inside"]) + int(entry["named"])
-    return interval(good, int(entry["worlds"]))[1] >= WANTED[0] and not entry["outside_tolerance"]
+    return Share(good, int(entry["worlds"])).high >= WANTED[0] and not entry["outside_tolerance"]
 
 
 def _mean(runs: Sequence[dict[str, Any]], name: str) -> float | None:
