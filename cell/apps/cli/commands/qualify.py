@@ -71,7 +71,8 @@ def qualify(
 ) -> None:
     """Run a job on many simulated worlds on the virtual clock: yield, figures beside their limits, what goes wrong.
 
-    A campaign goes on where it was stopped. Exits 1 where a part was placed outside its tolerance unnoticed.
+    A campaign goes on where it was stopped. Exits 1 where a part was placed outside its tolerance unnoticed, and where a
+    world ended by an error of the program.
     """
     from cell.apps.qualify import campaign as campaigns
     from cell.apps.qualify.compare import compare as paired
@@ -98,7 +99,7 @@ def qualify(
         print_json(told if compared is None else {**told, "compared": compared.as_dict()})
     else:
         _print([*tables_of(answer), *more], answer, page, line)
-    raise typer.Exit(EXIT_FAILED if answer.unnoticed.count else 0)
+    raise typer.Exit(EXIT_FAILED if answer.unnoticed.count or "error" in answer.shares else 0)
 
 
 def _campaign(job: str, path: Path | None, out: Path | None, *, level: str, first: int, target: Target) -> Campaign:

@@ -26,6 +26,7 @@ class Quick:
     def __init__(self, ends_at: int | None = None, error_mm: float = 0.1) -> None:
         self.ends_at = ends_at
         self.error_mm = error_mm
+        self.outcome = "placed"
         self.task: WorldTask | None = None
 
     def begin(self, task: WorldTask) -> None:
@@ -38,7 +39,7 @@ class Quick:
         yield self.task, self._row(self.task)
 
     def _row(self, task: WorldTask) -> Row:
-        return row(task.seed, "placed", self.error_mm, of=task.of)
+        return row(task.seed, self.outcome, self.error_mm, of=task.of)
 
     def close(self) -> None:
         pass
@@ -80,6 +81,14 @@ def test_a_part_outside_its_tolerance_that_nobody_noticed_fails(quick: Quick, ty
     quick.error_mm = 0.7
     code, out, _ = typed("qualify", "--seeds", "2", "--json")
     assert (code, json.loads(out)["unnoticed"]["count"]) == (1, 2)
+
+
+@pytest.mark.parametrize(("outcome", "code"), [("refused", 0), ("error", 1)])
+def test_a_program_that_fails_in_a_world_fails_and_a_part_that_is_refused_does_not(
+    quick: Quick, typed: Typed, outcome: str, code: int
+) -> None:
+    quick.outcome = outcome
+    assert typed("qualify", "--seeds", "2")[0] == code
 
 
 def test_campaigns_are_compared(quick: Quick, here: Path, typed: Typed) -> None:
