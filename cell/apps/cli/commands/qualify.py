@@ -71,8 +71,8 @@ def qualify(
 ) -> None:
     """Run a job on many simulated worlds on the virtual clock: yield, figures beside their limits, what goes wrong.
 
-    A campaign goes on where it was stopped. Exits 1 where a part was placed outside its tolerance unnoticed, and where a
-    world ended by an error of the program.
+    A campaign goes on where it was stopped. Exits 1 where a part was placed outside its tolerance unnoticed, and where
+    the program failed in a world.
     """
     from cell.apps.qualify import campaign as campaigns
     from cell.apps.qualify.compare import compare as paired
