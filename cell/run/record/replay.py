@@ -107,6 +107,10 @@ def load(folder: Path) -> dict[str, Any]:
                 raise ValueError(f"it has not all of {', '.join(sorted(keys))}")
     except (OSError, ValueError, KeyError) as error:
         raise CellError(f"{path} cannot be read: {error}") from error
+    if not (folder / "frames").is_dir():
+        raise ConfigError(
+            f"{folder.name} cannot be replayed: it kept no pictures. Set cell.frames = true, then run the job again"
+        )
     return data
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cell.run.folder import Report, list_runs, read_report
-from cell.run.report.page.lanes import Activity, activities, idle
+from cell.run.report.page.activities import Activity, activities, idle
 from drivers.errors import CellError
 from statemachine.journal import JournalError, JournalRecord, read
 

@@ -68,6 +68,12 @@ def test_a_run_that_came_to_no_cloud_says_that_it_cannot_be_replayed(tmp_path: P
         replay(tmp_path)
 
 
+def test_a_run_that_kept_no_pictures_says_how_to_have_them(copied: Path) -> None:
+    shutil.rmtree(copied / "frames")
+    with pytest.raises(ConfigError, match=r"it kept no pictures\. Set cell\.frames = true"):
+        replay(copied)
+
+
 @pytest.mark.parametrize("text", ["{}", "[]", '{"format": 1}', '{"format": 1, "photograph": []}', "{"])
 def test_a_file_that_does_not_tell_what_perception_got_is_named(tmp_path: Path, text: str) -> None:
     (tmp_path / PERCEPTION).write_text(text)

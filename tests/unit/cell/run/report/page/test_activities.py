@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cell.run.record.file import RecordFile
-from cell.run.report.page.lanes import RAIL_M_S, SWITCH_S, Activity, activities, idle
+from cell.run.report.page.activities import RAIL_M_S, SWITCH_S, Activity, activities, idle
 from lab.bench.job.whole_job import JobRecord
 
 BEGUN = 100.0
