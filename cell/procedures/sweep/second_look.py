@@ -107,7 +107,7 @@ def _swept_again(
     # What lens and light plane are off by cancels in the same strip only.
     before, now = scan.cloud.of_sweep(0), require_points(build_cloud(again))
     there, once_more = sweep.swaths[0], again.swaths[0]
-    faster = _by_lateness(here, there, pace(once_more) - pace(there))
+    faster = _shifted(there, _late(here) * (pace(once_more) - pace(there)))
     spread, spread_now = there.covariance, once_more.covariance
     if stood:
         spread, spread_now = by_times(there), here.settling + by_times(once_more) + faster
@@ -147,7 +147,6 @@ def sparse(here: Workplace, strip: SwathSection, before: Swath) -> ScanSection:
         # As much room as beyond the ends of the sweep.
         room = 0.5 * (rail.travel[1] - rail.travel[0] - scan.length) - ROOM_M
         speed = max(speed, min(HURRY * speed, rail.max_speed, math.sqrt(2.0 * rail.acceleration * max(room, 0.0))))
-    speed = min(speed, rail.max_speed)
     rate = min(scan.frame_rate, max(1.0, LINES * speed / scan.length))
     return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": (strip,)})
 
@@ -181,23 +180,21 @@ def moved_meanwhile(
 
 def _other_way(here: Workplace, there: Swath, back: Swath) -> Vector:
     """Covariance (6, 6) of base_from_flange by which sweep and way back differ: late stamps, play, the arm's rest."""
-    late = _by_lateness(here, there, pace(there) + pace(back))
+    late = _late(here) * (pace(there) + pace(back))
     if here.job.scan.mode == "arm":
-        return late + 2.0 * here.repeatability
+        return _shifted(there, late) + 2.0 * here.repeatability
     timing = times_known(here.calibration.scan, here.config)[0]
-    return late + _shifted(there, PLAY_M if timing is None else abs(timing.play) + timing.play_sigma)
+    return _shifted(there, late + (PLAY_M if timing is None else abs(timing.play) + timing.play_sigma))
 
 
-def _by_lateness(here: Workplace, swath: Swath, faster: float) -> Vector:
-    """Covariance (6, 6) of base_from_flange by which two sweeps differ, of which one goes by so much `faster`, m/s:
-    what comes late shifts the faster one farther."""
+def _late(here: Workplace) -> float:
+    """How late, s, one standard deviation, what is swept by comes all the time: it shifts a faster sweep farther."""
     config, timing = here.config, times_known(here.calibration.scan, here.config)[0]
     if here.job.scan.mode == "arm":
-        late = math.hypot(config.scan_camera.late / math.sqrt(3.0), LATENCY_S * here.devices.clock.rate)
-    else:
-        late = math.hypot(config.scan_camera.late, config.rail.late) / math.sqrt(3.0)
-        late = late if timing is None else timing.sigma
-    return _shifted(swath, late * faster)
+        return math.hypot(config.scan_camera.late / math.sqrt(3.0), LATENCY_S * here.devices.clock.rate)
+    return (
+        timing.sigma if timing is not None else math.hypot(config.scan_camera.late, config.rail.late) / math.sqrt(3.0)
+    )
 
 
 def require_points(cloud: Cloud) -> Cloud:
