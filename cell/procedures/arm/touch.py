@@ -80,8 +80,9 @@ class TouchCheck:
             return
         raise RefusedError(
             f"{self._words}, more than the allowed {1e3 * most:.3f} mm: the surface is not where the scan has it, or "
-            "the part does not sit in the claw as grasp.flange_from_part and grasp.sigma say. It was lifted again, "
-            "still held. Look how it sits and what lies on the place, run `cell calibrate verify`, then the job again",
+            "the part does not sit in the claw as grasp.flange_from_part and grasp.sigma say, or is another one. It "
+            "was lifted again, still held. Look at it, how it sits and what lies on the place, run "
+            "`cell calibrate verify`, then the job again",
             self.measured,
         )
 

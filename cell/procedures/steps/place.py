@@ -167,7 +167,7 @@ class Placing:
             self._lift()
             raise RefusedError(
                 f"the part touched something more than {1e3 * plan.contact_travel:.2f} mm above the place pose; it was "
-                "lifted again, still held. Look what lies on the place",
+                "lifted again, still held. Look what lies on the place, and whether the part is the right one",
                 Measured("contact, above the place pose", 1e3 * height, "mm", most=1e3 * plan.contact_travel),
             )
 
