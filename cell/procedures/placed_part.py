@@ -14,7 +14,7 @@ from cell.measure.geometry.poses import difference, from_parts, perturbed, trans
 from cell.measure.inversion.flush import Flush
 from cell.measure.inversion.local_deviation import LocalDeviation
 from cell.measure.inversion.mating import MatingGap
-from cell.measure.inversion.part_pose import PartPose, of_part
+from cell.measure.inversion.part_pose import SHIFTED, PartPose, of_part
 from cell.measure.inversion.whole_face import MOST_UNLIKE, FacePatch
 from cell.procedures.part_error import draws_of
 from cell.procedures.part_features import NOT_SEEN, FeatureSeen
@@ -32,6 +32,10 @@ NO_FLUSH = "how flush its edge is was not seen: no surface shows near it, or a v
 BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 OFF_DRAWING = "the part itself is not as drawn there: bent, worn, cut, or another one"
+SUNK_M = 25e-6
+"""So far below the surface a part may seem to be, beyond noise and what its pose is off by: form of both, and dirt."""
+SUNK = "where it is seen, the part as drawn would go {:.2f} mm into the surface"
+AMISS = "the part is not as drawn: worn below, its underside elsewhere below its upper side, or another one"
 ASIDE_UNSEEN = "it lies aside where its faces do not show that, or a piece of it is missing"
 COVERED = "something was left on the part: look at its face"
 WHOLE = "where the {} {} lies follows from the part as a whole: nobody looked at it by itself"
@@ -54,7 +58,8 @@ class PlacedPart:
     it. `before` is how far off, m, it lay before each correction. `came` is how it came to lie when it was first put
     down, had nothing been allowed for, `slips` how it moved in each correction as the claw opened (`GraspSeries`).
     `named` are the features that the job names, `own` what the points about them say by themselves, by name. `unlike`
-    is what of its face is not there, or covered. `axes` says, for people, whose axes the figures are in.
+    is what of its face is not there, or covered; it seems `sunk` so far, m, into the surface. `axes` says, for people,
+    whose axes the figures are in.
     """
 
     seen: PartPose
@@ -71,6 +76,7 @@ class PlacedPart:
     named: tuple[FeatureSection, ...] = ()
     own: Mapping[str, LocalDeviation] = field(default_factory=dict)
     unlike: FacePatch | None = None
+    sunk: float = 0.0
     axes: str = "the surface's axes"
 
     @classmethod
@@ -100,6 +106,14 @@ class PlacedPart:
             replace(seen, surface_from_part=there), belongs, points, covariance=kept, stated=stated, unseen=unseen,
             named=() if job.part is None else job.part.feature,
         )  # fmt: skip
+
+    def over(self, gap: MatingGap | None) -> PlacedPart:
+        """With the `gap` below it, as it was seen. A part goes into nothing: where it seems to, its underside lies
+        elsewhere below what was seen of it than drawn, and the part may be off by as much as brings it to rest."""
+        if gap is None or self.unseen or not gap.sunk > SUNK_M + self.unsure:
+            return replace(self, gap=gap)
+        off = gap.off_contact(self.seen.surface_from_part.translation, SHIFTED)
+        return replace(self, gap=gap, sunk=gap.sunk, covariance=self.covariance + np.diag(off**2))
 
     @cached_property
     def offsets(self) -> Vector:
@@ -201,6 +215,11 @@ class PlacedPart:
         return next((LIKELY[name] for name in clear), UNCLEAR)
 
     @property
+    def sunk_words(self) -> str:
+        """For people, of a part that seems to go into the surface."""
+        return SUNK.format(1e3 * self.sunk)
+
+    @property
     def slipped(self) -> bool:
         """Whether it went to the side farther than chance brings: on a slope that has tilted and raised it as well."""
         return self.likely == LIKELY["shifted"]
@@ -232,6 +251,7 @@ class PlacedPart:
         failed = [each for each in self.features if not each.measured.kept]
         out = "".join(f". Out of tolerance: {each.words}" for each in failed)
         out += "" if self.unlike is None else f". {self.unlike.words}"
+        out += f". {self.sunk_words}" * bool(self.sunk)
         likely = self._cause(measured, failed)
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
@@ -254,6 +274,8 @@ class PlacedPart:
             return BENT
         if off.kept and turned.kept and any(each.not_as_drawn for each in failed):
             return OFF_DRAWING
+        if self.sunk:
+            return AMISS + f". If it is, {self.likely}" * (self.likely != UNCLEAR)
         return self.likely
 
     @property
@@ -266,6 +288,7 @@ class PlacedPart:
             *(self.flush.notes if self.flush else (NO_FLUSH,) * bool(self.seen.beside)),
             *((more,) if np.abs(self._times).max() > CLEARLY else ()),
             *self.pushed,
+            *((self.sunk_words,) if self.sunk else ()),
             *(f"not seen of the placed part: {motion}" for motion in self.unseen),
             *(WHOLE.format(each.section.kind, each.section.name) for each in self.features if not each.asked),
         )

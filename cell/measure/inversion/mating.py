@@ -6,7 +6,7 @@ not lie where its pose says, and nothing but its own underside can tell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio as pin
@@ -22,6 +22,8 @@ LEAST_SEEN = 0.5
 SAMPLES = 40_000
 DEEPEST_M = 1.5e-3
 """What was scanned farther below the drawn surface is not the surface: a table beside it, or a hole."""
+FORM_M = 20e-6
+"""Of a gap, one standard deviation, roughly."""
 APART = "below the part as drawn there is nothing of the surface, or the triangles of part.mesh face inwards"
 NEXT_STEP = (
     "See that part.mesh is the drawing of this part, in the datum of grasp.flange_from_part and "
@@ -35,17 +37,31 @@ class MatingGap:
 
     `places` (n, 3) m are the squares' middles on the surface, surface frame; `gaps` (n,) m, below 0 where both
     interfere; `noise` (n,) m four standard deviations of each. `seen` is the share of the mating face with a square.
+    `opening` (n, 3), surface frame, is how much each gap opens with the part's motion there, m per m.
     """
 
     places: Array
     gaps: Array
     noise: Array
     seen: float
+    opening: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
     @property
     def overlap(self) -> float:
         """By how much, m, both interfere in the worst square, beyond its noise; below 0 where they nowhere do."""
         return float(np.max(-self.gaps - self.noise))
+
+    @property
+    def sunk(self) -> float:
+        """By how much, m, a twentieth of the squares interfere or more, beyond their noise: one alone may be dirt."""
+        return float(np.percentile(-self.gaps - self.noise, 95))
+
+    def off_contact(self, about: Array, sigmas: Array) -> Array:
+        """The motion (6,), m and rad, surface axes, about a point (3,), by which the part is off lying flush: by least
+        squares, where it is known beforehand to `sigmas` (6,)."""
+        rows = np.hstack([self.opening, np.cross(self.places - about, self.opening)]) * sigmas
+        told = rows.T @ rows + FORM_M**2 * np.eye(6)
+        return np.asarray(sigmas * np.linalg.solve(told, rows.T @ self.gaps))
 
     @property
     def apart(self) -> float:
@@ -156,7 +172,8 @@ def _gap(
         return None
     face = _mating_face(nominal, surface_from_part, part)
     seen = np.isin(face, np.unique(disagreement.square_of(below[over[medians]]))).mean() if len(face) else 0.0
-    return MatingGap(points[index[over[medians]]], middle, noise, float(seen))
+    opening = (feet.normals[mates] / feet.normals[mates, 2:])[medians] @ surface_from_part.rotation.T
+    return MatingGap(points[index[over[medians]]], middle, noise, float(seen), opening)
 
 
 def _mating_face(nominal: NominalSurface, surface_from_part: pin.SE3, part: NominalSurface) -> Indices:

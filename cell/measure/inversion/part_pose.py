@@ -51,7 +51,8 @@ class PartPose:
     `fit` is how its faces lie in the scan; its verdict names the motions that these do not show. `beside` is the number
     of points of the surface that showed beside the part; 0 where the earlier sweep tells where that lies, which is at
     `base_from_surface`. The vehicle rocked by `rocked`, m, up and down, as far as the sweep shows it. `moved` is how
-    the surface has moved in the arm base since the earlier sweep, (6,) m and rad; None where it lies as it lay.
+    the surface has moved in the arm base since the earlier sweep, (6,) m and rad; None where it lies as it lay. It
+    seems to lie `far` from there, χ² of six degrees of freedom.
     """
 
     base_from_surface: pin.SE3
@@ -61,6 +62,7 @@ class PartPose:
     beside: int
     rocked: float = 0.0
     moved: Array | None = None
+    far: float = 0.0
 
 
 def seen_from_above(part: NominalSurface, surface_from_part: pin.SE3) -> NominalSurface:
@@ -135,14 +137,15 @@ def find_part(
 @dataclass(frozen=True, eq=False)
 class _SurfaceSeen:
     """Where the surface lies by what shows of it beside the part: `base_from_surface`, its own covariance `unsure`
-    (6, 6), base axes, how it `follows` each parameter (6, m), the number of its `points`, and how it has `moved` (6,)
-    since the earlier sweep, None where it has not."""
+    (6, 6), base axes, how it `follows` each parameter (6, m), the number of its `points`, how it has `moved` (6,) since
+    the earlier sweep, None where it has not, and how `far` it seems to be from there, χ²."""
 
     base_from_surface: pin.SE3
     unsure: Array
     follows: Array
     points: int
     moved: Array | None = None
+    far: float = 0.0
 
 
 def _surface_beside(
@@ -174,9 +177,10 @@ def _surface_beside(
         return known
     apart = difference(alone.base_from_surface, surface.base_from_surface)
     spread = surface.covariance + alone.unsure + alone.follows @ alone.follows.T
-    if apart @ np.linalg.solve(spread, apart) > SURFACE_MOVED:
-        return replace(alone, moved=apart)
-    return seen(surface) or known
+    far = float(apart @ np.linalg.solve(spread, apart))
+    if far > SURFACE_MOVED:
+        return replace(alone, moved=apart, far=far)
+    return replace(seen(surface) or known, far=far)
 
 
 def _against(
@@ -204,7 +208,7 @@ def _against(
     turn = np.kron(np.eye(2), there.rotation.T)
     return PartPose(
         there, there.inverse() * fit.base_from_surface, turn @ fit.covariance @ turn.T, fit, beside.points,
-        moved=beside.moved,
+        moved=beside.moved, far=beside.far,
     )  # fmt: skip
 
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pinocchio as pin
 
 from cell.config.job import Job
 from cell.measure.calibration import ScanCalibration
+from cell.measure.calibration.drift.reference_plate import NOTED_RAD
+from cell.measure.calibration.drift.slip import NOTED_M
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance
 from cell.measure.inversion.effects.between_sweeps import GATE_M, LEAST_MOTION_M, PartOnGround
@@ -22,7 +25,7 @@ from cell.procedures.part_error import part_covariance, part_points
 from cell.procedures.part_features import by_themselves
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart, along_surface
 from cell.procedures.steps.correction import correct
-from cell.procedures.steps.laser_sweep import head_at, laser_sweep
+from cell.procedures.steps.laser_sweep import head_at, laser_sweep, seen_on_plate
 from cell.procedures.steps.place import PlaceResult, aside_words
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud, displacements, together
 from cell.procedures.steps.workplace import JobStep, Workplace
@@ -37,6 +40,10 @@ from statemachine.step import OnFailure, Step
 CLOUD = "placed.ply"
 SWEPT_AGAIN = (FRAMES_LOST, "rail.late_readings", "arm.late_readings", "camera.late_readings")
 """Faults of a sweep that the next one may not have."""
+DOUBTFUL = 20.0
+"""χ² of six degrees of freedom from which on a surface that seems to lie elsewhere may be a laser that turned: in 0.3 %
+of the sweeps it is chance."""
+UNTRUE = "the placed part was not seen where it lies"
 SWEEPS = 3
 """How often at most the part is swept until no frames are lost, no replies come too late, and it lies still."""
 
@@ -92,6 +99,8 @@ def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left:
     why = f"placed again it would be {1e3 * hope:.2f} mm off"
     if found.unlike is not None:
         why = found.unlike.words
+    elif found.sunk:
+        why = found.sunk_words
     elif found.seen.moved is not None:
         why = "surface or vehicle does not stand where it was swept, and nobody looked where the claw would go"
     elif found.aside >= FARTHEST_M:
@@ -129,6 +138,8 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
             f"the placed part is not where it was put down, or is not the part as drawn: {why}. {NEXT_STEP}",
             *error.numbers,
         ) from error
+    if seen.far > DOUBTFUL or not seen.beside:
+        _require_head(here, sweep, context)
     stated = part_covariance(here.job, pose, here.repeatability)
     gap = scanned_gap(scan.cloud, pose.base_from_surface, here.nominal, seen.surface_from_part, part)
     on_part, around = parted(cloud, faces, seen.base_from_surface * belongs)
@@ -136,10 +147,32 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         on_part, around, seen.base_from_surface, nominal=here.nominal, faces=faces, belongs=belongs,
         lies=seen.surface_from_part, tolerance=place.tolerance, rocks=seen.rocked,
     )  # fmt: skip
-    found = PlacedPart.of(here.job, seen, part_points(here.nominal), stated)
+    found = PlacedPart.of(here.job, seen, part_points(here.nominal), stated).over(gap)
     unlike = unlike_patch(cloud, seen.base_from_surface, found.seen.surface_from_part, faces)
     own = by_themselves(here.job, cloud, found.seen, faces)
-    return replace(found, gap=gap, flush=flush, own=own, unlike=unlike)
+    return replace(found, flush=flush, own=own, unlike=unlike)
+
+
+def _require_head(here: Workplace, sweep: SweepRecord, context: StepContext) -> None:
+    """Raise `MisplacedError` where the plate on the claw shows that laser or scan head has moved since the surface was
+    swept: a surface then seems pushed, and a part that hides its surface seems to lie aside."""
+    try:
+        pointing, slip = seen_on_plate(here, context)
+    except RefusedError as error:
+        raise MisplacedError(f"{UNTRUE}: {error}. {NEXT_STEP}", *error.numbers) from error
+    moved = []
+    if pointing is not None and sweep.pointing is not None:
+        turned = math.dist((pointing.turn, pointing.roll), (sweep.pointing.turn, sweep.pointing.roll))
+        moved.append(("laser turned", turned, NOTED_RAD, "mrad"))
+    if slip is not None and sweep.slip is not None:
+        moved.append(("scan head slipped", math.dist(slip.shift, sweep.slip.shift), NOTED_M, "mm"))
+    for what, far, most, unit in moved:
+        if far > most:
+            raise MisplacedError(
+                f"{UNTRUE}: {what} by {1e3 * far:.2f} {unit} since the surface was swept, allowed are {1e3 * most:g} "
+                f"{unit}. Look at its screws, then run `cell calibrate`. {NEXT_STEP}",
+                Measured(f"{what} since the sweep", 1e3 * far, unit, most=1e3 * most),
+            )
 
 
 def swept_part(
@@ -166,7 +199,7 @@ def swept_part(
         raise MisplacedError(
             f"the placed part does not lie still: in the last of {SWEEPS} sweeps to and fro it moved by "
             f"{1e3 * moved:.3f} mm{' or more' * (moved >= GATE_M)}, allowed are {1e3 * LEAST_MOTION_M:g} mm. It "
-            f"slides, sinks or turns: look what it lies on, and whether something pulls it. {NEXT_STEP}",
+            f"slides, sinks or turns, or the vehicle moves: look what both stand on, and what pulls. {NEXT_STEP}",
             Measured("placed part moved from sweep to sweep", 1e3 * moved, "mm", most=1e3 * LEAST_MOTION_M),
         )
     return points, record

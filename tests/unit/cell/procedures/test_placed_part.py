@@ -10,15 +10,18 @@ import pinocchio as pin
 import pytest
 import scipy
 
-from cell.config.job import FeatureSection, load_job
+from cell.config.job import FeatureSection, job_path, load_job
 from cell.measure.geometry.poses import from_parts
-from cell.measure.inversion import PlacePose
+from cell.measure.inversion import NominalSurface, PlacePose
 from cell.measure.inversion.flush import Flush
 from cell.measure.inversion.local_deviation import LocalDeviation, Span
+from cell.measure.inversion.mating import drawn_gap
+from cell.measure.inversion.nominal import read_mesh
 from cell.measure.inversion.observability import SmallMotion
 from cell.measure.inversion.part_pose import PartPose
-from cell.procedures.placed_part import BENT, LIKELY, OFF_DRAWING, UNCLEAR, WHOLE, PlacedPart, along_surface
+from cell.procedures.placed_part import AMISS, BENT, LIKELY, OFF_DRAWING, UNCLEAR, WHOLE, PlacedPart, along_surface
 from drivers.errors import MisplacedError
+from lab.bench.job.part_jobs import body
 from tests.support.lying_part import moved
 
 JOB, _ = load_job("pot")
@@ -102,6 +105,26 @@ def test_what_is_not_seen_moves_nothing_and_is_known_as_stated() -> None:
     seen = replace(found.seen, covariance=np.diag([2e-3**2] + [1e-10] * 5))
     with pytest.raises(MisplacedError, match=r"not all is seen .*part frame.*place\.verify"):
         PlacedPart.of(JOB, seen, POINTS, STATED)
+
+
+def test_a_part_that_seems_to_go_into_the_surface_may_be_off_by_what_brings_it_out() -> None:
+    file = job_path("pot").with_name("pot.ply")
+    vertices, faces = read_mesh(file, "m")
+    drawn, nominal = body(vertices, faces), NominalSurface(vertices, faces)
+    underside = NominalSurface(drawn.vertices, drawn.faces)
+    there, rests = part(moved(0.3e-3)), part(moved())
+    gap, flush = (drawn_gap(nominal, each.seen.surface_from_part, underside) for each in (there, rests))
+    found = there.over(gap)
+    assert 0.05e-3 < found.sunk < 0.2e-3 and any("mm into the surface" in note for note in found.notes)
+    assert np.sqrt(np.diag(found.covariance))[:3] == pytest.approx([0.3e-3, 1e-5, 1e-5], abs=0.02e-3)
+    assert there.in_tolerance(PLACE) and not found.in_tolerance(PLACE)
+    told = str(found.misplaced(PLACE))
+    assert AMISS in told and UNCLEAR not in told and "mm into the surface" in told
+    assert rests.over(flush).sunk == 0.0 and np.array_equal(rests.over(flush).covariance, rests.covariance)
+    unsure = part(moved(0.3e-3), sigma=0.1e-3)
+    assert unsure.over(gap).sunk == 0.0, "it may lie where it goes into nothing"
+    unseen = part(moved(0.3e-3), weak=("translation along the x axis of the surface frame",))
+    assert unseen.over(gap).sunk == 0.0, "it was not seen where it lies"
 
 
 def test_of_a_motion_only_what_is_along_the_surface_counts_as_aside() -> None:

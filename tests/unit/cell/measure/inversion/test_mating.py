@@ -103,6 +103,16 @@ def test_one_square_of_noise_is_no_overlap() -> None:
     assert replace(found, noise=1e-6 * np.ones(2)).problem(TOLERANCE) is not None
 
 
+def test_what_is_off_contact_brings_a_part_back_that_goes_into_the_surface() -> None:
+    off = pin.SE3(pin.exp3(np.array([0.002, -0.001, 0.003])), np.array([0.2e-3, -0.15e-3, -0.05e-3]))
+    found = drawn_gap(POT, off, surface_of(PART))
+    assert found is not None and 0.05e-3 < found.sunk < found.overlap
+    motion = found.off_contact(off.translation, np.array([2e-3] * 3 + [20e-3] * 3))
+    assert motion == pytest.approx([0.2e-3, -0.15e-3, -0.05e-3, 0.002, -0.001, 0.003], rel=0.03, abs=5e-6)
+    deep = np.where(np.arange(len(found.gaps)) == 0, -0.5e-3, 0.0)
+    assert replace(found, gaps=deep, noise=0.0 * deep).sunk == 0.0, "one square may be dirt"
+
+
 def test_the_scanned_surface_tells_the_same(placed_pot: JobRecord) -> None:
     cloud, pose = placed_pot.results["reconstruct"].cloud, placed_pot.results["invert_pose"].base_from_surface
     fits = scanned_gap(cloud, pose, POT, HERE, surface_of(PART))

@@ -25,8 +25,8 @@ from cell.procedures.steps.verify import CLOUD
 from cell.run.record.replay import replay
 from cell.run.report.page.make import make_page
 from drivers.errors import ConfigError, DeviceFault, MisplacedError
-from lab.bench.job.part_effects import motion, opened
-from lab.bench.job.part_jobs import MIDDLE, job_with_part
+from lab.bench.job.part_effects import EFFECTS, Change, head_slipped, laser_turned, motion, opened
+from lab.bench.job.part_jobs import ALL, MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.models import rail
 from sim_backends.optics.mesh import Mesh
@@ -327,6 +327,35 @@ def test_a_sweep_over_the_part_whose_replies_came_too_late_is_done_again(placed_
     assert sum("replies come so late" in note for note in site.notes) == 1
     with pytest.raises(DeviceFault, match="replies come so late"):
         LyingPart(placed_pot, tmp_path, changed=late).looked(moved())
+
+
+@pytest.mark.parametrize(
+    ("happened", "half", "told"),
+    [
+        (laser_turned(0.6), MIDDLE, r"not seen where it lies: laser turned by 0\.[56]\d mrad"),
+        (head_slipped(motion(0.3)), ALL, "not seen where it lies: the scan head has slipped"),
+    ],
+)
+def test_a_head_that_moved_after_the_sweep_is_neither_a_push_nor_a_part_that_lies_aside(
+    placed_pot: JobRecord, tmp_path: Path, happened: Change, half: tuple[float, float], told: str
+) -> None:
+    site = LyingPart(placed_pot, tmp_path, half=half, changed=lambda cell: happened(cell.world))
+    with pytest.raises(MisplacedError, match=told):
+        site.looked(moved())
+
+
+def test_a_part_whose_upper_side_lies_elsewhere_than_drawn_is_not_moved_by_it(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    """Its underside lies where it belongs: what was seen of it would have it placed .3 mm aside."""
+    aside, (job, mesh) = EFFECTS["upper side .3 mm aside in x"], load_job("pot")
+    site = LyingPart(
+        placed_pot, tmp_path, also="corrections = 1",
+        changed=lambda cell: aside.put_into(cell.world, job, mesh, MIDDLE, tmp_path),
+    )  # fmt: skip
+    with pytest.raises(MisplacedError, match=r"would go .* mm into the surface.*Most likely the part is not as drawn"):
+        site.looked(moved())
+    assert site.parts == [] and np.linalg.norm(site.lies().translation) < 1e-6
 
 
 @pytest.mark.parametrize(
