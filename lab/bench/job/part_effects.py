@@ -13,7 +13,7 @@ from cell.config.job import Job
 from cell.measure.inversion.nominal import read_mesh
 from lab.bench.job.part_jobs import Floats, body, within
 from sim_backends.world.bodies.station import Station
-from sim_backends.world.scene import rotation
+from sim_backends.world.scene import Scene, rotation
 from sim_backends.world.world import World
 
 Change = Callable[[World], None]
@@ -22,7 +22,7 @@ Change = Callable[[World], None]
 @dataclass(frozen=True)
 class PartEffect:
     """One effect: what has happened, as keys of `cell.procedures.steps.verify.LIKELY` of which one is to be told, and
-    how a world gets it: a `change` of it, or another `underside` of its part, corners (n, 3), m.
+    how a world gets it: a `change` of it, or another `underside` or `upper` side of its part, corners (n, 3), m.
 
     Without `causes` the part comes to lie where it belongs, or nearly.
     """
@@ -30,14 +30,20 @@ class PartEffect:
     causes: tuple[str, ...]
     change: Change | None = None
     underside: Callable[[Floats], Floats] | None = None
+    upper: Callable[[Floats], Floats] | None = None
 
     def put_into(self, world: World, job: Job, mesh: Path, half: tuple[float, float], folder: Path) -> None:
         """Give it to the world of a job, whose part covers `half` of its surface; files go to `folder`."""
         if self.change is not None:
             self.change(world)
-        if self.underside is not None:
+        if self.underside is not None or self.upper is not None:
             file = folder / "made.ply"
-            body(*within(*read_mesh(mesh, job.surface.mesh_unit), half), self.underside).export(file)
+            made = body(*within(*read_mesh(mesh, job.surface.mesh_unit), half), self.underside or np.copy)
+            if self.upper is not None:
+                # The corners above stand behind those below.
+                above = len(made.vertices) // 2
+                made.vertices[above:] = self.upper(made.vertices[above:])
+            made.export(file)
             drawn = replace(world.scene.drawing.station, part_mesh=str(file), part_mesh_unit="m")
             world.remake(world.scene, Station.of(drawn))
 
@@ -68,6 +74,66 @@ def opened(by: Floats) -> Change:
     return change
 
 
+def as_it_opens(what: Change) -> Change:
+    """It happens as soon as the claw has let the part go, each time."""
+
+    def change(world: World) -> None:
+        part, set_claw = world.part, world.part.set_claw
+
+        def then(closed: bool, flange: Floats) -> None:
+            held = part.held
+            set_claw(closed, flange)
+            if held and not part.held:
+                what(world)
+
+        part.set_claw = then  # type: ignore[method-assign]
+
+    return change
+
+
+def scene(made: Callable[[Scene], Scene]) -> Change:
+    """From then on cameras see another scene; where the part is does not change."""
+
+    def change(world: World) -> None:
+        now = world._items[world._current]
+        world._items[world._current] = replace(now, scene=made(now.scene))
+        world._make_current(world.collisions.found)
+
+    return change
+
+
+def laser_turned(angle: float) -> Change:
+    """The light plane has turned about the laser's exit and the stripe, mrad."""
+
+    def turned(drawn: Scene) -> Scene:
+        normal = rotation(1e-3 * np.array([0.0, angle, 0.0])) @ drawn.light_plane_normal
+        return replace(drawn, light_plane_normal=normal, light_plane_distance=float(normal @ drawn.laser_origin))
+
+    return scene(turned)
+
+
+def head_slipped(by: Floats) -> Change:
+    """The scan head sits elsewhere on its mount."""
+    return scene(lambda drawn: replace(drawn, flange_from_scan_camera=drawn.flange_from_scan_camera @ by))
+
+
+def later(by: Floats, seconds: float) -> Change:
+    """The part slips over the surface so long after it was let go, once, and settles there."""
+
+    def change(world: World) -> None:
+        part, stands, due = world.part, world.part._pose, [world.clock.now() + seconds]
+
+        def pose(flange: Floats) -> Floats:
+            if due and world.clock.now() >= due[0] and not part.held:
+                due.clear()
+                part._world_from_part = part._settle(stands(flange) @ by)
+            return np.asarray(stands(flange))
+
+        part._pose = pose  # type: ignore[method-assign]
+
+    return as_it_opens(change)
+
+
 def under(x: float, y: float, height: float, radius: float = 1.5) -> Change:
     """Something lies on the surface that no camera sees, in mm."""
 
@@ -92,6 +158,10 @@ def raised(where: Callable[[Floats], NDArray[np.bool_]], by: float) -> Callable[
 
 def _everywhere(corners: Floats) -> NDArray[np.bool_]:
     return np.ones(len(corners), dtype=np.bool_)
+
+
+def _bent(corners: Floats) -> Floats:
+    return corners - np.outer((corners[:, 0] / 0.022) ** 2, [0.0, 0.0, 0.15e-3])
 
 
 SLIPPED, ON_SOMETHING = ("shifted",), ("raised", "tilted")
@@ -124,5 +194,13 @@ EFFECTS: dict[str, PartEffect] = {
     "underside bulged by .3 mm": PartEffect(
         ON_SOMETHING, underside=lambda v: v - np.outer(np.exp(-((v[:, 0] / 0.008) ** 2)), [0.0, 0.0, 0.3e-3])
     ),
+    "upper side .3 mm aside in x": PartEffect((), upper=lambda v: np.add(v, [0.3e-3, 0.0, 0.0])),
+    "upper side .15 mm aside in y": PartEffect((), upper=lambda v: np.add(v, [0.0, 0.15e-3, 0.0])),
+    "grown by 2 per mille": PartEffect((), underside=lambda v: 1.002 * v, upper=lambda v: 1.002 * v),
+    "bent by .15 mm": PartEffect((), underside=_bent, upper=_bent),
+    "slips .4 mm in y while it is swept": PartEffect(SLIPPED, later(motion(0.0, 0.4), 8.0)),
+    "surface pushed .3 mm in x as the claw opens": PartEffect((), as_it_opens(lambda world: world.slide(motion(0.3)))),
+    "laser turns 1 mrad as the claw opens": PartEffect((), as_it_opens(laser_turned(1.0))),
+    "scan head slips .3 mm as the claw opens": PartEffect((), as_it_opens(head_slipped(motion(0.3)))),
 }
 """By name."""

@@ -19,7 +19,7 @@ MISPLACED = {"effect": SLIPS, "outcome": "misplaced", "outside": False, "named":
 
 def test_each_effect_names_a_cause_that_verify_tells() -> None:
     assert {cause for effect in EFFECTS.values() for cause in effect.causes} == set(LIKELY)
-    assert len(EFFECTS) >= 24
+    assert len(EFFECTS) >= 32
 
 
 def test_figures_are_of_the_parts_that_came_to_them() -> None:
