@@ -220,6 +220,13 @@ class PlacedPart:
         return SUNK.format(1e3 * self.sunk)
 
     @property
+    def as_it_lies(self) -> str:
+        """What has most likely happened to it, by where it was seen and how it would rest there."""
+        if not self.sunk:
+            return self.likely
+        return AMISS + f". If it is, {self.likely}" * (self.likely != UNCLEAR)
+
+    @property
     def slipped(self) -> bool:
         """Whether it went to the side farther than chance brings: on a slope that has tilted and raised it as well."""
         return self.likely == LIKELY["shifted"]
@@ -274,9 +281,7 @@ class PlacedPart:
             return BENT
         if off.kept and turned.kept and any(each.not_as_drawn for each in failed):
             return OFF_DRAWING
-        if self.sunk:
-            return AMISS + f". If it is, {self.likely}" * (self.likely != UNCLEAR)
-        return self.likely
+        return self.as_it_lies
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -80,9 +80,9 @@ def as_it_opens(what: Change) -> Change:
     def change(world: World) -> None:
         part, set_claw = world.part, world.part.set_claw
 
-        def then(closed: bool, flange: Floats) -> None:
+        def then(closed: bool, world_from_flange: Floats) -> None:
             held = part.held
-            set_claw(closed, flange)
+            set_claw(closed, world_from_flange)
             if held and not part.held:
                 what(world)
 
@@ -123,11 +123,11 @@ def later(by: Floats, seconds: float) -> Change:
     def change(world: World) -> None:
         part, stands, due = world.part, world.part._pose, [world.clock.now() + seconds]
 
-        def pose(flange: Floats) -> Floats:
+        def pose(world_from_flange: Floats) -> Floats:
             if due and world.clock.now() >= due[0] and not part.held:
                 due.clear()
-                part._world_from_part = part._settle(stands(flange) @ by)
-            return np.asarray(stands(flange))
+                part._world_from_part = part._settle(stands(world_from_flange) @ by)
+            return np.asarray(stands(world_from_flange))
 
         part._pose = pose  # type: ignore[method-assign]
 
