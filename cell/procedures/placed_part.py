@@ -34,7 +34,7 @@ NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 OFF_DRAWING = "the part itself is not as drawn there: bent, worn, cut, or another one"
 SUNK_M = 25e-6
 """So far below the surface a part may seem to be, beyond noise and what its pose is off by: form of both, and dirt."""
-SUNK = "where it is seen, the part as drawn would go {:.2f} mm into the surface"
+SUNK = "where it is seen, the part as drawn would {} the surface by {:.2f} mm"
 AMISS = "the part is not as drawn: worn below, its underside elsewhere below its upper side, or another one"
 ASIDE_UNSEEN = "it lies aside where its faces do not show that, or a piece of it is missing"
 COVERED = "something was left on the part: look at its face"
@@ -58,8 +58,8 @@ class PlacedPart:
     it. `before` is how far off, m, it lay before each correction. `came` is how it came to lie when it was first put
     down, had nothing been allowed for, `slips` how it moved in each correction as the claw opened (`GraspSeries`).
     `named` are the features that the job names, `own` what the points about them say by themselves, by name. `unlike`
-    is what of its face is not there, or covered; it seems `sunk` so far, m, into the surface. `axes` says, for people,
-    whose axes the figures are in.
+    is what of its face is not there, or covered; it seems `sunk` so far, m, into the surface, below 0 one that
+    hangs above it. `axes` says, for people, whose axes the figures are in.
     """
 
     seen: PartPose
@@ -107,13 +107,16 @@ class PlacedPart:
             named=() if job.part is None else job.part.feature,
         )  # fmt: skip
 
-    def over(self, gap: MatingGap | None) -> PlacedPart:
-        """With the `gap` below it, as it was seen. A part goes into nothing: where it seems to, its underside lies
-        elsewhere below what was seen of it than drawn, and the part may be off by as much as brings it to rest."""
-        if gap is None or self.unseen or not gap.sunk > SUNK_M + self.unsure:
-            return replace(self, gap=gap)
-        off = gap.off_contact(self.seen.surface_from_part.translation, SHIFTED)
-        return replace(self, gap=gap, sunk=gap.sunk, covariance=self.covariance + np.diag(off**2))
+    def over(self, gap: MatingGap | None, before: tuple[float, ...] = ()) -> PlacedPart:
+        """With the `gap` below it, as it was seen, and how far off it lay `before` each correction. A part goes into
+        nothing: where it seems to, its underside lies elsewhere below what was seen of it than drawn, and the part may
+        be off by as much as brings it to rest. So is one that was placed again by what was seen, and seems to hang."""
+        found, least = replace(self, gap=gap, before=before), SUNK_M + self.unsure
+        if gap is None or self.unseen:
+            return found
+        sunk = gap.sunk if gap.sunk > least else -gap.floating if before and gap.floating > least else 0.0
+        off = bool(sunk) * gap.off_contact(self.seen.surface_from_part.translation, SHIFTED)
+        return replace(found, sunk=sunk, covariance=self.covariance + np.diag(off**2))
 
     @cached_property
     def offsets(self) -> Vector:
@@ -216,8 +219,8 @@ class PlacedPart:
 
     @property
     def sunk_words(self) -> str:
-        """For people, of a part that seems to go into the surface."""
-        return SUNK.format(1e3 * self.sunk)
+        """For people, of a part that seems to go into the surface, or to hang."""
+        return SUNK.format("go into" if self.sunk > 0.0 else "hang above", 1e3 * abs(self.sunk))
 
     @property
     def as_it_lies(self) -> str:

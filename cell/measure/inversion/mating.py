@@ -56,6 +56,11 @@ class MatingGap:
         """By how much, m, a twentieth of the squares interfere or more, beyond their noise: one alone may be dirt."""
         return float(np.percentile(-self.gaps - self.noise, 95))
 
+    @property
+    def floating(self) -> float:
+        """By how much, m, all but a twentieth of the squares are apart or more, beyond their noise."""
+        return float(np.percentile(self.gaps - self.noise, 5))
+
     def off_contact(self, about: Array, sigmas: Array) -> Array:
         """The motion (6,), m and rad, surface axes, about a point (3,), by which the part is off lying flush: by least
         squares, where it is known beforehand to `sigmas` (6,)."""

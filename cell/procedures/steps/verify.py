@@ -73,11 +73,11 @@ def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
                 raise found.misplaced(plan, f"It was not corrected: {error}") from error
             context.note(text=f"it was not corrected: {error}")
             # The claw was near it, and may have moved it.
-            found = replace(_looked(here, pose, context), before=found.before)
+            found = _looked(here, pose, context, found.before)
             break
         for note in placed.notes:
             context.note(text=note)
-        found = replace(_looked(here, pose, context), before=(*found.before, found.off))
+        found = _looked(here, pose, context, (*found.before, found.off))
         # How it was held was seen: what it is off by to the side now came as the claw opened, and comes again.
         let_go = placed.base_from_flange * held
         slip = along_surface(let_go.inverse() * pose.base_from_surface * found.seen.surface_from_part)
@@ -116,8 +116,10 @@ def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left:
     return False
 
 
-def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPart:
-    """Sweep the placed part, fold the arm, and find the part in the sweep."""
+def _looked(
+    here: Workplace, pose: PlacePose, context: StepContext, before: tuple[float, ...] = ()
+) -> PlacedPart:  # fmt: skip
+    """Sweep the placed part, which lay `before` so far off, fold the arm, and find the part in the sweep."""
     sweep, scan, part = context.made(SweepRecord), context.made(Reconstruction), here.part_mesh
     if part is None:
         raise RefusedError("the job has no mesh of its part ([part]): nothing tells what the placed part looks like")
@@ -147,7 +149,7 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
         on_part, around, seen.base_from_surface, nominal=here.nominal, faces=faces, belongs=belongs,
         lies=seen.surface_from_part, tolerance=place.tolerance, rocks=seen.rocked,
     )  # fmt: skip
-    found = PlacedPart.of(here.job, seen, part_points(here.nominal), stated).over(gap)
+    found = PlacedPart.of(here.job, seen, part_points(here.nominal), stated).over(gap, before)
     unlike = unlike_patch(cloud, seen.base_from_surface, found.seen.surface_from_part, faces)
     own = by_themselves(here.job, cloud, found.seen, faces)
     return replace(found, flush=flush, own=own, unlike=unlike)

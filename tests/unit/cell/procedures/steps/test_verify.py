@@ -353,7 +353,7 @@ def test_a_part_whose_upper_side_lies_elsewhere_than_drawn_is_not_moved_by_it(
         placed_pot, tmp_path, also="corrections = 1",
         changed=lambda cell: aside.put_into(cell.world, job, mesh, MIDDLE, tmp_path),
     )  # fmt: skip
-    with pytest.raises(MisplacedError, match=r"would go .* mm into the surface.*Most likely the part is not as drawn"):
+    with pytest.raises(MisplacedError, match=r"would go into the surface by .*Most likely the part is not as drawn"):
         site.looked(moved())
     assert site.parts == [] and np.linalg.norm(site.lies().translation) < 1e-6
 
