@@ -58,8 +58,8 @@ class MatingGap:
 
     @property
     def floating(self) -> float:
-        """By how much, m, all but a twentieth of the squares are apart or more, beyond their noise."""
-        return float(np.percentile(self.gaps - self.noise, 5))
+        """By how much, m, all but a twentieth of the squares are apart or more: all of them average out their noise."""
+        return float(np.percentile(self.gaps, 5))
 
     def off_contact(self, about: Array, sigmas: Array) -> Array:
         """The motion (6,), m and rad, surface axes, about a point (3,), by which the part is off lying flush: by least
