@@ -101,6 +101,7 @@ class Level(StrEnum):
     nominal = "nominal"
     harsh = "harsh"
     workshop = "workshop"
+    outdoor = "outdoor"
 
 
 class CellClock(StrEnum):

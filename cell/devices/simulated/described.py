@@ -125,8 +125,11 @@ def _boxes(obstacles: dict[str, tuple[Pose, tuple[float, float, float]]]) -> dic
 
 
 def _camera(camera: CameraConfig, focus: float) -> drawn.CameraDrawing:
-    mounting = _matrix(camera.flange_from_camera.se3())
-    return drawn.CameraDrawing((camera.width, camera.height), camera.pixel, camera.focal_length, focus, mounting)
+    mounting, band = _matrix(camera.flange_from_camera.se3()), camera.filter
+    passed = None if band is None else (band.centre, band.width, band.transmission)
+    return drawn.CameraDrawing(
+        (camera.width, camera.height), camera.pixel, camera.focal_length, focus, mounting, passed
+    )  # fmt: skip
 
 
 def _witness(config: CellConfig) -> NDArray[np.float64] | None:

@@ -265,6 +265,7 @@ def _run_step(here: Workplace, context: StepContext) -> VehicleArrival:
     if warnings := vehicle.state().warnings:
         context.note(text=f"the vehicle warns: {'; '.join(warnings)}")
     vehicle.recover()
+    here.devices.take_any_light()
     head = _checked(here, context)
     if (stands := here.parts_before.arrival) is not None and here.whereabouts.still:
         vehicle.brake()
