@@ -225,7 +225,8 @@ class FilterConfig(Table):
 class CameraConfig(DeviceConfig):
     """A camera with its nominal optics and mounting.
 
-    `filter`: the band-pass before its lens; None without one. `late`: by how much its time stamps may come after the exposures really began; nobody can see that from outside.
+    `filter`: the band-pass before its lens; None without one. `late`: by how much its time stamps may come after the
+    exposures really began; nobody can see that from outside.
     """
 
     width: Pixels
@@ -255,6 +256,7 @@ class CameraConfig(DeviceConfig):
 
 OPTICS = frozenset(("width", "height", "pixel", "focal_length", "flange_from_camera"))
 """On these a calibration depends, whatever the camera's make."""
+OPTICS_SINCE = frozenset(("filter",))
 
 
 class LaserConfig(DeviceConfig):

@@ -38,7 +38,7 @@ MOST_WHITE = 0.05
 
 
 def bearable(frame: Frame) -> float:
-    """How long, s, a camera may expose under the light that this picture shows; as long as it did where that will do."""
+    """How long, s, a camera may expose under the light that this picture shows; no longer than it did."""
     level = percentile(counts_of(frame.image), 95)
     if level <= MOST_DN:
         return frame.exposure

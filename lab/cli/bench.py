@@ -311,7 +311,7 @@ def servo(
 def outdoor(
     seeds: WorldsOption = 3, job: JobOption = "pot", workers: WorkersOption = 0, json: JsonOption = False
 ) -> None:
-    """Jobs under 0 to 100 klx of sun with a swaying shadow, wind and uneven ground, with a band-pass filter and without.
+    """Jobs under 0 to 100 klx of sun with a moving shadow, wind and uneven ground; with a band-pass filter and without.
 
     Exit code 1 when a part was placed outside the job's tolerance.
     """

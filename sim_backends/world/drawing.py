@@ -94,8 +94,9 @@ Box = dict[str, list[object]]
 @dataclass(frozen=True, eq=False)
 class CameraDrawing:
     """A camera: `size` (width, height) in px, `pixel`, `focal_length` and `focus` (the distance of its sharpest
-    picture) in m, and where it is mounted; the scan camera with the carriage at the rail's position 0. `filter`: centre,
-    width, m, and transmission of a band-pass before the lens."""
+    picture) in m, and where it is mounted; the scan camera with the carriage at the rail's position 0.
+
+    `filter`: centre and width, m, and transmission of a band-pass before the lens."""
 
     size: tuple[int, int]
     pixel: float

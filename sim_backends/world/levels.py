@@ -116,14 +116,14 @@ class Effects:
         "klx",
         "most illuminance in the open, drawn from a fifth of it on; 15 % of it reach into a shadow, whose edge goes to "
         "and fro over the place",
-        "clear sky, sun from 10 to 60 degrees high (CIE S 011); what it is to the sensor: sim_backends/optics/daylight.py",
+        "clear sky, sun from 10 to 60 degrees high (CIE S 011); sim_backends/optics/daylight.py has what a sensor sees",
         option=True,
     )
     wind: float = _row(
         0.05e-3,
         "rad",
         "amplitude of the standing vehicle's rocking at about 4 Hz in the gusts, one every 10 s",
-        "8 m/s on 1 m², half a metre high, with gusts of 0.3 of it: 7 N m on tyres of 8e5 N m/rad, and their resonance, "
+        "8 m/s on 1 m², half a metre high, gusts of 0.3 of it: 7 N m on tyres of 8e5 N m/rad, and their resonance, "
         "assumed to be five times",
         option=True,
     )

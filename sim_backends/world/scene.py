@@ -72,8 +72,9 @@ class Workshop:
     far the light sheet is off its plane at the place that `Effects` names, m. Once all is warm: `pointing`, turn of
     the light plane about the stripe's direction, rad; `shift` (2, 2) of the scan and the target camera's principal
     points, px; `zoom`, relative. `rocking`: roll and pitch (2,), rad, at `rocking_hz` with `rocking_phase` (2,),
-    rad; `wind` (2,), rad, what gusts add to it. `ground` (4,): roll and pitch of the ground's waves, rad, and where they
-    begin, rad. `heat` (3,): how far the scan camera's mount moves as it warms, m. `sun_start` in m, `klx` in the open. `oil` (3,): the puddle's place, x and y from -1 to 1 across the surface, and its radius, m.
+    rad; `wind` (2,), rad, what gusts add to it. `ground` (4,): roll and pitch of the ground's waves, and where they
+    begin, rad. `heat` (3,): how far the scan camera's mount moves as it warms, m. `sun_start` in m, `klx` in the open.
+    `oil` (3,): the puddle's place, x and y from -1 to 1 across the surface, and its radius, m.
     """
 
     harmonics: Vector
