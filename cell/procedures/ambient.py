@@ -29,6 +29,8 @@ WHITE_DN, WHITER = 250, 4.0
 """A picture that is white tells only that it is to be shorter: by so many times."""
 WHITE_SHARE = 0.01
 TRIES = 8
+REACHES = "ambient light reaches"
+"""So the note of a sweep in bright light begins."""
 STEP_S = 1e-5
 """Cameras take whole steps of some microseconds."""
 LEAST_LINES = 0.3
@@ -50,6 +52,7 @@ def shorten(camera: GatedCamera, exposure: float) -> None:
     try:
         camera.shorten(max(STEP_S, math.floor(exposure / STEP_S) * STEP_S))
     except (LimitError, DeviceFault) as error:
+        camera.longest = math.inf
         raise RefusedError(
             f"ambient light whitens the pictures of {camera.name}, and it takes none as short as {1e3 * exposure:.3f} "
             f"ms ({error}). Shade the place, or put a grey or a band-pass filter before the lens"
@@ -82,7 +85,7 @@ def meet_light(devices: Devices) -> tuple[str, ...]:
         return ()
     dark = adapted(devices.scan_camera, devices.scan_camera.grab())
     level = percentile(counts_of(dark.image), 95)
-    return (f"ambient light reaches {level:.0f} of 255 grey levels at the exposure of {1e3 * dark.exposure:.2f} ms",)
+    return (f"{REACHES} {level:.0f} of 255 grey levels at the exposure of {1e3 * dark.exposure:.2f} ms",)
 
 
 def adapted(camera: GatedCamera, frame: Frame) -> Frame:
@@ -95,14 +98,14 @@ def adapted(camera: GatedCamera, frame: Frame) -> Frame:
     return frame
 
 
-def require_line(shares: Array, lit: Frame, height: float) -> None:
+def require_line(shares: Array, lit: Frame, heights: Array) -> None:
     """Raise `RefusedError` where ambient light hides the laser's line in a sweep: `shares` (n,) of the rows show it in
-    its lines, `height` DN above what surrounds it in the middle one, `lit`."""
+    its pictures, `heights` (m,) DN above what surrounds it in the middle one, `lit`."""
     share = float(np.median(shares))
     if share < LEAST_LINES:
-        level = percentile(counts_of(lit.image), 95)
+        level, height = percentile(counts_of(lit.image), 95), float(np.median(heights)) if len(heights) else 0.0
         raise hidden(
-            f"ambient light reaches {level:.0f} of 255 grey levels at the exposure of {1e3 * lit.exposure:.2f} ms, and "
+            f"{REACHES} {level:.0f} of 255 grey levels at the exposure of {1e3 * lit.exposure:.2f} ms, and "
             f"the laser's line stands {height:.0f} above it in {100.0 * share:.0f} % of the rows", share
         ).showing(seen={"frame": lit})  # fmt: skip
 

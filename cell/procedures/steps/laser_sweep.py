@@ -90,7 +90,8 @@ def laser_sweep(
             shorten(devices.scan_camera, bearable(collector.whitest))
         if collector.notes:
             shares = np.array(collector.counts) / geometry.camera.height
-            require_line(shares, swath.middle, float(np.nanmedian(swath.middle_profile.amplitude)))
+            line = swath.middle_profile
+            require_line(shares, swath.middle, line.amplitude[line.valid])
         swaths.append(swath)
         notes.append(collector.notes)
     looked = counted and scan.mode == "rail"

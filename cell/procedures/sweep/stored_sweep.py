@@ -26,6 +26,7 @@ from cell.measure.calibration.drift.slip import Slip
 from cell.measure.geometry.poses import difference, from_matrix
 from cell.measure.reconstruction import ScanGeometry
 from cell.measure.vision import StripeProfile
+from cell.procedures.ambient import REACHES
 from cell.procedures.arm.photograph import MOVED, BoardFix
 from cell.procedures.sweep.swath import Swath, SweepCollector
 from drivers.camera.folder import read_image
@@ -245,6 +246,7 @@ def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeomet
         raise ValueError(f"its figures are {lost}, {residual}, {shift}")
     shape = (geometry.camera.height, geometry.camera.width)
     collector = SweepCollector(geometry, scan, lambda frame: None, lambda fraction, text: None)
+    collector.notes = tuple(str(doubt) for doubt in stored.get("doubts", ()) if str(doubt).startswith(REACHES))
     for frame_id in arrays["seen"]:
         image = read_image(frame_path(folder, int(frame_id)), shape)
         collector.see(Frame(image, int(frame_id), scan.exposure, device_time=0.0, host_time=0.0, received=0.0))

@@ -87,9 +87,9 @@ def test_a_photograph_that_is_refused_and_partly_white_is_taken_again(cell: Virt
 
 def test_a_line_that_shows_in_few_rows_is_hidden() -> None:
     lit = frame(110.0)
-    require_line(np.full(100, 0.4), lit, 9.0)
+    require_line(np.full(100, 0.4), lit, np.full(50, 9.0))
     with pytest.raises(RefusedError, match=r"110 of 255 .* exposure of 1\.00 ms.*9 above it in 10 %") as refused:
-        require_line(np.full(100, 0.1), lit, 9.0)
+        require_line(np.full(100, 0.1), lit, np.full(50, 9.0))
     assert "scan_camera.filter" in str(refused.value)
     assert refused.value.numbers[0].value == pytest.approx(10.0)
 

@@ -14,6 +14,7 @@ from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics
 from sim_backends.optics.pattern import grain_at, grain_parameters
 from sim_backends.optics.scene import Grain
 from sim_backends.world import drawing
+from sim_backends.world.cameras import SKY
 from sim_backends.world.levels import (
     ALONE,
     CUT,
@@ -157,6 +158,20 @@ def test_the_fan_ends_and_the_sun_moves() -> None:
     late = world._cameras.picture("target", facing, base, False, 0.004, t=100.0).astype(float)
     moved = np.abs(late - early)
     assert np.percentile(moved, 99.5) > 8.0 > 3.0 * np.median(moved)
+
+
+def test_beyond_the_shadow_s_edge_it_is_as_much_brighter_as_the_sun_is_than_the_sky() -> None:
+    world = World(1, "nominal+sun", clock=SteppedClock())
+    ground, base = world.scene.world_from_place, world.world_from_base(0.0)
+
+    def grey(x: float, t: float) -> float:
+        facing = ground @ drawing.pose((x, -0.15, 0.13), (1, 0, 0), (0, 0, -1))
+        return float(world._cameras.picture("scan", facing, base, False, 50e-6, t=t).mean())
+
+    assert grey(0.18, 0.0) / grey(-0.2, 0.0) == pytest.approx(1.0 / SKY, rel=0.15)
+    # The edge goes to and fro.
+    over = [grey(world.scene.workshop.sun_start, t) for t in (0.0, 2.0, 6.0)]
+    assert over[1] < 0.8 * over[0] < 0.8 * 0.8 * over[2]
 
 
 @pytest.mark.parametrize("effect", [*Effects.names(), "workshop"])
