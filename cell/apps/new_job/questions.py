@@ -35,7 +35,7 @@ class Asker:
 
     given: Mapping[str, str | None]
     ask: Callable[[str, str | None], str] | None
-    tell: Callable[[str], None]
+    notify: Callable[[str], None]
     used: dict[str, str] = field(default_factory=dict)
     _told: float = -math.inf
 
@@ -43,7 +43,7 @@ class Asker:
         """Tell how far something is, unless that was told less than `PROGRESS_S` ago."""
         if time.monotonic() >= self._told + PROGRESS_S:
             self._told = time.monotonic()
-            self.tell(f"  {text} …")
+            self.notify(f"  {text} …")
 
     def get(self, option: str, question: str, default: str | None, parse: Callable[[str], T]) -> T:
         """The answer to a question, by `parse`, which raises `ValueError` or `ConfigError` for a wrong one.
@@ -65,7 +65,7 @@ class Asker:
             except (ValueError, ConfigError) as error:
                 if text is not None:
                     raise ConfigError(f"--{option}: {error}") from error
-                self.tell(str(error))
+                self.notify(str(error))
                 continue
             if answer != default:
                 self.used[option] = answer
