@@ -37,17 +37,17 @@ class Attempts:
 
     def attempt(self, step: Step, number: int) -> Failure | None:
         """Try a step for the time of this number: None, or the end that it leads to unless it is repeated."""
-        watchman, clock, teller = self._watchman, self._watchman.clock, self._watchman.teller
+        watchman, clock, events = self._watchman, self._watchman.clock, self._watchman.events
         self.tries = number
         met, self.met = self.met, None
         started, begun = clock.now(), time.monotonic()
         deadline = started + step.deadline_s * (clock.rate if step.on_wall else 1.0)
         context = StepContext(
-            step, number, deadline, results=dict(self.results), clock=clock, tell=teller.tell, control=watchman.control,
-            look=watchman.waiting.look,
+            step, number, deadline, results=dict(self.results), clock=clock, notify=events.notify,
+            control=watchman.control, check=watchman.waiting.check,
         )  # fmt: skip
         key = watchman.journal.step_started(step.name, number)
-        teller.tell(Event("step_started", step.name, {"attempt": number}))
+        events.notify(Event("step_started", step.name, {"attempt": number}))
         watchman.error = None
         call, end = watchman.watch(step.name, lambda: self._begin(context, met), deadline, context.token, ailing=True)
         context.token.cancel(f"{step.name} has ended")
@@ -57,7 +57,7 @@ class Attempts:
             stopped = f"{step.name} failed"
             trouble = watchman.halt(stopped)
             end = watchman.asked() or watchman.judge(call.error)
-            teller.stopped(stopped, trouble)
+            events.stopped(stopped, trouble)
         duration = clock.now() - started
         before = self.records[step.name]
         wall = before.wall_s + time.monotonic() - begun
@@ -66,12 +66,12 @@ class Attempts:
         self.records[step.name] = StepRecord(step.name, state, before.duration_s + duration, retries, wall)
         if end is not None:
             watchman.journal.step_ended(key, duration, error=end.reason)
-            teller.tell(Event("step_failed", step.name, {"attempt": number, "reason": end.reason}))
+            events.notify(Event("step_failed", step.name, {"attempt": number, "reason": end.reason}))
             return end
         summary = summary_of(call.result) or {}
         self.results[step.name] = call.result
         watchman.journal.step_ended(key, duration, summary)
-        teller.tell(Event("step_done", step.name, {"duration_s": duration, **summary}))
+        events.notify(Event("step_done", step.name, {"duration_s": duration, **summary}))
         return None
 
     def _begin(self, context: StepContext, met: Exception | None) -> object:
@@ -88,12 +88,12 @@ def await_word(step: Step, end: Failure, watchman: Watchman) -> tuple[Failure | 
 
     A fault that no recovery can clear, such as an emergency stop, ends the wait and the run.
     """
-    policy, control, tell = watchman.policy, watchman.control, watchman.teller.tell
+    policy, control, notify = watchman.policy, watchman.control, watchman.events.notify
     if policy.simulated_person:
         by = "the simulated person"
     else:
         number = control.ask(end.reason)
-        tell(Event("confirm_needed", step.name, {"reason": end.reason, "code": end.code, "number": number}))
+        notify(Event("confirm_needed", step.name, {"reason": end.reason, "code": end.code, "number": number}))
         try:
             until = time.monotonic() + policy.confirm_deadline_s
             while (found := control.answer()) is None:
@@ -105,7 +105,7 @@ def await_word(step: Step, end: Failure, watchman: Watchman) -> tuple[Failure | 
             by = found
         finally:
             control.asked_no_more()
-    tell(Event("confirmed", step.name, {"by": by, "reason": end.reason}))
+    notify(Event("confirmed", step.name, {"by": by, "reason": end.reason}))
     return None, by
 
 
@@ -137,13 +137,13 @@ def performed(
         if step.retries(error):
             if (unsafe := watchman.halt_before(f"before {step.name} is tried again", end)) is not None:
                 return unsafe
-            watchman.teller.failed(step.name, attempt, end, "tried again")
+            watchman.events.failed(step.name, attempt, end, "tried again")
             sequence.fire(JobTrigger.RETRY)
         elif end.recoverable and step.on_failure is OnFailure.RECOVER and recover is not None:
             failed, by = recovered(step, end, error, recover=recover, sequence=sequence, watchman=watchman)
             if failed is not None:
                 return failed
-            watchman.teller.failed(step.name, attempt, end, f"confirmed by {by}, recovered" if by else "recovered")
+            watchman.events.failed(step.name, attempt, end, f"confirmed by {by}, recovered" if by else "recovered")
         else:
             return end
         if (asked := hold()) is not None:

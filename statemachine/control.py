@@ -160,11 +160,11 @@ class RunControl:
             return self._held_s + (0.0 if since is None else time.monotonic() - since)
 
     def safe_point(
-        self, token: CancelToken, say: Callable[[bool], None], look: Callable[[], None] = lambda: None
+        self, token: CancelToken, say: Callable[[bool], None], check: Callable[[], None] = lambda: None
     ) -> None:
         """Stay here for as long as the run is paused; `say(True)` when it is held, `say(False)` when it goes on.
 
-        Held on the wall's time, whatever the cell's clock; `look()` is called meanwhile, and raises when it finds that
+        Held on the wall's time, whatever the cell's clock; `check()` is called meanwhile, and raises when it finds that
         the work is to end. Raises `Cancelled` when `token` ends the work.
         """
         token.check()
@@ -177,7 +177,7 @@ class RunControl:
             while self.paused():
                 if token.event.wait(0.02):
                     token.check()
-                look()
+                check()
         finally:
             with self._lock:
                 self._held_s += time.monotonic() - (self._held_since or time.monotonic())

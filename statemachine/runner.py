@@ -31,7 +31,7 @@ from statemachine.step import (
 )
 from statemachine.waiting import waiting_on
 from statemachine.watch import RunClock, SignalWatch
-from statemachine.watchman import Teller, Watchman
+from statemachine.watchman import EventLog, Watchman
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ class Scripting:
 
     def after(self, name: str, result: object) -> Failure | None:
         """What the script does with the result of a step: why that ends the run, or None."""
-        if (look := self._script.after.get(name)) is None:
+        if (check := self._script.after.get(name)) is None:
             return None
-        return self._do(name, lambda: look(result))[0]
+        return self._do(name, lambda: check(result))[0]
 
     def decide(self, name: str, end: Failure) -> Failure | Again:
         """Ask the script about a refusal: a step from which the run goes on, up to the refused one, or why it ends."""
@@ -157,7 +157,7 @@ class Runner:
     control: RunControl = field(default_factory=RunControl)
     script: Script = NO_SCRIPT
     _watchman: Watchman = field(init=False)
-    _teller: Teller = field(init=False)
+    _events: EventLog = field(init=False)
     _attempts: Attempts = field(init=False)
 
     def __post_init__(self) -> None:
@@ -172,7 +172,7 @@ class Runner:
         the safe stop.
         """
         with self._watching():
-            self.sequence.on_change = self._teller.changed
+            self.sequence.on_change = self._events.changed
             try:
                 end = self._drive()
             except Exception as error:
@@ -210,12 +210,12 @@ class Runner:
     @contextmanager
     def _watching(self) -> Iterator[None]:
         """Set up what watches, for a whole run and for a step alone."""
-        self._teller = Teller(self.journal, self.observer, lambda: str(self.sequence.state))
+        self._events = EventLog(self.journal, self.observer, lambda: str(self.sequence.state))
         with SignalWatch() as signals:
             self._watchman = Watchman(
                 policy=self.policy, journal=self.journal, clock=self.clock, control=self.control,
                 classify=self.classify, safe_stop=self.safe_stop, health=self.health, waiting=waiting_on(self.clock),
-                signals=signals, teller=self._teller,
+                signals=signals, events=self._events,
             )  # fmt: skip
             self._attempts = Attempts(self.sequence.steps, self.steps, self._watchman)
             yield
@@ -244,7 +244,7 @@ class Runner:
             decided = script.decide(state, end)
             end = self._go_back(state, end, decided) if isinstance(decided, Again) else decided
             if end is not None:
-                self._teller.failed(state, attempts.tries, end, "ended the run")
+                self._events.failed(state, attempts.tries, end, "ended the run")
                 return end
         return None
 
@@ -256,22 +256,22 @@ class Runner:
             return end
         step = self.sequence.state
         self.sequence.fire(JobTrigger.PAUSE)
-        self._teller.tell(Event("paused", step, {"text": f"held before {step}"}))
+        self._events.notify(Event("paused", step, {"text": f"held before {step}"}))
         while end is None and self.control.paused() and attempts.met is None:
             end = watchman.wait_briefly()
             attempts.met = watchman.examine()
         if end is None:
             self.sequence.fire(JobTrigger.RESUME)
             text = "goes on" if attempts.met is None else f"held no longer: {attempts.met}"
-            self._teller.tell(Event("going_on", step, {"text": text}))
+            self._events.notify(Event("going_on", step, {"text": text}))
         return end
 
     def _go_back(self, name: str, end: Failure, chosen: Again) -> Failure | None:
         """Go on from the step that the script chose after the end of step `name`; why that ends the run, or None."""
         if (unsafe := self._watchman.halt_before(f"before {chosen.step} is done again", end)) is not None:
             return unsafe
-        self._teller.failed(name, self._attempts.tries, end, f"again from {chosen.step}")
-        self._teller.tell(Event("decided", name, {"reason": end.reason, "again": chosen.step, "why": chosen.why}))
+        self._events.failed(name, self._attempts.tries, end, f"again from {chosen.step}")
+        self._events.notify(Event("decided", name, {"reason": end.reason, "again": chosen.step, "why": chosen.why}))
         self._attempts.forget_from(chosen.step)
         self.sequence.facts.chosen = chosen.step
         self.sequence.fire(JobTrigger.AGAIN)
@@ -292,8 +292,8 @@ class Runner:
             end = Failure(Outcome.FAULTED, f"{said}; the safe stop failed: {trouble}", "safe_stop")
         try:
             if trouble is not None and end is not None:
-                self._teller.failed("", 0, end, "ended the run")
-            self._teller.stopped(reason, trouble)
+                self._events.failed("", 0, end, "ended the run")
+            self._events.stopped(reason, trouble)
             # Who asked since the last look was told that the run was asked.
             self.control.obey(self.journal.take_requests())
             if end is not None:
@@ -304,10 +304,10 @@ class Runner:
             outcome = Outcome.FAULTED
             end = Failure(outcome, f"{said}; the end could not be recorded: {error}", "run.internal")
             said = end.reason
-        self._teller.tell(Event("run_ended", None, {"outcome": outcome.value, "reason": said}))
+        self._events.notify(Event("run_ended", None, {"outcome": outcome.value, "reason": said}))
         code = "" if end is None else end.code
         return RunResult(
             outcome, said, code, steps=tuple(self._attempts.records[name] for name in self.sequence.steps),
             results=dict(self._attempts.results), error=self._watchman.error, signal=self.control.signal,
-            faults=tuple(self._teller.faults),
+            faults=tuple(self._events.faults),
         )  # fmt: skip

@@ -154,22 +154,22 @@ class StepContext:
     """What a step is given: earlier results, its deadline, its end, and ways to report.
 
     `results` maps the earlier steps' names to what they returned. `deadline` is in seconds of the cell's clock.
-    `token` ends this attempt: with the run, or by itself when the attempt is cut short. `look` is how work that is held
-    sees what is asked of the run, where nobody else looks for it.
+    `token` ends this attempt: with the run, or by itself when the attempt is cut short. `check` lets held work
+    see what is asked of the run, where nobody else looks for it.
     """
 
     def __init__(
         self, step: Step, attempt: int, deadline: float, results: Mapping[str, object], clock: RunClock,
-        tell: Observer, control: RunControl | None = None, look: Callable[[], None] = lambda: None,
+        notify: Observer, control: RunControl | None = None, check: Callable[[], None] = lambda: None,
     ) -> None:  # fmt: skip
         self.step = step
         self.attempt = attempt
         self.deadline = deadline
         self.results = results
         self._clock = clock
-        self._tell = tell
+        self._notify = notify
         self._control = control or RunControl()
-        self._look = look
+        self._check = check
         self.token = CancelToken(self._control.token)
 
     def made(self, kind: type[Made]) -> Made:
@@ -192,9 +192,9 @@ class StepContext:
 
         def say(held: bool) -> None:
             kind = "paused" if held else "going_on"
-            self._tell(Event(kind, self.step.name, {"text": "held before its next motion" if held else "goes on"}))
+            self._notify(Event(kind, self.step.name, {"text": "held before its next motion" if held else "goes on"}))
 
-        self._control.safe_point(self.token, say, self._look)
+        self._control.safe_point(self.token, say, self._check)
 
     @property
     def held_s(self) -> float:
@@ -204,29 +204,29 @@ class StepContext:
     def progress(self, fraction: float, text: str = "") -> None:
         """Tell the observer how far the step is, 0 to 1; not written to the journal. Raises like `check`."""
         self.check()
-        self._tell(Event("progress", self.step.name, {"fraction": fraction, "text": text}))
+        self._notify(Event("progress", self.step.name, {"fraction": fraction, "text": text}))
 
     def ask(self, what: str) -> None:
         """Wait, however long, for a person's word about `what`. Nothing may move meanwhile. Raises like `check`."""
         about = {"reason": what, "code": self.step.name, "number": self._control.ask(what)}
-        self._tell(Event("confirm_needed", self.step.name, about))
+        self._notify(Event("confirm_needed", self.step.name, about))
         try:
             while (by := self._control.answer()) is None:
                 self.token.event.wait(0.02)
                 self.check()
-                self._look()
+                self._check()
         finally:
             self._control.asked_no_more()
-        self._tell(Event("confirmed", self.step.name, {"by": by, "reason": what}))
+        self._notify(Event("confirmed", self.step.name, {"by": by, "reason": what}))
         self.safe_point()
 
     def note(self, **data: object) -> None:
         """Write something worth keeping to the journal and tell the observer."""
-        self._tell(Event("note", self.step.name, data))
+        self._notify(Event("note", self.step.name, data))
 
     def fault(self, code: str, reason: str) -> None:
         """Note a fault that the step goes on after; it is in the run's faults."""
-        self._tell(Event("fault", self.step.name, {"attempt": self.attempt, "code": code, "reason": reason}))
+        self._notify(Event("fault", self.step.name, {"attempt": self.attempt, "code": code, "reason": reason}))
 
 
 @dataclass(frozen=True)

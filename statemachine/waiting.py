@@ -25,8 +25,8 @@ Cut = Callable[[], str | None]
 class WaitableClock(RunClock, Protocol):
     """A clock whose time moves when somebody waits on it."""
 
-    def looking(self, look: Callable[[], None]) -> AbstractContextManager[None]:
-        """Inside this context `look()` is called each time this thread has let time pass; what it raises comes out of
+    def checking(self, check: Callable[[], None]) -> AbstractContextManager[None]:
+        """Inside this context `check()` is called each time this thread has let time pass; what it raises comes out of
         the wait. Takes the place of an outer one."""
 
 
@@ -39,7 +39,7 @@ class Waiting(Protocol):
         What comes back is done unless it was still busy after that.
         """
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Called by work that is held on the wall's time, to see what is asked for; raises when it is to end."""
 
     def each(self, actions: Mapping[str, Callable[[], None]], timeout: float) -> list[str]:
@@ -66,7 +66,7 @@ class Threads:
                 break
         return call
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Somebody else looks around."""
 
     def each(self, actions: Mapping[str, Callable[[], None]], timeout: float) -> list[str]:
@@ -95,16 +95,16 @@ class InLine:
         call = Call()
         outer, self._look_out = self._look_out, _LookOut(self._clock, cut, grace)
         try:
-            with self._clock.looking(self._look_out.moved):
+            with self._clock.checking(self._look_out.moved):
                 call.perform(work)
         finally:
             self._look_out = outer
         return call
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Look around now, although no time has passed."""
         if self._look_out is not None:
-            self._look_out.look()
+            self._look_out.check()
 
     def each(self, actions: Mapping[str, Callable[[], None]], timeout: float) -> list[str]:
         """One after another; `timeout` is of the virtual clock. See `Waiting.each`."""
@@ -137,9 +137,9 @@ class _LookOut:
     def moved(self) -> None:
         """Look around if it is time to."""
         if self._clock.now() >= self._due:
-            self.look()
+            self.check()
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Ask whether the work is to end, and raise `Cancelled` if so; again and again for work that goes on then."""
         # The stop that ends the work waits as well, and is not to be ended by what it is for.
         if self._busy:

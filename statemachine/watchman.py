@@ -22,7 +22,7 @@ JOURNALLED = frozenset(
 """The kinds of events that are written to the journal; steps have a table of their own there."""
 
 
-class Teller:
+class EventLog:
     """What happens in one run is told here, from any thread; `faults` are all that were told, in their order."""
 
     def __init__(self, journal: Journal, observer: Observer | None, state: Callable[[], str]) -> None:
@@ -32,7 +32,7 @@ class Teller:
         self._observer = observer
         self._state = state
 
-    def tell(self, event: Event) -> None:
+    def notify(self, event: Event) -> None:
         """Write to the journal what is not in its steps table, and tell the observer."""
         if event.kind in JOURNALLED:
             self._journal.event(event.kind, event.step, event.data)
@@ -52,17 +52,19 @@ class Teller:
 
     def changed(self, trigger: JobTrigger, source: str, target: str) -> None:
         """The sequence went from one state to another."""
-        self.tell(Event("state", None, {"trigger": trigger.value, "from": str(source), "to": str(target)}))
+        self.notify(Event("state", None, {"trigger": trigger.value, "from": str(source), "to": str(target)}))
 
     def stopped(self, reason: str, trouble: str | None) -> None:
         """The cell was brought to rest; `trouble` is what could not be confirmed."""
-        self.tell(Event("safe_stop", None, {"reason": reason, "trouble": trouble}))
+        self.notify(Event("safe_stop", None, {"reason": reason, "trouble": trouble}))
 
     def failed(self, step: str, attempt: int, end: Failure, remedy: str) -> None:
         """What went wrong and what was done about it, for the report; an end that was asked for is no fault."""
         if end.outcome is Outcome.ABORTED:
             return
-        self.tell(Event("fault", step, {"attempt": attempt, "code": end.code, "reason": end.reason, "remedy": remedy}))
+        self.notify(
+            Event("fault", step, {"attempt": attempt, "code": end.code, "reason": end.reason, "remedy": remedy})
+        )
 
     def trace(self, error: BaseException) -> None:
         """Where an exception came from, for the journal alone."""
@@ -93,7 +95,7 @@ class Watchman:
     health: Callable[[], None] | None
     waiting: Waiting
     signals: SignalWatch
-    teller: Teller
+    events: EventLog
     error: BaseException | None = field(default=None, init=False)
     abandoned: bool = field(default=False, init=False)
     at_rest: bool = field(default=False, init=False)
@@ -126,12 +128,12 @@ class Watchman:
             return call, None
         ailment, self._ailment = self._ailment, None
         if ailment is not None:
-            self.teller.trace(ailment)
+            self.events.trace(ailment)
         if not call.done.is_set():
             self.abandoned = True
             text = f"{cause.reason}; {what} was still busy {self.policy.grace_s:g} s after the stop"
             cause = replace(cause, reason=text)
-        self.teller.stopped(cause.reason, trouble)
+        self.events.stopped(cause.reason, trouble)
         return call, cause
 
     def _cause(self, what: str, deadline: float, held: float, ailing: bool) -> Failure | None:
@@ -189,7 +191,7 @@ class Watchman:
         """What an exception means for the run; where it came from is written down."""
         if isinstance(error, KeyboardInterrupt | SystemExit):
             return Failure(Outcome.ABORTED, f"ended by {type(error).__name__}", "interrupt")
-        self.teller.trace(error)
+        self.events.trace(error)
         return self.classified(error)
 
     def classified(self, error: BaseException) -> Failure:
@@ -216,7 +218,7 @@ class Watchman:
     def halt_before(self, reason: str, end: Failure) -> Failure | None:
         """Bring the cell to rest before the run goes on after `end`; the end of the run if that was not confirmed."""
         trouble = self.halt(reason)
-        self.teller.stopped(reason, trouble)
+        self.events.stopped(reason, trouble)
         if trouble is None:
             return None
         return Failure(Outcome.FAULTED, f"{end.reason}; the safe stop after it failed: {trouble}", "safe_stop")

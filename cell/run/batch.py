@@ -136,7 +136,7 @@ def require_count(count: int) -> None:
 
 
 def perform(
-    here: OpenCell, jobs: Sequence[Job], count: int, run: Callable[[int, PartsBefore], RunOutcome],
+    open_cell: OpenCell, jobs: Sequence[Job], count: int, run: Callable[[int, PartsBefore], RunOutcome],
     between: Callable[[Callable[[WorkContext], None]], None], observer: Observer | None,
 ) -> BatchOutcome:  # fmt: skip
     """Do a batch: `run(number, parts_before)` a part; `between(work)` what a person is asked
@@ -146,10 +146,10 @@ def perform(
     begun, or is no error of the cell.
     """
     require_count(count := count * len(jobs))
-    tell = each_of(() if observer is None else (observer,))
+    notify = each_of(() if observer is None else (observer,))
     name = f"batch-{time.strftime('%Y%m%dT%H%M%S')}-{secrets.token_hex(2)}.json"
     whole = job_and_item(jobs[0].job.name)[0]
-    batch, why, interrupted = BatchOutcome(whole, count, here.runs_folder / name), "", False
+    batch, why, interrupted = BatchOutcome(whole, count, open_cell.runs_folder / name), "", False
     before = PartsBefore()
     try:
         while not why and len(batch.runs) < count:
@@ -158,7 +158,7 @@ def perform(
             # A person makes all items ready at once.
             refill = job is jobs[0]
             part = f"part {number} of {count}"
-            work = _question(here, job, part, batch.runs[-1], refill=refill) if number > 1 else None
+            work = _question(open_cell, job, part, batch.runs[-1], refill=refill) if number > 1 else None
             if work is not None:
                 between(work)
             # Whoever was at the cell, or set its world up anew, may have moved vehicle and station.
@@ -166,9 +166,9 @@ def perform(
             before = _known_after(before, last)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()
-            tell(Event("note", None, {"text": str(batch)}))
+            notify(Event("note", None, {"text": str(batch)}))
             interrupted = last.interrupted
-            why = _ended_by(here, job, last, number)
+            why = _ended_by(open_cell, job, last, number)
     except (CellError, SignalInterrupt) as error:
         if not batch.runs:
             raise
@@ -179,9 +179,9 @@ def perform(
     return replace(batch, reason=why or "every part was tried", interrupted=interrupted).written()
 
 
-def _ended_by(here: OpenCell, job: Job, last: RunOutcome, number: int) -> str:
+def _ended_by(open_cell: OpenCell, job: Job, last: RunOutcome, number: int) -> str:
     """Why no other part is begun after this end; empty where one is."""
-    if last.interrupted or last.stopped_after_end or not (last.outcome in GOOD or _skipped(here, job, last)):
+    if last.interrupted or last.stopped_after_end or not (last.outcome in GOOD or _skipped(open_cell, job, last)):
         return f"part {number} {last}"
     return f"after part {number}, as asked" if last.control.end_batch else ""
 
@@ -201,32 +201,34 @@ def _known_after(before: PartsBefore, last: RunOutcome) -> PartsBefore:
     return PartsBefore(series, stands)
 
 
-def _skipped(here: OpenCell, job: Job, last: RunOutcome) -> bool:
+def _skipped(open_cell: OpenCell, job: Job, last: RunOutcome) -> bool:
     """Whether the batch goes on after this end: nobody knows how a part lies that is down and was refused."""
     there = PartState.first(job)
-    untouched = last.report.get("part") == there.value and (job.nest is not None or here.devices.claw.holding)
+    untouched = last.report.get("part") == there.value and (job.nest is not None or open_cell.devices.claw.holding)
     return last.outcome == "refused" and untouched and job.batch.on_refusal != "end"
 
 
 def _question(
-    here: OpenCell, job: Job, part: str, last: RunOutcome, *, refill: bool
+    open_cell: OpenCell, job: Job, part: str, last: RunOutcome, *, refill: bool
 ) -> Callable[[WorkContext], None] | None:  # fmt: skip
     """What asks a person whether to go on after a refusal, and at a cell with real devices to `refill` it."""
-    by_hand = refill and not is_whole(here.simulated)
-    refused = last.outcome == "refused" and job.batch.on_refusal == "ask" and here.config.cell.confirm != "simulated"
+    by_hand = refill and not is_whole(open_cell.simulated)
+    refused = (
+        last.outcome == "refused" and job.batch.on_refusal == "ask" and open_cell.config.cell.confirm != "simulated"
+    )
 
     def work(context: WorkContext) -> None:
         if refused:
             context.ask(f"The last part was {last}. Go on with {part}?")
         if by_hand:
-            _refill(here, job, part, context)
+            _refill(open_cell, job, part, context)
 
     return work if refused or by_hand else None
 
 
-def _refill(here: OpenCell, job: Job, part: str, context: WorkContext) -> None:
+def _refill(open_cell: OpenCell, job: Job, part: str, context: WorkContext) -> None:
     """A person makes the next part ready."""
-    claw, simulated, ready = here.devices.claw, here.simulated, "and step back: the arm moves next"
+    claw, simulated, ready = open_cell.devices.claw, open_cell.simulated, "and step back: the arm moves next"
     filled = simulated is not None and "claw" in simulated.simulated
     while job.nest is None and not (filled or claw.holding):
         context.ask(f"Hold {part} between the claw's fingers: the claw closes on it")

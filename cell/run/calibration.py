@@ -78,22 +78,22 @@ def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibrat
     part_of, _ = load_job(job)
     config, devices = cell.config, cell.devices
 
-    tell = partial(_tell, run, "calibrate")
+    notify = partial(_notify, run, "calibrate")
 
     def work(context: WorkContext) -> tuple[Observations, CellCalibration]:
         mover = cell.mover(part_of, context.safe_point)
         # In command, so that a vehicle that somebody else moves or releases is noticed.
         devices.vehicle.recover()
         given = config, devices, mover, context.check
-        scan = collect_scan(*given, lambda f, t: tell(0.65 * f, t), context.keep)
+        scan = collect_scan(*given, lambda f, t: notify(0.65 * f, t), context.keep)
         witness = see_reference_plate(config, devices, context.keep)
-        target = collect_target(*given, lambda f, t: tell(0.65 + 0.3 * f, t), context.keep)
-        tell(0.96, "solving")
+        target = collect_target(*given, lambda f, t: notify(0.65 + 0.3 * f, t), context.keep)
+        notify(0.96, "solving")
         observations = store.gathered(
             scan, target, serial_numbers(devices), config=config, kinematics=arm_table(config, devices), witness=witness
         )
         made = store.solve_observations(observations).calibration
-        tell(0.98, "looking at the scan camera's shutter")
+        notify(0.98, "looking at the scan camera's shutter")
         with kept_if_refused(cell.calibrations_folder, made.name):
             made = look_at_shutter(config, devices, mover, calibration=made, check=context.check, keep=context.keep)
         made = with_edge(config, devices, context.keep, made)
@@ -102,7 +102,7 @@ def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibrat
     info = {"for_job": str(job)} if run.kind == "job" else None
     observations, calibration = cell.recorded(run, "calibration", work, info)
     store.save_with_observations(calibration, observations, cell.calibrations_folder)
-    tell(1.0, "stored")
+    notify(1.0, "stored")
     return calibration
 
 
@@ -123,8 +123,8 @@ def kept_if_refused(folder: Path, name: str) -> Iterator[None]:
         raise
 
 
-def _tell(run: Run[object], step: str, fraction: float, text: str) -> None:
-    run.tell(Event("progress", step, {"fraction": fraction, "text": text}))
+def _notify(run: Run[object], step: str, fraction: float, text: str) -> None:
+    run.notify(Event("progress", step, {"fraction": fraction, "text": text}))
 
 
 def _ready(cell: OpenCell, context: WorkContext, calibration: CellCalibration, job: Job) -> Mover:
@@ -140,38 +140,38 @@ def verify(cell: OpenCell, run: Run[object], calibration: CellCalibration, job: 
 
     What it finds out about the laser is kept with the stored calibration.
     """
-    tell = partial(_tell, run, "verify")
+    notify = partial(_notify, run, "verify")
 
     def work(context: WorkContext) -> Verification:
         mover = _ready(cell, context, calibration, job)
         seen = collect_verification(
-            cell.config, cell.devices, mover, calibration=calibration, check=context.check, progress=tell,
+            cell.config, cell.devices, mover, calibration=calibration, check=context.check, progress=notify,
             keep=context.keep,
         )  # fmt: skip
         return Verification.of(calibration, job, seen)
 
     made = cell.recorded(run, "verification", work)
     keep_confirmed(cell.calibrations_folder, calibration, made)
-    tell(1.0, "done")
+    notify(1.0, "done")
     return made
 
 
 def time_stamps(cell: OpenCell, run: Run[object], calibration: CellCalibration, job: Job) -> CellCalibration:
     """Sweep to and fro over the fine board, recorded in `run`: `calibration`, stored with how late the scan camera's
     time stamps come. `job` names the part that may be in the claw."""
-    tell = partial(_tell, run, "timing")
+    notify = partial(_notify, run, "timing")
 
     def work(context: WorkContext) -> CellCalibration:
         mover = _ready(cell, context, calibration, job)
         with kept_if_refused(cell.calibrations_folder, calibration.name):
             timing = collect_timing(
-                cell.config, cell.devices, mover, calibration, check=context.check, progress=tell, keep=context.keep
+                cell.config, cell.devices, mover, calibration, check=context.check, progress=notify, keep=context.keep
             )
         return replace(calibration, scan=replace(calibration.scan, timing=timing))
 
     made = cell.recorded(run, "timing", work)
     store.save_calibration(made, cell.calibrations_folder / f"{made.name}.json")
-    tell(1.0, "stored")
+    notify(1.0, "stored")
     return made
 
 

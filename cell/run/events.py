@@ -215,7 +215,7 @@ class Detached:
         self.failure: str | None = None
         self._observer = observer
         self._events = Subscription()
-        self._thread = threading.Thread(target=self._tell, name="observer", daemon=True)
+        self._thread = threading.Thread(target=self._notify, name="observer", daemon=True)
         self._thread.start()
 
     def __call__(self, event: Event) -> None:
@@ -227,7 +227,7 @@ class Detached:
         self._events.close()
         self._thread.join(timeout)
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         while (event := self._events.take()) is not None:
             try:
                 self._observer(event)

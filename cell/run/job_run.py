@@ -183,22 +183,22 @@ class JobRun:
         begun = self.devices.clock.now()
         open_before = self.devices.gate.is_open
         witness = None if self.truth is None else TruthRecorder(self.truth)
-        observers = (*self.inline, *(() if witness is None else (witness,)), self.run.tell)
+        observers = (*self.inline, *(() if witness is None else (witness,)), self.run.notify)
         listener = None if record is None else record.frame
         with FrameStore(folder / "frames", listener, kept=self.config.cell.frames) as frames:
             self.run.frames = frames
-            here = self._workplace(folder, whereabouts, frames)
-            result = self._runner(here, journal, each_of(observers)).run()
+            workplace = self._workplace(folder, whereabouts, frames)
+            result = self._runner(workplace, journal, each_of(observers)).run()
         save_perception(folder, result)
         if open_before and result.outcome in (Outcome.PLACED, Outcome.DONE):
             self._open_again()
         if result.outcome is not Outcome.PLACED:
-            result = replace(result, reason=here.part.explain(result.reason))
+            result = replace(result, reason=workplace.part.explain(result.reason))
         elif self.ready.job.part is not None:
             result = replace(result, reason=seen_words(result))
         finished = FinishedJob(
-            folder, self.config, here.job, nominal=self.ready.nominal, repeatability=here.repeatability, result=result,
-            info=self._facts_after(begun, here), started=started, witness=witness, frames=frames,
+            folder, self.config, workplace.job, nominal=self.ready.nominal, repeatability=workplace.repeatability,
+            result=result, info=self._facts_after(begun, workplace), started=started, witness=witness, frames=frames,
         )  # fmt: skip
         report = finished.report()
         return RunOutcome(
@@ -217,9 +217,9 @@ class JobRun:
             parts_before=self.parts_before, part=PartProgress(state),
         )  # fmt: skip
 
-    def _runner(self, here: Workplace, journal: Journal, observer: Observer) -> Runner:
+    def _runner(self, workplace: Workplace, journal: Journal, observer: Observer) -> Runner:
         return Runner(
-            sequence=self.ready.kind.sequence(), steps=self.ready.kind.work(here),
+            sequence=self.ready.kind.sequence(), steps=self.ready.kind.work(workplace),
             policy=self.ready.kind.policy(simulated_person=self.config.cell.confirm == "simulated"), journal=journal,
             clock=self.devices.clock, classify=partial(classify, following=self.devices.following),
             safe_stop=lambda reason: stop_cell(self.devices), observer=observer, recover=partial(clear, self.devices),
@@ -234,10 +234,10 @@ class JobRun:
         if not self.run.control.late:
             self.devices.gate.clear(stops)
 
-    def _facts_after(self, begun: float, here: Workplace) -> dict[str, object]:
+    def _facts_after(self, begun: float, workplace: Workplace) -> dict[str, object]:
         """What the report says of the run besides its result; `begun` is a time of the cell's clock."""
         cell_s = round(self.devices.clock.now() - begun, 3)
-        facts: dict[str, object] = {"cell_s": cell_s, **self._facts(), "part": here.part.state.value}
+        facts: dict[str, object] = {"cell_s": cell_s, **self._facts(), "part": workplace.part.state.value}
         injectors = (each for each in self.inline if isinstance(each, Injector))
         if missed := {name: why for each in injectors for name, why in each.missed.items()}:
             facts["not_injected"] = [{"fault": name, "why": why} for name, why in missed.items()]
@@ -286,7 +286,7 @@ def each_of(observers: tuple[Observer, ...]) -> Observer:
     """One observer that tells all; one that fails is told nothing more and keeps no other from listening."""
     listening = list(observers)
 
-    def tell(event: Event) -> None:
+    def notify(event: Event) -> None:
         for observer in list(listening):
             try:
                 observer(event)
@@ -294,7 +294,7 @@ def each_of(observers: tuple[Observer, ...]) -> Observer:
                 listening.remove(observer)
                 log.warning("an observer of the run failed and is told nothing more: %s", error)
 
-    return tell
+    return notify
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,7 +321,7 @@ class JobWork:
         cell, ready = self.cell, self.ready
 
         def note(text: str) -> None:
-            run.tell(Event("note", None, {"text": text}))
+            run.notify(Event("note", None, {"text": text}))
 
         if (simulated := cell.simulated) is not None and not is_whole(simulated):
             for sentence in beware(simulated.simulated, DEVICES):
@@ -361,6 +361,6 @@ class JobWork:
             raise error
         run.control.over = True
         outcome, reason = outcome_of(error), f"in the calibration before the job: {error}"
-        run.tell(Event("run_ended", None, {"outcome": outcome, "reason": reason}))
+        run.notify(Event("run_ended", None, {"outcome": outcome, "reason": reason}))
         report = {**read_report(run.folder), "outcome": outcome, "reason": reason}
         return RunOutcome(outcome, reason, run.folder, report, control=run.control, wall_s=wall_s)

@@ -162,7 +162,7 @@ class RecordedWork:
             raise
         finally:
             if self.run.kind == self.kind:
-                self.run.tell(Event("run_ended", self.kind, {"outcome": outcome, "reason": reason}))
+                self.run.notify(Event("run_ended", self.kind, {"outcome": outcome, "reason": reason}))
             if record is not None:
                 record.close()
             report = {
@@ -243,7 +243,7 @@ class RecordedWork:
     def _heard(self, event: Event) -> None:
         # Steps and states are those of a job.
         if not event.kind.startswith(("step_", "state")):
-            self.run.tell(event)
+            self.run.notify(event)
 
 
 @dataclass(eq=False)

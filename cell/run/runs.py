@@ -55,7 +55,7 @@ class Run(Generic[Result]):
         self.control = RunControl()
         self.record: Observer | None = None
         """Told every event before the run goes on, progress as well; while the run is recorded."""
-        self._telling = threading.Lock()
+        self._notifying = threading.Lock()
         self._over = False
         self._subscriptions: list[Subscription] = []
         self._past: deque[Event] = deque(maxlen=KEPT_EVENTS)
@@ -89,7 +89,7 @@ class Run(Generic[Result]):
     def events(self) -> Subscription:
         """Iterate over the run's events (`events.py`) from its beginning to its end; who is slow misses progress."""
         subscription = Subscription()
-        with self._telling:
+        with self._notifying:
             for event in self._past:
                 subscription.put(event)
             self._subscriptions.append(subscription)
@@ -131,13 +131,13 @@ class Run(Generic[Result]):
         if not self._call.done.wait(timeout):
             raise DeadlineError(self.kind, f"has not ended within {timeout:g} s")
 
-    def tell(self, event: Event) -> None:
+    def notify(self, event: Event) -> None:
         """The run's work says what happens; nobody who listens can hold it up."""
         if event.kind != "progress":
             log.info("%s %s %s", event.step or self.kind, event.kind, json.dumps(strict(event.data)))
         if (record := self.record) is not None:
             record(event)
-        with self._telling:
+        with self._notifying:
             if event.kind != "progress":
                 self._past.append(event)
             for subscription in self._subscriptions:
@@ -147,7 +147,7 @@ class Run(Generic[Result]):
 
     def progress(self, fraction: float, text: str) -> None:
         """Tell how far the run's work is, 0 to 1."""
-        self.tell(Event("progress", self.kind, {"fraction": fraction, "text": text}))
+        self.notify(Event("progress", self.kind, {"fraction": fraction, "text": text}))
 
     def _perform(self) -> Result:
         try:
@@ -157,7 +157,7 @@ class Run(Generic[Result]):
             log.log(logging.INFO if isinstance(error, Aborted) else logging.ERROR, "the %s ended: %s", self.kind, error)
             raise
         finally:
-            with self._telling:
+            with self._notifying:
                 self._over = True
                 for subscription in self._subscriptions:
                     subscription.close()

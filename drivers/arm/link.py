@@ -353,7 +353,7 @@ SLOWEST_S = 0.0045
 _UPDATE = "Update the controller's software."
 
 
-def look(name: str, address: str, clock: Clock, timeout: float) -> None:
+def probe(name: str, address: str, clock: Clock, timeout: float) -> None:
     """Raise `NotConnectedError`, with what is wrong and what to do, unless the arm at `address` tells its states.
 
     All within `timeout` wall seconds. Nothing on the arm is set, begun or ended.
@@ -364,7 +364,7 @@ def look(name: str, address: str, clock: Clock, timeout: float) -> None:
 
     try:
         with RtdeLink(address, clock, timeout) as link:
-            _look(link, clock, refuse)
+            _probe(link, clock, refuse)
     except TimeoutError as error:
         raise refuse(
             f"no answer within {timeout:g} s",
@@ -378,7 +378,7 @@ def look(name: str, address: str, clock: Clock, timeout: float) -> None:
         ) from error
 
 
-def _look(link: RtdeLink, clock: Clock, refuse: Callable[[str, str], NotConnectedError]) -> None:
+def _probe(link: RtdeLink, clock: Clock, refuse: Callable[[str, str], NotConnectedError]) -> None:
     if not _yes(link.ask("V", struct.pack(">H", VERSION))):
         raise refuse(f"its RTDE does not speak version {VERSION}", _UPDATE)
     reply = link.ask("O", struct.pack(">d", RATE_HZ) + ",".join(VARIABLES).encode())

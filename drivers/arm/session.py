@@ -14,7 +14,7 @@ from drivers.arm.dashboard import Dashboard
 from drivers.arm.factory import Forward, flange_agrees, require_same_flange, require_same_payload, same_payload
 from drivers.arm.faults import fault, require_named, require_remote, unlock
 from drivers.arm.feed import MODE_RUNNING, PLAYING, ChildSetup, Ended, Snapshot, StateFeed, safety_code
-from drivers.arm.link import ArmLink, look, see_safe
+from drivers.arm.link import ArmLink, probe, see_safe
 from drivers.clock import Clock
 from drivers.errors import Aborted, DeadlineError, DeviceError, DeviceFault, InterlockError, NotConnectedError, shown
 from drivers.interfaces import LinkStatistics
@@ -118,7 +118,7 @@ class ArmSession:
         self._closed = False
         self._stops = 0
         self._counting, self._recovering, self._comparing = threading.Lock(), threading.Lock(), threading.Lock()
-        look(name, setup.address, clock, connect_timeout)
+        probe(name, setup.address, clock, connect_timeout)
         if setup.control:
             self.require_remote()
             # One that does not answer is left to the connection, which says more.

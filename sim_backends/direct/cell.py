@@ -48,7 +48,7 @@ def require(name: str) -> None:
         raise ValueError(f"unknown fault {name!r}; known: {', '.join(NAMES)}")
 
 
-Look = Callable[[], None]
+Check = Callable[[], None]
 Ring = Callable[[], float | None]
 
 
@@ -64,7 +64,7 @@ class VirtualClock(Clock):
         self._time = time
         self._tick = tick
         self._moving = threading.Lock()
-        self._looking = threading.local()
+        self._checking = threading.local()
         self._alarms: dict[Ring, float] = {}
 
     def now(self) -> float:
@@ -75,33 +75,33 @@ class VirtualClock(Clock):
         """Let `seconds` of the world pass. Raises what the look-out of this thread raises (see `looking`)."""
         until = self.now() + seconds
         while self._step(until):
-            self.look()
+            self.check()
 
     def wait(self, event: threading.Event, timeout: float) -> bool:
         """Let time pass until `event` is set, at most `timeout` s; True when it was set."""
         until = self.now() + timeout
         while not event.is_set() and self._step(until):
-            self.look()
+            self.check()
         return event.is_set()
 
     @contextmanager
-    def looking(self, look: Look) -> Iterator[None]:
-        """Inside this context `look()` is called after each tick that this thread waits for, in place of an outer one.
+    def checking(self, check: Check) -> Iterator[None]:
+        """Inside this context `check()` is called after each tick that this thread waits for, in place of an outer one.
 
         What it raises comes out of the wait.
         """
-        outer = getattr(self._looking, "look", None)
-        self._looking.look = look
+        outer = getattr(self._checking, "check", None)
+        self._checking.check = check
         try:
             yield
         finally:
-            self._looking.look = outer
+            self._checking.check = outer
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Look around now, if this thread does that at all."""
-        look: Look | None = getattr(self._looking, "look", None)
-        if look is not None:
-            look()
+        check: Check | None = getattr(self._checking, "check", None)
+        if check is not None:
+            check()
 
     def _step(self, until: float) -> bool:
         with self._moving:
@@ -178,7 +178,7 @@ class DirectCell:
         self.scan_camera = DirectCamera("scan_camera", "scan", self.world, self.clock, wire=wire)
         self.target_camera = DirectCamera("target_camera", "target", self.world, self.clock, wire=wire)
         self._ticking: tuple[Ticking, ...] = (self.arm, self.vehicle)
-        self.clock.ring_in(0.0, self.rail.look)
+        self.clock.ring_in(0.0, self.rail.poll)
 
     def truth(self) -> dict[str, object]:
         """Everything true about the world now; see `sim_backends.world.world`."""

@@ -282,7 +282,7 @@ class DirectRail(DirectDevice):
         self._motion = self._checking = RailMove(self, None, asked=check)
         return self._motion
 
-    def look(self) -> float:
+    def poll(self) -> float:
         """Begin the next leg of a check beside what else goes on, as a driver's thread does; when to look again, s."""
         if self._checking is not None and self._checking.done:
             self._checking = None

@@ -31,7 +31,7 @@ class AtStation:
     """A cell of `record` where that placed, `further` metres on, its vehicle braked; `made` is what `record` made.
 
     `job` and `nominal` are those of `pot()` if not told otherwise, the arm's joints those of the sweep if `folded`:
-    with others its errors are others. `changed` changes the cell before anything moves, `tell` hears what steps tell.
+    with others its errors are others. `changed` changes the cell before anything moves, `notify` hears what steps tell.
     """
 
     record: JobRecord
@@ -42,8 +42,8 @@ class AtStation:
     level: str = ""
     folded: bool = True
     changed: Callable[[VirtualCell], None] = lambda cell: None
-    tell: Callable[[Event], None] = lambda event: None
-    look: Callable[[], None] = lambda: None
+    notify: Callable[[Event], None] = lambda event: None
+    check: Callable[[], None] = lambda: None
 
     def __post_init__(self) -> None:
         assert self.nominal.source is not None
@@ -62,7 +62,7 @@ class AtStation:
     def context(self, name: str) -> StepContext:
         """What this step of the job is given."""
         step = self.kind.policy().of(name)
-        return StepContext(step, 1, math.inf, self.made, self.cell.clock, self.tell, self.control, self.look)
+        return StepContext(step, 1, math.inf, self.made, self.cell.clock, self.notify, self.control, self.check)
 
     def do(self, *names: str) -> Any:
         """Do these steps; gives the last one's result, which all later ones get instead of the record's."""

@@ -53,9 +53,9 @@ def opened(folder: Path, shown: Shown, ask: Callable[[str], bool] | None = None,
 def commissioned(folder: Path, until: str, ask: Callable[[str], bool] | None = None) -> tuple[bool, Shown]:
     shown = Shown()
     made = opened(folder, shown, ask)
-    with closing(made.desk):
+    with closing(made.workplace):
         good = made.go(chosen((), until))
-        write_protocol(made.progress, CHECKS, made.desk.config)
+        write_protocol(made.progress, CHECKS, made.workplace.config)
     return good, shown
 
 

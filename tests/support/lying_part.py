@@ -59,7 +59,7 @@ class LyingPart:
         nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
         self._site = site = AtStation(
             self.record, self.folder, quick, nominal, folded=False, changed=self.changed,
-            tell=lambda event: self._told(event.data),
+            notify=lambda event: self._told(event.data),
         )  # fmt: skip
         cell, work = site.cell, site.work
         cell.devices.claw.bare.release()

@@ -75,23 +75,23 @@ class SeenBoard(NamedTuple):
     frame: Frame
 
 
-def eye_of(desk: CommissionWorkplace, name: str) -> Eye:
+def eye_of(workplace: CommissionWorkplace, name: str) -> Eye:
     """The eye "scan_camera" or "target_camera" of the cell."""
-    config = desk.config
+    config = workplace.config
     if name == "scan_camera":
         return Eye(name, config.scan_camera, config.calibration.fine, key="calibration.fine", depth=0.130, step=0.005)
     return Eye(name, config.target_camera, config.calibration.large, key="calibration.large", depth=0.650, step=0.030)
 
 
-def camera_of(desk: CommissionWorkplace, eye: Eye) -> Camera:
+def camera_of(workplace: CommissionWorkplace, eye: Eye) -> Camera:
     """Its device."""
-    devices = desk.devices
+    devices = workplace.devices
     return devices.scan_camera if eye.name == "scan_camera" else devices.target_camera
 
 
-def see(desk: CommissionWorkplace, eye: Eye, board: BoardSpec | None = None) -> SeenBoard:
+def see(workplace: CommissionWorkplace, eye: Eye, board: BoardSpec | None = None) -> SeenBoard:
     """The eye's board, or another one, from where the arm stands; `RefusedError` when it is not seen."""
-    camera = camera_of(desk, eye)
+    camera = camera_of(workplace, eye)
     camera.configure(eye.config.photo_exposure, PHOTO_RATE)
     frame = camera.grab()
     try:
@@ -99,20 +99,20 @@ def see(desk: CommissionWorkplace, eye: Eye, board: BoardSpec | None = None) -> 
         pose = board_pose(view, eye.model)
     except RefusedError as refused:
         raise refused.showing(seen={"frame": frame}) from refused
-    return SeenBoard(from_ur(desk.devices.arm.state().flange), pose.camera_from_board, view, frame)
+    return SeenBoard(from_ur(workplace.devices.arm.state().flange), pose.camera_from_board, view, frame)
 
 
-def find_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
+def find_view(workplace: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
     """Go where the camera sees its board: where it did last, where it is drawn to, or as if its bracket were turned.
 
     Where a part of something bright is in the picture, the camera goes on towards it. Raises `RefusedError` when the
     board is seen from nowhere.
     """
-    mover = desk.mover()
+    mover = workplace.mover()
     reason, tried = "", 0
-    for what, goal, hand in _candidates(desk, eye):
+    for what, goal, hand in _candidates(workplace, eye):
         for _ in range(1 + CENTRINGS):
-            desk.look_around()
+            workplace.look_around()
             try:
                 mover.to(goal, what)
             except DeviceFault:
@@ -122,13 +122,13 @@ def find_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
                 break
             tried += 1
             try:
-                seen = see(desk, eye)
+                seen = see(workplace, eye)
             except RefusedError as error:
                 reason = str(error)
                 frame = error.seen["frame"]
                 assert isinstance(frame, Frame)
                 if tried == 1:
-                    desk.keep(result, f"{eye.name}-sees-no-board", frame)
+                    workplace.keep(result, f"{eye.name}-sees-no-board", frame)
                 way = towards_bright(frame.image)
                 if way is None:
                     break
@@ -137,8 +137,8 @@ def find_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
                 continue
             if tried > 1:
                 result.notes.append(f"the board was seen from the {tried}. place that was tried: {what}")
-            seen, goal = _nearer_the_middle(desk, eye, seen, goal, hand)
-            desk.last_views[eye.name] = goal
+            seen, goal = _nearer_the_middle(workplace, eye, seen, goal, hand)
+            workplace.last_views[eye.name] = goal
             return seen
     raise RefusedError(
         f"{eye.name} saw the board {eye.plate.board} from none of {tried} places. See that the lens cap is off, the "
@@ -148,7 +148,7 @@ def find_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
 
 
 def _nearer_the_middle(
-    desk: CommissionWorkplace, eye: Eye, seen: SeenBoard, goal: pin.SE3, hand: pin.SE3
+    workplace: CommissionWorkplace, eye: Eye, seen: SeenBoard, goal: pin.SE3, hand: pin.SE3
 ) -> tuple[SeenBoard, pin.SE3]:
     """The view with the board nearer to the picture's middle, if the camera sits as `hand` has it; else as it is."""
     way = _off_middle(seen)
@@ -156,16 +156,16 @@ def _nearer_the_middle(
         return seen, goal
     nearer = goal * from_parts(hand.rotation @ (np.array([*way, 0.0]) * eye.depth / eye.model.fx))
     try:
-        desk.mover().to(nearer, f"{eye.name} with its board nearer to the middle")
-        moved = see(desk, eye)
+        workplace.mover().to(nearer, f"{eye.name} with its board nearer to the middle")
+        moved = see(workplace, eye)
     except DeviceFault:
         raise
     except CellError:
         moved = None
     if moved is not None and np.linalg.norm(_off_middle(moved)) < np.linalg.norm(way):
         return moved, nearer
-    desk.mover().to(goal, "back to where the board was seen")
-    return see(desk, eye), goal
+    workplace.mover().to(goal, "back to where the board was seen")
+    return see(workplace, eye), goal
 
 
 def _off_middle(seen: SeenBoard) -> Array:
@@ -191,15 +191,15 @@ def towards_bright(image: Image) -> Array | None:
     return way if np.linalg.norm(way) > LEAST_WAY_SHARE * image.shape[1] else None
 
 
-def _candidates(desk: CommissionWorkplace, eye: Eye) -> Iterator[tuple[str, pin.SE3, pin.SE3]]:
+def _candidates(workplace: CommissionWorkplace, eye: Eye) -> Iterator[tuple[str, pin.SE3, pin.SE3]]:
     """Places of the flange to try, with words for each, and flange_from_camera as it would be then."""
     drawn = eye.config.flange_from_camera.se3()
-    if eye.name in desk.last_views:
-        yield "where it was seen last", desk.last_views[eye.name], drawn
+    if eye.name in workplace.last_views:
+        yield "where it was seen last", workplace.last_views[eye.name], drawn
     tilted = from_parts(np.zeros(3), pin.exp3(np.array([TILT, 0.0, 0.0])))
     centre = eye.plate.base_from_board.se3() * from_parts(centre_of(eye.board))
     looking = centre * tilted * from_parts((0.0, 0.0, -eye.depth))
-    rails = _rail_places(desk, eye)
+    rails = _rail_places(workplace, eye)
     # A head that is turned in its place is carried another way; a camera without a rail looks the same way for it.
     for quarters in (0, 2, 1, 3) if eye.name == "scan_camera" else (0,):
         turn = _about_z(quarters)
@@ -221,33 +221,33 @@ def _words(what: str, quarters: int, eye: Eye, rail: float) -> str:
     return f"{words}, rail near {1e3 * rail:.0f} mm" if eye.name == "scan_camera" else words
 
 
-def _rail_places(desk: CommissionWorkplace, eye: Eye) -> list[float]:
+def _rail_places(workplace: CommissionWorkplace, eye: Eye) -> list[float]:
     """Where the carriage may stand, m, the middle first."""
     if eye.name != "scan_camera":
         return [0.0]
-    state = desk.devices.rail.state()
+    state = workplace.devices.rail.state()
     if state.homed_here:
         return [state.position]
-    low, high = desk.config.rail.travel
+    low, high = workplace.config.rail.travel
     count = max(1, math.ceil((high - low) / RAIL_STEP))
     places = [low + (k + 0.5) * (high - low) / count for k in range(count)]
     return sorted(places, key=lambda place: abs(place - 0.5 * (low + high)))
 
 
-def centred_view(desk: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
+def centred_view(workplace: CommissionWorkplace, result: Result, eye: Eye) -> SeenBoard:
     """As `find_view`, with the middle of the board in the middle of the picture, at the eye's depth.
 
     For a camera whose axes lie as they are drawn.
     """
-    seen = find_view(desk, result, eye)
+    seen = find_view(workplace, result, eye)
     at = seen.camera_from_board
     middle = at.rotation @ centre_of(eye.board) + at.translation
     hand = eye.config.flange_from_camera.se3()
     shift = from_parts(hand.rotation @ (middle - np.array([0.0, 0.0, eye.depth])))
     goal = seen.base_from_flange * shift
-    desk.mover().to(goal, f"{eye.name} above the middle of its board")
-    desk.last_views[eye.name] = goal
-    return see(desk, eye)
+    workplace.mover().to(goal, f"{eye.name} above the middle of its board")
+    workplace.last_views[eye.name] = goal
+    return see(workplace, eye)
 
 
 # --- mounting and scale, by geometry ---
@@ -391,20 +391,20 @@ LEAST_TURNED = 4
 """Views with turns that a mounting is solved from, besides those with shifts."""
 
 
-def measure(desk: CommissionWorkplace, result: Result, eye: Eye) -> tuple[Axes, RoughMounting]:
+def measure(workplace: CommissionWorkplace, result: Result, eye: Eye) -> tuple[Axes, RoughMounting]:
     """How the camera's axes lie on the flange, then where it sits, and how large the board is by the arm's measure.
 
     Raises `RefusedError` when the board is lost, or the views do not agree on one mounting.
     """
-    first = find_view(desk, result, eye)
-    desk.keep(result, f"{eye.name}-board", first.frame, first.view.pixels)
-    shifted = shifted_views(desk, eye, first.base_from_flange, eye.step)
+    first = find_view(workplace, result, eye)
+    workplace.keep(result, f"{eye.name}-board", first.frame, first.view.pixels)
+    shifted = shifted_views(workplace, eye, first.base_from_flange, eye.step)
     seen = [first, *shifted]
     axes = axes_from_shifts(*poses_of(seen))
     # Nothing is known yet of where the camera sits: small turns first, then larger ones about the board.
     hand = from_parts(eye.config.flange_from_camera.se3().translation, axes.flange_from_camera)
     for turn in (SMALL_TURN, TURN):
-        seen += views_from(desk, eye, _turned(eye, first, hand, axes.across, turn))
+        seen += views_from(workplace, eye, _turned(eye, first, hand, axes.across, turn))
         found = solve_mounting(*poses_of(seen), axes.flange_from_camera, axes.across)
         hand = found.flange_from_camera
     if len(seen) < 1 + len(shifted) + LEAST_TURNED:
@@ -412,29 +412,29 @@ def measure(desk: CommissionWorkplace, result: Result, eye: Eye) -> tuple[Axes, 
             f"only {len(seen) - 1 - len(shifted)} of 12 turned views show the board, at least {LEAST_TURNED} are "
             "needed: see that light and lens let the camera see it from the side as well"
         )
-    desk.last_views[eye.name] = first.base_from_flange
+    workplace.last_views[eye.name] = first.base_from_flange
     return axes, found
 
 
 def shifted_views(
-    desk: CommissionWorkplace, eye: Eye, first: pin.SE3, step: float, board: BoardSpec | None = None
+    workplace: CommissionWorkplace, eye: Eye, first: pin.SE3, step: float, board: BoardSpec | None = None
 ) -> list[SeenBoard]:
     """Views of the board with the flange shifted from `first` by `step` m each way along its axes."""
     shifts = [from_parts(sign * step * np.eye(3)[axis]) for axis in (0, 1, 2) for sign in (1.0, -1.0)]
-    return views_from(desk, eye, [first * shift for shift in shifts], board)
+    return views_from(workplace, eye, [first * shift for shift in shifts], board)
 
 
 def views_from(
-    desk: CommissionWorkplace, eye: Eye, goals: Iterable[pin.SE3], board: BoardSpec | None = None
+    workplace: CommissionWorkplace, eye: Eye, goals: Iterable[pin.SE3], board: BoardSpec | None = None
 ) -> list[SeenBoard]:
     """What is seen from these places; those that cannot be reached, or do not show the board, are left out."""
-    mover = desk.mover()
+    mover = workplace.mover()
     made = []
     for goal in goals:
-        desk.look_around()
+        workplace.look_around()
         try:
             mover.to(goal, f"{eye.name} before its board")
-            made.append(see(desk, eye, board))
+            made.append(see(workplace, eye, board))
         except DeviceFault:
             raise
         except CellError:

@@ -85,9 +85,9 @@ MENDS = 3
 
 @dataclass
 class Commissioning:
-    """Goes through the checks at a `desk`. `path` is cell.toml; `show(check, verdict, result)` is called after each."""
+    """Runs the checks at a `workplace`. `path` is cell.toml; `show(check, verdict, result)` is called after each."""
 
-    desk: CommissionWorkplace
+    workplace: CommissionWorkplace
     progress: Progress
     path: Path
     show: Callable[[CommissionCheck, str, Result | None], None]
@@ -107,7 +107,7 @@ class Commissioning:
         return good
 
     def _good(self, check: CommissionCheck) -> bool:
-        return self.progress.standing(check, self.desk.config) == CheckVerdict.GOOD
+        return self.progress.standing(check, self.workplace.config) == CheckVerdict.GOOD
 
     def _until_good(self, check: CommissionCheck) -> bool:
         """Do a check, mend what it found, and do it again, as often as that helps."""
@@ -124,12 +124,12 @@ class Commissioning:
 
     def _once(self, check: CommissionCheck) -> Result:
         result, begun = Result(), time.monotonic()
-        desk, run = self.desk, ""
+        workplace, run = self.workplace, ""
         try:
             if check.recorded:
                 run = self._recorded(check, result)
             else:
-                check.work(desk, result)
+                check.work(workplace, result)
         except Declined as declined:
             result.verdict = CheckVerdict.DECLINED
             result.notes.append(str(declined))
@@ -139,34 +139,34 @@ class Commissioning:
             result.verdict = CheckVerdict.FAILED
             result.notes.append(in_one_line(error))
             if isinstance(error, RefusedError) and isinstance(frame := error.seen.get("frame"), Frame):
-                desk.keep(result, f"{check.name}-refused", frame)
+                workplace.keep(result, f"{check.name}-refused", frame)
             if isinstance(error, DeviceFault):
                 # Whatever it was: what follows begins with devices that are asked anew.
-                desk.close()
-        self.progress.keep(check, desk.config, result, time.monotonic() - begun, run)
+                workplace.close()
+        self.progress.keep(check, workplace.config, result, time.monotonic() - begun, run)
         return result
 
     def _recorded(self, check: CommissionCheck, result: Result) -> str:
         """Do it as a run, so that it is in `cell runs` and hears `cell abort`; returns the run's name."""
-        desk = self.desk
+        workplace = self.workplace
         name: list[str] = []
 
         def work(context: WorkContext) -> None:
             # Done again after a fault that a person has confirmed: without what was noted before it.
             vars(result).update(vars(Result()))
-            current = desk.cell.current
+            current = workplace.cell.current
             if current is not None and current.folder is not None:
                 name[:] = [current.folder.name]
-            desk.context = context
+            workplace.context = context
             try:
-                check.work(desk, result)
+                check.work(workplace, result)
             finally:
-                desk.context = None
+                workplace.context = None
 
         try:
-            desk.cell.perform("commission", work, desk.heard, {"check": check.name})
+            workplace.cell.perform("commission", work, workplace.heard, {"check": check.name})
         finally:
-            desk.context = None
+            workplace.context = None
         return name[0] if name else ""
 
     def _mend(self, check: CommissionCheck, result: Result) -> bool:
@@ -176,27 +176,27 @@ class Commissioning:
         for finding in result.findings:
             changes |= finding.write
             in_job |= finding.write_job
-        job = job_path(self.desk.job_file)
+        job = job_path(self.workplace.job_file)
         wanted = [(path, keys) for path, keys in ((self.path, changes), (job, in_job)) if keys]
         shown = ", and ".join(
             f"into {path.name}: " + "; ".join(f"{key} = {value}" for key, value in keys.items())
             for path, keys in wanted
         )
-        if not wanted or not self.desk.person.sees(f"Write {shown}? The old file is kept."):
+        if not wanted or not self.workplace.person.sees(f"Write {shown}? The old file is kept."):
             return False
         backups = [write_changes(path, keys) for path, keys in wanted]
         for finding in result.findings:
             if finding.write or finding.write_job:
                 self.progress.keep_mended(check, asdict(finding), ", ".join(backup.name for backup in backups))
-        self.desk.close()
+        self.workplace.close()
         try:
-            self.progress.work_for(self.desk.job)
-            self.desk.connect()
+            self.progress.work_for(self.workplace.job)
+            self.workplace.connect()
         except ConfigError as error:
-            self.desk.close()
+            self.workplace.close()
             for (path, _), backup in zip(wanted, backups, strict=True):
                 backup.replace(path)
-            self.progress.work_for(self.desk.job)
+            self.progress.work_for(self.workplace.job)
             raise ConfigError(
                 f"what was measured does not fit the configuration, which is as it was: {error}"
             ) from error
@@ -206,7 +206,7 @@ class Commissioning:
         """Whether a person has changed something and wants the check done again."""
         if result.verdict is CheckVerdict.DECLINED:
             return False
-        return self.desk.person.again(f"{check.title}: {result.verdict.value}. Mend it and measure again now?")
+        return self.workplace.person.again(f"{check.title}: {result.verdict.value}. Mend it and measure again now?")
 
 
 def by_name(name: str) -> CommissionCheck:
@@ -247,7 +247,7 @@ def begin(
     """A commissioning of the cell of this configuration, whose record is in `commissioning/` beside it.
 
     With `sim="all"` the cell is simulated, as `truth` describes it. `ConfigError` for what is wrong before anything is
-    connected. The caller closes `desk`.
+    connected. The caller closes `workplace`.
     """
     path = Path(CONFIGURATION) if config is None else config
     if not path.is_file():
@@ -269,8 +269,8 @@ def begin(
         world = "" if truth is None else hashlib.sha256(truth.read_bytes()).hexdigest()[:12]
         which |= {"seed": seed, "level": level, "clock": clock, "world": world}
     folder = path.resolve().parent / FOLDER
-    desk = CommissionWorkplace(path, partial(Cell.open, path, **options), person, folder, job, simulated=simulated)
-    return Commissioning(desk, Progress(folder, which, desk.job), path, show)
+    workplace = CommissionWorkplace(path, partial(Cell.open, path, **options), person, folder, job, simulated=simulated)
+    return Commissioning(workplace, Progress(folder, which, workplace.job), path, show)
 
 
 def confirms_itself(config: Path | None) -> bool:

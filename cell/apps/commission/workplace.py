@@ -67,11 +67,11 @@ class Person:
 
 
 class SimulatedPerson(Person):
-    """Of a simulated cell: agrees to everything, has changed nothing, and says so through `tell`."""
+    """Of a simulated cell: agrees to everything, has changed nothing, and says so through `notify`."""
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
+    def __init__(self, notify: Callable[[str], None]) -> None:
         def agree(text: str) -> bool:
-            tell(f"{text} (simulated person: yes)")
+            notify(f"{text} (simulated person: yes)")
             return True
 
         super().__init__(agree)

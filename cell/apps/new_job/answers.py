@@ -41,35 +41,35 @@ def laid_mesh(asker: Asker, drawn: Drawn) -> tuple[Laid, str]:
     bodies = _bodies(asker, drawn)
     longest = float(np.ptp(np.concatenate([body.vertices for body in bodies]), axis=0).max())
     unit, why = _unit(asker, drawn, longest)
-    asker.tell(f"unit: {why}")
+    asker.notify(f"unit: {why}")
     up = asker.get("up", "Which axis of the mesh points up", "z", choice(*UP))
     turn = asker.get("turn", "Turn about it, or auto: the longer side along the sweep", "auto", _turn)
     laid = lay(bodies, unit, up, turn)
     lowest = METRES[unit] * min(float(body.vertices[:, 2].min()) for body in bodies)
     if up == "z" and 1e-6 < lowest <= ON_TABLE:
         laid = replace(raised(laid, lowest), foot=0.0)
-        asker.tell(
+        asker.notify(
             f"height: the mesh's own z = 0 is taken as the table's top, its lowest point is {1e3 * lowest:.4g} mm above"
         )
     if faces_down(laid):
         words = "More of the mesh faces down than up: turn its triangles round (yes), or else turn it over with --up"
         if asker.get("flip", words, None, choice("yes", "no")) == "yes":
             laid = replace(laid, faces=laid.faces[:, ::-1].copy())
-            asker.tell("triangles: all turned round")
+            asker.notify("triangles: all turned round")
     return centred(laid), unit
 
 
 def _bodies(asker: Asker, drawn: Drawn) -> list[MeshBody]:
     for note in drawn.notes:
-        asker.tell(f"mesh: {note}")
+        asker.notify(f"mesh: {note}")
     if len(drawn.bodies) == 1:
         return list(drawn.bodies)
-    asker.tell(f"mesh: {len(drawn.bodies)} bodies that share no corner, in the file's unit:")
+    asker.notify(f"mesh: {len(drawn.bodies)} bodies that share no corner, in the file's unit:")
     for k, body in enumerate(drawn.bodies[:LISTED]):
         sides = " x ".join(f"{side:.4g}" for side in body.size)
-        asker.tell(f"  {k + 1}: {sides}, {len(body.triangles)} triangles, {'closed' if body.closed else 'open'}")
+        asker.notify(f"  {k + 1}: {sides}, {len(body.triangles)} triangles, {'closed' if body.closed else 'open'}")
     for one, other in overlapping(drawn.bodies[:LISTED]):
-        asker.tell(
+        asker.notify(
             f"  {one + 1} and {other + 1} overlap: what lies inside is no surface, and what lies double counts once"
         )
 

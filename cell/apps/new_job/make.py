@@ -76,7 +76,7 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
         (there / targets[0].name).write_text(job_text(proposal.job, heading), encoding="utf-8")
         if part is not None:
             (there / part.target.name).write_bytes(part.given.read_bytes())
-        asker.tell("checking the job as the cell does, and whether the surface looks the same elsewhere …")
+        asker.notify("checking the job as the cell does, and whether the surface looks the same elsewhere …")
         notes = _checked(asker, there / targets[0].name, config, proposal)
         nominal = NominalSurface.load(there / targets[1].name, "mm")
         notes = [*proposal.notes, *notes, *told_by_few(proposal.seen, nominal)]
@@ -84,13 +84,13 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
             found = _place(asker, proposal, nominal, config)
         except RefusedError:
             for note in notes:
-                asker.tell(f"note: {note}")
+                asker.notify(f"note: {note}")
             picture = targets[2].with_stem(f"{name}-refused")
             draw_proposal(picture, proposal, nominal, config, f"job {name}, as it was refused: nothing has moved")
-            asker.tell(f"picture: {picture}; look at what the sweeps would see")
+            asker.notify(f"picture: {picture}; look at what the sweeps would see")
             raise
         draw_proposal(targets[2], proposal, nominal, config, f"job {name}, as proposed: nothing has moved")
-        asker.tell(f"picture: {targets[2]}; look at it")
+        asker.notify(f"picture: {targets[2]}; look at it")
         if asker.ask is not None and asker.get("write", "Write the job", "yes", choice("yes", "no")) == "no":
             raise CellError(f"not written, as you said; the picture is {targets[2]}. Again: {_again(asker)}")
         for target in (*targets[:2], *([] if part is None or part.same else [part.target])):
@@ -116,13 +116,13 @@ def _proposed(asker: Asker, laid: Laid, job: Job, config: CellConfig, *, step: f
     def reachable(tried: Job) -> str | None:
         return next(iter(sweep_problems(tried, config, laid.box)), None)
 
-    asker.tell("choosing sweeps …")
-    proposal = propose(laid, job, config, step=step, reachable=reachable, tell=asker.progress)
+    asker.notify("choosing sweeps …")
+    proposal = propose(laid, job, config, step=step, reachable=reachable, notify=asker.progress)
     if not proposal.open or asker.given.get("turn") is not None:
         return laid, proposal
     # The light comes aslant from behind: from the other side it falls on other flanks.
-    asker.tell("choosing sweeps from the other side as well …")
-    other = propose(about(laid), job, config, step=step, reachable=reachable, tell=asker.progress)
+    asker.notify("choosing sweeps from the other side as well …")
+    other = propose(about(laid), job, config, step=step, reachable=reachable, notify=asker.progress)
     if other.open:
         return laid, proposal
     return about(laid), replace(other, notes=(*other.notes, "turned by half a turn, to see more flanks"))
@@ -164,7 +164,7 @@ def _with_part(asker: Asker, job: Job, part: _PartFile | None) -> Job:
     unseen = shown_by(seen_from_above(mesh, job.place.surface_from_part.se3()), tolerance)
     if not unseen or job.place.verify != "all":
         return job
-    asker.tell(f'the part\'s faces do not show {", ".join(unseen)}: verify = "seen", the rest is looked at')
+    asker.notify(f'the part\'s faces do not show {", ".join(unseen)}: verify = "seen", the rest is looked at')
     return job.model_copy(update={"place": job.place.model_copy(update={"verify": "seen"})})
 
 
@@ -187,7 +187,7 @@ def _require_room(asker: Asker, targets: tuple[Path, ...], overwrite: bool) -> N
     if not there or overwrite:
         return
     if asker.ask is not None:
-        asker.tell(f"there already: {', '.join(there)}")
+        asker.notify(f"there already: {', '.join(there)}")
         if asker.get("overwrite", "Overwrite", "no", choice("yes", "no")) == "yes":
             return
     raise ConfigError(f"{', '.join(there)}: there already; name the job otherwise with --name, or say --overwrite")

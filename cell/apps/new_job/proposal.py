@@ -15,7 +15,7 @@ import pinocchio as pin
 
 from cell.apps.new_job.observability import verdict
 from cell.apps.new_job.surface import Laid, open_side
-from cell.apps.new_job.sweeps import ABOVE, FARTHEST, NEAREST, Array, Rays, SeenSurface, look
+from cell.apps.new_job.sweeps import ABOVE, FARTHEST, NEAREST, Array, Rays, SeenSurface, visible_surfaces
 from cell.check.fit import RAMP_MARGIN
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
 from cell.config.job import Job, ScanSection, SwathSection
@@ -67,22 +67,24 @@ class Proposal:
 
 def propose(
     body: Laid, job: Job, config: CellConfig, step: float, reachable: Callable[[Job], str | None],
-    tell: Callable[[str], None] = lambda text: None,
+    notify: Callable[[str], None] = lambda text: None,
 ) -> Proposal:  # fmt: skip
     """A scan of what lies open of `body`, with lines `step` m apart.
 
-    `reachable` says what keeps the arm from the poses of a job's sweeps, None when nothing does; `tell` is told how far
-    the choice is. Raises `ConfigError` when the surface is too deep, too wide or too long for this scan head.
+    `reachable` says what keeps the arm from the poses of a job's sweeps, None when nothing does; `notify` gets the
+    progress of the choice. Raises `ConfigError` when the surface is too deep, too wide or too long for this scan head.
     """
-    top = open_side(body, tell=tell)
+    top = open_side(body, notify=notify)
     scan, notes = _straight(top, job.scan, config, step)
-    search = _Search(config, Rays(body.vertices, body.faces), NominalSurface(top.vertices, top.faces), reachable, tell)
+    search = _Search(
+        config, Rays(body.vertices, body.faces), NominalSurface(top.vertices, top.faces), reachable, notify
+    )
     straight = _with(job, scan)
-    tell(f"what {len(scan.swath)} straight sweeps see")
-    seen = look(config, straight, search.rays)
+    notify(f"what {len(scan.swath)} straight sweeps see")
+    seen = visible_surfaces(config, straight, search.rays)
     job, seen, more, excess = search.tilted(straight, seen)
     ways = [ABOVE, *(way(swath) for swath in job.scan.swath if swath.roll or swath.pitch)]
-    surface = top if len(ways) == 1 else open_side(body, ways, tell)
+    surface = top if len(ways) == 1 else open_side(body, ways, notify)
     return Proposal(job, surface, tuple(seen), (*notes, *more), excess > 1.0)
 
 
@@ -164,7 +166,7 @@ class _Search:
     rays: Rays
     top: NominalSurface
     reachable: Callable[[Job], str | None]
-    tell: Callable[[str], None]
+    notify: Callable[[str], None]
 
     def tilted(self, job: Job, seen: list[SeenSurface]) -> tuple[Job, list[SeenSurface], list[str], float]:
         """With tilted sweeps added as long as each makes the worst known motion better known by a third, or sees more
@@ -179,14 +181,14 @@ class _Search:
         )
         left = {}
         for k, tilt in enumerate(TILTS):
-            self.tell(f"tilted sweep {k + 1} of {len(TILTS)}, {_words(*tilt)}")
+            self.notify(f"tilted sweep {k + 1} of {len(TILTS)}, {_words(*tilt)}")
             left[tilt] = self._one(job, *tilt)
         refused: list[str] = []
         added: list[str] = []
         while left and len(added) < MOST_TILTED and (worst > ENOUGH or missed > UNSEEN):
             tried = {}
             for tilt, one in left.items():
-                self.tell(f"which of {len(left)} tilted sweeps tells most, {len(added)} added so far")
+                self.notify(f"which of {len(left)} tilted sweeps tells most, {len(added)} added so far")
                 tried[tilt] = self._excess(job, [*seen, one]), self._missed([*seen, one])
             tilt = min(tried, key=lambda each: tried[each][0] if worst > ENOUGH else tried[each][1])
             excess, unseen = tried[tilt]
@@ -205,7 +207,7 @@ class _Search:
     def _one(self, job: Job, roll: float, pitch: float) -> SeenSurface:
         """What the tilted sweep alone sees."""
         swath = _and_tilted(job.scan, roll, pitch).swath[-1:]
-        return look(self.config, _with(job, job.scan.model_copy(update={"swath": swath})), self.rays)[0]
+        return visible_surfaces(self.config, _with(job, job.scan.model_copy(update={"swath": swath})), self.rays)[0]
 
     def _missed(self, seen: Sequence[SeenSurface]) -> float:
         """Share of the surface's area, 0 … 1, that no sweep sees."""

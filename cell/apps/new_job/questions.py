@@ -28,14 +28,14 @@ P = TypeVar("P", bound=Pose)
 @dataclass(eq=False)
 class Asker:
     """Asks the questions. `given` are the options by name, None for those that were not given; `ask` puts a question
-    with its default to a person, None where nobody is there; `tell` says something to that person.
+    with its default to a person, None where nobody is there; `notify` says something to that person.
 
     `used` collects what was answered, as options that would answer the same.
     """
 
     given: Mapping[str, str | None]
     ask: Callable[[str, str | None], str] | None
-    tell: Callable[[str], None]
+    notify: Callable[[str], None]
     used: dict[str, str] = field(default_factory=dict)
     _told: float = -math.inf
 
@@ -43,7 +43,7 @@ class Asker:
         """Tell how far something is, unless that was told less than `PROGRESS_S` ago."""
         if time.monotonic() >= self._told + PROGRESS_S:
             self._told = time.monotonic()
-            self.tell(f"  {text} …")
+            self.notify(f"  {text} …")
 
     def get(self, option: str, question: str, default: str | None, parse: Callable[[str], T]) -> T:
         """The answer to a question, by `parse`, which raises `ValueError` or `ConfigError` for a wrong one.
@@ -65,7 +65,7 @@ class Asker:
             except (ValueError, ConfigError) as error:
                 if text is not None:
                     raise ConfigError(f"--{option}: {error}") from error
-                self.tell(str(error))
+                self.notify(str(error))
                 continue
             if answer != default:
                 self.used[option] = answer

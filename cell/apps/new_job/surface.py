@@ -171,11 +171,11 @@ def centred(laid: Laid) -> Laid:
     return raised(laid, -round(0.5 * float(low[2] + high[2]), 3))
 
 
-def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,), tell: Callable[[str], None] = lambda text: None) -> Laid:
+def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,), notify: Callable[[str], None] = lambda text: None) -> Laid:
     """What lies open to an eye in one of the directions `ways` (3,), unit, S, and is not too steep for it.
 
     A triangle that is hidden in part is halved until its pieces are small. Where faces of overlapping bodies lie at
-    one place, the first body's counts. `tell` is told how far it is. Raises `ConfigError` when next to nothing is seen.
+    one place, the first body's counts. `notify` gets the progress. Raises `ConfigError` when next to nothing is seen.
     """
     rays = Rays(laid.vertices, laid.faces)
     body, earlier = before(laid.vertices, laid.faces)
@@ -186,7 +186,7 @@ def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,), tell: Callable[[str]
     pieces, normals, body = corners[facing], normals[facing], body[facing]
     kept = []
     while len(pieces):
-        tell(f"what lies open to the scan head: {len(pieces)} triangles to look at")
+        notify(f"what lies open to the scan head: {len(pieces)} triangles to look at")
         share = np.zeros(len(pieces))
         for k in np.unique(body):
             mine = body == k

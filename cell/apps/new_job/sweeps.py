@@ -184,7 +184,7 @@ def _alike(normals: Array, others: Array) -> NDArray[np.bool_]:
     return np.asarray(np.einsum("lri,lri->lr", normals, others) > SMOOTH)
 
 
-def look(config: CellConfig, job: Job, rays: Rays) -> list[SeenSurface]:
+def visible_surfaces(config: CellConfig, job: Job, rays: Rays) -> list[SeenSurface]:
     """What each of the job's sweeps sees of the surface that `rays` meet, as drawn."""
     return [
         _sweep(config, job, plan, rays) for plan in scan_plans(config, job, pin.SE3.Identity(), nominal_scan(config))

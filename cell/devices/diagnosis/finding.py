@@ -109,14 +109,14 @@ def configured(config: CellConfig, root: Path = ROOT) -> list[Found]:
 
     def look(name: str) -> Found:
         record = config.device(name)
-        state, ok = _look(name, record, root)
+        state, ok = _probe(name, record, root)
         return Found(f"configured {name}", record.place, state, ok)
 
     with ThreadPoolExecutor(len(names)) as at_once:
         return list(at_once.map(look, names))
 
 
-def _look(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
+def _probe(name: str, record: DeviceConfig, root: Path) -> tuple[str, bool]:
     place = record.url if isinstance(record, OnBoard) else record.place
     if record.driver == "fixed":
         return "nothing to connect", True

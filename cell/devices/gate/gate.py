@@ -101,16 +101,16 @@ class Gate:
     def asked(self, command: DeviceCommand | None, refused: str | None = None) -> None:
         """Tell the listener that a command is passed on, or was refused."""
         if command is not None:
-            self._tell(lambda listener: listener.command(command, refused))
+            self._notify(lambda listener: listener.command(command, refused))
 
     def seen(self, device: str, reading: object) -> None:
         """Tell the listener what was read of a device."""
-        self._tell(lambda listener: listener.reading(device, reading))
+        self._notify(lambda listener: listener.reading(device, reading))
 
-    def _tell(self, tell: Callable[[Listener], None]) -> None:
+    def _notify(self, notify: Callable[[Listener], None]) -> None:
         try:
             if (listener := self.listener) is not None:
-                tell(listener)
+                notify(listener)
         # Whatever is wrong with it, it keeps no command from passing, and no stop.
         except Exception as error:
             self.listener = None

@@ -417,7 +417,7 @@ class GatedLaser(Gated[interfaces.Laser]):
             held.callback(lambda: self.gate.asked(DeviceCommand("laser", "off")))
             self.gate.begin(DeviceCommand("laser", "lit"), lambda: held.enter_context(self.bare.lit()), held.close)
             self._renewed, self._slept, self._off = self._clock.now(), False, False
-            with self._clock.alarm(self._limit, self._look):
+            with self._clock.alarm(self._limit, self._check):
                 yield
                 self.renew()
 
@@ -443,7 +443,7 @@ class GatedLaser(Gated[interfaces.Laser]):
     def _limit(self) -> float:
         return UNATTENDED_S * self._clock.rate
 
-    def _look(self) -> float | None:
+    def _check(self) -> float | None:
         """Called by the alarm: off when the owner sleeps, else in how many seconds to look again.
 
         One that cannot be switched off is switched off again and again, until its owner's context ends.

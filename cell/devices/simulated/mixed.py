@@ -148,7 +148,7 @@ class _Guarded:
         self._motion, self._limit, self._stop, self._following = motion, limit, stop, following
         self._touched = False
         self._start = following.wrench()[:3]
-        self._watch = threading.Thread(target=self._look, name="simulated touch", daemon=True)
+        self._watch = threading.Thread(target=self._poll, name="simulated touch", daemon=True)
         self._watch.start()
 
     @property
@@ -170,7 +170,7 @@ class _Guarded:
                 raise
         self._watch.join(timeout)
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         while not self._motion.done:
             if np.linalg.norm(self._following.next_wrench()[:3] - self._start) >= self._limit:
                 self._touched = True

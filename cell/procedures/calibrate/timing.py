@@ -54,11 +54,11 @@ def collect_timing(
     pairs = [(fast, long), (fast, short), (slow, long), (fast, long), (fast, short), (slow, short), (fast, long)]
     pairs.append((fast, short))
 
-    def tell(k: int, count: int) -> None:
+    def notify(k: int, count: int) -> None:
         check()
         progress(k / count, f"fine board, sweep {k + 1} of {count}")
 
-    base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs=pairs, tell=tell, keep=keep)
+    base_from_flange, sweeps = _sweeps(config, devices, mover, calibration, pairs=pairs, notify=notify, keep=keep)
     given = most_late(config), config.rail.lead, link_of(config)
     return timing.find_timing(calibration.scan, base_from_flange, sweeps, *given)
 
@@ -77,7 +77,7 @@ def look_at_shutter(
     devices.interlocks.work_with(calibration.configuration)
     try:
         base_from_flange, sweeps = _sweeps(
-            config, devices, mover, calibration=calibration, pairs=pairs, tell=lambda k, count: check(), keep=keep
+            config, devices, mover, calibration=calibration, pairs=pairs, notify=lambda k, count: check(), keep=keep
         )
         shutter = timing.find_shutter(scan, base_from_flange, sweeps, link_of(config))
         late, sigma = timing.roughly_late(scan, base_from_flange, sweeps)
@@ -91,11 +91,11 @@ def look_at_shutter(
 
 def _sweeps(
     config: CellConfig, devices: Devices, mover: Mover, calibration: CellCalibration,
-    pairs: Sequence[tuple[float, float]], tell: Callable[[int, int], None], keep: Keep,
+    pairs: Sequence[tuple[float, float]], notify: Callable[[int, int], None], keep: Keep,
 ) -> tuple[pin.SE3, list[timing.TimedSweep]]:  # fmt: skip
     """Where the flange stood, and sweeps to and fro for each of `pairs` of speed in m/s and exposure in s.
 
-    `tell` is given each sweep's number and how many there are.
+    `notify` is given each sweep's number and how many there are.
     """
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
     view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)
@@ -111,7 +111,7 @@ def _sweeps(
     plan = [(speed, exposure, way) for speed, exposure in pairs for way in (1, -1)]
     sweeps = []
     for k, (speed, exposure, way) in enumerate(plan):
-        tell(k, len(plan))
+        notify(k, len(plan))
         # Pictures at other places each time: an error of the screw that they share would pass for lateness.
         inner = STAGGER_M * (k * GOLDEN % 1.0)
         between = (ends[0] + inner, ends[1] - STAGGER_M + inner)[::way]

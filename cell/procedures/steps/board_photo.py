@@ -26,18 +26,18 @@ WAIT_S, WAITS = 1.0, 4
 """How long a vehicle that rocks is waited for, and how often. One that has stopped is quiet by then."""
 
 
-def photographed(here: Workplace, goal: pin.SE3, progress: Callable[[float, str], None]) -> BoardFix:
+def photographed(workplace: Workplace, goal: pin.SE3, progress: Callable[[float, str], None]) -> BoardFix:
     """Move to the photograph pose `goal`, base_from_flange, settle, and take the board's pose from a quiet vehicle.
 
     Refusals (not found, too oblique, residual too high, ambiguous) come from `Workplace.photograph` with their reason,
     those of `until_quiet` likewise.
     """
-    here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
+    workplace.devices.target_camera.configure(workplace.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
     progress(0.1, "arm to the photograph pose")
-    here.mover.to(goal, "the photograph pose")
+    workplace.mover.to(goal, "the photograph pose")
     progress(0.7, "photographing the board")
-    vehicle, count = here.config.arm.vehicle_from_base.se3().inverse(), here.job.photo.count
-    return until_quiet(vehicle, lambda: here.photograph(count), here.devices.clock.sleep, progress)
+    vehicle, count = workplace.config.arm.vehicle_from_base.se3().inverse(), workplace.job.photo.count
+    return until_quiet(vehicle, lambda: workplace.photograph(count), workplace.devices.clock.sleep, progress)
 
 
 def until_quiet(
@@ -78,25 +78,27 @@ def rocks_on(swung: float, waited: float) -> str:
     )
 
 
-def require_board_unmoved(here: Workplace, fix: BoardFix, since: str, progress: Callable[[float, str], None]) -> None:
+def require_board_unmoved(
+    workplace: Workplace, fix: BoardFix, since: str, progress: Callable[[float, str], None]
+) -> None:
     """Photograph the board again from where it was photographed; `since` says when that was, for people.
 
     Raises `RefusedError` when it stands elsewhere by more than the arm's repeatability and the pictures leave open, and
     what a photograph raises.
     """
     progress(0.0, "looking whether the board still stands where it did")
-    board, camera = here.board, here.devices.target_camera
-    here.mover.to(
-        photo_pose(here.job, board, fix.base_from_board, here.calibration.target.flange_from_camera),
+    board, camera = workplace.board, workplace.devices.target_camera
+    workplace.mover.to(
+        photo_pose(workplace.job, board, fix.base_from_board, workplace.calibration.target.flange_from_camera),
         "the photograph pose",
     )
-    camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
-    now = here.photograph(here.job.photo.count if fix.swung else 1)
+    camera.configure(workplace.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
+    now = workplace.photograph(workplace.job.photo.count if fix.swung else 1)
     moved = difference(now.base_from_board, fix.base_from_board)
     # How the camera sits on the flange makes both photographs wrong alike.
     spread = fix.covariance + now.covariance - 2.0 * fix.by_mount
     if fix.swung:
-        vehicle = here.config.arm.vehicle_from_base.se3().inverse()
+        vehicle = workplace.config.arm.vehicle_from_base.se3().inverse()
         spread = spread + swing_covariance(fix.swung, fix.base_from_board, vehicle)
     if (far := float(moved @ np.linalg.solve(spread, moved))) <= MOVED:
         return
@@ -108,14 +110,18 @@ def require_board_unmoved(here: Workplace, fix: BoardFix, since: str, progress: 
     )
 
 
-def _run_step(here: Workplace, context: StepContext) -> BoardFix:
-    arrival, job = context.made(VehicleArrival), here.job
-    here.mover.avoid_station(arrival.base_from_place, job, here.board, around(here.nominal.extent, here.ground))
+def _run_step(workplace: Workplace, context: StepContext) -> BoardFix:
+    arrival, job = context.made(VehicleArrival), workplace.job
+    workplace.mover.avoid_station(
+        arrival.base_from_place, job, workplace.board, around(workplace.nominal.extent, workplace.ground)
+    )
     if arrival.shared is not None:
-        here.mover.near = arrival.shared.joints
-        return here.keep_again(arrival.shared)
-    goal = photo_pose(job, here.board, arrival.fix.base_from_board, here.calibration.target.flange_from_camera)
-    fix = photographed(here, goal, context.progress)
+        workplace.mover.near = arrival.shared.joints
+        return workplace.keep_again(arrival.shared)
+    goal = photo_pose(
+        job, workplace.board, arrival.fix.base_from_board, workplace.calibration.target.flange_from_camera
+    )
+    fix = photographed(workplace, goal, context.progress)
     for note in fix.notes:
         context.note(text=note)
     return fix

@@ -20,7 +20,7 @@ from statemachine.runner import StepContext
 
 
 def correct(
-    here: Workplace, placed: PlaceResult, pose: PlacePose, *, held: pin.SE3, slip: pin.SE3, seen: Vector,
+    workplace: Workplace, placed: PlaceResult, pose: PlacePose, *, held: pin.SE3, slip: pin.SE3, seen: Vector,
     context: StepContext,
 ) -> PlaceResult:  # fmt: skip
     """Grip the part, with the flange where it was let go, and place it anew; the arm stays above.
@@ -30,24 +30,24 @@ def correct(
 
     Raises what `Placing.put_down` raises, and `RefusedError` where something is met on the way to the part.
     """
-    belongs, points = here.job.place.surface_from_part.se3(), part_points(here.nominal)
-    if moved(slip, points) < SLIPS * expected_residual(here.job, here.repeatability, pose, points, seen):
+    belongs, points = workplace.job.place.surface_from_part.se3(), part_points(workplace.nominal)
+    if moved(slip, points) < SLIPS * expected_residual(workplace.job, workplace.repeatability, pose, points, seen):
         # As little comes of the arm.
         slip = pin.SE3.Identity()
-    job = job_with_grasp(here.job, held * slip, seen)
-    expected = expected_touch(job, here.nominal, pose, here.repeatability)
-    part = here.part_mesh
+    job = job_with_grasp(workplace.job, held * slip, seen)
+    expected = expected_touch(job, workplace.nominal, pose, workplace.repeatability)
+    part = workplace.part_mesh
     assert part is not None
     cloud = context.made(Reconstruction).cloud
     # Aimed beside its place, it touches slopes of the surface higher up.
-    gap = scanned_gap(cloud, pose.base_from_surface, here.nominal, belongs * slip.inverse(), part)
+    gap = scanned_gap(cloud, pose.base_from_surface, workplace.nominal, belongs * slip.inverse(), part)
     if gap is not None:
-        gap.require(here.job.place.tolerance)
+        gap.require(workplace.job.place.tolerance)
         expected = replace(expected, height=expected.height + gap.lift)
-    take(here, job, placed.base_from_flange, context, what="the placed part", pulls=False)
+    take(workplace, job, placed.base_from_flange, context, what="the placed part", pulls=False)
     placing = Placing(
-        job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
-        part=here.part, check=context.check, progress=lambda share, text: context.progress(0.5, f"again: {text}"),
-        note=lambda part: note_part(context, part),
+        job, pose.base_from_surface, expected, mover=workplace.mover, arm=workplace.devices.arm,
+        claw=workplace.devices.claw, part=workplace.part, check=context.check, progress=lambda share,
+        text: context.progress(0.5, f"again: {text}"), note=lambda part: note_part(context, part),
     )  # fmt: skip
     return replace(placing.put_down(fold=False), look=placed.look, pose=pose, mating=gap)

@@ -135,7 +135,7 @@ class TargetDrive:
         """By the board, where it is in sight already, or by odometry."""
         self.progress(0.05, "looking whether the board is in sight already")
         try:
-            self._look()
+            self._photograph()
         except RefusedError as unseen:
             try:
                 self.whereabouts.pose()
@@ -163,7 +163,7 @@ class TargetDrive:
         speed = self.job.approach.speed * self.pace.share
         drive_line(self.vehicle, self.whereabouts, goal, speed=speed, clock=self.clock, check=self.check)
 
-    def _look(self) -> BoardFix:
+    def _photograph(self) -> BoardFix:
         fix = self.photograph()
         if (doubt := self.whereabouts.see(self._place_from_vehicle(fix))) is not None:
             self.note(doubt)
@@ -174,7 +174,7 @@ class TargetDrive:
         way_so_far = self.whereabouts.way
         try:
             try:
-                return self._look()
+                return self._photograph()
             except RefusedError:
                 if self._sent is None or abs((self._sent.inverse() * self.whereabouts.pose()).x) < PASSED:
                     raise
@@ -183,7 +183,7 @@ class TargetDrive:
                 )
                 self._go(self._sent)
                 self.clock.sleep(SETTLE_S)
-                return self._look()
+                return self._photograph()
         except RefusedError as unseen:
             raise RefusedError(
                 f"after {way_so_far:.2f} m on odometry the board is not seen from where it should be: {unseen}. Look "
@@ -247,80 +247,80 @@ def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, re
     ).showing(seen={"frame": fix.frames[-1], "view": fix.views[-1]} if fix.frames else None)
 
 
-def _run_step(here: Workplace, context: StepContext) -> VehicleArrival:
+def _run_step(workplace: Workplace, context: StepContext) -> VehicleArrival:
     """The arm to its looking pose first, with the vehicle braked."""
-    if here.needs_part and not here.devices.claw.holding:
+    if workplace.needs_part and not workplace.devices.claw.holding:
         raise RefusedError(
-            f"the claw holds no part: put the part of job {here.job.job.name} into it, or see whether it was "
+            f"the claw holds no part: put the part of job {workplace.job.job.name} into it, or see whether it was "
             "placed already"
         )
-    if here.part.state.untaken and here.devices.claw.holding:
+    if workplace.part.state.untaken and workplace.devices.claw.holding:
         raise RefusedError(
-            f"the claw holds a part, and job {here.job.job.name} takes one that is {here.part.state.value}: take it "
-            "out of the claw"
+            f"the claw holds a part, and job {workplace.job.job.name} takes one that is "
+            f"{workplace.part.state.value}: take it out of the claw"
         )
-    vehicle = here.devices.vehicle
+    vehicle = workplace.devices.vehicle
     if trouble := vehicle.state().trouble:
         context.note(text=f"the vehicle reported before the run: {'; '.join(trouble)}; taking command clears it")
     if warnings := vehicle.state().warnings:
         context.note(text=f"the vehicle warns: {'; '.join(warnings)}")
     vehicle.recover()
-    head = _checked(here, context)
-    if (stands := here.parts_before.arrival) is not None and here.whereabouts.still:
+    head = _checked(workplace, context)
+    if (stands := workplace.parts_before.arrival) is not None and workplace.whereabouts.still:
         vehicle.brake()
         context.note(text="the vehicle stands as for the part before: neither driven nor photographed again")
         return replace(stands, photographs=0, head=head)
-    if head is None and not here.whereabouts.anchored:
-        here.mover.to_joints(HOME)
-    here.whereabouts.enter(here.job)
+    if head is None and not workplace.whereabouts.anchored:
+        workplace.mover.to_joints(HOME)
+    workplace.whereabouts.enter(workplace.job)
     context.progress(0.0, "arm to the looking pose")
-    camera = here.calibration.target.flange_from_camera
-    look = look_pose(here.config, here.job, here.board, camera)
-    here.mover.to_as_from(HOME, look, "the looking pose")
-    here.devices.interlocks.may_drive_with(f"the looking pose of job {here.job.job.name}", look)
-    here.devices.target_camera.configure(here.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
-    if not here.config.vehicle.DRIVES:
-        stand = here.config.arm.vehicle_from_base.se3()
+    camera = workplace.calibration.target.flange_from_camera
+    look = look_pose(workplace.config, workplace.job, workplace.board, camera)
+    workplace.mover.to_as_from(HOME, look, "the looking pose")
+    workplace.devices.interlocks.may_drive_with(f"the looking pose of job {workplace.job.job.name}", look)
+    workplace.devices.target_camera.configure(workplace.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
+    if not workplace.config.vehicle.DRIVES:
+        stand = workplace.config.arm.vehicle_from_base.se3()
         context.progress(0.3, "nothing to drive: looking whether the station stands where the job has it")
-        arrival = stand_at_target(here.job, stand, vehicle, here.whereabouts, here.photograph)
+        arrival = stand_at_target(workplace.job, stand, vehicle, workplace.whereabouts, workplace.photograph)
         context.note(text=arrival.words())
         return replace(arrival, head=head)
     vehicle.enable()
     drive = TargetDrive(
-        here.job, here.config.arm.vehicle_from_base.se3(), vehicle, whereabouts=here.whereabouts,
-        photograph=here.photograph, clock=here.devices.clock, check=context.check, progress=context.progress,
-        note=lambda text: context.note(text=text), hold=context.safe_point, carried=here.mover.solids(),
-        pace=here.mover.pace,
+        workplace.job, workplace.config.arm.vehicle_from_base.se3(), vehicle, whereabouts=workplace.whereabouts,
+        photograph=workplace.photograph, clock=workplace.devices.clock, check=context.check, progress=context.progress,
+        note=lambda text: context.note(text=text), hold=context.safe_point, carried=workplace.mover.solids(),
+        pace=workplace.mover.pace,
     )  # fmt: skip
     return replace(drive.to_target(), head=head)
 
 
-def _checked(here: Workplace, context: StepContext) -> InterimCheck | None:
+def _checked(workplace: Workplace, context: StepContext) -> InterimCheck | None:
     """Whether the scan head is where its calibration has it; None where that is not wanted or, with a note, not seen.
 
     Once in a run: when the step is done again, the vehicle may stand before a station that the arm does not know yet.
     Raises `RefusedError` where the head has moved too far for this job, or the board is not seen, and `DeviceFault`
     where the rail has lost steps.
     """
-    if here.looked or not here.config.calibration.each_job:
-        return here.interim
+    if workplace.looked or not workplace.config.calibration.each_job:
+        return workplace.interim
     try:
         found = interim_check(
-            here.config, here.devices, here.mover, here.calibration, here.job, check=context.check,
-            progress=lambda text: context.progress(0.0, text), keep=here.frames.keep,
+            workplace.config, workplace.devices, workplace.mover, workplace.calibration, workplace.job,
+            check=context.check, progress=lambda text: context.progress(0.0, text), keep=workplace.frames.keep,
         )  # fmt: skip
     except (CalibrationStale, Unreachable, CollisionError) as error:
         text = f"whether the scan head has moved since the calibration is not seen: {error}"
         context.note(text=f"{text}. Until it is, `cell calibrate verify` tells")
-        here.looked = True
+        workplace.looked = True
         return None
     if found.matters:
         # A carriage that lost steps has the camera aside as well.
-        check_lost_steps(here.devices)
+        check_lost_steps(workplace.devices)
     found.require()
-    here.interim, here.looked = found, True
+    workplace.interim, workplace.looked = found, True
     # Whatever ends the step from here on, these pictures do not show it.
-    here.frames.begin()
+    workplace.frames.begin()
     for note in found.notes:
         context.note(text=note)
     return found

@@ -19,7 +19,7 @@ MOST_PULL = 3.0
 """Times the contact force with which a part is pulled at, at most: more, and it sticks."""
 
 
-def take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what: str, pulls: bool = True) -> None:
+def take(workplace: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what: str, pulls: bool = True) -> None:
     """Grip the part, `what` in words, with the flange at `grip`, base_from_flange, and lift it.
 
     Raises `RefusedError` where the claw meets something on its way down, and, with `pulls`, where the part is lost, or
@@ -27,8 +27,8 @@ def take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what
     """
     if pulls:
         # After a grip that found no part its fingers are closed.
-        here.devices.claw.release()
-    plan, mover, part = job.place, here.mover, here.part
+        workplace.devices.claw.release()
+    plan, mover, part = job.place, workplace.mover, workplace.part
     normal = job.grasp.flange_from_part.se3().rotation[:, 2]
     above = grip * from_parts(plan.approach * normal)
     context.progress(0.5, f"gripping {what}")
@@ -36,8 +36,8 @@ def take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what
     mover.follow(mover.plan_to(above, f"above {what}"))
     mover.allow_part_contact()
     part.left = False
-    here.devices.arm.zero_force()
-    if not _reached(here, grip, normal):
+    workplace.devices.arm.zero_force()
+    if not _reached(workplace, grip, normal):
         mover.line(above, plan.speed, TOUCHES)
         mover.forbid_part_contact()
         part.left = True
@@ -49,7 +49,7 @@ def take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what
     before = part.state
     part.state = PartState.UNKNOWN
     note_part(context, part)
-    here.devices.claw.grip()
+    workplace.devices.claw.grip()
     where, part.state, part.where, part.left = part.where, PartState.HELD, None, False
     note_part(context, part)
     mover.hold_part(job.grasp.flange_from_part.se3(), job.grasp.size)
@@ -57,10 +57,10 @@ def take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what
     if pulls and mover.line(
         grip * from_parts(plan.contact_travel * normal), plan.contact_speed, TOUCHES, force_limit=most_pull
     ):
-        pull = float(np.linalg.norm(here.devices.arm.state().wrench[:3]))
+        pull = float(np.linalg.norm(workplace.devices.arm.state().wrench[:3]))
         part.state, part.where = PartState.UNKNOWN, where
         note_part(context, part)
-        here.devices.claw.release()
+        workplace.devices.claw.release()
         part.state, part.left = before, True
         note_part(context, part)
         mover.empty_claw()
@@ -73,19 +73,19 @@ def take(here: Workplace, job: Job, grip: pin.SE3, context: StepContext, *, what
             Measured("pull at the part", pull, "N", most=most_pull),
         )
     mover.line(above, plan.speed, TOUCHES)
-    if pulls and not here.devices.claw.holding:
+    if pulls and not workplace.devices.claw.holding:
         part.state = PartState.UNKNOWN
         note_part(context, part)
         raise RefusedError("the claw lost the part as it lifted it; look where it fell, and at the fingers")
 
 
-def _reached(here: Workplace, grip: pin.SE3, normal: Vector) -> bool:
+def _reached(workplace: Workplace, grip: pin.SE3, normal: Vector) -> bool:
     """Whether the open claw came down to `grip` along `normal`, (3,) on the flange, without touching anything."""
-    plan, mover = here.job.place, here.mover
+    plan, mover = workplace.job.place, workplace.mover
     slow = grip * from_parts(plan.contact_travel * normal)
     if mover.line(slow, plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force):
         return False
     # What presses already would be taken as zero.
-    if not np.linalg.norm(here.devices.arm.state().wrench[:3]) <= plan.contact_force:
+    if not np.linalg.norm(workplace.devices.arm.state().wrench[:3]) <= plan.contact_force:
         return False
     return not mover.line(grip, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)

@@ -100,23 +100,25 @@ def _retold(refused: RefusedError, text: str) -> RefusedError:
     return type(refused)(text, *refused.numbers).showing(seen=refused.seen)
 
 
-def _slipped(here: Workplace, sweep: SweepRecord) -> Vector:
+def _slipped(workplace: Workplace, sweep: SweepRecord) -> Vector:
     """What a scan head that has slipped since the calibration may move the place by, (6, 6), base axes."""
     if sweep.slip is None:
         return np.zeros((6, 6))
-    camera = sweep.base_from_flange.rotation @ here.calibration.scan.flange_from_camera.rotation
+    camera = sweep.base_from_flange.rotation @ workplace.calibration.scan.flange_from_camera.rotation
     return sweep.slip.covariance(camera)
 
 
-def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix) -> PlacePose:
+def inverted(workplace: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix) -> PlacePose:
     """`invert_pose` where a job is done."""
     head = None
-    if here.job.scan.mode == "rail":
-        known, travel = here.calibration.scan, here.config.rail.travel[1]
+    if workplace.job.scan.mode == "rail":
+        known, travel = workplace.calibration.scan, workplace.config.rail.travel[1]
         head = Head.of(scan.cloud, sweep.base_from_flange, known.flange_from_camera, known.rail_direction, travel)
-    taken = LineTimes(sweep.times, here.config.arm.vehicle_from_base.se3().inverse(), head)
+    taken = LineTimes(sweep.times, workplace.config.arm.vehicle_from_base.se3().inverse(), head)
     try:
-        return invert_pose(scan, fix, here.job, here.nominal, here.kinematic + _slipped(here, sweep), taken=taken)
+        return invert_pose(
+            scan, fix, workplace.job, workplace.nominal, workplace.kinematic + _slipped(workplace, sweep), taken=taken
+        )
     except NotObservable as refused:
         if not (notes := (*fix.notes, *sweep.notes)):
             raise
@@ -124,19 +126,19 @@ def inverted(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: Boa
         raise _retold(refused, f"{refused}. Before: {'; '.join(notes)}") from refused
 
 
-def _run_step(here: Workplace, context: StepContext) -> PlacePose:
+def _run_step(workplace: Workplace, context: StepContext) -> PlacePose:
     sweep, scan, fix = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
     try:
-        found = inverted(here, sweep, scan, fix)
+        found = inverted(workplace, sweep, scan, fix)
     except RefusedError as refused:
-        if not here.job.unloads:
+        if not workplace.job.unloads:
             raise
         # What is looked for is the part itself.
         why = str(refused).replace("nominal surface", "drawing of the part").replace("right surface", "right part")
         raise _retold(refused, f"the part to be unloaded is not seen where it belongs: {why}") from refused
     for note in found.notes:
         context.note(text=note)
-    here.registered(found.base_from_surface)
+    workplace.registered(found.base_from_surface)
     return found
 
 

@@ -68,9 +68,9 @@ class Kind:
         """How each step is watched."""
         return Policy(tuple(step.policy for step in self.steps), simulated_person=simulated_person)
 
-    def work(self, here: Workplace) -> dict[str, Callable[[StepContext], object]]:
+    def work(self, workplace: Workplace) -> dict[str, Callable[[StepContext], object]]:
         """What the runner calls, by the steps' names; each attempt enters the gate anew."""
-        return {step.name: partial(_enter, here, step) for step in self.steps}
+        return {step.name: partial(_enter, workplace, step) for step in self.steps}
 
     def require_steps(self, names: Iterable[str]) -> None:
         """`ConfigError` when one of these names is no step of this kind."""
@@ -90,16 +90,16 @@ class Kind:
         return replace(self, name=name, steps=(*self.steps[:at], step, *self.steps[at:]))
 
 
-def _enter(here: Workplace, step: JobStep, context: StepContext) -> object:
-    with here.devices.gate.entered(context.token):
+def _enter(workplace: Workplace, step: JobStep, context: StepContext) -> object:
+    with workplace.devices.gate.entered(context.token):
         context.check()
-        if (here.needs_part or here.held is not None) and step is not drive_to_target.STEP:
+        if (workplace.needs_part or workplace.held is not None) and step is not drive_to_target.STEP:
             note, when = partial(place.note_part, context), f"before the step {step.name}"
-            place.require_in_claw(here.devices.claw, here.part, note, when)
-        here.devices.interlocks.work_with(here.calibration.configuration)
-        here.mover.hold = context.safe_point
-        here.frames.begin()
-        result = step.work(here, context)
+            place.require_in_claw(workplace.devices.claw, workplace.part, note, when)
+        workplace.devices.interlocks.work_with(workplace.calibration.configuration)
+        workplace.mover.hold = context.safe_point
+        workplace.frames.begin()
+        result = step.work(workplace, context)
     # What a later step finds by this type, and whether the job ends placed, rests on it.
     if not isinstance(result, step.makes):
         raise TypeError(f"step {step.name} made a {type(result).__name__}, not the {step.makes.__name__} it promises")

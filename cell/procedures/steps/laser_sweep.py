@@ -34,7 +34,7 @@ it to one side without any scatter; what else the place may be off by has the ot
 
 
 def laser_sweep(
-    here: Workplace,
+    workplace: Workplace,
     base_from_surface: pin.SE3,
     head: ScanCalibration,
     scan: ScanSection,
@@ -54,13 +54,14 @@ def laser_sweep(
 
     Raises what `rail_sweep` and `arm_sweep` raise, and `DeviceFault` (rail.lost_steps).
     """
-    devices, config = here.devices, here.config
+    devices, config = workplace.devices, workplace.config
     home_rail(devices, progress)
-    plans = scan_plans(config, here.job.model_copy(update={"scan": scan}), base_from_surface, head)
+    plans = scan_plans(config, workplace.job.model_copy(update={"scan": scan}), base_from_surface, head)
     errors = SweepErrors(
-        here.repeatability, config.calibration.rail_sigma, (1.0 if back else SHIFT_SHARE) * here.job.place.tolerance,
+        workplace.repeatability, config.calibration.rail_sigma,
+        (1.0 if back else SHIFT_SHARE) * workplace.job.place.tolerance,
         rate=devices.clock.rate, late=math.hypot(config.scan_camera.late, config.rail.late),
-        timing=times_known(here.calibration.scan, config)[0], lost=most_lost,
+        timing=times_known(workplace.calibration.scan, config)[0], lost=most_lost,
     )  # fmt: skip
     sweep, geometry = arm_sweep if scan.mode == "arm" else rail_sweep, head.geometry()
     progress(0.01, "preparing")
@@ -70,13 +71,13 @@ def laser_sweep(
         check()
         name = f"sweep {k + 1} of {len(plans)}"
 
-        def tell(fraction: float, text: str, k: int = k, name: str = name) -> None:
+        def notify(fraction: float, text: str, k: int = k, name: str = name) -> None:
             progress((k + fraction) / len(plans), f"{name}: {text}" if len(plans) > 1 else text)
 
-        tell(0.02, "arm to the scan pose")
-        collector = SweepCollector(geometry, scan, keep_frame, tell)
+        notify(0.02, "arm to the scan pose")
+        collector = SweepCollector(geometry, scan, keep_frame, notify)
         sweeping(collector, base_from_surface)
-        swaths.append(sweep(plan, here.mover, devices, errors, collector))
+        swaths.append(sweep(plan, workplace.mover, devices, errors, collector))
     looked = counted and scan.mode == "rail"
     return SweepRecord(tuple(swaths), doubts=check_lost_steps(devices, progress) if looked else ())
 
@@ -92,57 +93,58 @@ def slowed_down(scan: ScanSection, attempt: int) -> ScanSection:
     return scan.model_copy(update={"speed": share * scan.speed, "frame_rate": max(1.0, share * scan.frame_rate)})
 
 
-def _run_step(here: Workplace, context: StepContext) -> SweepRecord:
+def _run_step(workplace: Workplace, context: StepContext) -> SweepRecord:
     """Not swept again what an earlier run has swept, if the board has not moved."""
     fix = context.made(BoardFix)
     # One that is to be done again holds no more, should this run be cut short now.
-    (here.folder / FILE).unlink(missing_ok=True)
+    (workplace.folder / FILE).unlink(missing_ok=True)
     if context.attempt > 1:
         # After a fault the arm's base may stand elsewhere.
         require_board_unmoved(
-            here, fix, "before the fault that ended the sweep", lambda _, text: context.progress(0.0, text)
+            workplace, fix, "before the fault that ended the sweep", lambda _, text: context.progress(0.0, text)
         )
         context.note(text="the board has not moved since the fault")
     # Used once: whoever has it swept again was not content with it.
-    earlier, here.earlier = here.earlier, None
+    earlier, workplace.earlier = workplace.earlier, None
     if earlier is not None:
         try:
             sweep = earlier.confirmed_by(fix)
         except CalibrationStale as moved:
             context.note(text=f"{moved}: sweeping again")
         else:
-            earlier.copy_to(here.folder)
+            earlier.copy_to(workplace.folder)
             for note in (f"the board has not moved: the sweep of run {earlier.folder.name} holds", *sweep.notes):
                 context.note(text=note)
             return sweep
-    sweep = _sweep(here, context, fix)
-    save_sweep(here.folder, sweep, fix, here.frames.settle())
+    sweep = _sweep(workplace, context, fix)
+    save_sweep(workplace.folder, sweep, fix, workplace.frames.settle())
     return sweep
 
 
-def _sweep(here: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
-    head = here.calibration.scan
-    home_rail(here.devices, context.progress)
-    pointing, slip = seen_on_plate(here, context)
-    doubts = times_known(head, here.config)[1]
+def _sweep(workplace: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
+    head = workplace.calibration.scan
+    home_rail(workplace.devices, context.progress)
+    pointing, slip = seen_on_plate(workplace, context)
+    doubts = times_known(head, workplace.config)[1]
     if pointing is not None:
-        head = head.pointed(pointing, here.config.laser.exit_point)
+        head = head.pointed(pointing, workplace.config.laser.exit_point)
     record = laser_sweep(
-        here, here.base_from_surface(fix), head, slowed_down(here.job.scan, context.attempt), check=context.check,
-        progress=context.progress, keep_frame=lambda frame: here.frames.keep("stripe", frame), sweeping=here.sweeping,
+        workplace, workplace.base_from_surface(fix), head, slowed_down(workplace.job.scan, context.attempt),
+        check=context.check, progress=context.progress, keep_frame=lambda frame: workplace.frames.keep("stripe", frame),
+        sweeping=workplace.sweeping,
     )  # fmt: skip
-    rest = here.devices.interlocks.situation.last if here.job.scan.mode == "rail" else None
-    doubts = (*record.doubts, *unwatched(head.witness), *doubts, *here.notes)
+    rest = workplace.devices.interlocks.situation.last if workplace.job.scan.mode == "rail" else None
+    doubts = (*record.doubts, *unwatched(head.witness), *doubts, *workplace.notes)
     record = replace(record, pointing=pointing, slip=slip, doubts=doubts, rest=rest)
     for note in record.notes:
         context.note(text=note)
     return record
 
 
-def head_at(here: Workplace, sweep: SweepRecord) -> ScanCalibration:
+def head_at(workplace: Workplace, sweep: SweepRecord) -> ScanCalibration:
     """The scan head with the laser where it pointed before this sweep."""
-    head = here.calibration.scan
-    return head if sweep.pointing is None else head.pointed(sweep.pointing, here.config.laser.exit_point)
+    head = workplace.calibration.scan
+    return head if sweep.pointing is None else head.pointed(sweep.pointing, workplace.config.laser.exit_point)
 
 
 def times_known(head: ScanCalibration, config: CellConfig) -> tuple[StampTiming | None, tuple[str, ...]]:
@@ -179,10 +181,10 @@ def unwatched(witness: PlateLine | None) -> tuple[str, ...]:
     return ()
 
 
-def seen_on_plate(here: Workplace, context: StepContext) -> tuple[Pointing | None, Slip | None]:
+def seen_on_plate(workplace: Workplace, context: StepContext) -> tuple[Pointing | None, Slip | None]:
     """Where the laser points now, and how far the head has slipped; None where the calibration saw no plate, or no edge
     of it. `RefusedError` when anything was knocked."""
-    head, config, devices, keep = here.calibration.scan, here.config, here.devices, here.frames.keep
+    head, config, devices, keep = workplace.calibration.scan, workplace.config, workplace.devices, workplace.frames.keep
     before = head.witness
     if before is None:
         return None, None

@@ -57,39 +57,43 @@ class HeldPart:
         return cls(from_ur(np.array(told["base_from_flange"], dtype=np.float64)), covariance)
 
 
-def _run_step(here: Workplace, context: StepContext) -> HeldPart:
-    fix, job, part = context.made(BoardFix), here.job, here.part
+def _run_step(workplace: Workplace, context: StepContext) -> HeldPart:
+    fix, job, part = context.made(BoardFix), workplace.job, workplace.part
     if part.state is not PartState.LIES:
         raise RefusedError(f"the part is {part.state.value}: nothing is gripped a second time")
     while True:
         before, pose = context.held_s, context.made(PlacePose)
         sweep, scan = context.made(SweepRecord), context.made(Reconstruction)
-        look = require_in_place(here, fix, sweep, scan=scan, pose=pose, context=context)
+        look = require_in_place(workplace, fix, sweep, scan=scan, pose=pose, context=context)
         if look.creep is not None:
-            pose = carried_on(here, sweep, scan, fix, look.creep)
+            pose = carried_on(workplace, sweep, scan, fix, look.creep)
         context.safe_point()
         # Whoever has the run held may reach in, and move the part.
         if context.held_s == before:
             break
     if job.scan.mode == "rail":
-        check_lost_steps(here.devices, lambda _, text: context.progress(0.05, text))
+        check_lost_steps(workplace.devices, lambda _, text: context.progress(0.05, text))
     for note in look.notes:
         context.note(text=note)
     grip = pose.base_from_surface * job.place.surface_from_part.se3() * job.grasp.flange_from_part.se3().inverse()
     part.where = pose.base_from_surface
-    _lies(here, fix, pose.base_from_surface)
-    take(here, job, grip, context, what="the part")
-    return HeldPart(grip, pose.covariance + here.repeatability + GRIPPED)
+    _lies(workplace, fix, pose.base_from_surface)
+    take(workplace, job, grip, context, what="the part")
+    return HeldPart(grip, pose.covariance + workplace.repeatability + GRIPPED)
 
 
-def _lies(here: Workplace, fix: BoardFix, base_from_part: pin.SE3) -> None:
+def _lies(workplace: Workplace, fix: BoardFix, base_from_part: pin.SE3) -> None:
     """From here on the arm avoids the part, and what lies below it, each by itself: one stays when the other goes."""
-    part = here.part_mesh
+    part = workplace.part_mesh
     assert part is not None
-    below = seen_from_below(part, here.job.place.surface_from_part.se3()).extent if here.ground is None else here.ground
-    base_from_place = fix.base_from_board * here.job.place_from_board.inverse()
-    here.mover.avoid_station(base_from_place, here.job, here.board, below)
-    here.mover.avoid_part(base_from_part, here.job.grasp.size)
+    below = (
+        seen_from_below(part, workplace.job.place.surface_from_part.se3()).extent
+        if workplace.ground is None
+        else workplace.ground
+    )
+    base_from_place = fix.base_from_board * workplace.job.place_from_board.inverse()
+    workplace.mover.avoid_station(base_from_place, workplace.job, workplace.board, below)
+    workplace.mover.avoid_part(base_from_part, workplace.job.grasp.size)
 
 
 # What was interrupted with the part between the fingers is left to a person.

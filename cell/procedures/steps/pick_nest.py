@@ -22,30 +22,34 @@ from statemachine.step import OnFailure, Step
 CLOUD = "nest.ply"
 
 
-def _run_step(here: Workplace, context: StepContext) -> HeldPart:
-    held = here.held if here.held is not None and here.part.state is PartState.HELD else _picked(here, context)
-    here.job = job_with_grasp(here.job, here.job.grasp.flange_from_part.se3(), held.covariance)
-    here.held = held
+def _run_step(workplace: Workplace, context: StepContext) -> HeldPart:
+    held = (
+        workplace.held
+        if workplace.held is not None and workplace.part.state is PartState.HELD
+        else _picked(workplace, context)
+    )
+    workplace.job = job_with_grasp(workplace.job, workplace.job.grasp.flange_from_part.se3(), held.covariance)
+    workplace.held = held
     return held
 
 
-def _picked(here: Workplace, context: StepContext) -> HeldPart:
-    job, part, arrival = at_nest(here.job), here.part_mesh, context.made(VehicleArrival)
+def _picked(workplace: Workplace, context: StepContext) -> HeldPart:
+    job, part, arrival = at_nest(workplace.job), workplace.part_mesh, context.made(VehicleArrival)
     assert part is not None
-    if here.part.state is not PartState.NESTED:
-        raise RefusedError(f"the part is {here.part.state.value}: nothing is gripped a second time")
+    if workplace.part.state is not PartState.NESTED:
+        raise RefusedError(f"the part is {workplace.part.state.value}: nothing is gripped a second time")
     belongs = job.place.surface_from_part.se3()
     # The arm moves beside the station from here on, and about the part.
-    here.mover.avoid_station(arrival.base_from_place, here.job, here.board, here.nominal.extent)
-    here.mover.avoid_part(belongs, job.grasp.size)
-    home_rail(here.devices, context.progress)
-    head, (pointing, _) = here.calibration.scan, seen_on_plate(here, context)
+    workplace.mover.avoid_station(arrival.base_from_place, workplace.job, workplace.board, workplace.nominal.extent)
+    workplace.mover.avoid_part(belongs, job.grasp.size)
+    home_rail(workplace.devices, context.progress)
+    head, (pointing, _) = workplace.calibration.scan, seen_on_plate(workplace, context)
     if pointing is not None:
-        head = head.pointed(pointing, here.config.laser.exit_point)
+        head = head.pointed(pointing, workplace.config.laser.exit_point)
     faces = seen_from_above(part, belongs)
     low, high = faces.extent
     over = belongs * from_parts((0.0, 0.0, 0.5 * float(low[2] + high[2])))
-    fit = part_in_base(here, job, faces, swept_part(here, head, over, context, frames="nest", cloud=CLOUD))
+    fit = part_in_base(workplace, job, faces, swept_part(workplace, head, over, context, frames="nest", cloud=CLOUD))
     off = 1e3 * moved(belongs.inverse() * fit.base_from_surface, part_points(faces))
     most = 1e3 * job.place.tolerance
     if not off <= most:
@@ -55,11 +59,11 @@ def _picked(here: Workplace, context: StepContext) -> HeldPart:
             Measured("part off its place in the nest", off, "mm", most=most),
         )
     context.note(text=f"the part lies {off:.2f} mm off its place in the nest, and is gripped where it lies")
-    grip = fit.base_from_surface * here.job.grasp.flange_from_part.se3().inverse()
-    here.part.where = fit.base_from_surface
-    take(here, here.job, grip, context, what="the part")
-    held = HeldPart(grip, fit.covariance + here.repeatability)
-    context.note(part=here.part.state.value, held=held.as_dict())
+    grip = fit.base_from_surface * workplace.job.grasp.flange_from_part.se3().inverse()
+    workplace.part.where = fit.base_from_surface
+    take(workplace, workplace.job, grip, context, what="the part")
+    held = HeldPart(grip, fit.covariance + workplace.repeatability)
+    context.note(part=workplace.part.state.value, held=held.as_dict())
     return held
 
 

@@ -252,40 +252,40 @@ def require_held(part: PartProgress) -> None:
         raise RefusedError(f"the part is {part.state.value}, not held: nothing is placed a second time")
 
 
-def _run_step(here: Workplace, context: StepContext) -> PlaceResult:
-    require_held(here.part)
+def _run_step(workplace: Workplace, context: StepContext) -> PlaceResult:
+    require_held(workplace.part)
     while True:
         held, pose = context.held_s, context.made(PlacePose)
-        aim, mating = AimedPlace.of(here, pose).fitted(here, pose, context)
-        look = _looked_again(here, pose, context)
+        aim, mating = AimedPlace.of(workplace, pose).fitted(workplace, pose, context)
+        look = _looked_again(workplace, pose, context)
         if look is not None and look.creep is not None:
             swept = context.made(SweepRecord), context.made(Reconstruction), context.made(BoardFix)
-            pose = carried_on(here, *swept, look.creep)
-        expected = expected_touch(aim.job, here.nominal, pose, here.repeatability)
+            pose = carried_on(workplace, *swept, look.creep)
+        expected = expected_touch(aim.job, workplace.nominal, pose, workplace.repeatability)
         if mating is not None:
             expected = replace(expected, height=expected.height + mating.lift)
-            pose = mating.stated(pose, here.job.place.surface_from_part.se3())
+            pose = mating.stated(pose, workplace.job.place.surface_from_part.se3())
         context.safe_point()
         # Whoever has the run held may reach in, also in the middle of a look: then it is looked at again.
         if context.held_s == held:
             break
     # While the arm comes down; the laser is off.
-    carriage = here.devices.rail.check_zero() if look is not None and here.job.scan.mode == "rail" else None
+    carriage = workplace.devices.rail.check_zero() if look is not None and workplace.job.scan.mode == "rail" else None
     placing = Placing(
-        aim.job, pose.base_from_surface, expected, mover=here.mover, arm=here.devices.arm, claw=here.devices.claw,
-        part=here.part, check=context.check, progress=context.progress,
+        aim.job, pose.base_from_surface, expected, mover=workplace.mover, arm=workplace.devices.arm,
+        claw=workplace.devices.claw, part=workplace.part, check=context.check, progress=context.progress,
         note=lambda part: note_part(context, part),
         ready=lambda: None if carriage is None else carriage.wait(30.0),
     )  # fmt: skip
     try:
-        done = placing.put_down(not here.looks_after)
+        done = placing.put_down(not workplace.looks_after)
     except RefusedError:
         # Steps that the rail has lost explain a touch that comes early: they are told first.
         placing.ready()
         raise
     done = replace(done, look=look, pose=pose, mating=mating)
     if aim.allowed is not None:
-        done = replace(done, allowed=aim.allowed, parts=len(here.parts_before.series.aside))
+        done = replace(done, allowed=aim.allowed, parts=len(workplace.parts_before.series.aside))
     for note in done.notes:
         context.note(text=note)
     return done
@@ -312,42 +312,53 @@ class AimedPlace:
     touching: tuple[pin.SE3, ...]
 
     @classmethod
-    def of(cls, here: Workplace, pose: PlacePose) -> AimedPlace:
+    def of(cls, workplace: Workplace, pose: PlacePose) -> AimedPlace:
         """By the parts of the batch before; straight at the place where they do not tell."""
-        points, grasp, belongs = part_points(here.nominal), here.job.grasp, here.job.place.surface_from_part.se3()
+        points, grasp, belongs = (
+            part_points(workplace.nominal),
+            workplace.job.grasp,
+            workplace.job.place.surface_from_part.se3(),
+        )
         unsure = grasp.covariance
-        noise = expected_residual(here.job, here.repeatability, pose, points, unsure)
-        allowed, slip = here.parts_before.series.allowance(points, noise), here.parts_before.series.slip(points, noise)
+        noise = expected_residual(workplace.job, workplace.repeatability, pose, points, unsure)
+        allowed, slip = (
+            workplace.parts_before.series.allowance(points, noise),
+            workplace.parts_before.series.slip(points, noise),
+        )
         if allowed is None:
-            return cls(here.job, None, (belongs,))
+            return cls(workplace.job, None, (belongs,))
         # Held aside, it touches at its place. One that slips as the claw opens touches aside, and slips into it.
         touching = (belongs, belongs * allowed.inverse()) if slip is None else (belongs * slip.inverse(),)
-        return cls(job_with_grasp(here.job, grasp.flange_from_part.se3() * allowed, unsure), allowed, touching)
+        return cls(job_with_grasp(workplace.job, grasp.flange_from_part.se3() * allowed, unsure), allowed, touching)
 
-    def fitted(self, here: Workplace, pose: PlacePose, context: StepContext) -> tuple[AimedPlace, MatingGap | None]:
+    def fitted(
+        self, workplace: Workplace, pose: PlacePose, context: StepContext
+    ) -> tuple[AimedPlace, MatingGap | None]:
         """This, and the gap where the part touches first; straight at the place where it would not fit aside.
 
         Raises `RefusedError` where it does not fit at its place.
         """
         try:
-            gaps = [_mated(here, pose, lies, context) for lies in self.touching]
+            gaps = [_mated(workplace, pose, lies, context) for lies in self.touching]
         except RefusedError as refused:
             if self.allowed is None:
                 raise
             context.note(text=f"parts before came to lie aside alike, which is not allowed for: {refused}")
-            return AimedPlace(here.job, None, (here.job.place.surface_from_part.se3(),)).fitted(here, pose, context)
+            return AimedPlace(workplace.job, None, (workplace.job.place.surface_from_part.se3(),)).fitted(
+                workplace, pose, context
+            )
         if self.allowed is not None:
-            context.note(text=aside_words(self.allowed, len(here.parts_before.series.aside)))
+            context.note(text=aside_words(self.allowed, len(workplace.parts_before.series.aside)))
         return self, max(gaps, key=lambda gap: -np.inf if gap is None else gap.lift)
 
 
-def _mated(here: Workplace, pose: PlacePose, lies: pin.SE3, context: StepContext) -> MatingGap | None:
+def _mated(workplace: Workplace, pose: PlacePose, lies: pin.SE3, context: StepContext) -> MatingGap | None:
     """The gap between the part as drawn, where it `lies` on the surface, and that as scanned; None without a mesh of
     the part or a scan.
 
     Raises `RefusedError` where they do not fit.
     """
-    if here.part_mesh is None:
+    if workplace.part_mesh is None:
         return None
     context.progress(0.0, "holding the part's underside against the surface")
     try:
@@ -356,23 +367,27 @@ def _mated(here: Workplace, pose: PlacePose, lies: pin.SE3, context: StepContext
         # A kind of job that measures in another way.
         context.note(text="nothing was scanned: the part's underside was not held against the surface")
         return None
-    found = scanned_gap(cloud, pose.base_from_surface, here.nominal, lies, here.part_mesh)
+    found = scanned_gap(cloud, pose.base_from_surface, workplace.nominal, lies, workplace.part_mesh)
     if found is None:
         raise RefusedError(f"{APART}. {NEXT_STEP}")
-    found.require(here.job.place.tolerance)
+    found.require(workplace.job.place.tolerance)
     return found
 
 
-def carried_on(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix, creep: Creep) -> PlacePose:
+def carried_on(
+    workplace: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix, creep: Creep
+) -> PlacePose:
     """The place when the part touches it, of a surface that creeps, from the sweep freed of that.
 
     Raises what `inverted` raises, and `NotObservable` where too little is known of the rate.
     """
     crept = together(scan.by_poses, lambda lines, rows: creep.motions(scan.cloud, lines, rows, sweep.times))
     still = replace(scan, cloud=creep.undone(scan.cloud, sweep.times), by_poses=crept)
-    plan = here.job.place
+    plan = workplace.job.place
     until = APPROACH_S + plan.approach / plan.speed + plan.contact_travel / plan.contact_speed
-    pose = creep.carried(inverted(here, sweep, still, fix), here.devices.clock.now() + until / here.pace.share)
+    pose = creep.carried(
+        inverted(workplace, sweep, still, fix), workplace.devices.clock.now() + until / workplace.pace.share
+    )
     turn = np.kron(np.eye(2), pose.base_from_surface.rotation) / ([plan.tolerance] * 3 + [plan.tolerance_angle] * 3)
     excess = 3.0 * float(np.sqrt(np.linalg.eigvalsh(turn.T @ pose.covariance @ turn)[-1]))
     if not excess <= 1.0:
@@ -384,7 +399,7 @@ def carried_on(here: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: B
     return pose
 
 
-def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> SecondLook | None:
+def _looked_again(workplace: Workplace, pose: PlacePose, context: StepContext) -> SecondLook | None:
     """`RefusedError` when the surface is not where it was measured, or not bare; None where it was measured without a
     sweep."""
     fix = context.made(BoardFix)
@@ -392,12 +407,12 @@ def _looked_again(here: Workplace, pose: PlacePose, context: StepContext) -> Sec
         sweep, scan = context.made(SweepRecord), context.made(Reconstruction)
     except LookupError:
         # A kind of job that measures in another way.
-        require_board_unmoved(here, fix, "before its place was measured", context.progress)
+        require_board_unmoved(workplace, fix, "before its place was measured", context.progress)
         return None
-    lies = here.job.place.surface_from_part.se3()
-    found = highest_standing(scan.cloud, here.nominal, pose.base_from_surface, lies, here.job.grasp.size)
-    require_bare(found, here.job.place.tolerance)
-    return require_in_place(here, fix, sweep, scan=scan, pose=pose, context=context)
+    lies = workplace.job.place.surface_from_part.se3()
+    found = highest_standing(scan.cloud, workplace.nominal, pose.base_from_surface, lies, workplace.job.grasp.size)
+    require_bare(found, workplace.job.place.tolerance)
+    return require_in_place(workplace, fix, sweep, scan=scan, pose=pose, context=context)
 
 
 # A part that may have touched the surface is not placed a second time by itself. The second look takes as long as a

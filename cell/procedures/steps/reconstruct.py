@@ -45,23 +45,23 @@ def build_cloud(sweep: SweepRecord) -> reconstruction.Cloud:
     return reconstruction.merge([s.builder.place(s.lines, s.flanges, s.rail, s.line_spread) for s in sweep.swaths])
 
 
-def reconstructed(here: Workplace, sweep: SweepRecord) -> Reconstruction:
+def reconstructed(workplace: Workplace, sweep: SweepRecord) -> Reconstruction:
     """Place every profile, remove outliers, interpolate the job's largest holes; the cloud is `cloud.ply` of the run.
 
     The file says which devices were simulated. Raises `RefusedError` when too few points are left; what there is of a
     cloud is written all the same.
     """
-    path, simulated = here.folder / "cloud.ply", here.config.cell.sim
+    path, simulated = workplace.folder / "cloud.ply", workplace.config.cell.sim
     # The cloud of an earlier sweep must not be taken for this one's.
     path.unlink(missing_ok=True)
     built = build_cloud(sweep)
     try:
-        cloud = reconstruction.fill_holes(built.require(), here.job.scan.largest_hole)
+        cloud = reconstruction.fill_holes(built.require(), workplace.job.scan.largest_hole)
     except RefusedError as refused:
         reconstruction.write_cloud(path, built, simulated)
         refused.showing(seen={"cloud": built})
         raise
-    by_calibration, by_poses = displacements(here, sweep, cloud)
+    by_calibration, by_poses = displacements(workplace, sweep, cloud)
     seams = tuple(reconstruction.find_seams(cloud, together(by_calibration, by_poses)))
     reconstruction.write_cloud(path, cloud, simulated)
     return Reconstruction(cloud, seams, by_calibration, by_poses)
@@ -72,13 +72,13 @@ def together(*motions: Motions) -> Motions:
     return lambda lines, rows: np.concatenate([each(lines, rows) for each in motions], axis=2)
 
 
-def displacements(here: Workplace, sweep: SweepRecord, cloud: reconstruction.Cloud) -> tuple[Motions, Motions]:
+def displacements(workplace: Workplace, sweep: SweepRecord, cloud: reconstruction.Cloud) -> tuple[Motions, Motions]:
     """How the points of a sweep's cloud move by what is not known of the calibration, and of the arm's poses."""
     # The same for all sweeps: what the calibration found, with the laser where it pointed before them.
-    geometry, variants = sweep.swaths[0].builder.geometry, head_at(here, sweep).variants()
+    geometry, variants = sweep.swaths[0].builder.geometry, head_at(workplace, sweep).variants()
     covariances = [swath.covariance for swath in sweep.swaths]
     # An arm that moves during the sweeps moves its base, too: the vehicle leans as the arm reaches out.
-    vehicle, lean = here.config.arm.vehicle_from_base.se3().inverse(), here.config.vehicle.lean_sigma
+    vehicle, lean = workplace.config.arm.vehicle_from_base.se3().inverse(), workplace.config.vehicle.lean_sigma
 
     def by_calibration(lines: Indices, rows: Indices) -> Array:
         return reconstruction.calibration_motions(
@@ -92,10 +92,10 @@ def displacements(here: Workplace, sweep: SweepRecord, cloud: reconstruction.Clo
     return by_calibration, by_poses
 
 
-def _run_step(here: Workplace, context: StepContext) -> Reconstruction:
+def _run_step(workplace: Workplace, context: StepContext) -> Reconstruction:
     sweep = context.made(SweepRecord)
-    made = reconstructed(here, sweep)
-    here.devices.gate.seen("scan_camera", TimedCloud(made.cloud, sweep.times))
+    made = reconstructed(workplace, sweep)
+    workplace.devices.gate.seen("scan_camera", TimedCloud(made.cloud, sweep.times))
     return made
 
 

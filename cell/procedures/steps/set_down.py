@@ -33,8 +33,8 @@ class SetDown:
         return {name: told[name] for name in ("contact", "depth_error_mm", "touch", "base_from_flange")}
 
 
-def _run_step(here: Workplace, context: StepContext) -> SetDown:
-    nest, part, job = here.job.nest, here.part_mesh, here.job
+def _run_step(workplace: Workplace, context: StepContext) -> SetDown:
+    nest, part, job = workplace.job.nest, workplace.part_mesh, workplace.job
     assert nest is not None and part is not None
     base_from_part = nest.base_from_part.se3()
     known = np.diag([nest.sigma**2] * 3 + [nest.sigma_angle**2] * 3)
@@ -42,9 +42,9 @@ def _run_step(here: Workplace, context: StepContext) -> SetDown:
     held = job_with_grasp(job, job.grasp.flange_from_part.se3(), context.made(HeldPart).covariance)
     below = seen_from_below(part, job.place.surface_from_part.se3())
     placing = Placing(
-        held, base_from_part, expected_touch(held, below, pose, here.repeatability), mover=here.mover,
-        arm=here.devices.arm, claw=here.devices.claw, part=here.part, check=context.check, progress=context.progress,
-        note=lambda part: note_part(context, part),
+        held, base_from_part, expected_touch(held, below, pose, workplace.repeatability), mover=workplace.mover,
+        arm=workplace.devices.arm, claw=workplace.devices.claw, part=workplace.part, check=context.check,
+        progress=context.progress, note=lambda part: note_part(context, part),
     )  # fmt: skip
     try:
         done = placing.put_down()
@@ -52,7 +52,7 @@ def _run_step(here: Workplace, context: StepContext) -> SetDown:
         raise RefusedError(f"at the nest, where [nest] of the job has it: {error}", *error.numbers) from error
     for note in () if done.touch is None else done.touch.notes:
         context.note(text=f"at the nest: {note}")
-    return SetDown(done, known + context.made(HeldPart).covariance + here.repeatability)
+    return SetDown(done, known + context.made(HeldPart).covariance + workplace.repeatability)
 
 
 # A part that may have touched its nest is not set down a second time by itself.

@@ -41,36 +41,36 @@ SWEEPS = 3
 """How often at most the part is swept until no frames are lost, no replies come too late, and it lies still."""
 
 
-def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
+def _run_step(workplace: Workplace, context: StepContext) -> PlacedPart:
     first = placed = context.made(PlaceResult)
-    pose, plan = placed.pose or context.made(PlacePose), here.job.place
-    found, slips = _looked(here, pose, context), list[pin.SE3]()
-    leaves = expected_residual(here.job, here.repeatability, pose, found.points, found.covariance)
-    slip = here.parts_before.series.slip(found.points, leaves) or pin.SE3.Identity()
+    pose, plan = placed.pose or context.made(PlacePose), workplace.job.place
+    found, slips = _looked(workplace, pose, context), list[pin.SE3]()
+    leaves = expected_residual(workplace.job, workplace.repeatability, pose, found.points, found.covariance)
+    slip = workplace.parts_before.series.slip(found.points, leaves) or pin.SE3.Identity()
     # Along a motion that is not seen it lies where it belongs: that would confirm what was allowed for.
     came = None if found.unseen else along_surface(
         first.allowed * found.belongs.inverse() * found.seen.surface_from_part
     )  # fmt: skip
     for left in range(plan.corrections, 0, -1):
-        if not _worth_correcting(here, pose, found, left, context):
+        if not _worth_correcting(workplace, pose, found, left, context):
             break
         context.note(text=f"the placed part lies {found.words}: it is gripped and placed again")
         held = placed.base_from_flange.inverse() * pose.base_from_surface * found.seen.surface_from_part
         try:
-            placed = correct(here, placed, pose, held=held, slip=slip, seen=found.covariance, context=context)
+            placed = correct(workplace, placed, pose, held=held, slip=slip, seen=found.covariance, context=context)
         except RefusedError as error:
-            if here.part.state is not PartState.RELEASED:
+            if workplace.part.state is not PartState.RELEASED:
                 raise
-            here.mover.fold()
+            workplace.mover.fold()
             if not found.in_tolerance(plan):
                 raise found.misplaced(plan, f"It was not corrected: {error}") from error
             context.note(text=f"it was not corrected: {error}")
             # The claw was near it, and may have moved it.
-            found = replace(_looked(here, pose, context), before=found.before)
+            found = replace(_looked(workplace, pose, context), before=found.before)
             break
         for note in placed.notes:
             context.note(text=note)
-        found = replace(_looked(here, pose, context), before=(*found.before, found.off))
+        found = replace(_looked(workplace, pose, context), before=(*found.before, found.off))
         # How it was held was seen: what it is off by to the side now came as the claw opened, and comes again.
         let_go = placed.base_from_flange * held
         slip = along_surface(let_go.inverse() * pose.base_from_surface * found.seen.surface_from_part)
@@ -82,12 +82,14 @@ def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
     return replace(found, came=came, slips=tuple(slips))
 
 
-def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left: int, context: StepContext) -> bool:
+def _worth_correcting(
+    workplace: Workplace, pose: PlacePose, found: PlacedPart, left: int, context: StepContext
+) -> bool:
     """Whether the part lies farther off than is accepted, and the corrections that are `left` would bring it nearer."""
-    plan = here.job.place
+    plan = workplace.job.place
     if found.off <= (plan.tolerance if plan.accept is None else plan.accept) and found.in_tolerance(plan):
         return False
-    known = here.job, here.repeatability, pose, found.points, found.covariance
+    known = workplace.job, workplace.repeatability, pose, found.points, found.covariance
     hope = expected_residual(*known, corrections=left)
     why = f"placed again it would be {1e3 * hope:.2f} mm off"
     if found.unlike is not None:
@@ -107,21 +109,21 @@ def _worth_correcting(here: Workplace, pose: PlacePose, found: PlacedPart, left:
     return False
 
 
-def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPart:
+def _looked(workplace: Workplace, pose: PlacePose, context: StepContext) -> PlacedPart:
     """Sweep the placed part, fold the arm, and find the part in the sweep."""
-    sweep, scan, part = context.made(SweepRecord), context.made(Reconstruction), here.part_mesh
+    sweep, scan, part = context.made(SweepRecord), context.made(Reconstruction), workplace.part_mesh
     if part is None:
         raise RefusedError("the job has no mesh of its part ([part]): nothing tells what the placed part looks like")
-    place, belongs = here.job.place, here.job.place.surface_from_part.se3()
+    place, belongs = workplace.job.place, workplace.job.place.surface_from_part.se3()
     faces, tolerance = seen_from_above(part, belongs), Tolerance(place.tolerance, place.tolerance_angle)
-    over = pose.base_from_surface * surface_from_faces(here.job, faces)
-    lying = PartOnGround(faces, pose.base_from_surface * belongs, (here.nominal, pose.base_from_surface))
-    cloud, record = swept_part(here, head_at(here, sweep), over, context, lying=lying)
+    over = pose.base_from_surface * surface_from_faces(workplace.job, faces)
+    lying = PartOnGround(faces, pose.base_from_surface * belongs, (workplace.nominal, pose.base_from_surface))
+    cloud, record = swept_part(workplace, head_at(workplace, sweep), over, context, lying=lying)
     try:
         seen = find_part(
-            cloud, faces, here.nominal, surface=Prior(pose.base_from_surface, pose.covariance), belongs=belongs,
-            tolerance=tolerance, moved=together(*displacements(here, record, cloud)), times=record.times,
-            base_from_vehicle=here.config.arm.vehicle_from_base.se3().inverse(),
+            cloud, faces, workplace.nominal, surface=Prior(pose.base_from_surface, pose.covariance), belongs=belongs,
+            tolerance=tolerance, moved=together(*displacements(workplace, record, cloud)), times=record.times,
+            base_from_vehicle=workplace.config.arm.vehicle_from_base.se3().inverse(),
         )  # fmt: skip
     except RefusedError as error:
         why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")
@@ -129,21 +131,21 @@ def _looked(here: Workplace, pose: PlacePose, context: StepContext) -> PlacedPar
             f"the placed part is not where it was put down, or is not the part as drawn: {why}. {NEXT_STEP}",
             *error.numbers,
         ) from error
-    stated = part_covariance(here.job, pose, here.repeatability)
-    gap = scanned_gap(scan.cloud, pose.base_from_surface, here.nominal, seen.surface_from_part, part)
+    stated = part_covariance(workplace.job, pose, workplace.repeatability)
+    gap = scanned_gap(scan.cloud, pose.base_from_surface, workplace.nominal, seen.surface_from_part, part)
     on_part, around = parted(cloud, faces, seen.base_from_surface * belongs)
     flush = None if not seen.beside else flush_along_edge(
-        on_part, around, seen.base_from_surface, nominal=here.nominal, faces=faces, belongs=belongs,
+        on_part, around, seen.base_from_surface, nominal=workplace.nominal, faces=faces, belongs=belongs,
         lies=seen.surface_from_part, tolerance=place.tolerance, rocks=seen.rocked,
     )  # fmt: skip
-    found = PlacedPart.of(here.job, seen, part_points(here.nominal), stated)
+    found = PlacedPart.of(workplace.job, seen, part_points(workplace.nominal), stated)
     unlike = unlike_patch(cloud, seen.base_from_surface, found.seen.surface_from_part, faces)
-    own = by_themselves(here.job, cloud, found.seen, faces)
+    own = by_themselves(workplace.job, cloud, found.seen, faces)
     return replace(found, gap=gap, flush=flush, own=own, unlike=unlike)
 
 
 def swept_part(
-    here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, *, frames: str = "verify",
+    workplace: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, *, frames: str = "verify",
     cloud: str = CLOUD, lying: PartOnGround | None = None,
 ) -> tuple[Cloud, SweepRecord]:  # fmt: skip
     """Sweep the part `over` what is in the place of the surface, base from there, look whether the rail has lost steps
@@ -151,11 +153,11 @@ def swept_part(
     whether the part is at rest: it is swept again until it is, and `MisplacedError` raised for one that is not."""
     while True:
         held = context.held_s
-        points, record, moved = _swept_at_rest(here, head, over, context, frames=frames, lying=lying)
-        write_cloud(here.folder / cloud, points, here.config.cell.sim)
+        points, record, moved = _swept_at_rest(workplace, head, over, context, frames=frames, lying=lying)
+        write_cloud(workplace.folder / cloud, points, workplace.config.cell.sim)
         context.progress(0.9, "folding the arm, and looking whether the rail has lost steps")
-        looking = here.devices.rail.check_zero() if here.job.scan.mode == "rail" else None
-        here.mover.fold()
+        looking = workplace.devices.rail.check_zero() if workplace.job.scan.mode == "rail" else None
+        workplace.mover.fold()
         if looking is not None:
             looking.wait(30.0)
         context.safe_point()
@@ -173,7 +175,7 @@ def swept_part(
 
 
 def _swept_at_rest(
-    here: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, *, frames: str,
+    workplace: Workplace, head: ScanCalibration, over: pin.SE3, context: StepContext, *, frames: str,
     lying: PartOnGround | None,
 ) -> tuple[Cloud, SweepRecord, float]:  # fmt: skip
     """The part's cloud and its sweep, made again until it is whole and the part is at rest: nothing of it is moved by
@@ -181,14 +183,14 @@ def _swept_at_rest(
     for left in reversed(range(SWEEPS)):
         try:
             record = laser_sweep(
-                here, over, head, here.job.scan, check=context.check, counted=False,
-                keep_frame=lambda frame: here.frames.keep(frames, frame),
+                workplace, over, head, workplace.job.scan, check=context.check, counted=False,
+                keep_frame=lambda frame: workplace.frames.keep(frames, frame),
                 progress=lambda share, text: context.progress(0.85 * share, f"the part: {text}"),
             )  # fmt: skip
             swept = build_cloud(record), record
-            moved = 0.0 if lying is None else moved_meanwhile(here, head, over, swept, part=lying, context=context)
-            if moved and here.job.scan.mode == "rail":
-                check_lost_steps(here.devices, lambda _, text: context.progress(0.85, text))
+            moved = 0.0 if lying is None else moved_meanwhile(workplace, head, over, swept, part=lying, context=context)
+            if moved and workplace.job.scan.mode == "rail":
+                check_lost_steps(workplace.devices, lambda _, text: context.progress(0.85, text))
         except DeviceFault as fault:
             if fault.code not in SWEPT_AGAIN or not left:
                 raise

@@ -29,20 +29,22 @@ from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
 
 
-def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
-    job, sweep = where_seen(here.job), context.made(SweepRecord)
+def _run_step(workplace: Workplace, context: StepContext) -> PlacedPart:
+    job, sweep = where_seen(workplace.job), context.made(SweepRecord)
     belongs = job.place.surface_from_part.se3()
-    swept = swept_part(here, head_at(here, sweep), belongs, context, lying=PartOnGround(here.nominal, belongs))
+    swept = swept_part(
+        workplace, head_at(workplace, sweep), belongs, context, lying=PartOnGround(workplace.nominal, belongs)
+    )
     try:
-        fit = part_in_base(here, job, here.nominal, swept)
+        fit = part_in_base(workplace, job, workplace.nominal, swept)
     except RefusedError as error:
         raise MisplacedError(f"{error}. {NEXT_STEP}", *error.numbers) from error
     stated = context.made(SetDown).covariance
     # The arm's base takes the place of a surface here.
     seen = PartPose(pin.SE3.Identity(), fit.base_from_surface, fit.covariance, fit, beside=fit.n_points)
-    found = PlacedPart.of(job, seen, part_points(here.nominal), stated)
-    own = by_themselves(job, swept[0], found.seen, here.nominal)
-    unlike = unlike_patch(swept[0], pin.SE3.Identity(), found.seen.surface_from_part, here.nominal)
+    found = PlacedPart.of(job, seen, part_points(workplace.nominal), stated)
+    own = by_themselves(job, swept[0], found.seen, workplace.nominal)
+    unlike = unlike_patch(swept[0], pin.SE3.Identity(), found.seen.surface_from_part, workplace.nominal)
     found = replace(found, own=own, unlike=unlike, axes="axes of the arm base, in its nest")
     for note in found.notes:
         context.note(text=f"in its nest: {note}")
@@ -51,20 +53,20 @@ def _run_step(here: Workplace, context: StepContext) -> PlacedPart:
     return found
 
 
-def part_in_base(here: Workplace, job: Job, faces: NominalSurface, swept: tuple[Cloud, SweepRecord]) -> PlacePose:
+def part_in_base(workplace: Workplace, job: Job, faces: NominalSurface, swept: tuple[Cloud, SweepRecord]) -> PlacePose:
     """Where the part with these `faces` lies in the arm base, by the sweep of its nest, which is the place of `job`.
 
     Raises `RefusedError` where it is not seen there.
     """
     (cloud, record), belongs = swept, job.place.surface_from_part.se3()
-    by_calibration, by_poses = displacements(here, record, cloud)
+    by_calibration, by_poses = displacements(workplace, record, cloud)
     on_part, _ = parted(cloud, faces, belongs)
     if not on_part.valid.any():
         raise RefusedError("the nest is empty: nothing was seen where the part belongs")
     try:
         return register(
             on_part, faces, Prior(belongs, np.diag(SHIFTED**2)),
-            Tolerance(job.place.tolerance, job.place.tolerance_angle), systematic=here.kinematic,
+            Tolerance(job.place.tolerance, job.place.tolerance_angle), systematic=workplace.kinematic,
             calibration=by_calibration, sweeps=by_poses, demands=DEMANDS, partly=True,
         )  # fmt: skip
     except RefusedError as error:

@@ -70,51 +70,55 @@ class SecondLook:
 
 
 def require_in_place(
-    here: Workplace, fix: BoardFix, sweep: SweepRecord, scan: Reconstruction, pose: PlacePose, context: StepContext
+    workplace: Workplace, fix: BoardFix, sweep: SweepRecord, scan: Reconstruction, pose: PlacePose, context: StepContext
 ) -> SecondLook:
     """Sweep the first strip again, in few lines, and compare; photograph the board if the lines leave much open.
 
     Whoever goes on looks whether the rail has lost steps in it.
     Raises `RefusedError` when either has moved by more than chance brings, and what a sweep and a photograph raise.
     """
-    place = here.job.place
-    found, creep = _swept_again(here, fix, sweep, scan=scan, pose=pose, context=context)
-    if found.moved and here.job.scan.mode == "rail":
+    place = workplace.job.place
+    found, creep = _swept_again(workplace, fix, sweep, scan=scan, pose=pose, context=context)
+    if found.moved and workplace.job.scan.mode == "rail":
         # Steps that the rail has lost look like a surface that moved.
-        check_lost_steps(here.devices, lambda _, text: context.progress(0.04, text))
+        check_lost_steps(workplace.devices, lambda _, text: context.progress(0.04, text))
     require_surface_unmoved(found)
     tolerance = Tolerance(place.tolerance, place.tolerance_angle)
-    hidden = tuple(found.hidden(pose.base_from_surface, tolerance, here.nominal.radius))
+    hidden = tuple(found.hidden(pose.base_from_surface, tolerance, workplace.nominal.radius))
     if hidden or pose.verdict.unseen:
-        require_board_unmoved(here, fix, "before the sweep", lambda _, text: context.progress(0.04, text))
+        require_board_unmoved(workplace, fix, "before the sweep", lambda _, text: context.progress(0.04, text))
     return SecondLook(found, hidden, creep)
 
 
 def _swept_again(
-    here: Workplace, fix: BoardFix, sweep: SweepRecord, scan: Reconstruction, pose: PlacePose, context: StepContext
+    workplace: Workplace, fix: BoardFix, sweep: SweepRecord, scan: Reconstruction, pose: PlacePose, context: StepContext
 ) -> tuple[between_sweeps.SurfaceMotion, between_sweeps.Creep | None]:
     # The arm is not moved from where it stands already.
-    stood = sweep.rest is not None and sweep.rest is here.devices.interlocks.situation.last and len(sweep.swaths) == 1
-    few = sparse(here, here.job.scan.swath[0], sweep.swaths[0])
+    stood = (
+        sweep.rest is not None and sweep.rest is workplace.devices.interlocks.situation.last and len(sweep.swaths) == 1
+    )
+    few = sparse(workplace, workplace.job.scan.swath[0], sweep.swaths[0])
     # A camera of a few frame rates takes all the lines.
-    rate = configure_fast(here.devices, few.exposure, (few.frame_rate, here.job.scan.frame_rate))
+    rate = configure_fast(workplace.devices, few.exposure, (few.frame_rate, workplace.job.scan.frame_rate))
     again = laser_sweep(
-        here, here.base_from_surface(fix), head_at(here, sweep), few.model_copy(update={"frame_rate": rate}),
-        keep_frame=lambda frame: here.frames.keep("second-look", frame), check=context.check,
-        progress=lambda share, text: context.progress(0.04 * share, f"whether the surface lies where it did: {text}"),
-        most_lost=MOST_LOST, counted=False,
+        workplace, workplace.base_from_surface(fix), head_at(workplace, sweep),
+        few.model_copy(update={"frame_rate": rate}), keep_frame=lambda frame: workplace.frames.keep("second-look",
+        frame), check=context.check, progress=lambda share, text: context.progress(0.04 * share,
+        f"whether the surface lies where it did: {text}"), most_lost=MOST_LOST, counted=False,
     )  # fmt: skip
     # What lens and light plane are off by cancels in the same strip only.
     before, now = scan.cloud.of_sweep(0), require_points(build_cloud(again))
     there, once_more = sweep.swaths[0], again.swaths[0]
-    faster = _shifted(there, _late(here) * (pace(once_more) - pace(there)))
+    faster = _shifted(there, _late(workplace) * (pace(once_more) - pace(there)))
     spread, spread_now = there.covariance, once_more.covariance
     if stood:
-        spread, spread_now = by_times(there), here.settling + by_times(once_more) + faster
+        spread, spread_now = by_times(there), workplace.settling + by_times(once_more) + faster
     by_poses = [
         partial(flange_motions, cloud, covariances=[each]) for cloud, each in ((before, spread), (now, spread_now))
     ]
-    moved = between_sweeps.surface_motion(before, now, here.nominal, pose.base_from_surface, (by_poses[0], by_poses[1]))
+    moved = between_sweeps.surface_motion(
+        before, now, workplace.nominal, pose.base_from_surface, (by_poses[0], by_poses[1])
+    )
     if not stood:
         return moved, None
     unsure = by_times(there) + by_times(once_more) + faster
@@ -138,10 +142,10 @@ def _shifted(swath: Swath, sigma: float) -> Vector:
     return shared
 
 
-def sparse(here: Workplace, strip: SwathSection, before: Swath) -> ScanSection:
+def sparse(workplace: Workplace, strip: SwathSection, before: Swath) -> ScanSection:
     """The `strip` that was swept `before`, in about `LINES` lines: by the rail faster, where there is room to gain
     speed; by the arm no faster, since a repetition is slower."""
-    scan, rail = here.job.scan, here.config.rail
+    scan, rail = workplace.job.scan, workplace.config.rail
     speed = min(scan.speed, pace(before))
     if scan.mode == "rail":
         # As much room as beyond the ends of the sweep.
@@ -158,40 +162,40 @@ def pace(swath: Swath) -> float:
 
 
 def moved_meanwhile(
-    here: Workplace, head: ScanCalibration, over: pin.SE3, swept: tuple[Cloud, SweepRecord], *,
+    workplace: Workplace, head: ScanCalibration, over: pin.SE3, swept: tuple[Cloud, SweepRecord], *,
     part: between_sweeps.PartOnGround, context: StepContext,
 ) -> float | None:  # fmt: skip
     """Sweep the last strip the other way, in few lines: how far, m, the part has moved on since, as `part.moved` has
     it. Raises what a sweep raises."""
-    (cloud, sweep), scan = swept, here.job.scan
+    (cloud, sweep), scan = swept, workplace.job.scan
     before = sweep.swaths[-1]
-    few = sparse(here, scan.swath[-1], before)
-    rate = configure_fast(here.devices, few.exposure, (few.frame_rate, scan.frame_rate))
+    few = sparse(workplace, scan.swath[-1], before)
+    rate = configure_fast(workplace.devices, few.exposure, (few.frame_rate, scan.frame_rate))
     back = laser_sweep(
-        here, over, head, few.model_copy(update={"frame_rate": rate}), check=context.check,
-        keep_frame=lambda frame: here.frames.keep("way-back", frame),
+        workplace, over, head, few.model_copy(update={"frame_rate": rate}), check=context.check,
+        keep_frame=lambda frame: workplace.frames.keep("way-back", frame),
         progress=lambda share, text: context.progress(0.85, f"whether the part lies still: {text}"),
         most_lost=MOST_LOST, back=True, counted=False,
     )  # fmt: skip
     now = back.swaths[0]
-    unsure = here.settling + by_times(before) + by_times(now) + _other_way(here, before, now)
+    unsure = workplace.settling + by_times(before) + by_times(now) + _other_way(workplace, before, now)
     return part.moved(cloud.of_sweep(len(sweep.swaths) - 1), build_cloud(back), unsure)
 
 
-def _other_way(here: Workplace, there: Swath, back: Swath) -> Vector:
+def _other_way(workplace: Workplace, there: Swath, back: Swath) -> Vector:
     """Covariance (6, 6) of base_from_flange by which sweep and way back differ: late stamps, play, the arm's rest."""
-    late = _late(here) * (pace(there) + pace(back))
-    if here.job.scan.mode == "arm":
-        return _shifted(there, late) + 2.0 * here.repeatability
-    timing = times_known(here.calibration.scan, here.config)[0]
+    late = _late(workplace) * (pace(there) + pace(back))
+    if workplace.job.scan.mode == "arm":
+        return _shifted(there, late) + 2.0 * workplace.repeatability
+    timing = times_known(workplace.calibration.scan, workplace.config)[0]
     return _shifted(there, late + (PLAY_M if timing is None else abs(timing.play) + timing.play_sigma))
 
 
-def _late(here: Workplace) -> float:
+def _late(workplace: Workplace) -> float:
     """How late, s, one standard deviation, what is swept by comes all the time: it shifts a faster sweep farther."""
-    config, timing = here.config, times_known(here.calibration.scan, here.config)[0]
-    if here.job.scan.mode == "arm":
-        return math.hypot(config.scan_camera.late / math.sqrt(3.0), LATENCY_S * here.devices.clock.rate)
+    config, timing = workplace.config, times_known(workplace.calibration.scan, workplace.config)[0]
+    if workplace.job.scan.mode == "arm":
+        return math.hypot(config.scan_camera.late / math.sqrt(3.0), LATENCY_S * workplace.devices.clock.rate)
     return (
         timing.sigma if timing is not None else math.hypot(config.scan_camera.late, config.rail.late) / math.sqrt(3.0)
     )

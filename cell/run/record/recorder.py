@@ -300,10 +300,10 @@ class Recorder(logging.Handler):
 
     def _wire(self, device: str) -> Callable[[bool, object], None]:
         topic = {"arm": "/arm/rtde", "vehicle": "/vehicle/can"}.get(device, f"/{device}/serial")
-        put, tell = self.file.put, rtde if device == "arm" else wire
+        put, notify = self.file.put, rtde if device == "arm" else wire
 
         def listen(sent: bool, what: object) -> None:
-            put(topic, time.time_ns(), partial(tell, sent, what))
+            put(topic, time.time_ns(), partial(notify, sent, what))
 
         return listen
 

@@ -148,27 +148,27 @@ def replay(folder: Path, progress: Progress = lambda fraction, text: None) -> li
     nominal = _nominal(folder, job)
     with tempfile.TemporaryDirectory(prefix="cell-replay-") as name, FrameStore(Path(name) / "frames") as frames:
         nobody = behind_gate(config, Clock())
-        here = Workplace(
+        workplace = Workplace(
             config, job, nominal, calibration=calibration, devices=nobody, frames=frames, folder=Path(name),
             whereabouts=Whereabouts(cast(Vehicle, None))
         )  # fmt: skip
         progress(0.05, "photograph")
         told = kept["photograph"]
-        camera = here.calibration.target.camera
+        camera = workplace.calibration.target.camera
         seen = _Kept(folder, told, (camera.height, camera.width))
         fix = photograph(
-            cast(Arm, seen), cast(Camera, seen), here.calibration.target, spec=here.board, limits=here.job.photo,
-            repeatability=here.repeatability, count=len(told["files"]),
+            cast(Arm, seen), cast(Camera, seen), workplace.calibration.target, spec=workplace.board,
+            limits=workplace.job.photo, repeatability=workplace.repeatability, count=len(told["files"]),
         )  # fmt: skip
-        fix = settled(fix, here.config.arm.vehicle_from_base.se3().inverse())
+        fix = settled(fix, workplace.config.arm.vehicle_from_base.se3().inverse())
         off = pose_difference(fix.base_from_board, told["base_from_board"])
         compared = [Compared("board's pose", off or _array_difference(fix.covariance, told["covariance"]))]
         progress(0.15, "sweep")
-        head, exit_point = here.calibration.scan, here.config.laser.exit_point
+        head, exit_point = workplace.calibration.scan, workplace.config.laser.exit_point
         # What was changed comes out otherwise, which is what a replay is to show.
-        stored = StoredSweep.load(folder, head, here.job.scan, exit_point, as_written=False)
+        stored = StoredSweep.load(folder, head, workplace.job.scan, exit_point, as_written=False)
         sweep = stored.confirmed_by(fix) if kept["earlier_sweep"] else stored.sweep
-        compared += _perceive(here, folder, kept, sweep=sweep, fix=fix, progress=progress)
+        compared += _perceive(workplace, folder, kept, sweep=sweep, fix=fix, progress=progress)
     progress(0.95, "pictures of the record")
     return compared + _pictures(folder)
 
@@ -209,7 +209,7 @@ class _Kept:
 
 
 def _perceive(
-    here: Workplace, folder: Path, kept: dict[str, Any], sweep: SweepRecord, fix: BoardFix, progress: Progress
+    workplace: Workplace, folder: Path, kept: dict[str, Any], sweep: SweepRecord, fix: BoardFix, progress: Progress
 ) -> list[Compared]:
     """Cloud and pose, or their refusal."""
     compared = []
@@ -218,14 +218,14 @@ def _perceive(
     step = REPLAYED[0]
     try:
         progress(0.5, step)
-        scan = reconstructed(here, sweep)
+        scan = reconstructed(workplace, sweep)
         step = REPLAYED[1]
         if kept["pose"] is not None or kept["refused"] is not None:
             progress(0.6, step)
-            pose = inverted(here, sweep, scan, fix)
+            pose = inverted(workplace, sweep, scan, fix)
     except RefusedError as error:
         refused = {"step": step, "reason": str(error)}
-    cloud = _cloud_difference(folder, here.folder, kept["cloud_sha256"])
+    cloud = _cloud_difference(folder, workplace.folder, kept["cloud_sha256"])
     if not cloud and scan is not None and of_points(scan) != kept["points_sha256"]:
         cloud = "the same to single precision only"
     compared.append(Compared("cloud", cloud))

@@ -216,7 +216,7 @@ class Cell:
             over.enter_context(self.devices.interlocks.lifted(lift))
             text = f"maintenance ({reason}): lifted {', '.join(lift)}"
             if (run := self.current) is not None:
-                run.tell(Event("note", None, {"text": text}))
+                run.notify(Event("note", None, {"text": text}))
             else:
                 over.enter_context(recorded_maintenance(self.runs_folder, self._here.facts, reason, lift))
             log.warning("%s", text)

@@ -160,9 +160,9 @@ class Trial:
     errors: dict[str, dict[str, float]]
 
 
-def campaign(seeds: Sequence[int], noise: Noise, tell: Callable[[int], None]) -> dict[str, Any]:
-    """Run the seeds on all cores and sum them up; `tell` hears how many are done."""
-    trials = run_all(partial(one_trial, noise=noise), seeds, progress=lambda done, _: tell(done))
+def campaign(seeds: Sequence[int], noise: Noise, notify: Callable[[int], None]) -> dict[str, Any]:
+    """Run the seeds on all cores and sum them up; `notify` hears how many are done."""
+    trials = run_all(partial(one_trial, noise=noise), seeds, progress=lambda done, _: notify(done))
     return summed_up(trials, noise)
 
 

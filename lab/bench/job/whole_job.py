@@ -152,7 +152,7 @@ class _WholeJob:
     job: Job
     nominal: NominalSurface
     record: JobRecord
-    tell: Progress
+    notify: Progress
 
     def perform(self, run: Run[None], folder: Path, calibrated: JobRecord | None, stood: float) -> None:
         """Fill the record; runs go to `folder`."""
@@ -187,13 +187,13 @@ class _WholeJob:
     def _calibrate(self, context: WorkContext) -> CellCalibration:
         mover = Mover(self.cell.devices.arm, self.cell.clock, self.config, self.job, context.safe_point)
         self.cell.devices.vehicle.brake()
-        devices, tell = self.cell.devices, self.tell
+        devices, notify = self.cell.devices, self.notify
         given, keep = (self.config, devices, mover, context.check), NoFrames().keep
-        scan = collect_scan(*given, lambda f, t: tell(0.36 * f, f"calibrate: {t}"), keep)
+        scan = collect_scan(*given, lambda f, t: notify(0.36 * f, f"calibrate: {t}"), keep)
         witness = see_reference_plate(self.config, devices, keep)
-        target = collect_target(*given, lambda f, t: tell(0.36 + 0.12 * f, f"calibrate: {t}"), keep)
+        target = collect_target(*given, lambda f, t: notify(0.36 + 0.12 * f, f"calibrate: {t}"), keep)
         self.record.observations = (scan, target)
-        tell(0.48, "calibrate: solving")
+        notify(0.48, "calibrate: solving")
         named = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
         identities = {device.name: device.identity().serial for device in named}
         known = identities, self.config, arm_table(self.config, self.cell.devices), witness
@@ -206,7 +206,7 @@ class _WholeJob:
         names = kind_of(self.job).names
         if event.kind == "step_started" and event.step in names:
             self.record.stage = str(event.step)
-            self.tell(0.6 + 0.4 * names.index(str(event.step)) / len(names), str(event.step))
+            self.notify(0.6 + 0.4 * names.index(str(event.step)) / len(names), str(event.step))
         if event.kind == "step_done" and event.step == "laser_sweep":
             self.record.at_sweep = self.cell.truth()
 

@@ -115,11 +115,11 @@ def sweep(lines: int, width: int, rows: int, seed: int) -> tuple[ProfileBuilder,
     return ProfileBuilder(geometry, lines), profiles
 
 
-def speed(seed: int, tell: Callable[[float, str], None]) -> dict[str, list[dict[str, float]]]:
-    """Milliseconds for each profile, and after the last frame, by camera; `tell` gets the share done and a text."""
+def speed(seed: int, notify: Callable[[float, str], None]) -> dict[str, list[dict[str, float]]]:
+    """Milliseconds for each profile, and after the last frame, by camera; `notify` gets the share done and a text."""
     rows = []
     for k, (width, height) in enumerate(CAMERAS):
-        tell(k / len(CAMERAS), f"{width}×{height}")
+        notify(k / len(CAMERAS), f"{width}×{height}")
         builder, profiles = sweep(LINES, width, height, seed)
         begun = time.perf_counter()
         for profile in profiles:

@@ -67,13 +67,13 @@ class _Session(Cell):
         """See `Cell.begin`."""
 
         def heard(run: Run[Made]) -> Made:
-            tell = run.tell
+            notify = run.notify
 
             def both(event: Event) -> None:
-                tell(event)
+                notify(event)
                 self._day.hear(run, event)
 
-            run.tell = both  # type: ignore[method-assign]
+            run.notify = both  # type: ignore[method-assign]
             return work(run)
 
         return super().begin(kind, heard, observer, stops)
@@ -309,7 +309,7 @@ class Day:
 
     def _hold(self, run: Run[object], entries: list[Entry]) -> None:
         """Time passes while the run waits for a person, and things happen meanwhile."""
-        with self._clock.looking(lambda: None):
+        with self._clock.checking(lambda: None):
             for entry in entries:
                 if entry.meanwhile:
                     self._happen(run, Entry(entry.meanwhile))

@@ -69,7 +69,7 @@ class ModbusDriveServer:
     def read(self, address: int, count: int, inputs: bool) -> list[int] | None:
         """`count` holding or input registers from `address` on; None when one of them does not exist."""
         with self._lock:
-            self._look()
+            self._poll()
             there = self._readable(inputs)
             if any(number not in there for number in range(address, address + count)):
                 return None
@@ -103,7 +103,7 @@ class ModbusDriveServer:
                 there[entry["address"]] = word | (told() == entry["set"]) << entry["bit"]
         return there
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """A search that has come to its end has found the zero."""
         t = self.clock.now()
         if self._searching and not self.rail.searching(t) and self.rail.velocity(t) == 0:
@@ -114,7 +114,7 @@ class ModbusDriveServer:
     def write(self, address: int, values: list[int]) -> bool:
         """Write holding registers; False when one of them does not exist, or cannot be written."""
         with self._lock:
-            self._look()
+            self._poll()
             given = [
                 name for name in ("start", "home", "stop") if self._map[name]["address"] == address and len(values) == 1
             ]

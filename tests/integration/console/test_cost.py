@@ -58,10 +58,10 @@ def show(server: Served, picture: np.ndarray) -> None:
     """Twenty states, ten pictures and ten increments of the cloud a second."""
     begun = time.monotonic()
     for n in range(round(SECONDS / PERIOD_S)):
-        server.process.tell(Show(json.dumps({"type": "state", "n": n, "fill": "x" * 3000})))
+        server.process.notify(Show(json.dumps({"type": "state", "n": n, "fill": "x" * 3000})))
         if n % 2 == 0:
-            server.process.tell(ShownPicture({"type": "picture", "camera": "scan_camera"}, np.roll(picture, n, 1)))
-            server.process.tell(CloudPart({"type": "cloud", "reset": n % 100 == 0}, b"\0" * 6400))
+            server.process.notify(ShownPicture({"type": "picture", "camera": "scan_camera"}, np.roll(picture, n, 1)))
+            server.process.notify(CloudPart({"type": "cloud", "reset": n % 100 == 0}, b"\0" * 6400))
         time.sleep(max(0.0, begun + (n + 1) * PERIOD_S - time.monotonic()))
 
 

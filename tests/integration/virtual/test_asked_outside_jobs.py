@@ -129,44 +129,44 @@ def test_a_jog_that_was_stopped_goes_on_to_its_goal_and_no_further(cell: Cell) -
 
 
 def test_manual_mode_asks_at_the_desk_takes_no_step_meanwhile_and_goes_on(cell: Cell) -> None:
-    desk = ConsoleController(cell, "pot", lambda client, words: None)
-    desk.joined("c1")
-    desk.do("c1", {"do": "hold", "name": "Ann"})
-    desk.do("c1", {"do": "manual", "on": True})
+    controller = ConsoleController(cell, "pot", lambda client, words: None)
+    controller.joined("c1")
+    controller.do("c1", {"do": "hold", "name": "Ann"})
+    controller.do("c1", {"do": "manual", "on": True})
     step = {"do": "jog_step", "device": "arm", "axis": "z", "amount": 0.01}
     stop_on_the_way(cell)
     with pytest.raises(DeviceFault, match="protective stop"):
-        desk.do("c1", step)
+        controller.do("c1", step)
     number, _ = asked(cell).control.question or (0, "")
     with pytest.raises(InterlockError, match="answer the question first"):
-        desk.do("c1", step)
-    desk.do("c1", {"do": "decide", "number": number, "choice": "confirm", "reason": "the way is clear"})
+        controller.do("c1", step)
+    controller.do("c1", {"do": "decide", "number": number, "choice": "confirm", "reason": "the way is clear"})
     assert until(lambda: (run := cell.current) is not None and run.control.question is None)
     assert until(lambda: simulated(cell).arm.model.safety is Safety.NORMAL)
     before = cell.devices.arm.state().flange[2]
 
     def stepped() -> bool:
         try:
-            return desk.do("c1", step)["ok"] is True
+            return controller.do("c1", step)["ok"] is True
         except Aborted:
             return False  # asked for before manual mode had begun anew: dropped, not done later
 
     assert until(stepped)
     assert cell.devices.arm.state().flange[2] - before == pytest.approx(0.01, abs=1e-4)
-    desk.close()
+    controller.close()
 
 
 def test_an_arm_that_stopped_while_nothing_runs_is_unlocked_by_a_person_alone(cell: Cell) -> None:
-    desk = ConsoleController(cell, "pot", lambda client, words: None)
-    desk.joined("c1")
+    controller = ConsoleController(cell, "pot", lambda client, words: None)
+    controller.joined("c1")
     simulated(cell).fault("arm.protective_stop")
     with pytest.raises(InterlockError, match="does not hold it"):
-        desk.do("c1", {"do": "recover"})
+        controller.do("c1", {"do": "recover"})
     with pytest.raises(CellError, match="the name of the person"):
         cell.recover(" ")
     assert simulated(cell).arm.model.safety is Safety.PROTECTIVE_STOP
-    desk.do("c1", {"do": "hold", "name": "Ann"})
-    desk.do("c1", {"do": "recover"})
+    controller.do("c1", {"do": "hold", "name": "Ann"})
+    controller.do("c1", {"do": "recover"})
     assert until(lambda: cell.current is None)
     assert simulated(cell).arm.model.safety is Safety.NORMAL
     (folder,) = cell.runs_folder.iterdir()

@@ -106,8 +106,8 @@ def test_a_vehicle_that_was_moved_in_a_fault_is_not_swept_from_where_it_stood() 
                 cell.simulated.world.vehicle._x += 0.01
 
         run = cell.start("pot.toml", inject=[STOP])
-        tell = run.tell
-        run.tell = lambda event: (push(event), tell(event))[1]  # type: ignore[method-assign]
+        notify = run.notify
+        run.notify = lambda event: (push(event), notify(event))[1]  # type: ignore[method-assign]
         outcome = run.result(120.0)
     assert outcome.outcome == "refused"
     assert outcome.report["refusal"]["step"] == "laser_sweep"

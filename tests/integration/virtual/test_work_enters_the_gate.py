@@ -37,8 +37,8 @@ def test_every_step_enters_the_gate_with_the_token_that_ends_it(tmp_path: Path) 
     cell = VirtualCell(config, 1)
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
     whereabouts = Whereabouts(cell.devices.vehicle)
-    here = Workplace(config, job, nominal, None, cell.devices, NoFrames(), tmp_path, whereabouts)  # type: ignore[arg-type]
-    for name, step in PLACE.work(here).items():
+    workplace = Workplace(config, job, nominal, None, cell.devices, NoFrames(), tmp_path, whereabouts)  # type: ignore[arg-type]
+    for name, step in PLACE.work(workplace).items():
         control = RunControl()
         control.abort("enough")
         with cell.devices.gate.entered(CancelToken()):

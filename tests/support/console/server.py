@@ -55,9 +55,9 @@ class Served:
             case Do(number, _, words):
                 self.heard.put(message)
                 if words.get("do") != "diag":
-                    self.process.tell(Answer(number, 200, {"ok": True, "text": str(words.get("do"))}))
+                    self.process.notify(Answer(number, 200, {"ok": True, "text": str(words.get("do"))}))
             case AskCell(number, job):
-                self.process.tell(Answer(number, 200, {"job": job}))
+                self.process.notify(Answer(number, 200, {"job": job}))
             case _:
                 self.heard.put(message)
 
@@ -171,10 +171,10 @@ class Reply:
         return json.loads(self.text)
 
 
-def refusal(desk: ConsoleController, client: str, **words: Any) -> CellError:
+def refusal(controller: ConsoleController, client: str, **words: Any) -> CellError:
     """What a desk answers to a command that it refuses."""
     with pytest.raises(CellError) as refused:
-        desk.do(client, words)
+        controller.do(client, words)
     return refused.value
 
 

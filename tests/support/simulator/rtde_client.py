@@ -23,7 +23,7 @@ class Rtde:
             if found == kind:
                 return content
 
-    def tell(self, payload: bytes) -> None:
+    def notify(self, payload: bytes) -> None:
         self.socket.sendall(struct.pack(">HB", 3 + len(payload), ord("U")) + payload)
 
     def next(self) -> tuple[str, bytes]:

@@ -86,7 +86,7 @@ class OtherDrive:
         self.node.add_read_callback(self._read)
         self.node.add_write_callback(self._written)
         network.subscribe(0x200 + node, lambda _i, data, _t: self._command(bytes(data)))
-        network.subscribe(0x080, lambda *_: self._tell())
+        network.subscribe(0x080, lambda *_: self._notify())
         network.subscribe(0x700 + 127, lambda *_: self._hear())
         self.node.nmt.send_command(0)
 
@@ -145,7 +145,7 @@ class OtherDrive:
         elif word & 0x07 == 0x06:
             self.state = "ready"
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         if self.node.nmt.state != "OPERATIONAL":
             return
         for k in range(4):

@@ -121,8 +121,8 @@ def verify(
 
     with Cell.open(config, sim=sim, seed=seed, level=level.value, job=job) as cell, ProgressDisplay() as display:
         verification = cell.verify(display, job)
-    tell = print_json if json else print_verification
-    tell(verification.summary())
+    notify = print_json if json else print_verification
+    notify(verification.summary())
     if not verification.good:
         raise typer.Exit(1)
 

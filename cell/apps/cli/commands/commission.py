@@ -65,7 +65,7 @@ def commission(
         config, _person(by_itself, console), partial(_show, console),
         job=job, sim=sim, seed=seed, level=level.value, clock=clock.value, truth=truth,
     )  # fmt: skip
-    made.desk.heard = tell_question
+    made.workplace.heard = tell_question
     if show:
         _list(made, checks, json)
         return
@@ -73,10 +73,10 @@ def commission(
         made.progress.forget([check.name for check in checks])
     try:
         good = made.go(checks)
-        protocol = write_protocol(made.progress, CHECKS, made.desk.config)
-        now = made.desk.config
+        protocol = write_protocol(made.progress, CHECKS, made.workplace.config)
+        now = made.workplace.config
     finally:
-        made.desk.close()
+        made.workplace.close()
     if json:
         rows = {
             check.name: {"standing": made.progress.standing(check, now), **(made.progress.result(check.name) or {})}

@@ -78,7 +78,7 @@ def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
     from cell.apps.console.host.console import Console
 
     gone = threading.Event()
-    with SignalWatch() as signals, Console(cell, job, address, page_teller(open_page), gone.set):
+    with SignalWatch() as signals, Console(cell, job, address, page_notifier(open_page), gone.set):
         while signals.reason is None and not gone.wait(0.2):
             pass
         if gone.is_set():
@@ -100,7 +100,7 @@ def run_shown(
     from cell.apps.console.host.console import Address, Console
 
     virtual = cell.simulated is not None and cell.simulated.facts["clock"] == "virtual"
-    with Console(cell, job, Address(port=port), page_teller(open_page)) as console:
+    with Console(cell, job, Address(port=port), page_notifier(open_page)) as console:
         with console.computing(job) if virtual else nullcontext() as done:
             outcome = cell.run(job, display, inject, until=until, script=console.script(job))
             if done is not None:
@@ -111,11 +111,11 @@ def run_shown(
     return outcome
 
 
-def page_teller(open_page: bool) -> Callable[[str], None]:
+def page_notifier(open_page: bool) -> Callable[[str], None]:
     """What is done with each new link: printed, and the first one opened."""
     told: list[str] = []
 
-    def tell(link: str) -> None:
+    def notify(link: str) -> None:
         typer.echo(
             f"the cell's page, for one browser: {link}" if not told else f"for another browser: {link}", err=True
         )
@@ -123,7 +123,7 @@ def page_teller(open_page: bool) -> Callable[[str], None]:
             open_unseen(link)
         told.append(link)
 
-    return tell
+    return notify
 
 
 def open_unseen(link: str) -> None:

@@ -149,13 +149,13 @@ def new_job(
     }  # fmt: skip
     told: list[str] = []
 
-    def tell(text: str) -> None:
+    def notify(text: str) -> None:
         told.append(text)
         if not json:
             typer.echo(text)
 
     source = find_config(config, simulated=True)
-    asker = Asker(given, None if yes else partial(typer.prompt, err=json), tell)
+    asker = Asker(given, None if yes else partial(typer.prompt, err=json), notify)
     made = make_job(asker, load_config(source), folder, overwrite)
     if json:
         known = {"seen": round(made.seen, 3), "expected": made.place.summary(), "notes": list(made.notes), "told": told}

@@ -25,18 +25,20 @@ MASS_OFF, CENTRE_OFF = 0.25, 0.025
 """kg and m by which a payload may differ from what the force tells."""
 
 
-def _axes(desk: CommissionWorkplace, result: Result) -> None:
-    arm = desk.devices.arm
-    desk.brake()
-    kinematics = desk.cell.mover(None).kinematics
+def _axes(workplace: CommissionWorkplace, result: Result) -> None:
+    arm = workplace.devices.arm
+    workplace.brake()
+    kinematics = workplace.cell.mover(None).kinematics
     for joint in range(6):
-        desk.look_around()
-        desk.confirm(f"joint {joint + 1}", "this joint alone", "2 deg and back", f"{math.degrees(SPEED):.0f} deg/s")
+        workplace.look_around()
+        workplace.confirm(
+            f"joint {joint + 1}", "this joint alone", "2 deg and back", f"{math.degrees(SPEED):.0f} deg/s"
+        )
         start = arm.state()
         goal = start.joints.copy()
         goal[joint] += STEP
         arm.move_joints(goal, SPEED, ACCELERATION).wait(20.0)
-        desk.devices.clock.sleep(desk.config.arm.settle_time)
+        workplace.devices.clock.sleep(workplace.config.arm.settle_time)
         then = arm.state()
         turned = np.degrees(then.joints - start.joints)
         low, high = math.degrees(STEP) - MOST_OFF_DEG, math.degrees(STEP) + MOST_OFF_DEG
@@ -48,7 +50,7 @@ def _axes(desk: CommissionWorkplace, result: Result) -> None:
         off = 1e3 * float(np.linalg.norm(way.translation - meant.translation))
         result.measure(f"flange off the model's way, joint {joint + 1}", off, "mm", most=0.1)
         arm.move_joints(start.joints, SPEED, ACCELERATION).wait(20.0)
-    if not desk.person.sees("Did each joint turn alone, a little way there and back, without touching anything?"):
+    if not workplace.person.sees("Did each joint turn alone, a little way there and back, without touching anything?"):
         result.notes.append("a person saw a joint move otherwise: see that the arm is the one at arm.address")
         result.require("a person saw every joint move as announced", False)
     beyond = arm.state().joints.copy()
@@ -57,14 +59,14 @@ def _axes(desk: CommissionWorkplace, result: Result) -> None:
     result.require("a joint beyond its limit refused", stayed)
 
 
-def _payload(desk: CommissionWorkplace, result: Result) -> None:
-    arm, config = desk.devices.arm, desk.config.arm
-    desk.fold()
-    mover = desk.mover()
+def _payload(workplace: CommissionWorkplace, result: Result) -> None:
+    arm, config = workplace.devices.arm, workplace.config.arm
+    workplace.fold()
+    mover = workplace.mover()
     turns: list[Vector] = []
     wrenches: list[Vector] = []
     for fourth, fifth in TURNS_DEG:
-        desk.look_around()
+        workplace.look_around()
         joints = HOME.copy()
         joints[3] += math.radians(fourth)
         joints[4] += math.radians(fifth)
@@ -72,7 +74,7 @@ def _payload(desk: CommissionWorkplace, result: Result) -> None:
         samples = []
         for _ in range(SAMPLES):
             samples.append(arm.state().wrench)
-            desk.devices.clock.sleep(PERIOD_S)
+            workplace.devices.clock.sleep(PERIOD_S)
         turns.append(from_ur(arm.state().flange).rotation)
         wrenches.append(np.mean(samples, axis=0))
     mover.to_joints(HOME)

@@ -27,10 +27,10 @@ LEAST_CONTRAST = 25.0
 MOST_SATURATED = 1.0
 
 
-def _look(name: str, desk: CommissionWorkplace, result: Result) -> None:
-    eye = eye_of(desk, name)
-    seen = find_view(desk, result, eye)
-    desk.keep(result, f"{name}-focus", seen.frame, seen.view.pixels)
+def _look(name: str, workplace: CommissionWorkplace, result: Result) -> None:
+    eye = eye_of(workplace, name)
+    seen = find_view(workplace, result, eye)
+    workplace.keep(result, f"{name}-focus", seen.frame, seen.view.pixels)
     picture_figures(result, seen.frame.image, seen.view.pixels, eye)
     result.measure("points of the board in the picture", len(seen.view.ids), "", least=12)
 
@@ -57,11 +57,11 @@ def picture_figures(result: Result, image: Image, points: object, eye: Eye) -> N
     )  # fmt: skip
 
 
-def _mounting(name: str, desk: CommissionWorkplace, result: Result) -> None:
-    eye = eye_of(desk, name)
-    axes, found = measure(desk, result, eye)
+def _mounting(name: str, workplace: CommissionWorkplace, result: Result) -> None:
+    eye = eye_of(workplace, name)
+    axes, found = measure(workplace, result, eye)
     drawn = eye.config.flange_from_camera.se3()
-    words, right = against_drawing(found.flange_from_camera, drawn, _carriage(desk, name))
+    words, right = against_drawing(found.flange_from_camera, drawn, _carriage(workplace, name))
     angle = np.linalg.norm(pin.log3(drawn.rotation.T @ found.flange_from_camera.rotation))
     result.measure("board by the arm's measure over its name", axes.across, "")
     result.measure("depth by the arm's measure over the picture's", axes.along, "")
@@ -82,12 +82,12 @@ def _mounting(name: str, desk: CommissionWorkplace, result: Result) -> None:
     _board(eye, result, axes.across, axes.along, found)
 
 
-def _carriage(desk: CommissionWorkplace, name: str) -> tuple[float, float]:
+def _carriage(workplace: CommissionWorkplace, name: str) -> tuple[float, float]:
     """Between which ways along its x axis the camera may be from where it is drawn, m: at rail position 0."""
     if name != "scan_camera":
         return 0.0, 0.0
-    state = desk.devices.rail.state()
-    low, high = desk.config.rail.travel
+    state = workplace.devices.rail.state()
+    low, high = workplace.config.rail.travel
     return (state.position, state.position) if state.homed_here else (min(low, 0.0), max(high, 0.0))
 
 

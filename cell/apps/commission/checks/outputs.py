@@ -47,37 +47,39 @@ def bright_rows(off: Image, on: Image) -> int:
     return int(((peak > 10.0 * noise) & narrow).sum())
 
 
-def _outputs(desk: CommissionWorkplace, result: Result) -> None:
-    config = desk.config
+def _outputs(workplace: CommissionWorkplace, result: Result) -> None:
+    config = workplace.config
     if not isinstance(config.laser, OnArm) or not isinstance(config.claw, OnArm):
         result.notes.append("laser or claw does not hang on the arm's outputs: each is tried as it is configured")
-        _laser_alone(desk, result)
-        desk.confirm("claw", "the claw opens and closes, hands out of it", "its whole stroke", "its own")
-        _claw(desk, result)
+        _laser_alone(workplace, result)
+        workplace.confirm("claw", "the claw opens and closes, hands out of it", "its whole stroke", "its own")
+        _claw(workplace, result)
         return
     laser, claw = config.laser.output, config.claw.output
-    centred_view(desk, result, eye_of(desk, "scan_camera"))
+    centred_view(workplace, result, eye_of(workplace, "scan_camera"))
     goggles = f"output {laser}: laser goggles on, nobody looks into the beam"
-    desk.confirm("laser", goggles, "half a second each time", "on and off")
-    desk.confirm("claw", f"output {claw}: the claw opens and closes, hands out of it", "its whole stroke", "its own")
-    if not desk.person.does("Take whatever is in the claw out of it: it will open."):
+    workplace.confirm("laser", goggles, "half a second each time", "on and off")
+    workplace.confirm(
+        "claw", f"output {claw}: the claw opens and closes, hands out of it", "its whole stroke", "its own"
+    )
+    if not workplace.person.does("Take whatever is in the claw out of it: it will open."):
         raise RefusedError("the claw was not emptied, so its output was not switched. Take out what is in it")
     # Both off first: an output that is on already shows nothing when it is switched on.
-    with desk.cell.maintenance("commissioning: what hangs on which output", ["own_switch"]):
+    with workplace.cell.maintenance("commissioning: what hangs on which output", ["own_switch"]):
         for output in (claw, laser):
-            desk.devices.arm.set_digital_output(output, False)
-        desk.devices.clock.sleep(SETTLE_S)
-        by_laser = _switch(desk, laser)
-        by_claw = _switch(desk, claw)
-    desk.keep(result, "output-laser-on", by_laser.on)
-    desk.keep(result, "output-claw-on", by_claw.on)
+            workplace.devices.arm.set_digital_output(output, False)
+        workplace.devices.clock.sleep(SETTLE_S)
+        by_laser = _switch(workplace, laser)
+        by_claw = _switch(workplace, claw)
+    workplace.keep(result, "output-laser-on", by_laser.on)
+    workplace.keep(result, "output-claw-on", by_claw.on)
     rows = by_laser.on.image.shape[0]
     enough = LEAST_ROWS_SHARE * rows
     result.measure(f"rows with a stripe while laser.output ({laser}) is on", by_laser.stripe_rows, f"of {rows}")
     result.measure(f"rows with a stripe while claw.output ({claw}) is on", by_claw.stripe_rows, f"of {rows}")
     if by_laser.stripe_rows >= enough and by_claw.stripe_rows < enough:
-        _stripe(desk, result, by_laser.on)
-        _claw(desk, result)
+        _stripe(workplace, result, by_laser.on)
+        _claw(workplace, result)
     elif by_claw.stripe_rows >= enough and by_laser.stripe_rows < enough:
         result.find(
             "laser.output, claw.output",
@@ -87,20 +89,20 @@ def _outputs(desk: CommissionWorkplace, result: Result) -> None:
             write={"laser.output": str(claw), "claw.output": str(laser)},
         )  # fmt: skip
     else:
-        _no_light(desk, result, laser, claw, enough)
+        _no_light(workplace, result, laser, claw, enough)
 
 
-def _no_light(desk: CommissionWorkplace, result: Result, laser: int, claw: int, enough: float) -> None:
+def _no_light(workplace: CommissionWorkplace, result: Result, laser: int, claw: int, enough: float) -> None:
     """Neither of the two lights the laser, or both do: try the others, if a person agrees."""
     others = [output for output in range(OUTPUTS) if output not in (laser, claw)]
     lit: list[int] = []
-    if desk.person.go_ahead(
+    if workplace.person.go_ahead(
         f"No stripe with outputs {laser} and {claw}. The others are switched on one after the other."
     ):
-        with desk.cell.maintenance("commissioning: which output lights the laser", ["own_switch"]):
+        with workplace.cell.maintenance("commissioning: which output lights the laser", ["own_switch"]):
             for output in others:
-                desk.look_around()
-                if _switch(desk, output).stripe_rows >= enough:
+                workplace.look_around()
+                if _switch(workplace, output).stripe_rows >= enough:
                     lit.append(output)
     result.find(
         "laser.output", "no stripe comes when the laser's output is switched on",
@@ -111,14 +113,14 @@ def _no_light(desk: CommissionWorkplace, result: Result, laser: int, claw: int, 
     )  # fmt: skip
 
 
-def _switch(desk: CommissionWorkplace, output: int) -> Switched:
+def _switch(workplace: CommissionWorkplace, output: int) -> Switched:
     """Switch an output on and off again, with a picture before and while it is on."""
-    arm, clock = desk.devices.arm, desk.devices.clock
-    camera = camera_of(desk, eye_of(desk, "scan_camera"))
-    camera.configure(desk.config.calibration.stripe_exposure, PHOTO_RATE)
+    arm, clock = workplace.devices.arm, workplace.devices.clock
+    camera = camera_of(workplace, eye_of(workplace, "scan_camera"))
+    camera.configure(workplace.config.calibration.stripe_exposure, PHOTO_RATE)
     off = camera.grab()
     # What lights up may be the laser, whatever the configuration says: a stop must not leave it on.
-    with desk.devices.interlocks.tried(output):
+    with workplace.devices.interlocks.tried(output):
         try:
             arm.set_digital_output(output, True)
             clock.sleep(SETTLE_S)
@@ -129,30 +131,30 @@ def _switch(desk: CommissionWorkplace, output: int) -> Switched:
     return Switched(off, on)
 
 
-def _laser_alone(desk: CommissionWorkplace, result: Result) -> None:
-    eye = eye_of(desk, "scan_camera")
-    centred_view(desk, result, eye)
-    desk.confirm("laser", "laser goggles on, nobody looks into the beam", "half a second", "on and off")
-    camera = camera_of(desk, eye)
-    camera.configure(desk.config.calibration.stripe_exposure, PHOTO_RATE)
+def _laser_alone(workplace: CommissionWorkplace, result: Result) -> None:
+    eye = eye_of(workplace, "scan_camera")
+    centred_view(workplace, result, eye)
+    workplace.confirm("laser", "laser goggles on, nobody looks into the beam", "half a second", "on and off")
+    camera = camera_of(workplace, eye)
+    camera.configure(workplace.config.calibration.stripe_exposure, PHOTO_RATE)
     off = camera.grab()
-    with desk.devices.interlocks.purpose("test"), desk.devices.laser.lit():
-        desk.devices.clock.sleep(SETTLE_S)
+    with workplace.devices.interlocks.purpose("test"), workplace.devices.laser.lit():
+        workplace.devices.clock.sleep(SETTLE_S)
         on = camera.grab()
-    desk.keep(result, "laser-on", on)
+    workplace.keep(result, "laser-on", on)
     rows = bright_rows(off.image, on.image)
     result.measure(
         "rows with a stripe while the laser is lit", rows, f"of {on.image.shape[0]}",
         least=LEAST_ROWS_SHARE * on.image.shape[0], remedy="See what switches the laser, its power and its shutter.",
     )  # fmt: skip
-    _stripe(desk, result, on)
+    _stripe(workplace, result, on)
 
 
-def _stripe(desk: CommissionWorkplace, result: Result, lit: Frame) -> None:
+def _stripe(workplace: CommissionWorkplace, result: Result, lit: Frame) -> None:
     """How good the stripe is: how many rows, how wide, how bright."""
     profile = extract(lit.image)
     rows = profile.rows
-    desk.keep(result, "stripe", lit, profile.pixels()[:: max(1, len(rows) // 60)])
+    workplace.keep(result, "stripe", lit, profile.pixels()[:: max(1, len(rows) // 60)])
     exposure = "calibration.stripe_exposure"
     result.measure(
         "rows with a stripe centre", len(rows), "", least=LEAST_ROWS_SHARE * lit.image.shape[0],
@@ -169,22 +171,22 @@ def _stripe(desk: CommissionWorkplace, result: Result, lit: Frame) -> None:
         result.measure("stripe rows that are saturated", saturated, "%", most=MOST_SATURATED, remedy=remedy)
 
 
-def _claw(desk: CommissionWorkplace, result: Result) -> None:
+def _claw(workplace: CommissionWorkplace, result: Result) -> None:
     """With a part in it the claw's input shows it, and shows it no more when it has opened."""
-    claw = desk.devices.claw
-    if not desk.person.does("Hold a part between the fingers: the claw closes on it.", desk.fill_claw):
+    claw = workplace.devices.claw
+    if not workplace.person.does("Hold a part between the fingers: the claw closes on it.", workplace.fill_claw):
         raise RefusedError("no part was put into the claw, so its feedback was not tried")
-    before = desk.devices.arm.state().digital_inputs
+    before = workplace.devices.arm.state().digital_inputs
     if not claw.holding:
         claw.grip(5.0)
-    held = desk.devices.arm.state().digital_inputs
+    held = workplace.devices.arm.state().digital_inputs
     result.require("claw.feedback shows the part when closed", claw.holding)
-    if not desk.person.does("Keep a hand below the part: the claw opens."):
+    if not workplace.person.does("Keep a hand below the part: the claw opens."):
         return
-    with desk.cell.maintenance("commissioning: the claw opens in the open", ["claw_at_contact"]):
+    with workplace.cell.maintenance("commissioning: the claw opens in the open", ["claw_at_contact"]):
         claw.release(5.0)
     result.measure("claw.feedback shows the part when open", float(claw.holding), "", most=0.0)
-    changed = (held ^ desk.devices.arm.state().digital_inputs) | (before ^ held)
+    changed = (held ^ workplace.devices.arm.state().digital_inputs) | (before ^ held)
     shown = ", ".join(str(k) for k in range(OUTPUTS) if changed >> k & 1) or "none"
     result.notes.append(f"inputs that changed with the claw: {shown}")
 

@@ -26,47 +26,49 @@ BEYOND = 0.006
 """How far beyond an end of the travel its limit switch is looked for, m."""
 
 
-def _direction(desk: CommissionWorkplace, result: Result) -> None:
-    rail = desk.devices.rail
-    eye = eye_of(desk, "scan_camera")
-    if not _nudged(desk) and not rail.state().homed_here:
-        desk.fold()
+def _direction(workplace: CommissionWorkplace, result: Result) -> None:
+    rail = workplace.devices.rail
+    eye = eye_of(workplace, "scan_camera")
+    if not _nudged(workplace) and not rail.state().homed_here:
+        workplace.fold()
         # The zero of a rail whose direction nobody has seen: a person watches it.
-        desk.confirm(
+        workplace.confirm(
             "rail", "it searches its home switch; watch whether it goes towards that, and stop it if not",
             "its whole travel at most", "half its configured speed",
         )  # fmt: skip
-        desk.devices.rail.home().wait(120.0)
-        if not desk.person.sees("Did the carriage go to its home switch and stop there?"):
+        workplace.devices.rail.home().wait(120.0)
+        if not workplace.person.sees("Did the carriage go to its home switch and stop there?"):
             raise RefusedError("the rail did not go to its home switch: have its drive turn the motor the other way")
-    first = centred_view(desk, result, eye)
-    desk.keep(result, "rail-before", first.frame, first.view.pixels)
+    first = centred_view(workplace, result, eye)
+    workplace.keep(result, "rail-before", first.frame, first.view.pixels)
     state = rail.state()
     step = -1.0 if state.right_switch and not state.left_switch else 1.0
-    desk.confirm("rail", "the carriage, away from its switches", "1 mm, then 5 mm, and back", f"{1e3 * SPEED:.0f} mm/s")
+    workplace.confirm(
+        "rail", "the carriage, away from its switches", "1 mm, then 5 mm, and back", f"{1e3 * SPEED:.0f} mm/s"
+    )
     told, moved = 0.0, np.zeros(3)
     for way in (FIRST_STEP, STEP):
-        _nudge(desk, step * (way - abs(told)))
+        _nudge(workplace, step * (way - abs(told)))
         told = step * way
         try:
-            then = see(desk, eye)
+            then = see(workplace, eye)
         except RefusedError:
             break
-        desk.keep(result, "rail-after", then.frame, then.view.pixels)
+        workplace.keep(result, "rail-after", then.frame, then.view.pixels)
         # The board stands, so the camera has gone the other way.
         moved = first.camera_from_board.translation - then.camera_from_board.translation
         reached = told
-    _nudge(desk, -told)
+    _nudge(workplace, -told)
     if not moved.any():
         raise RefusedError(
             f"after 1 mm of the rail the camera does not see the board any more: the carriage goes much farther than "
-            f"it is told. Look at rail.lead {1e3 * desk.config.rail.lead:g} mm and at the motor's steps per turn"
+            f"it is told. Look at rail.lead {1e3 * workplace.config.rail.lead:g} mm and at the motor's steps per turn"
         )
     way, along = float(np.linalg.norm(moved)), float(moved[0])
     result.measure("commanded", 1e3 * reached, "mm")
     result.measure("the camera went, along its x axis", 1e3 * along, "mm")
     result.measure("the camera went, in all", 1e3 * way, "mm")
-    judge(desk.config.rail, result, reached, moved)
+    judge(workplace.config.rail, result, reached, moved)
 
 
 def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
@@ -108,29 +110,29 @@ def judge(rail: RailConfig, result: Result, told: float, moved: Vector) -> None:
         )  # fmt: skip
 
 
-def _nudged(desk: CommissionWorkplace) -> bool:
+def _nudged(workplace: CommissionWorkplace) -> bool:
     """Whether this make of rail moves by a little before it is homed."""
-    rail = desk.devices.rail
+    rail = workplace.devices.rail
     return isinstance(getattr(rail, "bare", rail), Nudged)
 
 
-def _nudge(desk: CommissionWorkplace, way: float) -> None:
+def _nudge(workplace: CommissionWorkplace, way: float) -> None:
     """By a little; a make that moves only when it is homed has been homed."""
-    rail, speed = desk.devices.rail, min(SPEED, desk.config.rail.max_speed)
+    rail, speed = workplace.devices.rail, min(SPEED, workplace.config.rail.max_speed)
     if abs(way) < 1e-6:
         return
-    if _nudged(desk):
+    if _nudged(workplace):
         assert isinstance(rail, Nudged)
         rail.nudge(way, speed).wait(30.0)
     else:
         rail.move_to(rail.state().position + way, speed).wait(30.0)
 
 
-def _limits(desk: CommissionWorkplace, result: Result) -> None:
-    rail, config, clock = desk.devices.rail, desk.config.rail, desk.devices.clock
+def _limits(workplace: CommissionWorkplace, result: Result) -> None:
+    rail, config, clock = workplace.devices.rail, workplace.config.rail, workplace.devices.clock
     low, high = config.travel
-    desk.fold()
-    desk.confirm("rail", "it searches its home switch", "its whole travel at most", "half its configured speed")
+    workplace.fold()
+    workplace.confirm("rail", "it searches its home switch", "its whole travel at most", "half its configured speed")
     begun = clock.now()
     rail.home().wait(120.0)
     result.measure("home switch found after", clock.now() - begun, "s")
@@ -151,21 +153,21 @@ def _limits(desk: CommissionWorkplace, result: Result) -> None:
 
     kept = sum(refused(partial(go, beyond), LimitError) for beyond in (low - 0.001, high + 0.001))
     result.measure("commands 1 mm beyond an end refused", kept, "of 2", least=2.0)
-    _switches(desk, result, speed)
+    _switches(workplace, result, speed)
     rail.move_to(0.5 * (low + high), speed).wait(60.0)
 
 
-def _switches(desk: CommissionWorkplace, result: Result, speed: float) -> None:
+def _switches(workplace: CommissionWorkplace, result: Result, speed: float) -> None:
     """Slowly beyond each end of the travel, until its limit switch stops the carriage; then the zero is found anew."""
-    rail, (low, high) = desk.devices.rail, desk.config.rail.travel
-    if not _nudged(desk):
+    rail, (low, high) = workplace.devices.rail, workplace.config.rail.travel
+    if not _nudged(workplace):
         result.notes.append("this rail moves only within its travel: press its limit switches by hand")
         return
-    registers = getattr(desk.config.rail, "registers", None)
+    registers = getattr(workplace.config.rail, "registers", None)
     if registers is not None and None in (registers.left_switch, registers.right_switch):
         result.notes.append("rail.registers does not say where the drive tells its limit switches: press them by hand")
         return
-    desk.confirm(
+    workplace.confirm(
         "rail, beyond its travel", "the carriage, until a limit switch stops it", f"at most {1e3 * BEYOND:.0f} mm",
         f"{1e3 * SPEED:.0f} mm/s",
     )  # fmt: skip
@@ -175,7 +177,7 @@ def _switches(desk: CommissionWorkplace, result: Result, speed: float) -> None:
         rail.move_to(end, speed).wait(3.0 * (high - low) / speed + 20.0)
         code = ""
         try:
-            _nudge(desk, way)
+            _nudge(workplace, way)
         except DeviceFault as fault:
             code = fault.code
             if code == "rail.switches":
@@ -184,7 +186,7 @@ def _switches(desk: CommissionWorkplace, result: Result, speed: float) -> None:
                     "Swap the wires of the two limit switches at the module: as they are, neither stops the "
                     "carriage before the end of the rail.",
                 )  # fmt: skip
-                _nudge(desk, -way)
+                _nudge(workplace, -way)
                 return
         state = rail.state()
         hit = state.left_switch if name == "left" else state.right_switch
@@ -192,7 +194,7 @@ def _switches(desk: CommissionWorkplace, result: Result, speed: float) -> None:
             f"{name} limit switch stops the carriage", hit and code == "rail.limit_switch",
             f"No switch stopped it within {1e3 * BEYOND:.0f} mm: see the switch, its wire, and that it is on.",
         )  # fmt: skip
-        _nudge(desk, -way)
+        _nudge(workplace, -way)
     rail.home().wait(120.0)
 
 

@@ -31,19 +31,25 @@ LEAST_SEEN = 0.012
 """A way that the camera sees must be this long, m, to say which way it went."""
 
 
-def _wheels(desk: CommissionWorkplace, result: Result) -> None:
-    config, devices = desk.config, desk.devices
+def _wheels(workplace: CommissionWorkplace, result: Result) -> None:
+    config, devices = workplace.config, workplace.devices
     if not config.vehicle.DRIVES:
         result.notes.append("the vehicle is fixed: nothing drives")
         return
-    desk.fold()
-    desk.confirm("vehicle", "its wheels, straight ahead", f"{1e3 * WAY:.0f} mm and back", f"{1e3 * SPEED:.0f} mm/s")
+    workplace.fold()
+    workplace.confirm(
+        "vehicle", "its wheels, straight ahead", f"{1e3 * WAY:.0f} mm and back", f"{1e3 * SPEED:.0f} mm/s"
+    )
     with driven(devices.vehicle):
         odometry = RelativeOdometry(devices.vehicle)
-        drive_line(devices.vehicle, odometry, Planar(WAY, 0.0, 0.0), SPEED, clock=devices.clock, check=_look(desk))
+        drive_line(
+            devices.vehicle, odometry, Planar(WAY, 0.0, 0.0), SPEED, clock=devices.clock, check=_check(workplace)
+        )
         there = odometry.pose()
-        seen = desk.person.sees(f"Did the vehicle go {1e3 * WAY:.0f} mm ahead, the way it goes to the station?")
-        drive_line(devices.vehicle, odometry, Planar(0.0, 0.0, 0.0), SPEED, clock=devices.clock, check=_look(desk))
+        seen = workplace.person.sees(f"Did the vehicle go {1e3 * WAY:.0f} mm ahead, the way it goes to the station?")
+        drive_line(
+            devices.vehicle, odometry, Planar(0.0, 0.0, 0.0), SPEED, clock=devices.clock, check=_check(workplace)
+        )
     back = odometry.pose()
     low, high = 1e3 * WAY - MOST_OFF_MM, 1e3 * WAY + MOST_OFF_MM
     result.measure("ahead, by the wheels' counters", 1e3 * there.x, "mm", least=low, most=high)
@@ -53,61 +59,61 @@ def _wheels(desk: CommissionWorkplace, result: Result) -> None:
     result.require("a person saw it go ahead", seen)
 
 
-def _station(desk: CommissionWorkplace, result: Result) -> None:
+def _station(workplace: CommissionWorkplace, result: Result) -> None:
     """Nearer to the station in strides until its board is seen; then the arm measures the board, and it the wheels."""
-    config, devices, job = desk.config, desk.devices, desk.job
+    config, devices, job = workplace.config, workplace.devices, workplace.job
     look = look_pose(config, job, parse_board(job.board.spec), config.target_camera.flange_from_camera.se3())
     devices.interlocks.may_drive_with(f"the looking pose of job {job.job.name}", look)
-    if config.vehicle.DRIVES and not desk.person.does(
+    if config.vehicle.DRIVES and not workplace.person.does(
         f"The vehicle stands at the start of job {job.job.name}, and the way to the station is clear."
     ):
         raise RefusedError("the vehicle was not brought to the job's start")
-    desk.fold()
-    desk.mover().to(look, "the looking pose")
+    workplace.fold()
+    workplace.mover().to(look, "the looking pose")
     odometry = RelativeOdometry(devices.vehicle)
     try:
-        before = _until_seen(desk, result, odometry)
+        before = _until_seen(workplace, result, odometry)
         if before is None:
             raise RefusedError(
                 "the station's board was not seen on the way to it: see that it stands where the job has it, that it "
                 f"is {job.board.spec}, and that it has light"
             )
-        _pitch(desk, result, look)
+        _pitch(workplace, result, look)
         if config.vehicle.DRIVES:
-            _by_board(desk, result, odometry, before)
+            _by_board(workplace, result, odometry, before)
     finally:
         if config.vehicle.DRIVES:
-            desk.mover().to(look, "the looking pose")
-            _drive(desk, odometry, 0.0)
+            workplace.mover().to(look, "the looking pose")
+            _drive(workplace, odometry, 0.0)
 
 
-def _until_seen(desk: CommissionWorkplace, result: Result, odometry: RelativeOdometry) -> np.ndarray | None:
+def _until_seen(workplace: CommissionWorkplace, result: Result, odometry: RelativeOdometry) -> np.ndarray | None:
     """The station's board (3,) in the base once it is seen; None when it is not before the vehicle is near."""
-    approach = desk.job.approach
+    approach = workplace.job.approach
     way = (Planar.of(approach.start.se3()).inverse() * Planar.of(approach.target.se3())).x
     driven = 0.0
-    while (seen := _board_at(desk, result, "station-board")) is None:
+    while (seen := _board_at(workplace, result, "station-board")) is None:
         driven += STRIDE
-        if not desk.config.vehicle.DRIVES or driven > way - LEAST_LEFT:
+        if not workplace.config.vehicle.DRIVES or driven > way - LEAST_LEFT:
             return None
-        desk.confirm(
+        workplace.confirm(
             "vehicle, to the station", "its wheels, in strides, until the board is seen",
             f"at most {way - LEAST_LEFT:.1f} m, and back", f"{1e3 * STRIDE_SPEED:.0f} mm/s",
         )  # fmt: skip
-        _drive(desk, odometry, driven)
+        _drive(workplace, odometry, driven)
     result.measure("driven until the station's board was seen", driven, "m")
     return seen
 
 
-def _by_board(desk: CommissionWorkplace, result: Result, odometry: RelativeOdometry, before: np.ndarray) -> None:
+def _by_board(workplace: CommissionWorkplace, result: Result, odometry: RelativeOdometry, before: np.ndarray) -> None:
     """The wheels' way against the board, which stands: what comes nearer is the way of the vehicle."""
     from_here = odometry.pose().x
-    _drive(desk, odometry, from_here + WAY)
-    after = _board_at(desk, result, "station-board-nearer")
+    _drive(workplace, odometry, from_here + WAY)
+    after = _board_at(workplace, result, "station-board-nearer")
     if after is None:
         raise RefusedError(f"{1e3 * WAY:.0f} mm nearer, the station's board is not seen any more; see its light")
     counted = odometry.pose().x - from_here
-    way = desk.config.arm.vehicle_from_base.se3().rotation @ (before - after)
+    way = workplace.config.arm.vehicle_from_base.se3().rotation @ (before - after)
     result.measure("ahead, by the wheels' counters", 1e3 * counted, "mm")
     result.measure("ahead, by the station's board", 1e3 * way[0], "mm")
     if np.linalg.norm(way) < LEAST_SEEN:
@@ -128,25 +134,27 @@ def _by_board(desk: CommissionWorkplace, result: Result, odometry: RelativeOdome
     )  # fmt: skip
 
 
-def _drive(desk: CommissionWorkplace, odometry: RelativeOdometry, ahead: float) -> None:
+def _drive(workplace: CommissionWorkplace, odometry: RelativeOdometry, ahead: float) -> None:
     """So far ahead of where the odometry began, m, and braked."""
-    vehicle = desk.devices.vehicle
+    vehicle = workplace.devices.vehicle
     with driven(vehicle):
-        drive_line(vehicle, odometry, Planar(ahead, 0.0, 0.0), STRIDE_SPEED, desk.devices.clock, check=_look(desk))
+        drive_line(
+            vehicle, odometry, Planar(ahead, 0.0, 0.0), STRIDE_SPEED, workplace.devices.clock, check=_check(workplace)
+        )
 
 
-def _pitch(desk: CommissionWorkplace, result: Result, look: pin.SE3) -> None:
+def _pitch(workplace: CommissionWorkplace, result: Result, look: pin.SE3) -> None:
     """How large the station's board is, by the ways of the arm before it; the arm is back at `look` afterwards."""
-    board, eye = parse_board(desk.job.board.spec), eye_of(desk, "target_camera")
-    views = [*views_from(desk, eye, [look], board), *shifted_views(desk, eye, look, SHIFT, board)]
-    desk.mover().to(look, "the looking pose")
+    board, eye = parse_board(workplace.job.board.spec), eye_of(workplace, "target_camera")
+    views = [*views_from(workplace, eye, [look], board), *shifted_views(workplace, eye, look, SHIFT, board)]
+    workplace.mover().to(look, "the looking pose")
     try:
         across = axes_from_shifts(*poses_of(views)).across
     except RefusedError as refused:
         result.notes.append(f"the station's board could not be measured from here: {refused}")
         return
     result.measure("station's board by the arm's measure over its name", across, "")
-    judge_board(desk.job_file, board, across, result)
+    judge_board(workplace.job_file, board, across, result)
 
 
 def judge_board(job: str, board: BoardSpec, across: float, result: Result) -> None:
@@ -170,26 +178,26 @@ def judge_board(job: str, board: BoardSpec, across: float, result: Result) -> No
     )  # fmt: skip
 
 
-def _look(desk: CommissionWorkplace) -> Callable[[], None]:
+def _check(workplace: CommissionWorkplace) -> Callable[[], None]:
     def look() -> None:
-        desk.look_around()
-        desk.cell.whereabouts.count()
+        workplace.look_around()
+        workplace.cell.whereabouts.count()
 
     return look
 
 
-def _board_at(desk: CommissionWorkplace, result: Result, name: str) -> np.ndarray | None:
+def _board_at(workplace: CommissionWorkplace, result: Result, name: str) -> np.ndarray | None:
     """The station's board (3,) in the base, roughly; None when it is not seen."""
-    eye = eye_of(desk, "target_camera")
-    desk.devices.clock.sleep(desk.config.arm.settle_time)
+    eye = eye_of(workplace, "target_camera")
+    workplace.devices.clock.sleep(workplace.config.arm.settle_time)
     try:
-        seen = see(desk, eye, parse_board(desk.job.board.spec))
+        seen = see(workplace, eye, parse_board(workplace.job.board.spec))
     except RefusedError as refused:
         frame = refused.seen["frame"]
         assert isinstance(frame, Frame)
-        desk.keep(result, name, frame)
+        workplace.keep(result, name, frame)
         return None
-    desk.keep(result, name, seen.frame, seen.view.pixels)
+    workplace.keep(result, name, seen.frame, seen.view.pixels)
     found: pin.SE3 = seen.base_from_flange * eye.config.flange_from_camera.se3() * seen.camera_from_board
     return np.asarray(found.translation)
 

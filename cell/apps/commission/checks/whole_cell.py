@@ -19,8 +19,8 @@ WHERE = tuple(
 """What tells who is connected, and where, whatever the make."""
 
 
-def _links(desk: CommissionWorkplace, result: Result) -> None:
-    devices, config = desk.devices, desk.cell.config
+def _links(workplace: CommissionWorkplace, result: Result) -> None:
+    devices, config = workplace.devices, workplace.cell.config
     for name in STATES:
         device = getattr(devices, name)
         row = ask(name, config.device(name).place, getattr(device, "bare", device), devices.clock)
@@ -34,25 +34,28 @@ def _links(desk: CommissionWorkplace, result: Result) -> None:
                     remedy=reading.remedy,
                 )  # fmt: skip
     question = "Is the emergency stop within reach, the cell's surroundings clear, and nothing in the claw's way?"
-    result.require("a person has looked round", desk.person.sees(question))
+    result.require("a person has looked round", workplace.person.sees(question))
 
 
 BEFORE_PLACING = "invert_pose"
 ALL = ("rail", "arm", "vehicle", "scan_camera", "target_camera", "laser", "claw", "calibration")
 
 
-def _calibrate(desk: CommissionWorkplace, result: Result) -> None:
-    desk.mover()
-    desk.confirm("rail", "the carriage", "its whole travel", "its configured speed")
-    desk.confirm("laser", "laser goggles on", "at each view", "on and off")
+def _calibrate(workplace: CommissionWorkplace, result: Result) -> None:
+    workplace.mover()
+    workplace.confirm("rail", "the carriage", "its whole travel", "its configured speed")
+    workplace.confirm("laser", "laser goggles on", "at each view", "on and off")
     try:
-        calibration = desk.cell.calibration()
+        calibration = workplace.cell.calibration()
         result.notes.append("a calibration of this cell as it is configured was stored already")
     except CalibrationStale:
-        calibration = desk.cell.calibrate(desk.heard, desk.job_file)
+        calibration = workplace.cell.calibrate(workplace.heard, workplace.job_file)
     summary = calibration.summary()
-    result.notes.append(f"stored as {calibration.name} in {desk.cell.calibrations_folder.name}/")
-    scan, target = desk.config.scan_camera.flange_from_camera.se3(), desk.config.target_camera.flange_from_camera.se3()
+    result.notes.append(f"stored as {calibration.name} in {workplace.cell.calibrations_folder.name}/")
+    scan, target = (
+        workplace.config.scan_camera.flange_from_camera.se3(),
+        workplace.config.target_camera.flange_from_camera.se3(),
+    )
     for name, found, drawn in (
         ("scan_camera", calibration.scan.flange_from_camera_at(0.0), scan),
         ("target_camera", calibration.target.flange_from_camera, target),
@@ -64,8 +67,8 @@ def _calibrate(desk: CommissionWorkplace, result: Result) -> None:
     )
 
 
-def _verify(desk: CommissionWorkplace, result: Result) -> None:
-    verification = desk.cell.verify(desk.heard, desk.job_file)
+def _verify(workplace: CommissionWorkplace, result: Result) -> None:
+    verification = workplace.cell.verify(workplace.heard, workplace.job_file)
     summary = verification.summary()
     for row in summary["figures"]:
         result.measure(f"{row['name']} (1 sigma {row['sigma']:.4f})", row["value"], row["unit"])
@@ -73,21 +76,21 @@ def _verify(desk: CommissionWorkplace, result: Result) -> None:
     result.require("calibration is good today", verification.good, str(summary["reason"]))
 
 
-def _job(part: bool, desk: CommissionWorkplace, result: Result) -> None:
-    cell, name = desk.cell, desk.job.job.name
-    desk.confirm("vehicle", "its wheels, to the station", "the job's whole way", "its configured speed")
+def _job(part: bool, workplace: CommissionWorkplace, result: Result) -> None:
+    cell, name = workplace.cell, workplace.job.job.name
+    workplace.confirm("vehicle", "its wheels, to the station", "the job's whole way", "its configured speed")
     if not part:
         where = "The vehicle stands at the job's start pose, and the way to the station is clear; the claw is empty."
-        if not desk.person.does(where):
+        if not workplace.person.does(where):
             raise RefusedError("the vehicle was not brought to the job's start")
-    elif not desk.person.does(f"The part of job {name} is in the claw; the place is free.", desk.fill_claw):
+    elif not workplace.person.does(f"The part of job {name} is in the claw; the place is free.", workplace.fill_claw):
         raise RefusedError("no part was put into the claw")
-    if not desk.person.go_ahead(
+    if not workplace.person.go_ahead(
         f"The first job: {name}, {'whole' if part else 'up to the place pose, without placing'}."
     ):
         raise RefusedError("the job was not begun")
     known = cell.whereabouts.anchored
-    outcome = cell.run(desk.job_file, desk.heard, at_start=not known, until=None if part else BEFORE_PLACING)
+    outcome = cell.run(workplace.job_file, workplace.heard, at_start=not known, until=None if part else BEFORE_PLACING)
     result.notes.append(f"run {outcome.folder.name}: {outcome.outcome}, {outcome.reason}")
     for row in outcome.report.get("measured") or ():
         if isinstance(row.get("value"), int | float):

@@ -107,8 +107,8 @@ class Console:
         self._working = threading.BoundedSemaphore(MOST_AT_ONCE)
         bound = _bound(address)
         self.port: int = bound.getsockname()[1]
-        self.desk = ConsoleController(cell, job, self._say, lambda run, name: self._look.began(run, name))
-        self._look = CellObserver(cell, self.desk, lambda message: self._server.tell(message))
+        self.controller = ConsoleController(cell, job, self._say, lambda run, name: self._look.began(run, name))
+        self._look = CellObserver(cell, self.controller, lambda message: self._server.notify(message))
         certificate, key = (None if path is None else str(path) for path in (address.certificate, address.key))
         facts = cell_facts(cell, job)
         self._server = ServerProcess(
@@ -130,17 +130,17 @@ class Console:
     @property
     def seen(self) -> bool:
         """Whether a page is open."""
-        return bool(self.desk.holders.rows())
+        return bool(self.controller.holders.rows())
 
     def script(self, job: str) -> Script:
         """For a job that somebody else than a page begins: a refusal is asked about at the page, if one is open."""
 
         def seen() -> bool:
             if (run := self._cell.current) is not None:
-                self.desk.questions.hold(run)
+                self.controller.questions.hold(run)
             return self.seen
 
-        return self.desk.questions.script(kind_of(load_job(job)[0]).names, seen)
+        return self.controller.questions.script(kind_of(load_job(job)[0]).names, seen)
 
     @contextmanager
     def computing(self, job: str) -> Iterator[Callable[[RunOutcome], None]]:
@@ -148,7 +148,7 @@ class Console:
 
         The page is told that it is being computed, and offers its motion when it is.
         """
-        rehearsals = self.desk.rehearsals
+        rehearsals = self.controller.rehearsals
         seed = None if self._cell.simulated is None else self._cell.simulated.facts["seed"]
         about = {"job": job, "seed": seed, "run": None}
         rehearsals.present = {"state": "running", "text": "computing", "by_command": True, **about}
@@ -165,7 +165,7 @@ class Console:
 
     def close(self) -> None:
         """End it: what is held by a page stops. The cell stays open."""
-        self.desk.close()
+        self.controller.close()
         self._look.close()
         self._server.close()
 
@@ -183,30 +183,30 @@ class Console:
         """The server has ended, and with it all pages. The program hears of it first: no other thread can keep it
         back."""
         self._gone()
-        for row in self.desk.holders.rows():
-            self.desk.left(row["id"])
+        for row in self.controller.holders.rows():
+            self.controller.left(row["id"])
 
     def _say(self, client: str, words: dict[str, object]) -> None:
-        self._server.tell(Say(client, words))
+        self._server.notify(Say(client, words))
 
     def _heard(self, message: object) -> None:
         """In the pipe's thread: nothing here may last."""
         match message:
             case Beat(client, words, end):
                 try:
-                    self.desk.jog_end(client) if end else self.desk.beat(client, words)
+                    self.controller.jog_end(client) if end else self.controller.beat(client, words)
                 except Exception as error:
                     log.exception("a held button")
-                    self.desk.jog_end(client)
+                    self.controller.jog_end(client)
                     self._say(client, {"type": "jog", "press": 0, "state": "refused", "text": str(error)[:400]})
             case Joined(client):
-                self.desk.joined(client)
+                self.controller.joined(client)
             case Left(client):
-                self.desk.left(client)
+                self.controller.left(client)
             case Do(number, client, words):
-                self._begin(number, lambda: self.desk.do(client, words))
+                self._begin(number, lambda: self.controller.do(client, words))
             case AskCell(number, job):
-                self._begin(number, lambda: cell_facts(self._cell, self.desk.named_job(job)))
+                self._begin(number, lambda: cell_facts(self._cell, self.controller.named_job(job)))
             case Ready(token):
                 base = f"{self._scheme}://{self._names[0]}:{self.port}"
                 self.link = f"{base}/enter?token=" + (token or "TOKEN-OF-THE-FILE")
@@ -215,7 +215,7 @@ class Console:
     def _begin(self, number: int, work: Callable[[], dict[str, object]]) -> None:
         if not self._working.acquire(blocking=False):
             busy = {"ok": False, "error": "busy", "text": "too much is being asked at once; wait a moment"}
-            self._server.tell(Answer(number, 429, busy))
+            self._server.notify(Answer(number, 429, busy))
             return
         threading.Thread(target=self._answer, args=(number, work), name="console command", daemon=True).start()
 
@@ -232,7 +232,7 @@ class Console:
             status, answer = 500, {"ok": False, "error": "internal", "text": f"{type(error).__name__}: {error}"}
         finally:
             self._working.release()
-            self._server.tell(Answer(number, status, answer))
+            self._server.notify(Answer(number, status, answer))
 
 
 def _bound(address: Address) -> socket.socket:

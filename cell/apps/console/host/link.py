@@ -239,7 +239,7 @@ class ServerProcess:
         self._pipe.send(setup(fds[0]))
         bound.close()
         self._receiving, self._answering = threading.Lock(), threading.Lock()
-        for work in (self._hear, *MOST_STOPS * [self._carry_out_stops], self._tell, self._wait_for_end):
+        for work in (self._hear, *MOST_STOPS * [self._carry_out_stops], self._notify, self._wait_for_end):
             threading.Thread(target=work, name=f"console {work.__name__.strip('_')}", daemon=True).start()
         if not self._ready.wait(START_S):
             self.close()
@@ -250,7 +250,7 @@ class ServerProcess:
         """Process id of the server."""
         return self._process.pid
 
-    def tell(self, message: object) -> None:
+    def notify(self, message: object) -> None:
         """To the server, when it listens; never waits."""
         self._outbox.put(message)
 
@@ -265,7 +265,7 @@ class ServerProcess:
             self._process.kill()
             self._process.wait(END_S)
 
-    def _tell(self) -> None:
+    def _notify(self) -> None:
         with suppress(OSError, ValueError):
             while (message := self._outbox.take()) is not None:
                 self._pipe.send(message)

@@ -171,13 +171,13 @@ class _Step:
 
 
 class Manual:
-    """Manual mode of one cell, with the part of `job` out of the way. `tell` hears what becomes of presses."""
+    """Manual mode of one cell, with the part of `job` out of the way. `notify` hears what becomes of presses."""
 
-    def __init__(self, cell: Cell, job: Job, tell: Told) -> None:
+    def __init__(self, cell: Cell, job: Job, notify: Told) -> None:
         self.speed = 1.0
         self._cell = cell
         self._job = job
-        self._tell = tell
+        self._notify = notify
         self._wanted: queue.SimpleQueue[_Step | Press] = queue.SimpleQueue()
         self._off = threading.Event()
         self._on = threading.Event()
@@ -241,7 +241,7 @@ class Manual:
             self._require_on()
         except InterlockError as error:
             press.end(str(error))
-            self._tell(press, "refused", str(error))
+            self._notify(press, "refused", str(error))
             return
         self._wanted.put(press)
 
@@ -273,7 +273,7 @@ class Manual:
     def _drop(self, wanted: _Step | Press) -> None:
         if isinstance(wanted, Press):
             wanted.end(NOT_DONE)
-            self._tell(wanted, "refused", NOT_DONE)
+            self._notify(wanted, "refused", NOT_DONE)
         else:
             wanted.answer.append(Aborted(NOT_DONE))
             wanted.done.set()
@@ -293,20 +293,20 @@ class Manual:
 
     def _hold(self, press: Press, context: WorkContext) -> None:
         if press.over() is not None:
-            self._tell(press, "ended", str(press.ended))
+            self._notify(press, "ended", str(press.ended))
             return
         try:
             why = self._move(press, context)
         except CellError as error:
             press.end(str(error))
             context.check()
-            self._tell(press, "refused", str(error))
+            self._notify(press, "refused", str(error))
             log.info("hold %s %s: %s", press.device, press.axis, error)
             if _needs_person(error):
                 raise
             return
         press.end(why)
-        self._tell(press, "ended", why)
+        self._notify(press, "ended", why)
         log.info("hold %s %s%s: %s", press.device, press.axis, "+" if press.sign > 0 else "-", why)
 
     def _move(self, press: Press, context: WorkContext) -> str:
@@ -321,7 +321,7 @@ class Manual:
             press.beat = beat
             motion = self._begin(press, device)
             try:
-                self._tell(press, "moving", "")
+                self._notify(press, "moving", "")
                 while (why := press.over()) is None and not motion.done and not self._off.is_set():
                     context.check()
                     press.wait(LOOK_S)

@@ -36,10 +36,10 @@ log = logging.getLogger(__name__)
 
 
 class CellObserver:
-    """Of one cell and its desk; `tell` gives a message to the server."""
+    """Of one cell and its controller; `notify` gives a message to the server."""
 
-    def __init__(self, cell: Cell, desk: ConsoleController, tell: Callable[[object], None]) -> None:
-        self._cell, self._desk, self._tell = cell, desk, tell
+    def __init__(self, cell: Cell, controller: ConsoleController, notify: Callable[[object], None]) -> None:
+        self._cell, self._desk, self._notify = cell, controller, notify
         simulated = () if cell.simulated is None else cell.simulated.simulated
         # On the virtual clock the devices have no time of the wall, and are not to be looked at by another thread.
         self._virtual = cell.simulated is not None and cell.simulated.facts.get("clock") == "virtual"
@@ -73,13 +73,13 @@ class CellObserver:
         while not self._over.wait(max(0.0, due - time.monotonic())):
             due = max(due + PERIOD_S, time.monotonic())
             try:
-                self._look()
+                self._observe()
             # One look that fails is no reason to look no more.
             except Exception:
                 log.exception("the console's look failed")
                 self._over.wait(1.0)
 
-    def _look(self) -> None:
+    def _observe(self) -> None:
         self._count += 1
         self._follow_run()
         run = self._cell.current
@@ -87,24 +87,24 @@ class CellObserver:
             self._readings.look(idle=run is None)
         view = self._view
         told = None if view is None or view.over else view.as_dict()
-        self._tell(Show(json.dumps(self._state(view, told))))
+        self._notify(Show(json.dumps(self._state(view, told))))
         if view is not None and self._count % EVERY == 0:
             self._show(view.run)
 
     def _state(self, view: RunView | None, told: dict[str, Any] | None) -> dict[str, object]:
-        readings, desk = self._readings, self._desk
+        readings, controller = self._readings, self._desk
         faults = [*self._faults, *(view.faults if view is not None and told is not None else [])]
         return {
             "type": "state", "n": self._count, "t": round(time.time(), 3),
             "cell_s": round(self._cell.devices.clock.now(), 3),
             **readings.motion(), **self._now.as_dict(self._cell.devices.interlocks.situation), "run": told,
-            "question": desk.questions.present(view if told is not None else None),
-            "last": desk.with_finding(self._last), "faults": faults[-8:],
+            "question": controller.questions.present(view if told is not None else None),
+            "last": controller.with_finding(self._last), "faults": faults[-8:],
             "devices": {} if self._virtual else readings.devices("" if told is None else told["kind"]),
-            "safety": readings.safety(), "holder": desk.holders.holder, "clients": desk.holders.rows(),
-            "starting": desk.starting,
-            "manual": desk.manual.on, "jog": desk.jogging(), "speed": desk.manual.speed, "pace": self._cell.pace,
-            "dry_run": desk.rehearsals.present, "busy": busy_words(),
+            "safety": readings.safety(), "holder": controller.holders.holder, "clients": controller.holders.rows(),
+            "starting": controller.starting,
+            "manual": controller.manual.on, "jog": controller.jogging(), "speed": controller.manual.speed,
+            "pace": self._cell.pace, "dry_run": controller.rehearsals.present, "busy": busy_words(),
         }  # fmt: skip
 
     def _follow_run(self) -> None:
@@ -118,7 +118,7 @@ class CellObserver:
         for event in self._view.news():
             if (event["kind"], event["step"]) == ("step_started", "laser_sweep"):
                 self._cloud = GrowingCloud()
-            self._tell(Happened(json.dumps(event, default=str)))
+            self._notify(Happened(json.dumps(event, default=str)))
         if self._view.over:
             self._end_view()
 
@@ -154,7 +154,7 @@ class CellObserver:
     def _show(self, run: Run[object]) -> None:
         newest = self._pictures.newest(run)
         if newest is not None:
-            self._tell(ShownPicture(*newest))
+            self._notify(ShownPicture(*newest))
         arm = self._readings.arm
         flange = None if arm is None else from_ur(arm.flange).homogeneous
         rail = self._cell.devices.rail.motion if "rail" in self._cell.devices else None
@@ -162,7 +162,7 @@ class CellObserver:
         for part in (self._cloud.increment(run, flange, rail), self._cloud.final(run)):
             if part is not None:
                 header, payload = part
-                self._tell(CloudPart({**header, "run": folder}, payload))
+                self._notify(CloudPart({**header, "run": folder}, payload))
 
 
 def _figure(view: RunView) -> dict[str, object] | None:

@@ -127,15 +127,15 @@ class Rehearsals:
 def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, object]:
     """The dry run itself, in this process: name, outcome and reason of the run."""
 
-    def tell(fraction: float, text: str) -> None:
+    def notify(fraction: float, text: str) -> None:
         print(json.dumps({"fraction": round(fraction, 3), "text": text}), flush=True)
 
-    tell(0.0, "loading the program")
+    notify(0.0, "loading the program")
     from cell.config.job import load_job
     from cell.procedures.steps.kinds import kind_of
     from cell.run.session.supervisor import Cell
 
-    tell(0.0, "simulating the cell")
+    notify(0.0, "simulating the cell")
     with Cell.open(
         Path(config) if config else None, sim="all", seed=seed, level=level, job=job, clock="virtual",
         confirm="simulated",
@@ -145,9 +145,9 @@ def rehearse(job: str, seed: int, level: str, config: str) -> dict[str, object]:
         def observe(event: Event) -> None:
             if event.step in names and event.kind in ("step_started", "progress"):
                 within = float(str(event.data.get("fraction", 0.0)))
-                tell((names.index(event.step) + within) / len(names), event.step.replace("_", " "))
+                notify((names.index(event.step) + within) / len(names), event.step.replace("_", " "))
 
-        tell(0.0, "calibrating and planning")
+        notify(0.0, "calibrating and planning")
         outcome = cell.run(job, observe)
     return {"run": outcome.folder.name, "outcome": outcome.outcome, "reason": outcome.reason}
 

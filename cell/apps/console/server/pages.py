@@ -95,11 +95,11 @@ class Page:
 
 
 class Pages:
-    """All of them. `tell` sends a message on to the cell unless too many wait, `stop` stops it; neither waits. In the
+    """All of them. `notify` sends a message on to the cell unless too many wait, `stop` stops it; neither waits. In the
     event loop's thread."""
 
-    def __init__(self, tell: Callable[[object], bool], stop: Callable[[], object]) -> None:
-        self._tell = tell
+    def __init__(self, notify: Callable[[object], bool], stop: Callable[[], object]) -> None:
+        self._notify = notify
         self._stop = stop
         self._numbers = itertools.count(1)
         self._pages: dict[str, Page] = {}
@@ -144,7 +144,7 @@ class Pages:
             await socket.close(FULL, "too many pages are open; close one")
             return
         page = Page(next(self._numbers))
-        if not self._tell(Joined(page.id)):
+        if not self._notify(Joined(page.id)):
             await socket.close(FULL, "too much is being asked at once; wait a moment")
             return
         self._pages[page.id] = page
@@ -161,7 +161,7 @@ class Pages:
                 await self._hear(page, socket)
         finally:
             self._pages.pop(page.id, None)
-            self._tell(Left(page.id))
+            self._notify(Left(page.id))
             sending.cancel()
             await asyncio.wait([sending])
 
@@ -173,7 +173,7 @@ class Pages:
                 await asyncio.wait_for(sent, TIMEOUT_S)
         except (TimeoutError, RuntimeError, WebSocketDisconnect):
             # One that takes nothing any more: its button is not held, either.
-            self._tell(Left(page.id))
+            self._notify(Left(page.id))
             self._pages.pop(page.id, None)
             with suppress(RuntimeError, WebSocketDisconnect, OSError):
                 await socket.close(TOO_MANY)
@@ -201,7 +201,7 @@ class Pages:
                 # A close says at most 123 bytes.
                 await socket.close(MALFORMED, str(error).encode()[:120].decode(errors="ignore"))
                 return
-            self._tell(Beat(page.id, words, end=words["type"] == "jog_end"))
+            self._notify(Beat(page.id, words, end=words["type"] == "jog_end"))
 
 
 def _words(text: object) -> dict[str, object] | None:

@@ -55,9 +55,9 @@ class Patient(H11Protocol):
     def connection_made(self, transport: Any) -> None:
         """See `asyncio.Protocol`."""
         super().connection_made(transport)
-        self.loop.call_later(IDLE_S, self._look, None)
+        self.loop.call_later(IDLE_S, self._check_idle, None)
 
-    def _look(self, before: object) -> None:
+    def _check_idle(self, before: object) -> None:
         """Every `IDLE_S`: has anything been asked for since `before`, or is it still being answered?"""
         # A live link has another protocol by now, which looks after itself.
         if self.transport.get_protocol() is not self or self.transport.is_closing():
@@ -68,7 +68,7 @@ class Patient(H11Protocol):
         if answered and cycle is before:
             self.transport.close()
         else:
-            self.loop.call_later(IDLE_S, self._look, cycle)
+            self.loop.call_later(IDLE_S, self._check_idle, cycle)
 
 
 class Server:
@@ -80,7 +80,7 @@ class Server:
         self._waiting: dict[int, asyncio.Future[link.Answer]] = {}
         self._unsent: queue.SimpleQueue[object] = queue.SimpleQueue()
         self.access = Access(setup.hosts, setup.port, secure=setup.cert is not None, lasting=setup.lasting)
-        self.pages = Pages(self._tell, self._begin_stop)
+        self.pages = Pages(self._notify, self._begin_stop)
         self._stopping: dict[int, tuple[float, asyncio.Future[str | None]]] = {}
         self._next: asyncio.Future[str | None] | None = None
 
@@ -113,11 +113,11 @@ class Server:
 
     def _renew(self) -> None:
         """A new link for the next page."""
-        self._tell(link.Ready(None if self._setup.lasting is not None else self.access.link()))
+        self._notify(link.Ready(None if self._setup.lasting is not None else self.access.link()))
 
     # --- to the cell ---
 
-    def _tell(self, message: object) -> bool:
+    def _notify(self, message: object) -> bool:
         """Never waits; False when too much waits already. What ends something is sent in any case."""
         if self._unsent.qsize() >= MOST_UNSENT and not isinstance(message, link.Left | link.Ready):
             return False
@@ -132,7 +132,7 @@ class Server:
     async def _ask(self, make: Callable[[int], object]) -> tuple[int, Mapping[str, object]]:
         number = next(self._numbers)
         answer: asyncio.Future[link.Answer] = self._loop.create_future()
-        if not self._tell(make(number)):
+        if not self._notify(make(number)):
             return BUSY, {"ok": False, "error": "busy", "text": "too much is being asked at once; wait a moment"}
         self._waiting[number] = answer
         try:

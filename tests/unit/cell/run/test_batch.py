@@ -172,9 +172,9 @@ def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
         return RunOutcome(*how, tmp_path, {"cell_s": 1.0, "measured": [], "steps": []}, placed_pot.results)
 
     with opened() as cell:
-        here = replace(cell._here, simulated=None)
+        open_cell = replace(cell._here, simulated=None)
         cell.runs_folder.mkdir()
-        batch = perform(here, jobs, 3, run, between=lambda work: asked.append(len(tried)), observer=None)
+        batch = perform(open_cell, jobs, 3, run, between=lambda work: asked.append(len(tried)), observer=None)
     assert (tried, asked) == ([1, 2, 3, 4], [2]), "a person at a real cell makes both items ready again"
     assert shared == [False, True, False, True]
     assert (batch.job, batch.count, batch.reason) == (
@@ -197,7 +197,7 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
     asked: list[str] = []
     with opened() as cell:
         job, last = load_job("own.toml")[0], RunOutcome("placed", "all steps done", tmp_path, {})
-        here, claw = replace(cell._here, simulated=None), cell.devices.claw
+        open_cell, claw = replace(cell._here, simulated=None), cell.devices.claw
 
         def person(what: str) -> None:
             asked.append(what.split()[0])
@@ -209,8 +209,8 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
         def work(context: WorkContext) -> None:
             with cell.maintenance("the part is taken out", ["claw_at_contact"]):
                 claw.release()
-            assert _question(here, job, "part 2 of 2", last, refill=False) is None
-            question = _question(here, job, "part 2 of 2", last, refill=True)
+            assert _question(open_cell, job, "part 2 of 2", last, refill=False) is None
+            question = _question(open_cell, job, "part 2 of 2", last, refill=True)
             assert question is not None
             question(replace(context, ask=person))
 
@@ -234,9 +234,11 @@ def test_a_fault_ends_it_whatever_the_job_says_of_refusals_and_the_command_line_
     assert typed(*words, "--until", "board_photo")[0] == 2
 
 
-def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(here: Path, typed: Typed) -> None:
+def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(open_cell: Path, typed: Typed) -> None:
     """No terminal is here: the batch would wait for ever."""
-    (here / "pot.ply").write_bytes(job_path("pot").with_suffix(".ply").read_bytes())
-    (here / "asks.toml").write_text(f'{job_path("pot").read_text(encoding="utf-8")}\n[batch]\non_refusal = "ask"\n')
+    (open_cell / "pot.ply").write_bytes(job_path("pot").with_suffix(".ply").read_bytes())
+    (open_cell / "asks.toml").write_text(
+        f'{job_path("pot").read_text(encoding="utf-8")}\n[batch]\non_refusal = "ask"\n'
+    )
     code, _, error = typed("dry-run", "-j", "asks", "--count", "2", "--clock", "virtual")
     assert code == 2 and "there is no terminal to ask at" in " ".join(error.split())

@@ -37,8 +37,8 @@ def test_a_subscriber_that_never_reads_holds_a_bounded_number_of_events() -> Non
 
 def test_a_listener_that_comes_late_hears_what_was_and_a_run_that_has_ended_ends_it() -> None:
     def work(run: Run[int]) -> int:
-        run.tell(Event("step_started", "place", {"attempt": 1}))
-        run.tell(Event("run_ended", None, {"outcome": "placed", "reason": ""}))
+        run.notify(Event("step_started", "place", {"attempt": 1}))
+        run.notify(Event("run_ended", None, {"outcome": "placed", "reason": ""}))
         return 7
 
     run = Run("job", work)

@@ -17,9 +17,9 @@ def test_an_observer_that_fails_is_told_nothing_more_and_keeps_no_other_from_lis
         told.append("broken")
         raise OSError("no room")
 
-    tell = each_of((broken, lambda event: told.append(event.kind)))
+    notify = each_of((broken, lambda event: told.append(event.kind)))
     for kind in ("note", "state"):
-        tell(Event(kind, None, {}))
+        notify(Event(kind, None, {}))
     assert told == ["broken", "note", "state"]
     assert [line.getMessage() for line in caplog.records] == [
         "an observer of the run failed and is told nothing more: no room"

@@ -18,9 +18,9 @@ class Bench:
         self.feedback = MessageFeedback(
             "vehicle", self.clock, track=0.58, max_speed=0.5, max_yaw_rate=0.5, statistics=LinkStatistics()
         )
-        self.tell(0, 0)
+        self.notify(0, 0)
 
-    def tell(
+    def notify(
         self, left: int, right: int, bits: int = 0, mode: int = CAN_MODE, state: int = 0, speed: float = 0.0
     ) -> None:
         """One round of cyclic messages, 20 ms after the last."""
@@ -52,7 +52,7 @@ def bench() -> Bench:
 def test_error_bits_are_told_in_the_makers_words(bits: int, words: tuple[str, ...]) -> None:
     assert system_trouble(bits, commanded=True) == words
     bench = Bench()
-    bench.tell(0, 0, bits=bits)
+    bench.notify(0, 0, bits=bits)
     if not words:
         bench.feedback.check(in_command=True, driving=False)
         return
@@ -68,7 +68,7 @@ def test_an_error_that_came_while_driving_is_for_a_person_to_look_at(bench: Benc
             bench.feedback.commanded_to_move()
         else:
             bench.clock.time += 5.0
-        bench.tell(0, 0, bits=0x0100, state=2)
+        bench.notify(0, 0, bits=0x0100, state=2)
         with pytest.raises(DeviceFault, match="a motor driver fails") as caught:
             bench.feedback.check(in_command=True, driving=False)
         assert caught.value.recoverable is not driven
@@ -86,7 +86,7 @@ def test_a_motor_drivers_overload_is_a_fault_and_being_enabled_is_none() -> None
 
 
 def test_whoever_took_command_away_is_for_a_person_to_find_out(bench: Bench) -> None:
-    bench.tell(0, 0, mode=0)
+    bench.notify(0, 0, mode=0)
     bench.feedback.check(in_command=False, driving=False)
     with pytest.raises(DeviceFault, match="left CAN command") as caught:
         bench.feedback.check(in_command=True, driving=False)
@@ -122,7 +122,7 @@ def test_a_message_that_stopped_is_missed_though_the_others_go_on(bench: Bench) 
 def test_a_reading_is_as_old_as_the_oldest_of_what_it_is_made_of(bench: Bench, late: str) -> None:
     kept = bench.feedback.get(late)
     bench.clock.time += 0.5
-    bench.tell(0, 0)
+    bench.notify(0, 0)
     bench.feedback._newest[late] = kept
     with pytest.raises(DeadlineError, match=r"s old, allowed 0\.20 s"):
         bench.feedback.state(0.2, None)
@@ -135,7 +135,7 @@ def test_a_vehicle_that_rolls_back_or_turns_does_not_stand(bench: Bench, speed: 
     asked = bench.clock.time
     assert not bench.feedback.stands(asked)  # what was told before says nothing
     for _ in range(STILL_FRAMES):
-        bench.tell(0, 0)
+        bench.notify(0, 0)
     assert bench.feedback.stands(asked)
     bench.clock.time += 0.02
     bench.feedback.take("MotionState", {"Speed": speed, "YawRate": yaw_rate})
@@ -148,12 +148,12 @@ def test_a_stop_is_confirmed_by_feedback_that_agrees_with_itself(
 ) -> None:
     """Not by frames of standstill between others, and not while the wheels count on."""
     bench.feedback.commanded_to_move()
-    bench.tell(0, 0, speed=0.2)
+    bench.notify(0, 0, speed=0.2)
     for k in range(24):
-        bench.tell(way * k, way * k, speed=speeds[k % len(speeds)])
+        bench.notify(way * k, way * k, speed=speeds[k % len(speeds)])
         assert not bench.feedback.stands(0.0)
     for k in range(5):
-        bench.tell(way * 23 + k % 2, way * 23)
+        bench.notify(way * 23 + k % 2, way * 23)
     assert bench.feedback.stands(0.0)
 
 
@@ -164,17 +164,17 @@ def test_two_series_of_counts_are_two_vehicles(bench: Bench, other: int, step: i
     bench.feedback.commanded_to_move()
     with pytest.raises(DeviceFault, match="two vehicles report under the same identifiers") as met:
         for k in range(25):
-            bench.tell(100 + step * k, 100 + step * k)
+            bench.notify(100 + step * k, 100 + step * k)
             if k % every == 0:
                 bench.clock.time -= 0.02
-                bench.tell(100 + other, 100 + other)
+                bench.notify(100 + other, 100 + other)
             bench.feedback.check(in_command=False, driving=False)
     assert (met.value.code, met.value.recoverable) == ("vehicle.two_vehicles", False)
     bench.feedback.acknowledge()  # while it goes on, nobody takes command
     with pytest.raises(DeviceFault):
         bench.feedback.require_one()
     for _ in range(40):
-        bench.tell(100, 100)
+        bench.notify(100, 100)
     bench.feedback.acknowledge()
     bench.feedback.check(in_command=True, driving=True)
 
@@ -183,16 +183,16 @@ def test_command_is_taken_only_once_the_vehicle_says_so_afterwards_and_without_a
     asked = bench.clock.time
     assert not bench.feedback.commanded(asked)
     for wrong in ({"mode": 0}, {"state": 1}, {"state": 2}, {"bits": 0x0100}):
-        bench.tell(0, 0, **wrong)
+        bench.notify(0, 0, **wrong)
         assert not bench.feedback.commanded(asked), wrong
-    bench.tell(0, 0)
+    bench.notify(0, 0)
     assert bench.feedback.commanded(asked)
 
 
 def test_an_emergency_stop_is_told_whoever_is_in_command_and_no_program_clears_it() -> None:
     for in_command in (True, False):
         bench = Bench()
-        bench.tell(0, 0, state=1)
+        bench.notify(0, 0, state=1)
         with pytest.raises(DeviceFault, match="emergency stop") as caught:
             bench.feedback.check(in_command=in_command, driving=False)
         assert caught.value.code == "vehicle.emergency_stop"
@@ -222,33 +222,33 @@ def test_whoever_else_commands_it_is_noticed_and_takes_its_place_along(
 
 @pytest.mark.parametrize("pushed", [(-6, 0), (0, 6), (0, -6)])
 def test_each_wheel_tells_of_a_push_either_way(bench: Bench, pushed: tuple[int, int]) -> None:
-    bench.tell(0, 0)
-    bench.tell(*pushed)
+    bench.notify(0, 0)
+    bench.notify(*pushed)
     assert bench.interruption() == (1, "it moved by 6 mm without a command")
 
 
 def test_odometry_that_jumps_or_stays_away_no_longer_tells_the_place(bench: Bench) -> None:
     for count in range(50):
         bench.feedback.commanded_to_move()
-        bench.tell(10 * count, 10 * count)
+        bench.notify(10 * count, 10 * count)
     assert bench.interruption() == (0, "")
-    bench.tell(0, 0)  # switched off and on: 490 mm are gone
+    bench.notify(0, 0)  # switched off and on: 490 mm are gone
     assert bench.interruption() == (1, "its odometers jumped, so it was restarted")
     bench.clock.time += 2.2  # this program computed, what came meanwhile waits
-    bench.tell(0, 0)
+    bench.notify(0, 0)
     assert bench.interruption()[0] == 1
     for _ in range(22):
         bench.feedback.idle(0.1)
-    bench.tell(0, 0)
+    bench.notify(0, 0)
     assert bench.interruption() == (2, "nothing was heard of it for 2.2 s")
 
 
 def test_a_vehicle_that_is_pushed_while_nobody_commands_it_is_noticed(bench: Bench) -> None:
     for _ in range(10):
-        bench.tell(0, 0)
-    bench.tell(4, 3)
+        bench.notify(0, 0)
+    bench.notify(4, 3)
     assert bench.interruption()[0] == 0
-    bench.tell(9, 8)
+    bench.notify(9, 8)
     assert bench.interruption() == (1, "it moved by 9 mm without a command")
     with pytest.raises(DeviceFault, match="moved by 9 mm") as caught:
         bench.feedback.check(in_command=True, driving=False)
@@ -261,12 +261,12 @@ def test_a_restart_is_noticed_however_long_its_feedback_stayed_away(bench: Bench
     """It counts from zero again; while it was away it cannot have driven, since nobody commanded it."""
     for count in range(50):
         bench.feedback.commanded_to_move()
-        bench.tell(10 * count, 10 * count)
+        bench.notify(10 * count, 10 * count)
     for _ in range(250):
-        bench.tell(490, 490)
+        bench.notify(490, 490)
     assert bench.interruption()[0] == 0
     bench.clock.time += after
-    bench.tell(0, 0)
+    bench.notify(0, 0)
     assert bench.interruption()[0] >= 1
     assert bench.feedback.state(1.0, None).x == pytest.approx(0.49)
 
@@ -277,7 +277,7 @@ def test_in_a_gap_it_can_have_driven_until_it_rests_after_its_last_command() -> 
         bench = Bench()
         bench.feedback.commanded_to_move()
         bench.clock.time += gap
-        bench.tell(counted, counted)
+        bench.notify(counted, counted)
         assert bench.feedback.state(1.0, None).x == pytest.approx(0.0 if lost else 1e-3 * counted), (gap, counted)
         assert bench.interruption()[0] >= 1 or not lost
 
@@ -285,10 +285,10 @@ def test_in_a_gap_it_can_have_driven_until_it_rests_after_its_last_command() -> 
 def test_what_moves_by_our_own_command_is_no_push(bench: Bench) -> None:
     bench.feedback.commanded_to_move()
     for count in range(150):
-        bench.tell(8 * count, 8 * count)
+        bench.notify(8 * count, 8 * count)
     bench.clock.time += 0.9
     for _ in range(200):
-        bench.tell(8 * 149, 8 * 149)
+        bench.notify(8 * 149, 8 * 149)
     assert bench.interruption() == (0, "")
 
 

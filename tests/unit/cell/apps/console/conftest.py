@@ -25,7 +25,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
 
 
 @pytest.fixture
-def desk(cell: Cell) -> Iterator[ConsoleController]:
+def controller(cell: Cell) -> Iterator[ConsoleController]:
     made = ConsoleController(cell, "pot", lambda client, words: None)
     made.joined("c1")
     made.joined("c2")

@@ -16,7 +16,7 @@ from matplotlib.patches import Rectangle
 from cell.apps.new_job.picture import COLOURS, draw_proposal
 from cell.apps.new_job.proposal import Proposal
 from cell.apps.new_job.surface import Laid
-from cell.apps.new_job.sweeps import Rays, look
+from cell.apps.new_job.sweeps import Rays, visible_surfaces
 from cell.config.job import SwathSection
 from tests.support.report_runs import CONFIG, pot
 
@@ -28,7 +28,7 @@ def made() -> Proposal:
     """The middle of the pot in two sweeps side by side; much of it is left out."""
     job, nominal = pot(length=0.036, swath=tuple(SwathSection(across=f"{1e3 * y} mm") for y in ACROSS))
     vertices, faces = nominal.vertices, nominal.triangles
-    seen = look(CONFIG, job, Rays(vertices, faces))
+    seen = visible_surfaces(CONFIG, job, Rays(vertices, faces))
     return Proposal(job, Laid(vertices, faces, pin.SE3.Identity()), tuple(seen))
 
 

@@ -113,7 +113,7 @@ def arrived(
 ) -> tuple[VehicleArrival, list[str]]:
     """How a cell that stands at its target arrives there, and what is noted of it."""
     notes: list[str] = []
-    site = AtStation(record, folder, tell=lambda event: notes.append(str(event.data.get("text"))))
+    site = AtStation(record, folder, notify=lambda event: notes.append(str(event.data.get("text"))))
     site.work.config, site.work.calibration = config, calibration
     return site.do("drive_to_target"), notes
 

@@ -34,14 +34,14 @@ def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
     def photograph(count: int = 1) -> None:
         raise Taken
 
-    here, fix, asked = AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["board_photo"], []
-    monkeypatch.setattr(here, "photograph", photograph)
-    monkeypatch.setattr(here, "mover", SimpleNamespace(to=lambda *given: None))
-    monkeypatch.setattr(here.devices.target_camera, "configure", lambda *given: asked.append(given))
+    workplace, fix, asked = AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["board_photo"], []
+    monkeypatch.setattr(workplace, "photograph", photograph)
+    monkeypatch.setattr(workplace, "mover", SimpleNamespace(to=lambda *given: None))
+    monkeypatch.setattr(workplace.devices.target_camera, "configure", lambda *given: asked.append(given))
     with pytest.raises(Taken):
-        photographed(here, fix.base_from_board, lambda share, text: None)
+        photographed(workplace, fix.base_from_board, lambda share, text: None)
     with pytest.raises(Taken):
-        require_board_unmoved(here, fix, "before the sweep", lambda share, text: None)
+        require_board_unmoved(workplace, fix, "before the sweep", lambda share, text: None)
     assert asked == [(CONFIG.target_camera.photo_exposure, PHOTO_RATE_HZ)] * 2
 
 

@@ -149,8 +149,8 @@ def test_where_the_place_is_known_too_little_what_was_noted_of_the_sweep_is_told
     placed_pot: JobRecord, tmp_path: Path, doubts: tuple[str, ...]
 ) -> None:
     job, made = changed(pot()[0], "place", tolerance=0.05e-3), placed_pot.results
-    here = AtStation(placed_pot, tmp_path, job, folded=False).work
+    workplace = AtStation(placed_pot, tmp_path, job, folded=False).work
     sweep = replace(made["laser_sweep"], doubts=doubts)
     with pytest.raises(NotObservable) as caught:
-        inverted(here, sweep, made["reconstruct"], made["board_photo"])
+        inverted(workplace, sweep, made["reconstruct"], made["board_photo"])
     assert ("Before: nobody looked where the laser points" in str(caught.value)) == bool(doubts)

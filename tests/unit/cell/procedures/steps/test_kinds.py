@@ -31,7 +31,7 @@ class Tilt:
     angle: float
 
 
-def tilt(here: Workplace, context: StepContext) -> Tilt:
+def tilt(workplace: Workplace, context: StepContext) -> Tilt:
     rotation = context.made(BoardFix).base_from_board.rotation
     return Tilt(float(1.0 - abs(rotation[2, 2])))
 
@@ -107,7 +107,7 @@ def test_a_step_that_made_something_else_has_failed() -> None:
     site.devices = SimpleNamespace(gate=gate, interlocks=SimpleNamespace(work_with=print))
     site.calibration, site.mover = SimpleNamespace(configuration=""), SimpleNamespace()
     site.frames = SimpleNamespace(begin=print)
-    work = Kind("promising", (JobStep(Step("see", 5.0), lambda here, context: 7, Tilt),)).work(site)["see"]
+    work = Kind("promising", (JobStep(Step("see", 5.0), lambda workplace, context: 7, Tilt),)).work(site)["see"]
     with pytest.raises(TypeError, match="step see made a int, not the Tilt it promises"):
         work(StepContext(Step("see", 5.0), 1, 5.0, {}, Clock(), print))
 

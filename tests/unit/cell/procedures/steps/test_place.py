@@ -287,14 +287,14 @@ def test_a_claw_that_lost_its_part_does_not_go_down(site: Site) -> None:
 
 def test_a_job_with_an_empty_claw_ends_before_anything_moves(site: Site) -> None:
     site.cell.devices.claw.bare.release()
-    here = Workplace(
+    workplace = Workplace(
         CONFIG, JOB, NOMINAL, cast(Any, None), site.cell.devices, NoFrames(), Path(),
         Whereabouts(site.cell.devices.vehicle),
     )  # fmt: skip
     before = site.arm.state().joints
     context = StepContext(drive_to_target.STEP.policy, 1, 1e9, {}, site.cell.clock, lambda event: None)
     with pytest.raises(RefusedError, match="the claw holds no part"):
-        drive_to_target.STEP.work(here, context)
+        drive_to_target.STEP.work(workplace, context)
     assert np.array_equal(site.arm.state().joints, before)
 
 
@@ -368,7 +368,7 @@ def test_a_part_as_drawn_is_held_against_the_scanned_surface_before_it_goes_down
 
 def test_what_parts_had_alike_is_aimed_beside_where_the_part_fits_there(placed_pot: JobRecord, tmp_path: Path) -> None:
     site, notes = with_part(placed_pot, tmp_path), list[str]()
-    site.tell = lambda event: notes.append(str(event.data.get("text")))
+    site.notify = lambda event: notes.append(str(event.data.get("text")))
     pose, aside, still = placed_pot.results["invert_pose"], from_parts((0.2e-3, 0.0, 0.0)), pin.SE3.Identity()
 
     def aimed(by: pin.SE3, *slips: pin.SE3) -> AimedPlace:
@@ -394,7 +394,7 @@ def test_where_nothing_was_scanned_it_is_told_that_the_underside_was_not_looked_
 ) -> None:
     site, said = with_part(placed_pot, tmp_path), []
     del site.made["reconstruct"]
-    site.tell = said.append
+    site.notify = said.append
     assert _mated(site.work, placed_pot.results["invert_pose"], pin.SE3.Identity(), site.context("place")) is None
     assert any("was not held against the surface" in str(event.data) for event in said)
 

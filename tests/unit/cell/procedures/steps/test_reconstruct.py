@@ -40,11 +40,11 @@ def test_the_cloud_of_an_earlier_sweep_is_gone_whatever_becomes_of_this_one(
 def test_the_cloud_is_built_with_the_laser_where_it_pointed(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here, sweep, given = AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["laser_sweep"], []
+    workplace, sweep, given = AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["laser_sweep"], []
     monkeypatch.setattr(ScanCalibration, "variants", lambda head: given.append(head) or ())
-    turned, head = Pointing(1e-3, 1e-5, 0.0), here.calibration.scan
+    turned, head = Pointing(1e-3, 1e-5, 0.0), workplace.calibration.scan
     for pointing in (None, turned):
-        reconstruct.reconstructed(here, replace(sweep, pointing=pointing))
+        reconstruct.reconstructed(workplace, replace(sweep, pointing=pointing))
     expected = head.pointed(turned, CONFIG.laser.exit_point).geometry().light_plane
     assert given[0] is head
     np.testing.assert_array_equal(given[1].geometry().light_plane.normal, expected.normal)
@@ -53,15 +53,15 @@ def test_the_cloud_is_built_with_the_laser_where_it_pointed(
 
 def test_a_sweep_is_kept_and_its_cloud_shown_also_where_it_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
     assert placed_pot.folder is not None and (placed_pot.folder / FILE).is_file()
-    here, told = AtStation(placed_pot, tmp_path, folded=False).work, []
-    here.devices.gate.listener = cast(Any, SimpleNamespace(reading=lambda device, reading: told.append(device)))
+    workplace, told = AtStation(placed_pot, tmp_path, folded=False).work, []
+    workplace.devices.gate.listener = cast(Any, SimpleNamespace(reading=lambda device, reading: told.append(device)))
     few = with_few_lines(placed_pot, 1).results["laser_sweep"]
     for sweep in (placed_pot.results["laser_sweep"], few):
         context = cast(Any, SimpleNamespace(made={SweepRecord: sweep}.get))
         if sweep is few:
             with pytest.raises(RefusedError) as caught:
-                reconstruct.STEP.work(here, context)
+                reconstruct.STEP.work(workplace, context)
             assert isinstance(caught.value.seen["cloud"], Cloud)
         else:
-            reconstruct.STEP.work(here, context)
+            reconstruct.STEP.work(workplace, context)
     assert told == ["scan_camera"]

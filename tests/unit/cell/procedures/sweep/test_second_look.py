@@ -127,32 +127,32 @@ def test_a_camera_of_a_few_frame_rates_takes_all_lines_again(
 def test_a_second_look_takes_few_lines_of_one_strip_twice_as_fast_where_there_is_room(
     placed_pot: JobRecord, tmp_path: Path
 ) -> None:
-    here, (swath,) = AtStation(placed_pot, tmp_path).work, placed_pot.results["laser_sweep"].swaths
-    scan = here.job.scan
-    few = sparse(here, scan.swath[0], swath)
-    assert few.speed == pytest.approx(min(second_look.HURRY * scan.speed, here.config.rail.max_speed), rel=0.01)
+    workplace, (swath,) = AtStation(placed_pot, tmp_path).work, placed_pot.results["laser_sweep"].swaths
+    scan = workplace.job.scan
+    few = sparse(workplace, scan.swath[0], swath)
+    assert few.speed == pytest.approx(min(second_look.HURRY * scan.speed, workplace.config.rail.max_speed), rel=0.01)
     assert few.length / few.speed * few.frame_rate == pytest.approx(LINES) and len(few.swath) == 1
     # A sweep that was repeated went half as fast.
     slow = replace(swath, times=2.0 * swath.times)
-    assert sparse(here, scan.swath[0], slow).speed == pytest.approx(second_look.HURRY * second_look.pace(slow))
+    assert sparse(workplace, scan.swath[0], slow).speed == pytest.approx(second_look.HURRY * second_look.pace(slow))
     # The arm repeats it slower rather than faster; a camera that is slow stays so.
-    here.job = changed(here.job, "scan", mode="arm", frame_rate=5.0, speed=0.02)
-    by_arm = sparse(here, scan.swath[0], swath)
+    workplace.job = changed(workplace.job, "scan", mode="arm", frame_rate=5.0, speed=0.02)
+    by_arm = sparse(workplace, scan.swath[0], swath)
     assert (by_arm.speed, by_arm.frame_rate) == (0.02, 5.0)
 
 
 def test_stamps_that_come_late_shift_the_faster_look_farther(placed_pot: JobRecord, tmp_path: Path) -> None:
     site = AtStation(placed_pot, tmp_path)
-    sweep, here = site.made["laser_sweep"], site.work
+    sweep, workplace = site.made["laser_sweep"], site.work
     look_again(site)
     site.made["laser_sweep"] = replace(sweep, rest=site.cell.devices.interlocks.situation.last)
-    here.calibration = replace(here.calibration, scan=replace(here.calibration.scan, timing=None))
+    workplace.calibration = replace(workplace.calibration, scan=replace(workplace.calibration.scan, timing=None))
     (swath,), spread = sweep.swaths, []
     along = swath.builder.sweep_direction(swath.base_from_flange)
-    faster = sparse(here, here.job.scan.swath[0], swath).speed - here.job.scan.speed
+    faster = sparse(workplace, workplace.job.scan.swath[0], swath).speed - workplace.job.scan.speed
     for late in (0.0, 0.02):
-        config, by = here.config, {"rail": 0.0, "scan_camera": late}
-        here.config = config.model_copy(
+        config, by = workplace.config, {"rail": 0.0, "scan_camera": late}
+        workplace.config = config.model_copy(
             update={name: getattr(config, name).model_copy(update={"late": seconds}) for name, seconds in by.items()}
         )
         spread.append(float(along @ look_again(site).moved.covariance[:3, :3] @ along))
@@ -167,7 +167,7 @@ def test_a_look_that_loses_frames_tells_as_much(placed_pot: JobRecord, tmp_path:
             site.cell.scan_camera.model.fault("camera.frame_loss", 4)
             lost.append(4)
 
-    site = AtStation(placed_pot, tmp_path, tell=losing)
+    site = AtStation(placed_pot, tmp_path, notify=losing)
     assert not look_again(site).moved.moved
     assert sum(lost) > MAX_LOST_FRACTION * LINES
 
@@ -213,7 +213,7 @@ def test_after_a_pause_it_is_looked_at_anew(
         monkeypatch.setattr(SurfaceMotion, "hidden", lambda *_: ["(a motion that does not show)"])
         monkeypatch.setattr(second_look, "require_board_unmoved", lambda *_: site.context("place").safe_point())
 
-    def tell(event: Event) -> None:
+    def notify(event: Event) -> None:
         if "9 profiles" in event.data.get("text", "") and not held:
             site.control.pause()
 
@@ -222,7 +222,7 @@ def test_after_a_pause_it_is_looked_at_anew(
         slid(site.cell, (0.0, 1e-3))
         site.control.go_on()
 
-    site = AtStation(placed_pot, tmp_path, tell=tell, look=reach_in)
+    site = AtStation(placed_pot, tmp_path, notify=notify, look=reach_in)
     with pytest.raises(RefusedError, match=r"the surface has moved by (0\.9|1\.0)"):
         site.do("place")
     assert held == [True]
@@ -233,7 +233,7 @@ def test_a_few_steps_that_the_rail_lost_are_found_before_the_part_touches(
 ) -> None:
     """As few do not show in the lines: the count is looked at while the arm comes down."""
     heard: list[str] = []
-    site = AtStation(placed_pot, tmp_path, tell=lambda event: heard.append(str(event.data.get("text"))))
+    site = AtStation(placed_pot, tmp_path, notify=lambda event: heard.append(str(event.data.get("text"))))
     lose_few_steps_after_the_look(monkeypatch, lambda: site.cell)
     with pytest.raises(DeviceFault, match="lost steps"):
         site.do("place")

@@ -101,14 +101,14 @@ def begun(stored: StoredSweep, folder: Path, seen: pin.SE3, attempt: int) -> lis
     nothing_known = cast(Any, None)
     job = load_job("pot")[0]
     whereabouts = Whereabouts(cell.devices.vehicle)
-    here = Workplace(
+    workplace = Workplace(
         CONFIG, job, nothing_known, nothing_known, cell.devices, NoFrames(), folder, whereabouts, earlier=stored
     )
     events: list[Event] = []
     context = StepContext(STEP.policy, attempt, 1e9, {"board_photo": fix(seen)}, cell.clock, events.append)
     with pytest.raises((InterlockError, AttributeError)):
-        STEP.work(here, context)
-    assert attempt > 1 or here.earlier is None, "what is to be swept again was not good enough"
+        STEP.work(workplace, context)
+    assert attempt > 1 or workplace.earlier is None, "what is to be swept again was not good enough"
     assert not (folder / FILE).exists(), "should this run be cut short now, it is not resumed with that"
     return [str(event.data.get("text")) for event in events]
 

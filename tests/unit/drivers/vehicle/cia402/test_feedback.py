@@ -31,7 +31,7 @@ def test_readings_of_two_different_moments_are_not_one_pose() -> None:
     clock = Hand()
     feedback = DriveFeedback("vehicle", clock, WHEELS, max_speed=0.5, max_yaw_rate=0.8, statistics=LinkStatistics())
 
-    def tell(node: int, count: int) -> None:
+    def notify(node: int, count: int) -> None:
         clock.time += 0.001
         sign = -1 if node == 2 else 1
         feedback.take(node, MOTION, struct.pack("<i", 0))
@@ -40,8 +40,8 @@ def test_readings_of_two_different_moments_are_not_one_pose() -> None:
     feedback.commanded_to_move()
     for k in range(20):
         if k != 7:
-            tell(1, 600 * k)
-        tell(2, 600 * k)
+            notify(1, 600 * k)
+        notify(2, 600 * k)
         clock.time += 0.018
         feedback.commanded_to_move()
         state = feedback.state(10.0, None, True)
@@ -60,9 +60,9 @@ class Told:
         for drive in self.feedback.drives:
             drive.configured = True
         for node in (1, 2):
-            self.tell(node)
+            self.notify(node)
 
-    def tell(
+    def notify(
         self, node: int, velocity: int = 0, word: int = 0x0237, mode: int = 3, inputs: int = 0, count: int = 0
     ) -> None:
         self.clock.time += 0.001
@@ -81,11 +81,11 @@ def test_one_wheel_that_turns_either_way_is_no_standstill(node: int, velocity: i
     told = Told()
     for _ in range(AT_REST):
         asked = told.clock.time
-        told.tell(node)
+        told.notify(node)
         assert not told.feedback.stands(asked), "the other one has told nothing since"
-        told.tell(3 - node)
+        told.notify(3 - node)
     assert told.feedback.stands(asked)
-    told.tell(node, velocity)
+    told.notify(node, velocity)
     assert not told.feedback.stands(asked)
 
 
@@ -95,13 +95,13 @@ def test_counts_that_go_on_deny_a_speed_of_zero(node: int, way: int) -> None:
     told = Told()
     asked, step = told.clock.time, round(1.2 * CREPT_M / WHEELS.count_length)
     for k in range(1, 3 * AT_REST):
-        told.tell(node, count=way * k * step)
-        told.tell(3 - node)
+        told.notify(node, count=way * k * step)
+        told.notify(3 - node)
         assert not told.feedback.stands(asked)
     for k in range(AT_REST):
         # It hunts by some counts.
-        told.tell(node, count=way * (3 * AT_REST - 1) * step + 3 * (k % 2))
-        told.tell(3 - node)
+        told.notify(node, count=way * (3 * AT_REST - 1) * step + 3 * (k % 2))
+        told.notify(3 - node)
     assert told.feedback.stands(asked)
 
 
@@ -111,7 +111,7 @@ def test_one_drive_that_falls_silent_is_noticed_though_the_other_tells_on(node: 
     side = told.feedback.drives[node - 1].side
     last = told.feedback.drives[node - 1].moved
     told.clock.time += 0.6
-    told.tell(3 - node)
+    told.notify(3 - node)
     fault = told.refusal(driving=True)
     assert (fault.code, side in fault.message) == ("vehicle.silent", True)
     with pytest.raises(DeadlineError, match=r"0\.60 s old"):
@@ -125,9 +125,9 @@ def test_either_drives_input_tells_of_the_emergency_stop(node: int, active: bool
     told = Told(replace(WHEELS, stop_input=3, stop_active=active))
     free, pressed = (0, 1 << 3) if active else (1 << 3, 0)
     for each in (1, 2):
-        told.tell(each, inputs=free)
+        told.notify(each, inputs=free)
     told.feedback.check(in_command=True, driving=True)
-    told.tell(node, inputs=pressed)
+    told.notify(node, inputs=pressed)
     for in_command in (True, False):
         fault = told.refusal(in_command=in_command)
         assert (fault.code, fault.recoverable) == ("vehicle.emergency_stop", False)
@@ -148,7 +148,7 @@ def test_one_drive_that_does_not_obey_ends_driving(node: int, word: int, mode: i
     told = Told()
     assert told.feedback.gave_up() is None
     assert told.feedback.state(1.0, False, True).command_mode
-    told.tell(node, word=word, mode=mode)
+    told.notify(node, word=word, mode=mode)
     fault = told.feedback.gave_up()
     assert fault is not None
     assert why in fault.message
@@ -159,7 +159,7 @@ def test_one_drive_that_does_not_obey_ends_driving(node: int, word: int, mode: i
 def test_a_drive_that_was_restarted_does_not_obey() -> None:
     told = Told()
     told.feedback.take(2, HEARTBEAT, b"\0")
-    told.tell(2)
+    told.notify(2)
     fault = told.feedback.gave_up()
     assert fault is not None
     assert "was restarted" in fault.message

@@ -6,16 +6,16 @@ from pathlib import Path
 
 import pytest
 
-from cell.apps.cli.commands.console import page_teller
+from cell.apps.cli.commands.console import page_notifier
 
 
 def test_the_link_is_in_no_process_s_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
     """The browser is given a file that nobody else may read, in a folder that nobody else may enter."""
     opened: list[str] = []
     monkeypatch.setattr("webbrowser.open", opened.append)
-    tell = page_teller(open_page=True)
+    notify = page_notifier(open_page=True)
     for link in ("http://127.0.0.1:1/enter?token=first", "http://127.0.0.1:1/enter?token=second"):
-        tell(link)
+        notify(link)
     (url,) = opened
     page = Path(url.removeprefix("file://"))
     assert "token" not in url and "token=first" in page.read_text()

@@ -58,11 +58,11 @@ def test_a_rail_whose_motor_turns_backwards_is_nudged_but_finds_no_zero_until_it
 def test_limit_switches_that_are_exchanged_are_found_by_name_short_of_the_end_stop(tmp_path: Path) -> None:
     files(tmp_path)
     made, result = opened(tmp_path, Shown()), Result()
-    with closing(made.desk):
-        simulated = made.desk.cell.simulated
+    with closing(made.workplace):
+        simulated = made.workplace.cell.simulated
         assert isinstance(simulated, VirtualCell)
         simulated.fault("rail.exchanged_switches")
-        by_name("rail_limits").work(made.desk, result)
+        by_name("rail_limits").work(made.workplace, result)
         (finding,) = result.findings
         assert "left limit switch at the left end, measured that of the other end" in str(finding)
         assert not simulated.world.rail.stalled(simulated.clock.now())

@@ -19,10 +19,10 @@ def test_time_and_way_until_rest_are_measured_for_each_cause(
 ) -> None:
     files(tmp_path)
     made, result = opened(tmp_path, Shown()), Result()
-    with closing(made.desk):
-        cell, stop = made.desk.cell, made.desk.cell.stop
+    with closing(made.workplace):
+        cell, stop = made.workplace.cell, made.workplace.cell.stop
         monkeypatch.setattr(cell, "stop", lambda: (cell.devices.clock.sleep(late_s), stop()))
-        by_name("stops").work(made.desk, result)
+        by_name("stops").work(made.workplace, result)
     rows = {row.what: row for row in result.readings}
     for name in ("rail", "arm", "vehicle"):
         for cause in ("Cell.stop()", "`cell abort`"):

@@ -22,13 +22,13 @@ def test_a_station_board_of_another_pitch_is_written_into_a_job_of_ones_own_and_
     check, shown = by_name("station"), Shown()
     for name, written in (("pot", {}), (str(job), {"board.spec": '"marked_dots:9x7:24mm"'})):
         made, result = opened(tmp_path, shown, job=name), Result()
-        with closing(made.desk):
-            judge_board(name, parse_board(made.desk.job.board.spec), 1.201, result)
+        with closing(made.workplace):
+            judge_board(name, parse_board(made.workplace.job.board.spec), 1.201, result)
             (finding,) = result.findings
             assert finding.write_job == written
             assert 'write spec = "marked_dots:9x7:24mm"' in str(finding) or "own.toml it has to read" in str(finding)
-            made.progress.keep(check, made.desk.config, Result(), 1.0, "")
+            made.progress.keep(check, made.workplace.config, Result(), 1.0, "")
             assert made._mend(check, result) is bool(written)
-            assert made.progress.standing(check, made.desk.config) == ("stale" if written else "good")
+            assert made.progress.standing(check, made.workplace.config) == ("stale" if written else "good")
     assert load_job(job)[0].board.spec == "marked_dots:9x7:24mm"
     assert len(list(job.parent.glob("own.toml.before-*"))) == 1

@@ -15,7 +15,7 @@ from tests.support.commissioning import Shown, commissioned, files, opened
 def test_every_device_answers_is_named_and_well_and_a_person_has_looked_round(tmp_path: Path, clear: bool) -> None:
     files(tmp_path)
     made = opened(tmp_path, Shown(), lambda text: clear)
-    with closing(made.desk):
+    with closing(made.workplace):
         result = made._once(by_name("links"))
     assert result.verdict == ("good" if clear else "wrong")
     assert [row.what for row in result.readings if not row.ok] == ([] if clear else ["a person has looked round"])

@@ -82,7 +82,7 @@ def test_a_question_about_a_job_that_a_command_began_ends_with_it(cell: Cell, co
         failure = Failure(Outcome.REFUSED, "no board")
         asked = threading.Thread(target=lambda: made.append(decide("board_photo", failure)), daemon=True)
         asked.start()
-        assert until(lambda: console.desk.questions.present(None) is not None)
+        assert until(lambda: console.controller.questions.present(None) is not None)
         run.abort("interrupted")
         asked.join(5)
     assert made == [None]

@@ -19,18 +19,18 @@ from tests.support import until
 from tests.support.console.server import refusal
 
 
-def test_one_holds_the_others_see(desk: ConsoleController) -> None:
-    assert "nobody" in str(refusal(desk, "c1", do="home"))
-    assert desk.do("c1", {"do": "hold", "name": "  Ann\n\x07 "}) == {"ok": True, "text": "Ann holds the cell"}
-    assert "Ann" in str(refusal(desk, "c2", do="hold", name="Bob"))
-    assert "Ann does" in str(refusal(desk, "c2", do="start", job="pot"))
-    assert isinstance(refusal(desk, "c1", do="hand_over", to="c9"), InterlockError)
-    desk.do("c1", {"do": "hand_over", "to": "c2"})
-    assert isinstance(refusal(desk, "c1", do="leave"), InterlockError)
-    desk.left("c2")
-    assert desk.holders.holder is None
+def test_one_holds_the_others_see(controller: ConsoleController) -> None:
+    assert "nobody" in str(refusal(controller, "c1", do="home"))
+    assert controller.do("c1", {"do": "hold", "name": "  Ann\n\x07 "}) == {"ok": True, "text": "Ann holds the cell"}
+    assert "Ann" in str(refusal(controller, "c2", do="hold", name="Bob"))
+    assert "Ann does" in str(refusal(controller, "c2", do="start", job="pot"))
+    assert isinstance(refusal(controller, "c1", do="hand_over", to="c9"), InterlockError)
+    controller.do("c1", {"do": "hand_over", "to": "c2"})
+    assert isinstance(refusal(controller, "c1", do="leave"), InterlockError)
+    controller.left("c2")
+    assert controller.holders.holder is None
     # A page that is gone cannot come back as itself.
-    assert isinstance(refusal(desk, "c2", do="hold", name="Bob"), InterlockError)
+    assert isinstance(refusal(controller, "c2", do="hold", name="Bob"), InterlockError)
 
 
 @pytest.mark.parametrize(
@@ -61,40 +61,40 @@ def test_one_holds_the_others_see(desk: ConsoleController) -> None:
         ({"do": "dry_run", "seed": -1}, ConfigError),
     ],
 )
-def test_what_is_wrong_is_refused(desk: ConsoleController, words: dict[str, Any], kind: type[CellError]) -> None:
-    desk.do("c1", {"do": "hold", "name": "Ann"})
-    assert type(refusal(desk, "c1", **words)) is kind
+def test_what_is_wrong_is_refused(controller: ConsoleController, words: dict[str, Any], kind: type[CellError]) -> None:
+    controller.do("c1", {"do": "hold", "name": "Ann"})
+    assert type(refusal(controller, "c1", **words)) is kind
 
 
-def test_manual_mode_jogs_and_nothing_else_can_be_begun_meanwhile(cell: Cell, desk: ConsoleController) -> None:
-    desk.do("c1", {"do": "hold", "name": "Ann"})
-    desk.do("c1", {"do": "manual", "on": True})
-    assert desk.manual.on
+def test_manual_mode_jogs_and_nothing_else_can_be_begun_meanwhile(cell: Cell, controller: ConsoleController) -> None:
+    controller.do("c1", {"do": "hold", "name": "Ann"})
+    controller.do("c1", {"do": "manual", "on": True})
+    assert controller.manual.on
     before = cell.devices.arm.state().flange.copy()
-    desk.do("c1", {"do": "jog_step", "device": "arm", "axis": "z", "amount": 0.01})
+    controller.do("c1", {"do": "jog_step", "device": "arm", "axis": "z", "amount": 0.01})
     moved = cell.devices.arm.state().flange - before
     assert moved[:3] == pytest.approx([0, 0, 0.01], abs=1e-4)
-    assert isinstance(refusal(desk, "c1", do="jog_step", device="arm", axis="z", amount=2.0), LimitError)
-    assert isinstance(refusal(desk, "c1", do="jog_step", device="arm", axis="q", amount=0.01), ConfigError)
+    assert isinstance(refusal(controller, "c1", do="jog_step", device="arm", axis="z", amount=2.0), LimitError)
+    assert isinstance(refusal(controller, "c1", do="jog_step", device="arm", axis="q", amount=0.01), ConfigError)
     # What a step refuses does not end the mode; a job does not begin in it.
-    assert desk.manual.on
-    assert "jog is going on" in str(refusal(desk, "c1", do="start", job="pot"))
-    desk.do("c1", {"do": "leave"})
-    assert until(lambda: not desk.manual.on)
+    assert controller.manual.on
+    assert "jog is going on" in str(refusal(controller, "c1", do="start", job="pot"))
+    controller.do("c1", {"do": "leave"})
+    assert until(lambda: not controller.manual.on)
 
 
-def test_a_stop_ends_manual_mode_and_then_somebody_has_to_look(cell: Cell, desk: ConsoleController) -> None:
-    desk.do("c1", {"do": "hold", "name": "Ann"})
-    desk.do("c1", {"do": "manual", "on": True})
+def test_a_stop_ends_manual_mode_and_then_somebody_has_to_look(cell: Cell, controller: ConsoleController) -> None:
+    controller.do("c1", {"do": "hold", "name": "Ann"})
+    controller.do("c1", {"do": "manual", "on": True})
     cell.stop()
-    assert until(lambda: not desk.manual.on)
+    assert until(lambda: not controller.manual.on)
     assert not cell.devices.gate.is_open
-    desk.do("c1", {"do": "clear_stop", "by": "Ann"})
+    controller.do("c1", {"do": "clear_stop", "by": "Ann"})
     assert cell.devices.gate.is_open
 
 
 def test_what_takes_long_to_begin_is_answered_at_once_and_not_begun_twice(
-    cell: Cell, desk: ConsoleController, monkeypatch: pytest.MonkeyPatch
+    cell: Cell, controller: ConsoleController, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told, slow = [], threading.Event()
 
@@ -103,23 +103,23 @@ def test_what_takes_long_to_begin_is_answered_at_once_and_not_begun_twice(
         raise RefusedError("the battery is empty")
 
     monkeypatch.setattr(cell, "start", start)
-    monkeypatch.setattr(desk, "_say", lambda client, words: told.append((client, words)))
-    desk.do("c1", {"do": "hold", "name": "Ann"})
+    monkeypatch.setattr(controller, "_say", lambda client, words: told.append((client, words)))
+    controller.do("c1", {"do": "hold", "name": "Ann"})
     # While it still takes: the answer waits for `SOON_S` alone.
-    assert desk.do("c1", {"do": "start", "job": "pot"})["text"] == "starting job pot …"
+    assert controller.do("c1", {"do": "start", "job": "pot"})["text"] == "starting job pot …"
     assert SOON_S <= 0.1
-    assert desk.starting == "job pot"
+    assert controller.starting == "job pot"
     for again in ("start", "home", "calibrate"):
-        assert "is starting job pot" in str(refusal(desk, "c1", do=again))
+        assert "is starting job pot" in str(refusal(controller, "c1", do=again))
     slow.set()
-    assert until(lambda: desk.starting is None)
+    assert until(lambda: controller.starting is None)
     # What refuses it later is told to the page that asked.
     assert told == [("c1", {"type": "answer", "ok": False, "text": "the battery is empty"})]
-    assert "battery" in str(refusal(desk, "c1", do="start"))
+    assert "battery" in str(refusal(controller, "c1", do="start"))
 
 
 def test_a_stop_while_something_is_starting_ends_it(
-    cell: Cell, desk: ConsoleController, monkeypatch: pytest.MonkeyPatch
+    cell: Cell, controller: ConsoleController, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     slow, begun = threading.Event(), list[Run[Any]]()
 
@@ -129,8 +129,8 @@ def test_a_stop_while_something_is_starting_ends_it(
         begun[0].ended(10)
 
     monkeypatch.setattr(cell, "home", home)
-    desk.do("c1", {"do": "hold", "name": "Ann"})
-    assert desk.do("c1", {"do": "home"})["text"] == "starting homing …"
+    controller.do("c1", {"do": "hold", "name": "Ann"})
+    assert controller.do("c1", {"do": "home"})["text"] == "starting homing …"
     cell.stop()
     slow.set()
     assert until(lambda: begun and begun[0].done, 5.0)
@@ -139,7 +139,7 @@ def test_a_stop_while_something_is_starting_ends_it(
 
 
 def test_jobs_are_named_never_addressed(
-    desk: ConsoleController, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    controller: ConsoleController, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing of a file's text is told, and a pipe keeps nobody waiting."""
     elsewhere, here = tmp_path / "elsewhere", tmp_path / "here"
@@ -152,7 +152,7 @@ def test_jobs_are_named_never_addressed(
     (here / "linked.toml").symlink_to(elsewhere / "mine.toml")
     os.mkfifo(here / "pipe.toml")
     monkeypatch.chdir(here)
-    assert desk.named_job("mine") == "mine" and desk.named_job("seat") == "seat"
+    assert controller.named_job("mine") == "mine" and controller.named_job("seat") == "seat"
     wrong = [
         "../elsewhere/mine",
         "../elsewhere/mine.toml",
@@ -164,7 +164,7 @@ def test_jobs_are_named_never_addressed(
     ]
     for name in [*wrong, "pipe", "pipe.toml", "/dev/zero", "/etc/passwd", "", ".", "..", "x" * 300]:
         with pytest.raises(ConfigError) as refused:
-            desk.named_job(name)
+            controller.named_job(name)
         assert "secret" not in str(refused.value)
     shipped = [item for name in shipped_jobs() if name != "pot" for item in item_names(name)]
     assert jobs("pot") == ["pot", "mine", *shipped]
@@ -178,8 +178,8 @@ def test_jobs_are_named_never_addressed(
      {"device": "claw"}, {"axis": "x" * 900}, {"surplus": 1}],
     ids=str,
 )  # fmt: skip
-def test_a_beat_that_is_not_understood_moves_nothing(desk: ConsoleController, wrong: dict[str, Any]) -> None:
+def test_a_beat_that_is_not_understood_moves_nothing(controller: ConsoleController, wrong: dict[str, Any]) -> None:
     beat = {"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1, "at": 1.0}
     with pytest.raises(ConfigError, match="not understood"):
-        desk.beat("c1", beat | wrong)
-    desk.beat("c1", beat)
+        controller.beat("c1", beat | wrong)
+    controller.beat("c1", beat)

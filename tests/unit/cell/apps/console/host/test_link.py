@@ -26,11 +26,11 @@ def test_when_the_server_is_killed_the_program_hears_of_it_and_nobody_holds(
         key = json.loads(page.recv(timeout=20))["key"]
         ann.do(do="hold", name="Ann", key=key)
         ann.do(do="manual", on=True, key=key)
-        assert console.desk.manual.on
+        assert console.controller.manual.on
         os.kill(console._server.pid, signal.SIGKILL)
         assert gone.wait(5)
-        assert until(lambda: not console.desk.manual.on)
-        assert console.desk.holders.holder is None
+        assert until(lambda: not console.controller.manual.on)
+        assert console.controller.holders.holder is None
 
 
 def test_a_message_that_goes_wrong_ends_nothing(cell: Cell, console: Console, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -41,7 +41,7 @@ def test_a_message_that_goes_wrong_ends_nothing(cell: Cell, console: Console, mo
 
     ann = Browser(console.link)
     for name in ("beat", "joined"):
-        monkeypatch.setattr(console.desk, name, fail)
+        monkeypatch.setattr(console.controller, name, fail)
     with ann.live() as page:
         key = json.loads(page.recv(timeout=20))["key"]
         page.send(json.dumps({"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1}))
@@ -67,7 +67,7 @@ def test_a_killed_server_is_noticed_whatever_the_other_threads_do(
     gone, held = threading.Event(), threading.Event()
     with Console(cell, "pot", gone=gone.set) as console:
         console._heard(Beat("c1", {"type": "jog", "press": 1, "at": 10**400}))
-        monkeypatch.setattr(console.desk, hung, lambda *_: held.wait(60))
+        monkeypatch.setattr(console.controller, hung, lambda *_: held.wait(60))
         browser = Browser(console.link)
         with browser.live() as page:
             page.send(json.dumps({"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1}))

@@ -106,7 +106,7 @@ def test_who_waits_for_the_end_hears_it_at_once() -> None:
 @pytest.mark.parametrize(("device", "axis"), [("arm", "z"), ("arm", "j1"), ("rail", "")])
 @pytest.mark.parametrize("end", ["release", "page gone", "another button", "manual off", "silence"])
 def test_what_ends_a_held_button_stops_the_motion(
-    cell: Cell, desk: ConsoleController, monkeypatch: pytest.MonkeyPatch, device: str, axis: str, end: str
+    cell: Cell, controller: ConsoleController, monkeypatch: pytest.MonkeyPatch, device: str, axis: str, end: str
 ) -> None:
     """Virtual time passes here alone: what moves on after the end would be seen to."""
     cell.home("rail")
@@ -114,12 +114,12 @@ def test_what_ends_a_held_button_stops_the_motion(
     moved: Any = getattr(cell.devices, device)
     monkeypatch.setattr(moved.bare, "attended", lambda: nullcontext(lambda: None), raising=False)
     monkeypatch.setattr("cell.apps.console.host.manual.ATTENDED_S", 60.0)
-    monkeypatch.setattr(desk, "_say", lambda client, words: told.append(words["state"]))
-    desk.do("c1", {"do": "hold", "name": "Ann"})
-    desk.do("c1", {"do": "manual", "on": True})
+    monkeypatch.setattr(controller, "_say", lambda client, words: told.append(words["state"]))
+    controller.do("c1", {"do": "hold", "name": "Ann"})
+    controller.do("c1", {"do": "manual", "on": True})
 
     def beat(number: int) -> None:
-        desk.beat("c1", {"type": "jog", "press": number, "device": device, "axis": axis, "sign": 1, "at": None})
+        controller.beat("c1", {"type": "jog", "press": number, "device": device, "axis": axis, "sign": 1, "at": None})
 
     def place() -> Any:
         return moved.state().position if device == "rail" else moved.state().joints
@@ -130,8 +130,8 @@ def test_what_ends_a_held_button_stops_the_motion(
     cell.devices.clock.sleep(0.3)
     assert np.abs(place() - begun).max() > 1e-4
     ends: dict[str, Any] = {
-        "release": lambda: desk.jog_end("c1"), "page gone": lambda: desk.left("c1"), "another button": lambda: beat(2),
-        "manual off": lambda: desk.do("c1", {"do": "manual", "on": False}),
+        "release": lambda: controller.jog_end("c1"), "page gone": lambda: controller.left("c1"),
+        "another button": lambda: beat(2), "manual off": lambda: controller.do("c1", {"do": "manual", "on": False}),
         "silence": lambda: monkeypatch.setattr("cell.apps.console.host.manual.ATTENDED_S", 0.0),
     }  # fmt: skip
     ends[end]()

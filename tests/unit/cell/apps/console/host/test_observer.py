@@ -29,7 +29,7 @@ def test_a_placed_job_ends_with_its_figure(tmp_path: Path, report: dict[str, Any
 
     def work(run: Run[Any]) -> None:
         run.folder = tmp_path
-        run.tell(Event("run_ended", None, {"outcome": "placed", "reason": "all steps done"}))
+        run.notify(Event("run_ended", None, {"outcome": "placed", "reason": "all steps done"}))
         (tmp_path / "report.json").write_text(json.dumps({"outcome": "placed", **report}))
 
     run: Run[Any] = Run("job", work)

@@ -47,7 +47,7 @@ def words(chance: random.Random, kind: str, names: list[str]) -> dict[str, Any]:
 def desk_hears(console: Console, count: int) -> None:
     """Each command is answered and each message taken; in the order in which they are said."""
     chance, told = random.Random(22), queue.SimpleQueue[Any]()
-    console._server.tell = told.put  # type: ignore[method-assign]
+    console._server.notify = told.put  # type: ignore[method-assign]
     for client in ("c1", "c2"):
         console._heard(Joined(client))
     for number in range(count):

@@ -90,9 +90,9 @@ def test_who_reads_slowly_sees_the_newest_and_holds_nobody_up(server: Served) ->
         for page in (slow, quick):
             page.recv(timeout=10)
         for n in range(150):
-            server.process.tell(Show(json.dumps({"type": "state", "n": n, "fill": big})))
+            server.process.notify(Show(json.dumps({"type": "state", "n": n, "fill": big})))
             time.sleep(0.004)
-        server.process.tell(CloudPart({"type": "cloud", "reset": False}, b"\0" * 16))
+        server.process.notify(CloudPart({"type": "cloud", "reset": False}, b"\0" * 16))
         seen = _states(quick, 149)
         assert seen[-1] == 149
         late = _states(slow, 149)

@@ -20,18 +20,20 @@ def test_a_run_is_followed_by_its_own_events() -> None:
 
     def work(run: Run[Any]) -> None:
         seen.wait(10)
-        run.tell(Event("progress", "calibrate", {"fraction": 1.0, "text": "stored"}))
-        run.tell(Event("step_started", "board_photo", {"attempt": 1}))
-        run.tell(Event("progress", "board_photo", {"fraction": 0.5, "text": "to the board"}))
-        run.tell(
+        run.notify(Event("progress", "calibrate", {"fraction": 1.0, "text": "stored"}))
+        run.notify(Event("step_started", "board_photo", {"attempt": 1}))
+        run.notify(Event("progress", "board_photo", {"fraction": 0.5, "text": "to the board"}))
+        run.notify(
             Event(
                 "fault", "board_photo", {"attempt": 1, "code": "arm.link_lost", "reason": "cut", "remedy": "recovered"}
             )
         )
-        run.tell(Event("confirm_needed", "board_photo", {"reason": "look", "code": "arm.protective_stop", "number": 1}))
+        run.notify(
+            Event("confirm_needed", "board_photo", {"reason": "look", "code": "arm.protective_stop", "number": 1})
+        )
         begun.set()
         end.wait(10)
-        run.tell(Event("run_ended", None, {"outcome": "placed", "reason": "all steps done"}))
+        run.notify(Event("run_ended", None, {"outcome": "placed", "reason": "all steps done"}))
 
     run: Run[Any] = Run("job", work)
     view = RunView(run, STEPS, "pot", {"board_photo": 10.0, "laser_sweep": 5.0, "reconstruct": 1.0})
