@@ -205,7 +205,8 @@ class Planner:
     def _path(self, start: Joints, end: Joints, allowed: tuple[Pair, ...]) -> NDArray[np.float64]:
         """Corners (n, 6) rad of a free way, straight between them."""
         direct = np.stack([start, end])
-        if first_touch(self.collisions, direct, allowed) is None:
+        touch = first_touch(self.collisions, direct, allowed)
+        if touch is None:
             return direct
         ranges = np.array(self.limits.lower), np.array(self.limits.upper)
         for effort in EFFORTS:
@@ -214,5 +215,7 @@ class Planner:
                 return path
         raise CollisionError(
             f"no free way was found between joints {np.degrees(start).round(1).tolist()} and "
-            f"{np.degrees(end).round(1).tolist()} deg{limits()}. Move the arm to a freer posture with `cell jog` first"
+            f"{np.degrees(end).round(1).tolist()} deg{limits()}. On the straight way "
+            f"{', '.join(' and '.join(pair) for pair in touch.pairs)} would come closer than "
+            f"{1e3 * self.collisions.margin:.0f} mm. Move the arm to a freer posture with `cell jog` first"
         )
