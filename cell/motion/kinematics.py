@@ -21,6 +21,8 @@ Joints = NDArray[np.float64]
 """Joint angles of shape (6,), rad."""
 
 TURN = 2.0 * np.pi
+SAME_RAD = 1e-4
+"""Two branches whose joints differ by less are one."""
 
 
 class Unreachable(RefusedError):
@@ -156,7 +158,7 @@ class ArmKinematics:
             if (
                 error < 1e-7
                 and self.limits.inside(joints)
-                and not any(np.allclose(joints, f, atol=1e-4) for f in found)
+                and not any(np.abs(joints - f).max() < SAME_RAD for f in found)
             ):
                 found.append(joints)
         return sorted(found, key=lambda q: float(np.sum((q - seed) ** 2)))

@@ -61,7 +61,7 @@ class Cell:
     """
 
     def __init__(self, opened: OpenCell) -> None:
-        self._here = opened
+        self._open_cell = opened
         self.config: CellConfig = opened.config
         self.folder: Path = opened.folder
         self.devices: Devices = opened.devices
@@ -130,7 +130,7 @@ class Cell:
     @property
     def whereabouts(self) -> Whereabouts:
         """What is known of where the vehicle stands."""
-        return self._here.whereabouts
+        return self._open_cell.whereabouts
 
     @property
     def pace(self) -> float:
@@ -139,31 +139,31 @@ class Cell:
         Set from any thread, it holds from the next motion on, in this run and all later ones. `ConfigError` for
         anything else.
         """
-        return self._here.pace.share
+        return self._open_cell.pace.share
 
     @pace.setter
     def pace(self, share: float) -> None:
         if share == self.pace:
             return
-        self._here.pace.share = share
+        self._open_cell.pace.share = share
         log.info("arm and vehicle move at %.0f %% of their planned speed from the next motion on", 100 * share)
 
     @property
     def runs_folder(self) -> Path:
         """Where run folders go."""
-        return self._here.runs_folder
+        return self._open_cell.runs_folder
 
     @property
     def calibrations_folder(self) -> Path:
         """Where calibrations are stored."""
-        return self._here.calibrations_folder
+        return self._open_cell.calibrations_folder
 
     def mover(self, job: Job | None, hold: Callable[[], None] = lambda: None) -> Mover:
         """Planned moves of the arm, for jogging and calibration; with a job, its part is in the claw.
 
         `hold` is called before each free motion: a paused run waits in it.
         """
-        return self._here.mover(job, hold)
+        return self._open_cell.mover(job, hold)
 
     @property
     def current(self) -> Run[object] | None:
@@ -218,7 +218,7 @@ class Cell:
             if (run := self.current) is not None:
                 run.notify(Event("note", None, {"text": text}))
             else:
-                over.enter_context(recorded_maintenance(self.runs_folder, self._here.facts, reason, lift))
+                over.enter_context(recorded_maintenance(self.runs_folder, self._open_cell.facts, reason, lift))
             log.warning("%s", text)
             try:
                 yield
@@ -240,7 +240,7 @@ class Cell:
                 self._runs.end()
                 problems = self.devices.stop() + self.devices.close()
             finally:
-                self._here.lock.__exit__(None, None, None)
+                self._open_cell.lock.__exit__(None, None, None)
                 if self.simulated is not None:
                     self.simulated.close()
         self._signals.__exit__(None, None, None)
@@ -268,7 +268,7 @@ class Cell:
         info: Mapping[str, object] | None = None, stops: int | None = None,
     ) -> Made:  # fmt: skip
         """Do work outside a job, such as a jog, as a recorded run, and wait for its end. `stops` as in `begin`."""
-        return self.begin(kind, lambda run: self._here.recorded(run, kind, work, info), observer, stops).result()
+        return self.begin(kind, lambda run: self._open_cell.recorded(run, kind, work, info), observer, stops).result()
 
     def run(
         self, job: str | Path = "pot", observer: Observer | None = None, inject: Sequence[str] = (), *,
@@ -328,7 +328,7 @@ class Cell:
         for each in jobs if inject else ():
             Injector.scheduled(inject, kind_of(each).names, self.simulated)
         return batches.perform(
-            self._here, jobs, count,
+            self._open_cell, jobs, count,
             run=lambda number, parts_before: self._start(
                 names[(number - 1) % len(names)], observer, {}, None, inject=inject,
                 at_start=at_start and number == 1, parts_before=parts_before,
@@ -393,16 +393,16 @@ class Cell:
             if isinstance(error, CalibrationEdited) or not is_whole(self.simulated):
                 raise
             stored = error
-        info |= {**self._here.world, **ready.info}
+        info |= {**self._open_cell.world, **ready.info}
         work = JobWork(
-            self._here, job, ready, info, stored=stored, before=before, inline=inline, at_start=at_start,
+            self._open_cell, job, ready, info, stored=stored, before=before, inline=inline, at_start=at_start,
             parts_before=parts_before or PartsBefore(),
         )  # fmt: skip
         return self.begin("job", work.perform, observer, stops)
 
     def calibration(self) -> CellCalibration:
         """The stored calibration of this very cell as configured; see `find_calibration`, also for what it raises."""
-        return sessions.stored(self._here)
+        return sessions.stored(self._open_cell)
 
     def calibrate(self, observer: Observer | None = None, job: str | Path = "pot") -> CellCalibration:
         """Move through the calibration poses over the deck boards, solve, and store the result and what it came from.
@@ -416,7 +416,9 @@ class Cell:
         """
         stops = self.stops
         load_job(job)
-        return self.begin("calibration", lambda run: sessions.calibrate(self._here, run, job), observer, stops).result()
+        return self.begin(
+            "calibration", lambda run: sessions.calibrate(self._open_cell, run, job), observer, stops
+        ).result()
 
     def verify(self, observer: Observer | None = None, job: str | Path = "pot") -> Verification:
         """Look at the deck boards again and say how good the stored calibration is today.
@@ -454,7 +456,7 @@ class Cell:
         stops = self.stops
         loaded, _ = load_job(job)
         calibration = self.calibration()
-        return self.begin(kind, lambda run: work(self._here, run, calibration, loaded), observer, stops).result()
+        return self.begin(kind, lambda run: work(self._open_cell, run, calibration, loaded), observer, stops).result()
 
     def recover(self, by: str, observer: Observer | None = None) -> None:
         """Unlock the arm's protective stop, connect a lost link, clear the vehicle's fault. Nothing moves.

@@ -172,7 +172,7 @@ def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
         return RunOutcome(*how, tmp_path, {"cell_s": 1.0, "measured": [], "steps": []}, placed_pot.results)
 
     with opened() as cell:
-        open_cell = replace(cell._here, simulated=None)
+        open_cell = replace(cell._open_cell, simulated=None)
         cell.runs_folder.mkdir()
         batch = perform(open_cell, jobs, 3, run, between=lambda work: asked.append(len(tried)), observer=None)
     assert (tried, asked) == ([1, 2, 3, 4], [2]), "a person at a real cell makes both items ready again"
@@ -197,7 +197,7 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
     asked: list[str] = []
     with opened() as cell:
         job, last = load_job("own.toml")[0], RunOutcome("placed", "all steps done", tmp_path, {})
-        open_cell, claw = replace(cell._here, simulated=None), cell.devices.claw
+        open_cell, claw = replace(cell._open_cell, simulated=None), cell.devices.claw
 
         def person(what: str) -> None:
             asked.append(what.split()[0])
@@ -216,7 +216,7 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
 
         cell.perform("loading", work)
     assert asked == ["Hold", "Hold", "The"]
-    assert _question(cell._here, job, "part 2 of 2", last, refill=True) is None
+    assert _question(cell._open_cell, job, "part 2 of 2", last, refill=True) is None
 
 
 def test_a_fault_ends_it_whatever_the_job_says_of_refusals_and_the_command_line_shows_it(
@@ -234,7 +234,7 @@ def test_a_fault_ends_it_whatever_the_job_says_of_refusals_and_the_command_line_
     assert typed(*words, "--until", "board_photo")[0] == 2
 
 
-def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(open_cell: Path, typed: Typed) -> None:
+def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(here: Path, typed: Typed) -> None:
     """No terminal is here: the batch would wait for ever."""
     (open_cell / "pot.ply").write_bytes(job_path("pot").with_suffix(".ply").read_bytes())
     (open_cell / "asks.toml").write_text(

@@ -45,13 +45,13 @@ def _drive(real: World, told: WorldFollowing, seconds: float) -> None:
         real.vehicle.command(t, 0.2, 0.1)
         real.vehicle.tick(t)
         if k % 2 == 0:
-            told.notify("arm", [[t, *real.arm.drive.q, float(real.arm.moving), float(real.arm.digital_outputs)]])
+            told.tell("arm", [[t, *real.arm.drive.q, float(real.arm.moving), float(real.arm.digital_outputs)]])
         if k % 5 == 0:
             turns = real.rail.position(t) / (200 << real.rail.settings.microsteps)
-            told.notify("rail", [[t, start + turns * 0.002]])
+            told.tell("rail", [[t, start + turns * 0.002]])
         if k % 10 == 0:
             state = real.vehicle.feedback(t)
-            told.notify("vehicle", [[t, *_odometry(*real.vehicle.planar(t)), state.speed, state.yaw_rate, 0.0]])
+            told.tell("vehicle", [[t, *_odometry(*real.vehicle.planar(t)), state.speed, state.yaw_rate, 0.0]])
 
 
 def test_the_world_stands_as_what_it_follows(pair: tuple[World, World, WorldFollowing]) -> None:
@@ -83,9 +83,9 @@ def test_in_a_gap_in_which_something_moved_there_is_no_picture(pair: tuple[World
     """The arm turned by 0.3 rad between two readings that are 0.2 s apart, and stood before and after."""
     real, _, told = pair
     t = max(0.0, told._tracks["arm"].until)
-    told.notify("vehicle", [[t + at, 0.2, 0.0, 0.0, 0.0, 0.0, 1.0] for at in (0.1, 3.0)])
+    told.tell("vehicle", [[t + at, 0.2, 0.0, 0.0, 0.0, 0.0, 1.0] for at in (0.1, 3.0)])
     for at, turned in ((0.5, 0.0), (0.7, 0.0), (0.9, 0.3), (1.1, 0.3)):
-        told.notify("arm", [[t + at, *(real.arm.drive.q + turned), 0.0, 0.0]])
+        told.tell("arm", [[t + at, *(real.arm.drive.q + turned), 0.0, 0.0]])
     told.require("target", t + 0.6)
     told.require("target", t + 1.0)
     with pytest.raises(NotFollowed, match="where the arm was is not known: two readings of it are 200 ms apart"):
@@ -105,8 +105,8 @@ def test_a_camera_that_does_not_ride_on_the_rail_does_not_wait_for_it(
 ) -> None:
     real, follower, told = pair
     t = told._tracks["arm"].until + 0.5
-    told.notify("arm", [[t, *real.arm.drive.q, 0.0, 0.0]])
-    told.notify("vehicle", [[t, 0.2, 0.0, 0.0, 0.0, 0.0, 1.0]])
+    told.tell("arm", [[t, *real.arm.drive.q, 0.0, 0.0]])
+    told.tell("vehicle", [[t, 0.2, 0.0, 0.0, 0.0, 0.0, 1.0]])
     assert follower.rail.carriage(t) == follower.rail.carriage(t - 0.4)
 
 

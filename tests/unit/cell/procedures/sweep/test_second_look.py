@@ -222,7 +222,7 @@ def test_after_a_pause_it_is_looked_at_anew(
         slid(site.cell, (0.0, 1e-3))
         site.control.go_on()
 
-    site = AtStation(placed_pot, tmp_path, notify=notify, look=reach_in)
+    site = AtStation(placed_pot, tmp_path, notify=notify, check=reach_in)
     with pytest.raises(RefusedError, match=r"the surface has moved by (0\.9|1\.0)"):
         site.do("place")
     assert held == [True]
