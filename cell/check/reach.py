@@ -17,8 +17,7 @@ from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.part_pose import seen_from_above
-from cell.measure.vision import parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import centre_of, parse_board
 from cell.motion.collision import (
     TOUCHES,
     CollisionError,

@@ -15,8 +15,7 @@ from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_s
 from cell.apps.new_job.text import METRES, deg, mm, possible_units, size_words, told_by_size
 from cell.config.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
 from cell.measure.geometry.poses import from_parts
-from cell.measure.vision import parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import centre_of, parse_board
 from cell.procedures.sought_part import pose_record
 from drivers.common.addresses import checked_name
 from drivers.common.units import parse_quantity, shown

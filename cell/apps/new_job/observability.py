@@ -18,8 +18,8 @@ from cell.config.job import Job
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion import NominalSurface, PlacePose, Prior, Tolerance, invert_pose
 from cell.measure.inversion.observability import FREE, PoseVerdict, judge
-from cell.measure.reconstruction import flange_motions
-from cell.measure.vision import parse_board
+from cell.measure.reconstruction.build import flange_motions
+from cell.measure.vision.board.view import parse_board
 from cell.motion.collision import Body, tool_bodies
 from cell.procedures.arm.photograph import base_from_place_at_target, look_pose, photo_pose
 

@@ -24,7 +24,7 @@ from cell.measure.calibration.drift.decision import WORST_FIT
 from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
 from cell.measure.calibration.drift.interim import HeadShift
 from cell.measure.geometry.poses import from_parts, from_ur
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import NO_REFERENCE, CalibrationView, interim_view
 from cell.procedures.calibrate.boards import PHOTO_RATE, Keep, look_for

@@ -24,8 +24,8 @@ from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.drift.reference_plate import Pointing
 from cell.measure.calibration.drift.slip import Slip
 from cell.measure.geometry.poses import difference, from_matrix
-from cell.measure.reconstruction import ScanGeometry
-from cell.measure.vision import StripeProfile
+from cell.measure.reconstruction.build import ScanGeometry
+from cell.measure.vision.stripe.profile import StripeProfile
 from cell.procedures.arm.photograph import MOVED, BoardFix
 from cell.procedures.sweep.swath import Swath, SweepCollector
 from drivers.camera.folder import read_image

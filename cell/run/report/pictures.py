@@ -21,8 +21,8 @@ from cell.config.job import Job
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion import NominalSurface, PlacePose
 from cell.measure.inversion.flush import Flush
-from cell.measure.reconstruction import Cloud
-from cell.measure.vision import BoardView
+from cell.measure.reconstruction.cloud import Cloud
+from cell.measure.vision.board.view import BoardView
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.part_features import FeatureSeen

@@ -111,7 +111,7 @@ def _options(
     """What was said of a recording. Raises ConfigError for a word that is none of those allowed."""
     from cell.apps.recordings.command import Options
     from cell.apps.recordings.known_camera import read_camera
-    from cell.measure.vision import LaserChannel
+    from cell.measure.vision.stripe.planes import LaserChannel
 
     lasers = ("none", "red", "green", "blue", "grey", "auto")
     if setup not in (None, "eye-in-hand", "eye-to-hand"):
@@ -129,7 +129,7 @@ def _from_folder(folder: Path, board: str | None, said: Options, json: bool, det
     from cell.apps.cli.calibration.recorded_tables import print_recorded
     from cell.apps.recordings.command import calibrate_folder
     from cell.base.storage import sealed
-    from cell.measure.vision import parse_board
+    from cell.measure.vision.board.view import parse_board
 
     result = calibrate_folder(folder, None if board is None else parse_board(board, single_tag=True), said)
     if json:

@@ -11,7 +11,7 @@ from cell.measure.inversion import Prior, Tolerance, invert_pose
 from cell.measure.inversion.nominal import SIGMA_FLOOR, Scan
 from cell.measure.inversion.place_pose import PATCH_M, shared_by_patches
 from cell.measure.inversion.registration import register
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from tests.unit.cell.measure.inversion.test_registration import BOARD, JOB, TRUE, ledges, nominal, scanned
 
 Array = NDArray[np.float64]

@@ -8,7 +8,9 @@ import pytest
 
 from cell.measure.geometry.camera import seen_centres
 from cell.measure.geometry.poses import difference, transform
-from cell.measure.vision import PictureRefused, Reason, board_pose, find_board, parse_board
+from cell.measure.vision.board.board import board_pose, find_board
+from cell.measure.vision.board.view import parse_board
+from cell.measure.vision.pictures import PictureRefused, Reason
 from tests.unit.cell.measure.vision.board.drawn_boards import (
     FINE,
     LARGE,

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.measure.vision import parse_board
 from cell.measure.vision.board.board import find_board
+from cell.measure.vision.board.view import parse_board
 from cell.measure.vision.pictures import PictureRefused
 from drivers.errors import ConfigError
 
