@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from cell.check.place import contact_problems, mating_problems, mesh_box, place_problems, surface_problems, way_problems
-from cell.check.placed_part import verify_problems
-from cell.check.reach import reach_problems
+from cell.check.reach import reach_problems, verify_problems
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
 from cell.config.job import Job, item_names, load_job

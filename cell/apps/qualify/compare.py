@@ -9,8 +9,7 @@ from pathlib import Path
 from cell.apps.qualify.answer import limited
 from cell.apps.qualify.campaign import Campaign
 from cell.apps.qualify.intervals import mean_difference, share_difference
-from cell.apps.qualify.rows import Row, number, shown
-from cell.apps.qualify.store import ROWS, RowStore
+from cell.apps.qualify.rows import ROWS, Row, RowStore, number, shown
 from cell.run.batch import GOOD
 from drivers.errors import ConfigError
 

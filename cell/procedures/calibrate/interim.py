@@ -22,7 +22,7 @@ from cell.devices.devices import Devices
 from cell.measure.calibration import ScanObservation
 from cell.measure.calibration.drift.decision import WORST_FIT
 from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
-from cell.measure.calibration.drift.interim import HeadShift
+from cell.measure.calibration.drift.slip import HeadShift
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision.board.view import parse_board
 from cell.procedures.arm.moves import Mover

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.apps.qualify.rows import compared
-from cell.apps.qualify.store import RowStore
+from cell.apps.qualify.rows import RowStore, compared
 from tests.support import ROOT, running, until
 
 pytest.importorskip("pyarrow")

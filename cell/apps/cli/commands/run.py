@@ -159,7 +159,7 @@ def dry_run(
 
 def _say_qualified(job: str, config: Path | None) -> None:
     """Tell in a line how well `cell qualify` found this job to work, where it did."""
-    from cell.apps.qualify.kept import kept_line
+    from cell.apps.qualify.answer import kept_line
 
     if (line := kept_line(job, config)) is not None:
         typer.echo(line, err=True)

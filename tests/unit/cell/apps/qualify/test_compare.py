@@ -9,7 +9,7 @@ import pytest
 
 from cell.apps.qualify.campaign import Target
 from cell.apps.qualify.compare import compare, other_rows
-from cell.apps.qualify.store import RowStore
+from cell.apps.qualify.rows import RowStore
 from drivers.errors import ConfigError
 from tests.support.qualified import OF, campaign, row
 
