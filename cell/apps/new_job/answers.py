@@ -10,9 +10,21 @@ import numpy as np
 import pinocchio as pin
 
 from cell.apps.new_job.mesh_file import Drawn, MeshBody
-from cell.apps.new_job.questions import Asker, checked, choice, pose, pose_words, three
+from cell.apps.new_job.questions import (
+    METRES,
+    Asker,
+    checked,
+    choice,
+    deg,
+    mm,
+    pose,
+    pose_words,
+    possible_units,
+    size_words,
+    three,
+    told_by_size,
+)
 from cell.apps.new_job.surface import UP, Laid, centred, faces_down, lay, open_side, overlapping, raised
-from cell.apps.new_job.text import METRES, deg, mm, possible_units, size_words, told_by_size
 from cell.config.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision.board.view import centre_of, parse_board

@@ -19,10 +19,9 @@ from cell.apps.new_job.mesh_file import read_drawing
 from cell.apps.new_job.observability import known, place_from, sight_problems, told_by_few
 from cell.apps.new_job.picture import draw_proposal
 from cell.apps.new_job.proposal import Proposal, propose
-from cell.apps.new_job.questions import Asker, choice
+from cell.apps.new_job.questions import Asker, choice, job_text, pose_text
 from cell.apps.new_job.surface import Laid, about, as_stl
 from cell.apps.new_job.sweeps import FITS, Array, rivals
-from cell.apps.new_job.text import job_text, pose_text
 from cell.check.fit import require_fit
 from cell.check.reach import sweep_problems
 from cell.config.cell_config import CellConfig

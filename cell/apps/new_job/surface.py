@@ -19,8 +19,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.apps.new_job.mesh_file import MeshBody, joined
+from cell.apps.new_job.questions import METRES
 from cell.apps.new_job.sweeps import ABOVE, NEAR, Array, Faces, Rays
-from cell.apps.new_job.text import METRES
 from cell.measure.geometry.poses import from_parts
 from drivers.errors import ConfigError
 

@@ -13,9 +13,10 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.geometry.poses import composition_jacobians, difference
+from cell.measure.inversion.demands import Demands
 from cell.measure.inversion.effects.during_sweep import find_rocking, rocking_motions
 from cell.measure.inversion.nominal import Array, Indices, NominalSurface, Scan
-from cell.measure.inversion.observability import Demands, Tolerance, determined, judge
+from cell.measure.inversion.observability import Tolerance, determined, judge
 from cell.measure.inversion.place_pose import PlacePose, balance, invert_pose, shared_by_patches
 from cell.measure.inversion.registration import Prior, register
 from cell.measure.reconstruction.cloud import Cloud, Motions

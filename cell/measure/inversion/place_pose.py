@@ -1,4 +1,4 @@
-"""From the cloud to the place pose: registration and its whole uncertainty. `observability` has reasons to refuse it.
+"""From the cloud to the place pose: registration and its whole uncertainty. Reasons to refuse it are in `demands`.
 
 What neighbouring points of a scan are off by together: the drawing's facets, the part's form, a stripe on a slope.
 
@@ -27,22 +27,18 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import difference, perturbed
-from cell.measure.inversion.disagreement import dissent
-from cell.measure.inversion.nominal import SIGMA_FLOOR, Array, NominalSurface, Scan, sigmas_along
-from cell.measure.inversion.nominal import correspondences as matched
-from cell.measure.inversion.observability import (
-    FREE,
+from cell.measure.inversion.demands import (
     Demands,
-    PoseVerdict,
-    Tolerance,
-    determined,
     fit_figures,
-    judge,
     require_agreement,
     require_board,
     require_fit,
     require_whole,
 )
+from cell.measure.inversion.disagreement import dissent
+from cell.measure.inversion.nominal import SIGMA_FLOOR, Array, NominalSurface, Scan, sigmas_along
+from cell.measure.inversion.nominal import correspondences as matched
+from cell.measure.inversion.observability import FREE, PoseVerdict, Tolerance, determined, judge
 from cell.measure.inversion.registration import MOST_SHIFT, Prior, Registration, by_lines, candidates, register
 from cell.measure.reconstruction.cloud import Cloud
 from drivers.errors import Measured, RefusedError

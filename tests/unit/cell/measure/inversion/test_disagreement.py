@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_parts
 from cell.measure.inversion import Prior, invert_pose
+from cell.measure.inversion.demands import _squares
 from cell.measure.inversion.disagreement import (
     Dissent,
     Standing,
@@ -26,7 +27,6 @@ from cell.measure.inversion.disagreement import (
     require_bare,
 )
 from cell.measure.inversion.nominal import Scan
-from cell.measure.inversion.observability import _squares
 from cell.measure.inversion.registration import register
 from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.steps.kinds import PLACE
