@@ -13,8 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cell.apps.qualify.answer import BAD, FigureSpread, JobAnswer, WorstWorld, limited, values_of
-from cell.apps.qualify.compare import PairedComparison
+from cell.apps.qualify.answer import BAD, FigureSpread, JobAnswer, PairedComparison, WorstWorld, limited, values_of
 from cell.apps.qualify.intervals import Share
 from cell.apps.qualify.rows import Row, number, shown
 from cell.base.storage import replacing

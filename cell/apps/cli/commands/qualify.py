@@ -74,9 +74,8 @@ def qualify(
     the program failed in a world.
     """
     from cell.apps.qualify import campaign as campaigns
-    from cell.apps.qualify.answer import keep_line
-    from cell.apps.qualify.compare import compare as paired
-    from cell.apps.qualify.compare import other_rows
+    from cell.apps.qualify.answer import compare as paired
+    from cell.apps.qualify.answer import keep_line, other_rows
     from cell.apps.qualify.page import comparison_tables, tables_of, write_page
     from cell.apps.qualify.rows import RowStore
     from cell.apps.qualify.workers import open_workers

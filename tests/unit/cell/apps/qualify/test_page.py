@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from cell.apps.qualify import page
-from cell.apps.qualify.compare import compare
+from cell.apps.qualify.answer import compare
 from cell.apps.qualify.page import PAGE, comparison_tables, plots_of, tables_of, write_page
 from tests.support.qualified import row
 from tests.unit.cell.apps.qualify.test_answer import answer, some
