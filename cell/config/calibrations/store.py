@@ -18,7 +18,7 @@ import numpy as np
 from cell.base.storage import read_json, require_date, sealed, write_json
 from cell.config.cell_config import CellConfig
 from cell.measure.calibration import Priors, ScanCalibration, ScanObservation, TargetCalibration, TargetObservation
-from cell.measure.calibration.archive import SUFFIX, Observations, write_archive
+from cell.measure.calibration.archive import SUFFIX, Observations
 from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.calibration.judge.faults import SCALE_RANGE, refuse_wrong_lead
@@ -301,12 +301,6 @@ def save_calibration(calibration: CellCalibration, path: Path) -> None:
 def archive_of(folder: Path, calibration: CellCalibration) -> Path:
     """Where the observations of a stored calibration are kept."""
     return folder / f"{calibration.name}{SUFFIX}"
-
-
-def save_with_observations(calibration: CellCalibration, observations: Observations, folder: Path) -> None:
-    """Write the calibration and, beside it, what it can be solved from again."""
-    write_archive(archive_of(folder, calibration), observations)
-    save_calibration(calibration, folder / f"{calibration.name}.json")
 
 
 def read_calibration(path: Path) -> CellCalibration:

@@ -32,7 +32,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.folder import Report
 from cell.run.report.evidence import RefusalEvidence, ended_in, seen_placed
-from cell.run.report.figures import simulated_words, texture_words, value_and_limit
+from cell.run.report.figures import shown_limit, shown_value, simulated_words, texture_words
 from drivers.interfaces import Frame, Image, Vector
 from statemachine.runner import RunResult
 
@@ -238,7 +238,8 @@ def draw_reason(axes: Axes, report: Report, step: str | None) -> None:
     for k, row in enumerate(report["measured"][:fitting]):
         colour = "black" if row["kept"] else "tab:red"
         name = textwrap.shorten(str(row["name"]), REASON_COLUMNS, placeholder=" …")
-        _write(axes, 0.0, top - 2.2 * LINE * k, f"{name}\n      {value_and_limit(row)}", colour)
+        words = ", ".join(part for part in (shown_value(row), shown_limit(row)) if part)
+        _write(axes, 0.0, top - 2.2 * LINE * k, f"{name}\n      {words}", colour)
 
 
 def _write(axes: Axes, x: float, y: float, text: str, colour: str) -> None:
