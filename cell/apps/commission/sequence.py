@@ -226,13 +226,6 @@ def chosen(only: Sequence[str], until: str | None) -> list[CommissionCheck]:
     return picked
 
 
-def table() -> str:
-    """The checks as the table of docs/how-to/commission.md."""
-    rows = ["| check | moves | how far | how fast | has to hold |", "|---|---|---|---|---|"]
-    rows += [f"| `{c.name}` | {c.moves} | {c.far} | {c.fast} | {c.limit} |" for c in CHECKS]
-    return "\n".join(rows)
-
-
 FOLDER = "commissioning"
 
 
