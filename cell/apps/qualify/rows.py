@@ -106,8 +106,6 @@ Row = dict[str, Value]
 """A row by the names of its columns; what is not known of a world is missing, or None."""
 BOUNDS = {"at most": " at most", "at least": " at least"}
 """What a figure is held against, and how the column of its limit ends, after the figure's own name."""
-NOT_COMPARED = ("wall_s", "ended_s")
-"""Columns that are others each time: seconds on the wall, and when the world ended, in seconds since 1970."""
 TEXTS = ("key", "job", "job_hash", "configuration_hash", "code_hash", "level", "schedule", "outcome", "step", "code")
 WHOLE = ("seed", "parts", "corrections", "retries", "faults")
 WORST_FIRST = ("error", "aborted", "faulted", "misplaced", "refused")
@@ -216,11 +214,6 @@ def shown(name: str) -> tuple[str, str]:
         return figure[1], "" if figure[2] == "1" else figure[2]
     words, _, unit = name.rpartition("_")
     return words.replace("_", " "), unit
-
-
-def compared(row: Mapping[str, object]) -> dict[str, object]:
-    """Those columns of a row that are the same each time; what is not known is left out."""
-    return {name: value for name, value in row.items() if name not in NOT_COMPARED and value is not None}
 
 
 def number(value: Value) -> float:

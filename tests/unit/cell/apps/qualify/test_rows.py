@@ -13,9 +13,7 @@ from cell.apps.qualify.rows import (
     RowStore,
     code_hash,
     column,
-    compared,
     configuration_hash,
-    error_row,
     require_seeds,
     row_of,
     shown,
@@ -104,13 +102,6 @@ def test_a_figure_uses_a_share_of_its_limit() -> None:
 @pytest.mark.parametrize(("name", "unit"), [("place error, stated 95 % bound", "mm"), ("fit, χ²/dof", "")])
 def test_a_column_tells_its_figure_and_its_unit(name: str, unit: str) -> None:
     assert shown(column(name, unit)) == (name, unit)
-
-
-def test_what_differs_each_time_is_not_compared() -> None:
-    row = error_row(OF, "nominal", 7, outcome="error", step="", code="KeyError", reason="KeyError: 'x'")
-    timed = row | {"wall_s": 3.0, "ended_s": 1e9}
-    assert compared(timed) == compared(row)
-    assert compared(timed | {"cycle_s": 1.0}) != compared(row)
 
 
 pyarrow = pytest.importorskip("pyarrow.parquet")
