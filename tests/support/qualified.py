@@ -7,7 +7,8 @@ import signal
 from pathlib import Path
 
 from cell.apps.qualify.campaign import Campaign, Target
-from cell.apps.qualify.rows import QualifiedCode, Row, Value
+from cell.apps.qualify.identity import QualifiedCode
+from cell.apps.qualify.rows import Row, Value
 from cell.apps.qualify.world import WorldTask
 
 OF = QualifiedCode("pot", "job1", "configuration1", "code1")

@@ -17,8 +17,9 @@ from pathlib import Path
 import numpy as np
 
 from cell.apps.qualify.campaign import Campaign
+from cell.apps.qualify.identity import QualifiedCode, configuration_hash
 from cell.apps.qualify.intervals import Share, cpk, mean_difference, share_difference
-from cell.apps.qualify.rows import BOUNDS, ROWS, QualifiedCode, Row, RowStore, configuration_hash, number, shown, used
+from cell.apps.qualify.rows import BOUNDS, ROWS, Row, RowStore, number, shown, used
 from cell.base.storage import read_json, sealed, write_json
 from cell.config.cell_config import load_config
 from cell.config.files import beside, find_config

@@ -11,8 +11,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from cell.apps.qualify.identity import QualifiedCode, require_seeds
 from cell.apps.qualify.intervals import Share
-from cell.apps.qualify.rows import QualifiedCode, Row, RowStore, error_row, require_seeds
+from cell.apps.qualify.rows import Row, RowStore, error_row
 from cell.apps.qualify.workers import Workers
 from cell.apps.qualify.world import WorldTask
 from cell.run.batch import GOOD

@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from cell.apps.qualify.rows import QualifiedCode, Row, error_row, row_of
+from cell.apps.qualify.identity import QualifiedCode
+from cell.apps.qualify.rows import Row, error_row, row_of
 from cell.base.compiled import load
 from cell.base.storage import replacing
 from cell.config.calibrations.store import archive_of

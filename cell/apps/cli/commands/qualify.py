@@ -102,7 +102,7 @@ def qualify(
 def _campaign(job: str, path: Path | None, out: Path | None, *, level: str, first: int, target: Target) -> Campaign:
     """The campaign that was asked for. `ConfigError` where its job does not fit the cell."""
     from cell.apps.qualify.campaign import Campaign
-    from cell.apps.qualify.rows import QualifiedCode
+    from cell.apps.qualify.identity import QualifiedCode
     from cell.check.fit import read_fitting
     from cell.config.cell_config import default_toml, load_config
     from cell.config.files import beside

@@ -10,7 +10,8 @@ import pytest
 
 from cell.apps.qualify.answer import JobAnswer, compare, keep_line, kept_line, line_file, other_rows, repeat_command
 from cell.apps.qualify.campaign import Target
-from cell.apps.qualify.rows import QualifiedCode, Row, RowStore
+from cell.apps.qualify.identity import QualifiedCode
+from cell.apps.qualify.rows import Row, RowStore
 from cell.config.cell_config import default_toml, load_config
 from cell.config.job import job_path
 from drivers.errors import ConfigError

@@ -11,7 +11,8 @@ import pytest
 from cell import Cell
 from cell.apps.qualify import world
 from cell.apps.qualify.answer import repeat_command
-from cell.apps.qualify.rows import QualifiedCode, Row
+from cell.apps.qualify.identity import QualifiedCode
+from cell.apps.qualify.rows import Row
 from cell.apps.qualify.world import WorldTask, run_world
 from cell.config.cell_config import default_toml, load_config
 from cell.config.job import job_path
