@@ -252,8 +252,7 @@ def _in_order(series: Sequence[Series], pictures: int) -> Iterator[Series]:
 def _match_pictures(one: Series, listing: Listing, linked: dict[str, int]) -> None:
     """Find the picture of each record: as a table `linked` files and pictures, or by what both are called."""
     single = len({r.path for r in one.records}) == len(one.records)
-    # What each record is called: its file where it is alone in it, else what the file calls it.
-    labels = [listing.name(r.path) if single else r.label or "" for r in one.records]
+    labels = _labels(one, listing, single)
     which = list(range(len(listing.pictures)))
     found = _by_table(labels, linked)
     if not single or len(found.of) < LEAST:
@@ -263,6 +262,11 @@ def _match_pictures(one: Series, listing: Listing, linked: dict[str, int]) -> No
     one.by, one.of = found.by, {which[k]: one.records[i] for k, i in found.of.items()}
     one.alone = [one.records[i] for i in found.alone]
     one.doubled = {which[k]: [one.records[i] for i in hits] for k, hits in found.doubled.items()}
+
+
+def _labels(one: Series, listing: Listing, single: bool) -> list[str]:
+    """What each record is called: its file where it is alone in it, else what the file calls it."""
+    return [listing.name(r.path) if single else r.label or "" for r in one.records]
 
 
 def in_order_of_views(one: Series, frames: Sequence[RecordedFrame]) -> bool:
