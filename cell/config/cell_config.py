@@ -23,8 +23,7 @@ from cell.base.toml_file import read_toml, validate
 from cell.config.files import CONFIGURATION, DEVICES, RUNS, beside, find_config, runs_folder
 from cell.makes import BUILT_IN, make_of, record_of
 from cell.measure.geometry.poses import from_parts
-from cell.measure.vision import parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import centre_of, parse_board
 from cell.motion.collision import BASE, Body, Mounted, box
 from drivers.common.addresses import Folder, Name, checked_endpoint, checked_folder, is_example
 from drivers.common.units import number, quantity, shown

@@ -76,14 +76,6 @@ class JointLimits:
         """True when every angle lies in its range."""
         return bool(np.all(joints >= self.lower) and np.all(joints <= self.upper))
 
-    def scaled(self, fraction: float) -> JointLimits:
-        """The same ranges at a fraction (0 … 1] of the speed; times stretch by 1/fraction."""
-        if not 0.0 < fraction <= 1.0:
-            raise ValueError(f"speed fraction {fraction} must lie in (0, 1]")
-        powers = {"speed": 1, "acceleration": 2, "jerk": 3}
-        slower = {name: tuple(v * fraction**p for v in getattr(self, name)) for name, p in powers.items()}
-        return JointLimits(self.lower, self.upper, **slower)
-
 
 class ArmKinematics:
     """The arm from its base to its flange. An instance holds work space: use one per thread."""

@@ -19,7 +19,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.motion.collision import CollisionError, CollisionModel, Pair, first_touch
-from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
+from cell.motion.kinematics import ArmKinematics, Joints
 from cell.motion.trajectory import LineLimits, PointSpeed, Trajectory, carried_points, join, plan_joint, plan_line
 from drivers.packages import lacking
 
@@ -156,15 +156,12 @@ class Planner:
     `tool_speed` in m/s binds every point of the flange and of what it carries, in free moves and in lines.
     """
 
-    def __init__(
-        self, kinematics: ArmKinematics, collisions: CollisionModel, limits: JointLimits | None = None,
-        tool_speed: float | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, kinematics: ArmKinematics, collisions: CollisionModel, tool_speed: float | None = None) -> None:
         self.kinematics = kinematics
         carried = carried_points(collisions.bodies)
         self._points = None if tool_speed is None else PointSpeed(kinematics, carried, tool_speed)
         self.collisions = collisions
-        self.limits = limits or kinematics.limits
+        self.limits = kinematics.limits
 
     def reach(self, base_from_flange: pin.SE3, seed: Joints, what: str, allowed: Sequence[Pair] = ()) -> Joints:
         """Joint angles of a collision-free posture at the pose, the nearest to `seed`.

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from cell.apps.new_job.mesh_file import MeshBody, joined
 from cell.apps.new_job.sweeps import ABOVE, NEAR, Array, Faces, Rays
-from cell.apps.new_job.text import METRES
 from cell.measure.geometry.poses import from_parts
 from drivers.errors import ConfigError
 
+METRES = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
 APART = 1e-4
 """Share of a body's size by which another has to reach into it to overlap: bodies that touch do not."""
 

@@ -21,7 +21,7 @@ from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.measure.geometry.poses import difference, from_matrix, to_ur, transform
 from cell.measure.inversion import NominalSurface, PlacePose
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.part_error import draws, part_points, placed_points, point_covariances, stated_bound, through
 from cell.procedures.steps.reconstruct import Reconstruction

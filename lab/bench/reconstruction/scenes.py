@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts
-from cell.measure.reconstruction import Cloud, ProfileBuilder, ScanGeometry
+from cell.measure.reconstruction.build import ProfileBuilder, ScanGeometry
+from cell.measure.reconstruction.cloud import Cloud
 from cell.measure.vision.stripe.extract import StripeProfile
 
 Array = NDArray[np.float64]

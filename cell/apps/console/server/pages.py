@@ -13,8 +13,7 @@ from contextlib import suppress
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from cell.apps.console.host.link import Beat, Joined, Left
-from cell.apps.console.server.access import Bucket
-from cell.apps.console.server.commands import checked_message
+from cell.apps.console.server.access import Bucket, checked_message
 from drivers.errors import ConfigError
 
 VERSION = 1

@@ -17,8 +17,8 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.effects.between_sweeps import Creep, SurfaceMotion, surface_motion
-from cell.measure.reconstruction import Cloud, flange_motions, merge
-from cell.measure.reconstruction.cloud import Filled
+from cell.measure.reconstruction.build import flange_motions
+from cell.measure.reconstruction.cloud import Cloud, Filled, merge
 from cell.procedures.arm.touch import felt_touch
 from cell.procedures.steps import place as place_step
 from cell.procedures.sweep import second_look
