@@ -289,6 +289,29 @@ def schedules(
 
 
 @bench.command()
+def planner(
+    pairs: Annotated[int, typer.Option(min=1, max=10_000, help="Random pairs of free postures.")] = 200,
+    job: JobOption = "pot",
+    seed: SeedOption = 1,
+    patience: Annotated[
+        float, typer.Option(min=1.0, max=600.0, help="Processor time for a pair that no planner joined, s.")
+    ] = 20.0,
+    json: JsonOption = False,
+) -> None:
+    """How many random pairs of free postures the planner joins, how fast, how far apart, beside OMPL's own planners.
+
+    Exit code 1 when it joins less than 99.5 % of those that have a way, or bodies come closer than 5 mm.
+    """
+    from lab.bench.job.planner import planner as campaign
+
+    with bar() as told:
+        result = campaign(str(job), pairs, seed, patience, counted(told, pairs))
+    show(result, json)
+    if not result["within_limits"]:
+        raise typer.Exit(1)
+
+
+@bench.command()
 def servo(
     seconds: Annotated[float, typer.Option(min=2.0, max=600.0, help="How long each of the two streams is.")] = 20.0,
     seed: SeedOption = 1,

@@ -14,7 +14,7 @@ from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
 from cell.measure.calibration.drift.reference_plate import LEAST_ROWS, Edge, PlateLine
 from cell.measure.geometry.camera import Array
-from cell.measure.vision import extract
+from cell.measure.vision.stripe.extract import extract
 from cell.procedures.ambient import adapted, hidden
 from cell.procedures.calibrate.boards import Keep
 from cell.procedures.sweep.swath import frames_of

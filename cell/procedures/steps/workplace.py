@@ -17,7 +17,7 @@ from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.devices.devices import Devices
 from cell.measure.inversion import NominalSurface
-from cell.measure.vision import BoardSpec, parse_board
+from cell.measure.vision.board.view import BoardSpec, parse_board
 from cell.procedures.ambient import in_any_light
 from cell.procedures.arm.moves import Mover, Pace, PartProgress, PartState
 from cell.procedures.arm.photograph import APART_S, BoardFix, photograph

@@ -18,9 +18,9 @@ from cell.config.job import ScanSection
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.geometry.poses import from_matrix
 from cell.measure.inversion import NominalSurface
-from cell.measure.reconstruction import ProfileBuilder, ScanGeometry
-from cell.measure.vision import StripeProfile, StripeStream
-from cell.measure.vision.stripe.extract import drawn
+from cell.measure.reconstruction.build import ProfileBuilder, ScanGeometry
+from cell.measure.vision.stripe.extract import StripeStream, drawn
+from cell.measure.vision.stripe.profile import StripeProfile
 from cell.procedures.ambient import WHITER, bearable
 from drivers.errors import DeviceFault
 from drivers.interfaces import Camera, Frame, FrameStream, Sweep, Vector

@@ -18,8 +18,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import from_parts
-from cell.measure.reconstruction import Cloud, ScanGeometry
-from cell.measure.vision import StripeStream
+from cell.measure.reconstruction.build import ScanGeometry
+from cell.measure.reconstruction.cloud import Cloud
+from cell.measure.vision.stripe.extract import StripeStream
 from drivers.errors import RefusedError
 from lab.bench.calibration.world import Noise
 from lab.bench.reconstruction.scenes import swept

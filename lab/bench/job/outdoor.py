@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cell.config.cell_config import CellConfig, load_config
 from cell.devices.simulated.direct import VirtualCell
-from cell.measure.vision import extract
+from cell.measure.vision.stripe.extract import extract
 from cell.procedures.ambient import WANTED_DN
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.make import FilterConfig
