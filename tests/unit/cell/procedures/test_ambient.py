@@ -14,7 +14,7 @@ from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.reconstruction import ScanGeometry
+from cell.measure.reconstruction.build import ScanGeometry
 from cell.procedures.ambient import MOST_DN, adapted, bearable, in_any_light, meet_light, require_line, shorten
 from cell.procedures.sweep.swath import SweepCollector
 from drivers.errors import RefusedError
