@@ -178,7 +178,7 @@ def cell_toml() -> str:
 
 def job_toml() -> str:
     """The page of a job's file."""
-    from cell.apps.new_job.text import job_text
+    from cell.apps.new_job.questions import job_text
 
     part = PartSection.model_validate({"mesh": "part.stl", "mesh_unit": "mm"})
     pot = load_job("pot")[0]

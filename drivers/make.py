@@ -214,10 +214,19 @@ class VehicleConfig(DeviceConfig):
         return 0.001
 
 
+class FilterConfig(Table):
+    """A band-pass filter before a lens: the middle of what it passes, how wide that is (FWHM), and its transmission."""
+
+    centre: Annotated[float, quantity("nm", 300, 1100)]
+    width: Annotated[float, quantity("nm", 1, 400)]
+    transmission: Annotated[float, number(0.01, 1)]
+
+
 class CameraConfig(DeviceConfig):
     """A camera with its nominal optics and mounting.
 
-    `late`: by how much its time stamps may come after the exposures really began; nobody can see that from outside.
+    `filter`: the band-pass before its lens; None without one. `late`: by how much its time stamps may come after the
+    exposures really began; nobody can see that from outside.
     """
 
     width: Pixels
@@ -227,6 +236,7 @@ class CameraConfig(DeviceConfig):
     flange_from_camera: Mounting
     photo_exposure: PhotoExposure
     late: Late = 0.002
+    filter: FilterConfig | None = None
 
     @model_validator(mode="after")
     def _sees(self) -> Self:
@@ -246,6 +256,7 @@ class CameraConfig(DeviceConfig):
 
 OPTICS = frozenset(("width", "height", "pixel", "focal_length", "flange_from_camera"))
 """On these a calibration depends, whatever the camera's make."""
+OPTICS_SINCE = frozenset(("filter",))
 
 
 class LaserConfig(DeviceConfig):

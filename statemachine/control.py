@@ -164,7 +164,7 @@ class RunControl:
     ) -> None:
         """Stay here for as long as the run is paused; `say(True)` when it is held, `say(False)` when it goes on.
 
-        Held on the wall's time, whatever the cell's clock; `look()` is called meanwhile, and raises when it finds that
+        Held on the wall's time, whatever the cell's clock; `check()` is called meanwhile, and raises when it finds that
         the work is to end. Raises `Cancelled` when `token` ends the work.
         """
         token.check()

@@ -154,8 +154,8 @@ class StepContext:
     """What a step is given: earlier results, its deadline, its end, and ways to report.
 
     `results` maps the earlier steps' names to what they returned. `deadline` is in seconds of the cell's clock.
-    `token` ends this attempt: with the run, or by itself when the attempt is cut short. `look` is how work that is held
-    sees what is asked of the run, where nobody else looks for it.
+    `token` ends this attempt: with the run, or by itself when the attempt is cut short. `check` lets held work
+    see what is asked of the run, where nobody else looks for it.
     """
 
     def __init__(

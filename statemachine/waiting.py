@@ -26,7 +26,7 @@ class WaitableClock(RunClock, Protocol):
     """A clock whose time moves when somebody waits on it."""
 
     def checking(self, check: Callable[[], None]) -> AbstractContextManager[None]:
-        """Inside this context `look()` is called each time this thread has let time pass; what it raises comes out of
+        """Inside this context `check()` is called each time this thread has let time pass; what it raises comes out of
         the wait. Takes the place of an outer one."""
 
 

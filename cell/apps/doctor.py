@@ -22,7 +22,7 @@ from typing import Literal, NamedTuple
 from packaging.requirements import Requirement
 
 from cell.config.cell_config import DEVICES, CellConfig, beside, find_config, load_config, runs_folder
-from cell.devices.diagnosis.local_devices import ROOT, barred, opened_by
+from cell.devices.diagnosis.finding import ROOT, barred, opened_by
 from cell.run.folder import DISTRIBUTION, list_runs
 from drivers.errors import ConfigError
 from drivers.make import DeviceConfig

@@ -12,14 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from cell.check.place import contact_problems, mating_problems, mesh_box, place_problems, surface_problems, way_problems
-from cell.check.placed_part import verify_problems
-from cell.check.reach import reach_problems
+from cell.check.reach import reach_problems, verify_problems
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CALIBRATION_DEPTHS, CellConfig
 from cell.config.job import Job, item_names, load_job
 from cell.measure.geometry.poses import transform
-from cell.measure.vision import BoardSpec, parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import BoardSpec, centre_of, parse_board
 from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.sought_part import around, ground_below, nominal_of, sought

@@ -16,8 +16,7 @@ from cell.config.job import Job, PartSection
 from cell.measure.geometry.poses import from_parts, transform
 from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, drawn_gap
 from cell.measure.inversion.nominal import NominalSurface, read_mesh
-from cell.measure.vision import parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import centre_of, parse_board
 from cell.motion.collision import Body, station_bodies, vehicle_bodies
 from cell.procedures.drive.way import MAX_HEADING, Planar, wrap
 from cell.procedures.steps import verify

@@ -1,4 +1,5 @@
-"""Whether the arm reaches every pose of a job and of a calibration without touching anything, as drawn."""
+"""Whether the arm reaches every pose of a job and of a calibration without touching anything, as drawn, and whether a
+sweep can see how the part lies once it was placed."""
 
 from __future__ import annotations
 
@@ -15,10 +16,9 @@ from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.solve.results import PARAMETERS, Quality
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts
-from cell.measure.inversion import NominalSurface
-from cell.measure.inversion.part_pose import seen_from_above
-from cell.measure.vision import parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.inversion import NominalSurface, Tolerance
+from cell.measure.inversion.part_pose import seen_from_above, shown_by
+from cell.measure.vision.board.view import centre_of, parse_board
 from cell.motion.collision import (
     TOUCHES,
     CollisionError,
@@ -175,3 +175,30 @@ def _unreached(planner: Planner, goals: Iterator[Goal]) -> Iterator[str]:
         told += 1
         if told == 3:
             return
+
+
+def verify_problems(job: Job, config: CellConfig) -> Iterator[str]:
+    """What keeps a sweep from seeing the placed part; nothing where nobody looks."""
+    try:
+        faces = seen_faces(job)
+    except ConfigError as error:
+        yield str(error)
+        return
+    if faces is None or job.part is None:
+        return
+    name, (low, high) = Path(job.part.mesh).name, faces.extent
+    half, camera, laser = 0.5 * float(high[2] - low[2]), config.scan_camera, config.laser
+    nearest = job.scan.stand_off - half
+    column = camera.focal_length / camera.pixel * (1 / laser.tan_theta - laser.baseline / max(nearest, 1e-3))
+    if abs(column) > 0.5 * camera.width:
+        yield (
+            f'part.mesh "{name}": the faces of the placed part span {2e3 * half:.0f} mm of height; from scan.stand_off '
+            f"{1e3 * job.scan.stand_off:g} mm the laser's line on the highest leaves the scan camera's picture. Raise "
+            'scan.stand_off, or write place.verify = "none"'
+        )
+    tolerance = Tolerance(job.place.tolerance, job.place.tolerance_angle)
+    if job.place.verify == "all" and (unseen := shown_by(faces, tolerance)):
+        yield (
+            f'part.mesh "{name}": the faces of the placed part do not show {", ".join(unseen)}. Write place.verify = '
+            '"seen" to have the rest looked at, or "none"'
+        )

@@ -23,8 +23,7 @@ from cell.base.toml_file import read_toml, validate
 from cell.config.files import CONFIGURATION, DEVICES, RUNS, beside, find_config, runs_folder
 from cell.makes import BUILT_IN, make_of, record_of
 from cell.measure.geometry.poses import from_parts
-from cell.measure.vision import parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import centre_of, parse_board
 from cell.motion.collision import BASE, Body, Mounted, box
 from drivers.common.addresses import Folder, Name, checked_endpoint, checked_folder, is_example
 from drivers.common.units import number, quantity, shown
@@ -128,6 +127,8 @@ __all__ = [
 
 Confirm = Literal["person", "simulated"]
 """Who confirms what a person has to: a person, or the simulated cell itself."""
+NO_FILES = {"record": False, "frames": False, "picture": False}
+"""What a campaign changes in [cell]: its runs leave their report and journal alone."""
 CALIBRATION_DEPTHS = {"fine": (0.120, 0.130, 0.142), "large": (0.560, 0.650, 0.700)}
 """Nearest, usual and farthest distance of the calibration's views, m."""
 
@@ -145,6 +146,8 @@ class CellSection(Table):
     """Whether runs leave `record.mcap`."""
     frames: bool = True
     """Whether runs keep the pictures that they look at. Without them no sweep is used again after a resume."""
+    picture: bool = True
+    """Whether runs draw `picture.png`; campaigns of many runs leave it out."""
     meshes: Annotated[str, AfterValidator(lambda text: text and checked_folder(text))] = ""
     """A folder of the links' meshes for the 3-D scene, beside this file; empty for none."""
     sim: Annotated[tuple[str, ...], AfterValidator(lambda names: _devices(names))] = ()

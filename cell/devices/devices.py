@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, TypeVar
 
 from cell.devices.gate.gate import Gate
-from cell.devices.gate.gated import GatedLaser, GatedRail
+from cell.devices.gate.gated import GatedCamera, GatedLaser, GatedRail
 from cell.devices.gate.interlocks import Interlocks
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceError, DeviceFault, NotConnectedError
-from drivers.interfaces import Arm, ArmSafety, Camera, Claw, Device, Vehicle
+from drivers.interfaces import Arm, ArmSafety, Claw, Device, Vehicle
 from statemachine.waiting import waiting_on
 
 if TYPE_CHECKING:
@@ -31,8 +32,8 @@ class Devices:
 
     def __init__(
         self, clock: Clock, gate: Gate, *, arm: Arm | None = None, rail: GatedRail | None = None,
-        vehicle: Vehicle | None = None, scan_camera: Camera | None = None, target_camera: Camera | None = None,
-        laser: GatedLaser | None = None, claw: Claw | None = None,
+        vehicle: Vehicle | None = None, scan_camera: GatedCamera | None = None,
+        target_camera: GatedCamera | None = None, laser: GatedLaser | None = None, claw: Claw | None = None,
     ) -> None:  # fmt: skip
         self.clock = clock
         self.gate = gate
@@ -65,14 +66,29 @@ class Devices:
         return _there("vehicle", self._vehicle)
 
     @property
-    def scan_camera(self) -> Camera:
+    def scan_camera(self) -> GatedCamera:
         """The camera on the rail."""
         return _there("scan_camera", self._scan_camera)
 
     @property
-    def target_camera(self) -> Camera:
+    def target_camera(self) -> GatedCamera:
         """The camera on the flange."""
         return _there("target_camera", self._target_camera)
+
+    @property
+    def bright(self) -> bool:
+        """Whether ambient light has whitened a picture since `take_any_light`."""
+        return any(camera is not None and camera.longest < math.inf for camera in self._cameras)
+
+    def take_any_light(self) -> None:
+        """Forget how bright it was: the cameras expose as long as they are asked to."""
+        for camera in self._cameras:
+            if camera is not None:
+                camera.longest = math.inf
+
+    @property
+    def _cameras(self) -> tuple[GatedCamera | None, ...]:
+        return self._scan_camera, self._target_camera
 
     @property
     def laser(self) -> GatedLaser:

@@ -266,11 +266,6 @@ class CollisionModel:
         data = self._model, self._data, self._geometry, self._geometry_data
         return bool(pin.computeCollisions(*data, _array(joints), first_only))
 
-    def distance(self, joints: Joints) -> tuple[float, Pair]:
-        """Smallest distance in m between two bodies and their names; about 10 ms, for reports."""
-        index = pin.computeDistances(self._model, self._data, self._geometry, self._geometry_data, _array(joints))
-        return float(self._geometry_data.distanceResults[index].min_distance), self._pairs[index]
-
     def placed(self, joints: Joints) -> list[Body]:
         """All bodies where they are at the joint angles (6,) rad: the same ones, fixed to the base."""
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._geometry_data, _array(joints))

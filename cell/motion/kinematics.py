@@ -21,6 +21,8 @@ Joints = NDArray[np.float64]
 """Joint angles of shape (6,), rad."""
 
 TURN = 2.0 * np.pi
+SAME_RAD = 1e-4
+"""Two branches whose joints differ by less are one."""
 
 
 class Unreachable(RefusedError):
@@ -73,14 +75,6 @@ class JointLimits:
     def inside(self, joints: Joints) -> bool:
         """True when every angle lies in its range."""
         return bool(np.all(joints >= self.lower) and np.all(joints <= self.upper))
-
-    def scaled(self, fraction: float) -> JointLimits:
-        """The same ranges at a fraction (0 … 1] of the speed; times stretch by 1/fraction."""
-        if not 0.0 < fraction <= 1.0:
-            raise ValueError(f"speed fraction {fraction} must lie in (0, 1]")
-        powers = {"speed": 1, "acceleration": 2, "jerk": 3}
-        slower = {name: tuple(v * fraction**p for v in getattr(self, name)) for name, p in powers.items()}
-        return JointLimits(self.lower, self.upper, **slower)
 
 
 class ArmKinematics:
@@ -156,7 +150,7 @@ class ArmKinematics:
             if (
                 error < 1e-7
                 and self.limits.inside(joints)
-                and not any(np.allclose(joints, f, atol=1e-4) for f in found)
+                and not any(np.abs(joints - f).max() < SAME_RAD for f in found)
             ):
                 found.append(joints)
         return sorted(found, key=lambda q: float(np.sum((q - seed) ** 2)))

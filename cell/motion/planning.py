@@ -19,7 +19,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.motion.collision import CollisionError, CollisionModel, Pair, first_touch
-from cell.motion.kinematics import ArmKinematics, JointLimits, Joints
+from cell.motion.kinematics import ArmKinematics, Joints
 from cell.motion.trajectory import LineLimits, PointSpeed, Trajectory, carried_points, join, plan_joint, plan_line
 from drivers.packages import lacking
 
@@ -156,15 +156,12 @@ class Planner:
     `tool_speed` in m/s binds every point of the flange and of what it carries, in free moves and in lines.
     """
 
-    def __init__(
-        self, kinematics: ArmKinematics, collisions: CollisionModel, limits: JointLimits | None = None,
-        tool_speed: float | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, kinematics: ArmKinematics, collisions: CollisionModel, tool_speed: float | None = None) -> None:
         self.kinematics = kinematics
         carried = carried_points(collisions.bodies)
         self._points = None if tool_speed is None else PointSpeed(kinematics, carried, tool_speed)
         self.collisions = collisions
-        self.limits = limits or kinematics.limits
+        self.limits = kinematics.limits
 
     def reach(self, base_from_flange: pin.SE3, seed: Joints, what: str, allowed: Sequence[Pair] = ()) -> Joints:
         """Joint angles of a collision-free posture at the pose, the nearest to `seed`.
@@ -205,7 +202,8 @@ class Planner:
     def _path(self, start: Joints, end: Joints, allowed: tuple[Pair, ...]) -> NDArray[np.float64]:
         """Corners (n, 6) rad of a free way, straight between them."""
         direct = np.stack([start, end])
-        if first_touch(self.collisions, direct, allowed) is None:
+        touch = first_touch(self.collisions, direct, allowed)
+        if touch is None:
             return direct
         ranges = np.array(self.limits.lower), np.array(self.limits.upper)
         for effort in EFFORTS:
@@ -214,5 +212,7 @@ class Planner:
                 return path
         raise CollisionError(
             f"no free way was found between joints {np.degrees(start).round(1).tolist()} and "
-            f"{np.degrees(end).round(1).tolist()} deg{limits()}. Move the arm to a freer posture with `cell jog` first"
+            f"{np.degrees(end).round(1).tolist()} deg{limits()}. On the straight way "
+            f"{', '.join(' and '.join(pair) for pair in touch.pairs)} would come closer than "
+            f"{1e3 * self.collisions.margin:.0f} mm. Move the arm to a freer posture with `cell jog` first"
         )

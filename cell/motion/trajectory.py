@@ -109,10 +109,6 @@ class Trajectory:
         last: Joints = self.joints[-1]
         return last
 
-    def at(self, time: float) -> Joints:
-        """Joint angles (6,) at a time in s, linear between samples, held beyond the ends."""
-        return np.array([np.interp(time, self.times, column) for column in self.joints.T])
-
     def at_pace(self, share: float) -> Trajectory:
         """The same way at this share, up to 1, of its speed."""
         return Trajectory(self.times / share, self.joints)

@@ -17,7 +17,7 @@ from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.flush import heights_over
 from cell.measure.inversion.local_deviation import LocalDeviation, Span, higher_about, seen_middle, seen_rim
 from cell.measure.inversion.part_pose import PartPose
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from drivers.errors import Measured
 from drivers.interfaces import Vector
 

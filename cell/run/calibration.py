@@ -17,7 +17,7 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job, load_job
 from cell.devices.devices import Devices
-from cell.measure.calibration.archive import Observations
+from cell.measure.calibration.archive import Observations, write_archive
 from cell.measure.calibration.drift.timing import TimesRefused
 from cell.motion.kinematics import kinematics_name
 from cell.procedures.arm.moves import Mover
@@ -101,7 +101,8 @@ def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibrat
 
     info = {"for_job": str(job)} if run.kind == "job" else None
     observations, calibration = cell.recorded(run, "calibration", work, info)
-    store.save_with_observations(calibration, observations, cell.calibrations_folder)
+    write_archive(store.archive_of(cell.calibrations_folder, calibration), observations)
+    store.save_calibration(calibration, cell.calibrations_folder / f"{calibration.name}.json")
     notify(1.0, "stored")
     return calibration
 

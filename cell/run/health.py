@@ -77,11 +77,6 @@ class DriftSeries:
         return min(sum(float(np.sum((part - part.mean(axis=0)) ** 2)) for part in pair) for pair in pairs)
 
     @property
-    def creeps(self) -> bool:
-        """Whether there is a trend."""
-        return self._line is not None
-
-    @property
     def now(self) -> float:
         """How far off it is: by the trend where there is one, else the mean of the newest jobs."""
         return float(np.linalg.norm(self._line[0] if self._line else self.values[-NEWEST:].mean(axis=0)))

@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import from_parts, from_ur
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from cell.procedures.arm.photograph import drawn_interim_view, look_pose
 from cell.procedures.calibrate.interim import resting_pose
 from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, driven, turn_to

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, StringConstraints
 
 from drivers.common.addresses import Endpoint
 from drivers.common.units import number
-from drivers.make import OPTICS, AnyMake, CameraConfig, Make, Surroundings, with_endpoint
+from drivers.make import OPTICS, OPTICS_SINCE, AnyMake, CameraConfig, Make, Surroundings, with_endpoint
 
 if TYPE_CHECKING:
     from drivers.camera.folder import RecordedCamera
@@ -71,6 +71,13 @@ def _folder(name: str, config: FolderCameraConfig, around: Surroundings) -> Reco
     return RecordedCamera(name, Path(config.folder), clock=around.clock, shape=(config.height, config.width))
 
 
-STREAM: AnyMake = Make("camera", "stream", StreamCameraConfig, _stream, OPTICS, simulated=with_endpoint("address"))
-V4L2: AnyMake = Make("camera", "v4l2", V4l2CameraConfig, _v4l2, OPTICS | {"pixel_format"})
-FOLDER: AnyMake = Make("camera", "folder", FolderCameraConfig, _folder, OPTICS, replays=True)
+STREAM: AnyMake = Make(
+    "camera", "stream", StreamCameraConfig, _stream, OPTICS, calibrated_since=OPTICS_SINCE,
+    simulated=with_endpoint("address"),
+)  # fmt: skip
+V4L2: AnyMake = Make(
+    "camera", "v4l2", V4l2CameraConfig, _v4l2, OPTICS | {"pixel_format"}, calibrated_since=OPTICS_SINCE
+)
+FOLDER: AnyMake = Make(
+    "camera", "folder", FolderCameraConfig, _folder, OPTICS, calibrated_since=OPTICS_SINCE, replays=True
+)

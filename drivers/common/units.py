@@ -35,6 +35,7 @@ _USUAL = {
     "kbit/s": 1e3,
     "mm": 1e-3,
     "um": 1e-6,
+    "nm": 1e-9,
     "ms": 1e-3,
     "mrad": 1e-3,
     "mm/s": 1e-3,

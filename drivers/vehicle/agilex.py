@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
@@ -48,12 +48,12 @@ class AgilexVehicle:
     """A vehicle on the python-can bus (`interface`, `channel`).
 
     `track` in m between left and right wheels, effective for turning on the spot; `max_speed` in m/s, `max_yaw_rate`
-    in rad/s; `bus_options` go to python-can. Raises `NotConnectedError` when no vehicle reports on the bus.
+    in rad/s. Raises `NotConnectedError` when no vehicle reports on the bus.
     """
 
     def __init__(
         self, name: str, interface: str, channel: str, *, bitrate: int = 500_000, track: float, max_speed: float,
-        max_yaw_rate: float, clock: Clock, bus_options: Mapping[str, object] | None = None,
+        max_yaw_rate: float, clock: Clock,
     ) -> None:  # fmt: skip
         self.name = name
         self.statistics = LinkStatistics()
@@ -79,7 +79,7 @@ class AgilexVehicle:
         """Those of others on the bus that this program has answered by the brake."""
         self._closed = threading.Event()
         self._open = partial(
-            AgilexLink, name, interface, channel, bitrate=bitrate, options=dict(bus_options or {}),
+            AgilexLink, name, interface, channel, bitrate=bitrate,
             database=self._database, wanted=WANTED, told=self._feedback.take, idle=self._feedback.idle,
             statistics=self.statistics,
         )  # fmt: skip

@@ -33,7 +33,7 @@ class AgilexLink(CanLink):
     """
 
     def __init__(
-        self, name: str, interface: str, channel: str, *, bitrate: int, options: Mapping[str, object],
+        self, name: str, interface: str, channel: str, *, bitrate: int,
         database: Database, wanted: frozenset[str], told: Callable[[str, dict[str, float]], None],
         idle: Callable[[float], None], statistics: LinkStatistics,
     ) -> None:  # fmt: skip
@@ -43,7 +43,7 @@ class AgilexLink(CanLink):
         }
         self._told = told
         super().__init__(
-            name, interface, channel, bitrate=bitrate, options=options, receive=self._take, idle=idle,
+            name, interface, channel, bitrate=bitrate, receive=self._take, idle=idle,
             statistics=statistics, alone="the vehicle stops by itself 0.5 s after the last command",
         )  # fmt: skip
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -47,7 +47,7 @@ class CanLink:
     """
 
     def __init__(
-        self, name: str, interface: str, channel: str, *, bitrate: int, options: Mapping[str, object],
+        self, name: str, interface: str, channel: str, *, bitrate: int,
         receive: Callable[[can.Message], None], idle: Callable[[float], None], statistics: LinkStatistics, alone: str,
     ) -> None:  # fmt: skip
         self._name = name
@@ -62,7 +62,7 @@ class CanLink:
         self._heard: list[tuple[float, can.Message]] | None = None
         self._refused = 0
         """Frames in a row that the adapter has refused, where it says so."""
-        self._bus = self._open(interface, channel, bitrate, options)
+        self._bus = self._open(interface, channel, bitrate)
         self._interface = interface
         self._last_words: LastWords | None = None
         self._thread = threading.Thread(target=self._run, name=f"{name} receiver", daemon=True)
@@ -135,8 +135,8 @@ class CanLink:
                 self._last_words.close()
             self._bus.shutdown()
 
-    def _open(self, interface: str, channel: str, bitrate: int, options: Mapping[str, object]) -> can.BusABC:
-        settings: dict[str, Any] = {"bitrate": bitrate, **options}
+    def _open(self, interface: str, channel: str, bitrate: int) -> can.BusABC:
+        settings: dict[str, Any] = {"bitrate": bitrate}
         if interface == "slcan" and channel.startswith("socket://"):
             # The default waits 2 s for a serial adapter to boot, which one behind a socket has done already.
             settings.setdefault("sleep_after_open", 0.0)

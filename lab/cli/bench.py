@@ -218,11 +218,12 @@ def realism(
     """
     from drivers.errors import ConfigError
     from lab.bench.job.realism import ALONE, TOGETHER, campaign, is_well
-    from sim_backends.world.levels import Effects
+    from sim_backends.world.levels import OUTDOOR, Effects
 
     known = (ALONE, *Effects.names(), TOGETHER)
-    # No parts of the workshop: a scan camera needs a global shutter, what droops is broken, oil is wiped off.
-    options = ("rolling_shutter", "droop", "oil")
+    # No parts of the workshop: a scan camera needs a global shutter, what droops is broken, oil is wiped off. The open
+    # has a bench of its own.
+    options = ("rolling_shutter", "droop", "oil", *OUTDOOR)
     chosen = list(dict.fromkeys(effect or [name for name in known if name not in options]))
     if unknown := [name for name in chosen if name not in known]:
         raise ConfigError(f"--effect {unknown[0]} is none of {', '.join(known)}")
@@ -288,6 +289,29 @@ def schedules(
 
 
 @bench.command()
+def planner(
+    pairs: Annotated[int, typer.Option(min=1, max=10_000, help="Random pairs of free postures.")] = 200,
+    job: JobOption = "pot",
+    seed: SeedOption = 1,
+    patience: Annotated[
+        float, typer.Option(min=1.0, max=600.0, help="Processor time for a pair that no planner joined, s.")
+    ] = 20.0,
+    json: JsonOption = False,
+) -> None:
+    """How many random pairs of free postures the planner joins, how fast, how far apart, beside OMPL's own planners.
+
+    Exit code 1 when it joins less than 99.5 % of those that have a way, or bodies come closer than 5 mm.
+    """
+    from lab.bench.job.planner import planner as campaign
+
+    with bar() as told:
+        result = campaign(str(job), pairs, seed, patience, counted(told, pairs))
+    show(result, json)
+    if not result["within_limits"]:
+        raise typer.Exit(1)
+
+
+@bench.command()
 def servo(
     seconds: Annotated[float, typer.Option(min=2.0, max=600.0, help="How long each of the two streams is.")] = 20.0,
     seed: SeedOption = 1,
@@ -303,6 +327,24 @@ def servo(
         found = measure(seconds, seed, told)
     show(found, json)
     if found["verdict"] == "missed":
+        raise typer.Exit(1)
+
+
+@bench.command()
+def outdoor(
+    seeds: WorldsOption = 3, job: JobOption = "pot", workers: WorkersOption = 0, json: JsonOption = False
+) -> None:
+    """Jobs under 0 to 100 klx of sun with a moving shadow, wind and uneven ground; with a band-pass filter and without.
+
+    Exit code 1 when a part was placed outside the job's tolerance.
+    """
+    from lab.bench.job.outdoor import KLX, campaign
+
+    with bar() as told:
+        told(0, "the first runs are on their way")
+        result = campaign(job, range(1, seeds + 1), KLX, counted(told, 2 * seeds), workers)
+    show(result, json, without=("runs",))
+    if any(row["wrong"] for row in result["rows"].values()):
         raise typer.Exit(1)
 
 

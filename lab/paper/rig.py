@@ -19,9 +19,8 @@ from cell.measure.calibration.solve.results import KEPT, Quality
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts, perturbed
-from cell.measure.reconstruction import ScanGeometry
-from cell.measure.vision import BoardView, parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.reconstruction.build import ScanGeometry
+from cell.measure.vision.board.view import BoardView, centre_of, parse_board
 from cell.measure.vision.stripe.extract import StripeProfile
 from lab.bench.calibration.world import Noise, centroids, circle
 from sim_backends.optics import Board, BoardInstance, CameraOptics, LaserOptics, Mesh, MeshInstance

@@ -15,7 +15,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import perturbed, transform
-from cell.measure.reconstruction import Cloud, ScanGeometry
+from cell.measure.reconstruction.build import ScanGeometry
+from cell.measure.reconstruction.cloud import Cloud
 from lab.bench.over_cores import Progress, run_all
 from lab.bench.reconstruction.scenes import swept
 from lab.paper.rig import (

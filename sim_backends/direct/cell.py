@@ -86,11 +86,11 @@ class VirtualClock(Clock):
 
     @contextmanager
     def checking(self, check: Check) -> Iterator[None]:
-        """Inside this context `look()` is called after each tick that this thread waits for, in place of an outer one.
+        """Inside this context `check()` is called after each tick that this thread waits for, in place of an outer one.
 
         What it raises comes out of the wait.
         """
-        outer = getattr(self._checking, "look", None)
+        outer = getattr(self._checking, "check", None)
         self._checking.check = check
         try:
             yield
@@ -99,7 +99,7 @@ class VirtualClock(Clock):
 
     def check(self) -> None:
         """Look around now, if this thread does that at all."""
-        check: Check | None = getattr(self._checking, "look", None)
+        check: Check | None = getattr(self._checking, "check", None)
         if check is not None:
             check()
 

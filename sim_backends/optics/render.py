@@ -43,8 +43,8 @@ def expected_image(
             render_mesh(image, optics, instance, light, exposure)
         else:
             render_rectangle(image, optics, instance, light, exposure)
-    if light.sun is not None:
-        add_sun(image, optics, light.sun)
+    for sun in light.suns:
+        add_sun(image, optics, sun)
     if laser is not None:
         stripe = np.zeros_like(image)
         touched = render_stripe(stripe, optics, laser, list(scene), exposure)

@@ -132,7 +132,7 @@ SceneObject = BoardInstance | PlaneInstance | MeshInstance
 
 @dataclass(frozen=True, eq=False)
 class Sun:
-    """A strip of sunlight `strength` times the room's light, over `low` ≤ x ≤ `high`, m, of the plane z = 0."""
+    """A strip of light `strength` times what else lights it, over `low` ≤ x ≤ `high`, m, of the plane z = 0."""
 
     camera_from_ground: Pose
     low: float
@@ -154,7 +154,7 @@ class Light:
     direction: tuple[float, float, float] | None = None
     diffuse: float = 0.6
     surroundings: float = 0.35
-    sun: Sun | None = None
+    suns: tuple[Sun, ...] = ()
 
 
 @dataclass(frozen=True)

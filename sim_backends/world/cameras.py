@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_backends.optics.camera import CameraOptics
+from sim_backends.optics.daylight import ROOMS_PER_KLX, laser_passed, share_passed
 from sim_backends.optics.render import render
 from sim_backends.optics.scene import (
     Board,
@@ -35,7 +36,7 @@ Pose = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 SCAN_TRANSMISSION = 0.4
-"""Share of the ambient light that the scan camera's narrow-band filter lets through; the laser passes."""
+"""Share of the ambient light that the scan camera lets through where no filter is described; the laser passes."""
 TABLE_ALBEDO = 0.45
 WITNESS_ALBEDO = 0.5
 SURFACE_ALBEDO = 0.6
@@ -43,6 +44,12 @@ BOW_AT = (0.130, 0.018)
 """Where the sheet's bow is told: from the laser, and beside the fan's middle, m."""
 SUN_SPEED = 0.2e-3
 """m/s: a quarter of a degree a minute, from a window 3 m away."""
+OUTSIDE_M = 1.5
+"""So far from the place the open begins: cells are calibrated under a roof."""
+SKY = 0.15
+"""Share of a clear day's light that comes from the sky, and into the shadow."""
+SWAY_M, SWAY_S = 0.03, 8.0
+"""How far, and in what time, the shadow of what stands in the wind goes to and fro along the table's x axis."""
 _FAR = {"scan": (0.5, 3.0), "target": (3.0, 3.0)}
 """Beyond this distance, m, and so many times its focus, a camera has nothing to see that matters."""
 
@@ -73,6 +80,7 @@ class Cameras:
         nx, ny, nz = (float(v) for v in scene.light_plane_normal)
         self._laser = LaserOptics(
             origin=(x, y, z), normal=(nx, ny, nz), distance=scene.light_plane_distance,
+            brightness=LaserOptics.brightness * (1.0 if cell.scan.filter is None else laser_passed(cell.scan.filter)),
             speckle_contrast=scene.deviations.speckle_contrast,
             bow=scene.workshop.sheet_bow * BOW_AT[0] / BOW_AT[1] ** 2, end=effects.sheet_ends,
             shadows=((-0.06, 0.004, 0.7), (0.035, 0.002, 0.9)) if effects.dust else (),
@@ -107,7 +115,7 @@ class Cameras:
             objects += [seen for station, at in parts for seen in self._part(station, camera_from_world @ at)]
         with self._busy[camera]:
             lit = self.laser(warm) if laser and camera == "scan" else None
-            return render(optics, objects, lit, exposure, self._rng[camera], light=self._sunny(camera_from_world, t))
+            return render(optics, objects, lit, exposure, self._rng[camera], light=self._lit(camera_from_world, t))
 
     def _witness(self, camera_from_flange: Pose) -> list[SceneObject]:
         """The plate on the claw, if the camera sees any of it."""
@@ -150,15 +158,21 @@ class Cameras:
         lens = self.lens(camera, round(warm, 2))
         return replace(self._cold[camera], fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy)
 
-    def _sunny(self, camera_from_world: Pose, t: float) -> Light:
-        """The light with the sun's strip where it is at `t`: a hand's width, slowly along the table's x axis."""
-        scene = self._shown[0]
-        strength = scene.effects.sunlight
-        if not strength:
-            return self._light
-        low = scene.workshop.sun_start + SUN_SPEED * t - 0.1
+    def _lit(self, camera_from_world: Pose, t: float) -> Light:
+        """The light with the sun's strip where it is at `t`: a hand's width, slowly along the table's x axis.
+
+        In the open the sky lights all, and the sun all beyond the edge of a shadow.
+        """
+        scene, suns = self._shown[0], []
         ground = camera_from_world @ scene.world_from_place
-        return replace(self._light, sun=Sun(ground, low, low + 0.12, strength))
+        if strength := scene.effects.sunlight:
+            low = scene.workshop.sun_start + SUN_SPEED * t - 0.1
+            suns.append(Sun(ground, low, low + 0.12, strength))
+        if rooms := ROOMS_PER_KLX * scene.workshop.klx:
+            edge = scene.workshop.sun_start + SWAY_M * float(np.sin(2.0 * np.pi * t / SWAY_S))
+            suns.append(Sun(ground, -OUTSIDE_M, OUTSIDE_M, SKY * rooms))
+            suns.append(Sun(ground, edge, OUTSIDE_M, (1.0 - SKY) * rooms / (1.0 + SKY * rooms)))
+        return replace(self._light, suns=tuple(suns)) if suns else self._light
 
     def _objects(self, camera: str, camera_from_world: Pose, world_from_base: Pose) -> list[SceneObject]:
         scene, station, board_there = self._shown
@@ -211,6 +225,8 @@ def in_picture(optics: CameraOptics, corners: NDArray[np.float64]) -> bool:
 
 
 def _optics(scene: Scene, lens: Lens, drawn: CameraDrawing, transmission: float) -> CameraOptics:
+    if drawn.filter is not None:
+        transmission = share_passed(drawn.filter)
     return CameraOptics(
         width=drawn.size[0], height=drawn.size[1], fx=lens.fx, fy=lens.fy, cx=lens.cx, cy=lens.cy,
         distortion=lens.dist, pixel=drawn.pixel, f_number=drawing.F_NUMBER, focal=drawn.focal_length,

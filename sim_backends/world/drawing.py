@@ -94,13 +94,16 @@ Box = dict[str, list[object]]
 @dataclass(frozen=True, eq=False)
 class CameraDrawing:
     """A camera: `size` (width, height) in px, `pixel`, `focal_length` and `focus` (the distance of its sharpest
-    picture) in m, and where it is mounted; the scan camera with the carriage at the rail's position 0."""
+    picture) in m, and where it is mounted; the scan camera with the carriage at the rail's position 0.
+
+    `filter`: centre and width, m, and transmission of a band-pass before the lens."""
 
     size: tuple[int, int]
     pixel: float
     focal_length: float
     focus: float
     mounting: Pose
+    filter: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,9 +270,11 @@ def settled(drawn: Part, stock: Part) -> Part:
 
 
 def _settled(value: Any, stock: Any) -> Any:
+    if stock is None:
+        return value
     if is_dataclass(value):
         return settled(value, stock)
-    if isinstance(value, np.ndarray) and stock is not None:
+    if isinstance(value, np.ndarray):
         same = np.abs(value - stock)
         return stock if same[:3, 3].max() < TEXT_M and same[:3, :3].max() < TEXT_RAD else value
     if isinstance(value, float) or (isinstance(value, tuple) and value and isinstance(value[0], float)):

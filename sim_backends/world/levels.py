@@ -2,8 +2,8 @@
 
 Every draw is Gaussian and cut at 2.5 σ. `ideal` keeps only what a perfect cell would have too: the sensor's
 quantisation and a little read noise. `workshop` is `nominal` with what a workshop does to a cell that the drawing's
-tolerances leave out. Each such effect is off at the other levels and can be added alone: "nominal+rocking+grasp". Sizes
-marked "assumed" are of the usual order; nobody measured them on this cell.
+tolerances leave out, `outdoor` what the open adds. Each such effect is off at the other levels and can be added alone:
+"nominal+rocking+grasp". Sizes marked "assumed" are of the usual order; nobody measured them on this cell.
 """
 
 from __future__ import annotations
@@ -111,6 +111,32 @@ class Effects:
         "what stands on metal at 4 degrees of contact: 2 sin 2° of its capillary length, 1.8 mm; angle assumed",
         option=True,
     )
+    sun: float = _row(
+        100.0,
+        "klx",
+        "most illuminance in the open, drawn from a fifth of it on; 15 % of it reach into a shadow, whose edge goes to "
+        "and fro over the place",
+        "clear sky, sun from 10 to 60 degrees high (CIE S 011); sim_backends/optics/daylight.py has what a sensor sees",
+        option=True,
+    )
+    wind: float = _row(
+        0.05e-3,
+        "rad",
+        "amplitude of the standing vehicle's rocking at about 4 Hz in the gusts, one every 10 s",
+        "8 m/s on 1 m², half a metre high, gusts of 0.3 of it: 7 N m on tyres of 8e5 N m/rad, and their resonance, "
+        "assumed to be five times",
+        option=True,
+    )
+    ground: float = _row(
+        5e-3, "rad", "1 sigma of the ground's slope, in waves of 1.5 m", "paved yards fall by 1 to 2 %", option=True
+    )
+    heat: float = _row(
+        20e-6,
+        "m",
+        "1 sigma, per axis, by which the scan camera's mount has grown once it is warm",
+        "aluminium, 0.1 m, 23e-6 per K, 10 K",
+        option=True,
+    )
 
     @classmethod
     def names(cls) -> tuple[str, ...]:
@@ -124,6 +150,8 @@ ALONE = Effects(**{f.name: f.metadata["size"] for f in _ROWS})
 """The size of each when it is added alone."""
 WORKSHOP = Effects(**{f.name: f.metadata["size"] for f in _ROWS if not f.metadata["option"]})
 """All of them together, but for the options, which are added by their names."""
+OUTDOOR = ("sun", "wind", "ground", "heat")
+"""The options that the level of this name has."""
 WARMING_K, WARMING_S = 10.0, 1200.0
 """How much warmer laser and cameras become after they are switched on, and in what time (1/e)."""
 
@@ -200,7 +228,7 @@ NOMINAL = Deviations()
 IDEAL = Deviations(**{f.name: 0.0 for f in dataclasses.fields(Deviations)} | {"read_noise": 0.1})
 HARSH = Deviations(**{f.name: 2.5 * getattr(NOMINAL, f.name) for f in dataclasses.fields(Deviations)})
 
-LEVELS = {"ideal": IDEAL, "nominal": NOMINAL, "harsh": HARSH, "workshop": NOMINAL}
+LEVELS = {"ideal": IDEAL, "nominal": NOMINAL, "harsh": HARSH, "workshop": NOMINAL, "outdoor": NOMINAL}
 
 
 def deviations(level: str) -> Deviations:
@@ -215,9 +243,9 @@ def deviations(level: str) -> Deviations:
 
 
 def effects_of(level: str) -> Effects:
-    """The workshop's effects at `level`. Raises ValueError that lists the levels or the effects."""
+    """The effects at `level`. Raises ValueError that lists the levels or the effects."""
     base, *names = _parts(level)
-    return only(*names) if names else WORKSHOP if base == "workshop" else NONE
+    return WORKSHOP if base == "workshop" else only(*(OUTDOOR if base == "outdoor" else names))
 
 
 def number_of(level: str) -> str:
@@ -234,6 +262,6 @@ def assumed_noise(level: str) -> dict[str, dict[str, float | str]]:
 
 def _parts(level: str) -> list[str]:
     base, *names = level.split("+")
-    if base not in LEVELS or (names and base == "workshop"):
+    if base not in LEVELS or (names and base in ("workshop", "outdoor")):
         raise ValueError(f"unknown level {level!r}: choose one of {', '.join(LEVELS)}")
     return [base, *names]

@@ -72,7 +72,9 @@ class Workshop:
     far the light sheet is off its plane at the place that `Effects` names, m. Once all is warm: `pointing`, turn of
     the light plane about the stripe's direction, rad; `shift` (2, 2) of the scan and the target camera's principal
     points, px; `zoom`, relative. `rocking`: roll and pitch (2,), rad, at `rocking_hz` with `rocking_phase` (2,),
-    rad. `sun_start` in m. `oil` (3,): the puddle's place, x and y from -1 to 1 across the surface, and its radius, m.
+    rad; `wind` (2,), rad, what gusts add to it. `ground` (4,): roll and pitch of the ground's waves, and where they
+    begin, rad. `heat` (3,): how far the scan camera's mount moves as it warms, m. `sun_start` in m, `klx` in the open.
+    `oil` (3,): the puddle's place, x and y from -1 to 1 across the surface, and its radius, m.
     """
 
     harmonics: Vector
@@ -83,7 +85,11 @@ class Workshop:
     rocking: Vector
     rocking_hz: float
     rocking_phase: Vector
+    wind: Vector
+    ground: Vector
+    heat: Vector
     sun_start: float
+    klx: float
     oil: Vector
 
 
@@ -175,8 +181,8 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
     """
     sigma, effects = deviations(level), effects_of(level)
     if drawing.cell.fixed:
-        # No tyres, no springs.
-        effects = replace(effects, rocking=0.0)
+        # No tyres, no springs, no way over the ground.
+        effects = replace(effects, rocking=0.0, wind=0.0, ground=0.0)
     if seed < 0:
         raise ValueError(f"seed {seed} must be 0 or greater")
     d = _Draws(seed)
@@ -306,8 +312,12 @@ def _workshop(d: _Draws, effects: Effects) -> Workshop:
         shift=d.vector("warm_shift", warm, 4).reshape(2, 2),
         zoom=1e-5 * WARMING_K * bool(warm),
         rocking=effects.rocking * np.array([np.cos(direction), np.sin(direction)]),
+        wind=effects.wind * np.array([np.cos(direction), np.sin(direction)]),
+        ground=np.append(d.vector("ground", effects.ground, 2), d.vector("ground.phase", np.pi / CUT, 2)),
+        heat=d.vector("heat", effects.heat),
         rocking_hz=4.0 * (1.0 + d.scalar("rocking.frequency", 0.05)),
         rocking_phase=d.vector("rocking.phase", 1.0, 2) * np.pi,
         sun_start=d.scalar("sun", 0.05),
+        klx=effects.sun * (0.2 + d.even("klx", 0.8)),
         oil=bool(effects.oil) * stream(d.seed, "oil").uniform((-0.6, -0.6, 6e-3), (0.6, 0.6, 10e-3)),
     )

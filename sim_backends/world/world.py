@@ -36,6 +36,8 @@ Pose = NDArray[np.float64]
 
 ROLL = 10.0
 """Of a carriage that droops, rad per m."""
+GUST_S, WAVE_M = 10.0, 1.5
+"""From gust to gust, and from one of the ground's waves to the next."""
 BANDS = 6
 """In so many bands a rolling shutter is drawn."""
 
@@ -173,14 +175,17 @@ class World:
 
     def world_from_base(self, t: float) -> Pose:
         """True pose (4, 4) of the arm's base at world time `t`, the vehicle's lean and rocking included."""
-        drawn = self.scene.workshop
-        carried = self.scene.vehicle_from_base
-        if drawn.rocking.any():
-            roll, pitch = drawn.rocking * np.sin(2.0 * np.pi * drawn.rocking_hz * t + drawn.rocking_phase)
+        drawn, effects = self.scene.workshop, self.scene.effects
+        carried, world_from_vehicle = self.scene.vehicle_from_base, self.vehicle.world_from_vehicle(t)
+        if drawn.rocking.any() or effects.wind or effects.ground:
+            swing = drawn.rocking + drawn.wind * np.sin(np.pi * t / GUST_S) ** 2
+            turn = swing * np.sin(2.0 * np.pi * drawn.rocking_hz * t + drawn.rocking_phase)
+            waves = 2.0 * np.pi * world_from_vehicle[0, 3] / WAVE_M + drawn.ground[2:]
+            turn = turn + drawn.ground[:2] * np.sin(waves)
             tilt = np.eye(4)
-            tilt[:3, :3] = rotation(np.array([roll, pitch, 0.0]))
+            tilt[:3, :3] = rotation(np.append(turn, 0.0))
             carried = tilt @ carried
-        return self.vehicle.world_from_vehicle(t) @ carried
+        return world_from_vehicle @ carried
 
     def world_from_flange(self, t: float) -> Pose:
         """True pose (4, 4) of the flange at world time `t`."""
@@ -191,6 +196,8 @@ class World:
         if camera == "target":
             return self.scene.flange_from_target_camera
         made, carriage = self.scene.flange_from_scan_camera.copy(), self.rail.carriage(t)
+        if self.scene.effects.heat:
+            made[:3, 3] += self.warmth(t) * self.scene.workshop.heat
         made[:3, 3] += made[:3, :3] @ (carriage * self.scene.rail_direction)
         if droop := self.scene.effects.droop * (carriage / self.rail.params.travel[1]) ** 2:
             made[:3, 3] += droop * made[:3, 2]

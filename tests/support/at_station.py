@@ -31,7 +31,7 @@ class AtStation:
     """A cell of `record` where that placed, `further` metres on, its vehicle braked; `made` is what `record` made.
 
     `job` and `nominal` are those of `pot()` if not told otherwise, the arm's joints those of the sweep if `folded`:
-    with others its errors are others. `changed` changes the cell before anything moves, `tell` hears what steps tell.
+    with others its errors are others. `changed` changes the cell before anything moves, `notify` hears what steps tell.
     """
 
     record: JobRecord

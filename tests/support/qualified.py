@@ -58,3 +58,8 @@ def other_code(task: WorldTask) -> Row:
     from drivers.errors import ConfigError
 
     raise ConfigError("a worker has another code")
+
+
+def compared(row: Row) -> Row:
+    """Those columns of a row that are the same each time; what is not known is left out."""
+    return {name: value for name, value in row.items() if name not in ("wall_s", "ended_s") and value is not None}

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Iterable
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -101,22 +101,13 @@ class Level(StrEnum):
     nominal = "nominal"
     harsh = "harsh"
     workshop = "workshop"
+    outdoor = "outdoor"
 
 
-class CellClock(StrEnum):
-    """What a simulated cell keeps time with."""
-
-    wall = "wall"
-    virtual = "virtual"
-
-
-class Confirm(StrEnum):
-    """Who confirms what a person has to."""
-
-    person = "person"
-    simulated = "simulated"
-
-
+CellClock = Literal["wall", "virtual"]
+"""What a simulated cell keeps time with."""
+Confirm = Literal["person", "simulated"]
+"""Who confirms what a person has to."""
 ConfigOption = Annotated[
     Path | None,
     typer.Option(

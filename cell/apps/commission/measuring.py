@@ -25,8 +25,8 @@ from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import CameraConfig, PlateConfig
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.poses import from_parts, from_ur, mean
-from cell.measure.vision import BoardSpec, BoardView, board_pose, find_board, parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.board import board_pose, find_board
+from cell.measure.vision.board.view import BoardSpec, BoardView, centre_of, parse_board
 from drivers.errors import CellError, DeviceFault, RefusedError
 from drivers.interfaces import Camera, Frame, Image
 

@@ -22,7 +22,7 @@ from tomlkit.exceptions import TOMLKitError
 
 from cell.apps.commission.check import CheckVerdict, CommissionCheck, Progress, Result
 from cell.apps.commission.checks import arm, cameras, outputs, rail, stops, vehicle, whole_cell
-from cell.apps.commission.workplace import CommissionWorkplace, Declined, Person, in_one_line
+from cell.apps.commission.workplace import CommissionWorkplace, Declined, Person
 from cell.base.storage import replacing
 from cell.config.cell_config import CONFIGURATION, load_config, require_confirm
 from cell.config.job import job_path
@@ -85,7 +85,7 @@ MENDS = 3
 
 @dataclass
 class Commissioning:
-    """Goes through the checks at a `desk`. `path` is cell.toml; `show(check, verdict, result)` is called after each."""
+    """Runs the checks at a `workplace`. `path` is cell.toml; `show(check, verdict, result)` is called after each."""
 
     workplace: CommissionWorkplace
     progress: Progress
@@ -137,7 +137,7 @@ class Commissioning:
             raise
         except CellError as error:
             result.verdict = CheckVerdict.FAILED
-            result.notes.append(in_one_line(error))
+            result.notes.append(" ".join(str(error).split()))
             if isinstance(error, RefusedError) and isinstance(frame := error.seen.get("frame"), Frame):
                 workplace.keep(result, f"{check.name}-refused", frame)
             if isinstance(error, DeviceFault):
@@ -226,17 +226,6 @@ def chosen(only: Sequence[str], until: str | None) -> list[CommissionCheck]:
     return picked
 
 
-def table() -> str:
-    """The checks as the table of docs/how-to/commission.md."""
-    rows = ["| check | moves | how far | how fast | has to hold |", "|---|---|---|---|---|"]
-    rows += [f"| `{c.name}` | {c.moves} | {c.far} | {c.fast} | {c.limit} |" for c in CHECKS]
-    return "\n".join(rows)
-
-
-if __name__ == "__main__":
-    print(table())
-
-
 FOLDER = "commissioning"
 
 
@@ -247,7 +236,7 @@ def begin(
     """A commissioning of the cell of this configuration, whose record is in `commissioning/` beside it.
 
     With `sim="all"` the cell is simulated, as `truth` describes it. `ConfigError` for what is wrong before anything is
-    connected. The caller closes `desk`.
+    connected. The caller closes `workplace`.
     """
     path = Path(CONFIGURATION) if config is None else config
     if not path.is_file():

@@ -25,7 +25,6 @@ from cell.devices.simulated.process import cause_fault, make_ready
 from cell.motion.kinematics import HOME, Joints
 from cell.procedures.arm.moves import Mover, moved_once_more
 from cell.run.recorded_work import WorkContext
-from drivers.errors import CellError
 from drivers.interfaces import Frame, Image
 from statemachine.step import Observer
 
@@ -67,7 +66,7 @@ class Person:
 
 
 class SimulatedPerson(Person):
-    """Of a simulated cell: agrees to everything, has changed nothing, and says so through `tell`."""
+    """Of a simulated cell: agrees to everything, has changed nothing, and says so through `notify`."""
 
     def __init__(self, notify: Callable[[str], None]) -> None:
         def agree(text: str) -> bool:
@@ -254,8 +253,3 @@ def _shown(image: Image, marks: ArrayLike | None) -> cv2.typing.MatLike:
     for x, y in [] if marks is None else np.asarray(marks) * share:
         cv2.circle(small, (round(float(x)), round(float(y))), 2, (0, 200, 0), -1)
     return small
-
-
-def in_one_line(error: CellError) -> str:
-    """An error in one line."""
-    return " ".join(str(error).split())

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from cell.apps.new_job.mesh_file import MeshBody, joined
 from cell.apps.new_job.sweeps import ABOVE, NEAR, Array, Faces, Rays
-from cell.apps.new_job.text import METRES
 from cell.measure.geometry.poses import from_parts
 from drivers.errors import ConfigError
 
+METRES = {"mm": 1e-3, "m": 1.0, "inch": 0.0254}
 APART = 1e-4
 """Share of a body's size by which another has to reach into it to overlap: bodies that touch do not."""
 
@@ -175,7 +175,7 @@ def open_side(laid: Laid, ways: Sequence[Array] = (ABOVE,), notify: Callable[[st
     """What lies open to an eye in one of the directions `ways` (3,), unit, S, and is not too steep for it.
 
     A triangle that is hidden in part is halved until its pieces are small. Where faces of overlapping bodies lie at
-    one place, the first body's counts. `tell` is told how far it is. Raises `ConfigError` when next to nothing is seen.
+    one place, the first body's counts. `notify` gets the progress. Raises `ConfigError` when next to nothing is seen.
     """
     rays = Rays(laid.vertices, laid.faces)
     body, earlier = before(laid.vertices, laid.faces)

@@ -25,8 +25,8 @@ from cell.config.job import Job
 from cell.measure.geometry.light_plane import triangulate
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface
-from cell.measure.inversion.alternative_poses import observable, settled
 from cell.measure.inversion.nominal import SIGMA_FLOOR
+from cell.measure.inversion.place_pose import observable, settled
 from cell.measure.inversion.registration import MOST_SHIFT, candidates
 from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.arm.photograph import ScanPlan, scan_plans

@@ -1,19 +1,32 @@
-"""What the worlds of a campaign say: how many parts are placed, how near to limits, how fast, and what goes wrong."""
+"""What the worlds of a campaign say: how many parts are placed, how near to limits, how fast, and what goes wrong.
+
+The line that says so is kept for the job, and shown by `cell run` while it holds. Two campaigns on the same seeds are
+compared world by world: the difference in yield and in each figure.
+"""
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 import numpy as np
 
-from cell.apps.qualify.identity import QualifiedCode
-from cell.apps.qualify.intervals import Share, cpk
-from cell.apps.qualify.rows import BOUNDS, Row, number, shown, used
+from cell.apps.qualify.campaign import Campaign
+from cell.apps.qualify.identity import QualifiedCode, configuration_hash
+from cell.apps.qualify.intervals import Share, cpk, mean_difference, share_difference
+from cell.apps.qualify.rows import BOUNDS, ROWS, Row, RowStore, number, shown, used
+from cell.base.storage import read_json, sealed, write_json
+from cell.config.cell_config import load_config
+from cell.config.files import beside, find_config
+from cell.config.job import job_and_item, job_path, ships
 from cell.run.batch import GOOD
+from cell.run.resumption import job_hash
+from drivers.errors import CellError, ConfigError
 from drivers.interfaces import Vector
 
 BAD = ("refused", "misplaced", "faulted", "aborted", "error")
@@ -239,3 +252,139 @@ def _worst(rows: Sequence[Row], figures: Sequence[FigureSpread], command: Callab
             told = figure.worst_seed, str(row["outcome"]), ""
             bad.append(WorstWorld(*told, figure.name, figure.worst_used, command=command(row)))
     return bad
+
+
+FOLDER, SUFFIX = "qualified", ".qualified.json"
+
+
+def line_file(job: str | Path, config: Path | None) -> Path:
+    """Where the line of a job is: beside its file, or below the calibrations of a cell for a job that ships or whose
+    folder cannot be written. `config` is the cell's file."""
+    path, (_, number) = job_path(job), job_and_item(job)
+    name = f"{path.stem}{'' if number is None else f'-{number}'}{SUFFIX}"
+    if not ships(path) and os.access(path.parent, os.W_OK):
+        return path.parent / name
+    return beside(config) / load_config(config).cell.calibrations / FOLDER / name
+
+
+def keep_line(answer: JobAnswer, job: str | Path, config: Path | None) -> Path:
+    """Keep the line of an answer, with the hashes of what it is of; gives its file. Raises `OSError`."""
+    file = line_file(job, config)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    of = answer.of
+    hashes = {"job_hash": of.job_hash, "configuration_hash": of.configuration_hash, "code_hash": of.code_hash}
+    write_json(file, sealed({"line": answer.line, "job": of.job, **hashes}))
+    return file
+
+
+def kept_line(job: str | Path, config: Path | None) -> str | None:
+    """The line of a job as it is now, or that it does not hold any more and why; None where nobody qualified it.
+
+    `config` is the file that a command was given. Nothing is raised: what is wrong with the files is told elsewhere.
+    """
+    try:
+        path = find_config(config, simulated=True)
+        kept = read_json(line_file(job, path)).require()
+        now = {"job": job_hash(job), "configuration": configuration_hash(load_config(path))}
+    except (CellError, OSError, ValueError):
+        return None
+    changed = [name for name, value in now.items() if kept.get(f"{name}_hash") != value]
+    if not changed:
+        return str(kept.get("line"))
+    verb = "has" if len(changed) == 1 else "have"
+    return (
+        f"{kept.get('line')}: that does not hold any more, {' and '.join(changed)} {verb} changed since; "
+        f"`cell qualify {job}` tells anew"
+    )
+
+
+IDENTITY = ("job_hash", "configuration_hash", "code_hash")
+ALWAYS = ("cycle_s", "true_error_max_mm", "stated_bound_mm")
+"""Columns that are compared beside the figures."""
+
+
+@dataclass(frozen=True)
+class FigureDifference:
+    """This campaign less the other: the mean of the paired differences, its 95 % interval, and of how many worlds."""
+
+    name: str
+    unit: str
+    mean: float
+    low: float | None
+    high: float | None
+    n: int
+
+
+@dataclass(frozen=True)
+class ChangedWorld:
+    """A seed whose outcome changed, and why it is as it is now."""
+
+    seed: int
+    before: str
+    now: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class PairedComparison:
+    """`pairs` worlds of both campaigns; `other` names what differs there. `yields` is the difference in yield with the
+    ends of its interval, as shares; differences are this campaign less the other."""
+
+    other: Mapping[str, str]
+    pairs: int
+    yields: tuple[float, float, float]
+    figures: Sequence[FigureDifference]
+    changed: Sequence[ChangedWorld]
+
+    def as_dict(self) -> dict[str, object]:
+        """JSON-ready."""
+        return asdict(self)
+
+
+def other_rows(campaign: Campaign, folder: Path) -> list[Row]:
+    """The rows in `folder` to compare with: of the same job and level, from the version that ran last.
+
+    In the campaign's own folder that is another code, job or configuration. `ConfigError` where there is none.
+    """
+    if not (folder / ROWS).is_dir():
+        raise ConfigError(f"--compare {folder}: it holds no campaign (there is no {folder / ROWS}); name its --out")
+    rows = RowStore(folder).rows(job=campaign.of.job, level=campaign.level)
+    if folder.resolve() == campaign.folder.resolve():
+        own = campaign.wanted
+        rows = [row for row in rows if any(row[name] != own[name] for name in IDENTITY)]
+    if not rows:
+        raise ConfigError(
+            f"--compare {folder}: it holds no other worlds of job {campaign.of.job} at level {campaign.level}; run "
+            "`cell qualify` with the other version first"
+        )
+    newest = max(rows, key=lambda row: number(row.get("ended_s")))
+    return [row for row in rows if all(row[name] == newest[name] for name in IDENTITY)]
+
+
+def compare(rows: Sequence[Row], others: Sequence[Row]) -> PairedComparison:
+    """Pair by seed. `ConfigError` where no seed is in both."""
+    before = {row["seed"]: row for row in others}
+    pairs = [(row, before[row["seed"]]) for row in rows if row["seed"] in before]
+    if not pairs:
+        raise ConfigError("the two campaigns have no seed in common; give the same --first-seed, then compare again")
+    good = [(now["outcome"] in GOOD, was["outcome"] in GOOD) for now, was in pairs]
+    changed = [
+        ChangedWorld(int(number(now["seed"])), str(was["outcome"]), str(now["outcome"]), str(now["reason"]))
+        for now, was in pairs if now["outcome"] != was["outcome"]
+    ]  # fmt: skip
+    other = pairs[0][1]
+    return PairedComparison(
+        {name: str(other[name]) for name in IDENTITY}, len(pairs),
+        share_difference(good.count((True, False)), good.count((False, True)), len(pairs)),
+        figures=_differences(pairs), changed=changed,
+    )  # fmt: skip
+
+
+def _differences(pairs: Sequence[tuple[Row, Row]]) -> list[FigureDifference]:
+    found = []
+    for name in dict.fromkeys((*ALWAYS, *limited([now for now, _ in pairs]))):
+        both = [number(now[name]) - number(was[name]) for now, was in pairs if name in now and name in was]
+        if both:
+            mean, low, high = mean_difference(both)
+            found.append(FigureDifference(*shown(name), mean, low, high, n=len(both)))
+    return found

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from cell.apps.qualify.identity import QualifiedCode, require_seeds
 from cell.apps.qualify.intervals import Share
-from cell.apps.qualify.rows import Row, error_row
-from cell.apps.qualify.store import RowStore
+from cell.apps.qualify.rows import Row, RowStore, error_row
 from cell.apps.qualify.workers import Workers
 from cell.apps.qualify.world import WorldTask
 from cell.run.batch import GOOD

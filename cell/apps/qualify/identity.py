@@ -9,7 +9,7 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
-from cell.config.cell_config import CellConfig
+from cell.config.cell_config import NO_FILES, CellConfig
 from cell.config.job import job_and_item, load_job
 from cell.run.resumption import job_hash
 from drivers.errors import ConfigError
@@ -18,7 +18,7 @@ PACKAGES = ("cell", "drivers", "statemachine", "sim_backends")
 SOURCES = (".py", ".toml", ".dbc", ".ply", ".urdf")
 DIGITS = 16
 HIGHEST_SEED = 999_999
-WITHOUT = {"cell": {"runs", "calibrations", "record", "frames", "meshes", "sim", "confirm"}}
+WITHOUT = {"cell": {"runs", "calibrations", *NO_FILES, "meshes", "sim", "confirm"}}
 """What of a configuration changes nothing in a simulated world: where files go, and who answers."""
 
 

@@ -23,7 +23,7 @@ from cell.apps.qualify.rows import Row, error_row, row_of
 from cell.base.compiled import load
 from cell.base.storage import replacing
 from cell.config.calibrations.store import archive_of
-from cell.config.cell_config import DEVICES, CellConfig, load_config
+from cell.config.cell_config import DEVICES, NO_FILES, CellConfig, load_config
 from cell.config.job import Job, item_names, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
@@ -123,7 +123,7 @@ def _config(task: WorldTask, scratch: Path) -> CellConfig:
         with replacing(file) as out:
             out.write(task.configuration.encode())
     config = load_config(file)
-    changed = {"runs": str(scratch), "record": False, "frames": False, "sim": tuple(DEVICES), "confirm": "simulated"}
+    changed = {**NO_FILES, "runs": str(scratch), "sim": tuple(DEVICES), "confirm": "simulated"}
     return config.model_copy(update={"cell": config.cell.model_copy(update=changed)})
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from cell.base.storage import read_json, require_date, sealed, write_json
 from cell.config.cell_config import CellConfig
 from cell.measure.calibration import Priors, ScanCalibration, ScanObservation, TargetCalibration, TargetObservation
-from cell.measure.calibration.archive import SUFFIX, Observations, write_archive
+from cell.measure.calibration.archive import SUFFIX, Observations
 from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.calibration.judge.faults import SCALE_RANGE, refuse_wrong_lead
@@ -127,8 +127,7 @@ def _require(name: str, values: object, least: float = 0.0, most: float = MOUNT_
             raise ValueError(f"{name}: {value:.6g}, allowed {least:g} to {most:g}")
 
 
-FORMAT, UNSEALED = 2, 1
-"""Of the files written now, and of those that had no digest, which are read with a note."""
+FORMAT = 2
 
 
 class CalibrationEdited(CalibrationStale):
@@ -144,9 +143,8 @@ class CellCalibration:
     """Scan head and target camera, with the serial numbers and the configuration that they belong to.
 
     `made` is in seconds since the epoch; `identities` are serial numbers by device name. `kinematics` names the arm's
-    table with which the flange's poses were reckoned, as of `kinematics_name`; "" in files that do not say so.
+    table with which the flange's poses were reckoned, as of `kinematics_name`.
     `edits` tell of each edit of its file that a person has accepted: `who`, `when`, `why` and `changed` (the parts).
-    One that is not `sealed` was read from a file without a digest: it is stored again without one.
     """
 
     scan: ScanCalibration
@@ -156,7 +154,6 @@ class CellCalibration:
     made: float
     kinematics: str = ""
     edits: tuple[dict[str, Any], ...] = ()
-    sealed: bool = True
 
     @classmethod
     def solve(
@@ -185,7 +182,7 @@ class CellCalibration:
     def as_dict(self) -> dict[str, object]:
         """For storage."""
         return {
-            "format": FORMAT if self.sealed else UNSEALED, "made": self.made, "date": self.date,
+            "format": FORMAT, "made": self.made, "date": self.date,
             "identities": self.identities, "configuration": self.configuration, "kinematics": self.kinematics,
             "scan": self.scan.as_dict(), "target": self.target.as_dict(),
             **({"edits": list(self.edits)} if self.edits else {}),
@@ -194,8 +191,8 @@ class CellCalibration:
     def hash(self) -> str:
         """Hash of its content, for reports: of what it says, not of when it was made."""
         content = {key: value for key, value in self.as_dict().items() if key not in ("made", "date", "edits")}
-        # The first format's, so that a file has the hash that earlier runs tell of it.
-        content["format"] = UNSEALED
+        # The first format's: runs that were made with it tell this hash.
+        content["format"] = 1
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
     def summary(self) -> dict[str, Any]:
@@ -296,13 +293,9 @@ def name_of(identities: dict[str, str]) -> str:
 
 
 def save_calibration(calibration: CellCalibration, path: Path) -> None:
-    """Write it; a reader finds the old file or the new one, never half of one.
-
-    A fresh digest would vouch for what nobody could check: one that was read without a digest gets none.
-    """
+    """Write it; a reader finds the old file or the new one, never half of one."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    content = calibration.as_dict()
-    write_json(path, sealed(content, parts=True) if calibration.sealed else content)
+    write_json(path, sealed(calibration.as_dict(), parts=True))
 
 
 def archive_of(folder: Path, calibration: CellCalibration) -> Path:
@@ -310,16 +303,10 @@ def archive_of(folder: Path, calibration: CellCalibration) -> Path:
     return folder / f"{calibration.name}{SUFFIX}"
 
 
-def save_with_observations(calibration: CellCalibration, observations: Observations, folder: Path) -> None:
-    """Write the calibration and, beside it, what it can be solved from again."""
-    write_archive(archive_of(folder, calibration), observations)
-    save_calibration(calibration, folder / f"{calibration.name}.json")
-
-
 def read_calibration(path: Path) -> CellCalibration:
     """Read a stored calibration; raises `CalibrationStale` when the file is none, `CalibrationEdited` when it was
     changed since it was written."""
-    made, changed, _ = _read(path)
+    made, changed = _read(path)
     if changed:
         raise CalibrationEdited(
             f"{path} was changed after it was written: {', '.join(changed)}. Put the old file back or run `cell "
@@ -330,44 +317,33 @@ def read_calibration(path: Path) -> CellCalibration:
 
 
 def accept_calibration(path: Path, who: str, why: str) -> CellCalibration:
-    """Take an edited file, or one without a digest, as it is now, and keep in it who did so, when and why.
+    """Take an edited file as it is now, and keep in it who did so, when and why.
 
     `CalibrationStale` when what it says cannot be, `ConfigError` when nothing was changed.
     """
-    made, changed, intact = _read(path)
-    if intact:
+    made, changed = _read(path)
+    if not changed:
         raise ConfigError(f"{path} is as it was written; there is no edit to accept")
-    when, parts = time.strftime("%Y-%m-%d %H:%M:%S"), list(changed) or ["it had no digest"]
-    edit = {"who": who, "when": when, "why": why, "changed": parts}
-    accepted = replace(made, edits=(*made.edits, edit), sealed=True)
+    edit = {"who": who, "when": time.strftime("%Y-%m-%d %H:%M:%S"), "why": why, "changed": list(changed)}
+    accepted = replace(made, edits=(*made.edits, edit))
     save_calibration(accepted, path)
     return accepted
 
 
-def _read(path: Path) -> tuple[CellCalibration, tuple[str, ...], bool]:
-    """A file's calibration, which of its parts were changed since it was written, and whether its digest fits."""
+def _read(path: Path) -> tuple[CellCalibration, tuple[str, ...]]:
+    """A file's calibration, and which of its parts were changed since it was written."""
     try:
         stored = read_json(path)
         data = stored.content
-        if data["format"] not in (FORMAT, UNSEALED):
-            raise ValueError(f"format {data['format']}, this program reads {UNSEALED} and {FORMAT}")
-        scan = ScanCalibration.from_dict(data["scan"])
-        changed = stored.changed
-        if data["format"] == FORMAT and not stored.sealed:
-            changed = ("its digest, which is missing",)
-        elif not stored.sealed:
-            note = (
-                "the stored calibration was made before its file had a digest: an edit of it would not show. Run `cell "
-                f'calibrate`, or `cell calibrate accept {path.stem} --why "…"`'
-            )
-            scan = replace(scan, unread=(*scan.unread, note))
+        if data["format"] != FORMAT:
+            raise ValueError(f"format {data['format']}, this program reads {FORMAT}")
         made = CellCalibration(
-            scan,
+            ScanCalibration.from_dict(data["scan"]),
             TargetCalibration.from_dict(data["target"]),
             {str(name): str(serial) for name, serial in data["identities"].items()},
             configuration=str(data["configuration"]),
             made=float(data["made"]),
-            kinematics=str(data.get("kinematics", "")),
+            kinematics=str(data["kinematics"]),
             edits=tuple(
                 {
                     **{key: str(edit[key]) for key in ("who", "when", "why")},
@@ -375,12 +351,11 @@ def _read(path: Path) -> tuple[CellCalibration, tuple[str, ...], bool]:
                 }
                 for edit in data.get("edits", ())
             ),
-            sealed=stored.sealed,
         )
         require_valid(made)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError, OverflowError) as error:
         raise CalibrationStale(f"{path} cannot be read as a calibration ({error}); run `cell calibrate`") from error
-    return made, changed, stored.sealed and not changed
+    return made, stored.changed if stored.sealed else ("its digest, which is missing",)
 
 
 def _lens(camera: CameraModel) -> dict[str, float]:

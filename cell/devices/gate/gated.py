@@ -355,13 +355,16 @@ may take."""
 
 
 class GatedCamera(Gated[interfaces.Camera]):
-    """A camera whose commands are told at the gate. `tries`: how often at most a picture is asked for."""
+    """A camera whose commands are told at the gate. `tries`: how often at most a picture is asked for. `longest`: of
+    exposures, s, what ambient light allows; a longer one that is asked for is shortened to it."""
 
     tries = 1
+    longest = math.inf
 
     def __init__(self, bare: interfaces.Camera, gate: Gate) -> None:
         super().__init__(bare, gate)
         self.shape = bare.shape
+        self._asked = math.inf, 1.0
 
     @property
     def time_bound(self) -> float:
@@ -370,8 +373,14 @@ class GatedCamera(Gated[interfaces.Camera]):
 
     def configure(self, exposure: float, frame_rate: float) -> None:
         """See `Camera.configure`."""
+        self._asked, exposure = (exposure, frame_rate), min(exposure, self.longest)
         self.gate.asked(DeviceCommand(self.name, "configure", {"exposure": exposure, "frame_rate": frame_rate}))
         self.bare.configure(exposure, frame_rate)
+
+    def shorten(self, longest: float) -> None:
+        """Expose no longer than `longest`, s, from now on; raises what `configure` raises."""
+        self.longest = longest
+        self.configure(*self._asked)
 
     def grab(self, timeout: float = 2.0) -> interfaces.Frame:
         """See `Camera.grab`; with more `tries` than one the last one's `DeadlineError`."""

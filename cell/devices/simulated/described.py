@@ -125,8 +125,10 @@ def _boxes(obstacles: dict[str, tuple[Pose, tuple[float, float, float]]]) -> dic
 
 
 def _camera(camera: CameraConfig, focus: float) -> drawn.CameraDrawing:
-    mounting = _matrix(camera.flange_from_camera.se3())
-    return drawn.CameraDrawing((camera.width, camera.height), camera.pixel, camera.focal_length, focus, mounting)
+    mounting, band = _matrix(camera.flange_from_camera.se3()), camera.filter
+    passed = None if band is None else (band.centre, band.width, band.transmission)
+    size = camera.width, camera.height
+    return drawn.CameraDrawing(size, camera.pixel, camera.focal_length, focus, mounting=mounting, filter=passed)
 
 
 def _witness(config: CellConfig) -> NDArray[np.float64] | None:

@@ -253,11 +253,6 @@ class SimulatedCell:
         told: dict[str, Any] | None = self.endpoints.get("following")
         return None if told is None else WorldLink(told["address"])
 
-    @property
-    def pid(self) -> int:
-        """Process id of the simulated cell."""
-        return self._process.pid
-
     def _read_endpoints(self) -> dict[str, object]:
         assert self._process.stdout is not None
         deadline = time.monotonic() + START_TIMEOUT_S

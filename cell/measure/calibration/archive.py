@@ -7,7 +7,6 @@ the solution depends on. What is read is checked as if a stranger had written it
 from __future__ import annotations
 
 import json
-import logging
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
@@ -53,11 +52,9 @@ class TargetObservation:
     name: str = ""
 
 
-FORMAT, UNSEALED = 2, 1
-"""Of the archives written now, and of those that had no digest."""
+FORMAT = 2
 SUFFIX = ".observations.npz"
 PRIORS = ("arm_translation", "arm_rotation", "rail")
-log = logging.getLogger(__name__)
 PROFILE = ("centres", "sigma", "amplitude", "width", "saturated", "double")
 
 
@@ -114,8 +111,8 @@ def read_archive(path: Path) -> Observations:
     data = _arrays(path, advice)
     try:
         about = json.loads(str(data["about"]))
-        if about["format"] not in (FORMAT, UNSEALED):
-            raise ValueError(f"it has format {about['format']}, this program reads {UNSEALED} and {FORMAT}")
+        if about["format"] != FORMAT:
+            raise ValueError(f"it has format {about['format']}, this program reads {FORMAT}")
         scan = _read_views(data, "scan")
         profiles = _read_profiles(data, len(scan))
         rails = _finite(data, "scan_rail", (len(scan),))
@@ -139,13 +136,10 @@ def read_archive(path: Path) -> Observations:
             rail_lead=_positive(about, "rail_lead"),
             identities={str(name): str(serial) for name, serial in about["identities"].items()},
             configuration=str(about["configuration"]), made=float(about["made"]),
-            kinematics=str(about.get("kinematics", "")), witness=_read_witness(data, about),
+            kinematics=str(about["kinematics"]), witness=_read_witness(data, about),
         )  # fmt: skip
         # Last: what is wrong with a figure says more than that something was changed.
-        if about["format"] == FORMAT or DIGEST in data:
-            require_unchanged(data)
-        else:
-            log.warning("%s was written before archives had a digest: an edit of it does not show", path)
+        require_unchanged(data)
         return found
     except KeyError as error:
         raise ConfigError(f"{path} lacks {error}; {advice}") from error

@@ -14,8 +14,7 @@ from cell.config.cell_config import CellConfig, deck_plates, mounted, station_ob
 from cell.config.job import Job
 from cell.devices.gate.interlocks import Interlocks
 from cell.measure.geometry.poses import from_parts, from_ur
-from cell.measure.vision import BoardSpec
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import BoardSpec, centre_of
 from cell.motion import collision
 from cell.motion.collision import BASE, PLACED, TOUCHES, Body, CollisionError, CollisionModel, Pair, box
 from cell.motion.kinematics import HOME, JointLimits, Joints, Unreachable, arm_kinematics

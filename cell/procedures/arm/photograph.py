@@ -21,8 +21,8 @@ from cell.measure.calibration import ScanCalibration, TargetCalibration
 from cell.measure.calibration.drift.evidence import Reference
 from cell.measure.geometry.poses import compose_covariance, from_parts, from_ur, mean, transform
 from cell.measure.inversion.effects.during_sweep import require_firm, roll_of
-from cell.measure.vision import BoardPose, BoardSpec, BoardView, board_pose, find_board, parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.board import BoardPose, board_pose, find_board
+from cell.measure.vision.board.view import BoardSpec, BoardView, centre_of, parse_board
 from drivers.errors import CalibrationStale, Measured, RefusedError
 from drivers.interfaces import Arm, Camera, Frame, Vector
 

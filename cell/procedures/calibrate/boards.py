@@ -20,7 +20,9 @@ from cell.measure.calibration import ScanObservation, TargetObservation
 from cell.measure.calibration.solve.starts import solve_hand_eye
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.poses import from_parts, from_ur, mean
-from cell.measure.vision import BoardSpec, BoardView, board_pose, extract, find_board, parse_board
+from cell.measure.vision.board.board import board_pose, find_board
+from cell.measure.vision.board.view import BoardSpec, BoardView, parse_board
+from cell.measure.vision.stripe.extract import extract
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover, moved_once_more
 from cell.procedures.arm.photograph import CalibrationView, scan_calibration_views, target_calibration_views

@@ -22,9 +22,9 @@ from cell.devices.devices import Devices
 from cell.measure.calibration import ScanObservation
 from cell.measure.calibration.drift.decision import WORST_FIT
 from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
-from cell.measure.calibration.drift.interim import HeadShift
+from cell.measure.calibration.drift.slip import HeadShift
 from cell.measure.geometry.poses import from_parts, from_ur
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import NO_REFERENCE, CalibrationView, interim_view
 from cell.procedures.calibrate.boards import PHOTO_RATE, Keep, look_for

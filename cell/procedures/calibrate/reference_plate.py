@@ -14,7 +14,8 @@ from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
 from cell.measure.calibration.drift.reference_plate import LEAST_ROWS, Edge, PlateLine
 from cell.measure.geometry.camera import Array
-from cell.measure.vision import extract
+from cell.measure.vision.stripe.extract import extract
+from cell.procedures.ambient import adapted, hidden
 from cell.procedures.calibrate.boards import Keep
 from cell.procedures.sweep.swath import frames_of
 from cell.procedures.sweep.sweeping import check_lost_steps
@@ -35,8 +36,9 @@ def see_reference_plate(config: CellConfig, devices: Devices, keep: Keep) -> Pla
     configure_fast(devices, config.calibration.stripe_exposure)
     profiles = []
     with devices.interlocks.purpose("calibration"), devices.laser.lit():
+        frame = adapted(camera, camera.grab())
         for k in range(PICTURES):
-            frame = camera.grab()
+            frame = camera.grab() if k else frame
             keep(f"witness-{k + 1}", frame)
             profiles.append(extract(frame.image))
     columns = np.array([np.where(profile.double, np.nan, profile.centres) for profile in profiles])
@@ -73,6 +75,12 @@ def require_reference_plate(config: CellConfig, devices: Devices, keep: Keep) ->
             "run `cell calibrate` to work without one"
         )
     if (seen := see_reference_plate(config, devices, keep)) is None:
+        if devices.bright:
+            exposure = 1e3 * min(devices.scan_camera.longest, config.calibration.stripe_exposure)
+            raise hidden(
+                f"ambient light leaves an exposure of {exposure:.2f} ms, and the laser's line on the plate on the claw "
+                "stands out in too few of the rows", 0.0
+            )  # fmt: skip
         check_lost_steps(devices)  # A carriage that stands elsewhere sees it elsewhere.
         raise RefusedError(
             "the laser's witness, which the calibration saw, is not in the picture: see that the plate on the claw is "

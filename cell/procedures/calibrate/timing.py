@@ -13,7 +13,8 @@ from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices
 from cell.measure.calibration.drift import timing
 from cell.measure.geometry.poses import from_ur
-from cell.measure.vision import BoardSpec, find_board, parse_board
+from cell.measure.vision.board.board import find_board
+from cell.measure.vision.board.view import BoardSpec, parse_board
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import rail_ends, references, verification_views
@@ -95,7 +96,7 @@ def _sweeps(
 ) -> tuple[pin.SE3, list[timing.TimedSweep]]:  # fmt: skip
     """Where the flange stood, and sweeps to and fro for each of `pairs` of speed in m/s and exposure in s.
 
-    `tell` is given each sweep's number and how many there are.
+    `notify` is given each sweep's number and how many there are.
     """
     fine, large = parse_board(config.calibration.fine.board), parse_board(config.calibration.large.board)
     view, _ = verification_views(config, fine, large, calibration.scan, calibration.target)

@@ -40,10 +40,10 @@ from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibr
 from cell.measure.calibration.solve.starts import stripe_means
 from cell.measure.geometry.camera import Array
 from cell.measure.geometry.poses import from_parts, from_ur
-from cell.measure.reconstruction import ScanGeometry
-from cell.measure.vision import BoardSpec, BoardView, StripeProfile, parse_board
+from cell.measure.reconstruction.build import ScanGeometry
 from cell.measure.vision.board.board import board_pose
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import BoardSpec, BoardView, centre_of, parse_board
+from cell.measure.vision.stripe.profile import StripeProfile
 from cell.measure.vision.stripe_on_board import points_on_board
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover

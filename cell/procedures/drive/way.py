@@ -20,8 +20,7 @@ import pinocchio as pin
 from cell.config.cell_config import station_obstacles
 from cell.config.job import BoardSection, Job
 from cell.measure.geometry.poses import from_parts
-from cell.measure.vision import parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import centre_of, parse_board
 from cell.motion.collision import Body, station_bodies, vehicle_bodies
 from drivers.clock import Clock
 from drivers.errors import DeviceFault, RefusedError

@@ -11,7 +11,7 @@ from cell.measure.inversion.mating import scanned_gap
 from cell.procedures.arm.touch import expected_touch
 from cell.procedures.grasp import SLIPS, expected_residual, job_with_grasp, moved
 from cell.procedures.part_error import part_points
-from cell.procedures.steps.gripping import take
+from cell.procedures.steps.pick import take
 from cell.procedures.steps.place import PlaceResult, Placing, note_part
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import Workplace

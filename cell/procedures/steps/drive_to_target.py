@@ -256,8 +256,8 @@ def _run_step(workplace: Workplace, context: StepContext) -> VehicleArrival:
         )
     if workplace.part.state.untaken and workplace.devices.claw.holding:
         raise RefusedError(
-            f"the claw holds a part, and job {workplace.job.job.name} takes one that is {workplace.part.state.value}: take it "
-            "out of the claw"
+            f"the claw holds a part, and job {workplace.job.job.name} takes one that is "
+            f"{workplace.part.state.value}: take it out of the claw"
         )
     vehicle = workplace.devices.vehicle
     if trouble := vehicle.state().trouble:
@@ -265,6 +265,7 @@ def _run_step(workplace: Workplace, context: StepContext) -> VehicleArrival:
     if warnings := vehicle.state().warnings:
         context.note(text=f"the vehicle warns: {'; '.join(warnings)}")
     vehicle.recover()
+    workplace.devices.take_any_light()
     head = _checked(workplace, context)
     if (stands := workplace.parts_before.arrival) is not None and workplace.whereabouts.still:
         vehicle.brake()

@@ -116,13 +116,15 @@ LOAD = PLACE.with_step(pick_nest.STEP, after=drive_to_target.STEP.name, name="lo
 UNLOAD = Kind("unload", (*PLACE.steps[:-1], pick.STEP, set_down.STEP, verify_nest.STEP))
 """Takes a part from its surface: the sweep looks for the part itself, which is gripped and set into a nest."""
 BUILT_IN = {kind.name: kind for kind in (PLACE, LOAD, UNLOAD)}
+LOOKING = {kind.name: kind.with_step(verify.STEP, after=place.STEP.name, name=kind.name) for kind in (PLACE, LOAD)}
+"""Kinds whose placed part is looked at, by their names."""
 
 
 def kind_of(job: Job) -> Kind:
     """The kind of this job; raises what `find_kind` raises."""
     kind = find_kind(job.job.kind)
     looks = kind in (PLACE, LOAD) and job.part is not None and job.place.verify != "none"
-    return kind.with_step(verify.STEP, after=place.STEP.name, name=kind.name) if looks else kind
+    return LOOKING[kind.name] if looks else kind
 
 
 def find_kind(name: str) -> Kind:

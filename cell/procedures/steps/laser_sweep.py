@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain
 
+import numpy as np
 import pinocchio as pin
 
 from cell.config.calibrations.store import changed, doubt_of, link_of
@@ -16,6 +18,7 @@ from cell.measure.calibration.drift.reference_plate import PlateLine, Pointing
 from cell.measure.calibration.drift.reference_plate import pointing as pointing_since
 from cell.measure.calibration.drift.slip import LARGEST_M, Slip, slip_since
 from cell.measure.calibration.drift.timing import StampTiming
+from cell.procedures.ambient import MOST_WHITE, TRIES, bearable, require_line, shorten
 from cell.procedures.arm.photograph import BoardFix, scan_plans
 from cell.procedures.calibrate.reference_plate import require_edge, require_reference_plate
 from cell.procedures.steps.board_photo import require_board_unmoved
@@ -28,6 +31,10 @@ from drivers.interfaces import Frame
 from statemachine.runner import StepContext
 from statemachine.step import Step
 
+UNSEEN_BY_LIGHT = (
+    "whether the scan head has slipped since it was looked at over the fine board is not seen: ambient light makes the "
+    "edge of the plate on the claw as bright as the laser's line"
+)
 SHIFT_SHARE = 0.25
 """Share of the place's tolerance by which the unknown of its times may shift a sweep. Replies that are all late shift
 it to one side without any scatter; what else the place may be off by has the other three quarters."""
@@ -66,7 +73,7 @@ def laser_sweep(
     sweep, geometry = arm_sweep if scan.mode == "arm" else rail_sweep, head.geometry()
     progress(0.01, "preparing")
     warm_up(geometry)
-    swaths = []
+    swaths, notes = [], list[tuple[str, ...]]()
     for k, plan in enumerate(plan.back if back else plan for plan in plans):
         check()
         name = f"sweep {k + 1} of {len(plans)}"
@@ -75,11 +82,22 @@ def laser_sweep(
             progress((k + fraction) / len(plans), f"{name}: {text}" if len(plans) > 1 else text)
 
         notify(0.02, "arm to the scan pose")
-        collector = SweepCollector(geometry, scan, keep_frame, notify)
-        sweeping(collector, base_from_surface)
-        swaths.append(sweep(plan, workplace.mover, devices, errors, collector))
+        for _ in range(TRIES):
+            collector = SweepCollector(geometry, scan, keep_frame, notify)
+            sweeping(collector, base_from_surface)
+            swath = sweep(plan, workplace.mover, devices, errors, collector)
+            if collector.whitest is None or collector.white <= MOST_WHITE * len(collector.times):
+                break
+            shorten(devices.scan_camera, bearable(collector.whitest))
+        if collector.notes:
+            shares = np.array(collector.counts) / geometry.camera.height
+            line = swath.middle_profile
+            require_line(shares, swath.middle, line.amplitude[line.valid])
+        swaths.append(swath)
+        notes.append(collector.notes)
     looked = counted and scan.mode == "rail"
-    return SweepRecord(tuple(swaths), doubts=check_lost_steps(devices, progress) if looked else ())
+    lost = check_lost_steps(devices, progress) if looked else ()
+    return SweepRecord(tuple(swaths), doubts=(*lost, *chain.from_iterable(notes)))
 
 
 def slowed_down(scan: ScanSection, attempt: int) -> ScanSection:
@@ -134,7 +152,8 @@ def _sweep(workplace: Workplace, context: StepContext, fix: BoardFix) -> SweepRe
         sweeping=workplace.sweeping,
     )  # fmt: skip
     rest = workplace.devices.interlocks.situation.last if workplace.job.scan.mode == "rail" else None
-    doubts = (*record.doubts, *unwatched(head.witness), *doubts, *workplace.notes)
+    blinded = (UNSEEN_BY_LIGHT,) if workplace.devices.bright else ()
+    doubts = (*record.doubts, *unwatched(head.witness), *blinded, *doubts, *workplace.notes)
     record = replace(record, pointing=pointing, slip=slip, doubts=doubts, rest=rest)
     for note in record.notes:
         context.note(text=note)
@@ -183,7 +202,7 @@ def unwatched(witness: PlateLine | None) -> tuple[str, ...]:
 
 def seen_on_plate(workplace: Workplace, context: StepContext) -> tuple[Pointing | None, Slip | None]:
     """Where the laser points now, and how far the head has slipped; None where the calibration saw no plate, or no edge
-    of it. `RefusedError` when anything was knocked."""
+    of it, and of the slip where ambient light is bright. `RefusedError` when anything was knocked."""
     head, config, devices, keep = workplace.calibration.scan, workplace.config, workplace.devices, workplace.frames.keep
     before = head.witness
     if before is None:
@@ -193,7 +212,7 @@ def seen_on_plate(workplace: Workplace, context: StepContext) -> tuple[Pointing 
     pointing = pointing_since(
         before, seen, head.camera, plane=head.light_plane, exit_point=config.laser.exit_point, confirmed=head.confirmed
     )
-    if before.edge is None:
+    if before.edge is None or devices.bright:
         return pointing, None
     context.progress(0.005, "looking whether the scan head has slipped")
     seen = require_edge(config, devices, keep, before, seen)

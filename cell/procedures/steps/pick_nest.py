@@ -8,9 +8,8 @@ from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import job_with_grasp, moved
 from cell.procedures.part_error import part_points
 from cell.procedures.steps.drive_to_target import VehicleArrival
-from cell.procedures.steps.gripping import take
 from cell.procedures.steps.laser_sweep import seen_on_plate
-from cell.procedures.steps.pick import HeldPart
+from cell.procedures.steps.pick import HeldPart, take
 from cell.procedures.steps.verify import swept_part
 from cell.procedures.steps.verify_nest import at_nest, part_in_base
 from cell.procedures.steps.workplace import JobStep, Workplace

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from cell.measure import reconstruction
-from cell.measure.reconstruction.cloud import Array, Indices, Motions
+from cell.measure.reconstruction.build import calibration_motions, flange_motions, lean_motions
+from cell.measure.reconstruction.cloud import Array, Cloud, Indices, Motions, Seam, find_seams, merge
+from cell.measure.reconstruction.holes import fill_holes
+from cell.measure.reconstruction.ply import write_cloud
 from cell.procedures.steps.laser_sweep import head_at
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
@@ -22,8 +24,8 @@ class Reconstruction:
     """The cloud, how its sweeps agree where they overlap, and how its points move by one standard deviation of each
     independent parameter of the calibration, and by what each sweep's flange pose and the vehicle's lean are off."""
 
-    cloud: reconstruction.Cloud
-    seams: tuple[reconstruction.Seam, ...]
+    cloud: Cloud
+    seams: tuple[Seam, ...]
     by_calibration: Motions
     by_poses: Motions
 
@@ -36,13 +38,13 @@ class Reconstruction:
 class TimedCloud:
     """A cloud, and the host `times` (lines,) in s at which its lines were taken."""
 
-    cloud: reconstruction.Cloud
+    cloud: Cloud
     times: Vector
 
 
-def build_cloud(sweep: SweepRecord) -> reconstruction.Cloud:
+def build_cloud(sweep: SweepRecord) -> Cloud:
     """The sweeps' points in the arm base, outliers removed: all that lies between the last frame and the cloud."""
-    return reconstruction.merge([s.builder.place(s.lines, s.flanges, s.rail, s.line_spread) for s in sweep.swaths])
+    return merge([s.builder.place(s.lines, s.flanges, s.rail, s.line_spread) for s in sweep.swaths])
 
 
 def reconstructed(workplace: Workplace, sweep: SweepRecord) -> Reconstruction:
@@ -56,14 +58,14 @@ def reconstructed(workplace: Workplace, sweep: SweepRecord) -> Reconstruction:
     path.unlink(missing_ok=True)
     built = build_cloud(sweep)
     try:
-        cloud = reconstruction.fill_holes(built.require(), workplace.job.scan.largest_hole)
+        cloud = fill_holes(built.require(), workplace.job.scan.largest_hole)
     except RefusedError as refused:
-        reconstruction.write_cloud(path, built, simulated)
+        write_cloud(path, built, simulated)
         refused.showing(seen={"cloud": built})
         raise
     by_calibration, by_poses = displacements(workplace, sweep, cloud)
-    seams = tuple(reconstruction.find_seams(cloud, together(by_calibration, by_poses)))
-    reconstruction.write_cloud(path, cloud, simulated)
+    seams = tuple(find_seams(cloud, together(by_calibration, by_poses)))
+    write_cloud(path, cloud, simulated)
     return Reconstruction(cloud, seams, by_calibration, by_poses)
 
 
@@ -72,7 +74,7 @@ def together(*motions: Motions) -> Motions:
     return lambda lines, rows: np.concatenate([each(lines, rows) for each in motions], axis=2)
 
 
-def displacements(workplace: Workplace, sweep: SweepRecord, cloud: reconstruction.Cloud) -> tuple[Motions, Motions]:
+def displacements(workplace: Workplace, sweep: SweepRecord, cloud: Cloud) -> tuple[Motions, Motions]:
     """How the points of a sweep's cloud move by what is not known of the calibration, and of the arm's poses."""
     # The same for all sweeps: what the calibration found, with the laser where it pointed before them.
     geometry, variants = sweep.swaths[0].builder.geometry, head_at(workplace, sweep).variants()
@@ -81,13 +83,11 @@ def displacements(workplace: Workplace, sweep: SweepRecord, cloud: reconstructio
     vehicle, lean = workplace.config.arm.vehicle_from_base.se3().inverse(), workplace.config.vehicle.lean_sigma
 
     def by_calibration(lines: Indices, rows: Indices) -> Array:
-        return reconstruction.calibration_motions(
-            cloud, lines, rows, base_from_flange=None, geometry=geometry, variants=variants
-        )
+        return calibration_motions(cloud, lines, rows, base_from_flange=None, geometry=geometry, variants=variants)
 
     def by_poses(lines: Indices, rows: Indices) -> Array:
-        leaning = reconstruction.lean_motions(cloud, lines, rows, vehicle, lean)
-        return np.concatenate([reconstruction.flange_motions(cloud, lines, rows, covariances), leaning], axis=2)
+        leaning = lean_motions(cloud, lines, rows, vehicle, lean)
+        return np.concatenate([flange_motions(cloud, lines, rows, covariances), leaning], axis=2)
 
     return by_calibration, by_poses
 

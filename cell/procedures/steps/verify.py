@@ -18,7 +18,8 @@ from cell.measure.inversion.flush import flush_along_edge
 from cell.measure.inversion.mating import scanned_gap
 from cell.measure.inversion.part_pose import find_part, parted, seen_from_above
 from cell.measure.inversion.whole_face import unlike_patch
-from cell.measure.reconstruction import Cloud, write_cloud
+from cell.measure.reconstruction.cloud import Cloud
+from cell.measure.reconstruction.ply import write_cloud
 from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import FARTHEST_M, expected_residual
 from cell.procedures.part_error import part_covariance, part_points

@@ -13,7 +13,7 @@ from cell.measure.inversion import invert_pose as register
 from cell.measure.inversion.effects.between_sweeps import PartOnGround
 from cell.measure.inversion.part_pose import DEMANDS, SHIFTED, PartPose, parted
 from cell.measure.inversion.whole_face import unlike_patch
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.part_error import part_points
 from cell.procedures.part_features import by_themselves
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart

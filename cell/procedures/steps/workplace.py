@@ -17,7 +17,8 @@ from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.devices.devices import Devices
 from cell.measure.inversion import NominalSurface
-from cell.measure.vision import BoardSpec, parse_board
+from cell.measure.vision.board.view import BoardSpec, parse_board
+from cell.procedures.ambient import in_any_light
 from cell.procedures.arm.moves import Mover, Pace, PartProgress, PartState
 from cell.procedures.arm.photograph import APART_S, BoardFix, photograph
 from cell.procedures.calibrate.interim import InterimCheck, fine_board_view, resting_pose
@@ -178,11 +179,12 @@ class Workplace:
         # Numbered, since a camera may count its frames anew: a later photograph must not take an earlier one's place.
         self._photographs += 1
         what = f"board-{self._photographs:02d}"
-        fix = photograph(
-            self.devices.arm, self.devices.target_camera, self.calibration.target, spec=self.board,
+        camera = self.devices.target_camera
+        fix = in_any_light(camera, lambda: photograph(
+            self.devices.arm, camera, self.calibration.target, spec=self.board,
             limits=self.job.photo, repeatability=self.repeatability, count=count,
             keep=lambda frame: self.frames.keep(what, frame), pause=lambda: self.devices.clock.sleep(APART_S),
-        )  # fmt: skip
+        ))  # fmt: skip
         self.frames.found = fix.frames[-1], fix.views[-1].pixels
         if self.devices.following is not None:
             self.devices.following.board_seen(fix.base_from_board)

@@ -18,7 +18,8 @@ from cell.measure.calibration import ScanCalibration
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.effects import between_sweeps
 from cell.measure.inversion.observability import Tolerance
-from cell.measure.reconstruction import Cloud, flange_motions
+from cell.measure.reconstruction.build import flange_motions
+from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.calibrate.reference_plate import configure_fast
 from cell.procedures.steps.board_photo import require_board_unmoved

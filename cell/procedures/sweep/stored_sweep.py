@@ -24,8 +24,9 @@ from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.drift.reference_plate import Pointing
 from cell.measure.calibration.drift.slip import Slip
 from cell.measure.geometry.poses import difference, from_matrix
-from cell.measure.reconstruction import ScanGeometry
-from cell.measure.vision import StripeProfile
+from cell.measure.reconstruction.build import ScanGeometry
+from cell.measure.vision.stripe.profile import StripeProfile
+from cell.procedures.ambient import REACHES
 from cell.procedures.arm.photograph import MOVED, BoardFix
 from cell.procedures.sweep.swath import Swath, SweepCollector
 from drivers.camera.folder import read_image
@@ -91,8 +92,7 @@ class SweepRecord:
 
 
 FILE = "sweep.npz"
-FORMAT, UNSEALED = 5, 4
-"""Of the sweeps written now, and of those that had no digest, which a replay reads, and no run goes on with."""
+FORMAT = 5
 
 _ARRAYS = ("lines", "frame_ids", "times", "flanges", "rail", "line_spread", "covariance", "seen")
 
@@ -150,7 +150,7 @@ class StoredSweep:
         try:
             with np.load(path, allow_pickle=False) as data:
                 stored = {name: data[name] for name in data.files}
-            if stored["format"] != FORMAT and (as_written or stored["format"] != UNSEALED):
+            if stored["format"] != FORMAT:
                 raise ValueError(f"format {stored['format']}, this program reads {FORMAT}")
             if as_written:
                 require_unchanged(stored)
@@ -245,6 +245,7 @@ def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeomet
         raise ValueError(f"its figures are {lost}, {residual}, {shift}")
     shape = (geometry.camera.height, geometry.camera.width)
     collector = SweepCollector(geometry, scan, lambda frame: None, lambda fraction, text: None)
+    collector.notes = tuple(str(doubt) for doubt in stored.get("doubts", ()) if str(doubt).startswith(REACHES))
     for frame_id in arrays["seen"]:
         image = read_image(frame_path(folder, int(frame_id)), shape)
         collector.see(Frame(image, int(frame_id), scan.exposure, device_time=0.0, host_time=0.0, received=0.0))

@@ -18,9 +18,10 @@ from cell.config.job import ScanSection
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.geometry.poses import from_matrix
 from cell.measure.inversion import NominalSurface
-from cell.measure.reconstruction import ProfileBuilder, ScanGeometry
-from cell.measure.vision import StripeProfile, StripeStream
-from cell.measure.vision.stripe.extract import drawn
+from cell.measure.reconstruction.build import ProfileBuilder, ScanGeometry
+from cell.measure.vision.stripe.extract import StripeStream, drawn
+from cell.measure.vision.stripe.profile import StripeProfile
+from cell.procedures.ambient import WHITER, bearable
 from drivers.errors import DeviceFault
 from drivers.interfaces import Camera, Frame, FrameStream, Sweep, Vector
 
@@ -213,6 +214,9 @@ class SweepCollector:
     received: list[float] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
     frame_ids: list[int] = field(default_factory=list)
+    notes: tuple[str, ...] = ()
+    whitest: Frame | None = None
+    white: int = 0
     middle: tuple[Frame, StripeProfile] | None = None
     lost: int = 0
 
@@ -235,7 +239,11 @@ class SweepCollector:
 
     def see(self, frame: Frame) -> None:
         """Triangulate the stripe of one frame."""
-        profile = self.stripes.extract(frame.image)
+        image = frame.image
+        if self.notes and bearable(frame) * WHITER <= frame.exposure:
+            # A shadow has moved away: nothing is to be seen in white.
+            self.white, self.whitest, image = self.white + 1, frame, np.zeros_like(image)
+        profile = self.stripes.extract(image)
         if self.keep_profile is not None:
             self.keep_profile(profile)
         self.counts.append(self.builder.see(profile))

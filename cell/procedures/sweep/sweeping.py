@@ -18,6 +18,7 @@ from cell.devices.devices import Devices
 from cell.devices.simulated.following import MOST_SCATTER
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.motion.trajectory import LONGEST_GAP_S, FlangeTrack, Trajectory
+from cell.procedures.ambient import meet_light
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import ScanPlan
 from cell.procedures.sweep.swath import RailPath, Swath, SweepCollector, SweepErrors, TimeBound, shift_by_times
@@ -90,6 +91,7 @@ def arm_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepError
     mover.follow(way)
     rail = devices.rail.state().position
     camera.configure(scan.exposure, scan.frame_rate)
+    collector.notes = meet_light(devices)
     clocks = ClockMap()
     clocks.add([arm.latch_clock()])
     # Before anything is lit and moved in vain.
@@ -208,6 +210,7 @@ def rail_sweep(plan: ScanPlan, mover: Mover, devices: Devices, errors: SweepErro
     with beside_arm(mover, rail, lambda: rail.move_to(start)):
         mover.to(plan.base_from_flange, "the scan pose")
     devices.scan_camera.configure(scan.exposure, scan.frame_rate)
+    collector.notes = meet_light(devices)
     base_from_flange = from_ur(arm.state().flange)
     sweep = _sweep_lit(plan, devices, collector)
     begin, end = sweep.window

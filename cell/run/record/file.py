@@ -92,15 +92,6 @@ _FIELDS: dict[str, dict[str, object]] = {
 BY_TOPIC = {topic: channel for channel in CHANNELS for topic in channel.topics}
 
 
-def table() -> str:
-    """The channels as the rows of a Markdown table."""
-    rows = ["| channel | schema | what |", "|---|---|---|"]
-    for channel in CHANNELS:
-        of = f" ({', '.join(channel.devices)})" if channel.devices else ""
-        rows.append(f"| `{channel.topic}`{of} | `{channel.schema}` | {channel.what} |")
-    return "\n".join(rows)
-
-
 FILE = "record.mcap"
 NEEDED = ("mcap", "mcap_protobuf", "foxglove_schemas_protobuf")
 MOST_WAITING = 20_000

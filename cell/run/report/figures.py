@@ -21,11 +21,6 @@ def shown_limit(row: MeasuredRow) -> str:
     return f"{row['bound']} {_digits(row['limit'])} {row['unit']}".strip()
 
 
-def value_and_limit(row: MeasuredRow) -> str:
-    """Value and limit in one."""
-    return ", ".join(part for part in (shown_value(row), shown_limit(row)) if part)
-
-
 def _digits(value: float | None) -> str:
     if value is None:
         return "no number"

@@ -21,8 +21,8 @@ from cell.config.job import Job
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion import NominalSurface, PlacePose
 from cell.measure.inversion.flush import Flush
-from cell.measure.reconstruction import Cloud
-from cell.measure.vision import BoardView
+from cell.measure.reconstruction.cloud import Cloud
+from cell.measure.vision.board.view import BoardView
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.part_features import FeatureSeen
@@ -32,7 +32,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.folder import Report
 from cell.run.report.evidence import RefusalEvidence, ended_in, seen_placed
-from cell.run.report.figures import simulated_words, texture_words, value_and_limit
+from cell.run.report.figures import shown_limit, shown_value, simulated_words, texture_words
 from drivers.interfaces import Frame, Image, Vector
 from statemachine.runner import RunResult
 
@@ -238,7 +238,8 @@ def draw_reason(axes: Axes, report: Report, step: str | None) -> None:
     for k, row in enumerate(report["measured"][:fitting]):
         colour = "black" if row["kept"] else "tab:red"
         name = textwrap.shorten(str(row["name"]), REASON_COLUMNS, placeholder=" …")
-        _write(axes, 0.0, top - 2.2 * LINE * k, f"{name}\n      {value_and_limit(row)}", colour)
+        words = ", ".join(part for part in (shown_value(row), shown_limit(row)) if part)
+        _write(axes, 0.0, top - 2.2 * LINE * k, f"{name}\n      {words}", colour)
 
 
 def _write(axes: Axes, x: float, y: float, text: str, colour: str) -> None:

@@ -21,7 +21,7 @@ from cell.config.cell_config import CellConfig
 from cell.config.job import Job
 from cell.measure.geometry.poses import difference, from_matrix, to_ur, transform
 from cell.measure.inversion import NominalSurface, PlacePose
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.part_error import draws, part_points, placed_points, point_covariances, stated_bound, through
 from cell.procedures.steps.reconstruct import Reconstruction
@@ -96,6 +96,14 @@ class FinishedJob:
         if texture is not None:
             report["scan"]["texture"] = texture.as_dict()
             report["measured"] += [number.as_dict() for number in texture.measured()]
+        if self.config.cell.picture:
+            self._draw(report)
+        report = sealed(strict(timeless(report)))
+        _write(self.folder, report)
+        return report
+
+    def _draw(self, report: dict[str, Any]) -> None:
+        """The run's picture; why there is none is told in the `report`."""
         picture = self.folder / "picture.png"
         try:
             # Drawing is the slowest thing to load, and a command that jogs or stops the cell does not draw.
@@ -107,9 +115,6 @@ class FinishedJob:
             # Half of one shows nothing, and `cell` would point at it.
             with suppress(OSError):
                 picture.unlink()
-        report = sealed(strict(timeless(report)))
-        _write(self.folder, report)
-        return report
 
     def _of_the_run(self) -> dict[str, object]:
         """What every run has, in the order of the file; what is not known yet is None."""

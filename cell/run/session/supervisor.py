@@ -89,7 +89,7 @@ class Cell:
             sim: "all", "none", or the devices that are simulated, as a list or with commas; a simulated world then
                 follows what the real ones measure of themselves. Without it, `cell.sim` of the configuration.
             seed: Which simulated world, 0 to 999999.
-            level: How far that world deviates from the drawing: "ideal", "nominal", "harsh" or "workshop".
+            level: How far that world deviates from the drawing: "ideal", "nominal", "harsh", "workshop" or "outdoor".
             speed: How many times faster than the wall a simulated cell over wires runs, 0.1 to 20. Without it 3, or as
                 much as a slower computer keeps, 1 at least.
             job: Whose station, surface and part a simulated cell has at first.

@@ -19,7 +19,8 @@ from cell.base.compiled import is_kept
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.nominal import closest
 from cell.measure.inversion.registration import candidates
-from cell.measure.reconstruction import Cloud, fill_holes
+from cell.measure.reconstruction.cloud import Cloud
+from cell.measure.reconstruction.holes import fill_holes
 from cell.measure.reconstruction.outliers import find_outliers
 from cell.measure.vision.stripe.extract import read_drawn
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 from pydantic import AfterValidator, StringConstraints
 
 from drivers.common.units import number, quantity, whole
-from drivers.make import OPTICS, AnyMake, CameraConfig, Make, Surroundings, with_endpoint
+from drivers.make import OPTICS, OPTICS_SINCE, AnyMake, CameraConfig, Make, Surroundings, with_endpoint
 
 if TYPE_CHECKING:
     from drivers.camera.genicam.camera import GenicamCamera
@@ -102,6 +102,9 @@ def _without_aravis() -> str:
 _REGION = OPTICS | {"offset", "pixel_format"}
 
 GIGE: AnyMake = Make(
-    "camera", "gige", GigeCameraConfig, _gige, _REGION, simulated=with_endpoint("address"), missing=_without_aravis
+    "camera", "gige", GigeCameraConfig, _gige, _REGION, calibrated_since=OPTICS_SINCE,
+    simulated=with_endpoint("address"), missing=_without_aravis,
+)  # fmt: skip
+USB3: AnyMake = Make(
+    "camera", "usb3", Usb3CameraConfig, _usb3, _REGION, calibrated_since=OPTICS_SINCE, missing=_without_aravis
 )
-USB3: AnyMake = Make("camera", "usb3", Usb3CameraConfig, _usb3, _REGION, missing=_without_aravis)

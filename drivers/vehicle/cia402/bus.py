@@ -8,7 +8,7 @@ from __future__ import annotations
 import logging
 import struct
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TypeVar
 
 import can
@@ -73,7 +73,7 @@ class CanopenBus(CanLink):
     """
 
     def __init__(
-        self, name: str, interface: str, channel: str, *, bitrate: int, options: Mapping[str, object], own: int,
+        self, name: str, interface: str, channel: str, *, bitrate: int, own: int,
         nodes: tuple[int, int], take: Callable[[int, int, bytes], None], other: Callable[[str], None],
         idle: Callable[[float], None], statistics: LinkStatistics, alone: str,
     ) -> None:  # fmt: skip
@@ -92,7 +92,7 @@ class CanopenBus(CanLink):
             self._clients[node] = remote.sdo
             remote.sdo.RESPONSE_TIMEOUT = ANSWER_S
         super().__init__(
-            name, interface, channel, bitrate=bitrate, options=options, receive=self._take, idle=idle,
+            name, interface, channel, bitrate=bitrate, receive=self._take, idle=idle,
             statistics=statistics, alone=alone,
         )  # fmt: skip
 

@@ -193,7 +193,7 @@ def look_at_nodes(record: CanopenVehicleConfig) -> tuple[str, bool]:
 
     try:
         link = CanLink(
-            "vehicle", record.interface, record.channel, bitrate=round(record.bitrate), options={}, receive=take,
+            "vehicle", record.interface, record.channel, bitrate=round(record.bitrate), receive=take,
             idle=lambda seconds: None, statistics=LinkStatistics(), alone="nothing on it was set",
         )  # fmt: skip
         try:

@@ -8,7 +8,7 @@ How the drives' CAN bus is used, who else commands there, and what the drives te
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import can
@@ -72,7 +72,6 @@ class CanopenVehicle:
     def __init__(
         self, name: str, interface: str, channel: str, *, wheels: WheelDrives, watchdog: Watchdog, max_speed: float,
         max_yaw_rate: float, clock: Clock, bitrate: int = 500_000, look: bool = False,
-        bus_options: Mapping[str, object] | None = None,
     ) -> None:  # fmt: skip
         self.name = name
         self.statistics = LinkStatistics()
@@ -94,7 +93,7 @@ class CanopenVehicle:
         """How many stops were asked for."""
         self._closed = threading.Event()
         open_bus = partial(
-            CanopenBus, name, interface, channel, bitrate=bitrate, options=dict(bus_options or {}), own=watchdog.own,
+            CanopenBus, name, interface, channel, bitrate=bitrate, own=watchdog.own,
             nodes=wheels.nodes, take=self._feedback.take, other=self._feedback.other, idle=self._feedback.idle,
             statistics=self.statistics,
             alone=f"the drives stop by themselves {watchdog.seconds:g} s after the last sign of life",

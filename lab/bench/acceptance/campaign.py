@@ -18,8 +18,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import from_parts
-from cell.measure.reconstruction import Cloud, ScanGeometry
-from cell.measure.vision import StripeStream
+from cell.measure.reconstruction.build import ScanGeometry
+from cell.measure.reconstruction.cloud import Cloud
+from cell.measure.vision.stripe.extract import StripeStream
 from drivers.errors import RefusedError
 from lab.bench.calibration.world import Noise
 from lab.bench.reconstruction.scenes import swept
@@ -149,7 +150,7 @@ CAP = float(np.radians(50.0))
 """Part of a ball that is judged: within this angle of the direction to the head, where stripe and lens can see it."""
 FLAT_BORDER = 0.001
 """Border of the flat that is left out, m: mixed pixels."""
-NOISE_FACTOR = {"ideal": 0.1, "nominal": 1.0, "harsh": 2.5, "workshop": 1.0}
+NOISE_FACTOR = {"ideal": 0.1, "nominal": 1.0, "harsh": 2.5, "workshop": 1.0, "outdoor": 1.0}
 """Of the scan head's noise. Alone, on its bench, the head has of a workshop only what its drawing may be off."""
 LET_GO = 0.003
 """Share of the points that VDI/VDE 2634 part 2 lets the tester leave out of a form error."""

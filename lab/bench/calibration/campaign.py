@@ -161,7 +161,7 @@ class Trial:
 
 
 def campaign(seeds: Sequence[int], noise: Noise, notify: Callable[[int], None]) -> dict[str, Any]:
-    """Run the seeds on all cores and sum them up; `tell` hears how many are done."""
+    """Run the seeds on all cores and sum them up; `notify` hears how many are done."""
     trials = run_all(partial(one_trial, noise=noise), seeds, progress=lambda done, _: notify(done))
     return summed_up(trials, noise)
 

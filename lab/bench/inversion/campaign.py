@@ -22,7 +22,7 @@ from cell.measure.geometry.poses import difference, perturbed
 from cell.measure.inversion import Prior, Tolerance, invert_pose
 from cell.measure.inversion.nominal import Array, Scan
 from cell.measure.inversion.registration import register
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from drivers.errors import CellError, RefusedError
 from lab.bench.inversion.scenes import (
     PARTS,

@@ -19,7 +19,7 @@ from scipy.spatial import Delaunay
 from cell.measure.geometry.poses import difference, perturbed
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.nominal import Array
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 
 Height = Callable[[Array, Array], Array]
 Symmetry = Literal["none", "axis", "centre"]

@@ -20,7 +20,7 @@ from cell.motion.collision import tool_bodies
 from cell.motion.kinematics import JointLimits
 from cell.motion.trajectory import PointSpeed, carried_points, plan_joint
 from cell.procedures.arm.moves import Mover
-from cell.run.report.page.activities import Activity, activities, idle
+from cell.run.report.page.course import Activity, activities, idle
 
 MOVED = ("vehicle", "arm")
 """Devices of which the least time is told: what else is done takes as long as the job or a device's limits have it."""

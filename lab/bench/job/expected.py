@@ -22,8 +22,8 @@ from cell.measure.calibration.solve.joint import solve_joint, solve_staged
 from cell.measure.calibration.solve.normal import SHARED, AdjustmentState
 from cell.measure.geometry.poses import composition_jacobians, covariance_root, transform
 from cell.measure.inversion import NominalSurface, PlacePose
-from cell.measure.reconstruction import Cloud, calibration_motions, flange_motions
-from cell.measure.reconstruction.build import ScanGeometry
+from cell.measure.reconstruction.build import ScanGeometry, calibration_motions, flange_motions
+from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.part_error import part_points
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.interfaces import Vector

@@ -21,8 +21,8 @@ from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_matrix, mean, transform
 from cell.measure.inversion import NominalSurface
-from cell.measure.reconstruction import Cloud
 from cell.measure.reconstruction.build import ScanGeometry
+from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.part_error import part_points
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.run.report.report import SENSOR_POINTS, pose_of

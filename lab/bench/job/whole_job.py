@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from cell.config.calibrations.store import CellCalibration
-from cell.config.cell_config import CellConfig
+from cell.config.cell_config import NO_FILES, CellConfig
 from cell.config.job import Job, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
@@ -103,6 +103,8 @@ def run_whole_job(
     before the job. With `runs` its run's folder is kept there. `changed` changes the cell before anything is done.
     """
     assert nominal.source is not None
+    if runs is None:
+        config = config.model_copy(update={"cell": config.cell.model_copy(update=NO_FILES)})
     cell = VirtualCell(config, seed, level, Described(job, nominal.source))
     changed(cell)
     job, mesh = sought(job, nominal.source)

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts
-from cell.measure.reconstruction import Cloud, ProfileBuilder, ScanGeometry
+from cell.measure.reconstruction.build import ProfileBuilder, ScanGeometry
+from cell.measure.reconstruction.cloud import Cloud
 from cell.measure.vision.stripe.extract import StripeProfile
 
 Array = NDArray[np.float64]
@@ -116,7 +117,7 @@ def sweep(lines: int, width: int, rows: int, seed: int) -> tuple[ProfileBuilder,
 
 
 def speed(seed: int, notify: Callable[[float, str], None]) -> dict[str, list[dict[str, float]]]:
-    """Milliseconds for each profile, and after the last frame, by camera; `tell` gets the share done and a text."""
+    """Milliseconds for each profile, and after the last frame, by camera; `notify` gets the share done and a text."""
     rows = []
     for k, (width, height) in enumerate(CAMERAS):
         notify(k / len(CAMERAS), f"{width}×{height}")

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cell.apps.recordings.command import calibrate_folder
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from drivers.errors import ConfigError
 from tests.support.recorded_scenes import recording
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from cell.apps.qualify.rows import compared
-from cell.apps.qualify.store import RowStore
+from cell.apps.qualify.rows import RowStore
 from tests.support import ROOT, running, until
+from tests.support.qualified import compared
 
 pytest.importorskip("pyarrow")
 pytestmark = pytest.mark.campaign

@@ -135,12 +135,12 @@ def test_switching_outputs_turns_the_laser_on_and_drops_the_part(served: Served)
     rtde = Rtde(served.endpoints["arm"]["address"])
     recipe = rtde.ask("I", b"standard_digital_output_mask,standard_digital_output")[0]
     for index, on in ((0, True), (1, False)):
-        rtde.tell(bytes([recipe, 1 << index, int(on) << index]))
+        rtde.notify(bytes([recipe, 1 << index, int(on) << index]))
     # A request is answered in the period after its writes took effect.
     rtde.ask("v")
     rtde.ask("v")
     after = served.ask_truth(op="truth")["truth"]
-    rtde.tell(bytes([recipe, 1, 0]))
+    rtde.notify(bytes([recipe, 1, 0]))
     rtde.socket.close()
     assert after["laser_on"]
     assert not after["part"]["held"]

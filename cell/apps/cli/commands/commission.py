@@ -41,7 +41,7 @@ def commission(
     truth: TruthOption = None,
     seed: options.SeedOption = 1,
     level: options.LevelOption = Level.nominal,
-    clock: ClockOption = CellClock.wall,
+    clock: ClockOption = "wall",
     confirm: ConfirmOption = None,
     json: options.JsonOption = False,
 ) -> None:
@@ -56,14 +56,14 @@ def commission(
     from cell.apps.commission.check import write_protocol
     from cell.apps.commission.sequence import CHECKS, begin, chosen, confirms_itself
 
-    if sim != "all" and (truth is not None or confirm is Confirm.simulated):
+    if sim != "all" and (truth is not None or confirm == "simulated"):
         raise ConfigError("--truth and --confirm simulated are for a cell that is all simulated; give --sim all")
     checks = chosen(only or (), until)
     console = Console(stderr=json, highlight=False)
-    by_itself = confirm is not Confirm.person and (sim == "all" or (sim is None and confirms_itself(config)))
+    by_itself = confirm != "person" and (sim == "all" or (sim is None and confirms_itself(config)))
     made = begin(
         config, _person(by_itself, console), partial(_show, console),
-        job=job, sim=sim, seed=seed, level=level.value, clock=clock.value, truth=truth,
+        job=job, sim=sim, seed=seed, level=level.value, clock=clock, truth=truth,
     )  # fmt: skip
     made.workplace.heard = tell_question
     if show:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from cell.devices.diagnosis.diagnosis import Diagnosis
-    from cell.devices.diagnosis.local_devices import Found
+    from cell.devices.diagnosis.finding import Found
 
 
 def jog(

@@ -18,9 +18,8 @@ from cell.apps.cli.options import ConfigOption, JsonOption, Level, LevelOption, 
 if TYPE_CHECKING:
     from cell.apps.qualify.answer import JobAnswer
     from cell.apps.qualify.campaign import Campaign, Prefix, Target
-    from cell.apps.qualify.rows import Row
-    from cell.apps.qualify.store import RowStore
-    from cell.apps.qualify.tables import TextTable
+    from cell.apps.qualify.page import TextTable
+    from cell.apps.qualify.rows import Row, RowStore
     from cell.apps.qualify.workers import Workers
 
 JobArgument = Annotated[
@@ -75,12 +74,10 @@ def qualify(
     the program failed in a world.
     """
     from cell.apps.qualify import campaign as campaigns
-    from cell.apps.qualify.compare import compare as paired
-    from cell.apps.qualify.compare import other_rows
-    from cell.apps.qualify.kept import keep_line
-    from cell.apps.qualify.page import write_page
-    from cell.apps.qualify.store import RowStore
-    from cell.apps.qualify.tables import comparison_tables, tables_of
+    from cell.apps.qualify.answer import compare as paired
+    from cell.apps.qualify.answer import keep_line, other_rows
+    from cell.apps.qualify.page import comparison_tables, tables_of, write_page
+    from cell.apps.qualify.rows import RowStore
     from cell.apps.qualify.workers import open_workers
     from cell.config.files import find_config
 

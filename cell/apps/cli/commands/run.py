@@ -142,7 +142,7 @@ def dry_run(
     _say_qualified(job, config)
     opened = partial(
         Cell.open, config, sim="all", seed=seed, level=level.value, speed=speed, job=job,
-        confirm=None if confirm is None else confirm.value, clock=(clock or CellClock.wall).value,
+        confirm=confirm, clock=clock or "wall",
     )  # fmt: skip
     if count is not None:
         _require_terminal(loaded, confirm)
@@ -159,7 +159,7 @@ def dry_run(
 
 def _say_qualified(job: str, config: Path | None) -> None:
     """Tell in a line how well `cell qualify` found this job to work, where it did."""
-    from cell.apps.qualify.kept import kept_line
+    from cell.apps.qualify.answer import kept_line
 
     if (line := kept_line(job, config)) is not None:
         typer.echo(line, err=True)
@@ -203,7 +203,7 @@ def _perform_batch(
 
 def _require_terminal(job: Job, confirm: Confirm | None) -> None:
     """Refuse a batch that would ask a person, and wait for ever, where nobody is."""
-    if job.batch.on_refusal == "ask" and confirm is not Confirm.simulated and not _at_terminal():
+    if job.batch.on_refusal == "ask" and confirm != "simulated" and not _at_terminal():
         raise typer.BadParameter(
             f'batch.on_refusal of job {job.job.name} is "ask", and there is no terminal to ask at: add --confirm '
             'simulated, or write "end" or "skip"'
@@ -225,7 +225,7 @@ def _clock(config: CellConfig) -> CellClock:
     missing = (f"{name}: {why}" for name in DEVICES if (why := config.make(name).missing()))
     if why := next(missing, ""):
         typer.echo(f"this dry run is on the virtual clock, without the devices' protocols. {why}", err=True)
-    return CellClock.virtual if why else CellClock.wall
+    return "virtual" if why else "wall"
 
 
 def resume(

@@ -9,9 +9,8 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -28,19 +27,10 @@ NoiseOption = Annotated[
 ]
 
 
-class Format(StrEnum):
-    """What can be written."""
-
-    ply = "ply"
-    stl = "stl"
-    mesh = "mesh"
-
-
-class Wires(StrEnum):
-    """How raw traffic can be written."""
-
-    candump = "candump"
-    text = "text"
+Format = Literal["ply", "stl", "mesh"]
+"""What can be written of a cloud."""
+Wires = Literal["candump", "text"]
+"""How raw traffic can be written."""
 
 
 def abort(
@@ -204,7 +194,7 @@ def export(
     name: RunArgument = None,
     kind: Annotated[
         Format, typer.Option("--format", "-f", help="ply: the points; stl, mesh: triangles (mesh: coloured PLY).")
-    ] = Format.ply,
+    ] = "ply",
     out: Annotated[Path | None, typer.Option("--out", "-o", help="The file. Without it, in the run's folder.")] = None,
     job: Annotated[
         str | None, typer.Option("--job", "-j", help="The job whose nominal surface to compare with; else the run's.")
@@ -225,12 +215,12 @@ def export(
         raise ConfigError(f"--limit: {error}") from error
     source = find_config(config, simulated=True)
     folder = find_run(beside(source) / load_config(source).cell.runs, name, "job")
-    path = out or folder / f"export-{kind.value}{SUFFIXES[kind.value]}"
-    if path.suffix.lower() != SUFFIXES[kind.value]:
-        raise ConfigError(f"--out {path}: a file of format {kind.value} ends in {SUFFIXES[kind.value]}")
+    path = out or folder / f"export-{kind}{SUFFIXES[kind]}"
+    if path.suffix.lower() != SUFFIXES[kind]:
+        raise ConfigError(f"--out {path}: a file of format {kind} ends in {SUFFIXES[kind]}")
     if not path.parent.is_dir():
         raise ConfigError(f"--out {path}: there is no folder {path.parent}; make it first")
-    written = export_run(folder, kind.value, path, job, end)
+    written = export_run(folder, kind, path, job, end)
     if json:
         print_json(written)
         return
@@ -311,7 +301,7 @@ def export_wires(
     name: RunArgument = None,
     kind: Annotated[
         Wires, typer.Option("--format", "-f", help="candump: the CAN frames; text: all wires, a line each.")
-    ] = Wires.candump,
+    ] = "candump",
     out: Annotated[Path | None, typer.Option("--out", "-o", help="The file. Without it, beside the record.")] = None,
     config: ConfigOption = None,
     json: JsonOption = False,
@@ -320,7 +310,7 @@ def export_wires(
     from cell.run.record.reading import FORMATS
 
     path, _ = _record(name, config)
-    suffix, write = FORMATS[kind.value]
+    suffix, write = FORMATS[kind]
     target = out or path.with_suffix(suffix)
     if not target.parent.is_dir():
         raise ConfigError(f"--out {target}: there is no folder {target.parent}; make it first")
@@ -328,7 +318,7 @@ def export_wires(
     if json:
         print_json({"file": str(target), "lines": count})
         return
-    typer.echo(f"{target}: {count} {'CAN frames' if kind is Wires.candump else 'lines'}")
+    typer.echo(f"{target}: {count} {'CAN frames' if kind == 'candump' else 'lines'}")
     if not count:
         typer.echo("nothing passed on a wire: on the virtual clock, or with that device in the same process, none does")
 

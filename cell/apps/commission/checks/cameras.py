@@ -12,7 +12,7 @@ import pinocchio as pin
 from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.measuring import Eye, RoughMounting, against_drawing, eye_of, find_view, measure
 from cell.apps.commission.workplace import CommissionWorkplace
-from cell.measure.vision import BoardSpec
+from cell.measure.vision.board.view import BoardSpec
 from drivers.interfaces import Image
 
 PITCH_OFF = 0.025

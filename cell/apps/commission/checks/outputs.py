@@ -12,7 +12,7 @@ import numpy as np
 from cell.apps.commission.check import CommissionCheck, Result
 from cell.apps.commission.measuring import camera_of, centred_view, eye_of
 from cell.apps.commission.workplace import CommissionWorkplace
-from cell.measure.vision import extract
+from cell.measure.vision.stripe.extract import extract
 from drivers.errors import RefusedError
 from drivers.interfaces import Frame, Image
 from drivers.make import OnArm

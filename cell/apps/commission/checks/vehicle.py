@@ -13,7 +13,7 @@ from cell.apps.commission.checks.cameras import PITCH_OFF, renamed
 from cell.apps.commission.measuring import axes_from_shifts, eye_of, poses_of, see, shifted_views, views_from
 from cell.apps.commission.workplace import CommissionWorkplace
 from cell.config.job import job_path, ships
-from cell.measure.vision import BoardSpec, parse_board
+from cell.measure.vision.board.view import BoardSpec, parse_board
 from cell.procedures.arm.photograph import look_pose
 from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, driven
 from drivers.errors import RefusedError

@@ -245,11 +245,6 @@ class ServerProcess:
             self.close()
             raise CellError("the console's server did not start; install it with: pip install -e '.[console]'")
 
-    @property
-    def pid(self) -> int:
-        """Process id of the server."""
-        return self._process.pid
-
     def notify(self, message: object) -> None:
         """To the server, when it listens; never waits."""
         self._outbox.put(message)

@@ -171,7 +171,7 @@ class _Step:
 
 
 class Manual:
-    """Manual mode of one cell, with the part of `job` out of the way. `tell` hears what becomes of presses."""
+    """Manual mode of one cell, with the part of `job` out of the way. `notify` hears what becomes of presses."""
 
     def __init__(self, cell: Cell, job: Job, notify: Told) -> None:
         self.speed = 1.0

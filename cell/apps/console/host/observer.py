@@ -36,7 +36,7 @@ log = logging.getLogger(__name__)
 
 
 class CellObserver:
-    """Of one cell and its desk; `tell` gives a message to the server."""
+    """Of one cell and its controller; `notify` gives a message to the server."""
 
     def __init__(self, cell: Cell, controller: ConsoleController, notify: Callable[[object], None]) -> None:
         self._cell, self._desk, self._notify = cell, controller, notify

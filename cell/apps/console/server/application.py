@@ -22,8 +22,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
-from cell.apps.console.server.access import HEADERS, Access, Bucket, PageSession
-from cell.apps.console.server.commands import checked_command
+from cell.apps.console.server.access import HEADERS, Access, Bucket, PageSession, checked_command
 from cell.apps.console.server.pages import PROTOCOL, Pages
 from cell.apps.console.view.archive import Archive
 from drivers.errors import ConfigError

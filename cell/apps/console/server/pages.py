@@ -13,8 +13,7 @@ from contextlib import suppress
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from cell.apps.console.host.link import Beat, Joined, Left
-from cell.apps.console.server.access import Bucket
-from cell.apps.console.server.commands import checked_message
+from cell.apps.console.server.access import Bucket, checked_message
 from drivers.errors import ConfigError
 
 VERSION = 1
@@ -95,7 +94,7 @@ class Page:
 
 
 class Pages:
-    """All of them. `tell` sends a message on to the cell unless too many wait, `stop` stops it; neither waits. In the
+    """All of them. `notify` sends a message on to the cell unless too many wait, `stop` stops it; neither waits. In the
     event loop's thread."""
 
     def __init__(self, notify: Callable[[object], bool], stop: Callable[[], object]) -> None:

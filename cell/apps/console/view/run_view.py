@@ -149,6 +149,8 @@ WIDTH = 640
 STRIPE_POINTS = 160
 ROWS = 12
 """Each so many-th row of a profile is shown."""
+TARGET_PICTURES = ("board", "large", "target")
+"""How the names of the target camera's pictures begin."""
 
 Sent = tuple[dict[str, object], bytes]
 
@@ -156,8 +158,7 @@ Sent = tuple[dict[str, object], bytes]
 class Pictures:
     """The newest picture of a run that was not given yet."""
 
-    def __init__(self, target_names: tuple[str, ...] = ("board", "large", "target")) -> None:
-        self._targets = target_names
+    def __init__(self) -> None:
         self._given: Frame | None = None
         self._found: object = None
 
@@ -179,7 +180,7 @@ class Pictures:
         small = np.ascontiguousarray(frame.image[::step, ::step])
         header = {
             "type": "picture",
-            "camera": "target_camera" if what.startswith(self._targets) else "scan_camera",
+            "camera": "target_camera" if what.startswith(TARGET_PICTURES) else "scan_camera",
             "what": what, "width": small.shape[1], "height": small.shape[0], "scale": 1.0 / step,
             "board": None if board is None else (board / step).round(1).tolist(), "stripe": None,
         }  # fmt: skip

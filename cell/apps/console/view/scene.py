@@ -21,8 +21,7 @@ from cell.config.cell_config import CellConfig, deck_plates, mounted, station_ob
 from cell.config.job import Job, load_job
 from cell.devices.gate.interlocks import Situation
 from cell.measure.inversion.nominal import read_mesh
-from cell.measure.vision import parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import centre_of, parse_board
 from cell.motion.collision import PLACED, Body, arm_bodies, station_bodies, tool_bodies, vehicle_bodies
 from cell.motion.kinematics import HOME, arm_kinematics
 from cell.procedures.arm.photograph import base_from_place_at_target

@@ -19,7 +19,7 @@ from cell.measure.calibration.archive import ScanObservation
 from cell.measure.calibration.drift.evidence import dots_of
 from cell.measure.calibration.solve.normal import BOARD, POSITION, dots_block
 from cell.measure.geometry.camera import Array
-from cell.measure.vision import BoardView
+from cell.measure.vision.board.view import BoardView
 from drivers.errors import CalibrationStale, Measured, RefusedError
 
 if TYPE_CHECKING:

@@ -194,14 +194,14 @@ class ScanCalibration:
         confirmed = found("confirmed", ConfirmedTurn.read, alone)
         return cls(
             CameraModel.read(data["camera"]),
-            LightPlane.of(plane["normal"], float(plane["distance"])).bowed(float(plane.get("bow", 0.0))),
+            LightPlane.of(plane["normal"], float(plane["distance"])).bowed(float(plane["bow"])),
             np.array(data["rail_direction"], dtype=np.float64),
             flange_from_camera=from_matrix(data["flange_from_camera"]),
             covariance=np.array(data["covariance"], dtype=np.float64).reshape(KEPT, KEPT),
             quality=Quality(**data["quality"]), reference=Reference.read(data.get("reference")),
-            bow_sigma=float(plane.get("bow_sigma", 0.0)),
-            bow_gain=np.array(plane.get("bow_gain", np.zeros(KEPT)), dtype=np.float64).reshape(KEPT),
-            notes=tuple(data.get("notes", ())), witness=PlateLine.read(data.get("witness")), confirmed=confirmed,
+            bow_sigma=float(plane["bow_sigma"]),
+            bow_gain=np.array(plane["bow_gain"], dtype=np.float64).reshape(KEPT),
+            notes=tuple(data["notes"]), witness=PlateLine.read(data["witness"]), confirmed=confirmed,
             timing=timing, shutter=shutter, unread=tuple(unread), refused=str(data.get("refused", "")),
         )  # fmt: skip
 

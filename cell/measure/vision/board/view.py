@@ -240,11 +240,6 @@ class BoardView:
         """The points (n, 3) in the board frame in m, in the order of `ids`."""
         return self.spec.points()[self.ids]
 
-    @property
-    def complete(self) -> bool:
-        """True when no point of the board is missing."""
-        return len(self.ids) == len(self.spec.lattice())
-
     def turns(self) -> list[BoardView]:
         """This view and those with the other orders that the board's symmetry allows."""
         if not self.order_assumed:

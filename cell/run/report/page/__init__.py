@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def render(package: str, name: str, **values: object) -> str:
-    """The Jinja2 template `name` that lies in `package`, with these values: all of them are escaped.
+    """The Jinja2 template `name` that lies in `package`, with these values: all of them are escaped, but for TOML.
 
     `raw | base64` writes bytes for a `data:` address. Raises `jinja2.UndefinedError` for a value that is not given.
     """
@@ -22,7 +22,8 @@ def render(package: str, name: str, **values: object) -> str:
 def _environment(package: str) -> Environment:
     from jinja2 import Environment, PackageLoader, StrictUndefined  # only who writes a page waits for it
 
-    made = Environment(loader=PackageLoader(package, ""), autoescape=True, undefined=StrictUndefined)
+    made = Environment(loader=PackageLoader(package, ""), undefined=StrictUndefined)
+    made.autoescape = lambda name: name is None or ".toml." not in name
     made.trim_blocks = made.lstrip_blocks = True
     made.filters["base64"] = lambda raw: b64encode(raw).decode("ascii")
     return made

@@ -73,8 +73,8 @@ def test_a_held_button_ends_in_time(cell: Cell, device: str, axis: str, end: str
             "silence": over.set,
             "release": lambda: page.send('{"type": "jog_end"}'),
             "page closed": lambda: page.socket.close(),
-            "server frozen": lambda: os.kill(console._server.pid, signal.SIGSTOP),
-            "server killed": lambda: os.kill(console._server.pid, signal.SIGKILL),
+            "server frozen": lambda: os.kill(console._server._process.pid, signal.SIGSTOP),
+            "server killed": lambda: os.kill(console._server._process.pid, signal.SIGKILL),
             "stop": lambda: page.send('{"type": "stop"}'),
         }
         assert moving(cell, device)
@@ -87,7 +87,7 @@ def test_a_held_button_ends_in_time(cell: Cell, device: str, axis: str, end: str
             stood += begun - sent[0]
         print(f"{device} {axis} {end}: {1e3 * stood:.0f} ms")
         if end == "server frozen":
-            os.kill(console._server.pid, signal.SIGCONT)
+            os.kill(console._server._process.pid, signal.SIGCONT)
         assert stood < WITHIN_S
 
 

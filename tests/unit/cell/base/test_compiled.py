@@ -20,7 +20,7 @@ with warnings.catch_warnings(record=True) as caught:
     warnings.simplefilter("always")
     import cell.run.session.supervisor
     from cell.base.compiled import load
-    from cell.measure.vision import extract
+    from cell.measure.vision.stripe.extract import extract
     from lab.bench.stripe.truth import Cell, draw
     load()
 
@@ -41,7 +41,7 @@ import importlib, pkgutil
 from cell.measure.vision import stripe
 from lab.bench.stripe.truth import Cell, draw
 from cell.procedures.sweep.swath import warm_up
-from cell.measure.vision import StripeStream
+from cell.measure.vision.stripe.extract import StripeStream
 from tests.unit.cell.measure.reconstruction.test_build import GEOMETRY
 
 def loaded():

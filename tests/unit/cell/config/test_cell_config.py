@@ -17,7 +17,7 @@ from cell.config.job import Job, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.inversion import NominalSurface
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from cell.motion.collision import CollisionError
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
@@ -222,3 +222,6 @@ def test_addresses_do_not_make_a_calibration_foreign_but_optics_do() -> None:
     other = validate(CellConfig, edited(scan_camera__focal_length="8.1 mm"), "cell.toml")
     assert moved.calibration_hash() == own
     assert other.calibration_hash() != own
+    band = {"centre": "660 nm", "width": "20 nm", "transmission": 0.9}
+    filtered = validate(CellConfig, edited(scan_camera__filter=band), "cell.toml")
+    assert filtered.calibration_hash() != own and filtered.scan_camera.filter.width == pytest.approx(20e-9)

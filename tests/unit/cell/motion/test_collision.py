@@ -26,13 +26,6 @@ def test_the_part_may_touch_the_surface_only_where_allowed(planner: Planner) -> 
     assert planner.collisions.touching(resting, RESTING) == []
 
 
-def test_distance_to_the_table_is_the_height_above_it(planner: Planner) -> None:
-    joints = planner.kinematics.ik(down(0.75, -0.3, 0.05 + 0.17 + 0.012), WORKING)
-    distance, pair = planner.collisions.distance(joints)
-    assert set(pair) == {"part", "table"}
-    assert distance == pytest.approx(0.014, abs=1e-6)
-
-
 def test_bodies_need_names_and_sizes() -> None:
     with pytest.raises(ValueError, match="three lengths"):
         collision.box("flat", collision.BASE, pin.SE3.Identity(), (1.0, 0.0, 1.0))

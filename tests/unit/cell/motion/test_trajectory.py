@@ -21,12 +21,6 @@ def test_a_joint_move_is_jerk_limited_and_rests_at_both_ends() -> None:
     assert np.abs(motion.speeds()[[0, -1]]).max() < 1e-3
 
 
-def test_half_the_speed_takes_twice_as_long() -> None:
-    end = np.array([2.0, 0, 0, 0, 0, 0])
-    full, half = (trajectory.plan_joint(np.zeros(6), end, JointLimits().scaled(f)).duration for f in (1.0, 0.5))
-    assert half == pytest.approx(2 * full, rel=1e-6)
-
-
 def test_a_move_to_where_the_arm_stands_is_a_motion_of_one_period() -> None:
     motion = trajectory.plan_joint(WORKING, WORKING, JointLimits())
     assert motion.duration > 0

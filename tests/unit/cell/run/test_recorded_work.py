@@ -14,7 +14,7 @@ from cell.base.lateness import Lateness
 from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.boards import collect_scan, look_for

@@ -14,6 +14,7 @@ from sim_backends.models.arm_kinematics import UR10E_DH, JointErrors, Kinematics
 from sim_backends.optics.pattern import grain_at, grain_parameters
 from sim_backends.optics.scene import Grain
 from sim_backends.world import drawing
+from sim_backends.world.cameras import SKY
 from sim_backends.world.levels import (
     ALONE,
     CUT,
@@ -21,6 +22,7 @@ from sim_backends.world.levels import (
     IDEAL,
     LEVELS,
     NOMINAL,
+    OUTDOOR,
     Effects,
     assumed_noise,
     deviations,
@@ -40,7 +42,8 @@ def test_every_effect_can_be_had_alone_and_workshop_has_all_but_the_options() ->
         assert getattr(alone, name) == getattr(ALONE, name) > 0
         assert sum(bool(getattr(alone, other)) for other in Effects.names()) == 1
     off = [name for name in Effects.names() if not getattr(effects_of("workshop"), name)]
-    assert off == ["rolling_shutter", "droop", "oil"]
+    assert off == ["rolling_shutter", "droop", "oil", *OUTDOOR]
+    assert effects_of("outdoor") == only(*OUTDOOR)
     for level in ("ideal", "nominal", "harsh"):
         assert effects_of(level) == Effects()
 
@@ -54,6 +57,27 @@ def test_each_row_says_its_unit_meaning_and_source() -> None:
 def test_no_two_levels_share_a_serial_number() -> None:
     levels = [*LEVELS, *(f"nominal+{name}" for name in Effects.names()), "nominal+grasp+sag", "harsh+grasp"]
     assert len({number_of(level) for level in levels}) == len(levels)
+
+
+def test_the_sun_has_20_to_100_klx_by_seed() -> None:
+    drawn = [draw(seed, "outdoor").workshop.klx for seed in range(40)]
+    assert 20.0 <= min(drawn) < 30.0 and 90.0 < max(drawn) <= 100.0
+    assert draw(3, "workshop").workshop.klx == 0.0
+
+
+def test_in_the_open_gusts_come_and_go_the_ground_is_uneven_and_the_mount_grows() -> None:
+    world = World(3, "outdoor", clock=SteppedClock())
+    flat = World(3, "nominal", clock=SteppedClock())
+    tilts = [np.linalg.inv(flat.world_from_base(0.0)) @ world.world_from_base(t) for t in np.arange(0.0, 10.0, 0.01)]
+    angles = np.array([[tilt[2, 1], tilt[0, 2]] for tilt in tilts])
+    slope = world.scene.workshop.ground[:2]
+    assert 0.0 < np.abs(angles.mean(axis=0)).max() <= np.abs(slope).max()
+    off = np.linalg.norm(angles - angles.mean(axis=0), axis=1)
+    assert off[450:550].max() == pytest.approx(0.05e-3, rel=0.1) and off[:50].max() < 0.01e-3
+    cold = world.flange_from_camera("scan", 0.0)
+    world.stand(3600.0)
+    grown = world.flange_from_camera("scan", 0.0)[:3, 3] - cold[:3, 3]
+    assert grown == pytest.approx(0.95 * world.scene.workshop.heat, rel=0.01) and np.abs(grown).max() > 1e-6
 
 
 @pytest.mark.parametrize("effect", ["sheet_bow", "oil"])
@@ -134,6 +158,20 @@ def test_the_fan_ends_and_the_sun_moves() -> None:
     late = world._cameras.picture("target", facing, base, False, 0.004, t=100.0).astype(float)
     moved = np.abs(late - early)
     assert np.percentile(moved, 99.5) > 8.0 > 3.0 * np.median(moved)
+
+
+def test_beyond_the_shadow_s_edge_it_is_as_much_brighter_as_the_sun_is_than_the_sky() -> None:
+    world = World(1, "nominal+sun", clock=SteppedClock())
+    ground, base = world.scene.world_from_place, world.world_from_base(0.0)
+
+    def grey(x: float, t: float) -> float:
+        facing = ground @ drawing.pose((x, -0.15, 0.13), (1, 0, 0), (0, 0, -1))
+        return float(world._cameras.picture("scan", facing, base, False, 50e-6, t=t).mean())
+
+    assert grey(0.18, 0.0) / grey(-0.2, 0.0) == pytest.approx(1.0 / SKY, rel=0.15)
+    # The edge goes to and fro.
+    over = [grey(world.scene.workshop.sun_start, t) for t in (0.0, 2.0, 6.0)]
+    assert over[1] < 0.8 * over[0] < 0.8 * 0.8 * over[2]
 
 
 @pytest.mark.parametrize("effect", [*Effects.names(), "workshop"])

@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
+import cv2
 import numpy as np
+import pinocchio as pin
 import pytest
 import trimesh
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
+from cell.apps.new_job.make import COLOURS, draw_proposal
+from cell.apps.new_job.proposal import Proposal
+from cell.apps.new_job.surface import Laid
+from cell.apps.new_job.sweeps import Rays, visible_surfaces
 from cell.check.fit import require_fit
 from cell.config.cell_config import load_config
-from cell.config.job import load_job
+from cell.config.job import SwathSection, load_job
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion.nominal import read_mesh
 from drivers.errors import ConfigError
 from lab.bench.job.part_jobs import body
+from tests.support.report_runs import CONFIG, pot
 from tests.unit.cell.apps.new_job.meshes import from_options, relief
 
 
@@ -65,3 +77,80 @@ def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(tmp
         from_options(tmp_path, part=str(tmp_path / "drawings" / "lid.ply"), **given)
     with pytest.raises(ConfigError, match=r"--part: .*none\.ply cannot be read as a mesh"):
         from_options(tmp_path, True, part=str(tmp_path / "none.ply"), **given)
+
+
+ACROSS = (-0.012, 0.016)
+
+
+@pytest.fixture(scope="module")
+def made() -> Proposal:
+    """The middle of the pot in two sweeps side by side; much of it is left out."""
+    job, nominal = pot(length=0.036, swath=tuple(SwathSection(across=f"{1e3 * y} mm") for y in ACROSS))
+    vertices, faces = nominal.vertices, nominal.triangles
+    seen = visible_surfaces(CONFIG, job, Rays(vertices, faces))
+    return Proposal(job, Laid(vertices, faces, pin.SE3.Identity()), tuple(seen))
+
+
+@pytest.fixture(scope="module")
+def drawn(made: Proposal, tmp_path_factory: pytest.TempPathFactory) -> tuple[Figure, np.ndarray]:
+    """The figure as it was written, and the pixels of its file."""
+    kept: list[Figure] = []
+    save = Figure.savefig
+    path = tmp_path_factory.mktemp("picture") / "pot.png"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", lambda figure, path: (kept.append(figure), save(figure, path)))
+        draw_proposal(path, made, pot()[1], CONFIG, "job pot, as proposed")
+    pixels = cv2.imread(str(path))
+    assert pixels is not None
+    return kept[0], pixels
+
+
+def lines(axes: Axes, colour: str) -> list[np.ndarray]:
+    """Corners (n, 2) of every line of this colour."""
+    found = [np.asarray(line.get_xydata()) for line in axes.get_lines() if line.get_color() == colour]
+    return [corners for corners in found if len(corners)]
+
+
+def test_the_sweeps_are_drawn_where_the_proposal_has_them(made: Proposal, drawn: tuple[Figure, np.ndarray]) -> None:
+    figure, pixels = drawn
+    assert pixels.shape == (990, 1620, 3)
+    above, cut = figure.axes[0], next(axes for axes in figure.axes if axes.get_title().startswith("across"))
+    for colour, across, seen in zip(COLOURS, ACROSS, made.seen, strict=False):
+        points = 1e3 * seen.points[seen.valid]
+        (outline,) = lines(above, colour)
+        assert outline.min(axis=0) == pytest.approx(points[:, :2].min(axis=0))
+        assert outline.max(axis=0) == pytest.approx(points[:, :2].max(axis=0))
+        # A corner of the outline has its colour in the file as well.
+        column, row = above.transData.transform(outline[0])
+        near = pixels[int(990 - row) - 2 : int(990 - row) + 3, int(column) - 2 : int(column) + 3, ::-1] / 255.0
+        assert np.abs(near - to_rgb(colour)).sum(axis=2).min() < 0.1
+        # From the camera, which is straight above the middle of its sweep, to both ends of what it sees.
+        eyes = [corners[0] for corners in lines(cut, colour) if len(corners) == 2]
+        assert len(eyes) == 2
+        for eye in eyes:
+            assert eye == pytest.approx([1e3 * across, 1e3 * made.job.scan.stand_off], abs=0.5)
+    assert [text.get_text() for text in cut.get_legend().get_texts()] == [
+        "sweep 1: -12.0 mm across", "sweep 2: +16.0 mm across"
+    ]  # fmt: skip
+    assert f"camera {1e3 * made.job.scan.stand_off:.0f} mm above z = 0, 2 × 36 mm by the rail" in cut.get_title()
+
+
+def test_what_no_sweep_sees_and_the_part_are_shown(made: Proposal, drawn: tuple[Figure, np.ndarray]) -> None:
+    above = drawn[0].axes[0]
+    said = re.search(r"(\d+) % of the surface is seen", above.get_title())
+    assert said is not None
+    assert 30 < int(said[1]) < 95
+    assert int(said[1]) == pytest.approx(100 * made.share, abs=2.0)
+    hidden = np.asarray(above.collections[1].get_offsets())
+    seen = 1e3 * np.concatenate([each.points[each.valid] for each in made.seen])[:, :2]
+    inside = (np.abs(hidden[:, None] - seen[None, ::50]).max(axis=2) < 0.2).any(axis=1)
+    assert inside.mean() < 0.02
+    (part,) = [patch for patch in above.patches if isinstance(patch, Rectangle)]
+    size, place = 1e3 * np.array(made.job.grasp.size), 1e3 * made.job.place.surface_from_part.se3().translation
+    assert (part.get_width(), part.get_height()) == pytest.approx(tuple(size[:2]))
+    assert part.get_center() == pytest.approx(place[:2])
+
+
+def test_the_arm_is_drawn_at_the_first_sweep(drawn: tuple[Figure, np.ndarray]) -> None:
+    titles = [axes.get_title() for axes in drawn[0].axes]
+    assert {"from above, the arm at the first sweep", "from the side, the arm at the first sweep"} <= set(titles)

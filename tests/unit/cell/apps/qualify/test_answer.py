@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
-from cell.apps.qualify.answer import JobAnswer, repeat_command
-from cell.apps.qualify.rows import Row
-from tests.support.qualified import COVERED, ERROR, OF, row
+from cell.apps.qualify.answer import JobAnswer, compare, keep_line, kept_line, line_file, other_rows, repeat_command
+from cell.apps.qualify.campaign import Target
+from cell.apps.qualify.identity import QualifiedCode
+from cell.apps.qualify.rows import Row, RowStore
+from cell.config.cell_config import default_toml, load_config
+from cell.config.job import job_path
+from drivers.errors import ConfigError
+from tests.support import Typed
+from tests.support.qualified import COVERED, ERROR, OF, campaign, row
 
 
 def answer(*rows: Row) -> JobAnswer:
@@ -90,3 +98,94 @@ def test_it_is_json() -> None:
     told = json.loads(json.dumps(some().as_dict(), allow_nan=False))
     assert told["shares"]["placed"] == {**told["shares"]["placed"], "count": 6, "of": 10, "share": 0.6}
     assert json.dumps(answer(row(1, "refused")).as_dict(), allow_nan=False)
+
+
+LINE = "qualified 2026-11-30, 1 world of nominal, yield 100.0 % [2.5, 100.0]"
+
+
+@pytest.fixture
+def own(here: Path) -> Path:
+    """The job `pot` and the configuration that ship, as files of the present folder."""
+    shipped = job_path("pot")
+    (here / "pot.ply").write_bytes((shipped.parent / "pot.ply").read_bytes())
+    (here / "pot.toml").write_text(shipped.read_text(encoding="utf-8"), encoding="utf-8")
+    (here / "cell.toml").write_text(default_toml(), encoding="utf-8")
+    return here
+
+
+def keep(job: str, config: Path | None) -> Path:
+    of = QualifiedCode.of(job, load_config(config))
+    told = JobAnswer.of_rows(of, "nominal", first=1, rows=[row(1)], command=lambda one: "", date="2026-11-30")
+    return keep_line(told, job, config)
+
+
+def test_a_line_holds_until_job_or_configuration_change(own: Path) -> None:
+    assert kept_line("pot", None) is None
+    assert keep("pot", Path("cell.toml")) == Path("pot.qualified.json")
+    assert kept_line("pot", None) == LINE
+    text = (own / "cell.toml").read_text(encoding="utf-8")
+    (own / "cell.toml").write_text("# a comment\n" + text, encoding="utf-8")
+    assert kept_line("pot", None) == LINE
+    (own / "pot.toml").write_text((own / "pot.toml").read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    told = kept_line("pot", None)
+    assert told == f"{LINE}: that does not hold any more, job has changed since; `cell qualify pot` tells anew"
+    changed = text.replace('name = "cell-1"', 'name = "cell-2"')
+    assert changed != text
+    (own / "cell.toml").write_text(changed, encoding="utf-8")
+    assert "job and configuration have changed" in str(kept_line("pot", None))
+
+
+def test_that_of_a_job_that_ships_lies_below_the_calibrations(here: Path) -> None:
+    assert line_file("tray4#2", None) == here / "calibrations" / "qualified" / "tray4-2.qualified.json"
+    assert keep("pot", None) == here / "calibrations" / "qualified" / "pot.qualified.json"
+    assert kept_line("pot", None) == LINE
+
+
+def test_what_cannot_be_read_is_left_out(own: Path) -> None:
+    file = keep("pot", Path("cell.toml"))
+    file.write_text(file.read_text(encoding="utf-8").replace("100.0 %", "99.9 %"), encoding="utf-8")
+    assert kept_line("pot", None) is None, "a line that was edited is none"
+    assert kept_line("nothing", None) is None
+
+
+def test_a_command_that_runs_the_job_shows_it(own: Path, typed: Typed) -> None:
+    keep("pot", Path("cell.toml"))
+    _, _, complaints = typed("dry-run", "--inject", "arm.nothing@place:1%")
+    assert LINE not in complaints, "nothing is told before the command is right"
+    _, _, complaints = typed("dry-run", "--clock", "virtual", "--speed", "2")
+    assert LINE in complaints
+
+
+pytest.importorskip("pyarrow")
+OLD = replace(OF, code_hash="old")
+
+
+def test_pairs_are_of_the_same_seed() -> None:
+    now = [row(1, error_mm=0.1), row(2, error_mm=0.2), row(3, "refused", reason="dark"), row(9)]
+    before = [row(3, of=OLD), row(2, error_mm=0.3, of=OLD), row(1, error_mm=0.2, of=OLD), row(8, of=OLD)]
+    told = compare(now, before)
+    assert (told.pairs, told.other["code_hash"]) == (3, "old")
+    assert told.yields[0] == pytest.approx(-1 / 3)
+    assert [(one.seed, one.before, one.now, one.reason) for one in told.changed] == [(3, "placed", "refused", "dark")]
+    figure = next(one for one in told.figures if one.name == "place error, largest of 45 points")
+    assert (figure.mean, figure.n) == (pytest.approx(-0.1), 2)
+    with pytest.raises(ConfigError, match="no seed in common"):
+        compare([row(1)], [row(2)])
+
+
+def test_in_one_folder_it_is_the_other_version_that_ran_last(tmp_path: Path) -> None:
+    store, older = RowStore(tmp_path), replace(OF, code_hash="older")
+    for one in (row(1), row(1, of=OLD, ended_s=2e9), row(2, of=OLD, ended_s=3e9), row(1, of=older, ended_s=1e9)):
+        store.append(one)
+    found = other_rows(campaign(tmp_path, Target(2)), tmp_path)
+    assert {one["code_hash"] for one in found} == {"old"}
+    assert len(found) == 2
+
+
+def test_where_there_is_nothing_to_compare_with_that_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="holds no campaign"):
+        other_rows(campaign(tmp_path, Target(2)), tmp_path)
+    RowStore(tmp_path).append(row(1))
+    with pytest.raises(ConfigError, match="no other worlds"):
+        other_rows(campaign(tmp_path, Target(2)), tmp_path)
+    assert len(other_rows(campaign(tmp_path / "other", Target(2)), tmp_path)) == 1

@@ -10,7 +10,7 @@ import pytest
 from cell.apps.qualify.campaign import Prefix, Target
 from cell.apps.qualify.identity import QualifiedCode
 from cell.apps.qualify.intervals import Share
-from cell.apps.qualify.store import RowStore
+from cell.apps.qualify.rows import RowStore
 from cell.apps.qualify.workers import Ended
 from cell.apps.qualify.world import WorldTask
 from drivers.errors import CellError, ConfigError

@@ -11,8 +11,7 @@ import pytest
 
 from cell.apps.qualify import workers as module
 from cell.apps.qualify.campaign import Prefix, Target
-from cell.apps.qualify.rows import Row
-from cell.apps.qualify.store import RowStore
+from cell.apps.qualify.rows import Row, RowStore
 from cell.apps.qualify.workers import Cluster, Processes, Workers, open_workers
 from drivers.errors import CellError, ConfigError
 from tests.support.qualified import campaign, deadly, other_code, quick

@@ -12,12 +12,13 @@ from cell import Cell
 from cell.apps.qualify import world
 from cell.apps.qualify.answer import repeat_command
 from cell.apps.qualify.identity import QualifiedCode
-from cell.apps.qualify.rows import Row, compared
+from cell.apps.qualify.rows import Row
 from cell.apps.qualify.world import WorldTask, run_world
 from cell.config.cell_config import default_toml, load_config
 from cell.config.job import job_path
 from drivers.errors import Aborted, ConfigError, RefusedError
 from tests.support import Typed
+from tests.support.qualified import compared
 
 SEED = 2
 

@@ -13,7 +13,7 @@ from cell.apps.recordings.command import Options, attach_poses
 from cell.apps.recordings.frames import RecordedFrame
 from cell.apps.recordings.series import list_folder, match_series, read_series
 from cell.measure.geometry.camera import CameraModel
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 
 BOARD = parse_board("chessboard:7x5:20mm")
 SIZE = (640, 480)

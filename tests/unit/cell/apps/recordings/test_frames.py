@@ -9,8 +9,8 @@ import pytest
 from cell.apps.recordings import frames as recorded_frames
 from cell.apps.recordings.frames import read_frames
 from cell.apps.recordings.series import list_folder
-from cell.measure.vision import read_colours
 from cell.measure.vision.pictures import read_picture
+from cell.measure.vision.stripe.planes import read_colours
 from tests.unit.cell.apps.recordings.pictures import BASE_FROM_BOARD, BOARD, CAMERA, FLANGE_FROM_CAMERA, POSES, lit
 
 

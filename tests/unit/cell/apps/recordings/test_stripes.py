@@ -7,7 +7,7 @@ import numpy as np
 
 from cell.apps.recordings.frames import read_frames
 from cell.apps.recordings.series import list_folder
-from cell.measure.vision import LaserChannel
+from cell.measure.vision.stripe.planes import LaserChannel
 from tests.unit.cell.apps.recordings.pictures import BOARD, lit
 
 

@@ -135,6 +135,16 @@ def test_lens_sensor_and_light_plane_are_those_of_the_configuration(tmp_path: Pa
     assert picture.shape == (768, 1024)
 
 
+def test_a_described_filter_takes_its_share_of_the_laser_and_most_of_the_room(tmp_path: Path) -> None:
+    band = {"filter": '{ centre = "660 nm", width = "20 nm", transmission = 0.5 }'}
+    plain, filtered = ideal(tmp_path), ideal(tmp_path, {"scan_camera": band})
+    assert filtered.world.scene.drawing.cell.scan.filter == pytest.approx((660e-9, 20e-9, 0.5))
+    of_line = [np.percentile(light_on(cell.world, (0.0, 0.0, 0.6)), 99.9) for cell in (plain, filtered)]
+    assert of_line[1] == pytest.approx(0.5 * of_line[0], rel=0.1)
+    dark = [cell.world.render("scan", 0.0, 0.02).mean() for cell in (plain, filtered)]
+    assert dark[1] < 0.2 * dark[0]
+
+
 def test_the_stripe_of_a_described_head_is_where_the_closed_form_puts_it(tmp_path: Path) -> None:
     """x' = f (cot θ − l/Z), docs/explanation/theory.md, section 2, on the bare table at Z = 130 mm."""
     camera = {"focal_length": '"6 mm"', "pixel": '"3.45 um"', "width": "800", "height": "600"}

@@ -60,7 +60,7 @@ def _of_version_9(about):
     [
         ({"scan_pixels": None}, "lacks 'scan_pixels'"),
         ({"about": None}, "lacks 'about'"),
-        ({"about": _of_version_9}, "format 9, this program reads 1"),
+        ({"about": _of_version_9}, "format 9, this program reads 2"),
         ({"about": lambda about: np.array("{")}, "cannot be solved"),
         ({"scan_pixels": _not_a_number}, "scan_pixels holds 1 values that are no numbers"),
         ({"scan_flange": lambda poses: 2 * poses}, "is no rotation"),

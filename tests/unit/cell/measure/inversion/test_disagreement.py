@@ -28,7 +28,7 @@ from cell.measure.inversion.disagreement import (
 )
 from cell.measure.inversion.nominal import Scan
 from cell.measure.inversion.registration import register
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.steps.kinds import PLACE
 from cell.procedures.steps.place import STEP
 from drivers.errors import RefusedError

@@ -15,7 +15,7 @@ from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.flush import BESIDE_M, Flush, flush_along_edge
 from cell.measure.inversion.part_pose import parted
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from tests.unit.cell.measure.inversion.test_registration import TRUE, scanned
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.flush import heights_over
 from cell.measure.inversion.local_deviation import BLUR_M, LocalDeviation, Span, higher_about, seen_middle, seen_rim
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from tests.unit.cell.measure.inversion.test_flush import BELONGS, HALF, THICK, TOP, swept
 from tests.unit.cell.measure.inversion.test_registration import TRUE, scanned
 

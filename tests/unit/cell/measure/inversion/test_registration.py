@@ -19,7 +19,7 @@ from cell.measure.inversion.nominal import Scan
 from cell.measure.inversion.observability import judge
 from cell.measure.inversion.place_pose import balance
 from cell.measure.inversion.registration import register
-from cell.measure.reconstruction import Cloud, merge
+from cell.measure.reconstruction.cloud import Cloud, merge
 from drivers.errors import ConfigError, NotObservable, RefusedError
 from lab.bench.inversion.campaign import judge_case
 from lab.bench.inversion.scenes import PARTS, TRUE, Setting, scan, start_away

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.whole_face import FacePatch, unlike_patch
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from tests.unit.cell.measure.inversion.test_flush import BELONGS, HALF, THICK, TOP
 from tests.unit.cell.measure.inversion.test_local_deviation import HOLE, PIN, pierced, pinned
 from tests.unit.cell.measure.inversion.test_registration import TRUE, scanned

@@ -12,14 +12,9 @@ from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.reconstruction import (
-    Cloud,
-    ProfileBuilder,
-    ScanGeometry,
-    calibration_motions,
-    deviation_colours,
-    write_ply,
-)
+from cell.measure.reconstruction.build import ProfileBuilder, ScanGeometry, calibration_motions
+from cell.measure.reconstruction.cloud import Cloud
+from cell.measure.reconstruction.ply import deviation_colours, write_ply
 from cell.measure.vision.stripe.extract import StripeProfile
 from drivers.errors import RefusedError
 from lab.bench.reconstruction.scenes import swept

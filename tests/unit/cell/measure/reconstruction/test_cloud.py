@@ -10,15 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import from_ur, to_ur
-from cell.measure.reconstruction import (
-    Cloud,
-    ProfileBuilder,
-    calibration_motions,
-    find_seams,
-    flange_motions,
-    lean_motions,
-    merge,
-)
+from cell.measure.reconstruction.build import ProfileBuilder, calibration_motions, flange_motions, lean_motions
+from cell.measure.reconstruction.cloud import Cloud, find_seams, merge
 from cell.measure.vision.stripe.extract import StripeProfile
 from cell.motion.trajectory import FlangeTrack
 from drivers.clock import ClockMap, Latch

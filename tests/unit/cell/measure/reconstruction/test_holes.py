@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from cell.measure.reconstruction import Cloud, fill_holes, merge, write_cloud
-from cell.measure.reconstruction.ply import deviation_colours, read_cloud, triangles, write_mesh
+from cell.measure.reconstruction.cloud import Cloud, merge
+from cell.measure.reconstruction.holes import fill_holes
+from cell.measure.reconstruction.ply import deviation_colours, read_cloud, triangles, write_cloud, write_mesh
 from drivers.errors import ConfigError
 from lab.bench.reconstruction.scenes import cut_holes, scene
 

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.measure.reconstruction import deviation_colours, write_ply
-from cell.measure.reconstruction.ply import read_cloud
+from cell.measure.reconstruction.ply import deviation_colours, read_cloud, write_ply
 from drivers.errors import ConfigError
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.measure.vision import PictureRefused, Reason, read_picture
+from cell.measure.vision.pictures import PictureRefused, Reason, read_picture
 
 
 def test_cut_and_foreign_files_are_refused(tmp_path):

@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.geometry.camera import CameraModel
-from cell.measure.vision import StripeProfile, parse_board
+from cell.measure.vision.board.view import parse_board
+from cell.measure.vision.stripe.profile import StripeProfile
 from cell.measure.vision.stripe_on_board import on_plane, points_on_board
 
 CAMERA = CameraModel(640, 480, 1000.0, 1000.0, 320.0, 240.0)

@@ -13,7 +13,7 @@ from cell.config.cell_config import load_config
 from cell.config.job import PhotoSection, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix, from_parts
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import BoardFix, ScanPlan, look_pose, photograph

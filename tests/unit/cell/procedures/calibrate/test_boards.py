@@ -9,7 +9,7 @@ import pytest
 from cell.config.calibrations.store import nominal_camera
 from cell.config.cell_config import load_config
 from cell.measure.geometry.poses import difference, from_parts, perturbed
-from cell.measure.vision import BoardView, parse_board
+from cell.measure.vision.board.view import BoardView, parse_board
 from cell.procedures.arm.photograph import CalibrationView, scan_calibration_views
 from cell.procedures.calibrate.boards import SEARCH_M, Aim
 

@@ -13,7 +13,7 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig, load_config
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
-from cell.measure.calibration.drift.interim import HeadShift
+from cell.measure.calibration.drift.slip import HeadShift
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.interim import LOOKS, MOVED, InterimCheck, fine_board_view, interim_check, resting_pose

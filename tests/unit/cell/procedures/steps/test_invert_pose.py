@@ -14,7 +14,7 @@ from cell.measure.geometry.poses import difference
 from cell.measure.inversion import NominalSurface, PlacePose
 from cell.measure.inversion.effects.between_sweeps import Creep
 from cell.measure.inversion.effects.during_sweep import LEAST_SAG, Droop, Head, bow
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.part_error import stated_bound
 from cell.procedures.steps.invert_pose import LineTimes, inverted
 from cell.procedures.steps.invert_pose import invert_pose as step

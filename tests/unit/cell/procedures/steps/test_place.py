@@ -16,7 +16,7 @@ from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix, from_parts, from_ur
 from cell.measure.inversion import NominalSurface
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from cell.motion.collision import CollisionError
 from cell.motion.kinematics import HOME
 from cell.motion.trajectory import Trajectory

@@ -13,7 +13,7 @@ import pytest
 from cell.config.cell_config import load_config
 from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.drift.reference_plate import Pointing
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.steps import reconstruct
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord
 from drivers.errors import RefusedError

@@ -17,8 +17,8 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.effects.between_sweeps import Creep, SurfaceMotion, surface_motion
-from cell.measure.reconstruction import Cloud, flange_motions, merge
-from cell.measure.reconstruction.cloud import Filled
+from cell.measure.reconstruction.build import flange_motions
+from cell.measure.reconstruction.cloud import Cloud, Filled, merge
 from cell.procedures.arm.touch import felt_touch
 from cell.procedures.steps import place as place_step
 from cell.procedures.sweep import second_look
@@ -222,7 +222,7 @@ def test_after_a_pause_it_is_looked_at_anew(
         slid(site.cell, (0.0, 1e-3))
         site.control.go_on()
 
-    site = AtStation(placed_pot, tmp_path, notify=notify, look=reach_in)
+    site = AtStation(placed_pot, tmp_path, notify=notify, check=reach_in)
     with pytest.raises(RefusedError, match=r"the surface has moved by (0\.9|1\.0)"):
         site.do("place")
     assert held == [True]

@@ -21,7 +21,7 @@ from cell.procedures.frame_store import FrameStore
 from cell.procedures.steps.laser_sweep import STEP, SweepRecord
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep import stored_sweep
-from cell.procedures.sweep.stored_sweep import FILE, UNSEALED, StoredSweep, save_sweep
+from cell.procedures.sweep.stored_sweep import FILE, FORMAT, StoredSweep, save_sweep
 from cell.procedures.sweep.swath import Swath
 from drivers.errors import CalibrationStale, InterlockError, RefusedError
 from drivers.interfaces import Frame
@@ -149,11 +149,10 @@ def test_a_sweep_is_not_read_once_a_figure_was_edited_or_two_of_its_frames_are_e
     np.savez(tmp_path / FILE, **{**data, "rail_0": data["rail_0"] + 1e-6})
     with pytest.raises(RefusedError, match="was changed after it was written: rail_0"):
         StoredSweep.load(tmp_path, *given)
-    # Who looks at an old run reads it as it is.
-    np.savez(tmp_path / FILE, **{**data, "format": np.array(UNSEALED)})
+    # A replay reads it as it is.
     assert len(StoredSweep.load(tmp_path, *given, as_written=False).sweep.swaths) == 1
-    np.savez(tmp_path / FILE, **{**data, "format": np.array(UNSEALED - 1)})
-    with pytest.raises(RefusedError, match=f"format {UNSEALED - 1}, this program reads"):
+    np.savez(tmp_path / FILE, **{**data, "format": np.array(FORMAT - 1)})
+    with pytest.raises(RefusedError, match=f"format {FORMAT - 1}, this program reads"):
         StoredSweep.load(tmp_path, *given, as_written=False)
 
 

@@ -20,7 +20,7 @@ from cell.devices.gate.gated import UNATTENDED_S
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts, from_ur
-from cell.measure.reconstruction import ScanGeometry
+from cell.measure.reconstruction.build import ScanGeometry
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import ScanPlan

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.reconstruction import ScanGeometry
+from cell.measure.reconstruction.build import ScanGeometry
 from drivers.errors import RefusedError
 from lab.bench.acceptance import campaign
 from lab.bench.calibration.world import Noise

@@ -12,7 +12,7 @@ import pinocchio as pin
 import pytest
 
 from cell.measure.geometry.poses import difference
-from cell.measure.vision import board_pose, find_board
+from cell.measure.vision.board.board import board_pose, find_board
 from cell.measure.vision.board.view import KINDS, BoardView
 from lab.bench.board.campaign import Tally as BoardTally
 from lab.bench.board.campaign import camera_of, judge

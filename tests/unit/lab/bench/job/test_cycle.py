@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cell.config.cell_config import load_config
-from cell.run.report.page.activities import Activity, activities
+from cell.run.report.page.course import Activity, activities
 from lab.bench.job.cycle import LeastTimes, told
 from lab.bench.job.whole_job import JobRecord
 from tests.support.at_station import AtStation

@@ -13,8 +13,9 @@ import pytest
 from typer.testing import CliRunner
 
 from cell.apps.cli.app import app
+from cell.apps.cli.calibration.calibrate import verdicts
 from cell.apps.recordings.command import calibrate_folder
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from drivers.errors import ConfigError
 from tests.support.recorded_scenes import recording
 
@@ -113,3 +114,15 @@ def test_the_recorded_pairs_give_the_published_hand_eye():
     np.testing.assert_allclose(hand_eye["translation_mm"], (659, -249, 830), rtol=0.01)
     published = np.array([0.230, -2.540, 1.950])
     assert np.linalg.norm(hand_eye["euler_xyz_rad"] - published) < 0.01 * np.linalg.norm(published)
+
+
+def test_refused_values_are_shown_and_marked():
+    check = {"part": "hand_eye", "verdict": "refused", "text": "hand-eye: too far off"}
+    value = {"setup": "eye_in_hand", "translation_mm": [1, 2, 3], "sigma_mm": [4, 5, 6], "sigma_deg": [0.1, 0.2, 0.3]}
+    none = dict.fromkeys(("intrinsics", "hand_eye", "light_plane"))
+    result = {**none, "checks": [check], "notes": ["no light plane: dark"], "refused_values": {"hand_eye": value}}
+    camera, hand, plane = verdicts({**result, "refused": {"hand_eye": check["text"]}})
+    assert hand.startswith("hand-eye: REFUSED (do not use: eye in hand, x 1.00 ± 4.00, y 2.00 ± 5.00")
+    assert hand.endswith("too far off")
+    assert plane == "light plane: none: no light plane: dark"
+    assert camera == "camera: none: not asked for"

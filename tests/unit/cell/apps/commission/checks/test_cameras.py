@@ -15,7 +15,7 @@ from cell.apps.commission.checks.cameras import picture_figures, pose_toml, pose
 from cell.apps.commission.measuring import Eye
 from cell.config.cell_config import load_config
 from cell.measure.geometry.poses import from_parts
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 
 
 def figures(image: np.ndarray) -> set[str]:

@@ -9,7 +9,7 @@ from cell.apps.commission.check import Result
 from cell.apps.commission.checks.vehicle import judge_board
 from cell.apps.commission.sequence import by_name
 from cell.config.job import load_job
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from tests.support.commissioning import Shown, files, opened
 from tests.support.described_cells import described
 

@@ -27,7 +27,7 @@ def test_when_the_server_is_killed_the_program_hears_of_it_and_nobody_holds(
         ann.do(do="hold", name="Ann", key=key)
         ann.do(do="manual", on=True, key=key)
         assert console.controller.manual.on
-        os.kill(console._server.pid, signal.SIGKILL)
+        os.kill(console._server._process.pid, signal.SIGKILL)
         assert gone.wait(5)
         assert until(lambda: not console.controller.manual.on)
         assert console.controller.holders.holder is None
@@ -71,6 +71,6 @@ def test_a_killed_server_is_noticed_whatever_the_other_threads_do(
         browser = Browser(console.link)
         with browser.live() as page:
             page.send(json.dumps({"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1}))
-            os.kill(console._server.pid, signal.SIGKILL)
+            os.kill(console._server._process.pid, signal.SIGKILL)
             assert gone.wait(2.0)
         held.set()

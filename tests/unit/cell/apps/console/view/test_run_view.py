@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from cell.apps.console.host.questions import Questions
+from cell.apps.console.host.controller import Questions
 from cell.apps.console.view.run_view import RunView
 from cell.run.runs import Run
 from statemachine.step import Event

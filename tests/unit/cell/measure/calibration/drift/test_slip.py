@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
+from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import load_config
-from cell.measure.calibration.drift.slip import LARGEST_LAG_S, LARGEST_M, NOTED_M, Slip
+from cell.measure.calibration import ScanObservation
+from cell.measure.calibration.drift.evidence import PictureMeasurements, dots_of
+from cell.measure.calibration.drift.slip import CHANCE, LARGEST_LAG_S, LARGEST_M, NOTED_M, SUSPICIOUS, HeadShift, Slip
+from cell.measure.calibration.solve.normal import HAND
+from cell.measure.geometry.poses import from_matrix
+from cell.procedures.arm.photograph import interim_view
 from drivers.errors import RefusedError
+from lab.bench.calibration.observed_cell import ObservedCell, shifted
+from sim_backends.world.scene import draw, rotation
 
 CONFIG = load_config(None)
 
@@ -30,3 +41,94 @@ def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused(
     for lag in (-1.1 * LARGEST_LAG_S, 1.1 * LARGEST_LAG_S, np.nan):
         with pytest.raises(RefusedError, match="later"):
             Slip(0.0, 0.0, lag).require()
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> tuple[ObservedCell, CellCalibration]:
+    cell = ObservedCell(draw(3, "nominal"), CONFIG, np.random.default_rng([3, 31]))
+    return cell, CellCalibration.solve(cell.collect_scan(), cell.collect_target(), {"arm": "3"}, CONFIG)
+
+
+def look(cell: ObservedCell, calibration: CellCalibration, rests: int) -> HeadShift:
+    scan = calibration.scan
+    assert scan.reference is not None
+    view = interim_view(CONFIG, cell.fine, scan)
+    seen = []
+    for k in range(rests):
+        rest = cell.move(view.base_from_flange.homogeneous)
+        photo = cell.scan_view(rest, cell.carriage(view.rail_position))
+        one = ScanObservation(photo, None, from_matrix(rest.reported), view.rail_position)
+        seen.append(PictureMeasurements(dots_of(one), k, k))
+    return HeadShift.of(scan.state(scan.reference.base_from_board), scan.reference, seen)
+
+
+def test_a_head_that_nobody_touched_is_as_uncertain_as_it_is_said(
+    calibrated: tuple[ObservedCell, CellCalibration],
+) -> None:
+    cell, calibration = calibrated
+    looks = [look(cell, calibration, 1) for _ in range(60)]
+    squares = [one.change @ np.linalg.solve(one.covariance, one.change) for one in looks]
+    # All share the calibration's error, so that their mean may lie anywhere within what one of them leaves open.
+    assert np.mean(squares) < chi2.ppf(0.999, 6)
+    about = np.array([one.change for one in looks])
+    assert (about.std(axis=0) < 1.3 * np.sqrt(np.diag(looks[0].covariance))).all()
+    assert not any(one.changed for one in looks) and all(one.fits for one in looks)
+    assert np.mean([one.suspicious for one in looks]) < 0.4
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_shift_and_a_turn_are_found_and_told_by_how_much(
+    calibrated: tuple[ObservedCell, CellCalibration], axis: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell, calibration = calibrated
+    truth, mount = cell.truth, cell.truth.flange_from_scan
+    expected = 0.3e-3 * np.eye(3)[axis]
+    monkeypatch.setattr(cell, "truth", replace(truth, flange_from_scan=shifted(expected) @ mount))
+    found = look(cell, calibration, 2)
+    assert found.changed and found.looks == 2
+    assert np.abs(found.change[:3] - expected).max() < 4.0 * np.sqrt(np.diag(found.covariance))[:3].max()
+    turned = mount.copy()
+    turned[:3, :3] = rotation(1e-3 * np.eye(3)[axis]) @ mount[:3, :3]
+    monkeypatch.setattr(cell, "truth", replace(truth, flange_from_scan=turned))
+    found = look(cell, calibration, 2)
+    assert found.changed
+    assert found.change[3 + axis] == pytest.approx(1e-3, abs=4.0 * np.sqrt(found.covariance[3 + axis, 3 + axis]))
+
+
+def test_a_board_that_was_bent_fits_badly_wherever_the_head_is(
+    calibrated: tuple[ObservedCell, CellCalibration], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell, calibration = calibrated
+    found = [look(cell, calibration, 1)]
+    monkeypatch.setattr(cell, "bend", 0.2e-3)
+    found.append(look(cell, calibration, 1))
+    assert [one.fits for one in found] == [True, False]
+    assert 3.0 < found[1].dots < 5.5
+
+
+def test_more_rests_make_it_sharper_down_to_the_calibrations_own_error(
+    calibrated: tuple[ObservedCell, CellCalibration],
+) -> None:
+    sigma = [np.sqrt(np.diag(look(*calibrated, rests).covariance)) for rests in (1, 2, 8)]
+    assert (sigma[1] < 0.85 * sigma[0]).all() and (sigma[2] < 0.85 * sigma[1]).all()
+    assert (sigma[2] > 0.25 * sigma[0]).all()
+
+
+def test_what_chance_seldom_brings_is_looked_at_again_and_what_it_never_brings_has_changed() -> None:
+    made = HeadShift(np.zeros(6), np.eye(6), dots=1.0, chance=1.0, looks=1)
+    assert not made.suspicious and not made.changed
+    assert replace(made, chance=0.99 * SUSPICIOUS).suspicious and not replace(made, chance=1.01 * SUSPICIOUS).suspicious
+    assert replace(made, chance=0.99 * CHANCE).changed and not replace(made, chance=1.01 * CHANCE).changed
+    assert replace(made, dots=1.59).fits and not replace(made, dots=1.61).fits
+
+
+def test_changes_are_drawn_about_the_one_that_was_found_and_of_the_mount_alone() -> None:
+    sigma = np.array([1e-5, 2e-5, 3e-5, 1e-4, 2e-4, 3e-4])
+    found = HeadShift(1e-3 * np.arange(1.0, 7.0), np.diag(sigma**2), dots=1.0, chance=1.0, looks=1)
+    drawn = found.drawn(4000)
+    assert np.allclose(drawn[:, HAND].mean(axis=0), found.change, atol=0.1 * sigma.max())
+    assert drawn[:, HAND].std(axis=0) == pytest.approx(sigma, rel=0.06)
+    others = np.delete(drawn, np.arange(HAND.start, HAND.stop), axis=1)
+    assert not others.any() and not np.delete(found.likely, np.arange(HAND.start, HAND.stop)).any()
+    assert (found.likely[HAND] == found.change).all()
+    assert (found.drawn(4) == found.drawn(4)).all()

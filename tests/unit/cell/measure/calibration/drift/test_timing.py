@@ -32,7 +32,7 @@ from cell.measure.calibration.drift.timing import (
 from cell.measure.calibration.solve.results import KEPT, Quality, TargetCalibration
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
-from cell.measure.vision import BoardView, parse_board
+from cell.measure.vision.board.view import BoardView, parse_board
 from cell.procedures.steps.laser_sweep import times_known
 from cell.run.calibration import kept_if_refused
 from drivers.errors import CalibrationStale, RefusedError

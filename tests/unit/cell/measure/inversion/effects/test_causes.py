@@ -11,7 +11,7 @@ import pinocchio as pin
 import pytest
 
 from cell.measure.inversion.effects.causes import Cause, find_causes, likeliest
-from cell.measure.reconstruction import Cloud
+from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.steps.invert_pose import LineTimes
 from cell.procedures.steps.invert_pose import invert_pose as step
 from drivers.errors import RefusedError

@@ -7,8 +7,7 @@ import pinocchio as pin
 
 from cell.measure.geometry.camera import CameraModel, seen_centres
 from cell.measure.geometry.poses import transform
-from cell.measure.vision import parse_board
-from cell.measure.vision.board.view import centre_of
+from cell.measure.vision.board.view import centre_of, parse_board
 from sim_backends.optics.camera import CameraOptics
 from sim_backends.optics.render import render
 from sim_backends.optics.scene import Board, BoardInstance

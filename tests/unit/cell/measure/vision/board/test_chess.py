@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.measure.vision import find_board, parse_board
+from cell.measure.vision.board.board import find_board
+from cell.measure.vision.board.view import parse_board
 from sim_backends.optics.scene import LaserOptics
 from tests.unit.cell.measure.vision.board.drawn_boards import FINE, SCAN, photograph, placed, true_pixels
 

@@ -11,8 +11,7 @@ import pytest
 from scipy.special import ndtr
 
 from cell.measure.geometry.poses import difference
-from cell.measure.vision import board_pose
-from cell.measure.vision.board.board import without_outliers
+from cell.measure.vision.board.board import board_pose, without_outliers
 from cell.measure.vision.board.dots import measure_dots
 from cell.measure.vision.board.lattice import Blobs
 from cell.measure.vision.board.view import DOTS, KINDS, BoardView

@@ -6,7 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.measure.vision import PictureRefused, Reason, find_board, parse_board
+from cell.measure.vision.board.board import find_board
+from cell.measure.vision.board.view import parse_board
+from cell.measure.vision.pictures import PictureRefused, Reason
 from lab.bench.board.conditions import CONDITIONS, draw_view
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.measure.vision import PictureRefused, Reason, find_board, parse_board
+from cell.measure.vision.board.board import find_board
+from cell.measure.vision.board.view import parse_board
+from cell.measure.vision.pictures import PictureRefused, Reason
 from tests.unit.cell.measure.vision.board.drawn_boards import FINE, LARGE, SCAN, TARGET, photograph, placed, true_pixels
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from cell.measure.vision import parse_board
+from cell.measure.vision.board.view import parse_board
 from drivers.errors import ConfigError
 from tests.unit.cell.measure.vision.board.drawn_boards import FINE
 

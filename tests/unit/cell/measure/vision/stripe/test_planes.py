@@ -6,8 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.measure.vision import extract, read_colours, read_picture
-from cell.measure.vision.stripe.planes import as_picture, range_of
+from cell.measure.vision.pictures import read_picture
+from cell.measure.vision.stripe.extract import extract
+from cell.measure.vision.stripe.planes import as_picture, range_of, read_colours
 from lab.bench.stripe.workshop import Scene, draw
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
-from cell.measure.vision import Mark
 from cell.measure.vision.stripe.extract import extract
+from cell.measure.vision.stripe.profile import Mark
 from lab.bench.stripe.workshop import Scene, draw
 
 SHAPE = (384, 480)

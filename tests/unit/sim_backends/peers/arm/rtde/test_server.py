@@ -153,7 +153,7 @@ def test_inputs_of_ur_rtde_are_in_use_and_packets_are_padded_or_cut(arm: Client)
     assert client.ask("O", struct.pack(">d", 125.0) + names) == b"\1DOUBLE,DOUBLE"
     client.ask("S")
     for body, values in ((struct.pack(">3d", 1.0, 2.0, 3.0), (1.0, 2.0)), (struct.pack(">d", 4.0), (4.0, 0.0))):
-        client.tell(b"\1" + body)
+        client.notify(b"\1" + body)
         client.ask("v")
         assert struct.unpack(">B2d", client.states(2)[-1]) == (1, *values)
     client.socket.close()

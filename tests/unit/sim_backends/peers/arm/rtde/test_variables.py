@@ -73,7 +73,7 @@ def test_inputs_of_every_kind_come_back_as_outputs(address: str) -> None:
     client = Rtde(address)
     names = "input_bit_registers0_to_31,input_bit_register_70,input_int_register_40,input_double_register_41"
     assert client.ask("I", names.encode()) == b"\1UINT32,BOOL,INT32,DOUBLE"
-    client.tell(struct.pack(">BI?id", 1, 0x80000005, True, -7, 2.5))
+    client.notify(struct.pack(">BI?id", 1, 0x80000005, True, -7, 2.5))
     client.ask("O", struct.pack(">d", 500.0) + names.encode())
     client.ask("S")
     assert struct.unpack(">BI?id", client.states(4)[-1]) == (1, 0x80000005, True, -7, 2.5)

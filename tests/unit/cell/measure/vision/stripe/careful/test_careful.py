@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from cell.measure.vision import StripeProfile, read_colours
 from cell.measure.vision.stripe.careful.careful import fill_gaps
 from cell.measure.vision.stripe.extract import extract
+from cell.measure.vision.stripe.planes import read_colours
+from cell.measure.vision.stripe.profile import StripeProfile
 from lab.bench.stripe.workshop import Scene, draw
 
 

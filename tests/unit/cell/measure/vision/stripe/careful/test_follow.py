@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cell.measure.vision import LaserChannel, extract
+from cell.measure.vision.stripe.extract import extract
+from cell.measure.vision.stripe.planes import LaserChannel
 
 
 def test_a_core_that_is_saturated_in_one_channel_is_read_in_another():
