@@ -184,7 +184,9 @@ def job_toml() -> str:
     pot = load_job("pot")[0]
     place = pot.place.model_copy(update={"accept": pot.place.tolerance})
     # `pot` says most. What it leaves out `cell new-job` says for any job, the others for themselves alone.
-    shipped = [comments(job_path(name).read_text(encoding="utf-8")) for name in ("tray4", "unload", "shell", "pot")]
+    shipped = [
+        comments(job_path(name).read_text(encoding="utf-8")) for name in ("two-stations", "unload", "shell", "pot")
+    ]
     written = comments(job_text(pot.model_copy(update={"part": part, "place": place}), []))
     told = shipped[0] | shipped[1] | shipped[2] | written | shipped[3]
     text, models = "# job.toml\n\n" + NOTE, list(records(Job))

@@ -66,6 +66,7 @@ GROUPS = (
         "unit/cell/devices/simulated/test_direct.py",
         "integration/virtual/test_described_jobs.py",
         "integration/virtual/test_verify_job.py",
+        "integration/virtual/test_two_stations.py",
         "schedules/test_schedules.py",
     ),
     # Its steps, one by one.

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,11 @@ from cell.measure.geometry.poses import transform
 from cell.measure.vision.board.view import BoardSpec, centre_of, parse_board
 from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
+from cell.procedures.drive.way import Planar, Way, left_at
 from cell.procedures.sought_part import around, ground_below, nominal_of, sought
 from cell.procedures.steps import pick, pick_nest, verify
 from cell.procedures.steps.kinds import kind_of
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, RefusedError
 from drivers.make import CameraConfig
 
 RAMP_MARGIN = 0.0005
@@ -33,6 +35,10 @@ PLATE = (0.21, 0.17)
 LEAST_PITCH_PX = 8.0
 HIGHEST_PLATE = 0.3
 """How high above the deck a calibration board may be, m."""
+LEVEL, LEVEL_ANGLE = 0.001, math.radians(0.5)
+"""How even the floor between two stops is drawn, m and rad."""
+ON_LINE, ON_LINE_ANGLE = 0.05, math.radians(5)
+"""So near to the line, m and rad, a vehicle from another stop comes to its staging pose."""
 LONGEST_DRIVE_S, LONGEST_DESCENT_S = 150.0, 150.0
 """The steps that drive and place have 180 s."""
 
@@ -47,7 +53,7 @@ def require_fit(job: Job, config: CellConfig, mesh: Path, *, calibrates: bool = 
         *_kind(job), *_speeds(job, config), *_boards(job, config), *_plates(config), *_cameras(config),
         *way_problems(job, config), *place_problems(job),
     ]  # fmt: skip
-    problems = problems or list(_sight(job, config))
+    problems = problems or [*_sight(job, config), *_stops(job, config)]
     extent = mesh_box(mesh, job.surface.mesh_unit)
     problems += [*surface_problems(job, extent, mesh), *_stripe(job, config, extent[0][2], extent[1][2])]
     # The arm's poses follow from the others: where these are wrong, it would only be told twice.
@@ -169,6 +175,55 @@ def _sight(job: Job, config: CellConfig) -> Iterator[str]:
                 f"{where}, the board is seen {math.degrees(slant):.0f} deg from square, more than photo.max_obliquity, "
                 f"{math.degrees(job.photo.max_obliquity):.0f} deg"
             )
+
+
+@dataclass
+class _AsDrawn:
+    """A vehicle that stands as drawn; see `cell.procedures.drive.way.Reckoned`."""
+
+    stands: Planar
+    way: float = 0.0
+    turned: float = 0.0
+
+    def pose(self) -> Planar:
+        """Where it stands."""
+        return self.stands
+
+
+def _stops(job: Job, config: CellConfig) -> Iterator[str]:
+    """The vehicle comes, as drawn, from every other stop to that of this item."""
+    if job.stop and not config.vehicle.DRIVES:
+        yield "[[stop]]: the arm stands on a fixed frame, which drives to no other stop; leave the stops out"
+        return
+    staging = Planar.of(job.approach.staging.se3())
+    for stop in job.other_stops:
+        where = f"from stop {stop.name} to stop {job.at_stop}"
+        there = stop.place_from_stop * stop.approach.target.se3()
+        step = float(there.translation[2] - job.approach.target.se3().translation[2])
+        if abs(step) > LEVEL or there.rotation[2, 2] < math.cos(LEVEL_ANGLE):
+            yield (
+                f"stop.place_from_stop: {where} the floor rises by {-1e3 * step:.0f} mm or is tilted; stops have one "
+                f"level floor (allowed: {1e3 * LEVEL:g} mm, {math.degrees(LEVEL_ANGLE):g} deg)"
+            )
+            continue
+        drawn = _AsDrawn(Planar.of(there))
+        way = Way(job, config.arm.vehicle_from_base.se3(), drawn)
+        try:
+            back = way.require_line(left_at(stop))
+            drawn.stands, drawn.way = back, math.hypot(back.x - drawn.stands.x, back.y - drawn.stands.y)
+            beside = staging.inverse() * way.require_line(staging)
+        except RefusedError as refused:
+            yield f"{where}: {refused}. As drawn; change stop.place_from_stop or the start of its approach"
+            continue
+        if abs(beside.y) > ON_LINE or abs(beside.yaw) > ON_LINE_ANGLE:
+            yield (
+                f"{where}: at approach.staging the vehicle is still {1e3 * beside.y:.0f} mm beside the line, turned by "
+                f"{math.degrees(beside.yaw):.0f} deg (allowed: {1e3 * ON_LINE:g} mm, "
+                f"{math.degrees(ON_LINE_ANGLE):.0f} deg); give it a longer way: an earlier approach.start there, or a "
+                "later approach.staging here"
+            )
+        if (time := way.longest / job.approach.speed) > LONGEST_DRIVE_S:
+            yield f"{where} takes {time:.0f} s (allowed: at most {LONGEST_DRIVE_S:.0f} s); raise approach.speed"
 
 
 def _in_picture(key: str, board: BoardSpec, camera: CameraConfig, name: str, depth: float) -> Iterator[str]:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import dataclass
 from importlib.resources import files
+from itertools import combinations
 from pathlib import Path
 from typing import Annotated, Literal, Self
 
@@ -18,6 +20,7 @@ from pydantic import AfterValidator, Field, ValidationInfo, model_validator
 
 from cell.base.toml_file import below, read_toml, validate
 from cell.config.cell_config import StationObstacle, checked_board, once_each
+from cell.measure.vision.board.view import parse_board
 from drivers.common.addresses import Name, checked_name
 from drivers.common.units import KEPT, number, quantity, shown, whole
 from drivers.errors import ConfigError
@@ -234,10 +237,41 @@ class BatchSection(Table):
     on_refusal: Literal["end", "ask", "skip"] = "end"
 
 
+class StopSection(Table):
+    """A station of several, told apart by its board. What is left out is as in [board], [approach] and [[obstacle]].
+
+    `place_from_stop` is where its place frame lies in the place frame of the first stop, which has none.
+    """
+
+    name: Annotated[str, Name]
+    place_from_stop: Pose | None = None
+    board: BoardSection | None = None
+    approach: ApproachSection | None = None
+    obstacle: tuple[StationObstacle, ...] | None = None
+
+    @property
+    def frame(self) -> pin.SE3:
+        """Its place frame in that of the first stop."""
+        return pin.SE3.Identity() if self.place_from_stop is None else self.place_from_stop.se3()
+
+
+@dataclass(frozen=True, eq=False)
+class OtherStop:
+    """Another station of a job, whose place frame lies at `place_from_stop` in the place frame of its own."""
+
+    name: str
+    place_from_stop: pin.SE3
+    board: BoardSection
+    approach: ApproachSection
+    obstacles: tuple[StationObstacle, ...]
+
+
 class ItemSection(Table):
-    """One part of several: its kind, its nest and its surface. What is left out is as in [nest] and [surface]."""
+    """One part of several: its kind, nest, surface and stop. What is left out is as in [nest] and [surface], or the
+    first stop."""
 
     kind: Literal["load", "unload"]
+    stop: Annotated[str, Name] | None = None
     base_from_part: Mounting | None = None
     place_from_surface: Pose | None = None
 
@@ -257,6 +291,7 @@ class Job(Table):
     nest: NestSection | None = None
     batch: BatchSection = Field(default=BatchSection(), exclude=True)
     obstacle: tuple[StationObstacle, ...] = ()
+    stop: tuple[StopSection, ...] = ()
     item: tuple[ItemSection, ...] = ()
 
     @model_validator(mode="after")
@@ -264,14 +299,60 @@ class Job(Table):
         once_each("obstacle", self.obstacle)
         if self.item and self.nest is None:
             raise ValueError("[[item]] takes parts from nests, or to them: give [nest]")
+        if (problem := self._stop_problem()) is not None:
+            raise ValueError(problem)
         return self
 
+    def _stop_problem(self) -> str | None:
+        """What is wrong with the stops, or with how items name them."""
+        once_each("stop", self.stop)
+        names = [stop.name for stop in self.stop]
+        used = {item.stop or (names or [""])[0] for item in self.item} - {""}
+        if unknown := sorted(used - set(names)):
+            return f'item.stop "{unknown[0]}" is no [[stop]] (there: {", ".join(names) or "none"}); correct its name'
+        if idle := [name for name in names if name not in used]:
+            return f'stop {idle[0]} has no item: write stop = "{idle[0]}" under an [[item]], or leave the stop out'
+        for k, stop in enumerate(self.stop):
+            once_each(f"stop {stop.name}: obstacle", stop.obstacle or ())
+            if (stop.place_from_stop is None) is not (k == 0):
+                what = "give place_from_stop" if k else "leave out place_from_stop"
+                return (
+                    f"stop {stop.name}: {what}; it tells of each further stop where it lies in the frame of {names[0]}"
+                )
+        return self._boards_alike()
+
+    def _boards_alike(self) -> str | None:
+        """Which two stops have boards that nobody tells apart."""
+        seen = [(stop.name, parse_board((stop.board or self.board).spec)) for stop in self.stop]
+        for (one, first), (other, second) in combinations(seen, 2):
+            if first.kind == second.kind and {first.cols, first.rows} == {second.cols, second.rows}:
+                return (
+                    f"stops {one} and {other} have boards of {first.cols} x {first.rows} points, by which nobody tells "
+                    "before which one the vehicle stands; give one of them a board of other counts"
+                )
+        return None
+
     def of_item(self, number: int) -> Job:
-        """The job of an item, counted from 1: with its kind, nest and surface. Its items leave nothing out."""
+        """The job of an item, counted from 1: with its kind, nest, surface and stop. Items and stops leave nothing
+        out."""
         assert self.nest is not None
         lies, place = self.nest.base_from_part, self.surface.place_from_surface
+        stops = tuple(
+            stop.model_copy(
+                update={
+                    "board": stop.board or self.board,
+                    "approach": stop.approach or self.approach,
+                    "obstacle": self.obstacle if stop.obstacle is None else stop.obstacle,
+                }
+            )
+            for stop in self.stop
+        )
         whole = [
-            {"base_from_part": item.base_from_part or lies, "place_from_surface": item.place_from_surface or place}
+            {
+                "base_from_part": item.base_from_part or lies,
+                "place_from_surface": item.place_from_surface or place,
+                "stop": item.stop or next((stop.name for stop in stops), None),
+            }
             for item in self.item
         ]
         items = tuple(item.model_copy(update=told) for item, told in zip(self.item, whole, strict=True))
@@ -279,14 +360,37 @@ class Job(Table):
         nest = self.nest.model_copy(update={"base_from_part": own.base_from_part})
         surface = self.surface.model_copy(update={"place_from_surface": own.place_from_surface})
         job = self.job.model_copy(update={"name": name, "kind": own.kind})
-        return self.model_copy(update={"job": job, "nest": nest, "surface": surface, "item": items})
+        there = next((stop for stop in stops if stop.name == own.stop), self)
+        at = {"board": there.board, "approach": there.approach, "obstacle": there.obstacle, "stop": stops}
+        return self.model_copy(update={"job": job, "nest": nest, "surface": surface, "item": items, **at})
+
+    @property
+    def at_stop(self) -> str | None:
+        """The name of the stop of the job of an item; None where it has no stops."""
+        number = job_and_item(self.job.name)[1]
+        return self.item[number - 1].stop if self.stop and number is not None else None
+
+    @property
+    def other_stops(self) -> list[OtherStop]:
+        """The other stops of the job of an item."""
+        return [
+            OtherStop(stop.name, self._place_from(stop.name), stop.board, stop.approach, stop.obstacle)
+            for stop in self.stop
+            if stop.name != self.at_stop and stop.board and stop.approach and stop.obstacle is not None
+        ]
+
+    def _place_from(self, stop: str | None) -> pin.SE3:
+        """The place frame of this stop in that of the job of an item."""
+        frames = {each.name: each.frame for each in self.stop}
+        here = frames.get(self.at_stop or "", pin.SE3.Identity())
+        return here.inverse() * frames.get(stop or "", pin.SE3.Identity())
 
     @property
     def other_items(self) -> list[tuple[int, pin.SE3, pin.SE3]]:
         """The other items of the job of an item: their numbers, nests (base_from_part) and places (place_from_part)."""
         own, on = job_and_item(self.job.name)[1], self.place.surface_from_part.se3()
         return [
-            (k, item.base_from_part.se3(), item.place_from_surface.se3() * on)
+            (k, item.base_from_part.se3(), self._place_from(item.stop) * item.place_from_surface.se3() * on)
             for k, item in enumerate(self.item, 1)
             if k != own and item.base_from_part is not None and item.place_from_surface is not None
         ]

@@ -161,8 +161,10 @@ def perform(
             work = _question(open_cell, job, part, batch.runs[-1], refill=refill) if number > 1 else None
             if work is not None:
                 between(work)
-            # Whoever was at the cell, or set its world up anew, may have moved vehicle and station.
-            last = run(number, replace(before, arrival=None) if refill or work is not None else before)
+            # Whoever was at the cell, or set its world up anew, may have moved vehicle and station; the next stop is
+            # elsewhere.
+            anew = refill or work is not None or job.board != jobs[(number - 2) % len(jobs)].board
+            last = run(number, replace(before, arrival=None) if anew else before)
             before = _known_after(before, last)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()

@@ -83,6 +83,8 @@ class ReadyJob:
         job, mesh = sought(job, mesh)
         nominal = nominal_of(job, mesh)
         info: dict[str, object] = dict(job_source(file))
+        if job.at_stop is not None:
+            info["stop"] = job.at_stop
         # A resumed run must end where this one was to end, and be looked at as this one was.
         if until is not None:
             info["until"] = until

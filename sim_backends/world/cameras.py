@@ -68,8 +68,8 @@ class Cameras:
         self._busy = {name: threading.Lock() for name in self._cold}
 
     def show(self, scene: Scene, station: Station, others: Sequence[tuple[Scene, Station]] = ()) -> None:
-        """From now on the cameras see this station, in this scene, of the same drawing and clocks; and the surfaces of
-        `others` that lie elsewhere."""
+        """From now on the cameras see this station, in this scene, of the same drawing and clocks; and of `others` the
+        surfaces that lie elsewhere, and the tables and boards of other stops."""
         effects, cell = scene.effects, scene.drawing.cell
         self._lens = {"scan": scene.scan_lens, "target": scene.target_lens}
         self._cold = {
@@ -91,7 +91,9 @@ class Cameras:
             at = (ground.centre[0] + x * ground.half_x, ground.centre[1] + y * ground.half_y)
             oil = Puddle(at, radius, effects.oil)
         self._grain = Grain(effects.texture, effects.dust, effects.gloss, oil)
-        self._shown = scene, station, Board.parse(scene.drawing.station.board)
+        self._shown = scene, station
+        stops = {of.drawing.station.stop: of for of in (*(of for of, _ in others), scene)}
+        self._stops = [(of, Board.parse(of.drawing.station.board)) for of in stops.values()]
         there = [(of.world_from_surface, other) for of, other in others]
         self._others = [each for each in there if not np.array_equal(each[0], scene.world_from_surface)]
 
@@ -175,15 +177,15 @@ class Cameras:
         return replace(self._light, suns=tuple(suns)) if suns else self._light
 
     def _objects(self, camera: str, camera_from_world: Pose, world_from_base: Pose) -> list[SceneObject]:
-        scene, station, board_there = self._shown
+        scene, station = self._shown
         camera_from_base = camera_from_world @ world_from_base
-        camera_from_table = camera_from_world @ scene.world_from_table
         table = (2 * drawing.TABLE_HALF, 2 * drawing.TABLE_HALF)
+        tables = [camera_from_world @ of.world_from_table for of, _ in self._stops]
         placed: list[tuple[SceneObject, Pose, float]] = [
-            (PlaneInstance(camera_from_table, table, TABLE_ALBEDO), camera_from_table, drawing.TABLE_HALF * 1.5)
+            (PlaneInstance(at, table, TABLE_ALBEDO), at, drawing.TABLE_HALF * 1.5) for at in tables
         ]
         boards = [
-            (camera_from_world @ scene.world_from_board, board_there),
+            *((camera_from_world @ of.world_from_board, there) for of, there in self._stops),
             (camera_from_base @ scene.base_from_deck_board, self._deck[0]),
             (camera_from_base @ scene.base_from_fine_board, self._deck[1]),
         ]

@@ -188,6 +188,10 @@ class StationDrawing:
     """The part lies in the nest at first."""
     beside: tuple[StationDrawing, ...] = ()
     """Of a job with several items the station of each, this one's as well, none of which has another beside it."""
+    stop: str = ""
+    """Of a job with several stations the name of this one."""
+    place_from_stop: Pose | None = None
+    """Where its place frame lies in that of the job's first station; None for that."""
     waviness: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Amplitude and wavelength, m, and direction from the surface's x, rad, of a sine that the job's mesh has not."""
 

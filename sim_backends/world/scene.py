@@ -188,10 +188,9 @@ def draw(seed: int, level: str, drawing: Drawing = STOCK, parts: int = 0) -> Sce
     d = _Draws(seed)
     cell, station = drawing.cell, drawing.station
     normal, distance, origin = _light_plane(d, sigma, cell)
-    world_from_place = pose((0.0, 0.0, station.height), (1, 0, 0), (0, 0, 1))
-    surface = d.moved(
-        "station", world_from_place @ station.place_from_surface, sigma.station_translation, sigma.station_rotation
-    )
+    world_from_place = _stands(d, sigma, station)
+    name, lies = f"station.{station.stop}".rstrip("."), world_from_place @ station.place_from_surface
+    surface = d.moved(name, lies, sigma.station_translation, sigma.station_rotation)
     deck = (sigma.deck_board_translation, sigma.deck_board_rotation)
     grasp = "grasp" if parts == 0 else f"grasp.{parts}"
     return Scene(
@@ -235,6 +234,19 @@ def _lies(d: _Draws, name: str, station: StationDrawing) -> Pose:
     aside[:2, 3] = d.vector(f"{name}.translation", LIES[0], 2)
     aside[:3, :3] = rotation(np.array([0.0, 0.0, d.scalar(f"{name}.rotation", LIES[1])]))
     made: Pose = station.surface_from_part @ aside
+    return made
+
+
+def _stands(d: _Draws, sigma: Deviations, station: StationDrawing) -> Pose:
+    """Where the place frame of a station lies, W from P. One that is not the first is off its drawn place as a vehicle
+    is off its start."""
+    if station.place_from_stop is None:
+        return pose((0.0, 0.0, station.height), (1, 0, 0), (0, 0, 1))
+    off, name = np.eye(4), f"stop.{station.stop}"
+    off[:2, 3] = d.vector(f"{name}.translation", sigma.start_translation, 2)
+    off[:3, :3] = rotation(np.array([0.0, 0.0, d.scalar(f"{name}.rotation", sigma.start_rotation)]))
+    made: Pose = station.place_from_stop @ off
+    made[2, 3] = station.height
     return made
 
 

@@ -101,11 +101,12 @@ class World:
         self._report_grip()
 
     def _drawn_item(self, k: int) -> Item:
-        """One of those beside each other. The table of the first one carries them all."""
+        """One of those beside each other. The table of the first one at its stop carries them all."""
         beside, now = self.scene.drawing.station.beside, self.scene
+        at_stop = [each.stop for each in beside].index(beside[k].stop)
         first, own = (
             draw(now.seed, now.level, replace(now.drawing, station=replace(beside[n], beside=beside)), self.parts + n)
-            for n in (0, k)
+            for n in (at_stop, k)
         )
         on_table = first.world_from_table @ beside[k].place_from_surface
         scene = replace(own, world_from_table=first.world_from_table, world_from_surface=on_table)
@@ -117,8 +118,10 @@ class World:
         item = self._items[self._current]
         self.scene, self.station = item.scene, item.station
         self._solid = ArmPoints(item.scene.drawing)
-        self.collisions = Collisions(item.scene, item.part, found)
         others = [other for other in self._items if other is not item]
+        stops = {other.scene.drawing.station.stop: other.scene for other in others}
+        stops.pop(item.scene.drawing.station.stop, None)
+        self.collisions = Collisions(item.scene, item.part, found, list(stops.values()))
         self._cameras.show(item.scene, item.station, [(other.scene, other.station) for other in others])
 
     def _part(self, scene: Scene, station: Station) -> PartContact:

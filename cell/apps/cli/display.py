@@ -149,6 +149,8 @@ def duration(seconds: float | None) -> str:
 def _facts(report: Mapping[str, object]) -> str:
     kind = str(report.get("kind", "job"))
     facts = [f"job {report.get('job')}" if kind == "job" else kind]
+    if stop := report.get("stop"):
+        facts[0] += f" at stop {stop}"
     if words := simulated_words(report.get("simulated")):
         facts.append(f"{words}, seed {report.get('seed')}, level {report.get('level')}")
         if report.get("clock") == "wall" and isinstance(pace := report.get("speed"), float | int):

@@ -114,6 +114,10 @@ def _station(job: Job, mesh: Path, drives: bool) -> drawn.StationDrawing:
         part_mesh_unit="m" if part is None else part.mesh_unit,
         nest=None if nest is None else _matrix(nest.base_from_part.se3()),
         nest_filled=nest is not None and not job.unloads,
+        stop=job.at_stop or "",
+        place_from_stop=next(
+            (_matrix(stop.frame) for stop in job.stop if stop.name == job.at_stop and stop.place_from_stop), None
+        ),
     )
     return drawn.settled(station, STOCK.station)
 

@@ -17,8 +17,8 @@ from typing import Protocol
 import numpy as np
 import pinocchio as pin
 
-from cell.config.cell_config import station_obstacles
-from cell.config.job import BoardSection, Job
+from cell.config.cell_config import StationObstacle, station_obstacles
+from cell.config.job import BoardSection, Job, OtherStop
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision.board.view import centre_of, parse_board
 from cell.motion.collision import Body, station_bodies, vehicle_bodies
@@ -31,6 +31,7 @@ DECELERATION = 0.25  # m/s², below what the vehicle can do, so that it stops wh
 CREEP = 0.015  # m/s, the slowest speed that is commanded while a distance remains
 LINE_GAIN = 2.2  # rad of heading per m beside the line
 HEADING_GAIN = 2.0  # 1/s
+ROUND = 0.2  # m/s, the fastest from the line of another stop onto that of a job: in a bend of half a metre
 TURN_GAIN = 1.5  # 1/s
 MAX_HEADING = math.radians(25)
 MAX_TURN_RATE = math.radians(25)
@@ -252,8 +253,12 @@ class Whereabouts:
             self._anchor = _Anchor(
                 Planar.of(job.approach.start.se3()), self._anchor.reading, self._anchor.interruptions
             )
-        elif self._anchor is not None and self._board != job.board:
-            self._lose("it was last seen by the board of another job")
+        elif self._anchor is not None and self._anchor.pose is not None and self._board != job.board:
+            there = next((stop.place_from_stop for stop in job.other_stops if stop.board == self._board), None)
+            if there is None:
+                self._lose("it was last seen by the board of another job")
+            else:
+                self._anchor = replace(self._anchor, pose=Planar.of(there) * self._anchor.pose)
         self._board = job.board
 
     def see(self, seen: Planar) -> str | None:
@@ -388,20 +393,51 @@ class Upright:
         return self.low - ROOM_ABOVE < other.high and other.low - ROOM_ABOVE < self.high
 
 
+def speed_onto(job: Job, off: Planar) -> float:
+    """How fast, m/s, a vehicle goes onto the line of its goal, whose pose in the goal's frame is `off`."""
+    return min(job.approach.speed, ROUND) if job.stop and abs(off.yaw) > MAX_HEADING else job.approach.speed
+
+
+def left_at(stop: OtherStop) -> Planar:
+    """Where the vehicle leaves another stop: at the start of the line there, to which it backs."""
+    return Planar.of(stop.place_from_stop) * Planar.of(stop.approach.start.se3())
+
+
+class Reckoned(Protocol):
+    """A vehicle of which is known where it stands in the place frame."""
+
+    @property
+    def way(self) -> float:
+        """How far it has gone since it was seen, m."""
+
+    @property
+    def turned(self) -> float:
+        """How far it has turned on the spot since then, rad."""
+
+    def pose(self) -> Planar:
+        """The pose now."""
+
+
+def _standing(place_from_station: pin.SE3, board: BoardSection, obstacles: Sequence[StationObstacle]) -> list[Upright]:
+    """What stands at a station, whose own place frame lies there."""
+    centre = board.place_from_board.se3() * from_parts(centre_of(parse_board(board.spec)))
+    bodies = *station_bodies(place_from_station, centre), *station_obstacles(obstacles, place_from_station)
+    return [Upright.of(body, pin.SE3.Identity()) for body in bodies]
+
+
 class Way:
     """The ways that the vehicle of one job may go."""
 
     def __init__(
-        self, job: Job, vehicle_from_base: pin.SE3, whereabouts: Whereabouts, carried: Sequence[Body] = ()
+        self, job: Job, vehicle_from_base: pin.SE3, whereabouts: Reckoned, carried: Sequence[Body] = ()
     ) -> None:
         """`carried` is what goes with the vehicle besides its deck, in the arm base: arm, tool and part as they are."""
         self._job = job
         self._whereabouts = whereabouts
-        board = job.place_from_board * from_parts(centre_of(parse_board(job.board.spec)))
-        here = pin.SE3.Identity()
-        self._station = [
-            Upright.of(body, here) for body in (*station_bodies(here, board), *station_obstacles(job.obstacle, here))
-        ]
+        self._station = _standing(pin.SE3.Identity(), job.board, job.obstacle)
+        for stop in job.other_stops:
+            there = _standing(stop.place_from_stop, stop.board, stop.obstacles)
+            self._station += [replace(body, name=f"{body.name} of stop {stop.name}") for body in there]
         # Over the floor the deck's own height does not matter: nothing of a station hangs there.
         deck = replace(Upright.of(vehicle_bodies()[0], vehicle_from_base), low=-math.inf, high=math.inf)
         lifted = from_parts((0.0, 0.0, job.approach.target.se3().translation[2]))
@@ -409,14 +445,22 @@ class Way:
         self._vehicle = [deck, *others]
         self._pairs = [(ours, theirs) for ours in self._vehicle for theirs in self._station if ours.beside(theirs)]
         start, staging = Planar.of(job.approach.start.se3()), Planar.of(job.approach.staging.se3())
-        self.longest = max(math.hypot(staging.x - start.x, staging.y - start.y), 2 * BACK_UP) + ROOM_BEYOND
+        ways = [math.hypot(staging.x - start.x, staging.y - start.y), 2 * BACK_UP]
+        for stop in job.other_stops:
+            # Back to where the line to that stop begins, and round to this one's.
+            leave, begin = left_at(stop), Planar.of(stop.place_from_stop * stop.approach.target.se3())
+            round_to = abs(staging.x - leave.x) + abs(staging.y - leave.y)
+            ways.append(math.hypot(leave.x - begin.x, leave.y - begin.y) + round_to)
+        self.longest = max(ways) + ROOM_BEYOND
 
-    def require_line(self, goal: Planar) -> None:
-        """Raise `RefusedError` unless the vehicle may drive along the goal's line to `goal` on odometry."""
+    def require_line(self, goal: Planar) -> Planar:
+        """Where the vehicle comes to stand that drives along the goal's line to `goal` on odometry; raises
+        `RefusedError` unless it may."""
         pose, length, turned = self._whereabouts.pose(), self._whereabouts.way, self._whereabouts.turned
+        fastest = speed_onto(self._job, goal.inverse() * pose)
         self._require_room(pose, length, turned)
         for _ in range(round(_LONGEST_S / _STEP_S)):
-            speed, rate = line_command(pose, goal, self._job.approach.speed)
+            speed, rate = line_command(pose, goal, fastest)
             if speed == 0.0:
                 break
             pose = pose * Planar(speed * _STEP_S, 0.0, rate * _STEP_S)
@@ -427,6 +471,7 @@ class Way:
                 f"the vehicle would go {length:.2f} m on odometry alone since it was last seen, allowed "
                 f"{self.longest:.2f} m; bring it where it sees the board, with `cell jog vehicle`"
             )
+        return pose
 
     def require_turn(self, yaw: float) -> None:
         """Raise `RefusedError` unless the vehicle may turn on the spot to `yaw`."""

@@ -4,17 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import pinocchio as pin
 
-from cell.config.job import Job
+from cell.config.job import BoardSection, Job
 from cell.motion.collision import Body, CollisionError
 from cell.motion.kinematics import HOME, Unreachable
 from cell.procedures.arm.moves import Pace
 from cell.procedures.arm.photograph import BoardFix, look_pose
 from cell.procedures.calibrate.interim import InterimCheck, interim_check
-from cell.procedures.drive.way import BACK_UP, Planar, Way, Whereabouts, drive_line, next_step, turn_to, wrap
+from cell.procedures.drive.way import (
+    BACK_UP,
+    MAX_HEADING,
+    Planar,
+    Way,
+    Whereabouts,
+    drive_line,
+    left_at,
+    next_step,
+    speed_onto,
+    turn_to,
+    wrap,
+)
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
 from cell.procedures.sweep.sweeping import check_lost_steps
 from drivers.clock import Clock
@@ -28,6 +41,8 @@ SETTLE_S = 0.3
 """The suspension's, after the vehicle has come to rest."""
 UNSTEADY = 0.4
 """Share of the tolerance by which two photographs of a standing vehicle may differ before the picture is the cause."""
+BESIDE = 0.25
+"""A vehicle this near, m, to the line before another stop, that heads for it, backs along the line first."""
 PASSED = 0.02
 """So far, m, from where it was sent a vehicle that does not see the board is brought there first: readings that came
 late let it drive on, which the later ones tell."""
@@ -78,8 +93,8 @@ class TargetDrive:
 
     `photograph` gives the board in the base. `check` raises when the run is to end. `note` takes what is worth keeping.
     `hold` is called before each way, with the vehicle at rest: a paused run waits in it. `carried` are arm, tool and
-    part as they stand, in the arm base: they are kept off the station as the vehicle itself is. `pace` says how fast
-    each way is driven, of the job's `approach.speed`.
+    part as they stand, in the arm base: they are kept off the stations as the vehicle itself is. `pace` says how fast
+    each way is driven, of the job's `approach.speed`. `photograph_of` gives the board of another stop.
     """
 
     job: Job
@@ -94,6 +109,7 @@ class TargetDrive:
     hold: Callable[[], None] = lambda: None
     carried: Sequence[Body] = ()
     pace: Pace = field(default_factory=Pace)
+    photograph_of: Callable[[BoardSection], BoardFix] | None = None
     _sent: Planar | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
@@ -104,11 +120,13 @@ class TargetDrive:
         """Bring the vehicle to the job's target to within its tolerance and brake it there.
 
         The arm stands in its looking pose already and the vehicle is enabled. On odometry alone it goes no further than
-        the staging pose, and only when `whereabouts` knows where it stands.
+        the staging pose, and only when `whereabouts` knows where it stands. From another stop it backs first to the
+        start of the line there.
         Raises `RefusedError` when the vehicle neither sees the board nor knows where it stands, when its way leads too
         close to the station, and when the tolerance is not met after nine photographs.
         """
         self._require_known_place()
+        self._leave_other_stops()
         staging = Planar.of(self.job.approach.staging.se3())
         if (staging.inverse() * self.whereabouts.pose()).x < 0:
             self.progress(0.1, "driving on odometry")
@@ -140,8 +158,33 @@ class TargetDrive:
             try:
                 self.whereabouts.pose()
             except RefusedError as unknown:
+                if self._seen_from_another_stop():
+                    return
                 text = f"{unknown}; and it does not see the board: {unseen}. {next_step(self.job)}"
                 raise RefusedError(text).showing(*unseen.numbers, seen=unseen.seen) from unknown
+
+    def _seen_from_another_stop(self) -> bool:
+        """Whether the board of another stop is in sight, by which it is known where the vehicle stands."""
+        if (photograph := self.photograph_of) is None:
+            return False
+        for stop in self.job.other_stops:
+            with suppress(RefusedError):
+                fix = photograph(stop.board)
+                base_from_stop = fix.base_from_board * stop.board.place_from_board.se3().inverse()
+                seen = stop.place_from_stop * (self.vehicle_from_base * base_from_stop).inverse()
+                self.whereabouts.see(Planar.of(seen))
+                self.note(f"the vehicle stands before stop {stop.name}, by its board")
+                return True
+        return False
+
+    def _leave_other_stops(self) -> None:
+        """Back, from before another stop, to the start of the line there."""
+        for stop in self.job.other_stops:
+            start = left_at(stop)
+            stands = start.inverse() * self.whereabouts.pose()
+            if stands.x > PASSED and abs(stands.y) < BESIDE and abs(stands.yaw) < MAX_HEADING:
+                self.progress(0.1, f"leaving stop {stop.name}")
+                self._go(start)
 
     def _correct(self, error: Planar, near: bool) -> None:
         """Drive what `error`, the vehicle's pose in its target's frame, asks for; `near` where it only has to turn."""
@@ -160,7 +203,7 @@ class TargetDrive:
         self._sent = goal
         self.hold()
         self._way.require_line(goal)
-        speed = self.job.approach.speed * self.pace.share
+        speed = speed_onto(self.job, goal.inverse() * self.whereabouts.pose()) * self.pace.share
         drive_line(self.vehicle, self.whereabouts, goal, speed=speed, clock=self.clock, check=self.check)
 
     def _photograph(self) -> BoardFix:
@@ -291,7 +334,7 @@ def _run_step(workplace: Workplace, context: StepContext) -> VehicleArrival:
         workplace.job, workplace.config.arm.vehicle_from_base.se3(), vehicle, whereabouts=workplace.whereabouts,
         photograph=workplace.photograph, clock=workplace.devices.clock, check=context.check, progress=context.progress,
         note=lambda text: context.note(text=text), hold=context.safe_point, carried=workplace.mover.solids(),
-        pace=workplace.mover.pace,
+        pace=workplace.mover.pace, photograph_of=workplace.photograph_of,
     )  # fmt: skip
     return replace(drive.to_target(), head=head)
 

@@ -14,7 +14,7 @@ import pinocchio as pin
 
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
-from cell.config.job import Job
+from cell.config.job import BoardSection, Job
 from cell.devices.devices import Devices
 from cell.measure.inversion import NominalSurface
 from cell.measure.vision.board.view import BoardSpec, parse_board
@@ -189,6 +189,13 @@ class Workplace:
         if self.devices.following is not None:
             self.devices.following.board_seen(fix.base_from_board)
         return replace(fix, number=self._photographs)
+
+    def photograph_of(self, board: BoardSection) -> BoardFix:
+        """The board of another stop, in one photograph from where the arm stands."""
+        return photograph(
+            self.devices.arm, self.devices.target_camera, self.calibration.target, spec=parse_board(board.spec),
+            limits=self.job.photo, repeatability=self.repeatability,
+        )  # fmt: skip
 
     def keep_again(self, fix: BoardFix) -> BoardFix:
         """A photograph of the run before this one, its frames kept as if this one had made it."""

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 from cell.base.compiled import load
 from cell.config.cell_config import CellConfig, default_toml, load_config
-from cell.config.job import load_job
+from cell.config.job import Job, job_and_item, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.procedures.arm.moves import PartState
@@ -83,7 +83,16 @@ class _OneWorld(VirtualCell):
     """A cell whose station nobody sets up anew for a resumed run: it finds the part where the run before left it."""
 
     def make_ready(self, described: Described) -> None:
-        """All was ready when the world was drawn."""
+        """All was ready when the world was drawn; another item becomes the present one."""
+        if described.drawing(self._truth).as_json() != self.world.scene.drawing.as_json():
+            super().make_ready(described)
+
+
+def _item_before(job: Job) -> str | None:
+    """The item before this one, where it is at another stop: the vehicle comes from there."""
+    name, number = job_and_item(job.job.name)
+    there = job.item[number - 2].stop if job.stop and number is not None and number > 1 else job.at_stop
+    return None if there == job.at_stop else f"{name}#{(number or 2) - 1}"
 
 
 def configuration(folder: Path) -> CellConfig:
@@ -113,7 +122,9 @@ class Day:
         self._config = configuration(folder)
         shutil.copytree(calibrations, folder / self._config.cell.calibrations, dirs_exist_ok=True)
         self._job = load_job(schedule.job)[0]
-        self._virtual = _OneWorld(self._config, schedule.seed, schedule.level, Described.of(schedule.job))
+        self._item_before = _item_before(self._job)
+        described = Described.of(self._item_before or schedule.job)
+        self._virtual = _OneWorld(self._config, schedule.seed, schedule.level, described)
         self._clock = self._virtual.clock
         home = PartState.first(self._job).value
         self.oracle = Oracle(self._virtual.world, self._virtual.scan_camera.model, schedule.level, home)
@@ -123,6 +134,7 @@ class Day:
         self._pauses: list[Entry] = []
         self._met: list[tuple[str, str]] = []
         self._failure: BaseException | None = None
+        self._quiet = False
         self._begin()
 
     def _begin(self) -> None:
@@ -178,7 +190,9 @@ class Day:
         with _Session(opened, self) as cell:
             try:
                 if before is None:
-                    outcome = cell.run(self._schedule.job, at_start=True)
+                    if self._item_before is not None:
+                        self._come_from(cell, self._item_before)
+                    outcome = cell.run(self._schedule.job, at_start=self._item_before is None)
                 else:
                     # The world goes on: the vehicle stands where the run before left it.
                     cell.whereabouts.forget_word()
@@ -193,6 +207,14 @@ class Day:
                 self._computer.free_disk()
                 self._clock.sleep(WATCHED_S)
         return self._ended(outcome)
+
+    def _come_from(self, cell: Cell, item: str) -> None:
+        """Do an item at another stop, with nothing that happens, as the first of the day."""
+        self._quiet = True
+        done = cell.run(item, at_start=True)
+        self._quiet = False
+        if done.outcome != "placed":
+            raise CellError(f"{item}, with nothing that happened, ended {done}")
 
     def _ended(self, outcome: RunOutcome) -> tuple[str, str, Path | None]:
         if self._left is not None:
@@ -227,6 +249,8 @@ class Day:
 
     def hear(self, run: Run[object], event: Event) -> None:
         """An event of a run, before the run goes on."""
+        if self._quiet:
+            return
         try:
             self._hear(run, event)
         except Exception as error:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
@@ -140,8 +141,10 @@ class Collision:
 class Collisions:
     """Finds and remembers what meets what; safe between threads."""
 
-    def __init__(self, scene: Scene, ground: PartContact, found: tuple[Collision, ...] = ()) -> None:
-        """`found` are collisions from before."""
+    def __init__(
+        self, scene: Scene, ground: PartContact, found: tuple[Collision, ...] = (), others: Sequence[Scene] = ()
+    ) -> None:
+        """`found` are collisions from before, `others` the scenes of other stops."""
         self._ground = ground
         self._arm = ArmPoints(scene.drawing)
         base = scene.vehicle_from_base
@@ -149,40 +152,18 @@ class Collisions:
         self._base_from_vehicle = inverse(base)
         footprint = np.array([[high[0], high[1]], [high[0], low[1]], [low[0], low[1]], [low[0], high[1]]])
         self._footprint = _lifted(footprint, base)
-        x0, x1, y0, y1 = Board.parse(scene.drawing.station.board).bounds
-        board, half = scene.world_from_board.copy(), np.array([0.5 * (x1 - x0), 0.5 * (y1 - y0), 0.005])
-        board[:3, 3] += board[:3, :3] @ [0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0]
-        centre = board[:3, 3].copy()
-        board[:3, 3] += board[:3, 2] * half[2]
-        post = _POST + centre[:2]
-        table = drawing.TABLE_HALF * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
-        self._standing = {"table": _lifted(table, scene.world_from_table), "board post": post}
-        furthest = np.hypot(*self._footprint.T).max() + np.hypot(*post.T).max()
-        self._far = max(_FAR, float(furthest), float(np.hypot(*self._footprint.T).max()) + 2 * drawing.TABLE_HALF)
-        middle = 0.5 * centre[2]
-        post_pose = np.eye(4)
-        post_pose[:3, 3] = [*post.mean(axis=0), middle]
-        boxes = {
-            "board": (inverse(board), half),
-            "board post": (inverse(post_pose), np.array([*(0.5 * np.ptp(post, axis=0)), middle])),
-        }
         deck = np.eye(4)
         deck[:3, 3] = -DECK.mean(axis=0)
         on_vehicle = {f"obstacle {name}": _box(box) for name, box in scene.drawing.cell.obstacles.items()}
         self._on_vehicle = _Boxes({**on_vehicle, "vehicle": (deck, 0.5 * np.ptp(DECK, axis=0))})
-        top = float(base[2, 3] + DECK[1, 2])
-        for name, drawn in scene.drawing.station.obstacles.items():
-            centred, size = _box(drawn)
-            pose = scene.world_from_place @ inverse(centred)
-            boxes[f"station obstacle {name}"] = inverse(pose), size
-            corners = _moved(size * _CORNERS, pose)
-            if corners[:, 2].min() < top:
-                # As seen from above: the corners of its top and bottom together.
-                outline = scipy.spatial.ConvexHull(corners[:, :2])
-                self._standing[f"station obstacle {name}"] = corners[outline.vertices, :2]
-                self._far = max(
-                    self._far, float(np.hypot(*self._footprint.T).max() + np.hypot(*corners[:, :2].T).max())
-                )
+        self._standing, boxes = _standing(scene)
+        for other in others:
+            outlines, more = _standing(other)
+            of = f"of stop {other.drawing.station.stop}"
+            self._standing |= {f"{name} {of}": outline for name, outline in outlines.items()}
+            boxes |= {f"{name} {of}": box for name, box in more.items()}
+        farthest = max(float(np.hypot(*outline.T).max()) for outline in self._standing.values())
+        self._far = max(_FAR, float(np.hypot(*self._footprint.T).max()) + farthest)
         self._standing_boxes = _Boxes(boxes)
         self._solid = (*boxes, *on_vehicle, "vehicle", "table", "floor")
         self._lock = threading.Lock()
@@ -251,6 +232,38 @@ class Collisions:
         for body, obstacle in new:
             self.note(time, body, obstacle)
         return None if not new else " and ".join(f"the {body} hit the {obstacle}" for body, obstacle in new)
+
+
+def _standing(scene: Scene) -> tuple[dict[str, Vector], dict[str, tuple[Pose, Vector]]]:
+    """What stands at a station: outlines (n, 2) in W of what a vehicle meets, and boxes, box_from_world and half edges,
+    of what an arm meets besides the ground."""
+    x0, x1, y0, y1 = Board.parse(scene.drawing.station.board).bounds
+    board, half = scene.world_from_board.copy(), np.array([0.5 * (x1 - x0), 0.5 * (y1 - y0), 0.005])
+    board[:3, 3] += board[:3, :3] @ [0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0]
+    centre = board[:3, 3].copy()
+    board[:3, 3] += board[:3, 2] * half[2]
+    post_pose = scene.world_from_place.copy()
+    post_pose[:3, 3] = [*centre[:2], 0.0]
+    post = _lifted(_POST, post_pose)
+    table = drawing.TABLE_HALF * np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
+    standing = {"table": _lifted(table, scene.world_from_table), "board post": post}
+    middle = 0.5 * centre[2]
+    post_pose[:3, 3] = [*post.mean(axis=0), middle]
+    boxes = {
+        "board": (inverse(board), half),
+        "board post": (inverse(post_pose), np.array([*(0.5 * np.ptp(_POST, axis=0)), middle])),
+    }
+    top = float(scene.vehicle_from_base[2, 3] + DECK[1, 2])
+    for name, drawn in scene.drawing.station.obstacles.items():
+        centred, size = _box(drawn)
+        pose = scene.world_from_place @ inverse(centred)
+        boxes[f"station obstacle {name}"] = inverse(pose), size
+        corners = _moved(size * _CORNERS, pose)
+        if corners[:, 2].min() < top:
+            # As seen from above: the corners of its top and bottom together.
+            outline = scipy.spatial.ConvexHull(corners[:, :2])
+            standing[f"station obstacle {name}"] = corners[outline.vertices, :2]
+    return standing, boxes
 
 
 class _Boxes:

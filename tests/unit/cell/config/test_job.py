@@ -75,3 +75,47 @@ def test_an_item_that_is_not_there_and_items_without_a_nest_are_told(tmp_path: P
     path.write_text(path.read_text(encoding="utf-8").replace('name = "pot"', 'name = "pot#1"'))
     with pytest.raises(ConfigError, match='"pot#1" is no name'):
         load_job(path)
+
+
+def test_an_item_at_another_stop_has_its_board_way_and_obstacles_and_knows_where_the_first_one_stands() -> None:
+    left, right = (load_job(f"two-stations#{k}")[0] for k in (1, 2))
+    assert (left.at_stop, right.at_stop, load_job("tray4")[0].at_stop) == ("left", "right", None)
+    assert (left.board.spec, right.board.spec) == ("marked_dots:9x7:20mm", "marked_dots:11x9:16mm")
+    assert left.approach == right.approach, "what a stop leaves out is as [approach] has it"
+    assert ([o.name for o in left.obstacle], [o.name for o in right.obstacle]) == ([], ["rack"])
+    assert right.of_item(1) == left and left.of_item(2) == right, "whichever item it is asked of"
+    (first,), (second,) = right.other_stops, left.other_stops
+    assert (first.name, second.name, first.board) == ("left", "right", left.board)
+    assert first.place_from_stop.isApprox(second.place_from_stop.inverse())
+    # The corner is turned to the right: the first stop is behind and to the left of the second.
+    assert first.place_from_stop.translation == pytest.approx((-2.75, 2.75, 0.0))
+    place = first.place_from_stop * left.surface.place_from_surface.se3() * left.place.surface_from_part.se3()
+    assert right.other_items[0][2].isApprox(place)
+    assert load_job("pot")[0].other_stops == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ('stop = "right"', 'stop = "middle"', r'item\.stop "middle" is no \[\[stop\]\] \(there: left, right\)'),
+        ('stop = "right"', 'stop = "left"', "stop right has no item"),
+        ('name = "right"', 'name = "left"', "stop left is there twice"),
+        (
+            "place_from_stop",
+            "# place_from_stop",
+            "stop right: give place_from_stop; it tells of each further stop.*frame of left",
+        ),
+        ('name = "left"\n', 'name = "left"\nplace_from_stop = POSE\n', "stop left: leave out place_from_stop"),
+        ("11x9:16mm", "9x7:16mm", "stops left and right have boards of 9 x 7 points.*board of other counts"),
+        ("11x9:16mm", "7x9:16mm", "stops left and right have boards of 9 x 7 points.*board of other counts"),
+    ],
+)
+def test_stops_that_cannot_be_told_apart_or_found_are_refused(tmp_path: Path, old: str, new: str, told: str) -> None:
+    shipped = job_path("two-stations")
+    text = shipped.read_text()
+    for mesh in ("facets.ply", "shell-part.ply"):
+        text = text.replace(f'"{mesh}"', f'"{shipped.parent / mesh}"')
+    pose = '{ translation = ["0 mm", "0 mm", "0 mm"], rotation = ["0 deg", "0 deg", "0 deg"] }'
+    (path := tmp_path / "mine.toml").write_text(text.replace(old, new.replace("POSE", pose), 1))
+    with pytest.raises(ConfigError, match=told):
+        load_job(path)

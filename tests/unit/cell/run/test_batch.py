@@ -159,10 +159,11 @@ def test_somebody_lets_this_part_be_the_last(opened: Callable[..., Cell]) -> Non
     assert ([run.outcome for run in batch.runs], batch.reason) == (["refused"], "after part 1, as asked")
 
 
+@pytest.mark.parametrize(("name", "shares"), [("swap", True), ("two-stations", False)])
 def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
-    opened: Callable[..., Cell], tmp_path: Path, placed_pot: JobRecord
+    opened: Callable[..., Cell], tmp_path: Path, placed_pot: JobRecord, name: str, shares: bool
 ) -> None:
-    jobs, asked, tried = [load_job(f"swap#{k}")[0] for k in (1, 2)], list[int](), list[int]()
+    jobs, asked, tried = [load_job(f"{name}#{k}")[0] for k in (1, 2)], list[int](), list[int]()
     shared: list[bool] = []
 
     def run(number: int, before: PartsBefore) -> RunOutcome:
@@ -176,11 +177,11 @@ def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
         cell.runs_folder.mkdir()
         batch = perform(open_cell, jobs, 3, run, between=lambda work: asked.append(len(tried)), observer=None)
     assert (tried, asked) == ([1, 2, 3, 4], [2]), "a person at a real cell makes both items ready again"
-    assert shared == [False, True, False, True]
+    assert shared == [False, shares, False, shares], "before another stop the vehicle does not stand yet"
     assert (batch.job, batch.count, batch.reason) == (
-        "swap",
+        name,
         6,
-        "part 4 aborted: seen enough; not tried: swap#1, swap#2",
+        f"part 4 aborted: seen enough; not tried: {name}#1, {name}#2",
     )
 
 

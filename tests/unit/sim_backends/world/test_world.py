@@ -116,3 +116,32 @@ def test_the_items_of_a_job_stand_on_one_table_each_with_its_part_until_that_was
     assert world.parts == 0, "the second one lies as it lay"
     world.make_ready(first.station)
     assert world.parts == 2 and world._items[0].part.untouched, "the first one was taken: all is made ready again"
+
+
+def test_two_stations_stand_in_one_world_each_with_its_board_and_what_it_is_off_by() -> None:
+    there = drawing.pose((-2.75, -2.75, 0.0), (0, -1, 0), (0, 0, 1))
+    nest = drawing.pose((-0.6, 0.0, 0.03), (1, 0, 0), (0, 0, 1))
+    own = replace(drawing.STOCK.station, nest=nest, nest_filled=True, stop="left")
+    other = replace(own, stop="right", place_from_stop=there, board="marked_dots:11x9:16mm")
+    left, right = (replace(drawing.STOCK, station=replace(each, beside=(own, other))) for each in (own, other))
+    assert drawing.read(right.as_json()).as_json() == right.as_json()
+    world = World(3, "nominal", drawing=left, clock=SteppedClock())
+    first, second = (item.scene for item in world._items)
+    off = drawing.inverse(there) @ drawing.inverse(first.world_from_place) @ second.world_from_place
+    assert 1e-3 < np.linalg.norm(off[:3, 3]) < 0.08 and abs(off[2, 3]) < 1e-12 and off[2, 2] == 1.0
+    board = drawing.inverse(second.world_from_place) @ second.world_from_board
+    np.testing.assert_allclose(board, drawing.PLACE_FROM_BOARD, atol=1e-12)
+
+    def stands(station: int) -> bool:
+        x, y = (first, second)[station].world_from_table[:2, 3]
+        return world.collisions.blocks(0.0, (float(x), float(y), 0.0))
+
+    def shown(station: int) -> np.ndarray:
+        facing = (first, second)[station].world_from_board @ drawing.pose((0.08, 0.06, -0.9), (1, 0, 0), (0, 0, 1))
+        return world._cameras.picture("target", facing, np.eye(4), False, 0.01)
+
+    assert stands(0) and stands(1) and world.collisions.found[1].obstacle == "table of stop right"
+    assert shown(0).std() > 20 and shown(1).std() > 20
+    world.make_ready(right.station)
+    assert (world.scene, world.parts) == (second, 0), "both were there all along"
+    assert stands(0) and stands(1) and shown(0).std() > 20

@@ -261,6 +261,7 @@ def test_the_next_command_names_a_cell_that_is_elsewhere(tmp_path: Path) -> None
     (tmp_path / "my cell" / "cell.toml").touch()
     item = {**report, "outcome": "refused", "job_file": f"{job_path('swap')}#2"}
     assert str(next_step(item, folder)).endswith(" -j swap#2")
+    assert "job swap#2 at stop right" in "\n".join(end_screen({**item, "job": "swap#2", "stop": "right"}, folder))
     down = {**item, "part": "released", "next_item": f"{job_path('tray4')}#3"}
     assert str(next_step(down, folder)).endswith(" -j tray4#3")
     assert " -j tray4#3: the next item; " in str(next_step({**down, "outcome": "placed"}, folder))

@@ -5,6 +5,7 @@ The vehicle drives only from where it is known to stand, not too far unseen, and
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 
 from cell.config.cell_config import load_config
-from cell.config.job import Job, load_job
+from cell.config.job import BoardSection, Job, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix
 from cell.procedures.arm.photograph import BoardFix
@@ -26,6 +27,7 @@ from cell.procedures.drive.way import (
     Whereabouts,
     distance,
     drive_line,
+    left_at,
     line_command,
     turn_to,
     wrap,
@@ -146,8 +148,10 @@ SIGHT_M, SIGHT = 2.3, math.radians(40)
 class Site:
     """A simulated cell whose vehicle drives; the board's sight is told by the world's truth."""
 
-    def __init__(self, seed: int = 2, level: str = "nominal") -> None:
-        self.cell = VirtualCell(CONFIG, seed, level)
+    photograph_of: Callable[[BoardSection], BoardFix] | None = None
+
+    def __init__(self, seed: int = 2, level: str = "nominal", cell: VirtualCell | None = None) -> None:
+        self.cell = cell or VirtualCell(CONFIG, seed, level)
         self.vehicle = self.cell.vehicle
         self.whereabouts = Whereabouts(self.vehicle)
         self.notes: list[str] = []
@@ -157,8 +161,11 @@ class Site:
         return Planar(*self.cell.world.vehicle.planar(self.cell.clock.now()))
 
     def photograph(self) -> BoardFix:
+        return self.sight(self.cell.world.scene.world_from_board)
+
+    def sight(self, world_from_board: np.ndarray) -> BoardFix:
         t = self.cell.clock.now()
-        base_from_board = inverse(self.cell.world.world_from_base(t)) @ self.cell.world.scene.world_from_board
+        base_from_board = inverse(self.cell.world.world_from_base(t)) @ world_from_board
         x, y, _ = base_from_board[:3, 3]
         if math.hypot(x, y) > SIGHT_M or abs(math.atan2(y, x)) > SIGHT:
             raise RefusedError("no board found")
@@ -170,6 +177,7 @@ class Site:
         drive = TargetDrive(
             job, VEHICLE_FROM_BASE, self.vehicle, self.whereabouts, self.photograph, clock=self.cell.clock,
             check=lambda: None, progress=lambda share, text: None, note=self.notes.append,
+            photograph_of=self.photograph_of,
         )  # fmt: skip
         return drive.to_target()
 
@@ -283,6 +291,21 @@ def test_another_jobs_board_tells_nothing_about_this_place(site: Site) -> None:
     site.whereabouts.enter(JOB.model_copy(update={"board": board}))
     with pytest.raises(RefusedError, match="board of another job"):
         site.whereabouts.pose()
+
+
+def test_what_was_seen_at_one_stop_counts_at_the_next_and_each_stop_is_kept_clear_of(site: Site) -> None:
+    left, right = (load_job(f"two-stations#{k}")[0] for k in (1, 2))
+    site.whereabouts.enter(left)
+    site.whereabouts.see(Planar.of(left.approach.target.se3()))
+    site.whereabouts.enter(right)
+    stands = site.whereabouts.pose()
+    # 2.75 m back and aside, less 1.05 m before its table: it looks to the left from there.
+    assert (stands.x, stands.y, stands.yaw) == pytest.approx((-2.75, 1.7, math.radians(90)), abs=1e-3)
+    way = Way(right, VEHICLE_FROM_BASE, site.whereabouts)
+    (stop,) = right.other_stops
+    way.require_line(left_at(stop))
+    with pytest.raises(RefusedError, match="of the table of stop left"):
+        way.require_line(left_at(stop) * Planar(2.5, 0.0, 0.0))
 
 
 def seen_at(site: Site, pose: Planar) -> Way:

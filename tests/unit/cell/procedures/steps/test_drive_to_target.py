@@ -9,10 +9,14 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from cell.config.job import BoardSection, load_job
+from cell.devices.simulated.described import Described
+from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_matrix
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.drive.way import Planar, Whereabouts
 from drivers.errors import RefusedError
-from tests.unit.cell.procedures.drive.test_way import JOB, VEHICLE_FROM_BASE, LateVehicle, Site, moved
+from tests.unit.cell.procedures.drive.test_way import CONFIG, JOB, VEHICLE_FROM_BASE, LateVehicle, Site, moved
 
 
 def test_a_vehicle_that_nobody_knows_about_is_not_driven_and_told_what_to_do() -> None:
@@ -151,3 +155,51 @@ def test_a_target_in_the_table_is_not_driven_to() -> None:
         site.run(JOB.model_copy(update={"approach": JOB.approach.model_copy(update={"target": target})}))
     assert moved(Planar.of(JOB.approach.staging.se3()), site.truth()) < 0.05
     assert site.cell.world.collisions.found == ()
+
+
+class TwoStations(Site):
+    """A vehicle that stands before the first stop of `two-stations`, for the item at the second."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed, cell=VirtualCell(CONFIG, seed, "nominal", Described.of("two-stations")))
+        self.left, self.right = (load_job(f"two-stations#{k}")[0] for k in (1, 2))
+        self.boards = {self.left.board: self.cell.world.scene.world_from_board}
+        model, target = self.cell.world.vehicle, Planar.of(self.left.approach.target.se3())
+        model._x, model._y, model._yaw = target.x, target.y, target.yaw
+        self.cell.clock.sleep(0.1)
+        self.cell.make_ready(Described.of("two-stations#2"))
+        self.boards[self.right.board] = self.cell.world.scene.world_from_board
+
+    def photograph_of(self, board: BoardSection) -> BoardFix:
+        return self.sight(self.boards[board])
+
+    def off_target(self) -> Planar:
+        """The vehicle in the true frame of the second stop's target."""
+        place = Planar.of(from_matrix(self.cell.world.scene.world_from_place))
+        return (place * Planar.of(self.right.approach.target.se3())).inverse() * self.truth()
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("seed", [2, 5])
+def test_from_one_stop_it_backs_and_drives_round_to_the_next(seed: int, known: bool) -> None:
+    """By odometry, or in a new process by the board of the stop before which it stands."""
+    site = TwoStations(seed)
+    if known:
+        site.whereabouts.enter(site.left)
+        site.whereabouts.see(Planar.of(site.left.approach.target.se3()))
+    arrival = site.run(site.right)
+    assert max(abs(arrival.error_along), abs(arrival.error_across)) < site.right.approach.tolerance
+    assert math.hypot(site.off_target().x, site.off_target().y) < 0.012
+    assert site.cell.world.collisions.found == ()
+    assert ["stands before stop left" in note for note in site.notes] == [True] * (not known)
+    # And back, as in the next round.
+    site.cell.make_ready(Described.of("two-stations#1"))
+    site.run(site.left)
+    assert moved(Planar.of(site.left.approach.target.se3()), site.truth()) < 0.012
+
+
+def test_a_vehicle_that_sees_the_board_of_no_stop_is_not_driven() -> None:
+    site = TwoStations(2)
+    site.boards[site.left.board] = site.boards[site.right.board]
+    with pytest.raises(RefusedError, match=r"has just connected.*no board found"):
+        site.run(site.right)
