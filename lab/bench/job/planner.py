@@ -24,7 +24,8 @@ from cell.motion.collision import CollisionError
 from cell.motion.kinematics import Joints
 from cell.motion.planning import Planner
 
-PEERS: dict[str, Callable[[Any], Any]] = {
+MakePlanner = Callable[[Any], Any]
+PEERS: dict[str, MakePlanner] = {
     "OMPL RRT-Connect": geometric.RRTConnect, "OMPL LBKPIECE": geometric.LBKPIECE1, "OMPL BIT*": geometric.BITstar,
 }  # fmt: skip
 """As they come: their own range, their own resolution. A way of theirs may pass through a body between two looks."""
@@ -89,7 +90,7 @@ def _pair(joined: Planner, start: Joints, end: Joints, patience: float) -> dict[
     return row
 
 
-def by_ompl(make: Callable[[Any], Any], joined: Planner, start: Joints, end: Joints, seconds: float) -> Search:
+def by_ompl(make: MakePlanner, joined: Planner, start: Joints, end: Joints, seconds: float) -> Search:
     """A search by one of OMPL's planners within the arm's whole limits, at most `seconds` of processor time."""
     space, bounds = base.RealVectorStateSpace(6), base.RealVectorBounds(6)
     for joint in range(6):
