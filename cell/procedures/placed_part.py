@@ -34,7 +34,9 @@ NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 OFF_DRAWING = "the part itself is not as drawn there: bent, worn, cut, or another one"
 SUNK_M = 25e-6
 """So far below the surface a part may seem to be, beyond noise and what its pose is off by: form of both, and dirt."""
-SUNK = "where it is seen, the part as drawn would {} the surface by {:.2f} mm"
+SUNK = "the part as drawn would {} the surface by {:.2f} mm where it is seen"
+ASIDE = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
+"""Of a motion, what is along the surface."""
 AMISS = "the part is not as drawn: worn below, its underside elsewhere below its upper side, or another one"
 ASIDE_UNSEEN = "it lies aside where its faces do not show that, or a piece of it is missing"
 COVERED = "something was left on the part: look at its face"
@@ -110,12 +112,12 @@ class PlacedPart:
     def over(self, gap: MatingGap | None, before: tuple[float, ...] = ()) -> PlacedPart:
         """With the `gap` below it, as it was seen, and how far off it lay `before` each correction. A part goes into
         nothing: where it seems to, its underside lies elsewhere below what was seen of it than drawn, and the part may
-        be off by as much as brings it to rest. So is one that was placed again by what was seen, and seems to hang."""
+        lie as far aside as brings it to rest. So may one that was placed again by what was seen, and seems to hang."""
         found, least = replace(self, gap=gap, before=before), SUNK_M + self.unsure
         if gap is None or self.unseen:
             return found
         sunk = gap.sunk if gap.sunk > least else -gap.floating if before and gap.floating > least else 0.0
-        off = bool(sunk) * gap.off_contact(self.seen.surface_from_part.translation, SHIFTED)
+        off = bool(sunk) * ASIDE * gap.off_contact(self.seen.surface_from_part.translation, SHIFTED)
         return replace(found, sunk=sunk, covariance=self.covariance + np.diag(off**2))
 
     @cached_property
@@ -225,7 +227,7 @@ class PlacedPart:
     @property
     def as_it_lies(self) -> str:
         """What has most likely happened to it, by where it was seen and how it would rest there."""
-        if not self.sunk:
+        if not self.sunk or self.likely not in (UNCLEAR, LIKELY["shifted"]):
             return self.likely
         return AMISS + f". If it is, {self.likely}" * (self.likely != UNCLEAR)
 
@@ -261,7 +263,7 @@ class PlacedPart:
         failed = [each for each in self.features if not each.measured.kept]
         out = "".join(f". Out of tolerance: {each.words}" for each in failed)
         out += "" if self.unlike is None else f". {self.unlike.words}"
-        out += f". {self.sunk_words}" * bool(self.sunk)
+        out += f". Besides, {self.sunk_words}" * bool(self.sunk)
         likely = self._cause(measured, failed)
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
