@@ -102,7 +102,7 @@ class FinishedJob:
         _write(self.folder, report)
         return report
 
-    def _draw(self, report: dict[str, Any]) -> None:
+    def _draw(self, report: dict[str, object]) -> None:
         """The run's picture; why there is none is told in the `report`."""
         picture = self.folder / "picture.png"
         try:

@@ -24,7 +24,7 @@ from cell.motion.collision import CollisionError
 from cell.motion.kinematics import Joints
 from cell.motion.planning import Planner
 
-MakePlanner = Callable[[Any], Any]
+MakePlanner = Callable[..., Any]
 PEERS: dict[str, MakePlanner] = {
     "OMPL RRT-Connect": geometric.RRTConnect, "OMPL LBKPIECE": geometric.LBKPIECE1, "OMPL BIT*": geometric.BITstar,
 }  # fmt: skip

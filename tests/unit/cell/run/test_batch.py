@@ -235,11 +235,9 @@ def test_a_fault_ends_it_whatever_the_job_says_of_refusals_and_the_command_line_
     assert typed(*words, "--until", "board_photo")[0] == 2
 
 
-def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(open_cell: Path, typed: Typed) -> None:
+def test_a_dry_run_that_would_ask_where_nobody_is_is_refused(here: Path, typed: Typed) -> None:
     """No terminal is here: the batch would wait for ever."""
-    (open_cell / "pot.ply").write_bytes(job_path("pot").with_suffix(".ply").read_bytes())
-    (open_cell / "asks.toml").write_text(
-        f'{job_path("pot").read_text(encoding="utf-8")}\n[batch]\non_refusal = "ask"\n'
-    )
+    (here / "pot.ply").write_bytes(job_path("pot").with_suffix(".ply").read_bytes())
+    (here / "asks.toml").write_text(f'{job_path("pot").read_text(encoding="utf-8")}\n[batch]\non_refusal = "ask"\n')
     code, _, error = typed("dry-run", "-j", "asks", "--count", "2", "--clock", "virtual")
     assert code == 2 and "there is no terminal to ask at" in " ".join(error.split())

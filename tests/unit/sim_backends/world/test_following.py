@@ -122,4 +122,4 @@ def test_a_measured_board_brings_the_world_to_the_station(pair: tuple[World, Wor
 @pytest.mark.parametrize("row", [[1.0], [1.0, 2.0, 3.0], [float("nan"), 1.0], ["x", 1.0]])
 def test_what_is_no_reading_is_refused(pair: tuple[World, World, WorldFollowing], row) -> None:
     with pytest.raises((ValueError, TypeError)):
-        pair[2].notify("rail", [row])
+        pair[2].tell("rail", [row])

@@ -157,7 +157,7 @@ def on_the_bus(path: Path) -> None:
 
     statistics.traffic.listener = listen
     link = CanLink(
-        "vehicle", "virtual", str(path), bitrate=500_000, options={}, receive=lambda frame: None,
+        "vehicle", "virtual", str(path), bitrate=500_000, receive=lambda frame: None,
         idle=lambda seconds: None, statistics=statistics, alone="it stops",
     )  # fmt: skip
     other = can.Bus(interface="virtual", channel=str(path))

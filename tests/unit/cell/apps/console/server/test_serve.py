@@ -34,7 +34,7 @@ def test_a_stop_is_carried_out_in_a_flood(tmp_path: Path, seconds: float, least_
         with Flood(server) as flood:
             cookie, key = server.enter()
             time.sleep(1.0)
-            pids = {"Threads": (server.process.pid, os.getpid()), "VmRSS": (server.process.pid,)}
+            pids = {"Threads": (server.process._process.pid, os.getpid()), "VmRSS": (server.process._process.pid,)}
             before = {what: [status(pid, what) for pid in of] for what, of in pids.items()}
             late, answered, end, said = [], [], time.monotonic() + seconds, flood.said
             while time.monotonic() < end:
