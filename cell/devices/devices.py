@@ -77,14 +77,14 @@ class Devices:
 
     @property
     def bright(self) -> bool:
-        """Whether ambient light has whitened a picture since `take_any_light`."""
-        return any(camera is not None and camera.longest < math.inf for camera in self._cameras)
+        """Whether ambient light has whitened a picture since `forget_ambient_light`."""
+        return any(camera is not None and camera.longest_exposure < math.inf for camera in self._cameras)
 
-    def take_any_light(self) -> None:
+    def forget_ambient_light(self) -> None:
         """Forget how bright it was: the cameras expose as long as they are asked to."""
         for camera in self._cameras:
             if camera is not None:
-                camera.longest = math.inf
+                camera.longest_exposure = math.inf
 
     @property
     def _cameras(self) -> tuple[GatedCamera | None, ...]:

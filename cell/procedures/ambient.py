@@ -1,8 +1,8 @@
 """Ambient light: how long the cameras may expose under it, and whether the laser's line stands out of it.
 
 In a room a picture at the exposure that is asked for shows next to none, and nothing is done here. Where a picture is
-whitened by it, the camera exposes no longer than `GatedCamera.longest` until the next job or calibration begins; before
-each sweep the scan camera then takes a picture without the laser, which says how long it may expose.
+whitened by it, the camera exposes no longer than `GatedCamera.longest_exposure` until the next job or calibration
+begins; before each sweep the scan camera then takes a picture without the laser, which says how long it may expose.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def shorten(camera: GatedCamera, exposure: float) -> None:
     try:
         camera.shorten(max(STEP_S, math.floor(exposure / STEP_S) * STEP_S))
     except (LimitError, DeviceFault) as error:
-        camera.longest = math.inf
+        camera.longest_exposure = math.inf
         raise RefusedError(
             f"ambient light whitens the pictures of {camera.name}, and it takes none as short as {1e3 * exposure:.3f} "
             f"ms ({error}). Shade the place, or put a grey or a band-pass filter before the lens"

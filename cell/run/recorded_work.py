@@ -191,7 +191,7 @@ class RecordedWork:
             nonlocal stops
             with devices.gate.entered(context.token):
                 context.check()
-                devices.take_any_light()
+                devices.forget_ambient_light()
                 given = WorkContext(context.check, context.safe_point, context.progress, frames.keep, context.ask)
                 made = work(given)
             # A stop that a person asks for from here on is not cleared.

@@ -355,11 +355,14 @@ may take."""
 
 
 class GatedCamera(Gated[interfaces.Camera]):
-    """A camera whose commands are told at the gate. `tries`: how often at most a picture is asked for. `longest`: of
-    exposures, s, what ambient light allows; a longer one that is asked for is shortened to it."""
+    """A camera whose commands are told at the gate.
+
+    `tries`: how often at most a picture is asked for. `longest_exposure`: what ambient light allows, s; a longer one
+    that is asked for is shortened to it.
+    """
 
     tries = 1
-    longest = math.inf
+    longest_exposure = math.inf
 
     def __init__(self, bare: interfaces.Camera, gate: Gate) -> None:
         super().__init__(bare, gate)
@@ -373,13 +376,13 @@ class GatedCamera(Gated[interfaces.Camera]):
 
     def configure(self, exposure: float, frame_rate: float) -> None:
         """See `Camera.configure`."""
-        self._asked, exposure = (exposure, frame_rate), min(exposure, self.longest)
+        self._asked, exposure = (exposure, frame_rate), min(exposure, self.longest_exposure)
         self.gate.asked(DeviceCommand(self.name, "configure", {"exposure": exposure, "frame_rate": frame_rate}))
         self.bare.configure(exposure, frame_rate)
 
     def shorten(self, longest: float) -> None:
         """Expose no longer than `longest`, s, from now on; raises what `configure` raises."""
-        self.longest = longest
+        self.longest_exposure = longest
         self.configure(*self._asked)
 
     def grab(self, timeout: float = 2.0) -> interfaces.Frame:

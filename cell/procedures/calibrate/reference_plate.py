@@ -76,7 +76,7 @@ def require_reference_plate(config: CellConfig, devices: Devices, keep: Keep) ->
         )
     if (seen := see_reference_plate(config, devices, keep)) is None:
         if devices.bright:
-            exposure = 1e3 * min(devices.scan_camera.longest, config.calibration.stripe_exposure)
+            exposure = 1e3 * min(devices.scan_camera.longest_exposure, config.calibration.stripe_exposure)
             raise hidden(
                 f"ambient light leaves an exposure of {exposure:.2f} ms, and the laser's line on the plate on the claw "
                 "stands out in too few of the rows", 0.0

@@ -308,7 +308,7 @@ def _run_step(workplace: Workplace, context: StepContext) -> VehicleArrival:
     if warnings := vehicle.state().warnings:
         context.note(text=f"the vehicle warns: {'; '.join(warnings)}")
     vehicle.recover()
-    workplace.devices.take_any_light()
+    workplace.devices.forget_ambient_light()
     head = _checked(workplace, context)
     if (stands := workplace.parts_before.arrival) is not None and workplace.whereabouts.still:
         vehicle.brake()

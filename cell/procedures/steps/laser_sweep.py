@@ -75,7 +75,6 @@ def laser_sweep(
     warm_up(geometry)
     swaths, notes = [], list[tuple[str, ...]]()
     for k, plan in enumerate(plan.back if back else plan for plan in plans):
-        check()
         name = f"sweep {k + 1} of {len(plans)}"
 
         def notify(fraction: float, text: str, k: int = k, name: str = name) -> None:
@@ -83,6 +82,7 @@ def laser_sweep(
 
         notify(0.02, "arm to the scan pose")
         for _ in range(TRIES):
+            check()
             collector = SweepCollector(geometry, scan, keep_frame, notify)
             sweeping(collector, base_from_surface)
             swath = sweep(plan, workplace.mover, devices, errors, collector)

@@ -72,9 +72,10 @@ def planner(job: str, count: int, seed: int, patience: float, done: Callable[[st
 def free_posture(joined: Planner, drawn: np.random.Generator) -> Joints:
     """Joint angles (6,) rad within half a turn and the arm's limits, at which nothing touches."""
     low, high = np.maximum(joined.limits.lower, -np.pi), np.minimum(joined.limits.upper, np.pi)
-    while not joined.collisions.free(joints := drawn.uniform(low, high)):
-        pass
-    return joints
+    while True:
+        joints = drawn.uniform(low, high)
+        if joined.collisions.free(joints):
+            return joints
 
 
 def _pair(joined: Planner, start: Joints, end: Joints, patience: float) -> dict[str, Search]:

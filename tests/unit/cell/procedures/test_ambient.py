@@ -51,8 +51,8 @@ def test_a_camera_exposes_no_longer_than_the_light_allows_until_the_next_job(cel
     camera.configure(2e-3, 10.0)
     assert camera.grab().exposure == pytest.approx(0.12e-3)
     assert "0.12 ms" in meet_light(devices)[0]
-    devices.take_any_light()
-    assert camera.longest == math.inf and not devices.bright
+    devices.forget_ambient_light()
+    assert camera.longest_exposure == math.inf and not devices.bright
     camera.configure(2e-3, 10.0)
     assert camera.grab().exposure == pytest.approx(2e-3)
 
@@ -64,7 +64,7 @@ def test_a_camera_that_cannot_expose_so_briefly_refuses_and_names_the_light(cell
 
 def test_the_exposure_follows_what_the_camera_sees(cell: VirtualCell, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = cell.devices.scan_camera
-    monkeypatch.setattr(camera, "grab", lambda: frame(1e6 * camera.longest, camera.longest))
+    monkeypatch.setattr(camera, "grab", lambda: frame(1e6 * camera.longest_exposure, camera.longest_exposure))
     assert adapted(camera, frame(255.0, 2e-3)).exposure == pytest.approx(0.12e-3)
 
 
