@@ -32,9 +32,9 @@ NO_FLUSH = "how flush its edge is was not seen: no surface shows near it, or a v
 BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 OFF_DRAWING = "the part itself is not as drawn there: bent, worn, cut, or another one"
-SUNK_M = 25e-6
-"""So far below the surface a part may seem to be, beyond noise and what its pose is off by: form of both, and dirt."""
-SUNK = "the part as drawn would {} the surface by {:.2f} mm where it is seen"
+INTERFERENCE_M = 25e-6
+"""Interference that form and dirt explain, m, beyond noise and what the pose of the part is off by."""
+OFF_CONTACT = "the part as drawn would {} the surface by {:.2f} mm where it is seen"
 ASIDE = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
 """Of a motion, what is along the surface."""
 AMISS = "the part is not as drawn: worn below, its underside elsewhere below its upper side, or another one"
@@ -60,8 +60,8 @@ class PlacedPart:
     it. `before` is how far off, m, it lay before each correction. `came` is how it came to lie when it was first put
     down, had nothing been allowed for, `slips` how it moved in each correction as the claw opened (`GraspSeries`).
     `named` are the features that the job names, `own` what the points about them say by themselves, by name. `unlike`
-    is what of its face is not there, or covered; it seems `sunk` so far, m, into the surface, below 0 one that
-    hangs above it. `axes` says, for people, whose axes the figures are in.
+    is what of its face is not there, or covered. By its `interference`, m, it seems to go into the surface; below 0 it
+    seems to hang above it. `axes` says, for people, whose axes the figures are in.
     """
 
     seen: PartPose
@@ -78,7 +78,7 @@ class PlacedPart:
     named: tuple[FeatureSection, ...] = ()
     own: Mapping[str, LocalDeviation] = field(default_factory=dict)
     unlike: FacePatch | None = None
-    sunk: float = 0.0
+    interference: float = 0.0
     axes: str = "the surface's axes"
 
     @classmethod
@@ -110,15 +110,21 @@ class PlacedPart:
         )  # fmt: skip
 
     def over(self, gap: MatingGap | None, before: tuple[float, ...] = ()) -> PlacedPart:
-        """With the `gap` below it, as it was seen, and how far off it lay `before` each correction. A part goes into
-        nothing: where it seems to, its underside lies elsewhere below what was seen of it than drawn, and the part may
-        lie as far aside as brings it to rest. So may one that was placed again by what was seen, and seems to hang."""
-        found, least = replace(self, gap=gap, before=before), SUNK_M + self.unsure
+        """With the `gap` below it, as it was seen, and how far off it lay `before` each correction.
+
+        No part goes into its surface. One that seems to has its underside elsewhere than drawn below its upper side. It
+        may lie as far aside as brings it to rest. The same holds for one that was corrected and then seems to hang.
+        """
+        found, least = replace(self, gap=gap, before=before), INTERFERENCE_M + self.unsure
         if gap is None or self.unseen:
             return found
-        sunk = gap.sunk if gap.sunk > least else -gap.floating if before and gap.floating > least else 0.0
-        off = bool(sunk) * ASIDE * gap.off_contact(self.seen.surface_from_part.translation, SHIFTED)
-        return replace(found, sunk=sunk, covariance=self.covariance + np.diag(off**2))
+        interference = 0.0
+        if gap.interference > least:
+            interference = gap.interference
+        elif before and gap.clearance > least:
+            interference = -gap.clearance
+        off = bool(interference) * ASIDE * gap.off_contact(self.seen.surface_from_part.translation, SHIFTED)
+        return replace(found, interference=interference, covariance=self.covariance + np.diag(off**2))
 
     @cached_property
     def offsets(self) -> Vector:
@@ -220,14 +226,14 @@ class PlacedPart:
         return next((LIKELY[name] for name in clear), UNCLEAR)
 
     @property
-    def sunk_words(self) -> str:
+    def off_contact_words(self) -> str:
         """For people, of a part that seems to go into the surface, or to hang."""
-        return SUNK.format("go into" if self.sunk > 0.0 else "hang above", 1e3 * abs(self.sunk))
+        return OFF_CONTACT.format("go into" if self.interference > 0.0 else "hang above", 1e3 * abs(self.interference))
 
     @property
     def as_it_lies(self) -> str:
         """What has most likely happened to it, by where it was seen and how it would rest there."""
-        if not self.sunk or self.likely not in (UNCLEAR, LIKELY["shifted"]):
+        if not self.interference or self.likely not in (UNCLEAR, LIKELY["shifted"]):
             return self.likely
         return AMISS + f". If it is, {self.likely}" * (self.likely != UNCLEAR)
 
@@ -263,7 +269,7 @@ class PlacedPart:
         failed = [each for each in self.features if not each.measured.kept]
         out = "".join(f". Out of tolerance: {each.words}" for each in failed)
         out += "" if self.unlike is None else f". {self.unlike.words}"
-        out += f". Besides, {self.sunk_words}" * bool(self.sunk)
+        out += f". Besides, {self.off_contact_words}" * bool(self.interference)
         likely = self._cause(measured, failed)
         shift = ", ".join(f"{1e3 * v:+.2f}" for v in self.offsets.mean(axis=0))
         turn = ", ".join(f"{1e3 * v:+.1f}" for v in self.turn)
@@ -298,7 +304,7 @@ class PlacedPart:
             *(self.flush.notes if self.flush else (NO_FLUSH,) * bool(self.seen.beside)),
             *((more,) if np.abs(self._times).max() > CLEARLY else ()),
             *self.pushed,
-            *((self.sunk_words,) if self.sunk else ()),
+            *((self.off_contact_words,) if self.interference else ()),
             *(f"not seen of the placed part: {motion}" for motion in self.unseen),
             *(WHOLE.format(each.section.kind, each.section.name) for each in self.features if not each.asked),
         )

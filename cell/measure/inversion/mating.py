@@ -6,7 +6,7 @@ not lie where its pose says, and nothing but its own underside can tell.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio as pin
@@ -23,7 +23,7 @@ SAMPLES = 40_000
 DEEPEST_M = 1.5e-3
 """What was scanned farther below the drawn surface is not the surface: a table beside it, or a hole."""
 FORM_M = 20e-6
-"""Of a gap, one standard deviation, roughly."""
+"""What the form of part and surface makes of a gap, m, one standard deviation; assumed."""
 APART = "below the part as drawn there is nothing of the surface, or the triangles of part.mesh face inwards"
 NEXT_STEP = (
     "See that part.mesh is the drawing of this part, in the datum of grasp.flange_from_part and "
@@ -44,7 +44,7 @@ class MatingGap:
     gaps: Array
     noise: Array
     seen: float
-    opening: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    opening: Array
 
     @property
     def overlap(self) -> float:
@@ -52,21 +52,21 @@ class MatingGap:
         return float(np.max(-self.gaps - self.noise))
 
     @property
-    def sunk(self) -> float:
-        """By how much, m, a twentieth of the squares interfere or more, beyond their noise: one alone may be dirt."""
+    def interference(self) -> float:
+        """What 5 % of the squares interfere by or more, m, beyond their noise: a single one may be dirt."""
         return float(np.percentile(-self.gaps - self.noise, 95))
 
     @property
-    def floating(self) -> float:
-        """By how much, m, all but a twentieth of the squares are apart or more: all of them average out their noise."""
+    def clearance(self) -> float:
+        """What 95 % of the squares are apart by or more, m; the noise of so many averages out."""
         return float(np.percentile(self.gaps, 5))
 
     def off_contact(self, about: Array, sigmas: Array) -> Array:
-        """The motion (6,), m and rad, surface axes, about a point (3,), by which the part is off lying flush: by least
-        squares, where it is known beforehand to `sigmas` (6,)."""
+        """The motion (6,), m and rad, surface axes, about a point (3,) m, that would close all gaps: least squares with
+        the prior `sigmas` (6,)."""
         rows = np.hstack([self.opening, np.cross(self.places - about, self.opening)]) * sigmas
-        told = rows.T @ rows + FORM_M**2 * np.eye(6)
-        return np.asarray(sigmas * np.linalg.solve(told, rows.T @ self.gaps))
+        normal = rows.T @ rows + FORM_M**2 * np.eye(6)
+        return np.asarray(sigmas * np.linalg.solve(normal, rows.T @ self.gaps))
 
     @property
     def apart(self) -> float:

@@ -102,8 +102,8 @@ def _worth_correcting(
     why = f"placed again it would be {1e3 * hope:.2f} mm off"
     if found.unlike is not None:
         why = found.unlike.words
-    elif found.sunk:
-        why = found.sunk_words
+    elif found.interference:
+        why = found.off_contact_words
     elif found.seen.moved is not None:
         why = "surface or vehicle does not stand where it was swept, and nobody looked where the claw would go"
     elif found.aside >= FARTHEST_M:

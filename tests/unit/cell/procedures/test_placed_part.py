@@ -115,22 +115,22 @@ def test_a_part_that_seems_to_go_into_the_surface_may_be_off_by_what_brings_it_o
     there, rests = part(moved(0.3e-3)), part(moved())
     gap, flush = (drawn_gap(nominal, each.seen.surface_from_part, underside) for each in (there, rests))
     found = there.over(gap)
-    assert 0.05e-3 < found.sunk < 0.2e-3 and any("would go into the surface" in note for note in found.notes)
+    assert 0.05e-3 < found.interference < 0.2e-3 and any("would go into the surface" in note for note in found.notes)
     assert np.sqrt(np.diag(found.covariance))[:3] == pytest.approx([0.3e-3, 1e-5, 1e-5], abs=0.02e-3)
     assert there.in_tolerance(PLACE) and not found.in_tolerance(PLACE)
     told = str(found.misplaced(PLACE))
     assert AMISS in told and UNCLEAR not in told and "would go into the surface" in told
-    assert rests.over(flush).sunk == 0.0 and np.array_equal(rests.over(flush).covariance, rests.covariance)
+    assert rests.over(flush).interference == 0.0 and np.array_equal(rests.over(flush).covariance, rests.covariance)
     high = part(moved(z=0.1e-3))
     up = drawn_gap(nominal, high.seen.surface_from_part, underside)
-    assert high.over(up).sunk == 0.0, "it may lie on something"
+    assert high.over(up).interference == 0.0, "it may lie on something"
     again = high.over(up, (0.2e-3,))
-    assert again.sunk == pytest.approx(-0.1e-3, abs=2e-6) and again.in_tolerance(PLACE), "it is seen how high"
+    assert again.interference == pytest.approx(-0.1e-3, abs=2e-6) and again.in_tolerance(PLACE), "it is seen how high"
     assert again.before == (0.2e-3,) and any("would hang above the surface by 0.10 mm" in note for note in again.notes)
     unsure = part(moved(0.3e-3), sigma=0.1e-3)
-    assert unsure.over(gap).sunk == 0.0, "it may lie where it goes into nothing"
+    assert unsure.over(gap).interference == 0.0, "it may lie where it goes into nothing"
     unseen = part(moved(0.3e-3), weak=("translation along the x axis of the surface frame",))
-    assert unseen.over(gap).sunk == 0.0, "it was not seen where it lies"
+    assert unseen.over(gap).interference == 0.0, "it was not seen where it lies"
 
 
 def test_of_a_motion_only_what_is_along_the_surface_counts_as_aside() -> None:

@@ -97,7 +97,7 @@ def test_a_wrong_revision_is_refused_where_it_differs() -> None:
 
 def test_one_square_of_noise_is_no_overlap() -> None:
     gaps, noise = np.array([0.0, -0.5e-3]), np.array([1e-6, 0.3e-3])
-    found = MatingGap(np.zeros((2, 3)), gaps, noise, 1.0)
+    found = MatingGap(np.zeros((2, 3)), gaps, noise, 1.0, np.zeros((2, 3)))
     assert found.overlap == pytest.approx(0.2e-3)
     assert found.problem(TOLERANCE) is None
     assert replace(found, noise=1e-6 * np.ones(2)).problem(TOLERANCE) is not None
@@ -106,11 +106,11 @@ def test_one_square_of_noise_is_no_overlap() -> None:
 def test_what_is_off_contact_brings_a_part_back_that_goes_into_the_surface() -> None:
     off = pin.SE3(pin.exp3(np.array([0.002, -0.001, 0.003])), np.array([0.2e-3, -0.15e-3, -0.05e-3]))
     found = drawn_gap(POT, off, surface_of(PART))
-    assert found is not None and 0.05e-3 < found.sunk < found.overlap
+    assert found is not None and 0.05e-3 < found.interference < found.overlap
     motion = found.off_contact(off.translation, np.array([2e-3] * 3 + [20e-3] * 3))
     assert motion == pytest.approx([0.2e-3, -0.15e-3, -0.05e-3, 0.002, -0.001, 0.003], rel=0.03, abs=5e-6)
     deep = np.where(np.arange(len(found.gaps)) == 0, -0.5e-3, 0.0)
-    assert replace(found, gaps=deep, noise=0.0 * deep).sunk == 0.0, "one square may be dirt"
+    assert replace(found, gaps=deep, noise=0.0 * deep).interference == 0.0, "one square may be dirt"
 
 
 def test_the_scanned_surface_tells_the_same(placed_pot: JobRecord) -> None:
@@ -135,6 +135,6 @@ def test_a_part_that_lies_elsewhere_has_nothing_below_it() -> None:
 
 
 def test_figures_are_for_people_and_for_the_journal(tmp_path: Path) -> None:
-    found = MatingGap(np.zeros((3, 3)), np.array([-0.12e-3, 0.0, 0.3e-3]), np.zeros(3), 0.87)
+    found = MatingGap(np.zeros((3, 3)), np.array([-0.12e-3, 0.0, 0.3e-3]), np.zeros(3), 0.87, np.zeros((3, 3)))
     assert found.words == "gap -0.12 to 0.30 mm, 0.00 mm in the middle; 87 % of it seen"
     assert found.as_dict() == {"least_mm": -0.12, "median_mm": 0.0, "largest_mm": 0.3, "seen": 0.87}
