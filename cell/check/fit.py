@@ -21,7 +21,8 @@ from cell.measure.geometry.poses import transform
 from cell.measure.vision.board.view import BoardSpec, centre_of, parse_board
 from cell.motion.collision import tool_bodies, vehicle_bodies
 from cell.procedures.arm.photograph import look_pose
-from cell.procedures.drive.way import Planar, Way, left_at
+from cell.procedures.drive.driving import Planar
+from cell.procedures.drive.way import Way, left_at
 from cell.procedures.sought_part import around, ground_below, nominal_of, sought
 from cell.procedures.steps import pick, pick_nest, verify
 from cell.procedures.steps.kinds import kind_of

@@ -18,7 +18,7 @@ from cell.measure.inversion.mating import APART, NEXT_STEP, MatingGap, drawn_gap
 from cell.measure.inversion.nominal import NominalSurface, read_mesh
 from cell.measure.vision.board.view import centre_of, parse_board
 from cell.motion.collision import Body, station_bodies, vehicle_bodies
-from cell.procedures.drive.way import MAX_HEADING, Planar, wrap
+from cell.procedures.drive.driving import MAX_HEADING, Planar, wrap
 from cell.procedures.steps import verify
 from cell.procedures.steps.kinds import kind_of
 from drivers.interfaces import Vector

@@ -17,7 +17,7 @@ from cell.measure.geometry.poses import from_parts, from_ur
 from cell.measure.vision.board.view import parse_board
 from cell.procedures.arm.photograph import drawn_interim_view, look_pose
 from cell.procedures.calibrate.interim import resting_pose
-from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, driven, turn_to
+from cell.procedures.drive.driving import Planar, RelativeOdometry, drive_line, driven, turn_to
 from cell.run.recorded_work import WorkContext
 from drivers.common.units import parse_quantity
 from drivers.errors import ConfigError, DeviceFault, LimitError

@@ -22,8 +22,10 @@ They move: by `motion` times what a suite would do by itself, and as fast.
 A simulated device is also given faults, where its bench says how (`Faults`); with a real one those tests are skipped.
 """
 
+from cell.devices.contracts.arm import ArmContract
 from cell.devices.contracts.device import Bench, CameraContract, ClawContract, DeviceContract, Faults, LaserContract
-from cell.devices.contracts.moving import ArmContract, RailContract, VehicleContract
+from cell.devices.contracts.rail import RailContract
+from cell.devices.contracts.vehicle import VehicleContract
 
 __all__ = [
     "ArmContract", "Bench", "CameraContract", "ClawContract", "DeviceContract", "Faults", "LaserContract",

@@ -15,19 +15,8 @@ from cell.motion.kinematics import HOME, Unreachable
 from cell.procedures.arm.moves import Pace
 from cell.procedures.arm.photograph import BoardFix, look_pose
 from cell.procedures.calibrate.interim import InterimCheck, interim_check
-from cell.procedures.drive.way import (
-    BACK_UP,
-    MAX_HEADING,
-    Planar,
-    Way,
-    Whereabouts,
-    drive_line,
-    left_at,
-    next_step,
-    speed_onto,
-    turn_to,
-    wrap,
-)
+from cell.procedures.drive.driving import MAX_HEADING, Planar, drive_line, turn_to, wrap
+from cell.procedures.drive.way import BACK_UP, Way, Whereabouts, left_at, next_step, speed_onto
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
 from cell.procedures.sweep.sweeping import check_lost_steps
 from drivers.clock import Clock

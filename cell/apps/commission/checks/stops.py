@@ -11,7 +11,7 @@ import numpy as np
 
 from cell.apps.commission.check import CommissionCheck, Result, refused
 from cell.apps.commission.workplace import CommissionWorkplace
-from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, driven
+from cell.procedures.drive.driving import Planar, RelativeOdometry, drive_line, driven
 from cell.run.recorded_work import WorkContext
 from drivers.errors import Aborted, InterlockError
 from drivers.interfaces import ArmSafety, Motion

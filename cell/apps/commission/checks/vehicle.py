@@ -15,7 +15,7 @@ from cell.apps.commission.workplace import CommissionWorkplace
 from cell.config.job import job_path, ships
 from cell.measure.vision.board.view import BoardSpec, parse_board
 from cell.procedures.arm.photograph import look_pose
-from cell.procedures.drive.way import Planar, RelativeOdometry, drive_line, driven
+from cell.procedures.drive.driving import Planar, RelativeOdometry, drive_line, driven
 from drivers.errors import RefusedError
 from drivers.interfaces import Frame
 

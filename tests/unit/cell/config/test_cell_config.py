@@ -21,7 +21,8 @@ from cell.measure.vision.board.view import parse_board
 from cell.motion.collision import CollisionError
 from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import Mover
-from cell.procedures.drive.way import Planar, Upright, Way, Whereabouts
+from cell.procedures.drive.driving import Planar
+from cell.procedures.drive.way import Upright, Way, Whereabouts
 from drivers.errors import ConfigError, InterlockError, RefusedError
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 

@@ -16,7 +16,7 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.inversion import PlacePose
 from cell.measure.vision.board.view import BoardView, parse_board
 from cell.procedures.arm.photograph import APART_S, BoardFix, swing, swing_covariance
-from cell.procedures.drive.way import Planar
+from cell.procedures.drive.driving import Planar
 from cell.procedures.steps.board_photo import WAIT_S, WAITS, photographed, require_board_unmoved, until_quiet
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, PartsBefore
 from drivers.errors import RefusedError

@@ -14,7 +14,8 @@ from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import from_matrix
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.drive.way import Planar, Whereabouts
+from cell.procedures.drive.driving import Planar
+from cell.procedures.drive.way import Whereabouts
 from drivers.errors import RefusedError
 from tests.unit.cell.procedures.drive.test_way import CONFIG, JOB, VEHICLE_FROM_BASE, LateVehicle, Site, moved
 
