@@ -62,6 +62,7 @@ GROUPS = (
         "unit/cell/run/report/page",
         "unit/cell/run/test_job_run.py",
         "unit/cell/run/test_batch.py",
+        "unit/cell/apps/console/host/test_part_queue.py",
         "unit/cell/apps/cli/test_display.py",
         "unit/cell/devices/simulated/test_direct.py",
         "integration/virtual/test_described_jobs.py",

@@ -168,7 +168,7 @@ def perform(
             before = _known_after(before, last)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()
-            notify(Event("note", None, {"text": str(batch)}))
+            notify(Event("note", None, {"text": str(batch), "part": number, "count": count, "counts": batch.counts}))
             interrupted = last.interrupted
             why = _ended_by(open_cell, job, last, number)
     except (CellError, SignalInterrupt) as error:

@@ -24,10 +24,14 @@ def test_a_run_is_watched_paused_and_stopped(screen: Screen, watcher: Watcher) -
     assert screen.page.locator("#stop").is_enabled()
     assert "not an emergency stop" in screen.page.inner_text("#stop")
     screen.hold()
+    screen.page.fill("#count", "2")
     screen.page.click("#start")
     run = watcher.until(lambda state: state["run"])["run"]
     assert run["job"] == "pot"
     screen.shows("run-title", "job pot")
+    screen.shows("queue-title", "Queue of 2 parts, pot")
+    screen.page.click("[data-parts=end]")
+    screen.shows("queue-said", "0 of 2 done, ends after this part")
     screen.page.click("#pause")
     watcher.until(lambda state: state["run"]["state"] in ("pausing", "paused"))
     screen.shows("run-title", "paus")
@@ -42,6 +46,8 @@ def test_a_run_is_watched_paused_and_stopped(screen: Screen, watcher: Watcher) -
     ended = watcher.until(idle)
     screen.shows("stop-said", "was carried out")
     screen.shows("run-title", "No run")
+    screen.shows("queue-said", "ended")
+    screen.shows("queue-counts", "1.*stopped")
     # A stop holds direct commands until a person says that they have looked.
     assert ended["safety"]["stopped"]
     screen.page.click("#clear-stop")

@@ -14,10 +14,11 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from cell.apps.console.host.manual import Manual, Press, Presses
+from cell.apps.console.host.part_queue import PartQueue
 from cell.apps.console.host.rehearsal import Rehearsals
 from cell.apps.console.server.access import Holders, checked_command, checked_message
 from cell.apps.console.view.run_view import RunView
-from cell.config.job import load_job, require_job_name
+from cell.config.job import item_names, load_job, require_job_name
 from cell.devices.diagnosis.diagnosis import ask
 from cell.devices.gate.gate import Gated
 from cell.procedures.calibrate.verification import Verification
@@ -164,7 +165,7 @@ class ConsoleController:
         began: Callable[[Run[object], str | None], None] = lambda run, job: None,
     ) -> None:  # fmt: skip
         self.cell, self.job = cell, job
-        self.questions, self.rehearsals = Questions(), Rehearsals(cell)
+        self.questions, self.rehearsals, self.queue = Questions(), Rehearsals(cell), PartQueue(cell)
         self.holders, self.presses = Holders(self._lost), Presses()
         self._say, self._began = say, began
         self._beginning = threading.Lock()
@@ -183,6 +184,7 @@ class ConsoleController:
             "cancel_dry_run": lambda client, words: self.rehearsals.cancel(),
             "pause": lambda client, words: self._running("pause", Run.pause),
             "go_on": lambda client, words: self._running("go on", Run.go_on),
+            "queue": lambda client, words: self.queue.want(words["parts"]),
             "abort": self._abort,
             "decide": self._decide,
             "calibrate": lambda client, words: self._long(
@@ -253,6 +255,7 @@ class ConsoleController:
     def close(self) -> None:
         """The console ends: what is held stops."""
         self.presses.end_all("the console ends")
+        self.queue.close()
         self.rehearsals.close()
         self.manual.end()
         self.manual.join(5.0)
@@ -275,7 +278,12 @@ class ConsoleController:
 
     def _start(self, client: str, words: Words) -> str:
         job = self.named_job(words["job"])
-        until, at_start = words["until"], words["at_start"]
+        until, at_start, count = words["until"], words["at_start"], words["count"]
+        self.queue.require_none()
+        if count > 1 or len(item_names(job)) > 1:
+            if until is not None:
+                raise ConfigError("a batch does each part to its end; leave `until` out, or start one part")
+            return self._long(client, f"batch of {job}", lambda: self.queue.perform(job, count, at_start=at_start))
 
         def begin() -> None:
             run = self.cell.start(job, at_start=at_start, until=until, script=self._script(job))
@@ -334,6 +342,7 @@ class ConsoleController:
         return f"{what} has begun" if ended.is_set() else f"starting {what} …"
 
     def _resume(self, client: str, words: Words) -> str:
+        self.queue.require_none()
         return self._long(client, "resumed job", lambda: self.cell.resume(words["run"], script=self._script(self.job)))
 
     def _recover(self, client: str, words: Words) -> str:

@@ -102,7 +102,7 @@ class CellObserver:
             "last": controller.with_finding(self._last), "faults": faults[-8:],
             "devices": {} if self._virtual else readings.devices("" if told is None else told["kind"]),
             "safety": readings.safety(), "holder": controller.holders.holder, "clients": controller.holders.rows(),
-            "starting": controller.starting,
+            "starting": controller.starting, "queue": controller.queue.as_dict(),
             "manual": controller.manual.on, "jog": controller.jogging(), "speed": controller.manual.speed,
             "pace": self._cell.pace, "dry_run": controller.rehearsals.present, "busy": busy_words(),
         }  # fmt: skip
@@ -134,7 +134,7 @@ class CellObserver:
         named = self._named
         job = named[1] if named is not None and named[0] is run else None
         if run.kind == "job" and job is None:
-            job = self._desk.job
+            job = self._desk.queue.job or self._desk.job
         steps: tuple[str, ...] = ()
         if run.kind == "job" and job is not None:
             with suppress(CellError):

@@ -7,6 +7,7 @@ import { Jog } from './jog.js';
 import { Link } from './link.js';
 import { Pictures } from './pictures.js';
 import { Question } from './question.js';
+import { Queue } from './queue.js';
 import { Replay } from './replay.js';
 import { Runs } from './runs.js';
 import { CellScene } from './scene.js';
@@ -32,6 +33,7 @@ const scene = stage();
 const sequence = new Sequence(link, ask);
 const jog = new Jog(link, ask);
 const question = new Question(ask);
+const queue = new Queue(ask);
 const runs = new Runs(link);
 const replay = new Replay(link, (pose) => scene?.pose(pose), () => {
   scene?.showPresent(true);
@@ -115,6 +117,7 @@ link.on('state', (told) => {
   world(cell, state);
   devices(state);
   sequence.state(state, mine());
+  queue.state(state, mine());
   jog.state(state, mine());
   question.state(state, mine(), myName());
   if (!replay.on) live(state);

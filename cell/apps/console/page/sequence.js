@@ -41,9 +41,11 @@ export class Sequence {
 
   begin() {
     const values = { job: byId('job').value };
+    const count = Number(byId('count').value);
+    if (count > 1) values.count = count;
     if (byId('at-start').checked) values.at_start = true;
     if (byId('until').value) values.until = byId('until').value;
-    this.start('start', values, `job ${values.job}`);
+    this.start('start', values, count > 1 ? `${count} parts of ${values.job}` : `job ${values.job}`);
   }
 
   work(name) {
@@ -58,7 +60,7 @@ export class Sequence {
     byId('until').replaceChildren(el('option', { value: '', textContent: 'the end' }), ...until);
   }
 
-  state({ run, last, pace, starting, dry_run: dry }, mine) {
+  state({ run, last, pace, starting, queue, dry_run: dry }, mine) {
     const paused = run !== null && ['pausing', 'paused'].includes(run.state);
     say(byId('run-title'), run ? `${words(run.kind)} ${run.job ?? ''}`.trim() + this.mood(run) : 'No run');
     say(byId('run-text'), run ? this.now(run) : starting ? `Starting ${starting} …` : ended(last));
@@ -68,7 +70,7 @@ export class Sequence {
     show(byId('run-left').parentElement, run !== null);
     remake(byId('steps'), (run?.steps ?? []).map((step) => [step.name, step.state, step.retries, step.reason]), () => this.rows(run));
     show(byId('run-buttons'), run !== null);
-    show(byId('start-form'), run === null);
+    show(byId('start-form'), run === null && (!queue || queue.state === 'ended'));
     byId('pause').disabled = !mine || paused;
     byId('go-on').disabled = !mine || !paused;
     byId('abort').disabled = !mine;

@@ -34,6 +34,7 @@ Axis = Annotated[str, Field(pattern=r"^[a-z]{0,3}[1-6]?$")]
 Client = Annotated[str, Field(pattern=r"^c[0-9]{1,12}$")]
 Run = Annotated[str, Field(pattern=r"^[0-9]{8}T[0-9]{6}-[0-9a-f]{4}$")]
 Count = Annotated[int, Field(ge=0, le=2**53)]
+Parts = Annotated[int, Field(ge=1, le=10_000)]
 Seed = Annotated[int, Field(ge=0, le=999_999)]
 Step = Annotated[float, Field(ge=-100.0, le=100.0)]
 """Of a jog, m or rad; the cell's own limits are narrower."""
@@ -61,12 +62,15 @@ COMMANDS: dict[str, type[PageMessage]] = {
     "hand_over": _said(to=(Client, ...)),
     "clear_stop": _said(by=(Text, ...)),
     "recover": _said(by=(Text | None, None)),
-    "start": _said(job=(Text | None, None), until=(Identifier | None, None), at_start=(bool, False)),
+    "start": _said(
+        job=(Text | None, None), until=(Identifier | None, None), at_start=(bool, False), count=(Parts, 1)
+    ),
     "resume": _said(run=(Run | None, None)),
     "dry_run": _said(job=(Text | None, None), seed=(Seed | None, None)),
     "cancel_dry_run": _said(),
     "pause": _said(),
     "go_on": _said(),
+    "queue": _said(parts=(Literal["run", "hold", "end"], ...)),
     "abort": _said(reason=(Text, "asked for at the operator's screen")),
     "decide": _said(
         number=(Count, ...), choice=(Identifier, ...), step=(Identifier | None, None), by=(Text | None, None),

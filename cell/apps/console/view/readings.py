@@ -208,16 +208,16 @@ def cell_facts(cell: Cell, job: str) -> dict[str, object]:
 
 
 def jobs(own: str) -> list[str]:
-    """The console's own first, those of the present folder, and those that ship; of several parts the items."""
-    here = []
+    """The console's own first, those of the present folder, and those that ship; of several items each one, too."""
+    here: list[str] = []
     for path in sorted(Path.cwd().glob("*.toml")):
         try:
             require_job_name(path.stem)
             load_job(path.stem)
-            here += item_names(path.stem)
+            here += path.stem, *item_names(path.stem)
         except CellError:
             continue
-    shipped = [item for name in shipped_jobs() for item in item_names(name)]
+    shipped = [each for name in shipped_jobs() for each in (name, *item_names(name))]
     return list(dict.fromkeys((own, *here, *shipped)))
 
 
