@@ -172,7 +172,7 @@ class Reply:
 
 
 def refusal(controller: ConsoleController, client: str, **words: Any) -> CellError:
-    """What a desk answers to a command that it refuses."""
+    """What the controller answers to a command that it refuses."""
     with pytest.raises(CellError) as refused:
         controller.do(client, words)
     return refused.value

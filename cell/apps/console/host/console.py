@@ -1,4 +1,4 @@
-"""The console of an open cell: its server, the desk that obeys it, and the look that shows it the cell.
+"""The console of an open cell: its server, the controller that acts for its pages, the observer that shows them all.
 
 with Console(cell, "pot") as console:
     print(console.link)

@@ -1,4 +1,4 @@
-"""The operator's desk: what a page may ask of the cell, by the words of the command line, and who may ask it.
+"""What a page may ask of the cell, by the words of the command line, and who may ask it.
 
 Whoever asks is answered by a thread of its own, so that nothing waits behind something long. The stop is not here: it
 has a way of its own (`cell.apps.console.host.link`), and asks nobody. What a person has to decide is asked here, too: a
@@ -158,7 +158,7 @@ log = logging.getLogger(__name__)
 
 
 class ConsoleController:
-    """One cell's desk. `say(client, message)` sends something to one page, `began(run, job)` hears of each run."""
+    """Of one cell. `say(client, message)` sends something to one page, `began(run, job)` hears of each run."""
 
     def __init__(
         self, cell: Cell, job: str, say: Callable[[str, dict[str, object]], None],

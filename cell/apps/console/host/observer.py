@@ -39,7 +39,7 @@ class CellObserver:
     """Of one cell and its controller; `notify` gives a message to the server."""
 
     def __init__(self, cell: Cell, controller: ConsoleController, notify: Callable[[object], None]) -> None:
-        self._cell, self._desk, self._notify = cell, controller, notify
+        self._cell, self._controller, self._notify = cell, controller, notify
         simulated = () if cell.simulated is None else cell.simulated.simulated
         # On the virtual clock the devices have no time of the wall, and are not to be looked at by another thread.
         self._virtual = cell.simulated is not None and cell.simulated.facts.get("clock") == "virtual"
@@ -92,7 +92,7 @@ class CellObserver:
             self._show(view.run)
 
     def _state(self, view: RunView | None, told: dict[str, Any] | None) -> dict[str, object]:
-        readings, controller = self._readings, self._desk
+        readings, controller = self._readings, self._controller
         faults = [*self._faults, *(view.faults if view is not None and told is not None else [])]
         return {
             "type": "state", "n": self._count, "t": round(time.time(), 3),
@@ -134,7 +134,7 @@ class CellObserver:
         named = self._named
         job = named[1] if named is not None and named[0] is run else None
         if run.kind == "job" and job is None:
-            job = self._desk.queue.job or self._desk.job
+            job = self._controller.queue.job or self._controller.job
         steps: tuple[str, ...] = ()
         if run.kind == "job" and job is not None:
             with suppress(CellError):

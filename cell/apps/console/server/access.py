@@ -1,6 +1,6 @@
 """What a page may say, and who may talk to the server.
 
-The schemas of commands and messages (docs/reference/console.md) are those by which server and desk check: numbers
+The schemas of commands and messages (docs/reference/console.md) are those by which server and controller check: numbers
 finite and in range, texts of bounded length, no unknown keys. Who may talk: exact lists of hosts and origins, a token
 that works once, a cookie with a key, rates.
 

@@ -108,7 +108,7 @@ COUNTS = pytest.mark.parametrize("count", [600, pytest.param(50_000, marks=pytes
 
 
 @COUNTS
-def test_the_desk_answers_whatever_is_said(cell: Cell, count: int) -> None:
+def test_the_controller_answers_whatever_is_said(cell: Cell, count: int) -> None:
     with Console(cell, "pot") as console:
         desk_hears(console, count)
 
