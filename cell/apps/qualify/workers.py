@@ -238,6 +238,10 @@ def _connected(scheduler: str) -> Cluster:
         return Cluster(Client(scheduler, timeout=ANSWER_S), own=False)
     except (OSError, ValueError) as error:
         raise ConfigError(f"no scheduler answers at {scheduler}: {error}; start it, or name another address") from error
+    except (TypeError, RuntimeError) as error:
+        # What Dask raises where its settings of TLS and the address do not go together.
+        tls = "give Dask its certificates for tls://, or take its settings of TLS away (docs/how-to/qualify.md)"
+        raise ConfigError(f"{scheduler} cannot be asked: {error}; {tls}") from error
 
 
 def _local(count: int) -> Cluster:

@@ -123,6 +123,13 @@ def test_where_no_scheduler_answers_its_address_is_told(monkeypatch: pytest.Monk
         open_workers(None, "tcp://127.0.0.1:1", None)
 
 
+@pytest.mark.campaign
+def test_without_certificates_tls_says_what_is_missing() -> None:
+    pytest.importorskip("distributed")
+    with pytest.raises(ConfigError, match="give Dask its certificates"):
+        open_workers(None, "tls://127.0.0.1:1", None)
+
+
 def slow(task: module.WorldTask) -> Row:
     time.sleep(0.05)
     return quick(task)
