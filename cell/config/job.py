@@ -33,6 +33,7 @@ LONGEST_SWEEP_S = 100.0
 
 Speed = Annotated[float, quantity("mm/s", 0.1, 500)]
 Share = Annotated[float, number(-1, 1)]
+AreaSide = Annotated[float, quantity("mm", 1, 1000)]
 """Of a direction, along one axis."""
 
 
@@ -82,6 +83,19 @@ def _checked_mesh_name(text: str) -> str:
     return text
 
 
+class AreaSection(Table):
+    """An area of the surface whose waviness is told by itself: a rectangle along x and y of the surface's frame."""
+
+    name: Annotated[str, Name]
+    centre: tuple[Offset, Offset]
+    size: tuple[AreaSide, AreaSide]
+
+    @property
+    def corners(self) -> NDArray[np.float64]:
+        """Its lowest and its highest x and y (2, 2), m."""
+        return np.array(self.centre) + 0.5 * np.outer((-1.0, 1.0), self.size)
+
+
 class SurfaceSection(Table):
     """The nominal surface that the part is placed onto, and how well the board tells where it is."""
 
@@ -90,6 +104,12 @@ class SurfaceSection(Table):
     place_from_surface: Pose
     prior_sigma: Annotated[float, quantity("mm", 0.01, 100)]
     prior_sigma_angle: Annotated[float, quantity("deg", 0.01, 20)]
+    area: tuple[AreaSection, ...] = ()
+
+    @model_validator(mode="after")
+    def _distinct_areas(self) -> Self:
+        once_each("area", self.area)
+        return self
 
 
 class FeatureSection(Table):

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from cell.config.cell_config import load_config
-from cell.config.job import Job, load_job
+from cell.config.job import AreaSection, Job, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.devices.simulated.process import ask_truth
 from cell.measure.geometry.poses import from_parts
@@ -41,6 +41,10 @@ NAMES = list(PLACE.names)
 LOST = FaultRecord(
     1_790_000_000.0, "laser_sweep", 1, "camera.frames_lost", "scan_camera: 61 frames were lost", "tried again"
 )
+
+
+LEFT = AreaSection.model_validate({"name": "left", "centre": ["-16 mm", "0 mm"], "size": ["30 mm", "30 mm"]})
+"""An area of the surface of `pot` whose waviness is told by itself."""
 
 
 def pot(**scan: object) -> tuple[Job, NominalSurface]:
@@ -128,8 +132,9 @@ def begun(record: JobRecord, root: Path) -> Iterator[Workplace]:
     """Where a run of `record` in a new folder works; its frames are kept until the end."""
     folder = new_run(root)
     cell = VirtualCell(CONFIG, record.seed, record.level)
+    job, nominal = pot()
     with FrameStore(folder / "frames") as frames:
-        yield work_of(cell, *pot(), record, frames, folder)
+        yield work_of(cell, changed(job, "surface", area=(LEFT,)), nominal, record, frames, folder)
 
 
 def of_placed(record: JobRecord, root: Path, faults: tuple[FaultRecord, ...] = (), *, simulated: bool = True) -> Ended:

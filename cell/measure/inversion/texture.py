@@ -81,12 +81,12 @@ class Texture:
         shown = {f"{name}_mm": None if v is None else round(1e3 * v, 5) for name, v in values.items()}
         return {**shown, "area_mm2": round(1e6 * self.area, 1), "points": self.points, "reason": self.reason}
 
-    def measured(self) -> tuple[Measured, ...]:
+    def measured(self, area: str = "the surface") -> tuple[Measured, ...]:
         """Sq, or what it is less than, for what a run has measured; nothing where the area says nothing."""
         if self.limit is None:
             return ()
         name, value = ("Sq", self.sq) if self.sq is not None else ("Sq, is less than", self.limit)
-        return (Measured(f"waviness of the surface, {name}", 1e3 * value, "mm"),)
+        return (Measured(f"waviness of {area}, {name}", 1e3 * value, "mm"),)
 
 
 def measure_texture(given: Heights) -> Texture:
@@ -174,17 +174,21 @@ def form_removed(at: Array, slopes: Array, heights: Array) -> Array:
 
 
 def heights_over(
-    cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.SE3, motions: tuple[Motions, ...], shaken: float
-) -> Heights:
+    cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.SE3, motions: tuple[Motions, ...], shaken: float,
+    within: Array | None = None,
+) -> Heights:  # fmt: skip
     """What of a cloud lies over the nominal surface at the pose found.
 
-    `motions` say how the points move by what is not known of calibration and poses; `shaken` as in `Heights`.
+    `motions` say how the points move by what is not known of calibration and poses; `shaken` as in `Heights`; `within`
+    are the lowest and the highest x and y (2, 2) of an area in the surface's frame, m.
     """
     normal, sides = across(nominal)
     lines, rows = cloud.valid.nonzero()
     local = transform(base_from_surface.inverse(), cloud.points[lines, rows])
     chosen, feet = nominal.feet(local, REACH)
     keep = feet.inner & (feet.normals @ normal > STEEPEST)
+    if within is not None:
+        keep &= ((local[chosen, :2] >= within[0]) & (local[chosen, :2] <= within[1])).all(axis=1)
     chosen, normals = chosen[keep], feet.normals[keep]
     upright, places, lines, rows = normals @ normal, local[chosen] @ sides.T, lines[chosen], rows[chosen]
     some = np.unique(np.linspace(0, max(0, len(lines) - 1), min(MOST_MOVED, len(lines))).astype(np.intp))

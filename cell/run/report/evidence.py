@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 
-from cell.config.job import Job
+from cell.config.job import AreaSection, Job
 from cell.measure.inversion import NominalSurface, PlacePose, fit_figures
 from cell.measure.inversion.effects.during_sweep import find_rocking
 from cell.measure.inversion.texture import Texture, heights_over, measure_texture
@@ -24,6 +24,7 @@ from cell.procedures.steps.set_down import SetDown
 from cell.procedures.steps.verify_nest import where_seen
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.errors import Measured, MeasuredRow, RefusedError
+from drivers.interfaces import Vector
 from statemachine.runner import RunResult
 from statemachine.step import Outcome
 
@@ -86,15 +87,23 @@ def last_frames(result: RunResult, frames: FrameStore) -> list[str]:
     return [] if result.outcome is Outcome.PLACED else [f"frames/{name}" for name in frames.recent]
 
 
-def texture_of(result: RunResult, nominal: NominalSurface) -> Texture | None:
-    """The waviness of the scanned surface, also at a place that was judged and not believed; None without a place."""
+def textures_of(result: RunResult, nominal: NominalSurface, areas: Sequence[AreaSection]) -> dict[str, Texture]:
+    """The waviness of the scanned surface, by the name "", and of each of its `areas`, by its own.
+
+    Also at a place that was judged and not believed; empty without a place.
+    """
     sweep, made, found = (result.results.get(name) for name in ("laser_sweep", "reconstruct", "invert_pose"))
     place = found.base_from_surface if isinstance(found, PlacePose) else RefusalEvidence.of(result).seen.get("pose")
     if not (isinstance(sweep, SweepRecord) and isinstance(made, Reconstruction) and isinstance(place, pin.SE3)):
-        return None
+        return {}
     rocking = find_rocking(made.cloud, nominal, place, sweep.times)
     shaken = 0.0 if rocking is None else rocking.height / float(np.sqrt(2.0))
-    return measure_texture(heights_over(made.cloud, nominal, place, (made.by_calibration, made.by_poses), shaken))
+
+    def told(within: Vector | None) -> Texture:
+        motions = made.by_calibration, made.by_poses
+        return measure_texture(heights_over(made.cloud, nominal, place, motions, shaken, within))
+
+    return {"": told(None), **{area.name: told(area.corners) for area in areas}}
 
 
 def measured(

@@ -30,10 +30,15 @@ def _digits(value: float | None) -> str:
 
 
 def texture_words(report: Report) -> str:
-    """The waviness of the scanned surface, as `scan.texture` of a report has it, for people; "" without it."""
-    texture = (report.get("scan") or {}).get("texture")
-    if not texture:
+    """The waviness of the scanned surface and of its areas, as `scan` of a report has it, for people; "" without it."""
+    scan = report.get("scan") or {}
+    if not (texture := scan.get("texture")):
         return ""
+    areas = (f"{area['name']}: {_waviness(area)}" for area in scan.get("areas", ()))
+    return "; ".join([_waviness(texture), *areas])
+
+
+def _waviness(texture: Mapping[str, Any]) -> str:
     if texture["sq_mm"] is None:
         return f"no waviness told: {texture['reason']}"
     sizes = ", ".join(f"{name.capitalize()} {texture[f'{name}_mm']:.4f} mm" for name in ("sa", "sq", "sz"))

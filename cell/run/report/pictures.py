@@ -16,8 +16,9 @@ import pinocchio as pin
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
-from cell.config.job import Job
+from cell.config.job import AreaSection, Job
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion import NominalSurface, PlacePose
 from cell.measure.inversion.flush import Flush
@@ -102,7 +103,7 @@ def draw_board(axes: Axes, board: BoardPanel) -> None:
 
 def draw_surface(
     figure: Figure, axes: Axes, surface: SurfacePanel, span_mm: float, seams: Sequence[Mapping[str, object]],
-    waviness: Sequence[str] = (),
+    waviness: Sequence[str] = (), areas: Sequence[AreaSection] = (),
 ) -> None:  # fmt: skip
     """A map of the scanned points from above, means over squares: their deviation from the drawn surface within
     ±`span_mm`, or their height where no place of the surface was found."""
@@ -130,6 +131,10 @@ def draw_surface(
             edgecolors="black", linewidths=0.7,
         )  # fmt: skip
         title.append("framed: flush along the edge of the placed part")
+    for area in areas:
+        (x, y), (width, height) = 1e3 * area.corners[0], 1e3 * np.array(area.size)
+        axes.add_patch(Rectangle((x, y), width, height, fill=False, linestyle="--"))
+        axes.annotate(area.name, (x, y + height), xytext=(2, -8), textcoords="offset points", fontsize=7)
     for feature in surface.features:
         x, y = 1e3 * feature.belongs[:2]
         axes.plot(x, y, "x", color="black", markersize=6)
@@ -297,7 +302,10 @@ def draw_run(
     else:
         draw_board(left, board)
     if surface is not None:
-        draw_surface(figure, middle[0], surface, SCALE_SHARE * 1e3 * job.place.tolerance, seams, waviness=waviness)
+        draw_surface(
+            figure, middle[0], surface, SCALE_SHARE * 1e3 * job.place.tolerance, seams, waviness=waviness,
+            areas=job.surface.area,
+        )  # fmt: skip
     elif stripe is not None:
         draw_stripe(middle[0], stripe)
     if report["outcome"] == "placed":

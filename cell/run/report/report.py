@@ -28,7 +28,7 @@ from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.verify_nest import where_seen
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.folder import REPORT, release, timeless, when
-from cell.run.report.evidence import last_frames, measured, refusal, seen_placed, texture_of
+from cell.run.report.evidence import last_frames, measured, refusal, seen_placed, textures_of
 from drivers.interfaces import Vector
 from statemachine.runner import Event, RunResult
 from statemachine.step import summary_of
@@ -88,14 +88,17 @@ class FinishedJob:
             except Exception as error:
                 report["truth_missing"] = f"{type(error).__name__}: {error}"
         report["measured"] = measured(self.result, self.job, report["truth"], report["place_bound_95"])
-        texture = None
+        textures = {}
         try:
-            texture = texture_of(self.result, self.nominal)
+            textures = textures_of(self.result, self.nominal, self.job.surface.area)
         except Exception as error:
             report["texture_missing"] = f"{type(error).__name__}: {error}"
-        if texture is not None:
-            report["scan"]["texture"] = texture.as_dict()
-            report["measured"] += [number.as_dict() for number in texture.measured()]
+        for name, texture in textures.items():
+            if name:
+                report["scan"]["areas"].append({"name": name, **texture.as_dict()})
+            else:
+                report["scan"]["texture"] = texture.as_dict()
+            report["measured"] += [number.as_dict() for number in texture.measured(name or "the surface")]
         if self.config.cell.picture:
             self._draw(report)
         report = sealed(strict(timeless(report)))
@@ -136,7 +139,7 @@ class FinishedJob:
             "tolerance": {"translation_mm": 1e3 * place.tolerance, "rotation_mrad": 1e3 * place.tolerance_angle},
             "measured": [],
             "assumed_noise": {"level": self.info["level"], "sigmas": _configured_noise(self.config)},
-            "scan": {**made.summary(), "texture": None} if isinstance(made, Reconstruction) else None,
+            "scan": {**made.summary(), "texture": None, "areas": []} if isinstance(made, Reconstruction) else None,
             "truth": None,
         }  # fmt: skip
 

@@ -127,12 +127,12 @@ def test_a_real_cell_has_its_own_figures(ends: Ends) -> None:
 
 
 def test_a_surface_as_drawn_shows_no_waviness(placed: Ended) -> None:
-    texture, row = placed.report["scan"]["texture"], placed.report["measured"][-1]
+    texture, row = placed.report["scan"]["texture"], placed.report["measured"][-2]
     assert (texture["sa_mm"], texture["sq_mm"], texture["sz_mm"]) == (None, None, None)
     assert texture["nesting_mm"] == 5.0 and 0.003 < texture["limit_mm"] < 0.01
     assert texture["area_mm2"] == pytest.approx(63.0 * 32.0, rel=0.1)
     assert row["name"].endswith("is less than") and row["value"] == pytest.approx(texture["limit_mm"], abs=1e-5)
-    assert texture_words(placed.report) == f"no waviness told: {texture['reason']}"
+    assert texture_words(placed.report).startswith(f"no waviness told: {texture['reason']}; left: no waviness told: ")
 
 
 def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: Path) -> None:
@@ -149,7 +149,11 @@ def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: 
     texture, through = report["scan"]["texture"], 0.06 * 2.0 ** -((5.0 / 15.0) ** 2)
     assert texture["sq_mm"] == pytest.approx(through / math.sqrt(2.0), rel=0.03)
     assert texture["sz_mm"] == pytest.approx(2.0 * through, rel=0.25)  # the form bends so few waves
-    assert report["measured"][-1]["name"] == "waviness of the surface, Sq"
+    assert [row["name"] for row in report["measured"][-2:]] == ["waviness of the surface, Sq", "waviness of left, Sq"]
+    (left,) = report["scan"]["areas"]
+    assert left["area_mm2"] == pytest.approx(30.0 * 30.0, rel=0.1)
+    assert left["sq_mm"] == pytest.approx(through / math.sqrt(2.0), rel=0.25)  # two waves, less their form
+    assert f"; left: waviness over 5 mm: Sa {left['sa_mm']:.4f} mm" in texture_words(report)
     assert f"Waviness over 5 mm: Sa {texture['sa_mm']:.4f} mm, Sq {texture['sq_mm']:.4f} mm" in make_page(run.folder)
 
 
