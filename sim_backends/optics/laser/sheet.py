@@ -121,6 +121,7 @@ def angles(points: Vector, laser: LaserOptics) -> Vector:
     return np.asarray((way @ across) / (way @ axis))
 
 
+@lru_cache(maxsize=64)
 def _fan(laser: LaserOptics) -> tuple[Vector, Vector, Vector]:
     normal, _, origin = laser_frame(laser)
     axis = np.array([0.0, 0.0, 1.0]) - normal[2] * normal

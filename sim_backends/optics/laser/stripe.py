@@ -94,10 +94,11 @@ def render_stripe(
         [optics.focal, optics.f_number, optics.focus_distance, optics.pixel, optics.psf_px, optics.vignetting]
     )
     for instance in scene:
-        found, share = crossings(optics, laser, instance), None
+        met, share = instance, None
         if isinstance(instance, PlaneInstance):
             width, height = np.array(instance.size) + 2 * RIM * _spread(instance, laser)
-            found = crossings(optics, laser, replace(instance, size=(float(width), float(height))))
+            met = replace(instance, size=(float(width), float(height)))
+        found = crossings(optics, laser, met)
         if len(found.rows):
             found = found.keep(lit(found.points, found.normals, instance, scene, laser))
         if not len(found.rows):

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from cell import Cell
-from tests.support.described_cells import Changes, described, pose, write_saddle
+from tests.support.described_cells import LEAN, Changes, described, pose, write_saddle
 
 FAST: Changes = {"scan": {"speed": '"30 mm/s"'}}
 SADDLE: Changes = {
@@ -28,7 +28,7 @@ def require_placed(report: dict[str, Any]) -> None:
 
 def test_one_job_after_another_in_one_world(calibrated_folder: Path) -> None:
     """The second has a surface of its own; the claw is filled again, and the vehicle stays where it sees the board."""
-    cell, pot = described(calibrated_folder, None, FAST)
+    cell, pot = described(calibrated_folder, LEAN, FAST)
     _, saddle = described(calibrated_folder / "saddle", None, SADDLE)
     write_saddle(saddle.parent / "saddle.ply")
     with Cell.open(cell, sim="all", clock="virtual", seed=2, job=pot) as opened:

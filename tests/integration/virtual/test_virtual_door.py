@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import threading
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +15,7 @@ import pytest
 
 from cell import Cell
 from cell.config.cell_config import default_toml
-from cell.config.job import job_path
+from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.run.events import ConfirmNeeded, Held, RunEnded, RunEvent, StepStarted
 from cell.run.job_run import RunOutcome
@@ -29,6 +27,7 @@ from statemachine.runner import Again, Script
 from statemachine.step import Event
 from tests.golden.golden import plain_journal, plain_report
 from tests.support import Typed
+from tests.support.described_cells import LEAN, changed, quick_job
 
 SEED = 2
 STOP = "arm.protective_stop@laser_sweep:40%"
@@ -36,12 +35,9 @@ STOP = "arm.protective_stop@laser_sweep:40%"
 
 @pytest.fixture(autouse=True)
 def folder(calibrated_folder: Path) -> Path:
-    """A calibrated cell's folder, with the job `pot` swept twice as fast as shipped."""
-    shipped = job_path("pot")
-    text = shipped.read_text(encoding="utf-8").replace('speed = "15 mm/s"', 'speed = "30 mm/s"')
-    assert tomllib.loads(text)["scan"]["speed"] == "30 mm/s"
-    (calibrated_folder / "pot.toml").write_text(text, encoding="utf-8")
-    shutil.copy(shipped.parent / "pot.ply", calibrated_folder)
+    """The folder of a calibrated cell whose runs leave few files, with the job `pot` in a quarter of the lines."""
+    (calibrated_folder / "cell.toml").write_text(changed(default_toml(), LEAN), encoding="utf-8")
+    assert load_job(quick_job("pot", calibrated_folder))[0].scan.speed == 0.030
     return calibrated_folder
 
 
@@ -75,6 +71,7 @@ def plain_record(folder: Path) -> list[Any]:
 
 def test_the_same_seed_gives_the_same_bytes_through_a_fault_and_its_recovery() -> None:
     """Whether pictures are looked at on one core or on more."""
+    Path("cell.toml").unlink()
     first = done((STOP,), confirm="simulated")
     assert first.outcome == "placed"
     threads = cv2.getNumThreads()
@@ -171,6 +168,7 @@ def test_a_fault_that_no_program_may_clear_ends_the_run_and_leaves_the_cell_safe
 
 def test_a_drive_that_is_done_again_in_vain_does_not_look_at_the_fine_board_again() -> None:
     """The vehicle may stand before a station that the arm does not know yet."""
+    Path("cell.toml").unlink()
     outcome = done(("target_camera.silent@drive_to_target",), confirm="simulated")
     assert (outcome.outcome, outcome.report["code"]) == ("faulted", "DeadlineError")
     assert outcome.reason.startswith("target_camera")

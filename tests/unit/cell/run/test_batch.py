@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -27,9 +26,9 @@ from lab.bench.job.whole_job import JobRecord
 from statemachine.journal import request
 from statemachine.step import Event
 from tests.support import Typed
-from tests.support.described_cells import Changes, described, pose
+from tests.support.described_cells import LEAN, Changes, described, pose, quick
 
-FAST: Changes = {"scan": {"speed": '"30 mm/s"'}}
+FAST: Changes = {"scan": {"speed": '"30 mm/s"', "frame_rate": '"15 Hz"'}}
 
 
 @pytest.fixture
@@ -37,7 +36,7 @@ def opened(calibrated_folder: Path) -> Callable[..., Cell]:
     """Opens a calibrated cell with the job `own.toml` that has these rules; `moved`: its scan head was bumped since."""
 
     def make(on_refusal: str = "", moved: bool = False) -> Cell:
-        config, own = described(calibrated_folder, None, FAST)
+        config, own = described(calibrated_folder, LEAN, FAST)
         if on_refusal:
             own.write_text(f'{own.read_text()}\n[batch]\non_refusal = "{on_refusal}"\n')
         head: Changes = {"scan_camera": {"flange_from_camera": pose((92, -50, 80), (0, 0, 90))}}
@@ -57,7 +56,7 @@ def test_the_figures_are_those_of_the_runs_and_what_the_parts_have_alike_is_allo
     """Each part is gripped otherwise, and lies .3 mm aside in the claw."""
     lines: list[str] = []
     file = job_with_part(tmp_path, "pot", verify="all", half=MIDDLE)
-    file.write_text(re.sub(r'(?m)^speed = "15 mm/s"', 'speed = "30 mm/s"', file.read_text(), count=1))
+    file.write_text(quick(file.read_text()))
     aside = held(motion(0.0, 0.3))
     with opened() as cell:
         assert isinstance(cell.simulated, VirtualCell)

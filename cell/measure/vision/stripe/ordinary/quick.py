@@ -8,6 +8,7 @@ tell: those that show one peak say where it runs, else the peak with more energy
 from __future__ import annotations
 
 from enum import Enum
+from functools import cache, partial
 from math import sqrt
 from typing import Any
 
@@ -317,9 +318,13 @@ def choose(start: Array) -> NDArray[np.bool_]:
 
 def _line_through(x: Array, y: Array) -> tuple[float, float]:
     """Slope and value at 0 of a line that one bad point in four does not move: medians of slopes and of values."""
-    i, j = np.triu_indices(len(x), 1)
+    i, j = _pairs(len(x))
     slope = float(np.median((y[j] - y[i]) / (x[j] - x[i])))
     return slope, float(np.median(y - slope * x))
+
+
+_pairs = cache(partial(np.triu_indices, k=1))
+"""Numbers of the first and of the second of each pair among so many."""
 
 
 @compiled

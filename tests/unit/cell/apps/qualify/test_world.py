@@ -15,9 +15,9 @@ from cell.apps.qualify.identity import QualifiedCode
 from cell.apps.qualify.rows import Row
 from cell.apps.qualify.world import WorldTask, run_world
 from cell.config.cell_config import default_toml, load_config
-from cell.config.job import job_path
 from drivers.errors import Aborted, ConfigError, RefusedError
 from tests.support import Typed
+from tests.support.described_cells import quick_job
 from tests.support.qualified import compared
 
 SEED = 2
@@ -25,12 +25,9 @@ SEED = 2
 
 @pytest.fixture(scope="module")
 def task(tmp_path_factory: pytest.TempPathFactory) -> WorldTask:
-    """The job `pot`, swept twice as fast as shipped."""
-    folder, shipped = tmp_path_factory.mktemp("qualify"), job_path("pot")
-    text = shipped.read_text(encoding="utf-8").replace('speed = "15 mm/s"', 'speed = "30 mm/s"')
-    (folder / "pot.toml").write_text(text, encoding="utf-8")
-    (folder / "pot.ply").write_bytes((shipped.parent / "pot.ply").read_bytes())
-    job = str(folder / "pot.toml")
+    """The job `pot`, swept in a quarter of the lines shipped."""
+    folder = tmp_path_factory.mktemp("qualify")
+    job = str(quick_job("pot", folder))
     of = QualifiedCode.of(job, load_config(None))
     return WorldTask(of, job, default_toml(), folder / "campaign", level="nominal", seed=SEED)
 

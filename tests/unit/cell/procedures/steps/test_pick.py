@@ -20,6 +20,7 @@ from drivers.errors import ConfigError
 from lab.bench.job.whole_job import JobRecord
 from statemachine.step import Event
 from tests.support.at_station import lose_few_steps_after_the_look
+from tests.support.described_cells import LEAN, described, quick_job
 from tests.support.unloading import JOB, Change, unloaded
 
 
@@ -111,15 +112,16 @@ def test_where_there_is_no_part_or_the_claw_is_full_nothing_is_gripped(
 def test_through_the_public_door_it_is_not_resumed_once_it_was_gripped_and_the_next_part_lies_there(
     placed_pot: JobRecord, calibrated_folder: Path
 ) -> None:
-    with Cell.open(sim="all", seed=placed_pot.seed, clock="virtual", job="unload") as cell:
+    unload, (lean, _) = quick_job("unload", calibrated_folder), described(calibrated_folder, LEAN)
+    with Cell.open(lean, sim="all", seed=placed_pot.seed, clock="virtual", job=unload) as cell:
 
         def end(event: Event) -> None:
             if event.kind == "step_started" and event.step == "set_down" and cell.current is not None:
                 cell.current.abort("seen enough")
 
-        ended = cell.run("unload", end)
+        ended = cell.run(unload, end)
         assert (ended.outcome, ended.report["part"]) == ("aborted", "held")
         with pytest.raises(ConfigError, match="had gripped a part that lay"):
             cell.resume(ended.folder)
-        again = cell.run(job="unload", until="drive_to_target")
+        again = cell.run(unload, until="drive_to_target")
         assert (again.outcome, again.report["part"]) == ("done", "at the station"), "the claw is empty again"
