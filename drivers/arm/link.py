@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import select
 import signal
 import socket
 import struct
@@ -281,7 +282,9 @@ VARIABLES = (
     "actual_digital_output_bits", "robot_mode", "robot_status_bits", "safety_status_bits", "runtime_state",
     "payload", "payload_cog",
 )  # fmt: skip
-"""What the driver reads of the arm. Here, since the child process reads them too and starts without `numpy`."""
+"""What the driver reads of the arm, and the child process as well."""
+STATE = struct.Struct(">B25d2Qi3I4d")
+"""A packet of them, behind its recipe's number."""
 _HEADER = struct.Struct(">HB")
 
 
@@ -323,6 +326,18 @@ class RtdeLink:
             if chr(got) == kind:
                 return payload
 
+    def wait(self, seconds: float) -> bool:
+        """Whether something has come, or comes within so long on the wall."""
+        return bool(self._rest or select.select([self._socket], [], [], seconds)[0])
+
+    def newest(self, kind: str, timeout: float) -> bytes:
+        """The payload of the last packet of this kind that has come; where there is none the next, within `timeout`."""
+        self._deadline = self._clock.now() + timeout * self._clock.rate
+        payload = self.receive(kind)
+        while self.wait(0.0):
+            payload = self.receive(kind)
+        return payload
+
     def ask(self, kind: str, payload: bytes) -> bytes:
         """The reply to a packet, which is of its kind."""
         self.send(kind, payload)
@@ -332,7 +347,7 @@ class RtdeLink:
         while len(self._rest) < size:
             left = self._clock.wall(self._deadline - self._clock.now())
             if left <= 0:
-                raise TimeoutError
+                raise TimeoutError("the arm has gone silent")
             self._socket.settimeout(left)
             data = self._socket.recv(65536)
             if not data:

@@ -7,51 +7,46 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import struct
 import time
 
 from rtde_io import RTDEIOInterface
-from rtde_receive import RTDEReceiveInterface
 
 from drivers.arm.child.program import PERIOD
 from drivers.arm.feed import STOPPED, Snapshot
-from drivers.arm.link import VARIABLES
+from drivers.arm.link import RATE_HZ, STATE, VARIABLES, VERSION, RtdeLink
 from drivers.clock import Clock
 
 
 class Packets:
-    """What the arm at `address` sends of itself; RuntimeError when it does not answer."""
+    """What the arm at `address` sends of itself; OSError when it does not answer, or not any more.
+
+    Over a connection of its own that is waited for: ur-rtde's looks 10 000 times a second whether something has come.
+    """
 
     def __init__(self, address: str) -> None:
-        self._receive = RTDEReceiveInterface(address, 500.0, list(VARIABLES))
-        self._newest = 0.0
+        self._link = RtdeLink(address, Clock(), SILENCE_S)
+        self._link.ask("V", struct.pack(">H", VERSION))
+        self._link.ask("O", struct.pack(">d", RATE_HZ) + ",".join(VARIABLES).encode())
+        self._link.ask("S", b"")
 
-    @property
-    def connected(self) -> bool:
-        """Whether the arm keeps the connection."""
-        return bool(self._receive.isConnected())
-
-    @property
-    def news(self) -> bool:
-        """Whether a packet has come since the one that was read last."""
-        return bool(self._receive.getTimestamp() != self._newest)
+    def wait(self, seconds: float) -> bool:
+        """Whether a packet has come since the one that was read last, or comes within so long on the wall."""
+        return self._link.wait(seconds)
 
     def read(self) -> Snapshot:
-        """The newest packet, read whole: again if another one has come in between."""
-        receive = self._receive
-        while True:
-            self._newest = receive.getTimestamp()
-            snapshot = Snapshot(
-                stamp=time.monotonic(), joints=tuple(receive.getActualQ()), speeds=tuple(receive.getActualQd()),
-                flange=tuple(receive.getActualTCPPose()), wrench=tuple(receive.getActualTCPForce()),
-                safety_bits=receive.getSafetyStatusBits(), mode=receive.getRobotMode(),
-                runtime=receive.getRuntimeState(), inputs=receive.getActualDigitalInputBits(),
-                outputs=receive.getActualDigitalOutputBits(), device_time=self._newest,
-                payload=(receive.getPayload(), tuple(receive.getPayloadCog())),
-            )  # fmt: skip
-            if receive.getTimestamp() == self._newest:
-                return snapshot
+        """The newest packet, where none has come the next one."""
+        state = self._link.newest("U", SILENCE_S)
+        _, stamp, *joints, inputs, outputs, mode, _, safety_bits, runtime, mass, x, y, z = STATE.unpack(state)
+        q, qd, flange, wrench = (tuple(joints[k : k + 6]) for k in range(0, 24, 6))
+        return Snapshot(
+            time.monotonic(), q, qd, flange, wrench, safety_bits, mode, runtime, inputs, outputs, stamp,
+            payload=(mass, (x, y, z)),
+        )  # fmt: skip
 
 
+SILENCE_S = 1.5
+"""The arm counts as lost after this time without a packet; it sends one every 2 ms."""
 OFF_S = 1.0
 """How long on the wall an output may take to be seen off."""
 _SAFE_S = 5.0
