@@ -27,8 +27,6 @@ import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 
-import numpy as np
-
 from drivers.arm.faults import fault
 from drivers.arm.feed import UNANSWERED, ChildReply, ChildRequest, ChildSetup, Ended, Lost, Snapshot
 from drivers.clock import Clock, Latch
@@ -414,7 +412,7 @@ def _probe(link: RtdeLink, clock: Clock, refuse: Callable[[str, str], NotConnect
         if len(packet) != length:
             raise refuse(f"a state of {len(packet)} bytes came, {length} were agreed", _UPDATE)
         times.append(struct.unpack_from(">d", packet, 1)[0])
-    period = float(np.median(np.diff(times))) / clock.rate
+    period = sorted(b - a for a, b in itertools.pairwise(times))[PACKETS // 2 - 1] / clock.rate
     if not 0.0 < period <= SLOWEST_S:
         raise refuse(
             f"it tells its state every {1e3 * period:.1f} ms",

@@ -31,10 +31,9 @@ from types import FrameType
 from typing import NoReturn
 
 from rtde_control import RTDEControlInterface
-from rtde_io import RTDEIOInterface
 
 from drivers.arm.child.control import ControlThread
-from drivers.arm.child.outputs import OFF_S, SILENCE_S, Packets, keep_low, make_safe, switch_output
+from drivers.arm.child.outputs import OFF_S, SILENCE_S, Packets, keep_low, make_safe
 from drivers.arm.child.program import PERIOD
 from drivers.arm.dashboard import Dashboard
 from drivers.arm.feed import (
@@ -107,7 +106,7 @@ class Child:
         self._owner, self._ending = Owner(self._parent), False
         self._clock = Clock()
         with _ends_by_itself(_CONSTRUCTION_S):
-            self._packets = Packets(setup.address)
+            self._packets = Packets(setup.address, setup.control)
             self._snapshot = self._packets.read()
             control = self._take_control() if setup.control else None
         # Nobody listens: the same as the end of the pipe, which the main thread may not have seen yet.
@@ -122,7 +121,6 @@ class Child:
         An arm that another client holds refuses here, before anything on it has been changed.
         """
         address = self._setup.address
-        self._io = RTDEIOInterface(address)
         ready = not safety_code(self._snapshot.safety_bits) and self._snapshot.mode == MODE_RUNNING
         with _unhurried():
             control = RTDEControlInterface(address) if ready else None
@@ -149,7 +147,7 @@ class Child:
         """Whatever a lost link has left behind."""
         mask = sum(1 << index for index in self._setup.safe_off)
         for index in self._setup.safe_off:
-            switch_output(self._io, index, False)
+            self._packets.switch(index, False)
         deadline = time.monotonic() + OFF_S
         while self._packets.read().outputs & mask:
             if time.monotonic() > deadline:
@@ -182,9 +180,11 @@ class Child:
         self.shut_down(closing)
 
     def _switch(self, index: int, value: bool) -> tuple[str, str] | None:
-        if switch_output(self._io, index, value):
-            return None
-        return "arm.refused", f"the controller did not accept a value for output {index}"
+        try:
+            self._packets.switch(index, value)
+        except OSError as error:
+            return "arm.refused", f"the controller did not accept a value for output {index}: {error}"
+        return None
 
     def _go_off_in_the_end(self, outputs: tuple[int, ...]) -> tuple[str, str] | None:
         """From now on these go off when the owner is lost, and no others."""
@@ -213,7 +213,7 @@ class Child:
     def _leave_safe(self) -> None:
         self._control.submit(ChildRequest(0, "close"))
         for index in self._safe_off:
-            switch_output(self._io, index, False)
+            self._packets.switch(index, False)
         if not self._control.finished.wait(3.0):
             with suppress(DeviceError):
                 Dashboard("arm", self._setup.address).ask("stop")
@@ -264,7 +264,7 @@ class Child:
         """Stop the arm and switch the safe outputs off for an owner that is frozen; again if that goes on."""
         self._control.stop_because("arm.owner_frozen", f"for more than {FROZEN_S:g} s")
         for index in self._safe_off:
-            switch_output(self._io, index, False)
+            self._packets.switch(index, False)
         self._owner.beat()
 
     def _lose(self, text: str) -> NoReturn:

@@ -103,8 +103,12 @@ def test_a_child_that_waits_is_woken_by_packets_and_not_ten_thousand_times_a_sec
     assert 200 < woken(arm._session.link.pid) - before < 0.4 * 4500
 
 
+def test_a_child_starts_without_numpy_which_would_take_as_long_as_all_else(arm):
+    assert "numpy" not in Path(f"/proc/{arm._session.link.pid}/maps").read_text()
+
+
 def test_of_states_that_have_piled_up_the_newest_counts(bench):
-    packets = Packets(bench.address)
+    packets = Packets(bench.address, switches=False)
     Clock().sleep(0.1)
     before = bench.ask("show")["time"]
     assert packets.read().device_time > before - 0.01
