@@ -145,14 +145,19 @@ class Child:
 
     def _outputs_off(self) -> None:
         """Whatever a lost link has left behind."""
-        mask = sum(1 << index for index in self._setup.safe_off)
-        for index in self._setup.safe_off:
-            self._packets.switch(index, False)
+        mask = sum(1 << index for index in self._safe_off)
+        self._switch_off()
         deadline = time.monotonic() + OFF_S
         while self._packets.read().outputs & mask:
             if time.monotonic() > deadline:
-                raise RuntimeError(f"outputs {self._setup.safe_off} cannot be switched off")
+                raise RuntimeError(f"outputs {self._safe_off} cannot be switched off")
             self._clock.sleep(PERIOD)
+
+    def _switch_off(self) -> None:
+        """As well as it can be told: on a connection that is gone the controller's own setting does it."""
+        for index in self._safe_off:
+            with suppress(OSError):
+                self._packets.switch(index, False)
 
     def serve(self) -> None:
         """Obey the owner until it asks for the end or is gone, then end the process."""
@@ -212,8 +217,7 @@ class Child:
 
     def _leave_safe(self) -> None:
         self._control.submit(ChildRequest(0, "close"))
-        for index in self._safe_off:
-            self._packets.switch(index, False)
+        self._switch_off()
         if not self._control.finished.wait(3.0):
             with suppress(DeviceError):
                 Dashboard("arm", self._setup.address).ask("stop")
@@ -263,8 +267,7 @@ class Child:
     def _stand_in(self) -> None:
         """Stop the arm and switch the safe outputs off for an owner that is frozen; again if that goes on."""
         self._control.stop_because("arm.owner_frozen", f"for more than {FROZEN_S:g} s")
-        for index in self._safe_off:
-            self._packets.switch(index, False)
+        self._switch_off()
         self._owner.beat()
 
     def _lose(self, text: str) -> NoReturn:

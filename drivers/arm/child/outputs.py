@@ -32,8 +32,8 @@ class Packets:
         self._link.ask("O", struct.pack(">d", RATE_HZ) + ",".join(VARIABLES).encode())
         if switches:
             names = (f"{kind}_digital_output{part}" for kind in KINDS for part in ("_mask", ""))
-            self._recipe, *types = self._link.ask("I", ",".join(names).encode())
-            if b"IN_USE" in bytes(types):
+            (self._recipe,) = self._link.ask("I", ",".join(names).encode())[:1]
+            if not self._recipe:
                 raise OSError("its digital outputs are already in use by another program")
         self._link.ask("S", b"")
 
