@@ -18,14 +18,16 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Protocol, runtime_checkable
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Protocol, TypeAlias, runtime_checkable
 
 from drivers.clock import Latch
 
-Vector = NDArray[np.float64]
+if TYPE_CHECKING:
+    # The arm's process, which starts with each connection, does without.
+    import numpy as np
+    from numpy.typing import NDArray
+
+Vector: TypeAlias = "NDArray[np.float64]"
 """Array of shape (n,), float64."""
 
 ATTENDED_S = 0.15
@@ -410,7 +412,7 @@ class Rail(Device, Protocol):
         """Where the rail has to stand before `sweep`: `start` less the start-up distance; `LimitError` if outside."""
 
 
-Image = NDArray[np.uint8]
+Image: TypeAlias = "NDArray[np.uint8]"
 """Grey image of shape (height, width), 8 bit, row 0 at the top."""
 
 

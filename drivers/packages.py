@@ -7,7 +7,6 @@ leaves.
 from __future__ import annotations
 
 import platform
-from importlib.metadata import PackageNotFoundError, requires
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
@@ -33,6 +32,8 @@ def lacking(module: str, package: str) -> str:
 
 def _asked_for(package: str) -> Requirement:
     """What this program's distribution asks for, with its marker; the bare package where it is not installed."""
+    from importlib.metadata import PackageNotFoundError, requires
+
     from packaging.requirements import Requirement
 
     try:

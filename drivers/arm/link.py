@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import select
 import signal
 import socket
 import struct
@@ -25,8 +26,6 @@ import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
-
-import numpy as np
 
 from drivers.arm.faults import fault
 from drivers.arm.feed import UNANSWERED, ChildReply, ChildRequest, ChildSetup, Ended, Lost, Snapshot
@@ -281,7 +280,9 @@ VARIABLES = (
     "actual_digital_output_bits", "robot_mode", "robot_status_bits", "safety_status_bits", "runtime_state",
     "payload", "payload_cog",
 )  # fmt: skip
-"""What the driver reads of the arm. Here, since the child process reads them too and starts without `numpy`."""
+"""What the driver reads of the arm, and the child process as well."""
+STATE = struct.Struct(">B25d2Qi3I4d")
+"""A packet of them, behind its recipe's number."""
 _HEADER = struct.Struct(">HB")
 
 
@@ -323,6 +324,18 @@ class RtdeLink:
             if chr(got) == kind:
                 return payload
 
+    def wait(self, seconds: float) -> bool:
+        """Whether something has come, or comes within so long on the wall."""
+        return bool(self._rest or select.select([self._socket], [], [], seconds)[0])
+
+    def newest(self, kind: str, timeout: float) -> bytes:
+        """The payload of the last packet of this kind that has come; where there is none the next, within `timeout`."""
+        self._deadline = self._clock.now() + timeout * self._clock.rate
+        payload = self.receive(kind)
+        while self.wait(0.0):
+            payload = self.receive(kind)
+        return payload
+
     def ask(self, kind: str, payload: bytes) -> bytes:
         """The reply to a packet, which is of its kind."""
         self.send(kind, payload)
@@ -332,7 +345,7 @@ class RtdeLink:
         while len(self._rest) < size:
             left = self._clock.wall(self._deadline - self._clock.now())
             if left <= 0:
-                raise TimeoutError
+                raise TimeoutError("the arm has gone silent")
             self._socket.settimeout(left)
             data = self._socket.recv(65536)
             if not data:
@@ -399,7 +412,7 @@ def _probe(link: RtdeLink, clock: Clock, refuse: Callable[[str, str], NotConnect
         if len(packet) != length:
             raise refuse(f"a state of {len(packet)} bytes came, {length} were agreed", _UPDATE)
         times.append(struct.unpack_from(">d", packet, 1)[0])
-    period = float(np.median(np.diff(times))) / clock.rate
+    period = sorted(b - a for a, b in itertools.pairwise(times))[PACKETS // 2 - 1] / clock.rate
     if not 0.0 < period <= SLOWEST_S:
         raise refuse(
             f"it tells its state every {1e3 * period:.1f} ms",

@@ -45,7 +45,7 @@ class ArmOutputClawConfig(ClawConfig, OnArm):
 
 
 def _connect(name: str, config: UrArmConfig, around: Surroundings) -> UrArm:
-    from drivers.arm.motion import ArmLimits
+    from drivers.arm.limits import ArmLimits
     from drivers.arm.ur import UrArm
 
     return UrArm(

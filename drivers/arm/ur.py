@@ -21,8 +21,9 @@ from drivers.arm.dashboard import unknown
 from drivers.arm.factory import Forward, read_factory_kinematics
 from drivers.arm.faults import late_words
 from drivers.arm.feed import MODE_RUNNING, ChildSetup, Ended, Snapshot, safety_code
+from drivers.arm.limits import ArmLimits
 from drivers.arm.link import latch_clock
-from drivers.arm.motion import ArmLimits, UrMotion
+from drivers.arm.motion import UrMotion
 from drivers.arm.session import ArmSession
 from drivers.clock import Clock, Latch
 from drivers.errors import UNTOLD, Aborted, DeviceError, InterlockError, LimitError, check_positive, shown

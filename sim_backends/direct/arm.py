@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 
 from drivers.arm.faults import fault
-from drivers.arm.motion import ArmLimits
+from drivers.arm.limits import ArmLimits
 from drivers.clock import Clock, Latch
 from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, LimitError, check_range
 from drivers.interfaces import ArmSafety, ArmState, Identity, LinkTable, Vector

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.arm.motion import ArmLimits
+from drivers.arm.limits import ArmLimits
 from drivers.clock import Clock
 from sim_backends.clock import SteppedClock
 from sim_backends.direct.arm import DirectArm

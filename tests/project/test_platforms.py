@@ -24,7 +24,7 @@ NEVER = 'ur-rtde>=1.6.3,<1.7; python_version < "3"'
 @pytest.fixture
 def without_wheel(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rtde_control", None)
-    monkeypatch.setattr("drivers.packages.requires", lambda name: [NEVER])
+    monkeypatch.setattr("importlib.metadata.requires", lambda name: [NEVER])
 
 
 def test_a_package_without_a_wheel_here_is_named_with_the_remedy(
@@ -34,7 +34,7 @@ def test_a_package_without_a_wheel_here_is_named_with_the_remedy(
     assert f"ur-rtde has no wheel for Python {sys.version.split()[0]}" in words
     assert "Python 3.12 on Linux x86-64" in words
     assert lacking("numpy", "numpy") == ""
-    monkeypatch.setattr("drivers.packages.requires", lambda name: ["ur-rtde>=1.6.3,<1.7"])
+    monkeypatch.setattr("importlib.metadata.requires", lambda name: ["ur-rtde>=1.6.3,<1.7"])
     assert "pip install 'ur-rtde<1.7,>=1.6.3'" in lacking("rtde_control", "ur-rtde")
 
 

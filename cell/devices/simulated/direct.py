@@ -14,7 +14,7 @@ from cell.devices.assembly import behind_gate, connect_one, safe_off_outputs
 from cell.devices.devices import Devices
 from cell.devices.simulated.described import Described
 from cell.motion.kinematics import MODELS
-from drivers.arm.motion import ArmLimits
+from drivers.arm.limits import ArmLimits
 from drivers.errors import ConfigError
 from drivers.make import MOST_PAYLOAD
 from sim_backends.direct import cell

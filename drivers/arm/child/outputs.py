@@ -7,51 +7,60 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import struct
 import time
-
-from rtde_io import RTDEIOInterface
-from rtde_receive import RTDEReceiveInterface
 
 from drivers.arm.child.program import PERIOD
 from drivers.arm.feed import STOPPED, Snapshot
-from drivers.arm.link import VARIABLES
+from drivers.arm.link import RATE_HZ, STATE, VARIABLES, VERSION, RtdeLink
 from drivers.clock import Clock
+
+KINDS = ("standard", "configurable", "tool")
+"""Of digital outputs, eight of each but the last."""
 
 
 class Packets:
-    """What the arm at `address` sends of itself; RuntimeError when it does not answer."""
+    """What the arm at `address` sends of itself; OSError when it does not answer, or not any more.
 
-    def __init__(self, address: str) -> None:
-        self._receive = RTDEReceiveInterface(address, 500.0, list(VARIABLES))
-        self._newest = 0.0
+    Over a connection of its own that is waited for: ur-rtde's looks 10 000 times a second whether something has come.
+    """
 
-    @property
-    def connected(self) -> bool:
-        """Whether the arm keeps the connection."""
-        return bool(self._receive.isConnected())
+    def __init__(self, address: str, switches: bool) -> None:
+        """OSError when it `switches` the digital outputs and another client does."""
+        self._link = RtdeLink(address, Clock(), SILENCE_S)
+        self._link.ask("V", struct.pack(">H", VERSION))
+        self._link.ask("O", struct.pack(">d", RATE_HZ) + ",".join(VARIABLES).encode())
+        if switches:
+            names = (f"{kind}_digital_output{part}" for kind in KINDS for part in ("_mask", ""))
+            (self._recipe,) = self._link.ask("I", ",".join(names).encode())[:1]
+            if not self._recipe:
+                raise OSError("its digital outputs are already in use by another program")
+        self._link.ask("S", b"")
 
-    @property
-    def news(self) -> bool:
-        """Whether a packet has come since the one that was read last."""
-        return bool(self._receive.getTimestamp() != self._newest)
+    def switch(self, index: int, value: bool) -> None:
+        """Set digital output `index`: 0-7 standard, 8-15 configurable, 16-17 tool."""
+        fields = bytearray(2 * len(KINDS))
+        kind, number = divmod(index, 8)
+        fields[2 * kind : 2 * kind + 2] = 1 << number, value << number
+        self._link.send("U", bytes([self._recipe, *fields]))
+
+    def wait(self, seconds: float) -> bool:
+        """Whether a packet has come since the one that was read last, or comes within so long on the wall."""
+        return self._link.wait(seconds)
 
     def read(self) -> Snapshot:
-        """The newest packet, read whole: again if another one has come in between."""
-        receive = self._receive
-        while True:
-            self._newest = receive.getTimestamp()
-            snapshot = Snapshot(
-                stamp=time.monotonic(), joints=tuple(receive.getActualQ()), speeds=tuple(receive.getActualQd()),
-                flange=tuple(receive.getActualTCPPose()), wrench=tuple(receive.getActualTCPForce()),
-                safety_bits=receive.getSafetyStatusBits(), mode=receive.getRobotMode(),
-                runtime=receive.getRuntimeState(), inputs=receive.getActualDigitalInputBits(),
-                outputs=receive.getActualDigitalOutputBits(), device_time=self._newest,
-                payload=(receive.getPayload(), tuple(receive.getPayloadCog())),
-            )  # fmt: skip
-            if receive.getTimestamp() == self._newest:
-                return snapshot
+        """The newest packet, where none has come the next one."""
+        state = self._link.newest("U", SILENCE_S)
+        _, stamp, *joints, inputs, outputs, mode, _, safety_bits, runtime, mass, x, y, z = STATE.unpack(state)
+        q, qd, flange, wrench = (tuple(joints[k : k + 6]) for k in range(0, 24, 6))
+        return Snapshot(
+            time.monotonic(), q, qd, flange, wrench, safety_bits=safety_bits, mode=mode, runtime=runtime, inputs=inputs,
+            outputs=outputs, device_time=stamp, payload=(mass, (x, y, z)),
+        )  # fmt: skip
 
 
+SILENCE_S = 1.5
+"""The arm counts as lost after this time without a packet; it sends one every 2 ms."""
 OFF_S = 1.0
 """How long on the wall an output may take to be seen off."""
 _SAFE_S = 5.0
@@ -61,17 +70,6 @@ _GREETING = 79
 _STAYS, _LOW_WHEN_NOT_RUNNING = 0, 1
 _NOT_SAFE = 4
 """Exit code of `--safe` when an output stays on or the arm does not come to rest."""
-
-
-def _terminal(index: int) -> tuple[str, int]:
-    """Kind and number of digital output `index`: 0-7 standard, 8-15 configurable, 16-17 tool."""
-    return ("standard", "configurable", "tool")[index // 8], index % 8
-
-
-def switch_output(io: RTDEIOInterface, index: int, value: bool) -> bool:
-    """Set digital output `index`."""
-    kind, number = _terminal(index)
-    return bool(getattr(io, f"set{kind.capitalize()}DigitalOut")(number, value))
 
 
 def keep_low(address: str, outputs: tuple[int, ...], free: tuple[int, ...] = ()) -> None:
@@ -84,8 +82,7 @@ def keep_low(address: str, outputs: tuple[int, ...], free: tuple[int, ...] = ())
         return
     lines = []
     for index, choice in choices:
-        kind, number = _terminal(index)
-        lines.append(f"  set_runstate_{kind}_digital_output_to_value({number}, {choice})\n")
+        lines.append(f"  set_runstate_{KINDS[index // 8]}_digital_output_to_value({index % 8}, {choice})\n")
     try:
         _say(address, f"sec cell_outputs():\n{''.join(lines)}end\n".encode())
     except OSError as error:
@@ -110,11 +107,9 @@ def _say(address: str, program: bytes) -> None:
 def make_safe(address: str, outputs: list[int]) -> None:
     """Switch outputs off, then see on the arm's own word that they are and that it stands."""
     signal.setitimer(signal.ITIMER_REAL, _SAFE_S)
-    if outputs:
-        io = RTDEIOInterface(address)
-        for index in outputs:
-            switch_output(io, index, False)
-    packets = Packets(address)
+    packets = Packets(address, switches=bool(outputs))
+    for index in outputs:
+        packets.switch(index, False)
     mask = sum(1 << index for index in outputs)
     clock, deadline = Clock(), time.monotonic() + OFF_S
 

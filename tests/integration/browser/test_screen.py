@@ -209,8 +209,11 @@ def test_a_start_is_said_at_once_and_once_and_a_run_ends_with_its_figure(browser
     screen.close()
 
 
-def test_the_first_load_is_small_and_the_next_asks_only_whether_it_is_the_same(screen: Screen) -> None:
+def test_the_first_load_is_small_and_the_next_asks_only_whether_it_is_the_same(
+    browser: Browser, console: Console
+) -> None:
     """Over the wire, headers and all; without it three.js alone had 1.3 MB."""
+    screen = Screen.of(browser, console.link())
     sizes = """() => ['navigation', 'resource'].flatMap((type) => performance.getEntriesByType(type))
         .map((entry) => [new URL(entry.name).pathname, entry.transferSize])"""
     screen.shows("world", "SIMULATED")
@@ -223,6 +226,7 @@ def test_the_first_load_is_small_and_the_next_asks_only_whether_it_is_the_same(s
     assert again["/static/vendor/three.module.min.js"] < 1000
     assert sum(again.values()) - again["/api/cell"] < 20_000, again
     print(f"first load {sum(first.values())} bytes, next {sum(again.values())}")
+    screen.close()
 
 
 def test_an_error_is_told_in_a_sentence(screen: Screen) -> None:

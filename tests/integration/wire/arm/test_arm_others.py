@@ -142,13 +142,17 @@ def test_an_e_series_arm_may_leave_out_its_e(told, model, same):
         require_named("arm", board, model)
 
 
-def test_an_input_register_that_another_client_holds_is_named_at_connecting(bench):
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [(b"input_int_register_0", "registers are already in use"),
+     (b"tool_digital_output", "digital outputs are already in use")],
+)  # fmt: skip
+def test_an_input_that_another_client_holds_is_named_at_connecting(bench, name, told):
     with socket.create_connection((bench.address, 30004), timeout=2.0) as other:
         other.sendall(struct.pack(">HBH", 5, ord("V"), 2))
-        names = b"input_int_register_0"
-        other.sendall(struct.pack(">HB", 3 + len(names), ord("I")) + names)
+        other.sendall(struct.pack(">HB", 3 + len(name), ord("I")) + name)
         other.recv(4096)
-        with pytest.raises(NotConnectedError, match="registers are already in use"):
+        with pytest.raises(NotConnectedError, match=told):
             connect(bench.address)
     arm = connect(bench.address)
     nudge(arm)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import signal
 import socket
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +21,7 @@ from cell.devices.lock import CellLock
 from cell.run.folder import awaited_word
 from cell.run.jogging import jog, needed_for, parse_jog
 from drivers.clock import Clock
-from drivers.errors import DeviceFault, InterlockError, NotConnectedError
+from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from statemachine.journal import request
 from tests.support import Typed, until
 from tests.support.packages import RAIL, install, with_acme_rail
@@ -81,7 +83,7 @@ def test_diag_tells_what_the_devices_tell_changes_nothing_and_fails_when_one_doe
         assert after[name] == before[name], name
     assert after["rail"]["carriage"] == before["rail"]["carriage"]
     change(r'url = "socket://[^"]*"', 'url = "socket://127.0.0.1:1"')
-    code, out, _ = typed("diag", "--json")
+    code, out, _ = typed("diag", "--device", "rail", "--json")
     assert code == 1
     assert not json.loads(out)["rail"]["ok"]
 
@@ -231,17 +233,21 @@ def word(cell: Cell) -> None:
         cell.current.confirm("Ann")
 
 
-def test_an_arm_that_froze_is_used_again_by_the_same_program(tmp_path: Path) -> None:
+def test_an_arm_that_froze_is_used_again_by_the_same_program(endpoints: dict[str, Any]) -> None:
     """Its link is lost after 1.5 s of silence: a person's word connects it again."""
-    with started("sim", "serve", "--json", "--speed", "1", "--config-out", "cell.toml", folder=tmp_path) as sim:
-        assert sim.stdout is not None
-        sim.stdout.readline()
-        with Cell.open(tmp_path / "cell.toml", only=("arm", "vehicle")) as opened:
-            sim.send_signal(signal.SIGSTOP)
-            Clock().sleep(4.0)
-            with pytest.raises(DeviceFault, match="was lost"):
+    with Cell.open("cell.toml", only=("arm", "vehicle")) as opened:
+
+        def lost() -> bool:
+            with suppress(DeadlineError):
                 opened.devices.arm.state()
-            sim.send_signal(signal.SIGCONT)
-            opened.recover("Ann")
-            opened.home("arm", lambda event: event.kind == "confirm_needed" and word(opened))
-            assert opened.devices.arm.state().controlled
+            return False
+
+        os.kill(endpoints["pid"], signal.SIGSTOP)
+        try:
+            with pytest.raises(DeviceFault, match="was lost"):
+                until(lost, 4.0)
+        finally:
+            os.kill(endpoints["pid"], signal.SIGCONT)
+        opened.recover("Ann")
+        opened.home("arm", lambda event: event.kind == "confirm_needed" and word(opened))
+        assert opened.devices.arm.state().controlled

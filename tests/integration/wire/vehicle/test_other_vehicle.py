@@ -134,7 +134,7 @@ def test_what_other_nodes_send_is_not_the_vehicles(peer: OtherVehicle, driver: A
     driver.check()
 
 
-@pytest.mark.parametrize("mode", [0, 2, 3])
+@pytest.mark.parametrize("mode", [0, pytest.param(2, marks=pytest.mark.campaign), 3])
 def test_a_person_at_the_remote_control_is_in_charge_whatever_mode_the_model_reports(
     peer: OtherVehicle, driver: AgilexVehicle, mode: int
 ) -> None:

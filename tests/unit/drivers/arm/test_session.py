@@ -88,7 +88,7 @@ def children():
 @pytest.mark.parametrize(
     ("kind", "state"),
     [*itertools.product(["joints"], ["playing", "pausing", "paused", "resuming"]),
-     ("follow", "playing"), ("follow", "paused")],
+     ("follow", "playing"), pytest.param("follow", "paused", marks=pytest.mark.campaign)],
 )  # fmt: skip
 def test_after_a_stop_nothing_goes_on_whatever_the_program_was_doing(arm, bench, kind, state):
     moving = swinging(arm, bench, kind)

@@ -88,7 +88,7 @@ def test_a_search_ends_at_the_first_sign_that_the_carriage_goes_elsewhere(
     params: dict[str, Any], fault: str, mode: int, told: str, longest: float
 ) -> None:
     """By a switch of the other side, by a count that stands, or after the travel and a margin."""
-    with benched(1.0, RailParams(**params), reference_mode=mode) as made:
+    with benched(4.0, RailParams(**params), reference_mode=mode) as made:
         if fault:
             made.peer.fault(fault)
         begun = made.clock.now()

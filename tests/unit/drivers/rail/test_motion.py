@@ -85,9 +85,9 @@ def test_ramps_follow_from_speed_and_acceleration() -> None:
 
 
 @pytest.mark.wire
-@pytest.mark.parametrize(("lost", "refused"), [(0.0, False), (0.03e-3, False), (0.09e-3, True), (-0.09e-3, True)])
+@pytest.mark.parametrize(("lost", "refused"), [(0.03e-3, False), (0.09e-3, True), (-0.09e-3, True)])
 def test_a_count_that_is_off_by_more_than_a_twentieth_of_a_millimetre_is_refused(lost: float, refused: bool) -> None:
-    with benched(1.0) as made:
+    with benched(4.0) as made:
         rail, model = made.rail, made.model
         rail.home().wait(20.0)
         counted = model.position(made.world.now())

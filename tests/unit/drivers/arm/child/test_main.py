@@ -8,10 +8,12 @@ import signal
 import subprocess
 import sys
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from drivers.arm.child.outputs import Packets
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import NotConnectedError
@@ -93,6 +95,29 @@ def test_close_leaves_the_laser_off_and_no_process_and_may_be_repeated(bench):
         arm.state()
     with pytest.raises(NotConnectedError, match="was closed"):
         arm.move_joints(np.zeros(6), 1.0, 1.0)
+
+
+def test_a_child_that_waits_is_woken_by_packets_and_not_ten_thousand_times_a_second(arm):
+    before = woken(arm._session.link.pid)
+    Clock().sleep(0.4)
+    assert 200 < woken(arm._session.link.pid) - before < 0.4 * 4500
+
+
+def test_a_child_starts_without_numpy_which_would_take_as_long_as_all_else(arm):
+    assert "numpy" not in Path(f"/proc/{arm._session.link.pid}/maps").read_text()
+
+
+def test_of_states_that_have_piled_up_the_newest_counts(bench):
+    packets = Packets(bench.address, switches=False)
+    Clock().sleep(0.1)
+    before = bench.ask("show")["time"]
+    assert packets.read().device_time > before - 0.01
+
+
+def woken(process):
+    """How often threads of the process have waited so far."""
+    told = (path.read_text() for path in Path(f"/proc/{process}/task").glob("*/status"))
+    return sum(int(text.rpartition("\nvoluntary_ctxt_switches:")[2].split()[0]) for text in told)
 
 
 # Last: it takes the arm for the shared driver.
