@@ -53,8 +53,8 @@ class MatingGap:
 
     @property
     def interference(self) -> float:
-        """What 5 % of the squares interfere by or more, m, beyond their noise: a single one may be dirt."""
-        return float(np.percentile(-self.gaps - self.noise, 95))
+        """What 5 % of the squares interfere by or more, m: a single one may be dirt, and their noise averages out."""
+        return float(np.percentile(-self.gaps, 95))
 
     @property
     def clearance(self) -> float:
