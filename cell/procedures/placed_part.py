@@ -33,7 +33,9 @@ BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 OFF_DRAWING = "the part itself is not as drawn there: bent, worn, cut, or another one"
 INTERFERENCE_M = 25e-6
-"""Interference that form and dirt explain, m, beyond noise and what the pose of the part is off by."""
+"""Interference that form and dirt explain, m, beyond what the pose of the part is off by."""
+HANGS_M = 10e-6
+"""Clearance that form explains, m: whatever bears a part, some of the squares are closed there."""
 OFF_CONTACT = "the part as drawn would {} the surface by {:.2f} mm where it is seen"
 ASIDE = np.array([1.0, 1.0, 0.0, 0.0, 0.0, 1.0])
 """Of a motion, what is along the surface."""
@@ -113,17 +115,18 @@ class PlacedPart:
         """With the `gap` below it, as it was seen, and how far off it lay `before` each correction.
 
         No part goes into its surface. One that seems to has its underside elsewhere than drawn below its upper side. It
-        may lie as far aside as brings it to rest. The same holds for one that was corrected and then seems to hang.
+        may lie as far aside as brings it to rest. One that was corrected and then seems to hang was seen wrongly: it
+        may lie as far aside as it was moved by that.
         """
-        found, least = replace(self, gap=gap, before=before), INTERFERENCE_M + self.unsure
+        found = replace(self, gap=gap, before=before)
         if gap is None or self.unseen:
             return found
-        interference = 0.0
-        if gap.interference > least:
+        interference, off = 0.0, np.zeros(6)
+        if gap.interference > INTERFERENCE_M + self.unsure:
             interference = gap.interference
-        elif before and gap.clearance > least:
-            interference = -gap.clearance
-        off = bool(interference) * ASIDE * gap.off_contact(self.seen.surface_from_part.translation, SHIFTED)
+            off = ASIDE * gap.off_contact(self.seen.surface_from_part.translation, SHIFTED)
+        elif before and gap.clearance > HANGS_M + self.unsure:
+            interference, off[:2] = -gap.clearance, before[-1]
         return replace(found, interference=interference, covariance=self.covariance + np.diag(off**2))
 
     @cached_property

@@ -53,13 +53,13 @@ class MatingGap:
 
     @property
     def interference(self) -> float:
-        """What 5 % of the squares interfere by or more, m, beyond their noise: a single one may be dirt."""
-        return float(np.percentile(-self.gaps - self.noise, 95))
+        """What 5 % of the squares interfere by or more, m: a single one may be dirt, and their noise averages out."""
+        return float(np.percentile(-self.gaps, 95))
 
     @property
     def clearance(self) -> float:
-        """What 95 % of the squares are apart by or more, m; the noise of so many averages out."""
-        return float(np.percentile(self.gaps, 5))
+        """What 98 % of the squares are apart by or more, m: more of them are nearly closed about what bears a part."""
+        return float(np.percentile(self.gaps, 2))
 
     def off_contact(self, about: Array, sigmas: Array) -> Array:
         """The motion (6,), m and rad, surface axes, about a point (3,) m, that would close all gaps: least squares with

@@ -125,7 +125,13 @@ def test_a_part_that_seems_to_go_into_the_surface_may_be_off_by_what_brings_it_o
     up = drawn_gap(nominal, high.seen.surface_from_part, underside)
     assert high.over(up).interference == 0.0, "it may lie on something"
     again = high.over(up, (0.2e-3,))
-    assert again.interference == pytest.approx(-0.1e-3, abs=2e-6) and again.in_tolerance(PLACE), "it is seen how high"
+    assert again.interference == pytest.approx(-0.1e-3, abs=2e-6) and not again.in_tolerance(PLACE)
+    assert np.sqrt(np.diag(again.covariance))[:3] == pytest.approx([0.2e-3, 0.2e-3, 1e-5], abs=2e-6), "it went there"
+    tilted = part(moved(turn=(0.0, 0.008, 0.0)), sigma=2e-6)
+    edge = drawn_gap(nominal, tilted.seen.surface_from_part, underside)
+    assert (
+        edge is not None and tilted.over(replace(edge, gaps=edge.gaps - edge.gaps.min()), (0.2e-3,)).interference == 0.0
+    )
     assert again.before == (0.2e-3,) and any("would hang above the surface by 0.10 mm" in note for note in again.notes)
     unsure = part(moved(0.3e-3), sigma=0.1e-3)
     assert unsure.over(gap).interference == 0.0, "it may lie where it goes into nothing"

@@ -199,7 +199,8 @@ def _follow(value: NDArray[np.float32], like: Learned | None) -> tuple[Candidate
             return found, StripeChain(chain.rows[:0], chain.which[:0], chain.piece[:0], 0.0), 0.0, along
         # What a shrunken picture answers at may be wider than any stripe that is looked for.
         typical = float(np.median(found.scale[chain.rows, chain.which]))
-    typical = min(typical, follow.SCALES[-1])
+    # One that was taught may be narrower than any, such as a column of the sensor that is always bright.
+    typical = min(max(typical, follow.SCALES[0]), follow.SCALES[-1])
     near = scales[np.abs(np.log(scales / typical)) < 0.75]
     found = follow.candidates(value, np.arange(len(value)), tuple(near), along)
     chain = follow.follow(found)

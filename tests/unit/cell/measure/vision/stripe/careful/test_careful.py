@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 
-from cell.measure.vision.stripe.careful.careful import fill_gaps
+from cell.measure.vision.stripe.careful.careful import fill_gaps, read_carefully
 from cell.measure.vision.stripe.extract import extract
-from cell.measure.vision.stripe.planes import read_colours
-from cell.measure.vision.stripe.profile import StripeProfile
+from cell.measure.vision.stripe.planes import LaserChannel, as_picture, read_colours
+from cell.measure.vision.stripe.profile import StripeProfile, StripeSettings
 from lab.bench.stripe.workshop import Scene, draw
 
 
@@ -89,3 +91,11 @@ def test_a_gap_of_a_line_is_filled_only_with_the_same_line(piece, taken):
 def test_where_little_of_a_picture_shows_a_line_nothing_is_added_to_it():
     line = careful(np.where(np.arange(480) < 140, 320.0, np.nan))
     fill_gaps(line, lambda rows: pytest.fail("read again"))
+
+
+def test_a_line_is_looked_for_that_is_narrower_than_any_as_a_bright_column_of_the_sensor_teaches():
+    image, _ = line_of(np.linspace(1.5, 8, 480), seed=1)
+    taught = extract(image).learned
+    assert taught is not None
+    picture, narrow = as_picture(image, 250.0), replace(taught, scale=0.3)
+    assert read_carefully(picture, None, LaserChannel.AUTO, StripeSettings(), like=narrow).valid.any()
