@@ -23,7 +23,7 @@ from tests.support.report_runs import changed
 from tests.support.unloading import unloaded
 
 SHIPPED, _ = load_job("load")
-JOB = changed(SHIPPED, "scan", speed=2.0 * SHIPPED.scan.speed, frame_rate=0.5 * SHIPPED.scan.frame_rate)
+JOB = changed(SHIPPED, "scan", speed=2.0 * SHIPPED.scan.speed)
 
 
 @pytest.mark.parametrize(
