@@ -55,7 +55,7 @@ GROUPS = (
         "unit/drivers/relay/test_boards.py",
         "unit/drivers/claw/test_robotiq.py",
     ),
-    # The virtual job, and what is told of its ends.
+    # The virtual job, what is told of its ends, and jobs that pick.
     (
         "integration/virtual/test_virtual_door.py",
         "unit/cell/run/report",
@@ -69,6 +69,9 @@ GROUPS = (
         "integration/virtual/test_verify_job.py",
         "integration/virtual/test_two_stations.py",
         "schedules/test_schedules.py",
+        "unit/cell/procedures/steps/test_pick.py",
+        "unit/cell/procedures/steps/test_pick_nest.py",
+        "unit/cell/procedures/steps/test_verify_nest.py",
     ),
     # Its steps, one by one.
     (
@@ -82,9 +85,6 @@ GROUPS = (
         "unit/cell/procedures/steps/test_reconstruct.py",
         "unit/cell/procedures/steps/test_invert_pose.py",
         "unit/cell/procedures/steps/test_gripping.py",
-        "unit/cell/procedures/steps/test_pick.py",
-        "unit/cell/procedures/steps/test_pick_nest.py",
-        "unit/cell/procedures/steps/test_verify_nest.py",
         "unit/cell/procedures/steps/test_place.py",
         "unit/cell/procedures/steps/test_verify.py",
         "unit/cell/procedures/steps/test_correction.py",

@@ -28,8 +28,8 @@ from tests.support.report_runs import changed
 class LyingPart:
     """A cell of `record` at its station, whose part was put down; `also` is of the job's [place].
 
-    It is swept `faster` than shipped, with as many fewer pictures a second. `changed` changes its world before anybody
-    looks, `heard` is called with each text that is told, `series` tells of parts before, and the job names these
+    It is swept `faster` than shipped. `changed` changes its world before anybody looks, `heard` is called with each
+    text that is told, `series` tells of parts before, and the job names these
     `features`. `notes` are the texts, `parts` what it noted of the part, and
     `carried` whether its moves reckoned with a part in the claw then.
     """
@@ -54,8 +54,7 @@ class LyingPart:
         """What the step makes of a part that lies `off` its place."""
         file = job_with_part(self.folder, "pot", verify=self.verify, half=self.half, flat=self.flat, also=self.also)
         job, mesh = load_job(file)
-        speed, rate = self.faster * job.scan.speed, job.scan.frame_rate / self.faster
-        quick = changed(job, "scan", speed=speed, frame_rate=rate)
+        quick = changed(job, "scan", speed=self.faster * job.scan.speed)
         quick = changed(quick, "part", feature=self.features) if self.features else quick
         nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
         self._site = site = AtStation(

@@ -96,10 +96,10 @@ def _item_before(job: Job) -> str | None:
 
 
 def configuration(folder: Path) -> CellConfig:
-    """The cell as it ships, of a folder of its own; its runs draw no picture."""
+    """The cell as it ships, of a folder of its own; its runs leave no record and picture."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "cell.toml"
-    path.write_text(default_toml().replace("[cell]\n", "[cell]\npicture = false\n"), encoding="utf-8")
+    path.write_text(default_toml().replace("record = true", "picture = false\nrecord = false"), encoding="utf-8")
     return load_config(path)
 
 

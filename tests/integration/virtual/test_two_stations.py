@@ -8,29 +8,20 @@ import numpy as np
 import pytest
 
 from cell import Cell
-from cell.config.job import job_path
 from cell.devices.simulated.direct import VirtualCell
 from cell.run.record.replay import replay
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
 from statemachine.step import Event
-
-
-@pytest.fixture
-def fast(calibrated_folder: Path) -> Path:
-    """The job `two-stations`, swept twice as fast as shipped."""
-    text, file = job_path("two-stations").read_text(encoding="utf-8"), calibrated_folder / "two-stations.toml"
-    for name in ("facets.ply", "shell-part.ply"):
-        text = text.replace(f'"{name}"', f'"{job_path("pot").parent / name}"')
-    file.write_text(text.replace('speed = "15 mm/s"', 'speed = "30 mm/s"'), encoding="utf-8")
-    return file
+from tests.support.described_cells import UNDRAWN, described, quick_job
 
 
 def test_a_part_is_placed_at_each_stop_also_when_the_second_run_was_cut_short(
-    placed_pot: JobRecord, fast: Path
+    placed_pot: JobRecord, calibrated_folder: Path
 ) -> None:
-    told: list[str] = []
-    with Cell.open(sim="all", seed=placed_pot.seed, clock="virtual", job=fast) as cell:
+    fast, told = quick_job("two-stations", calibrated_folder), list[str]()
+    cell_file, _ = described(calibrated_folder, UNDRAWN)
+    with Cell.open(cell_file, sim="all", seed=placed_pot.seed, clock="virtual", job=fast) as cell:
         assert isinstance(cell.simulated, VirtualCell)
         world = cell.simulated.world
 

@@ -37,7 +37,7 @@ STOP = "arm.protective_stop@laser_sweep:40%"
 def folder(calibrated_folder: Path) -> Path:
     """The folder of a calibrated cell whose runs leave few files, with the job `pot` in a quarter of the lines."""
     (calibrated_folder / "cell.toml").write_text(changed(default_toml(), LEAN), encoding="utf-8")
-    assert load_job(quick_job("pot", calibrated_folder))[0].scan.speed == 0.030
+    assert load_job(quick_job("pot", calibrated_folder, 15.0))[0].scan.speed == 0.030
     return calibrated_folder
 
 

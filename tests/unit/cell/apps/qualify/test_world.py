@@ -27,7 +27,7 @@ SEED = 2
 def task(tmp_path_factory: pytest.TempPathFactory) -> WorldTask:
     """The job `pot`, swept in a quarter of the lines shipped."""
     folder = tmp_path_factory.mktemp("qualify")
-    job = str(quick_job("pot", folder))
+    job = str(quick_job("pot", folder, 15.0))
     of = QualifiedCode.of(job, load_config(None))
     return WorldTask(of, job, default_toml(), folder / "campaign", level="nominal", seed=SEED)
 

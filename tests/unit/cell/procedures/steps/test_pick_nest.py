@@ -18,8 +18,9 @@ from cell.run.record.replay import replay
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
 from statemachine.step import Event
+from tests.support.described_cells import UNDRAWN, described, quick_job
 from tests.support.report_runs import changed
-from tests.support.unloading import swap_file, unloaded
+from tests.support.unloading import unloaded
 
 SHIPPED, _ = load_job("load")
 JOB = changed(SHIPPED, "scan", speed=2.0 * SHIPPED.scan.speed)
@@ -49,8 +50,8 @@ def test_a_part_that_is_not_in_its_nest_is_not_gripped(placed_pot: JobRecord, me
 def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_resumed(
     placed_pot: JobRecord, calibrated_folder: Path
 ) -> None:
-    file = swap_file(calibrated_folder)
-    with Cell.open(sim="all", seed=placed_pot.seed, clock="virtual", job=file) as cell:
+    file, (undrawn, _) = quick_job("swap", calibrated_folder), described(calibrated_folder, UNDRAWN)
+    with Cell.open(undrawn, sim="all", seed=placed_pot.seed, clock="virtual", job=file) as cell:
         assert isinstance(cell.simulated, VirtualCell)
         world, begun = cell.simulated.world, list[str]()
         # It lies as the world has drawn it, which is not where the job expects it.
@@ -113,7 +114,8 @@ def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_r
 def test_a_part_that_the_claw_took_from_its_nest_is_placed_by_the_run_that_resumes(
     placed_pot: JobRecord, calibrated_folder: Path
 ) -> None:
-    with Cell.open(sim="all", seed=placed_pot.seed, clock="virtual", job="load") as cell:
+    load, (undrawn, _) = quick_job("load", calibrated_folder), described(calibrated_folder, UNDRAWN)
+    with Cell.open(undrawn, sim="all", seed=placed_pot.seed, clock="virtual", job=load) as cell:
 
         def until(step: str, text: str) -> Callable[[Event], None]:
             def end(event: Event) -> None:
@@ -123,7 +125,7 @@ def test_a_part_that_the_claw_took_from_its_nest_is_placed_by_the_run_that_resum
             return end
 
         # Close above the surface, from where the arm goes straight up at first; and before the step that picks.
-        first = cell.run("load", observer=until("place", "feeling"))
+        first = cell.run(load, observer=until("place", "feeling"))
         second = cell.resume(observer=until("drive_to_target", "in sight"))
         assert [(run.outcome, run.report["part"]) for run in (first, second)] == [("aborted", "held")] * 2
         done = cell.resume()

@@ -64,7 +64,7 @@ def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(lyi
 
 
 def test_a_part_in_its_place_is_left_there_and_nothing_is_said_of_it(placed_pot: JobRecord, tmp_path: Path) -> None:
-    site = LyingPart(placed_pot, tmp_path, also="corrections = 1", faster=1.4)
+    site = LyingPart(placed_pot, tmp_path, also="corrections = 1")
     found = site.looked(moved())
     require_seen(found, moved())
     assert found.before == () and site.parts == []
@@ -141,7 +141,7 @@ def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(
         )
         cell.world.remake(replace(scene, workshop=rocking), cell.world.station)
 
-    found = LyingPart(placed_pot, tmp_path, changed=rocks, faster=1.4).looked(moved(0.1e-3, z=0.05e-3))
+    found = LyingPart(placed_pot, tmp_path, changed=rocks).looked(moved(0.1e-3, z=0.05e-3))
     error = difference(found.seen.surface_from_part, moved(0.1e-3, z=0.05e-3))
     assert np.linalg.norm(error[:3]) < 0.03e-3 and np.abs(error[3:]).max() < 0.3e-3
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
@@ -224,7 +224,7 @@ def test_a_part_that_is_not_as_drawn_about_its_features_is_told_though_it_lies_i
     ]
     features = tuple(map(FeatureSection.model_validate, named))
     with pytest.raises(MisplacedError, match=r"lies 0.0\d ± 0.0\d mm off") as told:
-        LyingPart(placed_pot, tmp_path, changed=other, features=features, faster=1.4).looked(pin.SE3.Identity())
+        LyingPart(placed_pot, tmp_path, changed=other, features=features).looked(pin.SE3.Identity())
     for out in ("edge front is 0.2", "flat top is 0.4", OFF_DRAWING):
         assert out in str(told.value)
     assert str(told.value).count("Out of tolerance") == 2
@@ -448,7 +448,7 @@ def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replaye
 
 def test_a_part_that_slips_as_the_claw_opens_ends_the_run_as_misplaced(placed_pot: JobRecord, tmp_path: Path) -> None:
     job, mesh = load_job(job_with_part(tmp_path, "pot", verify="all", half=MIDDLE))
-    job = changed(job, "scan", speed=0.030, frame_rate=15.0)
+    job = changed(job, "scan", speed=0.030)
     slips = opened(motion(y=0.9, turn=(0, 0, 4)))
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
     done = run_whole_job(
