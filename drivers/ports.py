@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import socket
+from contextlib import suppress
+from typing import ClassVar, cast
 
 import serial
+from serial.urlhandler import protocol_socket
 
+from drivers.clock import Clock
 from drivers.errors import NotConnectedError
 
 WRITE_TIMEOUT_S = 2.0
@@ -13,6 +17,30 @@ WRITE_TIMEOUT_S = 2.0
 PARITIES = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
 FAILURES = (serial.SerialException, OSError)
 """What a port raises when its other end is gone."""
+
+
+class SocketPort(protocol_socket.Serial):
+    """A port at `socket://HOST:PORT`. pyserial's own waits after each closing, for servers that take one client at a
+    time: here who opens the same port again does."""
+
+    REOPEN_S = 0.3
+    _socket: socket.socket
+    _clock = Clock()
+    _free: ClassVar[dict[str | None, float]] = {}
+
+    def open(self) -> None:
+        """Connect, at the earliest `REOPEN_S` wall seconds after this program has closed the port."""
+        self._clock.sleep_until(self._free.get(self.port, 0.0))
+        super().open()
+
+    def close(self) -> None:
+        """Close the port at once; idempotent."""
+        if self.is_open:
+            with suppress(OSError):
+                self._socket.shutdown(socket.SHUT_RDWR)
+            self._socket.close()
+            self.is_open = False
+            self._free[self.port] = self._clock.now() + self.REOPEN_S
 
 
 def open_port(
@@ -23,7 +51,8 @@ def open_port(
     No other program that asks for a lock has the port meanwhile. Raises `NotConnectedError` for the device `name`.
     """
     try:
-        return serial.serial_for_url(
+        make = cast("type[serial.Serial]", SocketPort) if url.startswith("socket://") else serial.serial_for_url
+        return make(
             url, baudrate=baud, timeout=timeout, write_timeout=WRITE_TIMEOUT_S, parity=PARITIES[parity],
             stopbits=stop_bits, exclusive=True,
         )  # fmt: skip

@@ -8,21 +8,20 @@ machine does not run the writer for the length of the timeout.
 from __future__ import annotations
 
 import select
-import socket
 import time
 from typing import Any
 
 from serial import PortNotOpenError, SerialException, SerialTimeoutException
-from serial.urlhandler import protocol_socket
+
+from drivers.ports import SocketPort
 
 _CHUNK = 4096
 SCHEME = "bufsocket://"
 
 
-class Serial(protocol_socket.Serial):
+class Serial(SocketPort):
     """A `socket://` port with a read buffer; one thread may read while another writes."""
 
-    _socket: socket.socket
     _buffer = b""
 
     @property

@@ -34,7 +34,7 @@ class Drive:
     @classmethod
     def of(cls, record: ModbusRailConfig, *, pty: bool = False, echo: bool = False) -> Drive:
         world = WorldClock(SPEED)
-        params = RailParams(steps_per_turn=record.counts_per_turn, serial=4711)
+        params = RailParams(steps_per_turn=record.counts_per_turn, start=0.02, serial=4711)
         model = RailModel(params, np.random.default_rng(1))
         drive = ModbusDriveServer(model, world, record.model_dump(mode="json"))
         peer = ModbusPeer(drive, UNIT, pty=pty, echo=echo)

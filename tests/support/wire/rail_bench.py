@@ -64,7 +64,7 @@ def telegram(command: int, kind: int, value: int) -> bytes:
 def benched(speed: float = SPEED, params: RailParams | None = None, **how: Any) -> Iterator[Bench]:
     """The bench at `speed`, its rail connected as `how` says and closed in the end."""
     world, clock = WorldClock(speed), Clock(speed)
-    model = RailModel(params or RailParams(), np.random.default_rng(3))
+    model = RailModel(params or RailParams(start=0.02), np.random.default_rng(3))
     peer = TmclPeer(model, world)
     peer.start()
     try:
