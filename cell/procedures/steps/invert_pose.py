@@ -101,11 +101,11 @@ def _retold(refused: RefusedError, text: str) -> RefusedError:
 
 
 def _slipped(workplace: Workplace, sweep: SweepRecord) -> Vector:
-    """What a scan head that has slipped since the calibration may move the place by, (6, 6), base axes."""
+    """What a scan head that has slipped, or pictures that come later, may move the place by, (6, 6), base axes."""
     if sweep.slip is None:
         return np.zeros((6, 6))
     camera = sweep.base_from_flange.rotation @ workplace.calibration.scan.flange_from_camera.rotation
-    return sweep.slip.covariance(camera)
+    return sweep.slip.covariance(camera, workplace.job.scan.speed)
 
 
 def inverted(workplace: Workplace, sweep: SweepRecord, scan: Reconstruction, fix: BoardFix) -> PlacePose:

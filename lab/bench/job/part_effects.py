@@ -117,6 +117,12 @@ def head_slipped(by: Floats) -> Change:
     return scene(lambda drawn: replace(drawn, flange_from_scan_camera=drawn.flange_from_scan_camera @ by))
 
 
+def screw_worn(world: World) -> None:
+    """The rail's screw has .05 mm of play."""
+    params = world.rail.params
+    world.rail.params = replace(params, screw=replace(params.screw, backlash=0.05e-3))
+
+
 def later(by: Floats, seconds: float) -> Change:
     """The part slips over the surface so long after it was let go, once, and settles there."""
 
@@ -196,11 +202,14 @@ EFFECTS: dict[str, PartEffect] = {
     ),
     "upper side .3 mm aside in x": PartEffect((), upper=lambda v: np.add(v, [0.3e-3, 0.0, 0.0])),
     "upper side .15 mm aside in y": PartEffect((), upper=lambda v: np.add(v, [0.0, 0.15e-3, 0.0])),
+    "upper side .3 mm aside in y": PartEffect((), upper=lambda v: np.add(v, [0.0, 0.3e-3, 0.0])),
     "grown by 2 per mille": PartEffect((), underside=lambda v: 1.002 * v, upper=lambda v: 1.002 * v),
     "bent by .15 mm": PartEffect((), underside=_bent, upper=_bent),
     "slips .4 mm in y while it is swept": PartEffect(SLIPPED, later(motion(0.0, 0.4), 8.0)),
     "surface pushed .3 mm in x as the claw opens": PartEffect((), as_it_opens(lambda world: world.slide(motion(0.3)))),
     "laser turns 1 mrad as the claw opens": PartEffect((), as_it_opens(laser_turned(1.0))),
     "scan head slips .3 mm as the claw opens": PartEffect((), as_it_opens(head_slipped(motion(0.3)))),
+    "joint 6 turns 2 mrad as the claw opens": PartEffect((), as_it_opens(lambda world: world.arm.shift_zero(5, 2e-3))),
+    "rail's screw has play of .05 mm": PartEffect((), screw_worn),
 }
 """By name."""

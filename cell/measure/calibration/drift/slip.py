@@ -35,6 +35,8 @@ from drivers.errors import Measured, RefusedError
 NOTED_M = 0.05e-3
 """A shift that people are told of: plate, rail and picture that nobody touched give 0.02 mm."""
 LARGEST_M = 0.15e-3
+NOTED_LAG_S = 2e-3
+"""Of pictures that come later: so much the ones that are lost where the line leaves the plate may leave open."""
 LARGEST_LAG_S = 10e-3
 """Pictures that come so much later than at the calibration are paired with the wrong places of the rail."""
 PLATE_DEPTH_M = 0.085
@@ -67,6 +69,11 @@ class Slip:
         return float(np.hypot(self.along, self.across))
 
     @property
+    def lag_open(self) -> float:
+        """The lag that is reckoned with, s; 0 where it is too small for a word."""
+        return self.lag if abs(self.lag) > NOTED_LAG_S else 0.0
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """For people, what is not as usual."""
         made = []
@@ -76,6 +83,12 @@ class Slip:
                 f"{1e3 * self.across:+.3f} mm across the rail since the calibration; the stated uncertainty allows for "
                 "it. Look at the head's screws, then run `cell calibrate`"
             )
+        if self.lag_open:
+            made.append(
+                f"the scan camera's pictures come {1e3 * self.lag:+.1f} ms later against the rail's readings than at "
+                "the calibration, or the play of its screw is another; the stated uncertainty allows for it. Look at "
+                "both, then run `cell calibrate`"
+            )
         if self.hidden:
             made.append(
                 "whether the scan head has slipped across the rail is not seen: an end of the laser's line on the "
@@ -83,12 +96,14 @@ class Slip:
             )
         return tuple(made)
 
-    def covariance(self, axes: Array) -> Array:
-        """What a place may be off by because of it, (6, 6), m² and rad², base axes; `axes` (3, 3) are the camera's."""
-        made = np.zeros((6, 6))
+    def covariance(self, axes: Array, speed: float) -> Array:
+        """What a place may be off by because of it, (6, 6), m² and rad², base axes; `axes` (3, 3) are the camera's, and
+        `speed` is the sweep's, m/s."""
+        made, late = np.zeros((6, 6)), speed * self.lag_open * axes[:, 0]
+        made[:3, :3] = np.outer(late, late)
         if self.size > NOTED_M:
             shift = LEVER * (axes @ np.array([self.along, self.across, 0.0]))
-            made[:3, :3] = np.outer(shift, shift)
+            made[:3, :3] += np.outer(shift, shift)
             # A turn on its mount that shifts the plate by as much.
             made[3:, 3:] = (self.size / self.depth) ** 2 * np.eye(3)
         return made

@@ -26,12 +26,17 @@ CONFIG = load_config(None)
 def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused() -> None:
     axes = np.eye(3)[[1, 2, 0]]
     small, some, far = (Slip(size, 0.0, 0.0) for size in (0.9 * NOTED_M, 1.5 * NOTED_M, 1.1 * LARGEST_M))
-    assert small.notes == () and not small.covariance(axes).any()
+    assert small.notes == () and not small.covariance(axes, 0.015).any()
     assert "slipped by +0.075 mm along" in some.notes[0]
     # In the base, along the camera's x axis, and no less than the plate shows.
-    assert np.sqrt(np.diag(some.covariance(axes))[2]) >= 1.5 * NOTED_M
+    assert np.sqrt(np.diag(some.covariance(axes, 0.015))[2]) >= 1.5 * NOTED_M
     # A head that turned on its mount, 85 mm before the plate.
-    assert np.sqrt(np.diag(some.covariance(axes))[3:]) == pytest.approx(3 * [1.5 * NOTED_M / 0.085])
+    assert np.sqrt(np.diag(some.covariance(axes, 0.015))[3:]) == pytest.approx(3 * [1.5 * NOTED_M / 0.085])
+    early, late = Slip(0.0, 0.0, -1.8e-3), Slip(0.0, 0.0, 3e-3)
+    assert early.notes == () and not early.covariance(axes, 0.015).any()
+    assert "pictures come +3.0 ms later" in late.notes[0]
+    # Along the rail, by what the sweep covers meanwhile.
+    assert np.sqrt(np.diag(late.covariance(axes, 0.015))) == pytest.approx([0, 0, 45e-6, 0, 0, 0])
     small.require(), some.require()
     with pytest.raises(RefusedError, match=r"scan head has slipped by \+0\.165 mm along"):
         far.require()
