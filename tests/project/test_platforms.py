@@ -16,7 +16,6 @@ from cell.apps.cli.commands import run
 from cell.apps.doctor import asked_for
 from drivers.arm.link import ArmLink
 from drivers.packages import lacking
-from lab.bench import platforms
 
 NEVER = 'ur-rtde>=1.6.3,<1.7; python_version < "3"'
 
@@ -67,12 +66,3 @@ def test_over_the_wires_it_is_refused_before_anything_is_started(
 def test_the_doctor_asks_for_nothing_that_has_no_wheel_here(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cell.apps.doctor.tomllib.loads", lambda text: {"project": {"dependencies": [NEVER]}})
     assert asked_for(()) == {"": []}
-
-
-def test_the_table_of_platforms_follows_from_what_lacks() -> None:
-    assert platforms.works(set(), set()) == ("yes", "yes", "yes", "yes", "")
-    assert platforms.works({"ur-rtde"}, {"ur-rtde"}) == ("no: ur-rtde", "yes", "yes", "yes", "")
-    without = {"ompl", "embreex"}
-    last = ("over one corner: no ompl", "if built", "no: embreex", "ruckig")
-    assert platforms.works({"ruckig", *without}, without) == ("if built", *last)
-    assert platforms.works({"pin", "ompl"}, {"pin", "ompl"}) == ("no: pin",) * 4 + ("",)
