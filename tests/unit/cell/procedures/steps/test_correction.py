@@ -123,7 +123,7 @@ def test_what_is_interrupted_is_left_to_a_person() -> None:
 def test_a_part_that_lies_too_far_aside_is_not_gripped(placed_pot: JobRecord, tmp_path: Path) -> None:
     site = LyingPart(placed_pot, tmp_path, also="corrections = 1")
     with pytest.raises(MisplacedError):
-        site.looked(moved(3e-3, z=1e-3))
+        site.looked(moved(3e-3, z=1.5e-3))
     assert site.parts == [] and any("farther than 2 mm" in note for note in site.notes)
 
 

@@ -165,8 +165,8 @@ def test_a_vehicle_that_was_pushed_since_the_sweep_does_not_make_the_part_look_t
         pushed.append(text)
 
     site = LyingPart(placed_pot, tmp_path, heard=push, also='corrections = 1\naccept = "0.05 mm"')
-    found = site.looked(moved(0.1e-3))
-    error = difference(found.seen.surface_from_part, moved(0.1e-3))
+    found = site.looked(moved(0.1e-3, z=0.05e-3))
+    error = difference(found.seen.surface_from_part, moved(0.1e-3, z=0.05e-3))
     assert np.linalg.norm(error[:3]) < 0.03e-3 and np.abs(error[3:]).max() < 0.3e-3
     assert re.search("surface or vehicle was pushed: it stands 0.* mm and 1[12].. mrad from", str(site.notes))
     assert not found.before and "nobody looked where the claw would go" in str(site.notes)
