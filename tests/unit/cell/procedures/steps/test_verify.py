@@ -357,6 +357,7 @@ def test_a_part_whose_upper_side_lies_elsewhere_than_drawn_is_not_moved_by_it(
     with pytest.raises(MisplacedError, match=r"would go into the surface by .*Most likely the part is not as drawn"):
         site.looked(moved())
     assert site.parts == [] and np.linalg.norm(site.lies().translation) < 1e-6
+    assert any("no correction" in note and "would go into the surface" in note for note in site.notes)
 
 
 @pytest.mark.parametrize(
