@@ -32,8 +32,8 @@ NO_FLUSH = "how flush its edge is was not seen: no surface shows near it, or a v
 BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 OFF_DRAWING = "the part itself is not as drawn there: bent, worn, cut, or another one"
-INTERFERENCE_M = 25e-6
-"""Interference that form and dirt explain, m, beyond what the pose of the part is off by."""
+INTERFERENCE_M = 15e-6
+"""Interference that form and dirt explain, m, beyond noise and what the pose of the part is off by."""
 HANGS_M = 10e-6
 """Clearance that form explains, m: whatever bears a part, some of the squares are closed there."""
 OFF_CONTACT = "the part as drawn would {} the surface by {:.2f} mm where it is seen"

@@ -24,6 +24,8 @@ DEEPEST_M = 1.5e-3
 """What was scanned farther below the drawn surface is not the surface: a table beside it, or a hole."""
 FORM_M = 20e-6
 """What the form of part and surface makes of a gap, m, one standard deviation; assumed."""
+FIVE_PERCENT = 1.645
+"""Standard deviations that 5 % of all draws exceed."""
 APART = "below the part as drawn there is nothing of the surface, or the triangles of part.mesh face inwards"
 NEXT_STEP = (
     "See that part.mesh is the drawing of this part, in the datum of grasp.flange_from_part and "
@@ -53,8 +55,8 @@ class MatingGap:
 
     @property
     def interference(self) -> float:
-        """What 5 % of the squares interfere by or more, m: a single one may be dirt, and their noise averages out."""
-        return float(np.percentile(-self.gaps, 95))
+        """What 5 % of the squares interfere by or more, m, beyond what noise does to as many: one alone may be dirt."""
+        return float(np.percentile(-self.gaps - FIVE_PERCENT / disagreement.SIGMAS * self.noise, 95))
 
     @property
     def clearance(self) -> float:

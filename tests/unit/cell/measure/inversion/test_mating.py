@@ -110,9 +110,9 @@ def test_what_is_off_contact_brings_a_part_back_that_goes_into_the_surface() -> 
     motion = found.off_contact(off.translation, np.array([2e-3] * 3 + [20e-3] * 3))
     assert motion == pytest.approx([0.2e-3, -0.15e-3, -0.05e-3, 0.002, -0.001, 0.003], rel=0.03, abs=5e-6)
     deep = np.where(np.arange(len(found.gaps)) == 0, -0.5e-3, 0.0)
-    assert replace(found, gaps=deep).interference == 0.0, "one square may be dirt"
-    rough = replace(found, noise=found.noise + 0.1e-3)
-    assert rough.interference == found.interference > rough.overlap, "the noise of its squares averages out"
+    assert replace(found, gaps=deep, noise=0.0 * deep).interference == 0.0, "one square may be dirt"
+    rough = replace(found, gaps=np.random.default_rng(1).normal(0.0, 25e-6, 2000), noise=np.full(2000, 100e-6))
+    assert abs(rough.interference) < 5e-6, "noise alone"
 
 
 def test_the_scanned_surface_tells_the_same(placed_pot: JobRecord) -> None:
