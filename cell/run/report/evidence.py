@@ -101,7 +101,7 @@ def textures_of(result: RunResult, nominal: NominalSurface, areas: Sequence[Area
 
     def told(within: Vector | None) -> Texture:
         motions = made.by_calibration, made.by_poses
-        return measure_texture(heights_over(made.cloud, nominal, place, motions, shaken, within))
+        return measure_texture(heights_over(made.cloud, nominal, place, motions, shaken, within=within))
 
     return {"": told(None), **{area.name: told(area.corners) for area in areas}}
 

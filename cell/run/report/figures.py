@@ -38,7 +38,7 @@ def texture_words(report: Report) -> str:
     return "; ".join([_waviness(texture), *areas])
 
 
-def _waviness(texture: Mapping[str, Any]) -> str:
+def _waviness(texture: Report) -> str:
     if texture["sq_mm"] is None:
         return f"no waviness told: {texture['reason']}"
     sizes = ", ".join(f"{name.capitalize()} {texture[f'{name}_mm']:.4f} mm" for name in ("sa", "sq", "sz"))

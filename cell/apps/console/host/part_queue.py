@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from cell.run.runs import Run
 from drivers.errors import InterlockError
@@ -30,13 +30,21 @@ class PartQueue:
         self._wanted = "run"
         self.job: str | None = None
         """Of the parts, until the last one has ended."""
-        self._shown: dict[str, Any] | None = None
+        self._shown: dict[str, object] | None = None
 
     def perform(self, job: str, count: int, *, at_start: bool) -> None:
         """Do the parts, one after the other; raises what keeps the first one from being begun."""
         self.require_none()
         self._wanted, self.job, stops = "run", job, self._cell.stops
-        shown = self._shown = {"job": job, "part": 0, "count": count, "counts": {}, "reason": "", "state": "running"}
+        shown: dict[str, object] = {
+            "job": job,
+            "part": 0,
+            "count": count,
+            "counts": {},
+            "reason": "",
+            "state": "running",
+        }
+        self._shown = shown
 
         def seen(event: Event) -> None:
             self._run = self._cell.current or self._run
@@ -62,7 +70,7 @@ class PartQueue:
         self._wanted = what
         return WANTED[what]
 
-    def as_dict(self) -> dict[str, Any] | None:
+    def as_dict(self) -> dict[str, object] | None:
         """The batch as the page shows it (docs/reference/console.md), None before the first."""
         return None if self._shown is None else {**self._shown, "wanted": self._wanted}
 
@@ -70,7 +78,7 @@ class PartQueue:
         """No other part is begun."""
         self._wanted = "end"
 
-    def _between(self, shown: dict[str, Any], stops: int) -> None:
+    def _between(self, shown: dict[str, object], stops: int) -> None:
         """Called after each part: the next one begins when this returns. A stop meanwhile ends the batch."""
         while self._wanted == "hold" and self._cell.stops == stops:
             shown["state"] = "holding"
