@@ -17,7 +17,8 @@ from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.drive.driving import Planar
 from cell.procedures.drive.way import Whereabouts
 from drivers.errors import RefusedError
-from tests.unit.cell.procedures.drive.test_way import CONFIG, JOB, VEHICLE_FROM_BASE, LateVehicle, Site, moved
+from tests.unit.cell.procedures.drive.test_driving import LateVehicle, moved
+from tests.unit.cell.procedures.drive.test_way import CONFIG, JOB, VEHICLE_FROM_BASE, Site
 
 
 def test_a_vehicle_that_nobody_knows_about_is_not_driven_and_told_what_to_do() -> None:
