@@ -325,8 +325,14 @@ class RtdeLink:
                 return payload
 
     def wait(self, seconds: float) -> bool:
-        """Whether something has come, or comes within so long on the wall."""
-        return bool(self._rest or select.select([self._socket], [], [], seconds)[0])
+        """Whether a whole packet is here, looked for at most so long on the wall: `receive` then waits for nothing."""
+        if not self._whole and select.select([self._socket], [], [], seconds)[0]:
+            self._fill()
+        return self._whole
+
+    @property
+    def _whole(self) -> bool:
+        return len(self._rest) >= _HEADER.size and len(self._rest) >= _HEADER.unpack_from(self._rest)[0]
 
     def newest(self, kind: str, timeout: float) -> bytes:
         """The payload of the last packet of this kind that has come; where there is none the next, within `timeout`."""
@@ -347,12 +353,14 @@ class RtdeLink:
             if left <= 0:
                 raise TimeoutError("the arm has gone silent")
             self._socket.settimeout(left)
-            data = self._socket.recv(65536)
-            if not data:
-                raise ConnectionResetError("the arm closed the connection")
-            self._rest += data
+            self._fill()
         taken, self._rest = self._rest[:size], self._rest[size:]
         return taken
+
+    def _fill(self) -> None:
+        if not (data := self._socket.recv(65536)):
+            raise ConnectionResetError("the arm closed the connection")
+        self._rest += data
 
 
 SIZES = {

@@ -234,8 +234,7 @@ class Child:
         count = 0
         look = time.monotonic()
         while True:
-            news = self._packets.wait(LOOK_S)
-            before = self._snapshot
+            before, snapshot = self._snapshot, self._next_state()
             if time.monotonic() > look:
                 look = time.monotonic() + LOOK_S
                 if self._owner.frozen() and not self._ending:
@@ -249,20 +248,23 @@ class Child:
             if os.getppid() != self._parent:
                 os.kill(os.getpid(), signal.SIGTERM)
                 self._parent = os.getppid()
-            if not news:
+            if snapshot is None:
                 if time.monotonic() - before.stamp > SILENCE_S:
                     self._lose(f"no packet from the arm for {SILENCE_S:g} s")
                 continue
-            try:
-                snapshot = self._packets.read()
-            except OSError as error:
-                self._lose(str(error))
             # A stop for safety keeps what was late before it.
             late = before.late if safety_code(snapshot.safety_bits) and before.late else self._control.late
             snapshot = self._snapshot = replace(snapshot, late=late)
             count += 1
             if count % every == 0 or _urgent(snapshot) != _urgent(before):
                 self._send(snapshot)
+
+    def _next_state(self) -> Snapshot | None:
+        """The newest state that has come, or comes within `LOOK_S`; None where none does."""
+        try:
+            return self._packets.read() if self._packets.wait(LOOK_S) else None
+        except OSError as error:
+            self._lose(str(error))
 
     def _stand_in(self) -> None:
         """Stop the arm and switch the safe outputs off for an owner that is frozen; again if that goes on."""
@@ -317,10 +319,12 @@ def _unhurried() -> Iterator[None]:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         slack.write_text(str(_SLACK_NS))
         os.setpriority(os.PRIO_PROCESS, 0, -10)
-    yield
-    with suppress(OSError):
-        slack.write_text("0")  # the usual one
-    raise_priority()
+    try:
+        yield
+    finally:
+        with suppress(OSError):
+            slack.write_text("0")  # the usual one
+        raise_priority()
 
 
 def _serve(descriptor: int) -> None:

@@ -45,12 +45,14 @@ class Packets:
         self._link.send("U", bytes([self._recipe, *fields]))
 
     def wait(self, seconds: float) -> bool:
-        """Whether a packet has come since the one that was read last, or comes within so long on the wall."""
+        """Whether a packet has come since the one that was read last, or comes within so long on the wall: whole."""
         return self._link.wait(seconds)
 
     def read(self) -> Snapshot:
         """The newest packet, where none has come the next one."""
         state = self._link.newest("U", SILENCE_S)
+        if len(state) != STATE.size:
+            raise OSError(f"a state of {len(state)} bytes came, {STATE.size} were agreed")
         _, stamp, *joints, inputs, outputs, mode, _, safety_bits, runtime, mass, x, y, z = STATE.unpack(state)
         q, qd, flange, wrench = (tuple(joints[k : k + 6]) for k in range(0, 24, 6))
         return Snapshot(

@@ -13,7 +13,8 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from drivers.arm.link import latch_clock
+from drivers.arm import link
+from drivers.arm.link import RtdeLink, latch_clock
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, NotConnectedError
@@ -23,6 +24,23 @@ from tests.support.wire.arm_bench import ArmBench, joints_away, keep_outputs, so
 pytestmark = pytest.mark.wire
 
 LASER = 0
+
+
+def test_a_packet_that_stops_in_its_middle_keeps_nobody_waiting(monkeypatch):
+    packet = struct.pack(">HB", 7, ord("U")) + b"four"
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        monkeypatch.setattr(link, "PORT", server.getsockname()[1])
+        with RtdeLink("127.0.0.1", Clock(), 5.0) as made, server.accept()[0] as arm:
+            arm.sendall(packet[:5])
+            begun = time.monotonic()
+            assert not made.wait(0.05) and not made.wait(0.05)
+            assert time.monotonic() - begun < 1.0
+            arm.sendall(packet[5:] + packet[:2])
+            assert made.wait(1.0) and made.newest("U", 1.0) == b"four"
+            assert not made.wait(0.05)
+            arm.close()
+            with pytest.raises(ConnectionResetError, match="closed the connection"):
+                made.wait(1.0)
 
 
 @pytest.mark.parametrize("way", [signal.SIGKILL, signal.SIGSEGV])
