@@ -36,7 +36,7 @@ NOTED_M = 0.05e-3
 """A shift that people are told of: plate, rail and picture that nobody touched give 0.02 mm."""
 LARGEST_M = 0.15e-3
 NOTED_LAG_S = 2e-3
-"""Of pictures that come later: so much the ones that are lost where the line leaves the plate may leave open."""
+"""A lag that is told, s: less may come of a picture that is lost as the line leaves the plate."""
 LARGEST_LAG_S = 10e-3
 """Pictures that come so much later than at the calibration are paired with the wrong places of the rail."""
 PLATE_DEPTH_M = 0.085
@@ -69,6 +69,10 @@ class Slip:
         return float(np.hypot(self.along, self.across))
 
     @property
+    def _late(self) -> str:
+        return f"{1e3 * abs(self.lag):.1f} ms {'later' if self.lag > 0.0 else 'earlier'}"
+
+    @property
     def lag_open(self) -> float:
         """The lag that is reckoned with, s; 0 where it is too small for a word."""
         return self.lag if abs(self.lag) > NOTED_LAG_S else 0.0
@@ -85,7 +89,7 @@ class Slip:
             )
         if self.lag_open:
             made.append(
-                f"the scan camera's pictures come {1e3 * self.lag:+.1f} ms later against the rail's readings than at "
+                f"the scan camera's pictures come {self._late} against the rail's readings than at "
                 "the calibration, or the play of its screw is another; the stated uncertainty allows for it. Look at "
                 "both, then run `cell calibrate`"
             )
@@ -119,7 +123,7 @@ class Slip:
             )
         if not abs(self.lag) <= LARGEST_LAG_S:
             raise RefusedError(
-                f"the scan camera's pictures come {1e3 * self.lag:+.1f} ms later against the rail's readings than at "
+                f"the scan camera's pictures come {self._late} against the rail's readings than at "
                 f"the calibration, allowed are ±{1e3 * LARGEST_LAG_S:g} ms: a sweep would lie elsewhere as a whole. "
                 "See whether frames are lost or stamped otherwise (cable, packets, trigger), then run `cell calibrate`",
                 Measured("pictures come later by", 1e3 * self.lag, "ms", most=1e3 * LARGEST_LAG_S),
