@@ -325,15 +325,17 @@ class Cell:
         names = item_names(job)
         read_fitting(job, self.config, calibrates=is_whole(self.simulated))
         jobs = [load_job(name)[0] for name in names]
+        # A stop between two parts counts as one in a part: no other is begun.
+        stops = self.stops
         for each in jobs if inject else ():
             Injector.scheduled(inject, kind_of(each).names, self.simulated)
         return batches.perform(
             self._open_cell, jobs, count,
             run=lambda number, parts_before: self._start(
                 names[(number - 1) % len(names)], observer, {}, None, inject=inject,
-                at_start=at_start and number == 1, parts_before=parts_before,
+                at_start=at_start and number == 1, parts_before=parts_before, stops=stops,
             ).result(),
-            between=lambda work: self.perform("loading", work, observer), observer=observer,
+            between=lambda work: self.perform("loading", work, observer, stops=stops), observer=observer,
         )  # fmt: skip
 
     def resume(
@@ -363,7 +365,7 @@ class Cell:
     def _start(
         self, job: str | Path, observer: Observer | None, info: dict[str, object], before: UnfinishedRun | None,
         inject: Sequence[str] = (), *, at_start: bool, until: str | None = None, script: Script = NO_SCRIPT,
-        parts_before: PartsBefore | None = None,
+        parts_before: PartsBefore | None = None, stops: int | None = None,
     ) -> Run[RunOutcome]:  # fmt: skip
         inline: tuple[Observer, ...] = ()
         if inject:
@@ -374,7 +376,7 @@ class Cell:
             raise ConfigError(f"job {job} has {len(items)} items: name one, such as {items[0]}, or run all as a batch")
         self._runs.require_free()
         self._runs.require_no_late_stop()
-        stops = self.stops
+        stops = self.stops if stops is None else stops
         ready = ReadyJob.read(job, self.config, until, script, calibrates=is_whole(self.simulated))
         if before is not None and is_whole(self.simulated) and not self.devices.claw.holding:
             # The part of a simulated world that has ended lies in its nest again.

@@ -35,15 +35,9 @@ class PartQueue:
     def perform(self, job: str, count: int, *, at_start: bool) -> None:
         """Do the parts, one after the other; raises what keeps the first one from being begun."""
         self.require_none()
-        self._wanted, self.job, stops = "run", job, self._cell.stops
-        shown: dict[str, object] = {
-            "job": job,
-            "part": 0,
-            "count": count,
-            "counts": {},
-            "reason": "",
-            "state": "running",
-        }
+        self._wanted, self.job, self._run, stops = "run", job, None, self._cell.stops
+        shown: dict[str, object] = {"job": job, "part": 0, "count": count, "counts": {}}
+        shown |= {"reason": "", "state": "running"}
         self._shown = shown
 
         def seen(event: Event) -> None:
@@ -53,8 +47,7 @@ class PartQueue:
                 self._between(shown, stops)
 
         try:
-            reason = self._cell.run_batch(job, count, seen, at_start=at_start).reason
-            shown["reason"] = reason if self._cell.stops == stops else f"the cell was stopped: {reason}"
+            shown["reason"] = self._cell.run_batch(job, count, seen, at_start=at_start).reason
         finally:
             self.job, shown["state"] = None, "ended"
 
@@ -79,10 +72,10 @@ class PartQueue:
         self._wanted = "end"
 
     def _between(self, shown: dict[str, object], stops: int) -> None:
-        """Called after each part: the next one begins when this returns. A stop meanwhile ends the batch."""
+        """Called after each part: the next one begins when this returns, not after a stop (`Cell.run_batch`)."""
         while self._wanted == "hold" and self._cell.stops == stops:
             shown["state"] = "holding"
             time.sleep(LOOK_S)
         shown["state"] = "running"
-        if self._run is not None and (self._wanted == "end" or self._cell.stops != stops):
+        if self._run is not None and self._wanted == "end":
             self._run.end_batch()

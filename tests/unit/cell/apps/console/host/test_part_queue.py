@@ -70,4 +70,4 @@ def test_a_stop_ends_a_queue_that_holds(controller: ConsoleController) -> None:
     controller.cell.stop()
     assert becomes(controller, "ended")
     assert shown(controller)["counts"]["not tried"] == 1
-    assert shown(controller)["reason"].startswith("the cell was stopped")
+    assert shown(controller)["reason"].startswith("after part 1: the cell was stopped before the job began")
