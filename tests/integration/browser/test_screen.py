@@ -205,6 +205,8 @@ def test_a_start_is_said_at_once_and_once_and_a_run_ends_with_its_figure(browser
         changes["safety"] = {"stopped": last["outcome"] == "faulted"}
         screen.shows("state", word.replace("+", "."))
         screen.shows("state-text", sentence)
+    changes |= {"safety": {"stopped": False}, "queue": {"state": "holding", "part": 1, "count": 2, "counts": {}}}
+    screen.shows("state", "QUEUE HOLDS")
     page.unroute("**/api/do")
     screen.close()
 

@@ -19,7 +19,7 @@ export class Queue {
     byId('queue-done').value = queue.part / queue.count;
     say(byId('queue-said'), over ? `ended: ${queue.reason}` : `${queue.part} of ${queue.count} done${this.wish(queue)}`);
     const counts = Object.entries(queue.counts).filter(([name, n]) => n || ['placed', 'corrected', 'refused', 'misplaced'].includes(name));
-    remake(byId('queue-counts'), counts, () => counts.map(([name, n]) => el('li', { className: name },
+    remake(byId('queue-counts'), counts, () => counts.map(([name, n]) => el('li', { className: n && ['refused', 'misplaced', 'faulted', 'aborted'].includes(name) ? 'bad' : name },
       el('strong', { textContent: String(n) }), el('small', { textContent: ENDS[name] ?? name }))));
     show(byId('queue-buttons'), !over);
     document.querySelectorAll('[data-parts]').forEach((button) => {

@@ -5,7 +5,7 @@ import { byId, deg, el, figure, mm, remake, say, seconds, words } from './dom.js
 const ENDS = { refused: 'REFUSED', misplaced: 'MISPLACED', faulted: 'FAULT', failed: 'FAULT', aborted: 'STOPPED' };
 
 // Word, kind (for its colour) and sentence of a state.
-export function mood({ run, question, last, starting, safety, devices, manual }) {
+export function mood({ run, question, last, starting, safety, devices, manual, queue }) {
   if (question) return ['WAITS FOR YOU', 'wait', question.reason];
   if (run === null && starting) return ['STARTING', 'busy', `Starting ${words(starting)} …`];
   if (run && run.state === 'paused') return ['PAUSED', 'wait', 'The run holds. Press Go on, or Abort.'];
@@ -18,6 +18,8 @@ export function mood({ run, question, last, starting, safety, devices, manual })
   const sick = Object.values(devices).find((device) => !device.ok)?.fault;
   if (sick) return ['FAULT', 'bad', [sick.text, sick.remedy].filter(Boolean).join('. ')];
   if (safety.stopped) return [ENDS[last?.outcome] ?? 'STOPPED', 'bad', last?.reason ?? 'The cell was stopped. Look at it, then clear the stop.'];
+  if (queue?.state === 'holding') return ['QUEUE HOLDS', 'wait', `The next part begins when Go on is pressed. ${ended(last)}`];
+  if (queue?.state === 'running') return ['RUNNING', 'busy', 'The next part of the queue begins.'];
   if (last?.outcome === 'placed') return [`PLACED ${placed(last)}`.trim(), 'good', ended(last)];
   return ['READY', 'good', last ? ended(last) : 'Nothing is going on.'];
 }
