@@ -28,7 +28,7 @@ from cell.procedures.arm.moves import Pace, PartProgress, PartState
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import FrameStore
 from cell.procedures.sought_part import ground_below, nominal_of, sought
-from cell.procedures.steps import verify
+from cell.procedures.steps import pick, place, verify
 from cell.procedures.steps.kinds import Kind, kind_of
 from cell.procedures.steps.pick import HeldPart
 from cell.procedures.steps.workplace import PartsBefore, Workplace
@@ -215,6 +215,7 @@ class JobRun:
             self.config, job, self.ready.nominal, calibration=self.calibration, devices=self.devices, frames=frames,
             folder=folder, whereabouts=whereabouts, earlier=self.earlier, held=self.held,
             needs_part=kind.places and state is PartState.HELD, looks_after=verify.STEP.name in kind.names,
+            looks_again=place.STEP in kind.steps or pick.STEP in kind.steps,
             sweeping=self._sweeping, registered=self._registered, pace=self.pace, ground=self.ready.ground,
             parts_before=self.parts_before, part=PartProgress(state),
         )  # fmt: skip

@@ -1,4 +1,7 @@
-"""The laser sweep: to the scan pose, settle, laser on, constant-velocity sweep, laser off; as often as the job asks."""
+"""The laser sweep: to the scan pose, settle, laser on, constant-velocity sweep, laser off; as often as the job asks.
+
+Before a part is put down or taken, the way back is a second look, in few lines: does the surface still lie there?
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ import pinocchio as pin
 
 from cell.config.calibrations.store import changed, doubt_of, link_of
 from cell.config.cell_config import CellConfig
-from cell.config.job import LONGEST_SWEEP_S, ScanSection
+from cell.config.job import LONGEST_SWEEP_S, ScanSection, SwathSection
 from cell.measure.calibration import ScanCalibration
 from cell.measure.calibration.drift.reference_plate import PlateLine, Pointing
 from cell.measure.calibration.drift.reference_plate import pointing as pointing_since
@@ -20,11 +23,11 @@ from cell.measure.calibration.drift.slip import LARGEST_M, Slip, slip_since
 from cell.measure.calibration.drift.timing import StampTiming
 from cell.procedures.ambient import MOST_WHITE, TRIES, bearable, require_line, shorten
 from cell.procedures.arm.photograph import BoardFix, scan_plans
-from cell.procedures.calibrate.reference_plate import require_edge, require_reference_plate
+from cell.procedures.calibrate.reference_plate import configure_fast, require_edge, require_reference_plate
 from cell.procedures.steps.board_photo import require_board_unmoved
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord, save_sweep
-from cell.procedures.sweep.swath import MAX_LOST_FRACTION, SweepCollector, SweepErrors, warm_up
+from cell.procedures.sweep.swath import MAX_LOST_FRACTION, Swath, SweepCollector, SweepErrors, warm_up
 from cell.procedures.sweep.sweeping import arm_sweep, check_lost_steps, home_rail, rail_sweep
 from drivers.errors import CalibrationStale
 from drivers.interfaces import Frame
@@ -38,6 +41,15 @@ UNSEEN_BY_LIGHT = (
 SHIFT_SHARE = 0.25
 """Share of the place's tolerance by which the unknown of its times may shift a sweep. Replies that are all late shift
 it to one side without any scatter; what else the place may be off by has the other three quarters."""
+LINES = 48
+"""Of a look at a strip once more. Enough for a vehicle that rocks to average out: with 32, a sweep that was repeated at
+half its speed showed a rocking of 4 Hz as a slow motion: once for each of these lines, or nearly."""
+MOST_LOST = 0.5
+"""Share of its frames: a comparison misses none of them, and says what is left of it."""
+HURRY = 2.0
+"""So many times as fast as in the sweep the rail goes, where it can: few lines need few pictures."""
+ROOM_M = 1e-3
+"""Left of the travel beside what it takes to gain speed."""
 
 
 def laser_sweep(
@@ -100,6 +112,43 @@ def laser_sweep(
     return SweepRecord(tuple(swaths), doubts=(*lost, *chain.from_iterable(notes)))
 
 
+def in_few_lines(
+    workplace: Workplace, over: pin.SE3, head: ScanCalibration, before: Swath, *, keep: str, check: Callable[[], None],
+    progress: Callable[[float, str], None], back: bool = False, counted: bool = False,
+) -> SweepRecord:  # fmt: skip
+    """Sweep the job's last strip, swept `before`, once more in about `LINES` lines, the other way if `back`.
+
+    `over` is base_from_surface, `keep` what its frames are kept as. Raises what `laser_sweep` raises.
+    """
+    scan = workplace.job.scan
+    few = sparse(workplace, scan.swath[-1], before)
+    # A camera of a few frame rates takes all the lines.
+    rate = configure_fast(workplace.devices, few.exposure, (few.frame_rate, scan.frame_rate))
+    return laser_sweep(
+        workplace, over, head, few.model_copy(update={"frame_rate": rate}), most_lost=MOST_LOST, back=back,
+        keep_frame=lambda frame: workplace.frames.keep(keep, frame), check=check, progress=progress, counted=counted,
+    )  # fmt: skip
+
+
+def sparse(workplace: Workplace, strip: SwathSection, before: Swath) -> ScanSection:
+    """The `strip` that was swept `before`, in about `LINES` lines: by the rail faster, where there is room to gain
+    speed; by the arm no faster, since a repetition is slower."""
+    scan, rail = workplace.job.scan, workplace.config.rail
+    speed = min(scan.speed, pace(before))
+    if scan.mode == "rail":
+        # As much room as beyond the ends of the sweep.
+        room = 0.5 * (rail.travel[1] - rail.travel[0] - scan.length) - ROOM_M
+        speed = max(speed, min(HURRY * speed, rail.max_speed, math.sqrt(2.0 * rail.acceleration * max(room, 0.0))))
+    rate = min(scan.frame_rate, max(1.0, LINES * speed / scan.length))
+    return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": (strip,)})
+
+
+def pace(swath: Swath) -> float:
+    """How fast, m/s, the scan head went."""
+    ways = np.linalg.norm(swath.flanges[-1, :3, 3] - swath.flanges[0, :3, 3]) + abs(swath.rail[-1] - swath.rail[0])
+    return float(ways / (swath.times[-1] - swath.times[0]))
+
+
 def slowed_down(scan: ScanSection, attempt: int) -> ScanSection:
     """The sweep of the `attempt` (from 1): each repetition half as fast with half the frames, the lines as close.
 
@@ -146,15 +195,21 @@ def _sweep(workplace: Workplace, context: StepContext, fix: BoardFix) -> SweepRe
     doubts = times_known(head, workplace.config)[1]
     if pointing is not None:
         head = head.pointed(pointing, workplace.config.laser.exit_point)
+    over, again = workplace.base_from_surface(fix), workplace.looks_again
     record = laser_sweep(
-        workplace, workplace.base_from_surface(fix), head, slowed_down(workplace.job.scan, context.attempt),
+        workplace, over, head, slowed_down(workplace.job.scan, context.attempt),
         check=context.check, progress=context.progress, keep_frame=lambda frame: workplace.frames.keep("stripe", frame),
-        sweeping=workplace.sweeping,
+        sweeping=workplace.sweeping, counted=not again,
     )  # fmt: skip
     rest = workplace.devices.interlocks.situation.last if workplace.job.scan.mode == "rail" else None
+    back = None if not again else in_few_lines(
+        workplace, over, head, record.swaths[-1], keep="second-look", check=context.check, back=True, counted=True,
+        progress=lambda share, text: context.progress(0.9, f"whether the surface lies still: {text}"),
+    )  # fmt: skip
+    lost = () if back is None else back.doubts
     blinded = (UNSEEN_BY_LIGHT,) if workplace.devices.bright else ()
-    doubts = (*record.doubts, *unwatched(head.witness), *blinded, *doubts, *workplace.notes)
-    record = replace(record, pointing=pointing, slip=slip, doubts=doubts, rest=rest)
+    doubts = (*record.doubts, *lost, *unwatched(head.witness), *blinded, *doubts, *workplace.notes)
+    record = replace(record, pointing=pointing, slip=slip, doubts=doubts, rest=rest, back=back, held_s=context.held_s)
     for note in record.notes:
         context.note(text=note)
     return record
@@ -223,4 +278,4 @@ def seen_on_plate(workplace: Workplace, context: StepContext) -> tuple[Pointing 
     return pointing, slip
 
 
-STEP = JobStep(Step("laser_sweep", 120.0, 2, ("DeadlineError",)), _run_step, SweepRecord, needs=(BoardFix,))
+STEP = JobStep(Step("laser_sweep", 180.0, 2, ("DeadlineError",)), _run_step, SweepRecord, needs=(BoardFix,))

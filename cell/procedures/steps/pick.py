@@ -149,7 +149,7 @@ def _run_step(workplace: Workplace, context: StepContext) -> HeldPart:
         # Whoever has the run held may reach in, and move the part.
         if context.held_s == before:
             break
-    if job.scan.mode == "rail":
+    if not look.counted:
         check_lost_steps(workplace.devices, lambda _, text: context.progress(0.05, text))
     for note in look.notes:
         context.note(text=note)

@@ -270,7 +270,7 @@ def _run_step(workplace: Workplace, context: StepContext) -> PlaceResult:
         if context.held_s == held:
             break
     # While the arm comes down; the laser is off.
-    carriage = workplace.devices.rail.check_zero() if look is not None and workplace.job.scan.mode == "rail" else None
+    carriage = None if look is None or look.counted else workplace.devices.rail.check_zero()
     placing = Placing(
         aim.job, pose.base_from_surface, expected, mover=workplace.mover, arm=workplace.devices.arm,
         claw=workplace.devices.claw, part=workplace.part, check=context.check, progress=context.progress,

@@ -58,7 +58,8 @@ class Workplace:
 
     `job` changes once: a pick from a nest replaces its grasp by the measured one. `earlier` is the sweep of a run that
     this one resumes, `held` how that had gripped its part. `needs_part`: the claw must hold the part at the beginning.
-    `looks_after` is True for a run that looks at the placed part. `whereabouts` is kept over retries and runs: the
+    `looks_again` is True for a run that looks at the surface once more after its sweep, `looks_after` for one that
+    looks at the placed part. `whereabouts` is kept over retries and runs: the
     vehicle may stand anywhere when a step is done again. `sweeping` is told who takes the frames of each sweep, before
     it begins, and where the surface is by the board (base_from_surface), `registered` where it was found. `pace` is the
     share of the planned speed. `looked` says whether this run has tried to look at the fine board, `interim` what that
@@ -77,6 +78,7 @@ class Workplace:
     earlier: StoredSweep | None = None
     held: HeldPart | None = None
     needs_part: bool = True
+    looks_again: bool = False
     looks_after: bool = False
     sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None
     registered: Callable[[pin.SE3], None] = lambda base_from_surface: None

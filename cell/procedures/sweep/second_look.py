@@ -1,4 +1,4 @@
-"""Does the surface still lie where it was swept? A few lines of it are swept once more before the part is put down.
+"""Does the surface still lie where it was swept? A few lines on the way back tell, before the part is put down.
 
 The surface may slide while the board stands firm. Nothing that the arm feels tells a shift to the side. A placed part
 is looked at again on the rail's way back: it may still slide, sink or turn.
@@ -13,7 +13,6 @@ from functools import partial
 import numpy as np
 import pinocchio as pin
 
-from cell.config.job import ScanSection, SwathSection
 from cell.measure.calibration import ScanCalibration
 from cell.measure.inversion import PlacePose
 from cell.measure.inversion.effects import between_sweeps
@@ -21,9 +20,8 @@ from cell.measure.inversion.observability import Tolerance
 from cell.measure.reconstruction.build import flange_motions
 from cell.measure.reconstruction.cloud import Cloud
 from cell.procedures.arm.photograph import BoardFix
-from cell.procedures.calibrate.reference_plate import configure_fast
 from cell.procedures.steps.board_photo import require_board_unmoved
-from cell.procedures.steps.laser_sweep import head_at, laser_sweep, times_known
+from cell.procedures.steps.laser_sweep import head_at, in_few_lines, pace, times_known
 from cell.procedures.steps.reconstruct import Reconstruction, build_cloud
 from cell.procedures.steps.workplace import Workplace
 from cell.procedures.sweep.stored_sweep import SweepRecord
@@ -33,29 +31,24 @@ from drivers.errors import Measured, RefusedError
 from drivers.interfaces import Vector
 from statemachine.runner import StepContext
 
-LINES = 48
-"""Enough for a vehicle that rocks to average out. With 32, a sweep that was repeated at half its speed showed a rocking
-of 4 Hz as a slow motion: once for each of these lines, or nearly."""
 LEAST_POINTS = 500
-MOST_LOST = 0.5
-"""Share of its frames: a comparison misses none of them, and says what is left of it."""
-HURRY = 2.0
-"""So many times as fast as in the sweep the rail goes, where it can: few lines need few pictures."""
-ROOM_M = 1e-3
-"""Left of the travel beside what it takes to gain speed."""
 PLAY_M = 20e-6
 """By how much a carriage stands otherwise when it comes from the other side, where that was not measured."""
+FRESH_S = 5.0
+"""So old, s of the cell, a look may be before the part goes down: computing takes less."""
 NEXT_STEP = "See what pushed it, then run the job again from its sweep"
 
 
 @dataclass(frozen=True, eq=False)
 class SecondLook:
     """By how much the surface seemed to have `moved`, and in words what is `hidden`: motions that could be larger than
-    the place's tolerance unseen. `creep` is how it moves on, where that shows."""
+    the place's tolerance unseen. `creep` is how it moves on, where that shows. `counted` says whether the rail was
+    asked since whether it has lost steps."""
 
     moved: between_sweeps.SurfaceMotion
     hidden: tuple[str, ...]
     creep: between_sweeps.Creep | None = None
+    counted: bool = False
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -73,14 +66,17 @@ class SecondLook:
 def require_in_place(
     workplace: Workplace, fix: BoardFix, sweep: SweepRecord, scan: Reconstruction, pose: PlacePose, context: StepContext
 ) -> SecondLook:
-    """Sweep the first strip again, in few lines, and compare; photograph the board if the lines leave much open.
+    """Compare the sweep with its way back, or sweep the last strip again where that is too long ago; photograph the
+    board if the lines leave much open.
 
-    Whoever goes on looks whether the rail has lost steps in it.
+    Whoever goes on looks whether the rail has lost steps, unless that was `counted`.
     Raises `RefusedError` when either has moved by more than chance brings, and what a sweep and a photograph raise.
     """
     place = workplace.job.place
-    found, creep = _swept_again(workplace, fix, sweep, scan=scan, pose=pose, context=context)
-    if found.moved and workplace.job.scan.mode == "rail":
+    back = sweep.back if on_the_way_back(workplace, sweep, context) else None
+    found, creep = _swept_again(workplace, fix, sweep, back, scan=scan, pose=pose, context=context)
+    counted = back is not None or workplace.job.scan.mode == "arm"
+    if found.moved and not counted:
         # Steps that the rail has lost look like a surface that moved.
         check_lost_steps(workplace.devices, lambda _, text: context.progress(0.04, text))
     require_surface_unmoved(found)
@@ -88,32 +84,33 @@ def require_in_place(
     hidden = tuple(found.hidden(pose.base_from_surface, tolerance, workplace.nominal.radius))
     if hidden or pose.verdict.unseen:
         require_board_unmoved(workplace, fix, "before the sweep", lambda _, text: context.progress(0.04, text))
-    return SecondLook(found, hidden, creep)
+    return SecondLook(found, hidden, creep, counted)
 
 
 def _swept_again(
-    workplace: Workplace, fix: BoardFix, sweep: SweepRecord, scan: Reconstruction, pose: PlacePose, context: StepContext
-) -> tuple[between_sweeps.SurfaceMotion, between_sweeps.Creep | None]:
+    workplace: Workplace, fix: BoardFix, sweep: SweepRecord, back: SweepRecord | None, *, scan: Reconstruction,
+    pose: PlacePose, context: StepContext,
+) -> tuple[between_sweeps.SurfaceMotion, between_sweeps.Creep | None]:  # fmt: skip
     # The arm is not moved from where it stands already.
-    stood = (
-        sweep.rest is not None and sweep.rest is workplace.devices.interlocks.situation.last and len(sweep.swaths) == 1
-    )
-    few = sparse(workplace, workplace.job.scan.swath[0], sweep.swaths[0])
-    # A camera of a few frame rates takes all the lines.
-    rate = configure_fast(workplace.devices, few.exposure, (few.frame_rate, workplace.job.scan.frame_rate))
-    again = laser_sweep(
-        workplace, workplace.base_from_surface(fix), head_at(workplace, sweep),
-        few.model_copy(update={"frame_rate": rate}), keep_frame=lambda frame: workplace.frames.keep("second-look",
-        frame), check=context.check, progress=lambda share, text: context.progress(0.04 * share,
-        f"whether the surface lies where it did: {text}"), most_lost=MOST_LOST, counted=False,
+    stood = sweep.rest is not None and sweep.rest is workplace.devices.interlocks.situation.last
+    there = sweep.swaths[-1]
+    again = back if back is not None else in_few_lines(
+        workplace, workplace.base_from_surface(fix), head_at(workplace, sweep), there, keep="second-look",
+        check=context.check, progress=lambda share, text: context.progress(0.04 * share,
+        f"whether the surface lies where it did: {text}"),
     )  # fmt: skip
+    once_more = again.swaths[0]
+    if back is None:
+        otherwise = _shifted(there, _late(workplace) * (pace(once_more) - pace(there)))
+    else:
+        otherwise = _other_way(workplace, there, once_more)
     # What lens and light plane are off by cancels in the same strip only.
-    before, now = scan.cloud.of_sweep(0), require_points(build_cloud(again))
-    there, once_more = sweep.swaths[0], again.swaths[0]
-    faster = _shifted(there, _late(workplace) * (pace(once_more) - pace(there)))
+    before, now = scan.cloud.of_sweep(len(sweep.swaths) - 1), require_points(build_cloud(again))
     spread, spread_now = there.covariance, once_more.covariance
     if stood:
-        spread, spread_now = by_times(there), workplace.settling + by_times(once_more) + faster
+        spread, spread_now = by_times(there), workplace.settling + by_times(once_more) + otherwise
+    elif back is not None:
+        spread_now = spread_now + otherwise
     by_poses = [
         partial(flange_motions, cloud, covariances=[each]) for cloud, each in ((before, spread), (now, spread_now))
     ]
@@ -122,9 +119,17 @@ def _swept_again(
     )
     if not stood:
         return moved, None
-    unsure = by_times(there) + by_times(once_more) + faster
-    middles = float(sweep.times.mean()), float(again.times.mean())
+    unsure = by_times(there) + by_times(once_more) + otherwise
+    middles = float(there.times.mean()), float(again.times.mean())
     return moved, between_sweeps.Creep.of(moved, unsure, pose.base_from_surface.translation, *middles)
+
+
+def on_the_way_back(workplace: Workplace, sweep: SweepRecord, context: StepContext) -> bool:
+    """Whether the look on the sweep's way back still tells where the surface lies: nobody held the run since, and it is
+    `FRESH_S` ago at most."""
+    if sweep.back is None or context.held_s != sweep.held_s:
+        return False
+    return 0.0 <= workplace.devices.clock.now() - float(sweep.back.times[-1]) <= FRESH_S
 
 
 def by_times(swath: Swath) -> Vector:
@@ -143,40 +148,17 @@ def _shifted(swath: Swath, sigma: float) -> Vector:
     return shared
 
 
-def sparse(workplace: Workplace, strip: SwathSection, before: Swath) -> ScanSection:
-    """The `strip` that was swept `before`, in about `LINES` lines: by the rail faster, where there is room to gain
-    speed; by the arm no faster, since a repetition is slower."""
-    scan, rail = workplace.job.scan, workplace.config.rail
-    speed = min(scan.speed, pace(before))
-    if scan.mode == "rail":
-        # As much room as beyond the ends of the sweep.
-        room = 0.5 * (rail.travel[1] - rail.travel[0] - scan.length) - ROOM_M
-        speed = max(speed, min(HURRY * speed, rail.max_speed, math.sqrt(2.0 * rail.acceleration * max(room, 0.0))))
-    rate = min(scan.frame_rate, max(1.0, LINES * speed / scan.length))
-    return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": (strip,)})
-
-
-def pace(swath: Swath) -> float:
-    """How fast, m/s, the scan head went."""
-    ways = np.linalg.norm(swath.flanges[-1, :3, 3] - swath.flanges[0, :3, 3]) + abs(swath.rail[-1] - swath.rail[0])
-    return float(ways / (swath.times[-1] - swath.times[0]))
-
-
 def moved_meanwhile(
     workplace: Workplace, head: ScanCalibration, over: pin.SE3, swept: tuple[Cloud, SweepRecord], *,
     part: between_sweeps.PartOnGround, context: StepContext,
 ) -> float | None:  # fmt: skip
     """Sweep the last strip the other way, in few lines: how far, m, the part has moved on since, as `part.moved` has
     it. Raises what a sweep raises."""
-    (cloud, sweep), scan = swept, workplace.job.scan
+    cloud, sweep = swept
     before = sweep.swaths[-1]
-    few = sparse(workplace, scan.swath[-1], before)
-    rate = configure_fast(workplace.devices, few.exposure, (few.frame_rate, scan.frame_rate))
-    back = laser_sweep(
-        workplace, over, head, few.model_copy(update={"frame_rate": rate}), check=context.check,
-        keep_frame=lambda frame: workplace.frames.keep("way-back", frame),
+    back = in_few_lines(
+        workplace, over, head, before, keep="way-back", check=context.check, back=True,
         progress=lambda share, text: context.progress(0.85, f"whether the part lies still: {text}"),
-        most_lost=MOST_LOST, back=True, counted=False,
     )  # fmt: skip
     now = back.swaths[0]
     unsure = workplace.settling + by_times(before) + by_times(now) + _other_way(workplace, before, now)

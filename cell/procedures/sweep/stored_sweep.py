@@ -40,6 +40,8 @@ class SweepRecord:
 
     `pointing` of the laser and `slip` of the head, where a witness told them; `doubts` for people; `earlier` names the
     run that swept, where it was another one. `rest` is the motion that brought the arm to where it stood meanwhile.
+    `back` is the look at the last strip on the way back, None where nobody looked, and for `held_s` the run had been
+    held by then.
     """
 
     swaths: tuple[Swath, ...]
@@ -48,6 +50,8 @@ class SweepRecord:
     slip: Slip | None = None
     earlier: str = ""
     rest: ArmMotion | None = None
+    back: SweepRecord | None = None
+    held_s: float = 0.0
 
     @property
     def base_from_flange(self) -> pin.SE3:
