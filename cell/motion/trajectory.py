@@ -120,15 +120,21 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class LineLimits:
-    """Limits of a straight line: speed m/s, acceleration m/s², jerk m/s³ and turning speed rad/s."""
+    """Limits of a straight line: speed m/s, acceleration m/s², jerk m/s³ and turning speed rad/s.
+
+    The last `near` m of it, or its first when `leaving`, go at `near_speed` m/s at most.
+    """
 
     speed: float = 0.25
     acceleration: float = 0.8
     jerk: float = 8.0
     turn_speed: float = 0.8
+    near: float = 0.0
+    near_speed: float = 0.25
+    leaving: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("speed", "acceleration", "jerk", "turn_speed"):
+        for name in ("speed", "acceleration", "jerk", "turn_speed", "near_speed"):
             value = getattr(self, name)
             if not 0.0 < value < np.inf:
                 raise ValueError(f"line limit {name} = {value} must be finite and greater than 0")
@@ -199,7 +205,10 @@ def plan_line(
     scale = speed / line.speed
     limit = np.array(kinematics.limits.speed)
     for _ in range(6):
-        times, fraction = _profile(speed, line.acceleration * scale, line.jerk * scale, period)
+        near = line.near / max(distance, line.near, 1e-9), min(speed, line.near_speed * speed / line.speed)
+        times, fraction = _profile(speed, line.acceleration * scale, line.jerk * scale, period, near)
+        if line.leaving:
+            times, fraction = times[-1] - times[::-1], 1.0 - fraction[::-1]
         joints = np.empty((len(times), 6))
         joints[0] = start
         for i, s in enumerate(fraction[1:], start=1):
@@ -228,14 +237,36 @@ def _refuse_singular(kinematics: ArmKinematics, trajectory: Trajectory) -> None:
 
 
 def _profile(
-    speed: float, acceleration: float, jerk: float, period: float
+    speed: float, acceleration: float, jerk: float, period: float, near: tuple[float, float] = (0.0, 1.0)
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Ruckig's time-optimal way from 0 to 1, from rest to rest: times in s, about `period` apart, and positions."""
+    """Ruckig's time-optimal way from 0 to 1, from rest to rest: times in s, about `period` apart, and positions.
+
+    `near` is how much of it, at its end, goes at what speed at most, in ways per second.
+    """
     for name, value in {"speed": speed, "acceleration": acceleration, "jerk": jerk, "period": period}.items():
         if not 0.0 < value < np.inf:
             raise ValueError(f"{name} {value} must be finite and greater than 0")
+    last, slow = near
+    if 0.0 < last < 1.0:
+        parts = [
+            _stretch((0.0, 0.0), (1.0 - last, slow), speed, acceleration, jerk),
+            _stretch((1.0 - last, slow), (1.0, 0.0), slow, acceleration, jerk),
+        ]
+    else:
+        parts = [_stretch((0.0, 0.0), (1.0, 0.0), slow if last else speed, acceleration, jerk)]
+    ends = np.cumsum([0.0, *(part.duration for part in parts)])
+    times = np.linspace(0.0, ends[-1], max(1, int(np.ceil(ends[-1] / period - 1e-9))) + 1)
+    which = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(parts) - 1)
+    return times, np.array([parts[k].at_time(t - ends[k])[0][0] for k, t in zip(which, times, strict=True)])
+
+
+def _stretch(
+    begin: tuple[float, float], end: tuple[float, float], speed: float, acceleration: float, jerk: float
+) -> ruckig.Trajectory:
+    """Ruckig's way between two positions and speeds, at neither of which it speeds up."""
     request = ruckig.InputParameter(1)
-    request.current_position, request.target_position = [0.0], [1.0]
+    (request.current_position, request.current_velocity) = ([value] for value in begin)
+    (request.target_position, request.target_velocity) = ([value] for value in end)
     request.max_velocity, request.max_acceleration, request.max_jerk = [speed], [acceleration], [jerk]
     profile = ruckig.Trajectory(1)
     result = ruckig.Ruckig(1).calculate(request, profile)
@@ -244,8 +275,7 @@ def _profile(
             f"no motion within speed {speed:g}, acceleration {acceleration:g} and jerk {jerk:g} (ways per s, s², s³): "
             f"Ruckig reports {result}"
         )
-    times = np.linspace(0.0, profile.duration, max(1, int(np.ceil(profile.duration / period - 1e-9))) + 1)
-    return times, np.array([profile.at_time(t)[0][0] for t in times])
+    return profile
 
 
 LEAST_STATES = 10

@@ -20,9 +20,10 @@ from cell.devices.simulated.process import is_whole
 from cell.procedures.arm.moves import PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.placed_part import PlacedPart
-from cell.procedures.steps import board_photo, drive_to_target, verify
+from cell.procedures.steps import board_photo, drive_to_target, laser_sweep, verify
 from cell.procedures.steps.drive_to_target import VehicleArrival
-from cell.procedures.steps.workplace import PartsBefore
+from cell.procedures.steps.workplace import HeadLook, PartsBefore
+from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.folder import Report
 from cell.run.job_run import Observer, RunOutcome, each_of
 from cell.run.recorded_work import WorkContext
@@ -164,7 +165,11 @@ def perform(
             # Whoever was at the cell, or set its world up anew, may have moved vehicle and station; the next stop is
             # elsewhere.
             anew = refill or work is not None or job.board != jobs[(number - 2) % len(jobs)].board
-            last = run(number, replace(before, arrival=None) if anew else before)
+            if work is not None:
+                before = replace(before, look=None)
+            # A person makes the first item of each round ready, but in a cell that is simulated as a whole.
+            more = number < count and (number % len(jobs) > 0 or is_whole(open_cell.simulated))
+            last = run(number, replace(before, arrival=None if anew else before.arrival, more=more))
             before = _known_after(before, last)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()
@@ -198,9 +203,19 @@ def _known_after(before: PartsBefore, last: RunOutcome) -> PartsBefore:
     series, stands = before.series, None
     if isinstance(seen, PlacedPart) and seen.came is not None:
         series = series.after(seen.came, seen.slips)
-    if isinstance(arrival, VehicleArrival) and isinstance(photograph, BoardFix) and not photograph.swung:
-        stands = replace(arrival, shared=photograph)
-    return PartsBefore(series, stands)
+    board = photograph if isinstance(photograph, BoardFix) and not photograph.swung else None
+    if isinstance(arrival, VehicleArrival) and board is not None:
+        stands = replace(arrival, shared=board)
+    return PartsBefore(series, stands, board, _look_after(before, last))
+
+
+def _look_after(before: PartsBefore, last: RunOutcome) -> HeadLook | None:
+    """The look at the scan head that the next part may go by: none after a fault, for what was hit may sit elsewhere,
+    and where somebody held the run, for whoever did may have reached in."""
+    sweep = last.results.get(laser_sweep.STEP.name)
+    if not isinstance(sweep, SweepRecord) or last.report["faults"] or last.control.held_s:
+        return None
+    return before.look if sweep.looked_s else HeadLook(float(sweep.times[0]), sweep.pointing, sweep.slip)
 
 
 def _skipped(open_cell: OpenCell, job: Job, last: RunOutcome) -> bool:

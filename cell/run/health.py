@@ -178,18 +178,22 @@ Seen = tuple[list[float], float] | None
 """How far off a part was, by axis, and what is allowed; None where nobody looked."""
 
 
+SHARED = "head_looked_s_ago"
+"""In the result of a sweep that went by the look for a part before it: what that told counts once."""
+
+
 def _interim(step: Report) -> Seen:
     found = step.get("interim")
     return None if found is None else (found["off_mm"], found["place_allowed_mm"])
 
 
 def _slipped(step: Report) -> Seen:
-    found = step.get("head_slipped_um")
+    found = None if step.get(SHARED) else step.get("head_slipped_um")
     return None if found is None else ([1e-3 * value for value in found], 1e3 * LARGEST_M)
 
 
 def _turned(step: Report) -> Seen:
-    found = step.get("laser_turned_mrad")
+    found = None if step.get(SHARED) else step.get("laser_turned_mrad")
     # What a verification has seen of it counts no more.
     return None if found is None else ([found - step.get("laser_confirmed_mrad", 0.0)], 1e3 * LARGEST_RAD)
 
@@ -219,11 +223,12 @@ def health(root: Path, calibrations: Path, max_age_s: float, now: dt.datetime) -
     since = [report for report in jobs if report["calibration_date"] == calibrated and _cell(report) == _cell(newest)]
     made = dt.datetime.strptime(calibrated, DATE).astimezone()
     series = [made_of for watched in WATCHED if (made_of := _series(since, *watched)) is not None]
-    arrived = [found for report in since if (found := _steps(report).get(DRIVE))]
+    arrived = [steps for report in since if (steps := _steps(report)).get(DRIVE)]
+    unlooked = sum("interim" not in steps[DRIVE] and SHARED not in steps.get("laser_sweep", {}) for steps in arrived)
     shocks = [(str(report["run"]), str(report["reason"])) for report in since if report.get("code") in SHOCKS]
     looked = [report for report in since if _moved(report) or _interim(_steps(report).get(DRIVE, {})) is not None]
     return CellHealth(
-        calibrated, len(arrived), sum("interim" not in found for found in arrived), tuple(series), tuple(shocks),
+        calibrated, len(arrived), unlooked, tuple(series), tuple(shocks),
         moved=str(looked[-1]["run"]) if looked and _moved(looked[-1]) else "",
         age_days=(now - made).total_seconds() / DAY_S, max_age_days=max_age_s / DAY_S,
     )  # fmt: skip

@@ -73,6 +73,8 @@ def _part_at(name: str, base_from_part: pin.SE3, job: Job) -> Body:
     return box(name, BASE, base_from_part * from_parts((0.0, 0.0, 0.5 * job.grasp.size[2])), job.grasp.size)
 
 
+FAR_SPEED = 0.25
+"""m/s, of a straight line where it is not near its place yet, or not any more."""
 RISE_M, RISE_SPEED = 0.05, 0.04
 """How far the arm goes straight up from where it was stopped, m, and how fast, m/s."""
 ROOM_ABOVE = 0.005
@@ -194,9 +196,12 @@ class Mover:
         joints = self._planner.reach(base_from_flange, start if self.near is None else self.near, what)
         return self._planner.free(start, self.kinematics.unwound(joints, start)).at_pace(self.pace.share)
 
-    def to(self, base_from_flange: pin.SE3, what: str) -> None:
-        """Move freely to a flange pose and settle, unless the arm stands there."""
+    def to(self, base_from_flange: pin.SE3, what: str, near: float = 0.0) -> None:
+        """Move freely to a flange pose and settle, unless the arm stands there, or as `near`, m and rad."""
         self.hold()
+        off = base_from_flange.inverse() * from_ur(self._arm.state().flange)
+        if np.linalg.norm(off.translation) < near and np.linalg.norm(pin.log3(off.rotation)) < near:
+            return
         way = self.plan_to(base_from_flange, what)
         if np.abs(way.end - self.joints).max() > THERE:
             self.follow(way)
@@ -245,10 +250,21 @@ class Mover:
 
     def line(
         self, base_from_flange: pin.SE3, speed: float, allowed: Sequence[Pair] = (), *,
-        force_limit: float | None = None, settle: bool = True,
+        force_limit: float | None = None, settle: bool = True, near: float = 0.0, leaving: bool = False,
     ) -> bool:  # fmt: skip
-        """Move the flange in a straight line; True when it ended early in contact, at `force_limit` N."""
-        limits = LineLimits(speed=min(speed, self._tool_speed), acceleration=max(0.02, 3.0 * speed), jerk=8.0)
+        """Move the flange in a straight line; True when it ended early in contact, at `force_limit` N.
+
+        With `near`, m, only so much of its end, or of its beginning when `leaving`, goes at `speed`; the rest faster.
+        """
+        far = min(max(speed, FAR_SPEED) if near else speed, self._tool_speed)
+        limits = LineLimits(
+            speed=far,
+            acceleration=max(0.02, 3.0 * far),
+            jerk=8.0,
+            near=near,
+            near_speed=min(speed, far),
+            leaving=leaving,
+        )
         line = self._planner.line(self.joints, base_from_flange, limits, allowed)
         return self.follow(line.at_pace(self.pace.share), force_limit, settle)
 

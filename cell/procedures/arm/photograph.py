@@ -33,6 +33,9 @@ NO_REFERENCE = (
 MOVED = 22.46
 """Squared Mahalanobis distance of two board poses above which the station has moved: χ² of 6 at 0.999."""
 
+NEAR = 2e-3
+"""So near its pose, m, and rad, the arm photographs from where it rests: the board looks the same from there."""
+
 
 @dataclass(frozen=True, eq=False)
 class BoardFix:

@@ -14,7 +14,7 @@ import numpy as np
 import pinocchio as pin
 
 from cell.measure.geometry.poses import difference
-from cell.procedures.arm.photograph import MOVED, BoardFix, photo_pose, swing_covariance
+from cell.procedures.arm.photograph import MOVED, NEAR, BoardFix, photo_pose, swing_covariance
 from cell.procedures.sought_part import around
 from cell.procedures.steps.drive_to_target import VehicleArrival
 from cell.procedures.steps.workplace import PHOTO_RATE_HZ, JobStep, Workplace
@@ -34,7 +34,7 @@ def photographed(workplace: Workplace, goal: pin.SE3, progress: Callable[[float,
     """
     workplace.devices.target_camera.configure(workplace.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
     progress(0.1, "arm to the photograph pose")
-    workplace.mover.to(goal, "the photograph pose")
+    workplace.mover.to(goal, "the photograph pose", near=NEAR)
     progress(0.7, "photographing the board")
     vehicle, count = workplace.config.arm.vehicle_from_base.se3().inverse(), workplace.job.photo.count
     return until_quiet(vehicle, lambda: workplace.photograph(count), workplace.devices.clock.sleep, progress)
@@ -115,12 +115,15 @@ def _run_step(workplace: Workplace, context: StepContext) -> BoardFix:
     workplace.mover.avoid_station(
         arrival.base_from_place, job, workplace.board, around(workplace.nominal.extent, workplace.ground)
     )
-    if arrival.shared is not None:
-        workplace.mover.near = arrival.shared.joints
-        return workplace.keep_again(arrival.shared)
     goal = photo_pose(
         job, workplace.board, arrival.fix.base_from_board, workplace.calibration.target.flange_from_camera
     )
+    if workplace.parts_before.more:
+        # The next part begins where this one has its photograph.
+        workplace.mover.rest_at(goal)
+    if arrival.shared is not None:
+        workplace.mover.near = arrival.shared.joints
+        return workplace.keep_again(arrival.shared)
     fix = photographed(workplace, goal, context.progress)
     for note in fix.notes:
         context.note(text=note)

@@ -13,7 +13,7 @@ from cell.config.job import BoardSection, Job
 from cell.motion.collision import Body, CollisionError
 from cell.motion.kinematics import HOME, Unreachable
 from cell.procedures.arm.moves import Pace
-from cell.procedures.arm.photograph import BoardFix, look_pose
+from cell.procedures.arm.photograph import NEAR, BoardFix, look_pose, photo_pose
 from cell.procedures.calibrate.interim import InterimCheck, interim_check
 from cell.procedures.drive.driving import MAX_HEADING, Planar, drive_line, turn_to, wrap
 from cell.procedures.drive.way import BACK_UP, Way, Whereabouts, left_at, next_step, speed_onto
@@ -306,12 +306,14 @@ def _run_step(workplace: Workplace, context: StepContext) -> VehicleArrival:
     if head is None and not workplace.whereabouts.anchored:
         workplace.mover.to_joints(HOME)
     workplace.whereabouts.enter(workplace.job)
+    workplace.devices.target_camera.configure(workplace.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
+    if (stays := _still_there(workplace, context)) is not None:
+        return replace(stays, head=head)
     context.progress(0.0, "arm to the looking pose")
     camera = workplace.calibration.target.flange_from_camera
     look = look_pose(workplace.config, workplace.job, workplace.board, camera)
     workplace.mover.to_as_from(HOME, look, "the looking pose")
     workplace.devices.interlocks.may_drive_with(f"the looking pose of job {workplace.job.job.name}", look)
-    workplace.devices.target_camera.configure(workplace.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
     if not workplace.config.vehicle.DRIVES:
         stand = workplace.config.arm.vehicle_from_base.se3()
         context.progress(0.3, "nothing to drive: looking whether the station stands where the job has it")
@@ -328,6 +330,26 @@ def _run_step(workplace: Workplace, context: StepContext) -> VehicleArrival:
     return replace(drive.to_target(), head=head)
 
 
+def _still_there(workplace: Workplace, context: StepContext) -> VehicleArrival | None:
+    """Where the vehicle stands, by a photograph from where the part before had its own; None where it does not stand
+    there any more, or the board shows it off its target."""
+    before, vehicle = workplace.parts_before.board, workplace.devices.vehicle
+    if before is None or not workplace.whereabouts.still:
+        return None
+    context.progress(0.3, "looking from where the arm photographed the board before")
+    goal = photo_pose(
+        workplace.job, workplace.board, before.base_from_board, workplace.calibration.target.flange_from_camera
+    )
+    workplace.mover.to(goal, "the photograph pose", near=NEAR)
+    workplace.devices.clock.sleep(SETTLE_S)
+    stand = workplace.config.arm.vehicle_from_base.se3()
+    try:
+        return stand_at_target(workplace.job, stand, vehicle, workplace.whereabouts, workplace.photograph)
+    except RefusedError as off:
+        context.note(text=f"not as for the part before: {off}")
+        return None
+
+
 def _checked(workplace: Workplace, context: StepContext) -> InterimCheck | None:
     """Whether the scan head is where its calibration has it; None where that is not wanted or, with a note, not seen.
 
@@ -337,6 +359,13 @@ def _checked(workplace: Workplace, context: StepContext) -> InterimCheck | None:
     """
     if workplace.looked or not workplace.config.calibration.each_job:
         return workplace.interim
+    if (look := workplace.look_before) is not None:
+        ago = workplace.devices.clock.now() - look.at
+        context.note(
+            text=f"fine board and plate on the claw were looked at {ago:.0f} s ago, for a part before this one"
+        )
+        workplace.looked = True
+        return None
     try:
         found = interim_check(
             workplace.config, workplace.devices, workplace.mover, workplace.calibration, workplace.job,

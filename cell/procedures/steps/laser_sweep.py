@@ -191,7 +191,11 @@ def _run_step(workplace: Workplace, context: StepContext) -> SweepRecord:
 def _sweep(workplace: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     head = workplace.calibration.scan
     home_rail(workplace.devices, context.progress)
-    pointing, slip = seen_on_plate(workplace, context)
+    look = workplace.look_before if context.attempt == 1 else None
+    if look is None:
+        (pointing, slip), looked_s = seen_on_plate(workplace, context), 0.0
+    else:
+        pointing, slip, looked_s = look.pointing, look.slip, workplace.devices.clock.now() - look.at
     doubts = times_known(head, workplace.config)[1]
     if pointing is not None:
         head = head.pointed(pointing, workplace.config.laser.exit_point)
@@ -209,7 +213,16 @@ def _sweep(workplace: Workplace, context: StepContext, fix: BoardFix) -> SweepRe
     lost = () if back is None else back.doubts
     blinded = (UNSEEN_BY_LIGHT,) if workplace.devices.bright else ()
     doubts = (*record.doubts, *lost, *unwatched(head.witness), *blinded, *doubts, *workplace.notes)
-    record = replace(record, pointing=pointing, slip=slip, doubts=doubts, rest=rest, back=back, held_s=context.held_s)
+    record = replace(
+        record,
+        pointing=pointing,
+        slip=slip,
+        doubts=doubts,
+        rest=rest,
+        back=back,
+        held_s=context.held_s,
+        looked_s=looked_s,
+    )
     for note in record.notes:
         context.note(text=note)
     return record

@@ -18,7 +18,7 @@ from cell.motion.collision import TOUCHES
 from cell.procedures.arm.moves import PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.grasp import GRIPPED
-from cell.procedures.steps.place import FAST_FORCE, carried_on, note_part
+from cell.procedures.steps.place import FAST_FORCE, NEAR_M, carried_on, note_part
 from cell.procedures.steps.reconstruct import Reconstruction
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.second_look import require_in_place
@@ -52,7 +52,7 @@ def take(workplace: Workplace, job: Job, grip: pin.SE3, context: StepContext, *,
     part.left = False
     workplace.devices.arm.zero_force()
     if not _reached(workplace, grip, normal):
-        mover.line(above, plan.speed, TOUCHES)
+        mover.line(above, plan.speed, TOUCHES, near=NEAR_M, leaving=True)
         mover.forbid_part_contact()
         part.left = True
         raise RefusedError(
@@ -79,14 +79,14 @@ def take(workplace: Workplace, job: Job, grip: pin.SE3, context: StepContext, *,
         note_part(context, part)
         mover.empty_claw()
         mover.forbid_part_contact()
-        mover.line(above, plan.speed, TOUCHES)
+        mover.line(above, plan.speed, TOUCHES, near=NEAR_M, leaving=True)
         raise RefusedError(
             f"{what} sticks, or is heavier than place.contact_force lets the claw lift: it pulled with more than "
             f"{most_pull:.0f} N and let go, at most {1e3 * plan.contact_travel:g} mm above where the part lay. Look "
             "what holds it, or raise place.contact_force",
             Measured("pull at the part", pull, "N", most=most_pull),
         )
-    mover.line(above, plan.speed, TOUCHES)
+    mover.line(above, plan.speed, TOUCHES, near=NEAR_M, leaving=True)
     if pulls and not workplace.devices.claw.holding:
         part.state = PartState.UNKNOWN
         note_part(context, part)
@@ -97,7 +97,7 @@ def _reached(workplace: Workplace, grip: pin.SE3, normal: Vector) -> bool:
     """Whether the open claw came down to `grip` along `normal`, (3,) on the flange, without touching anything."""
     plan, mover = workplace.job.place, workplace.mover
     slow = grip * from_parts(plan.contact_travel * normal)
-    if mover.line(slow, plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force):
+    if mover.line(slow, plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force, near=NEAR_M):
         return False
     # What presses already would be taken as zero.
     if not np.linalg.norm(workplace.devices.arm.state().wrench[:3]) <= plan.contact_force:

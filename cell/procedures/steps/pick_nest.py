@@ -42,7 +42,8 @@ def _picked(workplace: Workplace, context: StepContext) -> HeldPart:
     workplace.mover.avoid_station(arrival.base_from_place, workplace.job, workplace.board, workplace.nominal.extent)
     workplace.mover.avoid_part(belongs, job.grasp.size)
     home_rail(workplace.devices, context.progress)
-    head, (pointing, _) = workplace.calibration.scan, seen_on_plate(workplace, context)
+    head, look = workplace.calibration.scan, workplace.look_before
+    pointing = look.pointing if look is not None else seen_on_plate(workplace, context)[0]
     if pointing is not None:
         head = head.pointed(pointing, workplace.config.laser.exit_point)
     faces = seen_from_above(part, belongs)

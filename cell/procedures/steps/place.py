@@ -37,6 +37,10 @@ FAST_FORCE = 3.0
 """Times the contact force at which the faster part of the descent ends: accelerating the part is felt as well."""
 
 
+NEAR_M = 5e-3
+"""So far above its end the fast part of the descent, and the way up, go at `place.speed`; beyond, faster."""
+
+
 @dataclass(frozen=True, eq=False)
 class PlaceResult:
     """Where the flange was when the part was let go, how far off in depth, m, and where the part touched first.
@@ -110,10 +114,10 @@ class Placing:
     def put_down(self, fold: bool = True) -> PlaceResult:
         """Put the part onto the surface, and fold the arm unless somebody looks at the part from where it stands then.
 
-        Straight down the surface's normal: at `place.speed` to just above, at `contact_speed` until the force changes
-        by `contact_force`. Raises `RefusedError` before anything moves when the part is not held any more. It does so
-        with the part still held and lifted when contact comes too early, not at all, or where the stated uncertainty of
-        the place does not allow it.
+        Straight down the surface's normal: fast at first, at `place.speed` to just above, at `contact_speed` until the
+        force changes by `contact_force`. Raises `RefusedError` before anything moves when the part is not held any
+        more. It does so with the part still held and lifted when contact comes too early, not at all, or where the
+        stated uncertainty of the place does not allow it.
         """
         require_held(self.part)
         self._approach()
@@ -143,13 +147,15 @@ class Placing:
 
     def _lift(self) -> None:
         plan = self.job.place
-        self.mover.line(self._flange_at(plan.approach), plan.speed, TOUCHES, settle=False)
+        above = self._flange_at(plan.approach)
+        self.mover.line(above, plan.speed, TOUCHES, settle=False, near=NEAR_M, leaving=True)
         require_in_claw(self.claw, self.part, self.note, "on its way down; it may lie on its place")
 
     def _approach(self) -> None:
         self.progress(0.05, "approaching")
         # Not held before it: nobody would look at the surface again.
-        self.mover.follow(self.mover.plan_to(self._flange_at(self.job.place.approach), "the approach pose"))
+        way = self.mover.plan_to(self._flange_at(self.job.place.approach), "the approach pose")
+        self.mover.follow(way, settle=False)
         self.check()
         require_in_claw(self.claw, self.part, self.note, "before the descent")
 
@@ -159,8 +165,9 @@ class Placing:
         self.progress(0.4, "descending")
         self.arm.zero_force()
         stopped = self.mover.line(
-            self._flange_at(plan.contact_travel), plan.speed, TOUCHES, force_limit=FAST_FORCE * plan.contact_force
-        )
+            self._flange_at(plan.contact_travel), plan.speed, TOUCHES, near=NEAR_M,
+            force_limit=FAST_FORCE * plan.contact_force,
+        )  # fmt: skip
         # At rest a lighter touch is felt than on the way; taken as zero, it would be pressed on without an end.
         if stopped or not np.linalg.norm(self.arm.state().wrench[:3]) <= plan.contact_force:
             height = self._depth()
@@ -184,7 +191,7 @@ class Placing:
         self.progress(0.6, "feeling for contact")
         below = self._flange_at(-plan.contact_travel)
         with self.arm.record() as states:
-            contact = self.mover.line(below, plan.contact_speed, TOUCHES, force_limit=plan.contact_force)
+            contact = self.mover.line(below, plan.contact_speed, TOUCHES, force_limit=plan.contact_force, settle=False)
         return contact, states
 
     def _require_contact(self, contact: bool, off: float) -> None:

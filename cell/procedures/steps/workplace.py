@@ -16,6 +16,8 @@ from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
 from cell.config.job import BoardSection, Job
 from cell.devices.devices import Devices
+from cell.measure.calibration.drift.reference_plate import Pointing
+from cell.measure.calibration.drift.slip import Slip
 from cell.measure.inversion import NominalSurface
 from cell.measure.vision.board.view import BoardSpec, parse_board
 from cell.procedures.ambient import in_any_light
@@ -43,13 +45,34 @@ PHOTO_RATE_HZ = 10.0
 """Frame rate while the station's board is photographed."""
 
 
+AGAIN_S = 600.0
+"""So long, s of the cell, a batch goes on by one look at the boards on deck and claw: what creeps creeps little."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeadLook:
+    """What the plate on the claw told of laser and scan head, and that the fine board was looked at: `at`, s of the
+    cell's clock."""
+
+    at: float
+    pointing: Pointing | None
+    slip: Slip | None
+
+
 @dataclass(frozen=True, eq=False)
 class PartsBefore:
     """What the parts before this one of its batch tell: how they came to lie, and where the vehicle has stood since
-    the last of them, None where it or the station may have been moved."""
+    the last of them, None where it or the station may have been moved.
+
+    `board` is where the station's board was then, `look` when the scan head was looked at, None where it has to be
+    anew. `more` says that another part follows by itself.
+    """
 
     series: GraspSeries = field(default_factory=GraspSeries)
     arrival: VehicleArrival | None = None
+    board: BoardFix | None = None
+    look: HeadLook | None = None
+    more: bool = False
 
 
 @dataclass(eq=False)
@@ -120,6 +143,12 @@ class Workplace:
     def base_from_surface(self, fix: BoardFix) -> pin.SE3:
         """Where the surface is by the board."""
         return fix.base_from_board * self.job.place_from_board.inverse() * self.job.surface.place_from_surface.se3()
+
+    @cached_property
+    def look_before(self) -> HeadLook | None:
+        """The look at the scan head that a part before this one had, if this one may go by it."""
+        look = self.parts_before.look
+        return look if look is not None and self.devices.clock.now() - look.at < AGAIN_S else None
 
     @property
     def repeatability(self) -> Vector:

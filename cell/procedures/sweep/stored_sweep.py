@@ -41,7 +41,7 @@ class SweepRecord:
     `pointing` of the laser and `slip` of the head, where a witness told them; `doubts` for people; `earlier` names the
     run that swept, where it was another one. `rest` is the motion that brought the arm to where it stood meanwhile.
     `back` is the look at the last strip on the way back, None where nobody looked, and for `held_s` the run had been
-    held by then.
+    held by then. So many seconds before, `looked_s`, the witness was looked at for a part before this one; 0 for this.
     """
 
     swaths: tuple[Swath, ...]
@@ -52,6 +52,7 @@ class SweepRecord:
     rest: ArmMotion | None = None
     back: SweepRecord | None = None
     held_s: float = 0.0
+    looked_s: float = 0.0
 
     @property
     def base_from_flange(self) -> pin.SE3:
@@ -91,6 +92,7 @@ class SweepRecord:
             "laser_confirmed_mrad": None if self.pointing is None else round(1e3 * self.pointing.confirmed, 4),
             "head_slipped_um": None if self.slip is None else [round(1e6 * v, 1) for v in self.slip.shift],
             "pictures_later_ms": None if self.slip is None else round(1e3 * self.slip.lag, 2),
+            **({"head_looked_s_ago": round(self.looked_s, 1)} if self.looked_s else {}),
             "time_shift_um": [round(1e6 * swath.shift, 2) for swath in self.swaths],
         }
 

@@ -9,7 +9,7 @@ import pytest
 
 from cell.config.job import LONGEST_SWEEP_S, load_job
 from cell.procedures.steps.laser_sweep import laser_sweep, slowed_down
-from cell.procedures.sweep.second_look import sparse
+from cell.procedures.steps.laser_sweep import sparse
 from cell.procedures.sweep.sweeping import UNCHECKED
 from drivers.errors import DeviceFault
 from lab.bench.job.whole_job import JobRecord
