@@ -20,8 +20,9 @@ from cell.devices.simulated.process import is_whole
 from cell.procedures.arm.moves import PartState
 from cell.procedures.arm.photograph import BoardFix
 from cell.procedures.placed_part import PlacedPart
-from cell.procedures.steps import board_photo, drive_to_target, laser_sweep, verify
+from cell.procedures.steps import board_photo, drive_to_target, laser_sweep, place, verify
 from cell.procedures.steps.drive_to_target import VehicleArrival
+from cell.procedures.steps.place import PlaceResult
 from cell.procedures.steps.workplace import HeadLook, PartsBefore
 from cell.procedures.sweep.stored_sweep import SweepRecord
 from cell.run.folder import Report
@@ -162,14 +163,11 @@ def perform(
             work = _question(open_cell, job, part, batch.runs[-1], refill=refill) if number > 1 else None
             if work is not None:
                 between(work)
-            # Whoever was at the cell, or set its world up anew, may have moved vehicle and station; the next stop is
-            # elsewhere.
-            anew = refill or work is not None or job.board != jobs[(number - 2) % len(jobs)].board
-            if work is not None:
-                before = replace(before, look=None)
+            elsewhere = job.board != jobs[(number - 2) % len(jobs)].board
+            before = _still_known(before, elsewhere=elsewhere, asked=work is not None, refill=refill)
             # A person makes the first item of each round ready, but in a cell that is simulated as a whole.
             more = number < count and (number % len(jobs) > 0 or is_whole(open_cell.simulated))
-            last = run(number, replace(before, arrival=None if anew else before.arrival, more=more))
+            last = run(number, replace(before, more=more))
             before = _known_after(before, last)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()
@@ -193,27 +191,38 @@ def _ended_by(open_cell: OpenCell, job: Job, last: RunOutcome, number: int) -> s
     return f"after part {number}, as asked" if last.control.end_batch else ""
 
 
+def _still_known(before: PartsBefore, *, elsewhere: bool, asked: bool, refill: bool) -> PartsBefore:
+    """What of it still holds for the next part. Whoever was `asked`, or sets the world up anew, may have moved vehicle
+    and station, and bumped the scan head; the next stop is `elsewhere`."""
+    if elsewhere:
+        before = replace(before, arrival=None, board=None)
+    if asked:
+        before = replace(before, look=None)
+    return replace(before, arrival=None) if asked or refill else before
+
+
 def _known_after(before: PartsBefore, last: RunOutcome) -> PartsBefore:
     """What parts tell of the next one; nothing after one that was refused, for whoever saw to it may have mended the
     fingers, changed the part, or moved the station."""
     if last.outcome not in GOOD:
         return PartsBefore()
-    names = drive_to_target.STEP.name, board_photo.STEP.name, verify.STEP.name
-    arrival, photograph, seen = map(last.results.get, names)
+    steps = drive_to_target, board_photo, place, verify
+    arrival, photograph, put, seen = (last.results.get(step.STEP.name) for step in steps)
     series, stands = before.series, None
     if isinstance(seen, PlacedPart) and seen.came is not None:
         series = series.after(seen.came, seen.slips)
     board = photograph if isinstance(photograph, BoardFix) and not photograph.swung else None
     if isinstance(arrival, VehicleArrival) and board is not None:
         stands = replace(arrival, shared=board)
-    return PartsBefore(series, stands, board, _look_after(before, last))
+    touch = put.touch.off if isinstance(put, PlaceResult) and put.touch is not None else None
+    return PartsBefore(series, stands, board, _look_after(before, last), touch)
 
 
 def _look_after(before: PartsBefore, last: RunOutcome) -> HeadLook | None:
     """The look at the scan head that the next part may go by: none after a fault, for what was hit may sit elsewhere,
     and where somebody held the run, for whoever did may have reached in."""
     sweep = last.results.get(laser_sweep.STEP.name)
-    if not isinstance(sweep, SweepRecord) or last.report["faults"] or last.control.held_s:
+    if not isinstance(sweep, SweepRecord) or last.report.get("faults") or last.control.held_s:
         return None
     return before.look if sweep.looked_s else HeadLook(float(sweep.times[0]), sweep.pointing, sweep.slip)
 

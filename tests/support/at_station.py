@@ -11,9 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cell.config.calibrations.store import link_of
 from cell.config.job import Job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
+from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.effects.between_sweeps import SurfaceMotion
 from cell.motion.kinematics import HOME
@@ -31,7 +33,8 @@ class AtStation:
     """A cell of `record` where that placed, `further` metres on, its vehicle braked; `made` is what `record` made.
 
     `job` and `nominal` are those of `pot()` if not told otherwise, the arm's joints those of the sweep if `folded`:
-    with others its errors are others. `changed` changes the cell before anything moves, `notify` hears what steps tell.
+    with others its errors are others. `timed`: it is known how late the camera's stamps come. `changed` changes the
+    cell before anything moves, `notify` hears what steps tell.
     """
 
     record: JobRecord
@@ -41,6 +44,7 @@ class AtStation:
     further: float = 0.0
     level: str = ""
     folded: bool = True
+    timed: bool = False
     changed: Callable[[VirtualCell], None] = lambda cell: None
     notify: Callable[[Event], None] = lambda event: None
     check: Callable[[], None] = lambda: None
@@ -54,15 +58,19 @@ class AtStation:
         self.changed(self.cell)
         self.kind, self.control = kind_of(self.job), RunControl()
         self.work = work_of(self.cell, self.job, self.nominal, self.record, NoFrames(), self.folder)
+        if self.timed:
+            scan = self.work.calibration.scan
+            timing = StampTiming(0.0, 0.1e-3, 0.0, 2e-6, 0.0, 1e-5, 0.0, 1e9, link_of(CONFIG))
+            self.work.calibration = replace(self.work.calibration, scan=replace(scan, timing=timing))
         self.made: dict[str, Any] = dict(self.record.results)
         if self.folded:
             self.cell.devices.interlocks.work_with(self.work.calibration.configuration)
             self.work.mover.to_joints(HOME)
 
-    def context(self, name: str) -> StepContext:
+    def context(self, name: str, attempt: int = 1) -> StepContext:
         """What this step of the job is given."""
         step = self.kind.policy().of(name)
-        return StepContext(step, 1, math.inf, self.made, self.cell.clock, self.notify, self.control, self.check)
+        return StepContext(step, attempt, math.inf, self.made, self.cell.clock, self.notify, self.control, self.check)
 
     def do(self, *names: str) -> Any:
         """Do these steps; gives the last one's result, which all later ones get instead of the record's."""

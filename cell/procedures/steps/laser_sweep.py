@@ -1,6 +1,7 @@
 """The laser sweep: to the scan pose, settle, laser on, constant-velocity sweep, laser off; as often as the job asks.
 
-Before a part is put down or taken, the way back is a second look, in few lines: does the surface still lie there?
+Before a part is put down or taken, the way back is a second look, in few lines: does the surface still lie there? That
+needs the lateness of the camera's stamps (`cell calibrate timing`); without it, the step that goes down looks.
 """
 
 from __future__ import annotations
@@ -46,8 +47,9 @@ LINES = 48
 half its speed showed a rocking of 4 Hz as a slow motion: once for each of these lines, or nearly."""
 MOST_LOST = 0.5
 """Share of its frames: a comparison misses none of them, and says what is left of it."""
-HURRY = 2.0
-"""So many times as fast as in the sweep the rail goes, where it can: few lines need few pictures."""
+HURRY, IN_TIME = 2.0, 2.6
+"""So many times as fast as in the sweep the rail goes, where it can: few lines need few pictures. Faster where it is
+known how late the camera's stamps come."""
 ROOM_M = 1e-3
 """Left of the travel beside what it takes to gain speed."""
 
@@ -138,7 +140,8 @@ def sparse(workplace: Workplace, strip: SwathSection, before: Swath) -> ScanSect
     if scan.mode == "rail":
         # As much room as beyond the ends of the sweep.
         room = 0.5 * (rail.travel[1] - rail.travel[0] - scan.length) - ROOM_M
-        speed = max(speed, min(HURRY * speed, rail.max_speed, math.sqrt(2.0 * rail.acceleration * max(room, 0.0))))
+        hurry = HURRY if times_known(workplace.calibration.scan, workplace.config)[0] is None else IN_TIME
+        speed = max(speed, min(hurry * speed, rail.max_speed, math.sqrt(2.0 * rail.acceleration * max(room, 0.0))))
     rate = min(scan.frame_rate, max(1.0, LINES * speed / scan.length))
     return scan.model_copy(update={"frame_rate": rate, "speed": speed, "swath": (strip,)})
 
@@ -196,10 +199,12 @@ def _sweep(workplace: Workplace, context: StepContext, fix: BoardFix) -> SweepRe
         (pointing, slip), looked_s = seen_on_plate(workplace, context), 0.0
     else:
         pointing, slip, looked_s = look.pointing, look.slip, workplace.devices.clock.now() - look.at
-    doubts = times_known(head, workplace.config)[1]
+    timing, doubts = times_known(head, workplace.config)
     if pointing is not None:
         head = head.pointed(pointing, workplace.config.laser.exit_point)
-    over, again = workplace.base_from_surface(fix), workplace.looks_again
+    over = workplace.base_from_surface(fix)
+    # Stamps that come late shift sweep and way back to either side: unless it is known by how much, that is blunt.
+    again = workplace.looks_again and timing is not None and workplace.job.scan.mode == "rail"
     record = laser_sweep(
         workplace, over, head, slowed_down(workplace.job.scan, context.attempt),
         check=context.check, progress=context.progress, keep_frame=lambda frame: workplace.frames.keep("stripe", frame),

@@ -31,8 +31,11 @@ from drivers.interfaces import Arm, ArmState, Claw
 from statemachine.runner import StepContext
 from statemachine.step import OnFailure, Step
 
-APPROACH_S = 3.0
-"""About what the arm takes from the scan pose to the approach pose."""
+APPROACH_S = 1.8
+"""About what the arm takes from the scan pose to where it feels for contact."""
+FEEL_M = 0.4e-3
+"""So far above the place it feels for contact where the part before touched within `ALIKE_M` of where it should."""
+ALIKE_M = 0.1e-3
 FAST_FORCE = 3.0
 """Times the contact force at which the faster part of the descent ends: accelerating the part is felt as well."""
 
@@ -96,7 +99,8 @@ class Placing:
 
     `expected` is where the part is to touch first. `part` follows what becomes of the part. `note` is called before the
     claw is told to release it, and again as soon as it has, before anything else is done. `check` raises when the run
-    is to end, `ready` where the part is not to touch the surface: it is asked once the part is just above.
+    is to end, `ready` where the part is not to touch the surface: it is asked once the part is just above. `feel` is
+    how far, m, above its place that is, `place.contact_travel` if not told.
     """
 
     job: Job
@@ -110,6 +114,7 @@ class Placing:
     progress: Callable[[float, str], None]
     note: Callable[[PartProgress], None]
     ready: Callable[[], None] = lambda: None
+    feel: float | None = None
 
     def put_down(self, fold: bool = True) -> PlaceResult:
         """Put the part onto the surface, and fold the arm unless somebody looks at the part from where it stands then.
@@ -162,10 +167,11 @@ class Placing:
     def _descend(self) -> None:
         """The fast part, to just above the place."""
         plan = self.job.place
+        feel = plan.contact_travel if self.feel is None else self.feel
         self.progress(0.4, "descending")
         self.arm.zero_force()
         stopped = self.mover.line(
-            self._flange_at(plan.contact_travel), plan.speed, TOUCHES, near=NEAR_M,
+            self._flange_at(feel), plan.speed, TOUCHES, near=NEAR_M,
             force_limit=FAST_FORCE * plan.contact_force,
         )  # fmt: skip
         # At rest a lighter touch is felt than on the way; taken as zero, it would be pressed on without an end.
@@ -173,9 +179,9 @@ class Placing:
             height = self._depth()
             self._lift()
             raise RefusedError(
-                f"the part touched something more than {1e3 * plan.contact_travel:.2f} mm above the place pose; it was "
+                f"the part touched something more than {1e3 * feel:.2f} mm above the place pose; it was "
                 "lifted again, still held. Look what lies on the place, and whether the part is the right one",
-                Measured("contact, above the place pose", 1e3 * height, "mm", most=1e3 * plan.contact_travel),
+                Measured("contact, above the place pose", 1e3 * height, "mm", most=1e3 * feel),
             )
 
     def _require_ready(self) -> None:
@@ -282,7 +288,7 @@ def _run_step(workplace: Workplace, context: StepContext) -> PlaceResult:
         aim.job, pose.base_from_surface, expected, mover=workplace.mover, arm=workplace.devices.arm,
         claw=workplace.devices.claw, part=workplace.part, check=context.check, progress=context.progress,
         note=lambda part: note_part(context, part),
-        ready=lambda: None if carriage is None else carriage.wait(30.0),
+        ready=lambda: None if carriage is None else carriage.wait(30.0), feel=felt_from(workplace),
     )  # fmt: skip
     try:
         done = placing.put_down(not workplace.looks_after)
@@ -391,7 +397,7 @@ def carried_on(
     crept = together(scan.by_poses, lambda lines, rows: creep.motions(scan.cloud, lines, rows, sweep.times))
     still = replace(scan, cloud=creep.undone(scan.cloud, sweep.times), by_poses=crept)
     plan = workplace.job.place
-    until = APPROACH_S + plan.approach / plan.speed + plan.contact_travel / plan.contact_speed
+    until = APPROACH_S + felt_from(workplace) / plan.contact_speed
     pose = creep.carried(
         inverted(workplace, sweep, still, fix), workplace.devices.clock.now() + until / workplace.pace.share
     )
@@ -404,6 +410,12 @@ def carried_on(
             Measured("3 sigma of a place that creeps, in tolerances", excess, most=1.0),
         )
     return pose
+
+
+def felt_from(workplace: Workplace) -> float:
+    """How far, m, above the place the arm feels for contact: less where the part before touched as expected."""
+    off, travel = workplace.parts_before.touch_off, workplace.job.place.contact_travel
+    return travel if off is None or abs(off) > ALIKE_M else min(travel, FEEL_M)
 
 
 def _looked_again(workplace: Workplace, pose: PlacePose, context: StepContext) -> SecondLook | None:

@@ -65,13 +65,15 @@ class PartsBefore:
     the last of them, None where it or the station may have been moved.
 
     `board` is where the station's board was then, `look` when the scan head was looked at, None where it has to be
-    anew. `more` says that another part follows by itself.
+    anew. `touch_off` is how far, m, from where it should the last of them touched first. `more` says that another part
+    follows by itself.
     """
 
     series: GraspSeries = field(default_factory=GraspSeries)
     arrival: VehicleArrival | None = None
     board: BoardFix | None = None
     look: HeadLook | None = None
+    touch_off: float | None = None
     more: bool = False
 
 

@@ -48,6 +48,26 @@ def test_a_line_is_straight_and_turns_evenly(arm: ArmKinematics) -> None:
     assert np.all(np.abs(motion.speeds()) <= np.array(arm.limits.speed))
 
 
+@pytest.mark.parametrize("leaving", [False, True])
+@pytest.mark.parametrize(("length", "fast"), [(0.05, True), (0.004, False)])
+def test_near_its_place_a_line_is_slow_and_beyond_it_fast(
+    arm: ArmKinematics, leaving: bool, length: float, fast: bool
+) -> None:
+    start = arm.ik(down(0.70, -0.1, 0.35), WORKING)
+    goal = arm.fk(start)
+    goal.translation -= [0.0, 0.0, length]
+    limits = trajectory.LineLimits(speed=0.25, acceleration=0.75, near=5e-3, near_speed=0.04, leaving=leaving)
+    motion = trajectory.plan_line(arm, start, goal, limits)
+    gone = np.array([float(arm.fk(start).translation[2] - independent_fk(q)[2, 3]) for q in motion.joints])
+    speeds, middles = np.diff(gone) / np.diff(motion.times), 0.5 * (gone[1:] + gone[:-1])
+    near = middles < 5e-3 if leaving else middles > length - 5e-3
+    assert speeds[near].max() <= 0.04 * 1.02 and speeds.min() > 0.0
+    assert gone[-1] == pytest.approx(length, abs=1e-6)
+    # Even, also where it goes from one to the other: a step of the speed would be a jerk.
+    assert np.abs(np.diff(speeds, n=2)).max() < 8.0 * 0.008**2 * 1.5
+    assert (speeds.max() > 0.12) == fast
+
+
 def test_a_line_through_a_singular_posture_is_refused(arm: ArmKinematics) -> None:
     start = np.array([0.0, -1.2, 1.8, -2.1, -0.3, 0.0])
     end = np.array([0.0, -1.2, 1.8, -2.1, 0.3, 0.0])

@@ -16,13 +16,14 @@ from cell.config.job import job_path, load_job
 from cell.devices.simulated.described import Described
 from cell.devices.simulated.direct import VirtualCell
 from cell.procedures.steps.workplace import PartsBefore
-from cell.run.batch import _question, perform
+from cell.run.batch import _known_after, _question, perform
 from cell.run.folder import list_runs, read_report
 from cell.run.job_run import RunOutcome
 from cell.run.recorded_work import WorkContext
 from lab.bench.job.part_effects import held, motion
 from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.whole_job import JobRecord
+from statemachine.control import RunControl
 from statemachine.journal import request
 from statemachine.step import Event
 from tests.support import Typed
@@ -69,6 +70,11 @@ def test_the_figures_are_those_of_the_runs_and_what_the_parts_have_alike_is_allo
 
         batch = cell.run_batch("pot.toml", 3, observe)
     steps = [{step["name"]: step["result"] for step in run.report["steps"]} for run in batch.runs]
+    # The arm goes to the deck once, and stays at the station until the last part.
+    assert ["interim" in each["drive_to_target"] for each in steps] == [True, False, False]
+    assert ["head_looked_s_ago" in each["laser_sweep"] for each in steps] == [False, True, True]
+    assert [each["drive_to_target"]["photographs"] for each in steps[1:]] == [1, 1]
+    assert batch.runs[1].report["cell_s"] < batch.runs[0].report["cell_s"] - 15.0
     assert ["allowed_for" in each["place"] for each in steps] == [False, False, True]
     assert steps[2]["place"]["allowed_for"]["shift_mm"] == [pytest.approx(0.0, abs=0.15), pytest.approx(0.3, abs=0.15)]
     for each in steps:
@@ -163,9 +169,10 @@ def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
     opened: Callable[..., Cell], tmp_path: Path, placed_pot: JobRecord, name: str, shares: bool
 ) -> None:
     jobs, asked, tried = [load_job(f"{name}#{k}")[0] for k in (1, 2)], list[int](), list[int]()
-    shared: list[bool] = []
+    shared, known = list[bool](), list[tuple[bool, ...]]()
 
     def run(number: int, before: PartsBefore) -> RunOutcome:
+        known.append((before.look is not None, before.board is not None, before.touch_off is not None, before.more))
         tried.append(number)
         shared.append(before.arrival is not None and before.arrival.shared is placed_pot.results["board_photo"])
         how = ("placed", "in place") if number < 4 else ("aborted", "seen enough")
@@ -177,11 +184,34 @@ def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
         batch = perform(open_cell, jobs, 3, run, between=lambda work: asked.append(len(tried)), observer=None)
     assert (tried, asked) == ([1, 2, 3, 4], [2]), "a person at a real cell makes both items ready again"
     assert shared == [False, shares, False, shares], "before another stop the vehicle does not stand yet"
+    assert [more for *_, more in known] == [True, False, True, False], "a person makes the third ready"
+    assert [look for look, *_ in known] == [False, True, False, True], "who was there may have bumped the head"
+    assert [(board, touch) for _, board, touch, _ in known[1:]] == [(shares, True)] * 3
     assert (batch.job, batch.count, batch.reason) == (
         name,
         6,
         f"part 4 aborted: seen enough; not tried: {name}#1, {name}#2",
     )
+
+
+@pytest.mark.parametrize(("faults", "held"), [([], False), ([{"code": "arm.protective_stop"}], False), ([], True)])
+def test_no_part_goes_by_a_look_at_the_head_from_before_a_fault_or_a_hold(
+    placed_pot: JobRecord, tmp_path: Path, faults: list[dict[str, str]], held: bool
+) -> None:
+    control = RunControl()
+    if held:
+        control.pause()
+        control.safe_point(control.token, lambda stays: control.go_on() if stays else None)
+    report = {"cell_s": 1.0, "measured": [], "steps": [], "faults": faults}
+    last = RunOutcome("placed", "in place", tmp_path, report, placed_pot.results, control)
+    known = _known_after(PartsBefore(), last)
+    assert (known.look is not None) == (not faults and not held)
+    sweep = placed_pot.results["laser_sweep"]
+    if known.look is not None:
+        assert (known.look.at, known.look.pointing) == (sweep.times[0], sweep.pointing)
+        # One that went by an earlier look hands that on, as old as it is.
+        shared = {**placed_pot.results, "laser_sweep": replace(sweep, looked_s=30.0)}
+        assert _known_after(known, replace(last, results=shared)).look is known.look
 
 
 @pytest.mark.parametrize("count", [0, 1_000_001])

@@ -15,6 +15,7 @@ import pytest
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.inversion import PlacePose
 from cell.measure.vision.board.view import BoardView, parse_board
+from cell.motion.kinematics import HOME
 from cell.procedures.arm.photograph import APART_S, BoardFix, swing, swing_covariance
 from cell.procedures.drive.driving import Planar
 from cell.procedures.steps.board_photo import WAIT_S, WAITS, photographed, require_board_unmoved, until_quiet
@@ -36,7 +37,7 @@ def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
 
     workplace, fix, asked = AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["board_photo"], []
     monkeypatch.setattr(workplace, "photograph", photograph)
-    monkeypatch.setattr(workplace, "mover", SimpleNamespace(to=lambda *given: None))
+    monkeypatch.setattr(workplace, "mover", SimpleNamespace(to=lambda *given, near=0.0: None))
     monkeypatch.setattr(workplace.devices.target_camera, "configure", lambda *given: asked.append(given))
     with pytest.raises(Taken):
         photographed(workplace, fix.base_from_board, lambda share, text: None)
@@ -61,6 +62,32 @@ def test_items_share_a_photograph_until_odometry_tells_that_the_vehicle_moved(
     again = there.do("drive_to_target")
     assert again.shared is None and again.photographs > 0 and "shared" not in again.summary()
     assert there.do("board_photo").number > 0
+
+
+@pytest.mark.parametrize("pushed", [0.0, 0.03])
+def test_the_next_part_begins_where_the_arm_photographed_the_board_unless_the_vehicle_stands_elsewhere(
+    placed_pot: JobRecord, tmp_path: Path, pushed: float
+) -> None:
+    said: list[str] = []
+    site = AtStation(placed_pot, tmp_path, further=pushed, notify=lambda event: said.append(event.data.get("text", "")))
+    fix = placed_pot.results["board_photo"]
+    site.work.whereabouts.enter(site.job)
+    site.work.whereabouts.see(Planar(0.0, 0.0, 0.0))
+    site.work.parts_before = PartsBefore(board=fix, more=True)
+    site.work.looked = True
+    site.work.mover.to_joints(fix.joints)
+    found = site.do("drive_to_target")
+    assert (np.abs(site.work.mover.joints - fix.joints).max() < 1e-3) == (pushed == 0.0)
+    assert (found.photographs == 1) == (pushed == 0.0)
+    assert any("not as for the part before: the vehicle" in text for text in said) == (pushed > 0.0)
+    # It is not moved by a hair for that, and rests there again in the end.
+    stood = site.work.mover.joints
+    assert site.do("board_photo").number > 0
+    if not pushed:
+        assert site.work.mover.joints == pytest.approx(stood, abs=1e-5)
+    site.work.mover.to_joints(HOME)
+    site.work.mover.fold()
+    assert site.work.mover.joints == pytest.approx(site.made["board_photo"].joints, abs=5e-3)
 
 
 BOARD = parse_board("chessboard:9x7:20mm")

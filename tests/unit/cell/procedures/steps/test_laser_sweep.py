@@ -8,8 +8,9 @@ from pathlib import Path
 import pytest
 
 from cell.config.job import LONGEST_SWEEP_S, load_job
-from cell.procedures.steps.laser_sweep import laser_sweep, slowed_down
-from cell.procedures.steps.laser_sweep import sparse
+from cell.measure.calibration.drift.reference_plate import Pointing
+from cell.procedures.steps.laser_sweep import laser_sweep, slowed_down, sparse
+from cell.procedures.steps.workplace import HeadLook, PartsBefore
 from cell.procedures.sweep.sweeping import UNCHECKED
 from drivers.errors import DeviceFault
 from lab.bench.job.whole_job import JobRecord
@@ -54,3 +55,36 @@ def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
         assert (met.value.code, met.value.recoverable) == ("rail.lost_steps", True)
         assert not rail.state().homed_here
     assert "looking whether the rail has lost steps" in told
+
+
+def test_steps_lost_in_a_sweep_with_a_second_look_are_found_after_its_way_back(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    site = AtStation(placed_pot, tmp_path, timed=True)
+    site.work.looks_again = True
+    site.cell.devices.rail.home().wait(60.0)
+    site.cell.fault("rail.lost_steps")
+    with pytest.raises(DeviceFault, match="lost steps"):
+        site.do("laser_sweep")
+
+
+@pytest.mark.parametrize(("ago", "attempt", "shared"), [(599.0, 1, True), (601.0, 1, False), (5.0, 2, False)])
+def test_a_part_goes_by_the_look_at_the_head_of_a_part_before_for_ten_minutes(
+    placed_pot: JobRecord, tmp_path: Path, ago: float, attempt: int, shared: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = AtStation(placed_pot, tmp_path)
+    kept: list[str] = []
+    monkeypatch.setattr(site.work.frames, "keep", lambda name, frame: kept.append(name.split("-")[0]))
+    pointing = Pointing(0.5e-3, 0.02e-3)
+    look = HeadLook(site.cell.clock.now() - ago, pointing, placed_pot.results["laser_sweep"].slip)
+    site.work.parts_before = PartsBefore(look=look)
+    context = site.context("drive_to_target")
+    site.work.whereabouts.enter(site.job)
+    site.made["drive_to_target"] = site.kind.work(site.work)["drive_to_target"](context)
+    assert (site.made["drive_to_target"].head is None) == (ago < 600.0)
+    swept = site.kind.work(site.work)["laser_sweep"](site.context("laser_sweep", attempt))
+    assert ("witness" in kept) == (not shared) and ("interim" in kept) == (ago > 600.0)
+    assert (swept.pointing is pointing) == shared
+    assert swept.summary().get("head_looked_s_ago", 0.0) == pytest.approx(ago + 30.0 if shared else 0.0, abs=30.0)
+    if shared:
+        assert swept.summary()["laser_turned_mrad"] == 0.5

@@ -28,7 +28,7 @@ from cell.procedures.grasp import GraspSeries
 from cell.procedures.part_error import stated_bound
 from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
-from cell.procedures.steps.place import AimedPlace, PlaceResult, Placing, _mated
+from cell.procedures.steps.place import AimedPlace, PlaceResult, Placing, _mated, felt_from
 from cell.procedures.steps.workplace import PartsBefore, Workplace
 from cell.run.report.report import place_error
 from cell.run.resumption import UnfinishedRun
@@ -94,7 +94,7 @@ class Site:
         placing = Placing(
             JOB, self.base_from_surface * from_parts((0.0, 0.0, -too_low)), STATED, mover=self.mover, arm=self.arm,
             claw=given["claw"], part=self.part, check=lambda: None, progress=lambda share, text: None,
-            note=given["note"], ready=given.get("ready", lambda: None),
+            note=given["note"], ready=given.get("ready", lambda: None), feel=given.get("feel"),
         )  # fmt: skip
         return placing.put_down()
 
@@ -186,20 +186,21 @@ def test_what_the_force_sensor_showed_before_the_descent_is_no_touch(site: Site)
 
 
 @pytest.mark.parametrize(
-    ("early", "told"),
+    ("early", "feel", "told"),
     [
-        (0.002, r"touched something more than 1\.00 mm above"),
-        (0.004, r"touched something more than 1\.00 mm above"),
-        (0.02, r"touched something more than 1\.00 mm above"),
-        (-0.004, r"no contact within 1\.00 mm"),
+        (0.0015, 0.4e-3, r"touched something more than 0\.40 mm above"),
+        (0.002, None, r"touched something more than 1\.00 mm above"),
+        (0.004, None, r"touched something more than 1\.00 mm above"),
+        (0.02, None, r"touched something more than 1\.00 mm above"),
+        (-0.004, None, r"no contact within 1\.00 mm"),
     ],
 )
 def test_a_surface_that_comes_early_or_not_at_all_is_refused_with_the_part_held_lifted_and_not_crushed(
-    site: Site, early: float, told: str
+    site: Site, early: float, feel: float | None, told: str
 ) -> None:
     """Also one that is met just before the slow part of the descent, where the fast one does not feel it yet."""
     with pytest.raises(RefusedError, match=told):
-        site.place(too_low=early)
+        site.place(too_low=early, feel=feel)
     assert site.held
     assert site.noted == []
     assert site.part.state is PartState.HELD
@@ -207,6 +208,15 @@ def test_a_surface_that_comes_early_or_not_at_all_is_refused_with_the_part_held_
     # 40 mm/s until 24 N is felt: far below the 150 N of a protective stop.
     assert early < 0.0 or 10.0 < max(site.forces) < 100.0
     assert site.part.explain("touched") == "touched"
+
+
+@pytest.mark.parametrize(("off", "from_mm"), [(None, 1.0), (0.02e-3, 0.4), (-0.2e-3, 1.0)])
+def test_where_the_part_before_touched_as_expected_contact_is_felt_for_nearer(
+    placed_pot: JobRecord, tmp_path: Path, off: float | None, from_mm: float
+) -> None:
+    work = AtStation(placed_pot, tmp_path, folded=False).work
+    work.parts_before = PartsBefore(touch_off=off)
+    assert 1e3 * felt_from(work) == pytest.approx(from_mm)
 
 
 @pytest.mark.parametrize(("too_low", "side"), [(0.4e-3, "higher"), (-0.4e-3, "lower")])

@@ -20,9 +20,11 @@ from cell.measure.inversion.effects.between_sweeps import Creep, SurfaceMotion, 
 from cell.measure.reconstruction.build import flange_motions
 from cell.measure.reconstruction.cloud import Cloud, Filled, merge
 from cell.procedures.arm.touch import felt_touch
+from cell.procedures.steps import laser_sweep as sweep_step
 from cell.procedures.steps import place as place_step
+from cell.procedures.steps.laser_sweep import LINES, sparse
 from cell.procedures.sweep import second_look
-from cell.procedures.sweep.second_look import LINES, SecondLook, by_times, require_in_place, require_points, sparse
+from cell.procedures.sweep.second_look import SecondLook, by_times, require_in_place, require_points
 from cell.procedures.sweep.swath import MAX_LOST_FRACTION
 from drivers.errors import CellError, DeviceFault, LimitError, NotObservable, RefusedError
 from lab.bench.job.scan_errors import own_base
@@ -93,6 +95,37 @@ def test_one_that_slid_over_its_table_is_refused(
     assert number.value > number.most == 1.0
 
 
+@pytest.mark.parametrize(("shift", "late"), [(0.0, 0.0), (0.25e-3, 0.0), (0.0, 6.0), (0.25e-3, 6.0)])
+def test_the_way_back_of_a_sweep_is_its_second_look_unless_it_is_too_long_ago(
+    placed_pot: JobRecord, tmp_path: Path, shift: float, late: float
+) -> None:
+    begun: list[str] = []
+
+    def push(event: Event) -> None:
+        text = event.data.get("text", "")
+        # One that was pushed before the way back, or, when that is too long ago, after it.
+        if "whether the surface lies" in text and not begun and (late > 0.0) == ("lies where it did" in text):
+            begun.append(text)
+            slid(site.cell, (shift, 0.0))
+
+    site = AtStation(placed_pot, tmp_path, notify=push, timed=True)
+    site.work.looks_again = True
+    back = site.do("laser_sweep").back
+    assert back is not None and LINES - 4 < len(back.swaths[0].lines) < LINES + 4
+    assert (back.swaths[0].rail[0] > back.swaths[0].rail[-1]) != (
+        site.made["laser_sweep"].swaths[0].rail[0] > site.made["laser_sweep"].swaths[0].rail[-1]
+    )
+    site.do("reconstruct", "invert_pose")
+    site.cell.clock.sleep(late)
+    if shift:
+        with pytest.raises(RefusedError, match=r"the surface has moved by 0\.2\d mm"):
+            look_again(site)
+    else:
+        look = look_again(site)
+        assert look.counted == (late == 0.0) and not look.moved.moved and look.notes == ()
+    assert begun
+
+
 def test_one_that_is_not_there_any_more_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
     with pytest.raises(RefusedError, match="does not lie any more where it was swept"):
         looked(placed_pot, tmp_path, (0.0, 0.045))
@@ -130,11 +163,11 @@ def test_a_second_look_takes_few_lines_of_one_strip_twice_as_fast_where_there_is
     workplace, (swath,) = AtStation(placed_pot, tmp_path).work, placed_pot.results["laser_sweep"].swaths
     scan = workplace.job.scan
     few = sparse(workplace, scan.swath[0], swath)
-    assert few.speed == pytest.approx(min(second_look.HURRY * scan.speed, workplace.config.rail.max_speed), rel=0.01)
+    assert few.speed == pytest.approx(min(sweep_step.HURRY * scan.speed, workplace.config.rail.max_speed), rel=0.01)
     assert few.length / few.speed * few.frame_rate == pytest.approx(LINES) and len(few.swath) == 1
     # A sweep that was repeated went half as fast.
     slow = replace(swath, times=2.0 * swath.times)
-    assert sparse(workplace, scan.swath[0], slow).speed == pytest.approx(second_look.HURRY * second_look.pace(slow))
+    assert sparse(workplace, scan.swath[0], slow).speed == pytest.approx(sweep_step.HURRY * sweep_step.pace(slow))
     # The arm repeats it slower rather than faster; a camera that is slow stays so.
     workplace.job = changed(workplace.job, "scan", mode="arm", frame_rate=5.0, speed=0.02)
     by_arm = sparse(workplace, scan.swath[0], swath)
@@ -326,7 +359,7 @@ def test_a_place_that_creeps_is_carried_on_to_the_time_of_the_contact(
     made = (site.made[name] for name in ("laser_sweep", "reconstruct", "board_photo"))
     place_step.carried_on(site.work, *made, Creep(np.zeros(6), 1e-16 * np.eye(6), np.zeros(3), 0.0))
     plan, now = site.job.place, site.cell.clock.now()
-    descent = plan.approach / plan.speed + plan.contact_travel / plan.contact_speed
+    descent = plan.contact_travel / plan.contact_speed
     assert until == [pytest.approx(now + (place_step.APPROACH_S + descent) / 0.5)]
 
 
