@@ -254,17 +254,27 @@ def stand_at_target(
             f"the arm stands on a fixed frame and does not see the board: {unseen}. Bring the station to where "
             "approach.target has it, or correct approach.target"
         ).showing(*unseen.numbers, seen=unseen.seen) from unseen
+    found, near = _arrived(job, vehicle_from_base, whereabouts, fix)
+    if not near:
+        error = Planar(found.error_along, found.error_across, found.error_yaw)
+        raise _off_target(
+            error, job, fix, "the arm, on its fixed frame,", "", remedy="move the station, or correct approach.target"
+        )
+    vehicle.brake()
+    return replace(found, driven=False)
+
+
+def _arrived(
+    job: Job, vehicle_from_base: pin.SE3, whereabouts: Whereabouts, fix: BoardFix
+) -> tuple[VehicleArrival, bool]:
+    """Where a vehicle that was not driven stands by one photograph, and whether that is within the job's tolerance."""
     base_from_place = fix.base_from_board * job.place_from_board.inverse()
     stands = Planar.of((vehicle_from_base * base_from_place).inverse())
     whereabouts.see(stands)
     error = Planar.of(job.approach.target.se3()).inverse() * stands
     most, most_angle = job.approach.tolerance, job.approach.tolerance_angle
-    if not (abs(error.x) <= most and abs(error.y) <= most and abs(error.yaw) <= most_angle):
-        raise _off_target(
-            error, job, fix, "the arm, on its fixed frame,", "", remedy="move the station, or correct approach.target"
-        )
-    vehicle.brake()
-    return VehicleArrival(base_from_place, fix, error.x, error.y, error_yaw=error.yaw, photographs=1, driven=False)
+    near = abs(error.x) <= most and abs(error.y) <= most and abs(error.yaw) <= most_angle
+    return VehicleArrival(base_from_place, fix, error.x, error.y, error_yaw=error.yaw, photographs=1), near
 
 
 def _off_target(error: Planar, job: Job, fix: BoardFix, who: str, after: str, remedy: str) -> RefusedError:
@@ -331,9 +341,9 @@ def _run_step(workplace: Workplace, context: StepContext) -> VehicleArrival:
 
 
 def _still_there(workplace: Workplace, context: StepContext) -> VehicleArrival | None:
-    """Where the vehicle stands, by a photograph from where the part before had its own; None where it does not stand
-    there any more, or the board shows it off its target."""
-    before, vehicle = workplace.parts_before.board, workplace.devices.vehicle
+    """Where the vehicle stands, by a photograph from where the part before had its own; None, for it to be driven,
+    where it has moved, or the board shows it off its target or not at all."""
+    before = workplace.parts_before.board
     if before is None or not workplace.whereabouts.still:
         return None
     context.progress(0.3, "looking from where the arm photographed the board before")
@@ -344,10 +354,16 @@ def _still_there(workplace: Workplace, context: StepContext) -> VehicleArrival |
     workplace.devices.clock.sleep(SETTLE_S)
     stand = workplace.config.arm.vehicle_from_base.se3()
     try:
-        return stand_at_target(workplace.job, stand, vehicle, workplace.whereabouts, workplace.photograph)
-    except RefusedError as off:
-        context.note(text=f"not as for the part before: {off}")
+        found, near = _arrived(workplace.job, stand, workplace.whereabouts, workplace.photograph())
+    except RefusedError as unseen:
+        context.note(text=f"the board is not seen from where it was for the part before: {unseen}")
         return None
+    if near:
+        workplace.devices.vehicle.brake()
+        return found
+    x, y = 1e3 * found.error_along, 1e3 * found.error_across
+    context.note(text=f"the vehicle stands ({x:.1f}, {y:.1f}) mm off its target now, and is driven there again")
+    return None
 
 
 def _checked(workplace: Workplace, context: StepContext) -> InterimCheck | None:

@@ -79,7 +79,7 @@ def test_the_next_part_begins_where_the_arm_photographed_the_board_unless_the_ve
     found = site.do("drive_to_target")
     assert (np.abs(site.work.mover.joints - fix.joints).max() < 1e-3) == (pushed == 0.0)
     assert (found.photographs == 1) == (pushed == 0.0)
-    assert any("not as for the part before: the vehicle" in text for text in said) == (pushed > 0.0)
+    assert any("off its target now, and is driven there again" in text for text in said) == (pushed > 0.0)
     # It is not moved by a hair for that, and rests there again in the end.
     stood = site.work.mover.joints
     assert site.do("board_photo").number > 0
@@ -87,7 +87,8 @@ def test_the_next_part_begins_where_the_arm_photographed_the_board_unless_the_ve
         assert site.work.mover.joints == pytest.approx(stood, abs=1e-5)
     site.work.mover.to_joints(HOME)
     site.work.mover.fold()
-    assert site.work.mover.joints == pytest.approx(site.made["board_photo"].joints, abs=5e-3)
+    off = site.work.mover.joints - site.made["board_photo"].joints
+    assert np.abs(np.sin(0.5 * off)).max() < 5e-3
 
 
 BOARD = parse_board("chessboard:9x7:20mm")
