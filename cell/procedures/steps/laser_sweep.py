@@ -47,7 +47,7 @@ LINES = 48
 half its speed showed a rocking of 4 Hz as a slow motion: once for each of these lines, or nearly."""
 MOST_LOST = 0.5
 """Share of its frames: a comparison misses none of them, and says what is left of it."""
-HURRY, IN_TIME = 2.0, 2.6
+HURRY, IN_TIME = 2.0, 3.0
 """So many times as fast as in the sweep the rail goes, where it can: few lines need few pictures. Faster where it is
 known how late the camera's stamps come."""
 ROOM_M = 1e-3

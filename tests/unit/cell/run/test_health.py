@@ -27,14 +27,16 @@ DAY_S = 86_400.0
 MAX_AGE_S = 30 * DAY_S
 
 
-def job(root: Path, day: float, off: list[float] | None = None, **more: Any) -> str:
-    """A job's report of this day, whose look at the board saw the head `off`, mm."""
+def job(root: Path, day: float, off: list[float] | None = None, shared: bool = False, **more: Any) -> str:
+    """A job's report of this day, whose look at the board saw the head `off`, mm; `shared`: it went by one before."""
     folder = new_run(root)
     started = (MADE + dt.timedelta(days=day)).strftime("%Y-%m-%dT%H:%M:%S%z")
     arrival: dict[str, Any] = {"photographs": 2}
     if off is not None:
         arrival["interim"] = {"off_mm": off, "place_allowed_mm": 0.18}
     sweep = {"head_slipped_um": [30.0, -40.0], "laser_turned_mrad": 0.35, "laser_confirmed_mrad": 0.3}
+    if shared:
+        sweep["head_looked_s_ago"] = 40.0
     steps = [{"name": "drive_to_target", "result": arrival}, {"name": "laser_sweep", "result": sweep}]
     report = {
         "run": folder.name, "kind": "job", "outcome": "placed", "reason": "", "code": None, "started": started,
@@ -109,6 +111,16 @@ def test_the_jobs_since_the_newest_calibration_count(tmp_path: Path) -> None:
     assert rail.values[0].tolist() == pytest.approx([0.03, -0.04]) and rail.last == pytest.approx(0.05)
     assert laser.now == pytest.approx(0.05) and len(names) == 6
     assert found.days_left == pytest.approx(23.0) and found.due == "a calibration is due in 23.0 days, by its age"
+
+
+def test_a_look_that_parts_share_counts_once(tmp_path: Path) -> None:
+    """Of a batch, only the first part looked; nobody forgot to."""
+    job(tmp_path, 0.0, [0.0, 0.0, 0.0])
+    for part in range(3):
+        job(tmp_path, 0.001 * (part + 1), shared=True)
+    found = health(tmp_path, tmp_path / "calibrations", MAX_AGE_S, MADE + dt.timedelta(days=1))
+    assert (found.jobs, found.unlooked) == (4, 0)
+    assert [len(one.days) for one in found.series] == [1, 1, 1]
 
 
 def test_a_creeping_head_is_due_before_its_calibration_is_old(tmp_path: Path) -> None:

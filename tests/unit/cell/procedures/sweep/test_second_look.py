@@ -95,6 +95,14 @@ def test_one_that_slid_over_its_table_is_refused(
     assert number.value > number.most == 1.0
 
 
+def test_a_way_back_is_too_blunt_where_it_is_not_known_how_late_the_stamps_come(
+    placed_pot: JobRecord, tmp_path: Path
+) -> None:
+    site = AtStation(placed_pot, tmp_path)
+    site.work.looks_again = True
+    assert site.do("laser_sweep").back is None
+
+
 @pytest.mark.parametrize(("shift", "late"), [(0.0, 0.0), (0.25e-3, 0.0), (0.0, 6.0), (0.25e-3, 6.0)])
 def test_the_way_back_of_a_sweep_is_its_second_look_unless_it_is_too_long_ago(
     placed_pot: JobRecord, tmp_path: Path, shift: float, late: float
