@@ -248,12 +248,16 @@ def _profile(
             raise ValueError(f"{name} {value} must be finite and greater than 0")
     last, slow = near
     if 0.0 < last < 1.0:
-        parts = [
-            _stretch((0.0, 0.0), (1.0 - last, slow), speed, acceleration, jerk),
-            _stretch((1.0 - last, slow), (1.0, 0.0), slow, acceleration, jerk),
-        ]
-    else:
-        parts = [_stretch((0.0, 0.0), (1.0, 0.0), slow if last else speed, acceleration, jerk)]
+        before = _stretch((0.0, 0.0), (1.0 - last, slow), speed, acceleration, jerk)
+        times, way = _sampled([before, _stretch((1.0 - last, slow), (1.0, 0.0), slow, acceleration, jerk)], period)
+        # Where there is too little room to gain speed before, it would be gained by going back first.
+        if np.diff(way).min() >= 0.0:
+            return times, way
+    return _sampled([_stretch((0.0, 0.0), (1.0, 0.0), slow if last else speed, acceleration, jerk)], period)
+
+
+def _sampled(parts: Sequence[ruckig.Trajectory], period: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times, s, about `period` apart, and the positions then, of profiles that follow each other."""
     ends = np.cumsum([0.0, *(part.duration for part in parts)])
     times = np.linspace(0.0, ends[-1], max(1, int(np.ceil(ends[-1] / period - 1e-9))) + 1)
     which = np.clip(np.searchsorted(ends, times, side="right") - 1, 0, len(parts) - 1)

@@ -117,7 +117,7 @@ def calibration(
 def cycle(
     job: JobOption = "shell", seed: SeedOption = 1, level: LevelOption = Level.nominal, json: JsonOption = False
 ) -> None:
-    """Where the time of a job goes, cold and repeated: each motion of arm and vehicle beside its least time."""
+    """Where the time of a job goes, first and in the middle of a batch: each motion beside its least time."""
     from lab.bench.job.cycle import cycle as campaign
 
     with bar() as told:

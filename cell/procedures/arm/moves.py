@@ -258,13 +258,9 @@ class Mover:
         """
         far = min(max(speed, FAR_SPEED) if near else speed, self._tool_speed)
         limits = LineLimits(
-            speed=far,
-            acceleration=max(0.02, 3.0 * far),
-            jerk=8.0,
-            near=near,
-            near_speed=min(speed, far),
+            speed=far, acceleration=max(0.02, 3.0 * far), jerk=8.0, near=near, near_speed=min(speed, far),
             leaving=leaving,
-        )
+        )  # fmt: skip
         line = self._planner.line(self.joints, base_from_flange, limits, allowed)
         return self.follow(line.at_pace(self.pace.share), force_limit, settle)
 

@@ -350,10 +350,10 @@ def _still_there(workplace: Workplace, context: StepContext) -> VehicleArrival |
     goal = photo_pose(
         workplace.job, workplace.board, before.base_from_board, workplace.calibration.target.flange_from_camera
     )
-    workplace.mover.to(goal, "the photograph pose", near=NEAR)
-    workplace.devices.clock.sleep(SETTLE_S)
     stand = workplace.config.arm.vehicle_from_base.se3()
     try:
+        workplace.mover.to(goal, "the photograph pose", near=NEAR)
+        workplace.devices.clock.sleep(SETTLE_S)
         found, near = _arrived(workplace.job, stand, workplace.whereabouts, workplace.photograph())
     except RefusedError as unseen:
         context.note(text=f"the board is not seen from where it was for the part before: {unseen}")

@@ -219,15 +219,9 @@ def _sweep(workplace: Workplace, context: StepContext, fix: BoardFix) -> SweepRe
     blinded = (UNSEEN_BY_LIGHT,) if workplace.devices.bright else ()
     doubts = (*record.doubts, *lost, *unwatched(head.witness), *blinded, *doubts, *workplace.notes)
     record = replace(
-        record,
-        pointing=pointing,
-        slip=slip,
-        doubts=doubts,
-        rest=rest,
-        back=back,
-        held_s=context.held_s,
+        record, pointing=pointing, slip=slip, doubts=doubts, rest=rest, back=back, held_s=context.held_s,
         looked_s=looked_s,
-    )
+    )  # fmt: skip
     for note in record.notes:
         context.note(text=note)
     return record

@@ -1,7 +1,7 @@
 """`cell bench cycle`: where the time of a job goes, motion by motion, beside the least that each could take.
 
-A batch on the virtual clock: its first part is cold (the arm stands at HOME, the rail is not homed), one in its middle
-repeated. What a device did comes from the run's record, as the report's drawing shows it.
+A batch on the virtual clock, in a cell that is calibrated, its time stamps as well. Its first part is cold, one in its
+middle repeated. What a device did comes from the run's record, as the report's drawing shows it.
 """
 
 from __future__ import annotations
@@ -34,6 +34,10 @@ def cycle(job: str, seed: int, level: str, done: Callable[[str], None]) -> dict[
     result: dict[str, object] = {}
     with Cell.open(sim="all", seed=seed, level=level, clock="virtual", job=job) as cell:
         limits = LeastTimes.of(cell.devices, config, loaded)
+        # As an engineer does before parts are made.
+        cell.calibrate(job=job)
+        cell.time_stamps(job=job)
+        done("calibrated")
         batch = cell.run_batch(job, PARTS)
         if len(batch.runs) < PARTS:
             raise RefusedError(f"the batch ended early: {batch.reason}. Try another --seed")

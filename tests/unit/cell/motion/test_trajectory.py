@@ -49,7 +49,7 @@ def test_a_line_is_straight_and_turns_evenly(arm: ArmKinematics) -> None:
 
 
 @pytest.mark.parametrize("leaving", [False, True])
-@pytest.mark.parametrize(("length", "fast"), [(0.05, True), (0.004, False)])
+@pytest.mark.parametrize(("length", "fast"), [(0.05, True), (0.0055, False), (0.004, False)])
 def test_near_its_place_a_line_is_slow_and_beyond_it_fast(
     arm: ArmKinematics, leaving: bool, length: float, fast: bool
 ) -> None:
