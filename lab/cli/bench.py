@@ -121,8 +121,8 @@ def cycle(
     from lab.bench.job.cycle import cycle as campaign
 
     with bar() as told:
-        told(0, "the first run is on its way")
-        result = campaign(str(job), seed, level.value, counted(told, 2))
+        told(0, "calibrating")
+        result = campaign(str(job), seed, level.value, counted(told, 3))
     show(result, json)
 
 
