@@ -112,13 +112,6 @@ def test_a_real_cell_that_is_to_confirm_by_itself_is_not_opened(tmp_path: Path) 
         Cell.open(tmp_path / "cell.toml", confirm="simulated")
 
 
-def test_the_configuration_that_ships_names_no_device() -> None:
-    with pytest.raises(ConfigError) as told:
-        require_real_addresses(load_config(None))
-    for key in ("arm.address", "scan_camera.address", "target_camera.address"):
-        assert key in str(told.value)
-
-
 @pytest.mark.parametrize(
     ("text", "runs"),
     [

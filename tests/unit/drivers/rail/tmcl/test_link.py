@@ -18,15 +18,7 @@ from pytrinamic.tmcl import TMCLReply, TMCLRequest
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
-from drivers.rail.tmcl.link import (
-    Axis,
-    TelegramError,
-    TmclCommand,
-    TmclLink,
-    TmclRequest,
-    decode_firmware,
-    decode_reply,
-)
+from drivers.rail.tmcl.link import Axis, TelegramError, TmclLink, TmclRequest, decode_firmware, decode_reply
 from sim_backends.clock import WorldClock
 from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.rail.tmcl import TmclPeer
@@ -34,20 +26,6 @@ from tests.support.wire.rail_bench import SPEED, Bench, connect, reply
 
 BYTE = st.integers(0, 255)
 VALUE = st.integers(-(2**31), 2**31 - 1)
-
-
-@pytest.mark.parametrize(
-    ("request_", "telegram"),
-    [
-        (TmclRequest(1, TmclCommand.ROTATE_RIGHT, 0, 0, 350), "01 01 00 00 00 00 01 5e 61"),
-        (TmclRequest(1, TmclCommand.MOTOR_STOP, 0, 0), "01 03 00 00 00 00 00 00 04"),
-        (TmclRequest(1, TmclCommand.MOVE_TO, 0, 0, 1000), "01 04 00 00 00 00 03 e8 f0"),
-        (TmclRequest(1, TmclCommand.MOVE_TO, 0, 0, -1), "01 04 00 00 ff ff ff ff 01"),
-        (TmclRequest(1, TmclCommand.GET_AXIS, Axis.POSITION, 0), "01 06 01 00 00 00 00 00 08"),
-    ],
-)
-def test_telegrams_read_as_in_the_manual(request_: TmclRequest, telegram: str) -> None:
-    assert request_.encode() == bytes.fromhex(telegram)
 
 
 @given(BYTE, BYTE, BYTE, BYTE, VALUE)
