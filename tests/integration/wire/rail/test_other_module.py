@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 
-import numpy as np
 import pytest
 
 from drivers.clock import Clock
@@ -128,16 +127,3 @@ def test_a_spoilt_reply_is_asked_for_once_more(module: OtherModule, rail: TmclRa
 def test_nobody_at_the_address_is_told_with_address_and_baud_rate(module: OtherModule) -> None:
     with pytest.raises(DeadlineError, match=r"module address 3 \(rail\.address\), rail\.baud \(9600"):
         connect(module, address=3)
-
-
-def test_a_reset_in_the_middle_of_a_sweep_is_told(module: OtherModule, rail: TmclRail) -> None:
-    rail.move_to(rail.sweep_start(0.01, 0.035, SPEED)).wait(10.0)
-    running = rail.sweep(0.01, 0.035, SPEED)
-    while len(running.samples) < 10:
-        np.asarray(running.samples)
-    module.power_on()
-    with pytest.raises(DeviceFault) as met:
-        running.wait(10.0)
-    assert met.value.code == "rail.reset"
-    with pytest.raises(DeviceFault, match="reset"):
-        _ = running.window

@@ -8,7 +8,6 @@ import pytest
 
 from drivers.clock import Clock
 from drivers.errors import ConfigError, InterlockError
-from drivers.interfaces import Rail
 from tests.support.wire.rail_bench import Bench, connect, telegram
 
 pytestmark = pytest.mark.wire
@@ -18,16 +17,6 @@ pytestmark = pytest.mark.wire
 def test_impossible_parameters_are_refused_before_the_port_is_opened(wrong: dict[str, Any]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         connect("socket://127.0.0.1:1", Clock(), **wrong)
-
-
-def test_the_rail_says_who_it_is_and_how_fast_it_answers(bench: Bench) -> None:
-    rail: Rail = bench.rail
-    identity = rail.identity()
-    assert (identity.model, identity.serial, identity.firmware) == ("TMCM-1260", "1", "1260V112")
-    assert identity.address == bench.peer.url
-    assert 0.0 < rail.ping() < 0.5
-    assert len(rail.statistics.round_trips_s) > 5
-    assert not rail.statistics.errors
 
 
 def test_who_only_looks_sets_nothing_and_stops_nothing(homed: Bench) -> None:
