@@ -55,9 +55,7 @@ def done(inject: tuple[str, ...] = (), until: str | None = None, **options: Any)
 def require_safe(report: dict[str, Any]) -> None:
     """By the world's truth, not by what the devices said."""
     end = report["end_state"]
-    assert not end["laser_on"]
-    assert not end["rail_moving"]
-    assert not end["arm"]["moving"]
+    assert not end["laser_on"] and not end["rail_moving"] and not end["arm"]["moving"]
     assert end["vehicle"]["braked"] and end["vehicle"]["stopped"]
     assert end["collisions"] == []
     # Whatever fails before the release, the part stays in the claw.
@@ -106,8 +104,7 @@ def test_a_vehicle_that_was_moved_in_a_fault_is_not_swept_from_where_it_stood() 
         notify = run.notify
         run.notify = lambda event: (push(event), notify(event))[1]  # type: ignore[method-assign]
         outcome = run.result(120.0)
-    assert outcome.outcome == "refused"
-    assert outcome.report["refusal"]["step"] == "laser_sweep"
+    assert (outcome.outcome, outcome.report["refusal"]["step"]) == ("refused", "laser_sweep")
     require_safe(dict(outcome.report))
     assert re.search(r"the board has moved by \d+\.\d+ mm .* since it was photographed", outcome.reason)
 
@@ -255,8 +252,7 @@ def test_a_job_that_does_not_fit_what_is_there_is_refused(folder: Path) -> None:
     assert 'tolerance = "0.6 mm"' in text
     (folder / "pot.toml").write_text(text.replace('tolerance = "0.6 mm"', 'tolerance = "0.05 mm"'), encoding="utf-8")
     outcome = done()
-    assert outcome.outcome == "refused"
-    assert outcome.report["refusal"]["step"] == "invert_pose"
+    assert (outcome.outcome, outcome.report["refusal"]["step"]) == ("refused", "invert_pose")
     require_safe(dict(outcome.report))
 
 

@@ -38,9 +38,7 @@ def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound_and_ends_
     assert placed["truth"]["error_mm"]["d"]["mean"] <= 0.60
     assert placed["truth"]["sensor_mm"]["p85"] <= 0.15
     end = placed["end_state"]
-    assert not end["laser_on"]
-    assert end["vehicle"]["braked"]
-    assert not end["arm"]["moving"]
+    assert not end["laser_on"] and end["vehicle"]["braked"] and not end["arm"]["moving"]
     assert not end["part"]["held"]
 
 

@@ -120,8 +120,7 @@ def test_a_spoilt_reply_is_asked_for_once_more(module: OtherModule, rail: TmclRa
     motion = rail.move_to(0.02)
     setattr(module, trouble, 1)
     motion.wait(10.0)
-    assert rail.state().position == pytest.approx(0.02, abs=1e-6)
-    assert rail.statistics.errors["retries"] == 1
+    assert (rail.state().position, rail.statistics.errors["retries"]) == (pytest.approx(0.02, abs=1e-6), 1)
 
 
 def test_nobody_at_the_address_is_told_with_address_and_baud_rate(module: OtherModule) -> None:

@@ -74,8 +74,7 @@ def test_check_reads_the_local_files_and_says_which(typed: Typed) -> None:
     assert typed("init")[0] == 0
     told = json.loads(typed("check", "--json")[1])
     assert (told["ok"], told["configuration"], told["job_file"]) == (True, "cell.toml", "pot.toml")
-    assert told["job"] == "pot"
-    assert told["mesh"] == "pot.ply"
+    assert (told["job"], told["mesh"]) == ("pot", "pot.ply")
     assert any("192.0.2.10" in note for note in told["notes"])
     Path("cell.toml").write_text(default_toml().replace('lead = "2 mm"', 'lead = "2"'))
     assert typed("check")[0] == 2

@@ -24,8 +24,7 @@ def test_the_job_of_the_present_folder_wins_over_the_one_that_ships() -> None:
     Path("pot").mkdir()
     assert job_path("pot") == shipped
     Path("pot.toml").write_text(shipped.read_text())
-    assert job_path("pot") == Path("pot.toml")
-    assert job_path(shipped) == shipped
+    assert (job_path("pot"), job_path(shipped)) == (Path("pot.toml"), shipped)
 
 
 def test_what_a_batch_does_is_checked_and_no_part_of_what_runs_rest_on(tmp_path: Path) -> None:

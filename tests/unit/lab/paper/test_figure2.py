@@ -48,10 +48,8 @@ def test_light_in_the_middle_hardly_changes_from_30_to_35_mm() -> None:
 
 
 def test_35_mm_is_the_smallest_that_meets_a_fifth_of_a_millimetre_at_a_tenth_of_a_pixel() -> None:
-    assert smallest_baseline(0.1 * 4.8e-6) == 0.035
-    assert smallest_baseline(0.31e-6) == 0.035
-    assert smallest_baseline(0.29e-6) == 0.030
-    assert smallest_baseline(0.55e-6) == 0.040
+    assert (smallest_baseline(0.1 * 4.8e-6), smallest_baseline(0.31e-6)) == (0.035, 0.035)
+    assert (smallest_baseline(0.29e-6), smallest_baseline(0.55e-6)) == (0.030, 0.040)
 
 
 def test_errors_are_what_moved_rays_do() -> None:

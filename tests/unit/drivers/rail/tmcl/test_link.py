@@ -88,8 +88,7 @@ def test_a_value_beyond_32_bits_is_refused() -> None:
 def test_a_lost_reply_is_asked_for_once_more_and_counted(homed: Bench) -> None:
     homed.peer.fault("rail.drop_reply")
     homed.rail.move_to(0.03).wait(20.0)
-    assert homed.carriage() == pytest.approx(0.03, abs=1e-6)
-    assert homed.rail.statistics.errors["retries"] == 1
+    assert (homed.carriage(), homed.rail.statistics.errors["retries"]) == (pytest.approx(0.03, abs=1e-6), 1)
     assert homed.rail.statistics.errors["timeouts"] == 1
 
 

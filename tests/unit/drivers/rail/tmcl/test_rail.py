@@ -25,8 +25,7 @@ def test_who_only_looks_sets_nothing_and_stops_nothing(homed: Bench) -> None:
     before = homed.model.settings
     looking = connect(homed.peer.url, homed.clock, control=False)
     state = looking.state()
-    assert state.moving
-    assert state.homed
+    assert state.moving and state.homed
     for command in (looking.home, lambda: looking.move_to(0.01), looking.stop):
         with pytest.raises(InterlockError, match="looked at only"):
             command()

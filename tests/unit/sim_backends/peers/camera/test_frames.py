@@ -230,8 +230,7 @@ def test_a_second_client_is_turned_away_and_may_come_once_the_first_is_gone(peer
         second.receive()
     client.vanish()
     third = Client(peer.address)
-    assert third.ask(op="identify")["ok"]
-    assert third.ask(op="trigger")["ok"]
+    assert third.ask(op="identify")["ok"] and third.ask(op="trigger")["ok"]
     third.frame()
     third.socket.close()
 
@@ -248,8 +247,7 @@ def test_garbage_ends_its_own_connection_only(peer: FramePeer) -> None:
     half.vanish()
     second = Client(peer.address)
     second.socket.sendall(b"CFS1" + struct.pack(">II", 3, 0) + b"{a:")
-    assert not second.receive()[0]["ok"]
-    assert second.ask(op="latch")["ok"]
+    assert not second.receive()[0]["ok"] and second.ask(op="latch")["ok"]
     second.socket.close()
 
 

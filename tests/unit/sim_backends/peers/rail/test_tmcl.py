@@ -76,8 +76,7 @@ def test_the_vendors_client_homes_and_moves_the_rail(
     client.reference_search(0, 0)
     assert client.reference_search(2, 0) != 0
     until(clock, lambda: client.reference_search(2, 0) == 0)
-    assert axis.actual_position == 0
-    assert axis.get_axis_parameter(axis.AP.HomeSwitch) == 1
+    assert (axis.actual_position, axis.get_axis_parameter(axis.AP.HomeSwitch)) == (0, 1)
     assert model.carriage(clock.now()) == pytest.approx(0.0, abs=1e-9)
     module.move_to(0, 25 * STEPS, 10 * STEPS)
     assert axis.get_position_reached() == 0

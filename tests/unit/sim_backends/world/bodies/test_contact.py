@@ -98,8 +98,7 @@ def test_contact_pushes_against_the_side_that_it_runs_into() -> None:
     tilted = target @ turned((0.0, 0.02, 0.0))
     wrench = part.wrench(flange_for(raised(tilted, dz=0.0)))
     # Turned about +y, the side at +x is low; the force there, at +x of the flange, turns back about −y.
-    assert wrench[2] > 0
-    assert wrench[4] < 0
+    assert wrench[2] > 0 and wrench[4] < 0
 
 
 def test_released_on_the_surface_the_part_stays_where_it_was_placed() -> None:
@@ -152,8 +151,7 @@ def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact() ->
     seen = (drawing.inverse(target) @ rest @ underside.T).T
     gap = seen[:, 2] - surface("pot").height(seen[:, 0], seen[:, 1])
     assert 0 < rest[2, 3] - target[2, 3] < 0.002
-    assert gap.min() > -2e-5
-    assert gap.min() < 2e-4
+    assert gap.min() > -2e-5 and gap.min() < 2e-4
 
 
 def test_dropped_beside_the_table_the_part_falls_to_the_floor() -> None:

@@ -23,8 +23,7 @@ def test_slopes_are_the_derivatives_of_the_height(name: str) -> None:
     step = 1e-7
     by_x = (surface(name).height(x + step, y) - surface(name).height(x - step, y)) / (2 * step)
     by_y = (surface(name).height(x, y + step) - surface(name).height(x, y - step)) / (2 * step)
-    assert np.abs(gx - by_x).max() < 1e-7
-    assert np.abs(gy - by_y).max() < 1e-7
+    assert np.abs(gx - by_x).max() < 1e-7 and np.abs(gy - by_y).max() < 1e-7
 
 
 @pytest.mark.parametrize("name", NAMES)
