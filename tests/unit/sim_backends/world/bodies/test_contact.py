@@ -101,17 +101,13 @@ def test_contact_pushes_against_the_side_that_it_runs_into() -> None:
     assert wrench[2] > 0 and wrench[4] < 0
 
 
-def test_released_on_the_surface_the_part_stays_where_it_was_placed() -> None:
-    part, target = contact()
-    part.set_claw(False, flange_for(target))
-    assert not part.held
-    assert part.part_pose(np.eye(4)) == pytest.approx(target, abs=1e-8)
-
-
-def test_released_above_the_surface_the_part_falls_straight_down_onto_it() -> None:
+@pytest.mark.parametrize(
+    ("dz", "within"), [(0.0, 1e-8), (0.008, 1e-7), (-0.0004, 5e-6)], ids=["touching", "above", "pressed in"]
+)
+def test_wherever_the_claw_lets_go_of_it_the_part_comes_to_touch_the_surface(dz: float, within: float) -> None:
     part, target = contact(lean=(0.0, 0.0, 0.0))
-    part.set_claw(False, flange_for(raised(target, dz=0.008)))
-    assert part.part_pose(np.eye(4)) == pytest.approx(target, abs=1e-7)
+    part.set_claw(False, flange_for(raised(target, dz=dz)))
+    assert not part.held and part.part_pose(np.eye(4)) == pytest.approx(target, abs=within)
 
 
 def test_a_surface_that_is_pushed_takes_along_what_lies_on_it_and_nothing_that_is_held() -> None:
@@ -131,12 +127,6 @@ def test_a_part_that_a_person_takes_is_neither_in_the_claw_nor_near() -> None:
     assert np.linalg.norm(part.part_pose(flange_for(target))[:3, 3] - target[:3, 3]) == pytest.approx(5.0)
     part.set_claw(True, flange_for(target))
     assert not part.held
-
-
-def test_a_part_that_was_pressed_in_springs_back_to_touch_the_surface() -> None:
-    part, target = contact()
-    part.set_claw(False, flange_for(raised(target, dz=-0.0004)))
-    assert part.part_pose(np.eye(4))[2, 3] == pytest.approx(target[2, 3], abs=5e-6)
 
 
 def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact() -> None:
