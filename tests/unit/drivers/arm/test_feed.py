@@ -15,7 +15,6 @@ from drivers.errors import DeadlineError
 from drivers.interfaces import LinkStatistics
 from tests.support.wire.arm_bench import snapshot
 
-
 SAFETY_BITS = {
     "arm.protective_stop": [2], "arm.recovery_mode": [3], "arm.safeguard_stop": [4, 10],
     "arm.emergency_stop": [5, 6, 7], "arm.safety_fault": [8, 9],

@@ -42,13 +42,8 @@ def test_replies_of_the_vendors_library_are_understood(
 ) -> None:
     data = bytes(TMCLReply(host, module, status, command, value).to_buffer())
     reply = decode_reply(data, TmclRequest(module, command, 0, 0))
-    assert (reply.host, reply.module, reply.status, reply.command, reply.value) == (
-        host,
-        module,
-        status,
-        command,
-        value,
-    )
+    found = (reply.host, reply.module, reply.status, reply.command, reply.value)
+    assert found == (host, module, status, command, value)
 
 
 @given(st.integers(0, 8), st.integers(1, 255))
