@@ -16,10 +16,12 @@ import pytest
 
 from cell import Cell
 from cell.config.cell_config import default_toml, load_config
+from cell.devices.assembly import connect
+from cell.devices.lock import CellLock
 from cell.run.folder import awaited_word
 from cell.run.jogging import jog, needed_for, parse_jog
 from drivers.clock import Clock
-from drivers.errors import DeadlineError, DeviceFault
+from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
 from statemachine.journal import request
 from tests.support import Typed, until
 from tests.support.packages import RAIL, install, with_acme_rail
@@ -174,6 +176,20 @@ def test_an_arm_whose_program_somebody_has_ended_is_jogged_all_the_same(endpoint
         assert np.degrees(arm.state().joints - joints)[0] == pytest.approx(2.0, abs=0.01)
 
 
+def test_only_the_device_that_is_used_is_held_and_no_other_can_be_asked(endpoints: dict[str, Any]) -> None:
+    config = load_config(Path("cell.toml"))
+    with CellLock(config, ["rail"]):
+        with CellLock(config, ["vehicle"]):
+            pass
+        with pytest.raises(InterlockError, match="the rail at"), CellLock(config):
+            pass
+    devices = connect(config, ["rail"])
+    assert [device.name for device in devices] == ["rail"]
+    with pytest.raises(NotConnectedError, match="arm: this command works without it"):
+        _ = devices.arm
+    assert devices.stop() == devices.close() == []
+
+
 def test_a_rail_of_another_maker_is_jogged_from_the_command_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,6 +202,15 @@ def test_a_rail_of_another_maker_is_jogged_from_the_command_line(
 
 
 # --- out of a fault ---
+
+
+def test_an_idle_protective_stop_is_unlocked_by_a_person_who_is_named(endpoints: dict[str, Any], typed: Typed) -> None:
+    ask(endpoints, op="fault", name="arm.protective_stop")
+    code, _, error = typed("recover")
+    assert code == 2 and "--by NAME" in error
+    assert truth(endpoints)["arm"]["safety"] == "protective_stop"
+    code, _, error = typed("recover", "--by", "Ann")
+    assert (code, truth(endpoints)["arm"]["safety"]) == (0, "normal"), error
 
 
 def test_a_homing_that_stopped_goes_on_after_cell_confirm(endpoints: dict[str, Any], here: Path) -> None:

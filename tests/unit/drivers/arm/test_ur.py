@@ -11,6 +11,14 @@ from tests.support.wire.arm_bench import joints_away, swing
 pytestmark = pytest.mark.wire
 
 
+def test_it_knows_who_the_arm_is_and_how_long_a_round_trip_takes(arm, bench):
+    identity = arm.identity()
+    assert (identity.model, identity.serial, identity.firmware) == ("UR10e", "20235500001", "5.15.2.1130077")
+    assert identity.address == bench.address
+    assert 0.0 < arm.ping() < 1.0
+    assert len(arm.statistics.round_trips_s) == 1
+
+
 def test_it_sets_a_zero_tool_and_the_payload_and_keeps_them_through_a_recovery(arm, bench):
     shown = bench.ask("show")
     assert np.array_equal(shown["tcp"], np.eye(4))

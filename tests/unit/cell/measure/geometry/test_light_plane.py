@@ -49,13 +49,6 @@ def test_parameter_jacobian_is_that_of_finite_differences():
         np.testing.assert_allclose(jacobian * scale, expected, rtol=1e-5, atol=1e-5)
 
 
-def test_ray_jacobian_is_that_of_finite_differences():
-    pixel = np.array([120.0, 400.0])
-    _, jacobian = CAMERA.rays_with_jacobian(pixel)
-    expected = numerical(lambda q: CAMERA.rays(q)[0], pixel, 1e-3)
-    np.testing.assert_allclose(jacobian[0], expected, rtol=1e-6, atol=1e-10)
-
-
 def test_triangulation_jacobians_are_those_of_finite_differences():
     plane = LightPlane.of((0.95, 0.03, -0.29), -0.034)
     ray = CAMERA.rays([[300.0, 100.0]])[0]

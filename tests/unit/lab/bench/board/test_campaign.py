@@ -37,9 +37,8 @@ def test_a_board_is_found_with_every_point_under_its_own_name(name, kind):
     assert tally.row()["centre_rms_px"] < (0.6 if (name, kind) == ("defocus sigma 3 px", "aprilgrid") else 0.15)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_blurred_tags_say_that_their_corners_are_poorly_known(seed):
-    view = seen("defocus sigma 3 px", "aprilgrid", seed)
+def test_blurred_tags_say_that_their_corners_are_poorly_known():
+    view = seen("defocus sigma 3 px", "aprilgrid")
     found = find_board(view.picture, view.spec)
     off = found.pixels - view.pixels[found.ids]
     assert np.sqrt(np.mean((off / found.sigma[:, None]) ** 2)) < 2.0
