@@ -45,11 +45,6 @@ def test_sections_are_numbered_without_gaps(document: str) -> None:
     assert sections(document) == list(range(1, len(sections(document)) + 1))
 
 
-def test_nothing_cites_a_document_that_a_reader_does_not_have() -> None:
-    outside = re.compile(r"\b(?:theory|protocol)s?[\s_]" + "sheets?", re.IGNORECASE)
-    assert [path for path, text in texts() if outside.search(text)] == []
-
-
 def test_every_place_of_the_walks_exists() -> None:
     walks = (ROOT / "docs/explanation/walks.md").read_text(encoding="utf-8")
     places = re.findall(r"^\d+\. `([^`]+)`(?:, `(\w+)`)?:", walks, re.MULTILINE)

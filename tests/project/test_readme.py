@@ -35,12 +35,6 @@ def command_lines() -> list[str]:
     return sorted({re.sub(r"[\[\]]", "", part).strip() for part in parts if part.strip().startswith("cell ")})
 
 
-def test_the_readme_is_short() -> None:
-    text = (ROOT / "README.md").read_bytes()
-    assert len(text.splitlines()) <= 150
-    assert len(text) <= 9000
-
-
 @pytest.mark.parametrize("page", [page for page in PAGES if page == "README.md" or page.startswith("docs/tutorials/")])
 def test_a_beginner_imports_from_the_public_door_alone(page: str) -> None:
     code = "\n".join([*blocks("py", page), *blocks("python", page)])

@@ -21,9 +21,9 @@ KEPT = [json.loads(line) for line in (Path(__file__).parent / "kept.jsonl").read
 
 
 def check(kept: dict[str, Any], calibrations: Path) -> None:
-    """Its job swept twice as fast as shipped."""
+    """Its job swept twice as fast as shipped; where no part is drawn, in a quarter of the lines."""
     name, _, item = kept["schedule"]["job"].partition("#")
-    job = f"{quick_job(name, calibrations.parent)}{item and '#'}{item}"
+    job = f"{quick_job(name, calibrations.parent, 15.0 if name == 'pot' else 30.0)}{item and '#'}{item}"
     record = perform(Schedule.from_json(json.dumps(kept["schedule"] | {"job": job})), calibrations)
     assert [str(violation) for violation in record.violations] == []
     assert [outcome for outcome, _ in record.ends] == kept["ends"], record.ends
@@ -39,5 +39,4 @@ def test_a_kept_schedule_breaks_no_rule(kept: dict[str, Any], calibrated_folder:
 @pytest.mark.campaign
 def test_drawn_schedules_break_no_rule(tmp_path: Path) -> None:
     found = campaign(["pot", "load"], ["nominal"], 40, 1000, tmp_path, workers=2, told=lambda *_: None)
-    assert found["violations"] == []
-    assert found["schedules"] == 40
+    assert (found["violations"], found["schedules"]) == ([], 40)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 
 import cv2
@@ -11,7 +10,6 @@ import pytest
 
 from cell.apps.recordings.command import calibrate_folder
 from cell.measure.vision.board.view import parse_board
-from drivers.errors import ConfigError
 from tests.support.recorded_scenes import recording
 
 CHESS = parse_board("chessboard:7x6:10mm")
@@ -56,11 +54,9 @@ def line_laser(tmp_path_factory):
 
 def test_the_whole_chain_is_flatter_than_the_staged_pipeline(line_laser):
     flatness = line_laser["flatness"]
-    assert flatness["rms_mm"] < 0.448
-    assert flatness["p95_mm"] < 1.011
+    assert flatness["rms_mm"] < 0.448 and flatness["p95_mm"] < 1.011
     # On at least as many points and as large a part of the board as the simple pipeline took.
-    assert flatness["points"] >= 2763
-    assert min(flatness["extent_mm"]) > 0.95 * 85
+    assert flatness["points"] >= 2763 and min(flatness["extent_mm"]) > 0.95 * 85
     assert max(flatness["extent_mm"]) > 0.95 * 147
 
 
@@ -83,42 +79,20 @@ def test_camera_hand_eye_and_plane_are_those_of_the_simple_pipeline(line_laser):
     assert line_laser["light_plane"]["rms_mm"] < 0.481
 
 
-def test_the_report_is_plain_json(line_laser):
-    assert json.loads(json.dumps(line_laser, allow_nan=False))["board"] == "chessboard:7x6:10mm"
-
-
 def test_without_poses_the_camera_and_the_light_plane_are_had(tmp_path):
     for path in sorted(recording("robot_line_laser").glob("*.png"))[:5]:
         shutil.copy(path, tmp_path)
     found = calibrate_folder(tmp_path, CHESS).as_dict()
-    assert found["intrinsics"]["rms_px"] < 0.36
-    assert found["light_plane"]["rms_mm"] < 0.6
-    assert found["hand_eye"] is None
-    assert found["flatness"] is None
+    assert found["intrinsics"]["rms_px"] < 0.36 and found["light_plane"]["rms_mm"] < 0.6
+    assert found["hand_eye"] is None and found["flatness"] is None
     assert any("pose" in note for note in found["notes"])
 
 
 def test_spoilt_frames_are_refused_one_by_one_with_the_reason(line_laser):
     refused = [f for f in line_laser["frames"] if not f["used"]]
     assert {f["name"]: f["reason"] for f in refused} == {
-        "frame0020.png": "black",
-        "frame0021.png": "saturated",
-        "frame0022.png": "cut",
-        "frame0023.png": "wrong_size",
-        "frame0024.png": "no_board",
-        "frame0025.png": "turned",
-        "frame0026.png": "turned",
-        "frame0027.png": "unreadable",
-        "frame0028.png": "no_pose",
-        "frame0029.png": "no_pose",
-    }
+        "frame0020.png": "black", "frame0021.png": "saturated", "frame0022.png": "cut", "frame0023.png": "wrong_size",
+        "frame0024.png": "no_board", "frame0025.png": "turned", "frame0026.png": "turned",
+        "frame0027.png": "unreadable", "frame0028.png": "no_pose", "frame0029.png": "no_pose",
+    }  # fmt: skip
     assert all(len(f["text"]) > 20 for f in refused)
-
-
-def test_an_empty_or_missing_folder_is_named(tmp_path):
-    with pytest.raises(ConfigError, match="no pictures"):
-        calibrate_folder(tmp_path, CHESS)
-    with pytest.raises(ConfigError, match="not a folder"):
-        calibrate_folder(tmp_path / "none", CHESS)
-    with pytest.raises(ConfigError, match="--board"):
-        calibrate_folder(tmp_path, None)

@@ -67,5 +67,4 @@ class Client:
         until(lambda: self.receive.getRobotMode() == 7)
         self.control.reuploadScript()
         until(lambda: bool(self.control.isProgramRunning()))
-        assert self.control.moveJ(HOME.tolist(), 2.0, 20.0)
-        assert self.control.setTcp([0.0] * 6)
+        assert self.control.moveJ(HOME.tolist(), 2.0, 20.0) and self.control.setTcp([0.0] * 6)

@@ -113,11 +113,8 @@ def assert_safe(endpoints: dict[str, Any]) -> None:
     until = time.monotonic() + BRAKE_FRAME_S
     while not (truth := ask(endpoints, op="truth")["truth"])["vehicle"]["braked"] and time.monotonic() < until:
         Clock().sleep(0.01)
-    assert not truth["laser_on"]
-    assert truth["vehicle"]["stopped"]
-    assert truth["vehicle"]["braked"]
-    assert not truth["rail_moving"]
-    assert not truth["arm"]["moving"]
+    assert not truth["laser_on"] and truth["vehicle"]["stopped"] and truth["vehicle"]["braked"]
+    assert not truth["rail_moving"] and not truth["arm"]["moving"]
 
 
 def wait_for_step(folder: Path, step: str, process: subprocess.Popen[str], timeout: float = 120.0) -> Path:

@@ -160,8 +160,7 @@ def test_a_broken_package_is_listed_with_its_error_and_stops_nothing(
     assert load_config(None).rail.driver == "tmcl"
     with pytest.raises(ConfigError) as caught:
         loaded(tmp_path)
-    assert "rail.driver" in str(caught.value)
-    assert words in str(caught.value)
+    assert "rail.driver" in str(caught.value) and words in str(caught.value)
 
 
 def test_a_package_cannot_take_the_name_of_a_built_in_make(site: Path) -> None:

@@ -125,6 +125,4 @@ def test_half_a_second_after_the_last_sign_of_life_all_is_safe(
         owner.communicate(timeout=10)
     assert truth["vehicle"]["stopped"]
     assert truth["vehicle"]["braked"] or script not in (ALL, DRIVE)
-    assert not truth["rail_moving"]
-    assert not truth["arm"]["moving"]
-    assert not truth["laser_on"]
+    assert not truth["rail_moving"] and not truth["arm"]["moving"] and not truth["laser_on"]

@@ -142,8 +142,7 @@ def test_switching_outputs_turns_the_laser_on_and_drops_the_part(served: Served)
     after = served.ask_truth(op="truth")["truth"]
     rtde.notify(bytes([recipe, 1, 0]))
     rtde.socket.close()
-    assert after["laser_on"]
-    assert not after["part"]["held"]
+    assert after["laser_on"] and not after["part"]["held"]
 
 
 def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served) -> None:
@@ -153,8 +152,7 @@ def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served
     assert served.ask_truth(op="truth")["truth"]["arm"]["safety"] == "normal"
     refused = served.ask_truth(op="fault", name="arm.coffee")
     assert not refused["ok"]
-    assert "arm.protective_stop" in refused["error"]
-    assert "can.bus_off" in refused["error"]
+    assert "arm.protective_stop" in refused["error"] and "can.bus_off" in refused["error"]
 
 
 def test_it_ends_with_its_input_so_that_it_cannot_outlive_its_owner() -> None:

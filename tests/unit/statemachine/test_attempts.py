@@ -18,8 +18,7 @@ def test_a_named_exception_is_retried_from_a_cell_at_rest(tmp_path):
     bench = Bench(tmp_path, board_photo=failing(TimeoutError("no frame"), TimeoutError("no frame")))
     result = bench.policy("board_photo", 10.0, 2, ("TimeoutError",)).run()
     assert result.outcome is Outcome.PLACED
-    assert result.results["board_photo"] == "made in attempt 3"
-    assert result.steps[1].retries == 2
+    assert (result.results["board_photo"], result.steps[1].retries) == ("made in attempt 3", 2)
     start = bench.log.index("board_photo")
     stops = ["stop: board_photo failed", "stop: before board_photo is tried again"]
     assert bench.log[start : start + 7] == ["board_photo", *stops, "board_photo", *stops, "board_photo"]
@@ -74,8 +73,7 @@ def test_a_recovery_that_fails_ends_the_run_with_both_reasons(tmp_path):
     bench.runner.recover = lambda error, token, confirmed: failing(OSError("the link is gone"))(None)
     result = bench.policy("laser_sweep", 10.0, 1).run()
     assert result.outcome is Outcome.FAULTED
-    assert "protective stop" in result.reason
-    assert "the link is gone" in result.reason
+    assert "protective stop" in result.reason and "the link is gone" in result.reason
 
 
 def test_an_abort_while_the_cell_recovers_ends_the_recovery_before_it_begins_anything(tmp_path):
@@ -119,8 +117,7 @@ def test_nothing_is_tried_again_on_a_cell_of_which_it_is_not_known_that_it_stand
     bench.runner.script = Script(on_refusal=lambda step, failure: Again("board_photo", "wiped the lens"))
     result = bench.policy("board_photo", 10.0, 2, retried).run()
     assert (result.outcome, result.code) == (Outcome.FAULTED, "safe_stop")
-    assert str(error) in result.reason
-    assert "not confirmed" in result.reason
+    assert str(error) in result.reason and "not confirmed" in result.reason
     assert bench.log.count("board_photo") == 1
 
 
@@ -160,8 +157,7 @@ def test_an_emergency_stop_ends_the_wait_for_a_persons_word(tmp_path):
     ).recovers()  # fmt: skip
     result = bench.policy("laser_sweep", 10.0, 1).times(confirm_deadline_s=5.0).run()
     assert (result.outcome, result.reason) == (Outcome.FAULTED, "the emergency stop is pressed")
-    assert not bench.recovered
-    assert not bench.control.confirm("too late")
+    assert not bench.recovered and not bench.control.confirm("too late")
 
 
 def test_nobody_confirms_and_the_run_ends_without_a_recovery(tmp_path):

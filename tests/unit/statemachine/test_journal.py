@@ -41,8 +41,7 @@ def test_what_was_written_can_be_read_while_the_run_goes_on(tmp_path):
         ("board_photo", 1, "failed", 0.5, "no frame came"),
         ("board_photo", 2, "done", 0.25, None),
     ]
-    assert record.done == {"board_photo": {"residual_px": 0.08}}
-    assert record.events[0].data == {"views": 3}
+    assert (record.done, record.events[0].data) == ({"board_photo": {"residual_px": 0.08}}, {"views": 3})
     journal.run_ended("placed", "all steps done")
     assert read(tmp_path).run.outcome == "placed"
     journal.close()
@@ -63,8 +62,7 @@ def test_every_row_that_a_killed_writer_reported_is_there(tmp_path):
     record = read(tmp_path)
     assert [row.data["line"] for row in record.events][:reported] == list(range(1, reported + 1))
     assert len(record.events) <= reported + 1
-    assert record.done == {"board_photo": {"residual_px": 0.08}}
-    assert record.steps[-1].state == "running"
+    assert (record.done, record.steps[-1].state) == ({"board_photo": {"residual_px": 0.08}}, "running")
     assert not record.finished
     base = sqlite3.connect(tmp_path / FILE_NAME)
     assert base.execute("PRAGMA integrity_check").fetchone() == ("ok",)

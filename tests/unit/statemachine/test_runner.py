@@ -73,8 +73,7 @@ def test_a_refusal_ends_the_run_with_its_reason(tmp_path):
 def test_an_unexpected_exception_is_a_fault_and_its_traceback_is_kept(tmp_path):
     bench = Bench(tmp_path, reconstruct=failing(ZeroDivisionError("division by zero")))
     result = bench.run()
-    assert result.outcome is Outcome.FAULTED
-    assert isinstance(result.error, ZeroDivisionError)
+    assert result.outcome is Outcome.FAULTED and isinstance(result.error, ZeroDivisionError)
     (trace,) = [event for event in bench.record.events if event.kind == "traceback"]
     assert "ZeroDivisionError" in trace.data["text"]
     assert trace.step == "reconstruct"
@@ -100,14 +99,12 @@ def test_who_asks_for_the_end_after_the_last_step_or_as_the_run_ends_well_is_lat
         bench.on_stop = lambda: bench.control.abort("Cell.stop()")
     else:
         bench.runner.observer = lambda event: event.data.get("to") == "placed" and bench.control.abort("Cell.stop()")
-    assert bench.run().outcome is Outcome.PLACED
-    assert bench.control.late
+    assert bench.run().outcome is Outcome.PLACED and bench.control.late
 
 
 def test_who_ended_a_run_did_not_come_late(tmp_path):
     bench = Bench(tmp_path, board_photo=lambda context: bench.control.abort("enough"))
-    assert bench.run().outcome is Outcome.ABORTED
-    assert not bench.control.late
+    assert bench.run().outcome is Outcome.ABORTED and not bench.control.late
 
 
 def test_a_signal_after_the_end_of_the_run_is_kept(tmp_path):
@@ -161,8 +158,7 @@ def test_a_runner_without_work_for_a_step_is_refused(tmp_path):
 
 
 def test_a_script_that_looks_or_decides_is_not_idle():
-    assert Script().idle
-    assert not Script(after={"place": print}).idle
+    assert Script().idle and not Script(after={"place": print}).idle
     assert not Script(on_refusal=lambda step, failure: None).idle
 
 

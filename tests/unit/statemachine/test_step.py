@@ -9,10 +9,8 @@ from statemachine.step import Policy, Step
 
 def test_a_retry_is_for_the_named_errors_and_those_that_derive_from_them():
     step = Step("any", 1.0, 1, ("OSError",))
-    assert step.retries(OSError())
-    assert step.retries(ConnectionResetError())
-    assert not step.retries(ValueError())
-    assert not step.retries(Exception())
+    assert step.retries(OSError()) and step.retries(ConnectionResetError())
+    assert not step.retries(ValueError()) and not step.retries(Exception())
 
 
 @pytest.mark.parametrize(

@@ -105,19 +105,9 @@ def test_an_arm_of_another_size_is_named_before_anything_is_sent_to_it():
         ((struct.pack(">iB", 3, 16), _package(TOLD)), None),
         ((b"", _package(TOLD)), None),
     ],
-    ids=[
-        "none",
-        "short",
-        "part",
-        "long",
-        "nan",
-        "not initialised",
-        "one that is cut off",
-        "one not initialised",
-        "a broken stream",
-        "silence",
-    ],
-)
+    ids=["none", "short", "part", "long", "nan", "not initialised",
+         "one that is cut off", "one not initialised", "a broken stream", "silence"],
+)  # fmt: skip
 def test_what_a_port_sends_is_the_table_or_unknown_with_its_reason(sent, why):
     with _server() as server:
         threading.Thread(target=_send, args=(server, *sent), daemon=True).start()

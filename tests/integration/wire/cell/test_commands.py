@@ -71,8 +71,7 @@ def test_diag_tells_what_the_devices_tell_changes_nothing_and_fails_when_one_doe
     assert all(row["ok"] and np.isfinite(row["p99_ms"]) for row in rows.values())
     figures = {(name, figure["what"]): figure for name, row in rows.items() for figure in row["readings"]}
     told = {key: figures[key]["value"] for key in figures}
-    assert told["arm", "supply"] == 48.0
-    assert told["arm", "hottest joint"] == 30.0
+    assert (told["arm", "supply"], told["arm", "hottest joint"]) == (48.0, 30.0)
     assert told["vehicle", "battery"] == pytest.approx(26.4)
     assert 0.0 < told["vehicle", "bus load, at most"] < 50.0
     assert told["rail", "driver too hot"] == 0.0
@@ -119,8 +118,7 @@ def test_the_rail_works_while_the_arm_is_switched_off(endpoints: dict[str, Any],
     code, out, error = typed("diag", "--device", "rail", "--json")
     assert code == 0, error
     rows = json.loads(out)
-    assert list(rows) == ["rail"]
-    assert rows["rail"]["state"] == "homed, at 5.00 mm"
+    assert (list(rows), rows["rail"]["state"]) == (["rail"], "homed, at 5.00 mm")
     code, _, error = typed("home")
     assert code == 1
     assert "127.255.0.9" in error

@@ -35,9 +35,7 @@ def test_everything_moves_and_shines_and_nothing_does_after_the_stop(tmp_path: P
             vehicle.drive(-0.2, 0.0)
             devices.clock.sleep(0.4)
             truth = ask(endpoints, op="truth")["truth"]
-            assert truth["laser_on"]
-            assert truth["arm"]["moving"]
-            assert truth["rail_moving"]
+            assert truth["laser_on"] and truth["arm"]["moving"] and truth["rail_moving"]
             assert not truth["vehicle"]["stopped"]
 
             assert devices.stop() == []

@@ -11,7 +11,6 @@ import pytest
 from cell.config.job import load_job
 from cell.procedures.drive.way import Whereabouts
 from drivers.errors import DeviceFault, InterlockError, RefusedError
-from sim_backends.models.vehicle import Mode
 from tests.support.wire.vehicle_bench import STANDSTILL, Bench, benched
 from tests.unit.drivers.vehicle import conftest
 
@@ -19,17 +18,6 @@ pytestmark = pytest.mark.wire
 
 
 bench, enabled = conftest.bench, conftest.enabled
-
-
-def test_it_starts_in_standby_and_does_not_move_before_it_is_enabled(bench: Bench) -> None:
-    assert not bench.vehicle.state().command_mode
-    with pytest.raises(InterlockError, match="enable"):
-        bench.vehicle.drive(0.1, 0.0)
-    bench.vehicle.enable()
-    state = bench.vehicle.state()
-    assert state.command_mode
-    assert not state.braked
-    assert state.battery_volts == pytest.approx(26.4)
 
 
 def test_it_drives_as_told_and_odometry_follows(enabled: Bench) -> None:
@@ -44,21 +32,6 @@ def test_it_drives_as_told_and_odometry_follows(enabled: Bench) -> None:
     state = enabled.vehicle.state()
     assert (state.x, state.y) == pytest.approx((x, y), abs=0.005)
     assert state.yaw == pytest.approx(yaw, abs=0.005)
-
-
-def test_an_emergency_stop_is_a_fault_that_names_it(enabled: Bench) -> None:
-    enabled.drive_for(0.5, 0.3)
-    enabled.peer.fault("vehicle.emergency_stop")
-    enabled.until(lambda: enabled.vehicle.state().emergency_stop)
-    with pytest.raises(DeviceFault, match="emergency stop") as caught:
-        enabled.vehicle.drive(0.1, 0.0)
-    assert caught.value.code == "vehicle.emergency_stop"
-    with pytest.raises(DeviceFault):
-        enabled.vehicle.enable()
-    enabled.peer.clear()
-    enabled.vehicle.enable()
-    enabled.drive_for(0.3, 0.2)
-    assert enabled.true_speed() > 0.0
 
 
 def test_a_motor_fault_is_told_in_words_and_cleared_by_enabling(enabled: Bench) -> None:
@@ -158,17 +131,6 @@ def test_it_is_braked_first_against_others_on_the_bus(
             vehicle.stop()
         finally:
             notifier.stop()
-
-
-def test_a_person_who_takes_the_remote_control_ends_the_command(enabled: Bench) -> None:
-    enabled.model.set_mode(enabled.world.now(), Mode.STANDBY)
-    with pytest.raises(DeviceFault, match="left CAN command") as caught:
-        enabled.until(lambda: enabled.vehicle.check() is not None)
-    assert caught.value.code == "vehicle.command_lost"
-    enabled.vehicle.check()  # told once: whoever is in charge now is no fault of the vehicle
-    with pytest.raises(InterlockError, match="enable"):
-        enabled.vehicle.drive(0.1, 0.0)
-    assert enabled.vehicle.state().interruptions == 1
 
 
 def test_a_driver_that_never_took_command_knows_nothing_of_the_brake_and_sends_no_motion(bench: Bench) -> None:

@@ -48,13 +48,11 @@ def test_a_mesh_lies_on_its_closed_form(name: str) -> None:
     points, _ = trimesh.sample.sample_surface(mesh, POINTS, seed=0)
     heights, normals = field.sample(*np.clip(points[:, :2], -half, half).T)
     off = (points[:, 2] - heights) * normals[:, 2]
-    assert np.sqrt(np.mean(off**2)) < 1.7e-6
-    assert np.abs(off).max() < 15e-6
+    assert np.sqrt(np.mean(off**2)) < 1.7e-6 and np.abs(off).max() < 15e-6
     # What a registration of the whole surface follows: its facets lie as much above the closed form as below.
     ways = np.hstack([normals, np.cross(points, normals)])
     pose, *_ = np.linalg.lstsq(ways, off, rcond=None)
-    assert np.abs(pose[:3]).max() < 0.1e-6
-    assert np.abs(pose[3:]).max() < 4e-6
+    assert np.abs(pose[:3]).max() < 0.1e-6 and np.abs(pose[3:]).max() < 4e-6
     # Edges are as steep as the closed form has them.
     drawn, facets = np.degrees(np.arccos([normals[:, 2].min(), mesh.face_normals[:, 2].min()]))
     assert facets > drawn - 1.0

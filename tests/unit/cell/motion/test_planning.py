@@ -13,37 +13,11 @@ from cell.motion.collision import CollisionError, CollisionModel, first_touch
 from cell.motion.kinematics import ArmKinematics, DenavitHartenberg, Joints
 from cell.motion.planning import EFFORTS, Planner
 from cell.motion.trajectory import LineLimits, plan_joint
-from tests.unit.cell.motion.conftest import (
-    BASE_FROM_PLACE,
-    DOWN,
-    FLANGE_FROM_PART,
-    PLACE_FROM_BOARD_CENTRE,
-    RESTING,
-    WORKING,
-    assert_within,
-    down,
-)
+from tests.unit.cell.motion.conftest import DOWN, FLANGE_FROM_PART, RESTING, WORKING, assert_within, down
 from tests.unit.cell.motion.test_trajectory import fastest_point
 
 FLANGE_FROM_TARGET = pin.SE3(pin.utils.rotate("z", np.pi / 2), np.array([-0.10, 0.0, 0.03]))
 FLANGE_FROM_SCAN_MIDDLE = pin.SE3(pin.utils.rotate("z", np.pi / 2), np.array([0.09, 0.0, 0.08]))
-
-
-def test_scan_place_and_photo_postures_are_free(planner: Planner) -> None:
-    board = BASE_FROM_PLACE * PLACE_FROM_BOARD_CENTRE
-    photo = pin.SE3(board.rotation, board.translation - 0.95 * board.rotation[:, 2]) * FLANGE_FROM_TARGET.inverse()
-    for name, pose in {"scan": down(0.75, -0.09, 0.26), "above": down(0.75, 0, 0.30), "photo": photo}.items():
-        joints = planner.reach(pose, WORKING, name)
-        assert planner.kinematics.manipulability(joints) > 0.1
-
-
-def test_calibration_postures_over_the_fine_plate_are_free(planner: Planner) -> None:
-    face_up = np.diag([1.0, -1.0, -1.0])
-    for tilt_x, tilt_y in [(0, 0), (20, 0), (-20, 0), (0, 20), (0, -20)]:
-        tilt = pin.utils.rotate("x", np.radians(tilt_x)) @ pin.utils.rotate("y", np.radians(tilt_y))
-        rotation = face_up @ tilt
-        camera = pin.SE3(rotation, np.array([-0.55, 0.25, 0.02]) - 0.13 * rotation[:, 2])
-        planner.reach(camera * FLANGE_FROM_SCAN_MIDDLE.inverse(), WORKING, f"tilt {tilt_x}, {tilt_y}")
 
 
 def test_the_job_is_planned_without_touching_anything(planner: Planner) -> None:

@@ -16,8 +16,7 @@ def test_a_joint_move_is_jerk_limited_and_rests_at_both_ends() -> None:
     limits, start, end = JointLimits(), np.zeros(6), np.array([1.5, -1.0, 0.5, -2.0, 0.1, 0.0])
     motion = trajectory.plan_joint(start, end, limits, period=0.002)
     assert_within(motion, limits)
-    assert np.array_equal(motion.start, start)
-    assert np.array_equal(motion.end, end)
+    assert np.array_equal(motion.start, start) and np.array_equal(motion.end, end)
     assert np.abs(motion.speeds()[[0, -1]]).max() < 1e-3
 
 

@@ -53,6 +53,5 @@ def test_only_the_frames_of_the_last_step_are_its_evidence(tmp_path: Path) -> No
         store.begin()
         for number in range(2, 40):
             store.keep("stripe", frame(number))
-    assert store.recent[-1] == "stripe-000039.png"
-    assert len(store.recent) == 12
+    assert (store.recent[-1], len(store.recent)) == ("stripe-000039.png", 12)
     assert len(list((tmp_path / "frames").iterdir())) == 39

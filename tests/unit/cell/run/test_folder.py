@@ -48,8 +48,7 @@ def test_a_run_without_a_report_tells_what_its_journal_does(tmp_path: Path) -> N
     journal.step_started("drive_to_target", 1)
     journal.close()
     report = read_report(folder)
-    assert report["outcome"] == "not ended"
-    assert report["job"] == "pot"
+    assert (report["outcome"], report["job"]) == ("not ended", "pot")
     assert report["steps"][0]["name"] == "drive_to_target"
     write_json(folder / "report.json", {"outcome": "placed"})
     assert read_report(folder) == {"outcome": "placed"}
@@ -75,8 +74,7 @@ def test_what_is_going_on_is_found_and_what_has_ended_or_died_is_not(tmp_path: P
     journal.run_ended("done", "calibration done")
     with pytest.raises(ConfigError, match="nothing is going on"):
         find_going(root, None)
-    assert find_run(root, None, "job") == dead
-    assert find_run(root, None, "calibration") == ended
+    assert (find_run(root, None, "job"), find_run(root, None, "calibration")) == (dead, ended)
 
 
 def test_what_a_run_waits_for_is_read_from_its_journal(tmp_path: Path) -> None:

@@ -70,8 +70,7 @@ def test_what_creeps_is_told_with_the_day_on_which_the_limit_is_reached() -> Non
     rng = np.random.default_rng(5)
     along = np.array([0.6, 0.8, 0.0])
     found = series([(0.01 * day * along + 1e-4 * rng.normal(size=3)).tolist() for day in range(10)])
-    assert found.a_day == pytest.approx(0.01, rel=0.02)
-    assert found.now == pytest.approx(0.09, abs=0.001)
+    assert (found.a_day, found.now) == (pytest.approx(0.01, rel=0.02), pytest.approx(0.09, abs=0.001))
     assert found.days_left == pytest.approx(9.0, rel=0.05)
     assert series([[0.2, 0.0, 0.0]] * 6).days_left == 0.0
     assert series([[0.1, 0.0, 0.0]] * 6).days_left is None

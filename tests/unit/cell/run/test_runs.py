@@ -28,8 +28,7 @@ def test_a_signal_at_the_very_end_of_a_job_leaves_its_result_and_is_kept(late: f
         return 7
 
     run = Run("job", work)
-    assert run.result(5.0) == 7
-    assert run.control.signal == signal.SIGTERM
+    assert (run.result(5.0), run.control.signal) == (7, signal.SIGTERM)
 
 
 @pytest.mark.parametrize("late", [0.0, 0.2])

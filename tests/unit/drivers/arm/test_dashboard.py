@@ -23,8 +23,7 @@ def test_the_dashboard_answers_line_by_line_over_one_connection(server):
 
     threading.Thread(target=serve, daemon=True).start()
     dashboard = Dashboard("arm", server.getsockname()[0])
-    assert dashboard.ask("robotmode") == "you said robotmode"
-    assert dashboard.ask("stop") == "you said stop"
+    assert (dashboard.ask("robotmode"), dashboard.ask("stop")) == ("you said robotmode", "you said stop")
     time.sleep(0.1)
     assert dashboard.ask("robotmode") == "you said robotmode"
     dashboard.close()

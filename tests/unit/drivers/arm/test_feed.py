@@ -15,29 +15,17 @@ from drivers.errors import DeadlineError
 from drivers.interfaces import LinkStatistics
 from tests.support.wire.arm_bench import snapshot
 
-
-@pytest.mark.parametrize(
-    ("bit", "code"),
-    [
-        (2, "arm.protective_stop"),
-        (3, "arm.recovery_mode"),
-        (4, "arm.safeguard_stop"),
-        (5, "arm.emergency_stop"),
-        (6, "arm.emergency_stop"),
-        (7, "arm.emergency_stop"),
-        (8, "arm.safety_fault"),
-        (9, "arm.safety_fault"),
-        (10, "arm.safeguard_stop"),
-    ],
-)
-def test_safety_bits_have_the_makers_meaning(bit, code):
-    # docs/reference/protocols.md, section 1
-    assert safety_code(1 << bit) == code
-    assert safety_code(1) == ""
+SAFETY_BITS = {
+    "arm.protective_stop": [2], "arm.recovery_mode": [3], "arm.safeguard_stop": [4, 10],
+    "arm.emergency_stop": [5, 6, 7], "arm.safety_fault": [8, 9],
+}  # fmt: skip
+"""docs/reference/protocols.md, section 1."""
 
 
-def test_an_emergency_stop_outranks_a_protective_stop():
-    assert safety_code(1 << 2 | 1 << 6) == "arm.emergency_stop"
+@pytest.mark.parametrize("code", SAFETY_BITS)
+def test_safety_bits_have_the_makers_meaning_and_an_emergency_stop_outranks_a_protective_stop(code):
+    assert {safety_code(1 << bit) for bit in SAFETY_BITS[code]} == {code}
+    assert (safety_code(1), safety_code(1 << 2 | 1 << 6)) == ("", "arm.emergency_stop")
 
 
 def feed(clock):

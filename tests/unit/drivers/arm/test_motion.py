@@ -13,10 +13,8 @@ from drivers.errors import Aborted, DeadlineError, DeviceFault, NotConnectedErro
 
 def test_a_trajectory_is_straight_between_its_points_and_ends_at_its_last():
     trajectory = JointTrajectory([0.0, 1.0, 3.0], [(0.0,) * 6, (1.0,) * 6, (5.0,) * 6])
-    assert trajectory.at(-1.0) == (0.0,) * 6
-    assert trajectory.at(0.25) == pytest.approx((0.25,) * 6)
-    assert trajectory.at(2.0) == pytest.approx((3.0,) * 6)
-    assert trajectory.at(99.0) == (5.0,) * 6
+    assert (trajectory.at(-1.0), trajectory.at(0.25)) == ((0.0,) * 6, pytest.approx((0.25,) * 6))
+    assert (trajectory.at(2.0), trajectory.at(99.0)) == (pytest.approx((3.0,) * 6), (5.0,) * 6)
 
 
 def test_pose_difference_agrees_with_an_independent_one():
@@ -44,8 +42,7 @@ def test_a_motion_that_arrived_can_be_waited_for_twice():
     moving.end("arrived")
     moving.wait(0.0)
     moving.wait(0.0)
-    assert moving.done
-    assert not moving.contact
+    assert moving.done and not moving.contact
 
 
 def test_a_motion_that_ended_at_its_force_limit_says_so_without_an_error():

@@ -43,11 +43,3 @@ def test_nothing_is_sent_when_limits_or_interlocks_forbid_it(arm, bench):
     with pytest.raises(LimitError, match="output 18 does not exist"):
         arm.set_digital_output(18, True)
     assert bench.ask("show")["q"] == stands
-
-
-def test_a_second_motion_is_refused_while_one_is_under_way(arm):
-    moving = arm.move_joints(joints_away(arm, 1.0), 0.5, 2.0)
-    with pytest.raises(InterlockError, match="still under way"):
-        arm.move_joints(joints_away(arm, 0.1), 0.5, 2.0)
-    arm.stop()
-    assert moving.done

@@ -87,8 +87,7 @@ def test_frames_that_find_it_full_are_lost_and_the_earlier_ones_kept() -> None:
         frames.put(frame(number))
     assert [frames.next(0.1).frame_id for _ in range(2)] == [1, 2]
     frames.put(frame(5))
-    assert frames.next(0.1).lost_before == 2
-    assert frames.lost == 2
+    assert (frames.next(0.1).lost_before, frames.lost) == (2, 2)
 
 
 @pytest.mark.parametrize("aborted", [True, False])

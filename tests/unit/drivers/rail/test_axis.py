@@ -52,16 +52,6 @@ def test_stop_overtakes_a_running_motion(homed: Bench) -> None:
     assert homed.carriage() == pytest.approx(0.01, abs=1e-6)
 
 
-def test_a_stopped_search_leaves_the_rail_unhomed(bench: Bench) -> None:
-    motion = bench.rail.home()
-    bench.rail.stop()
-    with pytest.raises(Aborted):
-        motion.wait(5.0)
-    assert not bench.rail.state().homed
-    bench.rail.home().wait(20.0)
-    assert bench.rail.state().homed
-
-
 def test_a_search_whose_stop_has_no_answer_is_not_told_as_stopped(bench: Bench) -> None:
     motion = bench.rail.home()
     for _ in range(100):

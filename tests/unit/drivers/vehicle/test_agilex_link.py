@@ -93,7 +93,6 @@ def test_odometers_may_wrap() -> None:
 def test_a_restarted_vehicle_does_not_throw_the_odometry_about() -> None:
     odometry = PlanarOdometry(TRACK)
     odometry.update(50_000, 50_000, farthest=0.1)
-    assert odometry.update(50_050, 50_050, farthest=0.1)
-    assert not odometry.update(0, 0, farthest=0.1)
+    assert odometry.update(50_050, 50_050, farthest=0.1) and not odometry.update(0, 0, farthest=0.1)
     assert odometry.update(10, 10, farthest=0.1)
     assert odometry.x == pytest.approx(0.060)

@@ -11,17 +11,7 @@ import typer
 from typer.testing import CliRunner
 
 from lab.cli import register
-from lab.paper.figure2 import (
-    Head,
-    Light,
-    delta_limit,
-    errors,
-    figure2,
-    largest_dz,
-    peak_power,
-    smallest_baseline,
-    uniformity,
-)
+from lab.paper.figure2 import Head, Light, delta_limit, errors, figure2, largest_dz, smallest_baseline, uniformity
 from tests.unit.lab.paper.test_equations import FOCAL, point_of
 
 
@@ -42,16 +32,9 @@ def test_light_is_the_more_even_the_longer_the_baseline() -> None:
     assert found == pytest.approx([0.00, 0.11, 0.17, 0.33, 0.52], abs=0.005)
 
 
-def test_light_in_the_middle_hardly_changes_from_30_to_35_mm() -> None:
-    small, large = (float(peak_power(Head.at_stand_off(b, 8e-3), 0.0, Light())) for b in (0.030, 0.035))
-    assert large / small - 1 == pytest.approx(-0.011, abs=5e-4)
-
-
 def test_35_mm_is_the_smallest_that_meets_a_fifth_of_a_millimetre_at_a_tenth_of_a_pixel() -> None:
-    assert smallest_baseline(0.1 * 4.8e-6) == 0.035
-    assert smallest_baseline(0.31e-6) == 0.035
-    assert smallest_baseline(0.29e-6) == 0.030
-    assert smallest_baseline(0.55e-6) == 0.040
+    assert (smallest_baseline(0.1 * 4.8e-6), smallest_baseline(0.31e-6)) == (0.035, 0.035)
+    assert (smallest_baseline(0.29e-6), smallest_baseline(0.55e-6)) == (0.030, 0.040)
 
 
 def test_errors_are_what_moved_rays_do() -> None:

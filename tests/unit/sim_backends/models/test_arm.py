@@ -136,12 +136,9 @@ def test_a_protective_stop_can_be_unlocked_after_its_delay_and_the_motion_resume
     run(arm, 0.5)
     arm.fault("protective_stop")
     run(arm, 1.0)
-    assert not arm.moving
-    assert not arm.ready
-    assert not arm.unlock()
+    assert not arm.moving and not arm.ready and not arm.unlock()
     run(arm, 4.1)
-    assert arm.unlock()
-    assert arm.ready
+    assert arm.unlock() and arm.ready
     run(arm, 0.5)
     assert not arm.moving, "an unlocked arm must not move by itself"
     arm.resume()
@@ -159,11 +156,9 @@ def test_an_emergency_stop_brakes_then_switches_off_until_it_is_cleared_and_powe
     assert not arm.set_power(Power.RUNNING)
     arm.clear()
     assert (arm.safety, arm.power, arm.ready) == (Safety.NORMAL, Power.OFF, False)
-    assert arm.set_power(Power.RUNNING)
-    assert arm.ready
+    assert arm.set_power(Power.RUNNING) and arm.ready
     run(arm, 0.5)
-    assert arm.idle
-    assert not arm.moving
+    assert arm.idle and not arm.moving
 
 
 def test_unknown_faults_and_inputs_are_refused() -> None:

@@ -25,8 +25,7 @@ def test_between_two_readings_a_device_goes_straight_and_beyond_them_it_is_where
 @pytest.mark.parametrize("way", [lambda t: 0.015 * t, lambda t: 0.02], ids=["even", "at rest"])
 def test_an_even_motion_is_known_across_a_gap(way) -> None:
     told = track(*((t, way(t)) for t in (-0.05, -0.04, 0.0, 0.010, 0.020, 0.120, 0.130, 0.180, 0.2)))
-    assert told.doubt(0.07) == pytest.approx(0.0, abs=1e-12)
-    assert told.at(0.07)[0] == pytest.approx(way(0.07))
+    assert (told.doubt(0.07), told.at(0.07)[0]) == (pytest.approx(0.0, abs=1e-12), pytest.approx(way(0.07)))
 
 
 @pytest.mark.parametrize("start", [0.0, 0.03, 0.05, 0.09])

@@ -17,8 +17,7 @@ def test_a_ramp_arrives_at_rest_within_its_limits(x0: float, v0: float, target: 
     times = np.linspace(5.0, pieces[-1].t + 1.0, 20001)
     states = np.array([next(p for p in reversed(pieces) if p.t <= t).at(t) for t in times])
     dt = times[1] - times[0]
-    assert states[0] == pytest.approx([x0, v0])
-    assert states[-1] == pytest.approx([target, 0.0], abs=1e-12)
+    assert (states[0], states[-1]) == (pytest.approx([x0, v0]), pytest.approx([target, 0.0], abs=1e-12))
     assert np.max(np.abs(np.diff(states[:, 1]))) <= 2.0 * dt * (1 + 1e-9)
     assert np.max(np.abs(states[:, 1])) <= max(4.0, abs(v0)) + 1e-9
     np.testing.assert_allclose(np.diff(states[:, 0]), 0.5 * dt * (states[1:, 1] + states[:-1, 1]), atol=1e-6)

@@ -36,14 +36,6 @@ def test_power_on_is_standby_where_commands_are_ignored() -> None:
     assert model.planar(2.0) == (-3.05, 0.0, 0.0)
 
 
-def test_speed_follows_the_acceleration_limit() -> None:
-    model = vehicle(acceleration=0.6)
-    model.set_mode(0.0, Mode.CAN)
-    drive(model, 0.0, 1.0, 0.3)
-    assert model.feedback(1.0).speed == pytest.approx(0.3)
-    assert model.feedback(1.0).left == pytest.approx(0.3 * 1.0 - 0.3**2 / (2 * 0.6), abs=1e-3)
-
-
 def test_without_commands_it_stops_after_half_a_second() -> None:
     model = vehicle(acceleration=0.6)
     model.set_mode(0.0, Mode.CAN)

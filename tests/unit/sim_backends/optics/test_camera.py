@@ -30,14 +30,6 @@ def test_sensor_noise_has_the_stated_mean_and_variance(level):
     assert picture.var() == pytest.approx(level / 40 + 0.4**2 + 1 / 12, rel=0.02)
 
 
-def test_sensor_saturates_at_255_and_never_wraps():
-    image = np.full((64, 64), 400, np.float32)
-    image[:32] = 0
-    picture = sensor(image, SCAN, np.random.default_rng(0))
-    assert (picture[32:] == 255).all()
-    assert picture[:32].max() <= 3
-
-
 def test_undistortion_undoes_the_lens_to_a_nanopixel():
     pixels = np.array([[0.0, 0.0], [639.0, 479.0], [319.5, 239.5], [17.3, 440.2]])
     rays = np.column_stack([SCAN.undistort(pixels), np.ones(4)])

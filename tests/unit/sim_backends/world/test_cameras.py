@@ -20,19 +20,6 @@ def above(point: tuple[float, float, float]) -> np.ndarray:
     return drawing.pose(point, (1, 0, 0), (0, 0, -1))
 
 
-def test_the_stripe_on_the_table_is_where_the_closed_form_puts_it(ideal: StandingWorld) -> None:
-    """x' = f (cot θ − l/Z), docs/explanation/theory.md, section 2, on the bare table beside the surface at Z = 130
-    mm."""
-    picture = ideal.look("scan", above((0.12, 0.0, 0.60 + 0.130)), laser=True).astype(float)
-    dark = ideal.look("scan", above((0.12, 0.0, 0.60 + 0.130))).astype(float)
-    light = (picture - dark)[40:440]
-    light[light < 4] = 0.0
-    centres = (light * np.arange(640)).sum(axis=1) / light.sum(axis=1)
-    expected = 319.5 + 0.008 / 4.8e-6 * (1 / 3.5 - 0.035 / 0.130)
-    assert centres.mean() == pytest.approx(expected, abs=0.01)
-    assert centres.std() < 0.05
-
-
 def test_the_stripe_follows_the_relief(ideal: StandingWorld) -> None:
     """Each lit pixel's ray, cut with the light plane, ends on the closed form of the surface."""
     world_from_camera = above((0.0, 0.0, 0.60 + 0.130))
@@ -62,8 +49,3 @@ def test_the_target_camera_sees_the_boards_dots_where_a_pinhole_puts_them(ideal:
         at = [(patch.sum(axis=axis) * np.arange(-14, 15)).sum() / patch.sum() for axis in (0, 1)]
         exact = np.array([i * 0.02 - 0.08, j * 0.02 - 0.06]) / 0.9 * 0.008 / 4.8e-6 + [639.5, 511.5]
         assert [u + at[0], v + at[1]] == pytest.approx(exact, abs=0.05)
-
-
-def test_a_camera_that_looks_away_sees_only_the_room(ideal: StandingWorld) -> None:
-    picture = ideal.look("target", drawing.pose((-0.75, 0.0, 1.5), (1, 0, 0), (0, 0, 1)), exposure=0.008)
-    assert np.ptp(picture) < 30

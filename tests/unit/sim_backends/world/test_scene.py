@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from sim_backends.world.scene import draw, stream
+from sim_backends.world.scene import draw
 
 
 def flat(value: object) -> np.ndarray:
@@ -22,8 +22,3 @@ def test_a_seed_fixes_the_whole_world_and_another_changes_it() -> None:
     a, b = draw(7, "nominal"), draw(8, "nominal")
     for name in ("world_from_surface", "flange_from_scan_camera", "light_plane_normal", "dh_error", "rail_direction"):
         assert np.abs(getattr(a, name) - getattr(b, name)).max() > 0, name
-
-
-def test_each_quantity_has_a_stream_of_its_own() -> None:
-    a, b = stream(3, "light_plane.tilt"), stream(3, "light_plane.offset")
-    assert abs(np.corrcoef(a.standard_normal(2000), b.standard_normal(2000))[0, 1]) < 0.1

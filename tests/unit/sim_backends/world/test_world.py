@@ -33,8 +33,7 @@ def test_the_arm_carries_laser_claw_and_grip_feedback_at_its_next_tick() -> None
     world.arm.tick(t + 0.02)
     assert not world.part.held
     assert not world.arm.digital_inputs & 1
-    assert not world.laser.at(t + 0.015)
-    assert world.laser.at(t + 0.025)
+    assert not world.laser.at(t + 0.015) and world.laser.at(t + 0.025)
 
 
 def test_pressing_the_part_down_is_felt_upward_in_base_axes() -> None:
@@ -78,9 +77,7 @@ def test_truth_is_complete_json_and_consistent() -> None:
     assert pose["base_from_flange"] @ pose["flange_from_part"] == pytest.approx(pose["base_from_part"])
     assert pose["base_from_surface"] @ pose["surface_from_part"] == pytest.approx(pose["base_from_part"])
     assert told["assumed_noise"]["speckle_contrast"]["sigma"] == 0.15
-    assert told["part"]["held"]
-    assert not told["laser_on"]
-    assert told["vehicle"]["stopped"]
+    assert told["part"]["held"] and not told["laser_on"] and told["vehicle"]["stopped"]
 
 
 def test_the_items_of_a_job_stand_on_one_table_each_with_its_part_until_that_was_taken() -> None:

@@ -49,8 +49,7 @@ def test_the_end_of_a_run_is_one_screen(
     assert max(map(len, lines)) <= 80
     assert lines[0].startswith(f"{outcome}  ")
     text = "\n".join(lines)
-    assert "cell time" in text
-    assert "wall time" in text
+    assert "cell time" in text and "wall time" in text
     assert [line[:18].strip() for line in lines if line[:18].strip() in NAMES] == NAMES
     assert f"runs/{run.folder.name}/report.json" in text
     assert any(line.startswith("next ") and "cell " in line for line in lines)
@@ -230,9 +229,7 @@ def test_the_list_tells_when_what_how_and_how_long(root: Path, ends: Ends, typed
     assert (step["state"], step["retries"], step["duration_s"]) == ("done", 1, 3.5)
     code, text, _ = typed("runs")
     assert code == 0
-    assert "2026-03-01 10:00" in text
-    assert "2 min  stored" in text
-    assert "job pot (sim)" in text
+    assert "2026-03-01 10:00" in text and "2 min  stored" in text and "job pot (sim)" in text
     assert "31 s  translation" in text
     assert max(map(len, text.splitlines())) <= 80
 

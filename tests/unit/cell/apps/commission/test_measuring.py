@@ -52,8 +52,7 @@ def test_shifts_show_the_axes_and_the_board_and_turns_the_place(degrees: float) 
 def test_a_wrong_lens_is_told_from_a_wrong_board() -> None:
     flanges, boards = views(DRAWN, pitch=1.0, focal=1.5)
     axes = axes_from_shifts(flanges[:7], boards[:7])
-    assert axes.across == pytest.approx(1.0)
-    assert axes.along == pytest.approx(1.0 / 1.5)
+    assert (axes.across, axes.along) == (pytest.approx(1.0), pytest.approx(1.0 / 1.5))
 
 
 def test_a_mirrored_picture_and_shifts_along_two_axes_are_refused() -> None:

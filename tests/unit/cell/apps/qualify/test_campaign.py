@@ -108,8 +108,7 @@ def test_a_prefix_waits_for_its_first_seeds() -> None:
     for seed in (3, 2, 5, 0):
         prefix.take(seed, "placed")
     assert (prefix.known, prefix.end) == (0, None)
-    assert prefix.has(3)
-    assert not prefix.has(1)
+    assert prefix.has(3) and not prefix.has(1)
     prefix.take(1, "refused")
     assert (prefix.known, prefix.good, prefix.end) == (3, 2, 3)
 
@@ -137,8 +136,7 @@ def test_workers_that_cannot_go_on_leave_the_rows(tmp_path: Path) -> None:
 
 
 def test_targets_from_the_command_line() -> None:
-    assert Target.of(None, None, None) == Target(2000, 0.05)
-    assert Target.of(7, None, None) == Target(7)
+    assert (Target.of(None, None, None), Target.of(7, None, None)) == (Target(2000, 0.05), Target(7))
     for text in ("yield:±1%", "yield:1 %", "yield:+-1%"):
         assert Target.of(None, text, 300) == Target(300, 0.01)
     for text in ("yield", "yield:±0%", "yield:±80%", "cpk:±1%"):

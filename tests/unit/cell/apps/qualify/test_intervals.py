@@ -44,5 +44,4 @@ def test_cpk_by_hand() -> None:
     assert cpk([-0.1, -0.2, -0.3], [0.5] * 3) == pytest.approx(1.0), "an upper limit holds for either sign"
     assert cpk([80.0, 90.0, 100.0], [60.0] * 3, at_least=True) == pytest.approx(1.0)
     assert cpk([0.1, 0.4, 0.9], [0.5, 1.0, 1.5]) == pytest.approx((1 - 0.4) / (3 * 0.2)), "each in shares of its limit"
-    assert cpk([0.1], [0.5]) is None
-    assert cpk([0.1, 0.1], [0.5, 0.5]) is None
+    assert cpk([0.1], [0.5]) is None and cpk([0.1, 0.1], [0.5, 0.5]) is None

@@ -32,8 +32,7 @@ def test_every_row_has_all_columns_and_units() -> None:
 def test_of_many_worst_worlds_some_are_shown() -> None:
     bad = answer(*(row(seed, "refused", reason="dark") for seed in range(1, 31)))
     table = next(one for one in tables_of(bad) if one.title.startswith("the worst worlds"))
-    assert table.title == f"the worst worlds, {page.MOST_WORLDS} of 30"
-    assert len(table.rows) == page.MOST_WORLDS
+    assert (table.title, len(table.rows)) == (f"the worst worlds, {page.MOST_WORLDS} of 30", page.MOST_WORLDS)
 
 
 def test_a_comparison_tells_its_signs() -> None:

@@ -67,8 +67,7 @@ def test_rows_come_back_as_they_were(tmp_path: Path) -> None:
     for one in rows:
         store.append(one)
     assert sorted(RowStore(tmp_path).rows(), key=lambda one: str(one["seed"])) == rows
-    assert store.outcomes(level="nominal") == {1: "placed", 2: "refused"}
-    assert store.rows(level="harsh") == []
+    assert (store.outcomes(level="nominal"), store.rows(level="harsh")) == ({1: "placed", 2: "refused"}, [])
 
 
 def test_a_kill_between_writing_and_renaming_loses_that_row_only(

@@ -177,8 +177,7 @@ def test_poses_are_read_as_they_were_meant(recording, seen, spelling):
     about = understood.about
     assert (about["reading"], about["unit"], about["matched_by"]) == SPELLINGS[spelling][2]
     assert about["setup"] == "eye_in_hand"
-    assert about["turn_deg"] < 0.1
-    assert about["shift_mm"] < 0.5
+    assert about["turn_deg"] < 0.1 and about["shift_mm"] < 0.5
     for frame, pose in zip(frames, POSES, strict=True):
         assert np.abs(frame.base_from_flange.homogeneous - pose).max() < 1e-6
 

@@ -22,12 +22,6 @@ def found(folder: Path) -> CellCalibration:
     return find_calibration(folder, DEVICES, CONFIGURATION, MAX_AGE)
 
 
-def test_the_own_one_is_found_as_it_was_stored(tmp_path: Path) -> None:
-    stored = made()
-    save_calibration(stored, tmp_path / "own.json")
-    assert found(tmp_path).as_dict() == stored.as_dict()
-
-
 def test_of_several_the_newest_is_taken(tmp_path: Path) -> None:
     for age in (3, 1, 2):
         save_calibration(made(age * DAY), tmp_path / f"{age}.json")

@@ -82,8 +82,7 @@ def vehicle(frames: list[tuple[float, can.Message]], interface: CanInterface | N
 def test_a_vehicles_voltages_temperatures_and_bus_load_are_read() -> None:
     found = vehicle(heard())
     assert outside(found) == []
-    assert named(found, "battery") == pytest.approx(25.8)
-    assert named(found, "charge") == 80
+    assert (named(found, "battery"), named(found, "charge")) == (pytest.approx(25.8), 80)
     assert named(found, "battery's temperature") == pytest.approx(25.1)
     assert named(found, "hottest motor or its driver") == 40
     # A standard frame of 8 bytes has 108 bits, at most 24 stuffed ones, and 3 of pause.

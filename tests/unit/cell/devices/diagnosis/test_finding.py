@@ -66,8 +66,7 @@ def test_serial_ports_are_told_with_their_steady_name_and_what_they_look_like(tm
     )
     assert rail.write == '[rail] url = "/dev/serial/by-id/usb-Trinamic_Stepper-if00"'
     assert adapter.write == f'[vehicle] interface = "slcan", channel = "{device}"'
-    assert plain.state == "free"
-    assert plain.write.count("usb-Trinamic") == 2
+    assert (plain.state, plain.write.count("usb-Trinamic")) == ("free", 2)
 
 
 def test_a_port_that_is_gone_or_in_use_is_told_with_the_next_step(tmp_path: Path) -> None:

@@ -53,14 +53,12 @@ def asked(deformed: Callable[[Array], Array]) -> Dissent:
 def test_a_quarter_that_has_sunk_is_found_with_its_depth() -> None:
     found = asked(lambda x: -0.0004 * (x < EDGE))
     assert found.shift == pytest.approx(0.0004, abs=1e-4)
-    assert found.middle[0] < -0.015
-    assert found.excess > 0.5
+    assert found.middle[0] < -0.015 and found.excess > 0.5
 
 
 def test_a_quarter_that_is_tilted_is_found_with_its_angle() -> None:
     found = asked(lambda x: 0.006 * np.minimum(x - EDGE, 0.0))
-    assert found.turn == pytest.approx(0.006, rel=0.1)
-    assert found.shift == pytest.approx(0.006 * -EDGE, rel=0.15)
+    assert (found.turn, found.shift) == (pytest.approx(0.006, rel=0.1), pytest.approx(0.006 * -EDGE, rel=0.15))
     assert found.middle[0] < EDGE
 
 

@@ -118,8 +118,7 @@ def test_what_is_off_contact_brings_a_part_back_that_goes_into_the_surface() -> 
 def test_the_scanned_surface_tells_the_same(placed_pot: JobRecord) -> None:
     cloud, pose = placed_pot.results["reconstruct"].cloud, placed_pot.results["invert_pose"].base_from_surface
     fits = scanned_gap(cloud, pose, POT, HERE, surface_of(PART))
-    assert fits is not None
-    assert max(fits.overlap, np.abs(np.median(fits.gaps))) < 0.03e-3
+    assert fits is not None and max(fits.overlap, np.abs(np.median(fits.gaps))) < 0.03e-3
     assert fits.seen > 0.75 and fits.problem(TOLERANCE) is None
     for height in (-0.5e-3, 0.5e-3):
         found = scanned_gap(cloud, pose, POT, moved(z=height), surface_of(PART))

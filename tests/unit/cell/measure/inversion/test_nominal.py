@@ -26,8 +26,7 @@ def test_closest_points_of_large_triangles_agree_with_a_brute_force_search() -> 
     _, feet = surface.feet(points)
     exact = np.linalg.norm(points - feet.points, axis=1)
     brute = cKDTree(dense).query(points)[0]
-    assert np.all(exact <= brute + 1e-12)
-    assert np.all(brute - exact < 5e-5)
+    assert np.all(exact <= brute + 1e-12) and np.all(brute - exact < 5e-5)
 
 
 def test_the_rim_of_a_large_triangle_is_left_out() -> None:

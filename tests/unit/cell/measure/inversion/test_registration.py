@@ -161,8 +161,7 @@ def test_the_true_pose_is_found_from_the_boards_with_the_uncertainty_stated(heig
         prior = Prior(perturbed(TRUE, rng.normal(size=6) * np.sqrt(np.diag(BOARD))), BOARD)
         found = register(Scan.of(scanned(height, seed, missing=0.4 * (seed % 2)), 4000), nominal(height), prior)
         error = difference(found.base_from_surface, TRUE)
-        assert np.linalg.norm(error[:3]) < 30e-6
-        assert np.linalg.norm(error[3:]) < 1e-3
+        assert np.linalg.norm(error[:3]) < 30e-6 and np.linalg.norm(error[3:]) < 1e-3
         scores.append(error @ np.linalg.solve(found.covariance, error))
     # The mean of six χ² variables of six degrees of freedom, within four of its standard deviations.
     assert 6 - 4 * np.sqrt(12 / 6) < np.mean(scores) < 6 + 4 * np.sqrt(12 / 6)
@@ -234,8 +233,7 @@ def test_sweeps_that_do_not_fit_each_other_do_not_tilt_the_surface() -> None:
     told_apart = inverted(freeform, cloud, prior, sweeps=sweeps)
     assert np.linalg.norm(difference(as_they_lie.base_from_surface, TRUE)[3:]) > 5e-4
     off = difference(told_apart.base_from_surface, TRUE)
-    assert np.abs(off[:3] - error / 2).max() < 8e-6
-    assert np.abs(off[3:]).max() < 1.6e-4
+    assert np.abs(off[:3] - error / 2).max() < 8e-6 and np.abs(off[3:]).max() < 1.6e-4
     # The mean of two independent errors is what remains.
     assert told_apart.sigma[:3] == pytest.approx([sigma / np.sqrt(2)] * 3, rel=0.05)
     assert told_apart.sigma[3:].max() < 1e-4
@@ -268,8 +266,7 @@ def test_a_shift_that_only_a_wall_tells_is_left_to_the_board() -> None:
         inverted(ledges, cloud, Prior(TRUE, BOARD))
     board = perturbed(TRUE, [0.0001, 0.0001, 0.0001, 0.0, 0.0, 0.0])
     pose = inverted(ledges, cloud, Prior(board, np.diag([0.0001**2] * 3 + [0.001**2] * 3)))
-    assert pose.verdict.unseen
-    assert pose.sigma[0] > 2 * np.sqrt(found.covariance[0, 0])
+    assert pose.verdict.unseen and pose.sigma[0] > 2 * np.sqrt(found.covariance[0, 0])
     off = difference(pose.base_from_surface, TRUE)
     assert abs(off[2]) < 1e-5 < 2e-5 < off[0] < 1.1e-4
 

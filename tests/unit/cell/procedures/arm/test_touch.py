@@ -74,8 +74,7 @@ def test_force_errors_that_last_are_stated(follows: float, still: ArmState) -> N
         )  # fmt: skip
         assert found is not None
         off.append((found.height - 0.1e-3) / found.sigma)
-    assert np.sqrt(np.mean(np.square(off))) < 1.5
-    assert np.abs(off).max() < 3.5
+    assert np.sqrt(np.mean(np.square(off))) < 1.5 and np.abs(off).max() < 3.5
 
 
 def test_an_arm_that_tells_next_to_nothing_is_no_witness(still: ArmState) -> None:

@@ -52,5 +52,4 @@ def test_what_limits_the_place_is_no_more_than_all_of_it_and_what_is_added_bette
 def test_three_pictures_are_drawn(examined: Examination, tmp_path: Path) -> None:
     for path in examined.draw(tmp_path / "pictures"):
         picture = cv2.imread(str(path))
-        assert min(picture.shape[:2]) > 600
-        assert picture.std() > 10
+        assert min(picture.shape[:2]) > 600 and picture.std() > 10

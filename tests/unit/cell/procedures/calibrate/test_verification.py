@@ -40,8 +40,7 @@ def test_what_the_board_has_confirmed_is_not_uncertain_any_more(further: float) 
     alone, known = seen.stated, TURN.since(seen).stated
     assert alone.sigma > abs(seen.turn)
     assert known.turn == pytest.approx(TURN.turn + further)
-    assert known.sigma == pytest.approx(np.hypot(PLATE_RAD, TURN.sigma))
-    assert known.open == 0.0
+    assert (known.sigma, known.open) == (pytest.approx(np.hypot(PLATE_RAD, TURN.sigma)), 0.0)
 
 
 def test_a_plate_that_is_knocked_after_it_was_confirmed_is_not_believed() -> None:

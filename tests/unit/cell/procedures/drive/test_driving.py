@@ -46,9 +46,7 @@ def test_the_line_law_arrives_within_a_centimetre_and_a_degree(seed: int) -> Non
         speed += np.clip(command[0] - speed, -0.5 * step, 0.5 * step)
         rate += np.clip(command[1] - rate, -1.5 * step, 1.5 * step)
         pose = pose * Planar(speed * step, 0.0, rate * step)
-    assert abs(pose.x) < 0.002
-    assert abs(pose.y) < 0.010
-    assert abs(pose.yaw) < math.radians(2.0)
+    assert abs(pose.x) < 0.002 and abs(pose.y) < 0.010 and abs(pose.yaw) < math.radians(2.0)
     assert speed < 0.05
 
 

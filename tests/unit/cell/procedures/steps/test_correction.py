@@ -39,13 +39,6 @@ def test_a_part_that_lies_aside_is_gripped_and_placed_where_it_belongs(placed_po
     assert any("it is gripped and placed again" in note for note in site.notes)
 
 
-def test_what_is_accepted_is_not_touched_and_what_is_not_is_corrected(placed_pot: JobRecord, tmp_path: Path) -> None:
-    off = moved(0.2e-3, z=0.1e-3)
-    assert LyingPart(placed_pot, tmp_path, also="corrections = 1").looked(off).before == ()
-    nearer = LyingPart(placed_pot, tmp_path, also='corrections = 1\naccept = "0.1 mm"').looked(off)
-    assert len(nearer.before) == 1 and nearer.off < nearer.before[0]
-
-
 def test_a_part_that_lies_on_something_is_left_there(placed_pot: JobRecord, tmp_path: Path) -> None:
     """Placed again it would lie as high."""
     site = LyingPart(placed_pot, tmp_path, also="corrections = 3")

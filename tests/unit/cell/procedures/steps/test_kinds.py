@@ -42,8 +42,7 @@ LOOK = PLACE.with_step(LEAN, after="board_photo", name="look_and_place")
 
 def test_one_more_step_is_one_step_and_one_line() -> None:
     assert LOOK.names == ("drive_to_target", "board_photo", "see_lean", *PLACE.names[2:])
-    assert LOOK.sequence().success == "placed"
-    assert LOOK.policy().of("see_lean").deadline_s == 5.0
+    assert (LOOK.sequence().success, LOOK.policy().of("see_lean").deadline_s) == ("placed", 5.0)
     only_look = LOOK.until("see_lean")
     assert only_look.names == ("drive_to_target", "board_photo", "see_lean")
     assert only_look.sequence().success == "done"
@@ -79,8 +78,7 @@ def test_a_step_that_does_not_exist_is_named_with_those_that_do() -> None:
 
 def test_a_step_finds_what_it_needs_by_type() -> None:
     context = StepContext(Step("see", 1.0), 1, 1.0, {"a": Tilt(0.1), "b": 7, "c": Tilt(0.2)}, Clock(), print)
-    assert context.made(Tilt) == Tilt(0.2)
-    assert context.made(int) == 7
+    assert (context.made(Tilt), context.made(int)) == (Tilt(0.2), 7)
     with pytest.raises(LookupError, match="see needs a PlaceResult, which none of a, b, c made"):
         context.made(PlaceResult)
 

@@ -112,7 +112,7 @@ def test_where_there_is_no_part_or_the_claw_is_full_nothing_is_gripped(
 def test_through_the_public_door_it_is_not_resumed_once_it_was_gripped_and_the_next_part_lies_there(
     placed_pot: JobRecord, calibrated_folder: Path
 ) -> None:
-    unload, (lean, _) = quick_job("unload", calibrated_folder), described(calibrated_folder, LEAN)
+    unload, (lean, _) = quick_job("unload", calibrated_folder, 20.0), described(calibrated_folder, LEAN)
     with Cell.open(lean, sim="all", seed=placed_pot.seed, clock="virtual", job=unload) as cell:
 
         def end(event: Event) -> None:

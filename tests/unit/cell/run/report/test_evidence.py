@@ -70,8 +70,7 @@ def test_a_place_that_was_refused_is_shown_with_all_its_figures(ends: Ends) -> N
 
 def test_a_part_that_met_nothing_says_how_far_it_was_lowered(ends: Ends) -> None:
     (number,) = ends(report_runs.no_contact).report["refusal"]["numbers"]
-    assert number["name"] == "reached without contact"
-    assert number["value"] == pytest.approx(-1.0, abs=0.1)
+    assert (number["name"], number["value"]) == ("reached without contact", pytest.approx(-1.0, abs=0.1))
 
 
 def test_a_photograph_is_kept_before_it_is_looked_at(ends: Ends) -> None:
@@ -86,8 +85,7 @@ def test_evidence_nearest_to_the_cause_stays() -> None:
     )
     error.showing(seen={"frame": 2, "pose": 3})
     assert [(number.name, number.value) for number in error.numbers] == [("points", 3), ("rms", 0.1)]
-    assert error.seen == {"frame": 1, "pose": 3}
-    assert str(error) == "too little"
+    assert (error.seen, str(error)) == ({"frame": 1, "pose": 3}, "too little")
 
 
 def test_a_fault_keeps_the_last_frames_and_every_fault_before_it(ends: Ends) -> None:
@@ -107,8 +105,7 @@ def test_a_placed_run_measures_itself_against_its_limits(placed: Ended) -> None:
     truth = placed.report["truth"]
     assert rows["place error, largest of 45 points"]["value"] == truth["error_mm"]["d"]["max"]
     assert rows["place error, largest of 45 points"]["limit"] == 0.6
-    assert rows["place error, stated 95 % bound"]["limit"] == 0.6
-    assert rows["contact depth"]["limit"] == 1.0
+    assert (rows["place error, stated 95 % bound"]["limit"], rows["contact depth"]["limit"]) == (0.6, 1.0)
     assert rows["surface covered"]["limit"] == 35.0
     assert 0.5 < rows["fit, χ²/dof"]["value"] < 2.0
 

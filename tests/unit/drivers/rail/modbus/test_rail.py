@@ -62,9 +62,7 @@ def test_another_client_reads_from_the_drive_what_the_rail_has_written() -> None
     def read(address: int, count: int) -> list[int]:
         return list(client.read_holding_registers(address, count=count, device_id=UNIT).registers)
 
-    assert read(0x6201, 2) == [0, 61_500]
-    assert read(0x6203, 1) == [450]
-    assert read(0x602C, 2) == [0, 61_500]
+    assert (read(0x6201, 2), read(0x6203, 1), read(0x602C, 2)) == ([0, 61_500], [450], [0, 61_500])
     assert drive.model.carriage(drive.clock.now()) == pytest.approx(0.0123, abs=1e-6)
     assert client.write_register(0x9999, 1, device_id=UNIT).isError()
     client.close()
@@ -120,8 +118,7 @@ def test_who_only_looks_writes_nothing(drive: Drive) -> None:
     drive.homed().close()
     before = dict(drive.peer.drive._written)
     rail = drive.rail(control=False)
-    assert rail.state().homed
-    assert rail.examine(0.0)[0].ok
+    assert rail.state().homed and rail.examine(0.0)[0].ok
     assert rail.identity().serial == "A1234"
     rail.close()
     assert drive.peer.drive._written == before

@@ -87,8 +87,7 @@ def test_a_rail_that_somebody_left_at_a_limit_switch_is_not_homed_any_more(bench
     bench.clock.sleep(7.0)
     again = connect(bench.peer.url, bench.clock, travel=(0.0, 0.12))
     state = again.state()
-    assert state.right_switch
-    assert not state.homed
+    assert state.right_switch and not state.homed
     again.close()
 
 
@@ -130,8 +129,7 @@ def test_homing_after_a_reset_sets_the_module_up_again(homed: Bench) -> None:
     homed.peer.fault("rail.reset")
     homed.rail.home().wait(20.0)
     homed.rail.move_to(0.02).wait(10.0)
-    assert homed.carriage() == pytest.approx(0.02, abs=1e-6)
-    assert homed.model.settings.search_mode == 5
+    assert (homed.carriage(), homed.model.settings.search_mode) == (pytest.approx(0.02, abs=1e-6), 5)
     assert homed.model.settings.max_acceleration == round(ACCELERATION * 200 * 256 / 0.002)
 
 

@@ -8,7 +8,6 @@ import pytest
 
 from drivers.clock import Clock
 from drivers.errors import ConfigError, InterlockError
-from drivers.interfaces import Rail
 from tests.support.wire.rail_bench import Bench, connect, telegram
 
 pytestmark = pytest.mark.wire
@@ -20,24 +19,13 @@ def test_impossible_parameters_are_refused_before_the_port_is_opened(wrong: dict
         connect("socket://127.0.0.1:1", Clock(), **wrong)
 
 
-def test_the_rail_says_who_it_is_and_how_fast_it_answers(bench: Bench) -> None:
-    rail: Rail = bench.rail
-    identity = rail.identity()
-    assert (identity.model, identity.serial, identity.firmware) == ("TMCM-1260", "1", "1260V112")
-    assert identity.address == bench.peer.url
-    assert 0.0 < rail.ping() < 0.5
-    assert len(rail.statistics.round_trips_s) > 5
-    assert not rail.statistics.errors
-
-
 def test_who_only_looks_sets_nothing_and_stops_nothing(homed: Bench) -> None:
     homed.rail.close()
     homed.peer.module.handle(telegram(4, 0, round(0.09 / 0.002 * 200 * 256)))
     before = homed.model.settings
     looking = connect(homed.peer.url, homed.clock, control=False)
     state = looking.state()
-    assert state.moving
-    assert state.homed
+    assert state.moving and state.homed
     for command in (looking.home, lambda: looking.move_to(0.01), looking.stop):
         with pytest.raises(InterlockError, match="looked at only"):
             command()

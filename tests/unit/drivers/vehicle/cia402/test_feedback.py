@@ -22,8 +22,7 @@ def test_metres_a_second_become_numbers_of_the_drives() -> None:
     assert WHEELS.targets(0.3, 0.0) == (5730, -5730)
     assert WHEELS.targets(0.0, 1.0) == (-5539, -5539)  # 0.29 m/s of the rims, against each other
     assert WHEELS.motion((5730, -5730)) == pytest.approx((0.3, 0.0), abs=3e-5)
-    assert WHEELS.count_length == pytest.approx(2 * math.pi * 0.1 / 81920)
-    assert WHEELS.ramp(1.0) == 19099
+    assert (WHEELS.count_length, WHEELS.ramp(1.0)) == (pytest.approx(2 * math.pi * 0.1 / 81920), 19099)
 
 
 def test_readings_of_two_different_moments_are_not_one_pose() -> None:
@@ -146,13 +145,11 @@ def test_either_drives_input_tells_of_the_emergency_stop(node: int, active: bool
 )
 def test_one_drive_that_does_not_obey_ends_driving(node: int, word: int, mode: int, why: str) -> None:
     told = Told()
-    assert told.feedback.gave_up() is None
-    assert told.feedback.state(1.0, False, True).command_mode
+    assert told.feedback.gave_up() is None and told.feedback.state(1.0, False, True).command_mode
     told.notify(node, word=word, mode=mode)
     fault = told.feedback.gave_up()
     assert fault is not None
-    assert why in fault.message
-    assert told.feedback.drives[node - 1].side in fault.message
+    assert why in fault.message and told.feedback.drives[node - 1].side in fault.message
     assert not told.feedback.state(1.0, False, True).command_mode
 
 
@@ -179,8 +176,6 @@ def test_a_wrong_unit_is_told_and_an_offset_or_a_gap_is_none() -> None:
             found = found or check.contradiction(clock.time, position, velocity)
         return found
 
-    assert ratio(5730) == 0.0
-    assert ratio(57300) == pytest.approx(10.0, rel=0.01)
-    assert ratio(-5730) == pytest.approx(-1.0, rel=0.01)
-    assert ratio(20, 3600.0, 0.05, moves=False) == 0.0
+    assert (ratio(5730), ratio(57300)) == (0.0, pytest.approx(10.0, rel=0.01))
+    assert (ratio(-5730), ratio(20, 3600.0, 0.05, moves=False)) == (pytest.approx(-1.0, rel=0.01), 0.0)
     assert ratio(57300, period=0.15) == 0.0

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import time
 
 import pytest
 
-from drivers.errors import DeadlineError, DeviceFault, InterlockError
+from drivers.errors import DeadlineError, DeviceFault
 from drivers.vehicle.feedback import QUIET_S
 from sim_backends.peers.vehicle.canopen import WheelState
 from tests.support.canopen_bench import WATCHDOG_S, Bench, at_bench, with_output_brake
@@ -17,28 +16,6 @@ pytestmark = pytest.mark.wire
 PRE_OPERATIONAL = 0x7F
 RAMP_WALL_S = 0.3
 """From 0.3 m/s to standstill, and the time to notice, on the wall at three times its pace."""
-
-
-def test_it_drives_as_told_stops_and_locks_its_brake(bench: Bench) -> None:
-    vehicle = bench.vehicle
-    end = time.monotonic() + 0.6
-    while time.monotonic() < end:
-        vehicle.drive(0.3, 0.4)
-        time.sleep(0.01)
-    assert (vehicle.state().speed, vehicle.state().yaw_rate) == pytest.approx((0.3, 0.4), abs=0.003)
-    vehicle.stop()
-    x, y, yaw = bench.peer.model.planar(bench.world.now())
-    assert bench.speed() == 0.0
-    assert math.hypot(x, y) > 0.2
-    bench.until(lambda: (vehicle.state().x, vehicle.state().y) == pytest.approx((x, y), abs=0.001))
-    assert vehicle.state().yaw == pytest.approx(yaw, abs=0.001)
-    vehicle.drive(0.1, 0.0)  # still enabled
-    vehicle.brake()
-    assert vehicle.state().braked
-    bench.until(bench.braked)
-    with pytest.raises(InterlockError, match="the brake is locked"):
-        vehicle.drive(0.1, 0.0)
-    assert vehicle.state().battery_volts == 26.4
 
 
 def test_a_drive_that_is_lost_keeps_no_other_brake_open_and_nobody_says_braked() -> None:

@@ -25,13 +25,6 @@ def ball(count: int = 3000, radius: float = 0.0075) -> np.ndarray:
     )
 
 
-def test_a_perfect_sphere_is_found_and_has_no_form_error() -> None:
-    fit = campaign.fit_sphere(ball())
-    np.testing.assert_allclose(fit.centre, [0.05, 0.01, 0.13], atol=1e-12)
-    assert fit.radius == pytest.approx(0.0075, abs=1e-12)
-    assert campaign.form_all(fit.deviations) < 1e-11
-
-
 def test_the_sphere_fit_minimises_the_distances_of_noisy_points() -> None:
     points = ball() + 2e-5 * np.random.default_rng(3).normal(size=(3000, 3))
     fit = campaign.fit_sphere(points)
@@ -45,30 +38,10 @@ def test_the_sphere_fit_minimises_the_distances_of_noisy_points() -> None:
             assert squares(fit.centre + sign * step[:3], fit.radius + sign * step[3]) > least
 
 
-def test_form_errors_of_a_uniform_band_are_its_width() -> None:
-    deviations = np.linspace(-1e-5, 3e-5, 10_001)
-    assert campaign.form_95(deviations) == pytest.approx(0.95 * 4e-5, rel=1e-3)
-    assert campaign.form_all(deviations) == pytest.approx(0.997 * 4e-5, rel=1e-3)
-
-
 def test_three_points_in_a_thousand_are_let_go_and_no_more() -> None:
     deviations = np.concatenate([np.linspace(-1e-5, 1e-5, 997), [1e-3, -2e-3, 3e-3]])
     assert campaign.form_all(deviations) == pytest.approx(2e-5)
     assert campaign.form_all(np.concatenate([deviations[3:], [4e-3] * 3])) > 1e-3
-
-
-def test_flatness_does_not_depend_on_the_pose() -> None:
-    rng = np.random.default_rng(4)
-    points = np.column_stack([rng.uniform(-1, 1, (500, 2)), 1e-3 * rng.uniform(-1, 1, 500)])
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    assert campaign.form_95(campaign.plane_deviations(points @ turn.T + 5)) == pytest.approx(
-        campaign.form_95(campaign.plane_deviations(points)), rel=1e-9
-    )
-
-
-def test_the_cap_is_cut_at_its_angle() -> None:
-    directions = np.array([[0, 0, -1.0], [np.sin(0.8), 0, -np.cos(0.8)], [np.sin(0.9), 0, -np.cos(0.9)]])
-    assert campaign.cap(directions, np.zeros(3), np.array([0, 0, -2.0]), 0.85).tolist() == [True, True, False]
 
 
 def test_too_few_points_are_refused() -> None:

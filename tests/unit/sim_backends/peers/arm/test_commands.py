@@ -79,8 +79,7 @@ def test_a_streamed_joint_trajectory_is_tracked_with_a_small_lag(arm: Client) ->
 
 def test_a_move_during_a_stream_ends_the_program_as_on_the_controller(arm: Client) -> None:
     arm.control.servoJ(HOME.tolist(), 0.0, 0.0, 0.002, 0.1, 300.0)
-    assert not arm.control.moveJ(HOME.tolist(), 1.0, 1.0)
-    assert not arm.control.isProgramRunning()
+    assert not arm.control.moveJ(HOME.tolist(), 1.0, 1.0) and not arm.control.isProgramRunning()
 
 
 def test_speed_commands_and_jogging(arm: Client) -> None:
@@ -128,8 +127,7 @@ def test_kinematics_answers_agree_with_an_independent_chain(arm: Client) -> None
 
 def test_a_pose_out_of_reach_ends_the_program_and_the_call_says_so(arm: Client) -> None:
     assert arm.control.getInverseKinematics([2.0, 0, 0, 0, 0, 0]) == []
-    assert not arm.control.isProgramRunning()
-    assert not arm.control.moveJ(HOME.tolist(), 1.0, 1.0)
+    assert not arm.control.isProgramRunning() and not arm.control.moveJ(HOME.tolist(), 1.0, 1.0)
 
 
 def test_tool_and_payload_are_taken(arm: Client) -> None:

@@ -27,13 +27,11 @@ def arrived(controller: Controller) -> bool:
 
 
 def test_a_pause_comes_to_rest_and_a_play_goes_on_to_the_old_target(moving: Controller) -> None:
-    assert moving.program.pause()
-    assert moving.state is RuntimeState.PAUSING
+    assert moving.program.pause() and moving.state is RuntimeState.PAUSING
     moving.run_for(0.2)
     assert (moving.state, moving.model.moving) == (RuntimeState.PAUSED, False)
     moving.run_for(1.0)
-    assert not moving.model.moving
-    assert moving.program.play()
+    assert not moving.model.moving and moving.program.play()
     moving.run_for(0.05)
     assert moving.state is RuntimeState.RESUMING
     moving.run_for(4.0)

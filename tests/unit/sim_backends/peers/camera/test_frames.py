@@ -115,15 +115,6 @@ def world_time(device_ns: int) -> float:
     return (device_ns * 1e-9 - 5000.0) / (1.0 + 80e-6)
 
 
-def test_the_camera_says_who_it_is(client: Client) -> None:
-    identity = client.ask(op="identify")
-    assert identity["ok"] is True
-    assert (identity["model"], identity["serial"], identity["firmware"]) == ("SimCam", "SIM000007-SCAN", "1.0")
-    assert (identity["width"], identity["height"], identity["pixel_format"]) == (64, 48, "mono8")
-    assert identity["frame_rate_max_hz"] == 120.0
-    assert 0.0 < identity["exposure_min_s"] < identity["exposure_max_s"]
-
-
 def test_the_latch_reads_the_device_clock(client: Client, clock: WorldClock) -> None:
     before = clock.now()
     device_ns = client.ask(op="latch")["device_ns"]
@@ -171,14 +162,6 @@ def test_slow_rendering_drops_exposures_beyond_the_backlog_and_says_so(
     # A dropped exposure has taken its time all the same.
     grid = frames[0]["device_ns"] + (np.array(ids) - 1) * 1e9 / 120.0
     np.testing.assert_allclose([frame["device_ns"] for frame in frames], grid, atol=10)
-
-
-def test_lost_frames_leave_a_gap_in_the_ids(client: Client, peer: FramePeer) -> None:
-    client.ask(op="start", frame_rate=50.0)
-    ids = [client.frame()["frame_id"]]
-    peer.fault("camera.frame_loss", 3)
-    ids += [client.frame()["frame_id"] for _ in range(11)]
-    assert sorted(np.diff(ids)) == [1] * 10 + [4]
 
 
 def test_after_stop_no_frame_follows(client: Client, scene: Scene, clock: WorldClock) -> None:
@@ -230,8 +213,7 @@ def test_a_second_client_is_turned_away_and_may_come_once_the_first_is_gone(peer
         second.receive()
     client.vanish()
     third = Client(peer.address)
-    assert third.ask(op="identify")["ok"]
-    assert third.ask(op="trigger")["ok"]
+    assert third.ask(op="identify")["ok"] and third.ask(op="trigger")["ok"]
     third.frame()
     third.socket.close()
 
@@ -248,21 +230,8 @@ def test_garbage_ends_its_own_connection_only(peer: FramePeer) -> None:
     half.vanish()
     second = Client(peer.address)
     second.socket.sendall(b"CFS1" + struct.pack(">II", 3, 0) + b"{a:")
-    assert not second.receive()[0]["ok"]
-    assert second.ask(op="latch")["ok"]
+    assert not second.receive()[0]["ok"] and second.ask(op="latch")["ok"]
     second.socket.close()
-
-
-def test_a_silent_camera_says_nothing_until_it_is_cleared(peer: FramePeer, client: Client) -> None:
-    with pytest.raises(ValueError, match=r"camera\.frame_loss"):
-        peer.fault("camera.nonsense")
-    peer.fault("camera.silent")
-    client.socket.settimeout(0.2)
-    with pytest.raises(TimeoutError):
-        client.ask(op="latch")
-    peer.clear()
-    client.socket.settimeout(3.0)
-    assert client.ask(op="latch")["ok"]
 
 
 def test_stopping_leaves_no_thread_even_in_mid_stream(clock: WorldClock, scene: Scene) -> None:

@@ -57,8 +57,7 @@ def test_one_client_controls_it_and_loses_control_when_it_falls_silent(peer: Gig
     first, second = Client(peer), Client(peer)
     assert first.write(g.WIDTH, 32) == 0x8006, "nobody controls it yet"
     assert first.write(g.CONTROL, 2) == first.write(g.HEARTBEAT, 500) == first.write(g.WIDTH, 32) == 0
-    assert second.write(g.WIDTH, 16) == 0x8006
-    assert second.read(g.WIDTH) == 32
+    assert (second.write(g.WIDTH, 16), second.read(g.WIDTH)) == (0x8006, 32)
     assert first.ask(0x99, b"")[0] == 0x8001
     assert until(lambda: not second.read(g.CONTROL), 5.0)
     assert second.write(g.CONTROL, 2) == 0

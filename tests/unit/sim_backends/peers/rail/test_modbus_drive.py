@@ -72,8 +72,7 @@ def test_it_homes_and_positions_once_all_settings_are_as_they_have_to_be(drive: 
 
 
 def test_what_it_has_not_does_not_exist_and_a_reset_forgets_the_zero(drive: Drive) -> None:
-    assert drive.server.read(0x9999, 1, False) is None
-    assert not drive.server.write(0x9999, [1])
+    assert drive.server.read(0x9999, 1, False) is None and not drive.server.write(0x9999, [1])
     assert not drive.server.write(drive.map["position"]["address"], [1, 2])
     drive.server.reset()
     assert not drive.is_set("homed")

@@ -76,8 +76,7 @@ def test_the_vendors_client_homes_and_moves_the_rail(
     client.reference_search(0, 0)
     assert client.reference_search(2, 0) != 0
     until(clock, lambda: client.reference_search(2, 0) == 0)
-    assert axis.actual_position == 0
-    assert axis.get_axis_parameter(axis.AP.HomeSwitch) == 1
+    assert (axis.actual_position, axis.get_axis_parameter(axis.AP.HomeSwitch)) == (0, 1)
     assert model.carriage(clock.now()) == pytest.approx(0.0, abs=1e-9)
     module.move_to(0, 25 * STEPS, 10 * STEPS)
     assert axis.get_position_reached() == 0
@@ -223,17 +222,3 @@ def test_a_reset_takes_what_is_not_in_the_eeprom(peer: TmclPeer, module: TMCM126
     assert [module.get_global_parameter(number, 2) for number in (0, 7, 8, 200)] == [4711, 70, 0, 0]
     assert axis.get_axis_parameter(axis.AP.MaxVelocity) == 512_000
     assert model.carriage(peer.module.clock.now()) == stands
-
-
-def test_late_replies_are_late_until_the_faults_are_cleared(peer: TmclPeer, port: serial.SerialBase) -> None:
-    def round_trip() -> float:
-        clock = WorldClock()
-        port.write(request(1, 6, 1))
-        assert len(port.read(9)) == 9
-        return clock.now()
-
-    peer.fault("rail.late_reply")
-    assert 0.2 < min(round_trip(), round_trip()) < 0.5
-    peer.clear()
-    # The shortest: whoever asks may not be run for a moment.
-    assert min(round_trip() for _ in range(3)) < 0.15

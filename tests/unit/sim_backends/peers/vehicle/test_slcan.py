@@ -57,15 +57,9 @@ def test_bus_off_ends_the_connection_and_it_can_be_opened_again(peer: AgilexPeer
 
 
 def test_an_adapter_answers_as_the_lawicel_protocol_says(adapter: socket.socket, peer: AgilexPeer) -> None:
-    assert ask(adapter, b"V") == b"V1013\r"
-    assert ask(adapter, b"N") == b"NSIM1\r"
-    assert ask(adapter, b"t1110") == b"\a"
-    assert ask(adapter, b"S5") == b"\r"
-    assert ask(adapter, b"O") == b"\r"
-    assert ask(adapter, b"O") == b"\a"
-    assert ask(adapter, b"t1110") == b"\a"
-    assert ask(adapter, b"F") == b"F84\r"
-    assert ask(adapter, b"C") == b"\r"
+    assert (ask(adapter, b"V"), ask(adapter, b"N"), ask(adapter, b"t1110")) == (b"V1013\r", b"NSIM1\r", b"\a")
+    assert (ask(adapter, b"S5"), ask(adapter, b"O"), ask(adapter, b"O")) == (b"\r", b"\r", b"\a")
+    assert (ask(adapter, b"t1110"), ask(adapter, b"F"), ask(adapter, b"C")) == (b"\a", b"F84\r", b"\r")
     assert ask(adapter, b"S6") == b"\r"
     for malformed in (b"t11", b"t8000", b"t1119", b"t1112AA", b"tXYZ0", b"S9", b"Q", b"\xff\xfe"):
         assert ask(adapter, malformed) == b"\a"

@@ -98,21 +98,16 @@ def test_contact_pushes_against_the_side_that_it_runs_into() -> None:
     tilted = target @ turned((0.0, 0.02, 0.0))
     wrench = part.wrench(flange_for(raised(tilted, dz=0.0)))
     # Turned about +y, the side at +x is low; the force there, at +x of the flange, turns back about −y.
-    assert wrench[2] > 0
-    assert wrench[4] < 0
+    assert wrench[2] > 0 and wrench[4] < 0
 
 
-def test_released_on_the_surface_the_part_stays_where_it_was_placed() -> None:
-    part, target = contact()
-    part.set_claw(False, flange_for(target))
-    assert not part.held
-    assert part.part_pose(np.eye(4)) == pytest.approx(target, abs=1e-8)
-
-
-def test_released_above_the_surface_the_part_falls_straight_down_onto_it() -> None:
+@pytest.mark.parametrize(
+    ("dz", "within"), [(0.0, 1e-8), (0.008, 1e-7), (-0.0004, 5e-6)], ids=["touching", "above", "pressed in"]
+)
+def test_wherever_the_claw_lets_go_of_it_the_part_comes_to_touch_the_surface(dz: float, within: float) -> None:
     part, target = contact(lean=(0.0, 0.0, 0.0))
-    part.set_claw(False, flange_for(raised(target, dz=0.008)))
-    assert part.part_pose(np.eye(4)) == pytest.approx(target, abs=1e-7)
+    part.set_claw(False, flange_for(raised(target, dz=dz)))
+    assert not part.held and part.part_pose(np.eye(4)) == pytest.approx(target, abs=within)
 
 
 def test_a_surface_that_is_pushed_takes_along_what_lies_on_it_and_nothing_that_is_held() -> None:
@@ -134,12 +129,6 @@ def test_a_part_that_a_person_takes_is_neither_in_the_claw_nor_near() -> None:
     assert not part.held
 
 
-def test_a_part_that_was_pressed_in_springs_back_to_touch_the_surface() -> None:
-    part, target = contact()
-    part.set_claw(False, flange_for(raised(target, dz=-0.0004)))
-    assert part.part_pose(np.eye(4))[2, 3] == pytest.approx(target[2, 3], abs=5e-6)
-
-
 def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact() -> None:
     part, target = contact()
     part.set_claw(False, flange_for(raised(target, dx=0.002, dz=0.002)))
@@ -152,8 +141,7 @@ def test_a_part_put_down_beside_its_place_rests_higher_on_its_first_contact() ->
     seen = (drawing.inverse(target) @ rest @ underside.T).T
     gap = seen[:, 2] - surface("pot").height(seen[:, 0], seen[:, 1])
     assert 0 < rest[2, 3] - target[2, 3] < 0.002
-    assert gap.min() > -2e-5
-    assert gap.min() < 2e-4
+    assert gap.min() > -2e-5 and gap.min() < 2e-4
 
 
 def test_dropped_beside_the_table_the_part_falls_to_the_floor() -> None:

@@ -23,44 +23,7 @@ def test_slopes_are_the_derivatives_of_the_height(name: str) -> None:
     step = 1e-7
     by_x = (surface(name).height(x + step, y) - surface(name).height(x - step, y)) / (2 * step)
     by_y = (surface(name).height(x, y + step) - surface(name).height(x, y - step)) / (2 * step)
-    assert np.abs(gx - by_x).max() < 1e-7
-    assert np.abs(gy - by_y).max() < 1e-7
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_relief_stays_between_the_table_and_15_mm(name: str) -> None:
-    h = surface(name).height(*grid(name))
-    assert h.min() > 0.001
-    assert h.max() < 0.015
-    assert np.ptp(h) <= 0.012
-
-
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("unseen", [0.0, 0.008])
-def test_every_direction_is_observable(name: str, unseen: float) -> None:
-    """Smallest eigenvalue of the normalised information (docs/explanation/theory.md, section 9), also when the view is
-    cut."""
-    x, y = grid(name)
-    seen = y <= surface(name).half_y - unseen
-    heights, normals = surface(name).sample(x[seen], y[seen])
-    points = np.column_stack([x[seen], y[seen], heights])
-    points -= points.mean(axis=0)
-    radius = np.sqrt((points**2).sum(axis=1).mean())
-    jacobian = np.hstack([np.cross(points, normals) / radius, normals])
-    assert np.linalg.eigvalsh(jacobian.T @ jacobian / len(points))[0] > 5e-3
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_no_flank_hides_from_camera_or_laser(name: str) -> None:
-    """The laser comes in 16° off the camera's axis: a flank of less than 74° towards it is lit."""
-    _, gx, gy = surface(name).relief(*grid(name))
-    assert np.degrees(np.arctan(np.hypot(gx, gy).max())) < 70.0
-
-
-def test_the_seat_has_edges_and_the_pot_has_none() -> None:
-    steepest = {n: np.degrees(np.arctan(np.hypot(*surface(n).relief(*grid(n))[1:]))).max() for n in NAMES}
-    assert steepest["pot"] < 35.0
-    assert steepest["seat"] > 50.0
+    assert np.abs(gx - by_x).max() < 1e-7 and np.abs(gy - by_y).max() < 1e-7
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -57,13 +57,6 @@ def test_people_get_tables_with_units(tmp_path):
     assert "circles-03.jpg" in calibrate(tmp_path, "--board", "dots:6x6:34mm", "--laser", "none", "--details").stdout
 
 
-def test_pairs_of_poses_need_no_board():
-    ran = calibrate(recording("hand_eye"))
-    assert ran.exit_code == 0, ran.output
-    assert "eye to hand" in ran.stdout
-    assert "mm" in ran.stdout
-
-
 def test_another_board_than_that_in_the_pictures_is_an_error(tmp_path):
     shutil.copy(recording("dot_board") / "circles-01.jpg", tmp_path)
     ran = calibrate(tmp_path, "--board", "dots:9x7:34mm", "--json")

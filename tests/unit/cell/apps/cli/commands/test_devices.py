@@ -14,8 +14,7 @@ from cell.config.cell_config import default_toml
 
 def test_a_jog_without_a_motion_and_a_recovery_by_nobody_say_what_they_lack(monkeypatch: pytest.MonkeyPatch) -> None:
     refused = CliRunner().invoke(app, ["jog"])
-    assert "say what to move" in str(refused.exception)
-    assert "--sim all" in str(refused.exception)
+    assert "say what to move" in str(refused.exception) and "--sim all" in str(refused.exception)
     monkeypatch.setattr("cell.run.session.supervisor.Cell.open", lambda *_, **__: pytest.fail("the cell was opened"))
     refused = CliRunner().invoke(app, ["recover", "--sim", "all"])
     assert "a person has to look at the cell first" in str(refused.exception)

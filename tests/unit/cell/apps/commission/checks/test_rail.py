@@ -25,8 +25,7 @@ def judged(told: float, moved: tuple[float, float, float]) -> list[str]:
 
 
 def test_a_rail_is_judged_by_the_way_that_its_camera_went() -> None:
-    assert judged(0.005, (4.97, 0.05, -0.1)) == []
-    assert judged(-0.005, (-4.97, 0.05, -0.1)) == []
+    assert (judged(0.005, (4.97, 0.05, -0.1)), judged(-0.005, (-4.97, 0.05, -0.1))) == ([], [])
     assert judged(0.005, (-5.02, 0.1, 0.0)) == ["rail.reversed {'rail.reversed': 'true'}"]
     assert judged(0.005, (9.95, 0.1, 0.0)) == ["rail.lead {'rail.lead': '\"4 mm\"'}"]
     assert judged(-0.005, (1.26, 0.0, 0.0)) == [

@@ -139,8 +139,7 @@ def test_the_link_works_once_and_gives_a_cookie_that_no_script_sees(server: Serv
 def test_a_link_works_once_also_before_the_next_is_made() -> None:
     access = Access(("127.0.0.1",), 1, secure=False)
     replaced, link = access.link(), access.link()
-    assert access.enter(replaced) is None
-    assert access.enter(link) is not None
+    assert access.enter(replaced) is None and access.enter(link) is not None
     assert access.enter(link) is None
 
 
@@ -211,8 +210,7 @@ STRANGERS = [
 @pytest.mark.parametrize("origin", [*STRANGERS, None])
 def test_a_page_from_elsewhere_commands_nothing_and_sees_nothing(server: Served, origin: str | None) -> None:
     before, given = server.stops, None if origin is None else origin.format(port=server.port)
-    assert server.ask("POST", "/api/do", '{"do": "stop"}', origin=given).status == 403
-    assert server.stops == before
+    assert (server.ask("POST", "/api/do", '{"do": "stop"}', origin=given).status, server.stops) == (403, before)
     with pytest.raises(InvalidStatus) as refused:
         server.live(origin=given)
     assert refused.value.response.status_code == 403

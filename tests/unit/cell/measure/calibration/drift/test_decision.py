@@ -75,14 +75,6 @@ def looked_again(cell: ObservedCell, calibration: CellCalibration, truth: Truth)
         cell.truth = before
 
 
-def test_the_rail_is_known_to_a_tenth_of_a_milliradian(calibrated):
-    cell, calibration = calibrated
-    sigma = np.sqrt(np.diag(calibration.scan.covariance))[12:15]
-    error = calibration.scan.rail_direction - cell.truth.rail_direction
-    assert (sigma[1:] < 0.2e-3).all()
-    assert (np.abs(error) < 4 * sigma).all()
-
-
 @pytest.mark.parametrize(("checks", "most_alarms"), [(3, 0), pytest.param(20, 2, marks=pytest.mark.campaign)])
 def test_a_good_calibration_is_called_good(calibrated, checks, most_alarms):
     cell, calibration = calibrated
@@ -125,8 +117,7 @@ def test_a_change_that_does_little_to_the_place_is_told_and_not_called_bad(calib
     (focus,) = (d for d in disturbances() if d.name == "scan lens, 0.2 mm of focus")
     seen = looked_again(cell, calibration, focus.moved(cell.truth))
     verification = Verification.of(calibration, JOB, seen)
-    assert verification.verdict.changed
-    assert verification.good
+    assert verification.verdict.changed and verification.good
     summary = verification.summary()
     assert summary["verdict"] == "good, slightly changed"
     place = summary["place"]
@@ -222,8 +213,7 @@ def test_a_plate_of_the_witness_that_was_knocked_is_named(calibrated, angle):
     cell, calibration = calibrated
     seen = replace(look_again(cell, calibration), pointing=Pointing(angle, 1e-4), exit_point=EXIT)
     verification = Verification.of(calibration, JOB, seen)
-    assert not verification.good
-    assert verification.reason.startswith("the plate on the claw")
+    assert not verification.good and verification.reason.startswith("the plate on the claw")
     assert verification.summary()["witness"]["plate_moved"]
     # The place goes off by as much as the depth of what is swept, 130 mm away with the laser 35 mm beside.
     assert verification.misled == pytest.approx(abs(angle) * 0.130**2 / 0.035, rel=0.4)
@@ -281,8 +271,7 @@ def test_what_is_called_detectable_is_found_and_what_is_far_below_is_not(harsh):
         there = looked_again(cell, calibration, changed(cell.truth, replace(d, step=share * d.step)))
         found[share] += not verify(calibration.scan, calibration.target, there).good
     # Of 12 at 95 %, fewer than 10 are found once in fifty times; a quarter of the size is found little above chance.
-    assert found[1.0] >= 10
-    assert found[0.25] <= 2
+    assert found[1.0] >= 10 and found[0.25] <= 2
 
 
 def test_a_good_verdict_says_within_what(harsh):

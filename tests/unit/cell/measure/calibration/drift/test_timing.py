@@ -94,8 +94,7 @@ def test_it_is_known_to_a_tenth_of_a_millisecond_and_no_better_than_it_says() ->
     for seed in range(10):
         late = np.random.default_rng(100 + seed).uniform(-0.5e-3, 2e-3)
         found = find_timing(calibration(), here, sweeps(seed, late), MOST_LATE_S, LEAD_M, {})
-        assert found.sigma < 0.12e-3
-        assert abs(found.readout) < 0.1e-3
+        assert found.sigma < 0.12e-3 and abs(found.readout) < 0.1e-3
         assert found.play == pytest.approx(12e-6, abs=4 * found.play_sigma)
         off.append((found.late - late) / found.sigma)
     assert np.abs(off).max() < 3.5
@@ -236,5 +235,4 @@ def test_a_sweep_puts_late_stamps_back_and_is_surer_of_its_place() -> None:
     moved = before.rail[same] - after.rail[np.isin(after.frame_ids, before.frame_ids)]
     assert moved == pytest.approx(np.full(len(moved), 0.02 * FOUND.late), abs=0.3e-6)
     shares = [float(np.sqrt(np.linalg.eigvalsh(one.covariance)[-1])) for one in (before, after)]
-    assert shares[0] > 0.02 * MOST_LATE_S / np.sqrt(3)
-    assert shares[1] < 0.005e-3
+    assert shares[0] > 0.02 * MOST_LATE_S / np.sqrt(3) and shares[1] < 0.005e-3

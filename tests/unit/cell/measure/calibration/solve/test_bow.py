@@ -82,8 +82,7 @@ def test_the_bow_is_kept_with_the_calibration_and_varied_by_its_deviation() -> N
     # The normal is brought to length 1 again, which may change its last digit.
     assert again.light_plane.normal == pytest.approx(calibration.light_plane.normal, rel=1e-15, abs=1e-15)
     assert again.light_plane.distance == pytest.approx(calibration.light_plane.distance, rel=1e-15)
-    assert again.light_plane.bow == calibration.light_plane.bow
-    assert again.bow_sigma == calibration.bow_sigma
+    assert (again.light_plane.bow, again.bow_sigma) == (calibration.light_plane.bow, calibration.bow_sigma)
     bows = [variant.light_plane.bow for variant in again.variants()]
     assert bows[-1] - calibration.light_plane.bow == pytest.approx(calibration.bow_sigma)
     assert set(bows[:-1]) == {calibration.light_plane.bow}

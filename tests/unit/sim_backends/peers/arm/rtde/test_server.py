@@ -79,8 +79,7 @@ def test_an_emergency_stop_switches_off_until_the_arm_is_powered_again(arm: Clie
     arm.simulator.ask("emergency_stop")
     until(lambda: bool(arm.receive.isEmergencyStopped()))
     until(lambda: arm.receive.getRobotMode() == 3)
-    assert arm.receive.getSafetyMode() == 7
-    assert arm.receive.getRuntimeState() == 1
+    assert (arm.receive.getSafetyMode(), arm.receive.getRuntimeState()) == (7, 1)
     assert arm.receive.getRobotStatus() & 3 == 0
     assert not arm.control.moveJ(HOME.tolist(), 1.0, 1.0)
     assert dashboard(arm.simulator.address, "brake release", "robotmode")[1] == "Robotmode: POWER_OFF"
@@ -132,8 +131,7 @@ def test_clients_that_vanish_send_garbage_or_never_read_leave_the_others_alone(a
 
 def test_two_arms_run_side_by_side_and_a_client_can_leave_and_come_back(arm: Client) -> None:
     with ArmBench() as other:
-        assert other.address != arm.simulator.address
-        assert other.address.startswith("127.0.")
+        assert other.address != arm.simulator.address and other.address.startswith("127.0.")
         for offset in (0.1, 0.2):
             control = RTDEControlInterface(other.address)
             assert distance(se3(control.getForwardKinematics()), flange(HOME + offset - 0.1)) < 1e-9

@@ -105,5 +105,4 @@ SAME_NAME_TWICE = "def program():\n  def f(a, a):\n  end\nend\n"
     ],
 )
 def test_a_text_that_python_does_not_compile_is_a_compile_error(controller: Controller, text: str) -> None:
-    assert not controller.program.load(text)
-    assert controller.failed()
+    assert not controller.program.load(text) and controller.failed()

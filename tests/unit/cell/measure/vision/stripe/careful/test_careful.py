@@ -46,8 +46,7 @@ def test_pieces_of_a_line_that_are_much_wider_or_narrower_than_the_rest_are_read
         image, centres = line_of(width, seed)
         profile = extract(image)
         error = profile.centres - centres
-        assert np.isfinite(error).mean() > 0.98
-        assert np.nanmax(np.abs(error)) < 0.7
+        assert np.isfinite(error).mean() > 0.98 and np.nanmax(np.abs(error)) < 0.7
         for piece in np.array_split(np.arange(480), 3):
             score = np.sqrt(np.nanmean((error / profile.sigma)[piece] ** 2))
             assert 0.4 < score < 1.25, score

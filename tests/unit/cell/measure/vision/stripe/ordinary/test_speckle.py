@@ -15,11 +15,9 @@ SMALL = (256, 384)
 @pytest.mark.parametrize("cell", [Cell(1.2, 100, 0.2), Cell(2, 100, 0.2), Cell(3, 60, 0.5)])
 def test_the_stated_deviation_is_not_too_small_under_speckle(cell):
     row = measure(cell)
-    assert row["stated_over_true"] > 0.95
-    assert row["found"] > 0.98
+    assert row["stated_over_true"] > 0.95 and row["found"] > 0.98
     if cell.contrast < 0.3:
-        assert row["efficiency"] > 0.85
-        assert row["stated_over_true"] < 1.2
+        assert row["efficiency"] > 0.85 and row["stated_over_true"] < 1.2
 
 
 def test_in_a_stream_the_speckle_of_a_block_is_that_of_its_first_picture_with_a_stripe():
