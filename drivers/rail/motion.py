@@ -336,8 +336,7 @@ class ZeroCheck:
                 f"its reference switch went on between {shown(self._off_at, 'm')} and {shown(self._on_at, 'm')} by its "
                 "count"
             )
-        if not self._arrived():
-            return
+        # The edge is passed: what is left of the way tells nothing more.
         if self._off_at - self._on_at > SURE_M and self._creeps + 1 < MOST_CREEPS:
             # Readings came too late to tell.
             self._creeps += 1

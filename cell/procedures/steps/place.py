@@ -33,8 +33,9 @@ from statemachine.step import OnFailure, Step
 
 APPROACH_S = 1.8
 """About what the arm takes from the scan pose to where it feels for contact."""
-FEEL_M = 0.4e-3
-"""So far above the place it feels for contact where the part before touched within `ALIKE_M` of where it should."""
+FREE_M = 0.15e-3
+"""Where the part before touched within `ALIKE_M` of where it should, contact is felt for from so far above the highest
+touch that is allowed: one that comes earlier is then seen to, and what the force reads of nothing."""
 ALIKE_M = 0.1e-3
 FAST_FORCE = 3.0
 """Times the contact force at which the faster part of the descent ends: accelerating the part is felt as well."""
@@ -288,7 +289,7 @@ def _run_step(workplace: Workplace, context: StepContext) -> PlaceResult:
         aim.job, pose.base_from_surface, expected, mover=workplace.mover, arm=workplace.devices.arm,
         claw=workplace.devices.claw, part=workplace.part, check=context.check, progress=context.progress,
         note=lambda part: note_part(context, part),
-        ready=lambda: None if carriage is None else carriage.wait(30.0), feel=felt_from(workplace),
+        ready=lambda: None if carriage is None else carriage.wait(30.0), feel=felt_from(workplace, expected),
     )  # fmt: skip
     try:
         done = placing.put_down(not workplace.looks_after)
@@ -397,7 +398,7 @@ def carried_on(
     crept = together(scan.by_poses, lambda lines, rows: creep.motions(scan.cloud, lines, rows, sweep.times))
     still = replace(scan, cloud=creep.undone(scan.cloud, sweep.times), by_poses=crept)
     plan = workplace.job.place
-    until = APPROACH_S + felt_from(workplace) / plan.contact_speed
+    until = APPROACH_S + plan.contact_travel / plan.contact_speed
     pose = creep.carried(
         inverted(workplace, sweep, still, fix), workplace.devices.clock.now() + until / workplace.pace.share
     )
@@ -412,10 +413,12 @@ def carried_on(
     return pose
 
 
-def felt_from(workplace: Workplace) -> float:
+def felt_from(workplace: Workplace, expected: TouchHeight) -> float:
     """How far, m, above the place the arm feels for contact: less where the part before touched as expected."""
     off, travel = workplace.parts_before.touch_off, workplace.job.place.contact_travel
-    return travel if off is None or abs(off) > ALIKE_M else min(travel, FEEL_M)
+    if off is None or abs(off) > ALIKE_M:
+        return travel
+    return min(travel, expected.height + REFUSED * float(np.hypot(expected.sigma, FELT_M)) + FREE_M)
 
 
 def _looked_again(workplace: Workplace, pose: PlacePose, context: StepContext) -> SecondLook | None:

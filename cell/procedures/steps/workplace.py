@@ -45,9 +45,9 @@ PHOTO_RATE_HZ = 10.0
 """Frame rate while the station's board is photographed."""
 
 
-AGAIN_S, UNSEEN_AGAIN_S = 600.0, 120.0
-"""So long, s of the cell, a batch goes on by one look at the boards on deck and claw: what creeps creeps little, and a
-scan head that is bumped shows in where the placed parts lie. Less where nobody looks at those."""
+AGAIN_S = 600.0
+"""So long, s of the cell, a batch goes on by one look at the boards on deck and claw, where its placed parts are looked
+at: what creeps creeps little, and a scan head that was bumped shows in where they lie."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,8 +150,8 @@ class Workplace:
     @cached_property
     def look_before(self) -> HeadLook | None:
         """The look at the scan head that a part before this one had, if this one may go by it."""
-        look, lasts = self.parts_before.look, AGAIN_S if self.looks_after else UNSEEN_AGAIN_S
-        return look if look is not None and self.devices.clock.now() - look.at < lasts else None
+        look = self.parts_before.look if self.looks_after else None
+        return look if look is not None and self.devices.clock.now() - look.at < AGAIN_S else None
 
     @property
     def repeatability(self) -> Vector:
