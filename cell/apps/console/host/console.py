@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.host.link import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, ServerProcess, ServerSetup
@@ -23,11 +22,9 @@ from cell.apps.console.view.readings import cell_facts
 from cell.config.job import load_job
 from cell.procedures.steps.kinds import kind_of
 from cell.run.job_run import RunOutcome
+from cell.run.session.supervisor import Cell
 from drivers.errors import CellError, ConfigError, InterlockError
 from statemachine.runner import Script
-
-if TYPE_CHECKING:
-    from cell.run.session.supervisor import Cell
 
 LEAST_TOKEN = 32
 _LOOPBACK = "127.0.0.1"

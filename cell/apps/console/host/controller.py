@@ -11,7 +11,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cell.apps.console.host.manual import Manual, Press, Presses
 from cell.apps.console.host.part_queue import PartQueue
@@ -25,13 +25,10 @@ from cell.procedures.calibrate.verification import Verification
 from cell.procedures.steps.kinds import kind_of
 from cell.run.jogging import Jog
 from cell.run.runs import Run
+from cell.run.session.supervisor import Cell
 from drivers.errors import CellError, ConfigError, InterlockError, Measured, RefusedError
 from statemachine.runner import Again, Script
 from statemachine.step import Failure
-
-if TYPE_CHECKING:
-    from cell.run.session.supervisor import Cell
-
 
 LOOK_S = 0.05
 CONFIRM, AGAIN, ABORT = "confirm", "again", "abort"

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -26,12 +26,9 @@ from cell.config.job import Job
 from cell.devices.gate.gate import Gated
 from cell.run.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM, Jog, begin_program, moved
 from cell.run.recorded_work import CONFIRMED_BY_A_PERSON, WorkContext
+from cell.run.session.supervisor import Cell
 from drivers.errors import Aborted, CellError, ConfigError, DeviceError, DeviceFault, InterlockError, LimitError
 from drivers.interfaces import ATTENDED_S, Arm, Attended, Motion, Rail
-
-if TYPE_CHECKING:
-    from cell.run.session.supervisor import Cell
-
 
 LATE_S = 0.25
 """A beat that was longer under way than the quickest of its page by more than this is none: the button may be up."""

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.host.link import CloudPart, Happened, Show, ShownPicture
@@ -22,10 +22,8 @@ from cell.measure.geometry.poses import from_ur
 from cell.procedures.steps.kinds import kind_of
 from cell.run.folder import list_runs, read_report
 from cell.run.runs import Run
+from cell.run.session.supervisor import Cell
 from drivers.errors import CellError
-
-if TYPE_CHECKING:
-    from cell.run.session.supervisor import Cell
 
 PERIOD_S = 0.05
 EVERY = 2

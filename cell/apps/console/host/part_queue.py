@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
 
 from cell.run.runs import Run
+from cell.run.session.supervisor import Cell
 from drivers.errors import InterlockError
 from statemachine.step import Event
-
-if TYPE_CHECKING:
-    from cell.run.session.supervisor import Cell
 
 LOOK_S = 0.05
 """Wall seconds between two looks at what is wanted while the queue holds."""

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -25,12 +25,9 @@ from cell.devices.simulated.process import is_whole
 from cell.motion.kinematics import arm_kinematics
 from cell.procedures.steps.kinds import kind_of
 from cell.run.jogging import MAX_ANGLE_DEG, MAX_LENGTH_MM
+from cell.run.session.supervisor import Cell
 from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import ArmSafety, ArmState, Attended, RailState, VehicleState
-
-if TYPE_CHECKING:
-    from cell.run.session.supervisor import Cell
-
 
 OLD_S = 1.0
 """A reading that is older is not shown."""
