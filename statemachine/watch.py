@@ -1,12 +1,10 @@
 """Small pieces that keep a run in hand: work whose end can be awaited, and signals that are noted, not raised."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from collections.abc import Callable
 from types import FrameType
-from typing import Protocol
+from typing import Protocol, Self
 
 
 class RunClock(Protocol):
@@ -74,7 +72,7 @@ class EndSignals:
         self._previous: dict[int, object] = {}
         self._raised = False
 
-    def __enter__(self) -> EndSignals:
+    def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             for number in self._numbers:
                 if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
@@ -109,7 +107,7 @@ class SignalWatch:
         """What to tell the operator, or None if no signal came."""
         return None if self.number is None else said(self.number)
 
-    def __enter__(self) -> SignalWatch:
+    def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
                 self._previous[number] = signal.signal(number, self._note)

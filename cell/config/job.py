@@ -3,8 +3,6 @@
 Frames: place P (table top, z up), board D, nominal surface S, part Q. A mesh is named relative to the job file.
 """
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import dataclass
@@ -352,7 +350,7 @@ class Job(Table):
                 )
         return None
 
-    def of_item(self, number: int) -> Job:
+    def of_item(self, number: int) -> Self:
         """The job of an item, counted from 1: with its kind, nest, surface and stop. Items and stops leave nothing
         out."""
         assert self.nest is not None

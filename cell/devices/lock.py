@@ -1,7 +1,5 @@
 """The lock by which one process at a time holds the devices of a cell."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import hashlib
@@ -13,6 +11,7 @@ import tempfile
 from collections.abc import Collection
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Self
 
 from cell.config.cell_config import DEVICES, CellConfig
 from drivers.errors import InterlockError
@@ -37,7 +36,7 @@ class CellLock:
         self._addresses = {name: config.device(name).held for name in own}
         self._held = ExitStack()
 
-    def __enter__(self) -> CellLock:
+    def __enter__(self) -> Self:
         with ExitStack() as held:
             for device, address in self._addresses.items():
                 self._hold(held, device, address)

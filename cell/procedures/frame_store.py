@@ -1,13 +1,12 @@
 """Keeps the frames of a run as PNG files, written by a thread of its own so that no sweep waits for the disk."""
 
-from __future__ import annotations
-
 import hashlib
 import queue
 import threading
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
@@ -140,7 +139,7 @@ class FrameStore:
                 self._failure = f"{path}: {error}"
             picture.give(data)
 
-    def __enter__(self) -> FrameStore:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -4,9 +4,8 @@ They follow from where the part was seen, which its faces tell as a whole, and f
 themselves; each has a tolerance of its own.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 import pinocchio as pin
@@ -47,7 +46,7 @@ class FeatureSeen:
     def of(
         cls, section: FeatureSection, seen: pin.SE3, belongs: pin.SE3, *, motions: Vector, percent: float,
         own: LocalDeviation = NOT_SEEN,
-    ) -> FeatureSeen:  # fmt: skip
+    ) -> Self:  # fmt: skip
         """Of a part that was `seen`, and that `belongs` elsewhere, both surface_from_part.
 
         `motions` (n, 6), m and rad, surface axes, about the part's origin, are drawn from what is not known of it; the

@@ -1,7 +1,5 @@
 """One job as a recorded run: read and checked, calibrated for if need be, run, and reported."""
 
-from __future__ import annotations
-
 import logging
 import os
 import time
@@ -9,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pinocchio as pin
 
@@ -70,7 +68,7 @@ class ReadyJob:
     @classmethod
     def read(
         cls, file: str | Path, config: CellConfig, until: str | None, script: Script, *, calibrates: bool = False
-    ) -> ReadyJob:
+    ) -> Self:
         """From its file or by its name; `ConfigError` when it does not fit the cell or has no such step.
 
         With `calibrates` the cell may be calibrated first, with this job's part in the claw.

@@ -1,14 +1,12 @@
 """Which run can be resumed, and with what: its job as it was, and its sweep if that may still hold."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import NoneType
-from typing import Any
+from typing import Any, Self
 
 from cell.config.calibrations.store import CellCalibration
 from cell.config.cell_config import CellConfig
@@ -38,7 +36,7 @@ class UnfinishedRun:
     held: HeldPart | None = None
 
     @classmethod
-    def find(cls, folder: Path, *, scripted: bool = False) -> UnfinishedRun:
+    def find(cls, folder: Path, *, scripted: bool = False) -> Self:
         """The run in `folder`; `ConfigError` when it came to an end of its own, or its job is another one by now.
 
         A run that a script looked at is only found for one that is `scripted` as well.

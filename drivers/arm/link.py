@@ -11,8 +11,6 @@ cannot be known from outside: how long the controller held the joints' angles ba
 Source: the maker's RTDE guide, version 2; docs/reference/protocols.md, section 1.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import select
@@ -26,6 +24,7 @@ import threading
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
+from typing import Self
 
 from drivers.arm.faults import fault
 from drivers.arm.feed import UNANSWERED, ChildReply, ChildRequest, ChildSetup, Ended, Lost, Snapshot
@@ -300,7 +299,7 @@ class RtdeLink:
         self._socket = socket.create_connection((address, PORT), timeout=timeout)
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
-    def __enter__(self) -> RtdeLink:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *error: object) -> None:

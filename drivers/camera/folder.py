@@ -4,8 +4,6 @@
 were lost, frame (the number of the exposure). The recording's clock is laid on the host's anew when an acquisition
 begins. How that lies to other devices' clocks nobody knows, so its times are unlimited in their error."""
 
-from __future__ import annotations
-
 import csv
 import math
 import threading
@@ -13,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
@@ -184,7 +183,7 @@ class RecordedCamera:
             return self.next(timeout)
 
     @contextmanager
-    def stream(self) -> Iterator[RecordedCamera]:
+    def stream(self) -> Iterator[Self]:
         """The remaining pictures, the first one's exposure beginning now."""
         with self._exclusive():
             self._begin()

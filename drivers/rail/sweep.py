@@ -9,11 +9,10 @@ The counter held at some instant between request and reply, wherever in between.
 other: a reading before and one after a place confine the time at which it was passed, so the shortest round trips tell
 the time and slow ones do no harm. What all replies are late by stays unknown, and is stated."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -86,7 +85,7 @@ class EvenMotion:
     residual: float
 
     @classmethod
-    def of(cls, times: Vector, positions: Vector, round_trips: Vector) -> EvenMotion:
+    def of(cls, times: Vector, positions: Vector, round_trips: Vector) -> Self:
         """From (n,) readings: host time of the middle of the round trip in s, position in m, round trip in s.
 
         The line is that of `fit_line`, moved to where the readings confine it should it lie outside.

@@ -5,11 +5,9 @@ light plane meets the optical axis at the same distance Z0, and those with the s
 give, and which rule chooses 35 mm.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,7 +31,7 @@ class Head:
     theta: float
 
     @classmethod
-    def at_stand_off(cls, baseline: float, focal: float) -> Head:
+    def at_stand_off(cls, baseline: float, focal: float) -> Self:
         """The head whose light plane meets the optical axis at `STAND_OFF` (equation 6)."""
         return cls(baseline, focal, float(np.arctan2(STAND_OFF, baseline)))
 

@@ -5,15 +5,13 @@ flange truly is differs by what that calibration has left, and by a repeatabilit
 rest.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from enum import Enum, IntEnum
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -99,7 +97,7 @@ class ArmParams:
     serial: str = "20235500001"
 
     @classmethod
-    def of(cls, model: str, **others: Any) -> ArmParams:
+    def of(cls, model: str, **others: Any) -> Self:
         """Those of the maker's `model`, a key of `TABLES`, with `others` as given."""
         given = {"dh": TABLES[model].copy(), "speed_limits": np.radians(SPEED_LIMITS[model]), **others}
         return cls(model=model, **given)

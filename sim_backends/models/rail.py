@@ -4,11 +4,10 @@ Motion is kept as a time line of constant-acceleration pieces in motor turns, so
 may ask for the recent past. The controller counts microsteps; only `carriage` knows where the carriage really is.
 """
 
-from __future__ import annotations
-
 import threading
 from bisect import bisect_right
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
@@ -35,7 +34,7 @@ class RailParams:
     serial: int = 1
     firmware: tuple[int, int] = (1, 12)
 
-    def around(self, travel: tuple[float, float]) -> RailParams:
+    def around(self, travel: tuple[float, float]) -> Self:
         """The same for a usable `travel`, m: the home switch at 0, the others 2 mm and the ends 4 mm beyond both."""
         low, high = min(0.0, travel[0]), max(0.0, travel[1])
         return replace(self, travel=travel, switches=(low - 0.002, high + 0.002), ends=(low - 0.004, high + 0.004))

@@ -3,10 +3,9 @@
 Plain records without behaviour; every pose is a 4×4 matrix that maps the object's coordinates into the camera frame.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, field
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,7 +46,7 @@ class Board:
             )
 
     @classmethod
-    def parse(cls, spec: str) -> Board:
+    def parse(cls, spec: str) -> Self:
         """Make a board of a text such as `marked_dots:9x7:20mm`; `ValueError` if it is not one."""
         match = re.fullmatch(r"(\w+):(\d+)x(\d+):([\d.]+)\s*(mm|cm|m)", spec)
         if match is None:

@@ -1,7 +1,5 @@
 """Progress bars while a run goes on, and while a first run compiles."""
 
-from __future__ import annotations
-
 import getpass
 import os
 import select
@@ -11,6 +9,7 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
+from typing import Self
 
 from rich.console import Console
 from rich.markup import escape
@@ -101,7 +100,7 @@ class ProgressDisplay:
         plain = self.console.options.ascii_only
         self._good, self._bad = ("+", "!") if plain else ("[green]✓", "[red]✗")
 
-    def __enter__(self) -> ProgressDisplay:
+    def __enter__(self) -> Self:
         self._progress.start()
         if self._compiles:
             self._watch.start()

@@ -4,8 +4,6 @@ The line that says so is kept for the job, and shown by `cell run` while it hold
 compared world by world: the difference in yield and in each figure.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -13,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -124,7 +123,7 @@ class JobAnswer:
     @classmethod
     def of_rows(
         cls, of: QualifiedCode, level: str, *, first: int, rows: Sequence[Row], command: Callable[[Row], str], date: str
-    ) -> JobAnswer:
+    ) -> Self:
         """The answer of these rows; `command(row)` repeats a world."""
         good = [row for row in rows if row["outcome"] in GOOD]
         counts = Counter(str(row["outcome"]) for row in rows)

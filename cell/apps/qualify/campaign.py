@@ -3,13 +3,12 @@
 The answer is that of the first n seeds. n depends on their outcomes alone, not on how many workers there are.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 
 from cell.apps.qualify.identity import QualifiedCode, require_seeds
 from cell.apps.qualify.intervals import Share
@@ -34,7 +33,7 @@ class Target:
     half_width: float | None = None
 
     @classmethod
-    def of(cls, seeds: int | None, until: str | None, most: int | None) -> Target:
+    def of(cls, seeds: int | None, until: str | None, most: int | None) -> Self:
         """From what was typed. `ConfigError` for what is no target."""
         if seeds is not None:
             if until is not None or most is not None:

@@ -1,13 +1,12 @@
 """What the rows of a campaign are of: the hashes of job, configuration and code, and the key of one world."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from typing import Self
 
 from cell.config.cell_config import NO_FILES, CellConfig
 from cell.config.job import job_and_item, load_job
@@ -32,7 +31,7 @@ class QualifiedCode:
     code_hash: str
 
     @classmethod
-    def of(cls, job: str | Path, config: CellConfig) -> QualifiedCode:
+    def of(cls, job: str | Path, config: CellConfig) -> Self:
         """Of the job of this file or name. Raises `ConfigError` where there is none."""
         whole, number = job_and_item(job)
         name = load_job(whole)[0].job.name.partition("#")[0]

@@ -3,8 +3,6 @@
 Which numbers mean what is not decided here (`conventions.py`); only names that say it themselves are kept.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import re
@@ -12,7 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 from xml.etree import ElementTree
 
 import numpy as np
@@ -330,7 +328,7 @@ class _TableLine(NamedTuple):
     words: list[str]
 
     @classmethod
-    def of(cls, text: str) -> _TableLine:
+    def of(cls, text: str) -> Self:
         separator = r"[;\t]" if re.search(r"[;\t]", text) else "," if "," in text else r"\s+"
         cells = [cell.strip().strip("\"'") for cell in re.split(separator, text)]
         words = [word for word in re.split(r"[\s,;=()\[\]{}\"']+", NUMBER.sub(" ", text)) if word]
@@ -455,7 +453,7 @@ class _Half(NamedTuple):
     turns: bool
 
     @classmethod
-    def of(cls, path: Path, where: str, rows: Array) -> _Half:
+    def of(cls, path: Path, where: str, rows: Array) -> Self:
         words = re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", f"{path.stem} {where}").lower())
         roles = [found for word in words if (found := HALVES.fullmatch(word))]
         turns = rows.shape[1] != 3 or (bool(roles) and not any(found[1] for found in roles))

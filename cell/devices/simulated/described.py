@@ -3,12 +3,11 @@
 What cannot be simulated as it is described is refused here, before anything is started.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 import pinocchio as pin
@@ -44,7 +43,7 @@ class Described:
     mesh: Path
 
     @classmethod
-    def of(cls, job: str | Path) -> Described:
+    def of(cls, job: str | Path) -> Self:
         """The job of that file or name. Raises `ConfigError`."""
         return cls(*load_job(job))
 

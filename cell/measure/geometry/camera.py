@@ -4,11 +4,9 @@ Camera frame: x right, y down, z into the scene, origin at the projection centre
 upper left pixel. The coefficients are OpenCV's k1, k2, p1, p2, k3, so that its calibrations can be used as they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -40,7 +38,7 @@ class CameraModel:
         """The nine parameters in the order of `PARAMETER_NAMES`."""
         return np.array([self.fx, self.fy, self.cx, self.cy, *self.dist])
 
-    def with_parameters(self, values: ArrayLike) -> CameraModel:
+    def with_parameters(self, values: ArrayLike) -> Self:
         """The same sensor with other parameters, in the order of `PARAMETER_NAMES`."""
         fx, fy, cx, cy, k1, k2, p1, p2, k3 = (float(v) for v in np.asarray(values, dtype=np.float64))
         return replace(self, fx=fx, fy=fy, cx=cx, cy=cy, dist=(k1, k2, p1, p2, k3))
@@ -50,7 +48,7 @@ class CameraModel:
         return {"width": self.width, "height": self.height, "parameters": self.parameters.tolist()}
 
     @classmethod
-    def read(cls, data: Mapping[str, Any]) -> CameraModel:
+    def read(cls, data: Mapping[str, Any]) -> Self:
         """From storage; KeyError, TypeError or ValueError when it is none."""
         sensor = cls(int(data["width"]), int(data["height"]), 1.0, fy=1.0, cx=0.0, cy=0.0)
         return sensor.with_parameters(data["parameters"])

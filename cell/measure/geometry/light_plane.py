@@ -4,9 +4,8 @@ A sheet may be bowed across the stripe's length:
 what lens and laser leave of it, a few hundredths of a millimetre. docs/explanation/theory.md, section 2.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,7 +36,7 @@ class LightPlane:
             raise ValueError(f"the normal of a light plane must have length 1, not {length:.6g}: use LightPlane.of")
 
     @classmethod
-    def of(cls, normal: ArrayLike, distance: float) -> LightPlane:
+    def of(cls, normal: ArrayLike, distance: float) -> Self:
         """The plane normal·P = distance with a normal of any length but zero; one of length 1 is kept to the bit."""
         n = np.asarray(normal, dtype=np.float64)
         length = float(np.linalg.norm(n))
@@ -50,12 +49,12 @@ class LightPlane:
         return cls((x, y, z), float(distance) / length)
 
     @classmethod
-    def from_baseline(cls, baseline: float, theta: float) -> LightPlane:
+    def from_baseline(cls, baseline: float, theta: float) -> Self:
         """The paper's set-up: laser at (−baseline, 0, 0) in m, plane X = −baseline + Z cot(theta), theta in rad."""
         return cls.of((1.0, 0.0, -1.0 / np.tan(theta)), -baseline)
 
     @classmethod
-    def fit(cls, points: ArrayLike) -> LightPlane:
+    def fit(cls, points: ArrayLike) -> Self:
         """Least-squares plane of points (n, 3). Paper, step 5 of section 4.1."""
         p = np.asarray(points, dtype=np.float64)
         centre = p.mean(axis=0)
@@ -64,7 +63,7 @@ class LightPlane:
             normal = -normal
         return cls.of(normal, float(normal @ centre))
 
-    def bowed(self, bow: float) -> LightPlane:
+    def bowed(self, bow: float) -> Self:
         """The same plane with this bow (1: metres off the plane, per m² beside its middle and per 1/m of depth)."""
         return replace(self, bow=float(bow))
 

@@ -8,11 +8,10 @@ A seam says how well two sweeps agree where they overlap. Its figure holds all t
 one sweep: the arm's repeatability, the vehicle's lean, and calibration errors that two poses of the head do not share.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 import scipy
@@ -97,7 +96,7 @@ class Cloud:
         ends = np.searchsorted(self.sweeps, np.arange(int(self.sweeps.max()) + 2))
         return [slice(int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
-    def of_sweep(self, number: int) -> Cloud:
+    def of_sweep(self, number: int) -> Self:
         """The measured points of one of its sweeps, as a cloud of their own."""
         lines = self.each_sweep()[number]
         names = ("points", "stripe_spread", "rail_spread", "centres", "rail", "rejected", "flanges")
@@ -127,7 +126,7 @@ class Cloud:
         b = np.einsum("ni,ni->n", self.rail_spread[lines], directions)
         return np.asarray(np.hypot(a, b), dtype=np.float64)
 
-    def require(self, least_points: int = 500) -> Cloud:
+    def require(self, least_points: int = 500) -> Self:
         """The cloud itself; raises `RefusedError` when it has fewer than `least_points` measured points."""
         if self.size < least_points:
             raise RefusedError(

@@ -5,12 +5,11 @@ turned mount, a joint with a new zero or a bumped board does, shows alike: the b
 it.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Self
 
 import numpy as np
 import pinocchio as pin
@@ -58,7 +57,7 @@ class InterimCheck:
     @classmethod
     def of(
         cls, calibration: CellCalibration, job: Job, looks: Sequence[ScanObservation], middle: float
-    ) -> InterimCheck:  # fmt: skip
+    ) -> Self:  # fmt: skip
         """From photographs of the fine board, each from a rest of its own; raises what `interim_view` raises.
 
         `middle` is where the rail stands in the middle of a sweep, m: a head that turns takes its rail along.

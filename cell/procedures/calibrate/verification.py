@@ -5,14 +5,12 @@ arm's repeatability. What the board shows of the laser is kept with the calibrat
 claw, which may have been knocked. The decision is `cell.measure.calibration.drift.decision`'s.
 """
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pinocchio as pin
@@ -294,7 +292,7 @@ class Verification:
     misled: float = 0.0
 
     @classmethod
-    def of(cls, calibration: CellCalibration, job: Job, seen: CheckObservations) -> Verification:
+    def of(cls, calibration: CellCalibration, job: Job, seen: CheckObservations) -> Self:
         """Compare what was seen with the calibration, and reckon the effect for a job."""
         scan, effect = calibration.scan, at_place(calibration, job)
         witness = check_witness(scan, seen)

@@ -1,11 +1,9 @@
 """What a run was judged by: its measured figures beside their limits, and what it looked at when it was refused."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pinocchio as pin
@@ -42,7 +40,7 @@ class RefusalEvidence:
     seen: Mapping[str, object]
 
     @classmethod
-    def of(cls, result: RunResult) -> RefusalEvidence:
+    def of(cls, result: RunResult) -> Self:
         """What the error behind the end of a run shows; nothing for other ends."""
         error = result.error
         if result.outcome in JUDGED and isinstance(error, RefusedError):

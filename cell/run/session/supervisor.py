@@ -4,14 +4,12 @@ with Cell.open("cell.toml", sim="all", seed=7) as cell:
     result = cell.run(job="pot")
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Self, TypeVar
 
 from cell.base.compiled import load
 from cell.base.lateness import LATENESS
@@ -80,7 +78,7 @@ class Cell:
         cls, config: str | Path | None = None, *, sim: Sim = None, seed: int = 1, level: str = "nominal",
         speed: float | None = None, job: str | Path = "pot", confirm: Confirm | None = None,
         only: Collection[str] = tuple(DEVICES), clock: str = "wall", truth: str | Path | None = None,
-    ) -> Cell:  # fmt: skip
+    ) -> Self:  # fmt: skip
         """Connect to the cell's devices and hold them; or start a simulated cell and hold that.
 
         Args:
@@ -116,7 +114,7 @@ class Cell:
         cell._signals.__enter__()
         return cell
 
-    def __enter__(self) -> Cell:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:

@@ -1,13 +1,11 @@
 """What each act does: to the world, to the computer that the cell runs on, and to the files of a run that is left."""
 
-from __future__ import annotations
-
 import resource
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -52,7 +50,7 @@ class Computer:
     A full disk is the process's limit of a file's size: nothing that is written makes a file longer.
     """
 
-    def __enter__(self) -> Computer:
+    def __enter__(self) -> Self:
         self._limits = resource.getrlimit(resource.RLIMIT_FSIZE)
         self._time, self._strftime = time.time, time.strftime
         self._ahead = 0.0
@@ -91,7 +89,7 @@ class LeftRun:
     files: dict[str, bytes]
 
     @classmethod
-    def taken(cls, folder: Path, entry: Entry) -> LeftRun:
+    def taken(cls, folder: Path, entry: Entry) -> Self:
         """Take the files as they are now; a power cut has torn one of them."""
         files = {name: (folder / name).read_bytes() for name in JOURNAL_FILES if (folder / name).exists()}
         if entry.act == POWER_CUT:

@@ -1,10 +1,9 @@
 """A schedule: which job in which world, and what happens to it when. It is data, drawn from a seed by one function."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Self
 
 import numpy as np
 
@@ -74,7 +73,7 @@ class Schedule:
         return json.dumps(plain)
 
     @classmethod
-    def from_json(cls, text: str) -> Schedule:
+    def from_json(cls, text: str) -> Self:
         """From such a line; ValueError for one that is none."""
         try:
             plain = json.loads(text)
@@ -87,7 +86,7 @@ class Schedule:
                 raise ValueError(f"{entry.act!r} or {entry.meanwhile!r} is no act: {', '.join((*FAULTS, *ACTS))}")
         return made
 
-    def without(self, number: int) -> Schedule:
+    def without(self, number: int) -> Self:
         """This one less an entry."""
         return replace(self, entries=self.entries[:number] + self.entries[number + 1 :])
 

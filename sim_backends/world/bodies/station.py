@@ -1,9 +1,8 @@
 """The station of one scene as bodies: the surface as it is felt and as it is seen, and how far it reaches."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +33,7 @@ class Station:
     part_seen: Mesh | None = None
 
     @classmethod
-    def of(cls, drawn: StationDrawing) -> Station:
+    def of(cls, drawn: StationDrawing) -> Self:
         """The station as drawn. Raises ValueError for an unknown surface or a file that is no mesh."""
         if not drawn.mesh:
             ground, seen = named_surface(drawn.surface), _closed_form(drawn.surface, drawn.waviness)

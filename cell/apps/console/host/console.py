@@ -4,8 +4,6 @@ with Console(cell, "pot") as console:
     print(console.link)
 """
 
-from __future__ import annotations
-
 import logging
 import socket
 import ssl
@@ -14,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.host.link import Answer, AskCell, Beat, Do, Joined, Left, Ready, Say, ServerProcess, ServerSetup
@@ -118,7 +117,7 @@ class Console:
         )  # fmt: skip
         self._look.start()
 
-    def __enter__(self) -> Console:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -6,11 +6,9 @@ same there and does the same to depths. A roll about the beam leaves the line's 
 it tilts a scan by as many times its angle as the sheet is steep. docs/explanation/theory.md, section 7.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -111,7 +109,7 @@ class PlateLine:
         return {"rail": self.rail, "height": len(self.columns), "rows": rows.tolist(), **values, "edge": edge}
 
     @classmethod
-    def read(cls, data: dict[str, Any] | None) -> PlateLine | None:
+    def read(cls, data: dict[str, Any] | None) -> Self | None:
         """From storage; KeyError, TypeError, ValueError or IndexError when it is none."""
         if data is None:
             return None
@@ -148,7 +146,7 @@ class Pointing:
         return rest if abs(rest) > NOTED_RAD else 0.0
 
     @property
-    def stated(self) -> Pointing:
+    def stated(self) -> Self:
         """With the deviation that a job has to reckon with, which has nothing but the plate to go by."""
         return replace(self, sigma=float(np.hypot(self.sigma, self.open)))
 
@@ -194,7 +192,7 @@ class ConfirmedTurn:
         return Pointing(turn, float(np.hypot(seen.sigma, self.sigma)), self.turn)
 
     @classmethod
-    def read(cls, data: dict[str, Any] | None) -> ConfirmedTurn | None:
+    def read(cls, data: dict[str, Any] | None) -> Self | None:
         """From storage; KeyError, TypeError or ValueError when it is none."""
         if data is None:
             return None

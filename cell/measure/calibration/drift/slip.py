@@ -8,10 +8,9 @@ Between full verifications every job looks at the fine board once, too. The arm 
 time, so one look is blunt: one that chance seldom brings is repeated, and all looks together decide.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 import scipy
@@ -168,7 +167,7 @@ class WitnessCheck:
     wrong: Array
 
     @classmethod
-    def of(cls, plate: Pointing, exit_point: Array, state: AdjustmentState, weighed: DriftEvidence) -> WitnessCheck:
+    def of(cls, plate: Pointing, exit_point: Array, state: AdjustmentState, weighed: DriftEvidence) -> Self:
         """From what the plate shows and the `weighed` evidence of the board against the calibrated `state`."""
         assert state.plane is not None
         there = turned(state.plane, exit_point, _STEP)
@@ -240,7 +239,7 @@ class HeadShift:
     looks: int
 
     @classmethod
-    def of(cls, state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements]) -> HeadShift:
+    def of(cls, state: AdjustmentState, reference: Reference, looks: Sequence[PictureMeasurements]) -> Self:
         """From pictures of the board, each from a rest of its own, beside the calibrated `state`.
 
         A head that slipped is shifted or turned, seldom both, so each is held against chance by itself.

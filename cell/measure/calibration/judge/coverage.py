@@ -5,11 +5,9 @@ each has two figures: what its own deviation does alone, and what is left when i
 from the adjustment's own information; whether the arm reaches a view is not asked.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import pinocchio as pin
@@ -50,7 +48,7 @@ class Coverage:
     rail: Array
 
     @classmethod
-    def of(cls, joint: Joint) -> Coverage:
+    def of(cls, joint: Joint) -> Self:
         """At the solution of a joint adjustment."""
         state = joint.adjusted.state
         dots, off, stripe, away, reach = [], [], [], [], []

@@ -1,10 +1,9 @@
 """Is the light plane a plane, and is it known? Straight stripes, stripes of another line, scatter, flatness."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -102,7 +101,7 @@ class PlaneKnown:
     @classmethod
     def of(
         cls, plane: LightPlane, others: Sequence[LightPlane], cloud: Array, moved: Sequence[LightPlane] = ()
-    ) -> PlaneKnown:
+    ) -> Self:
         """`others` (n) lack one frame each; `moved` are as `planes_of_cameras` gives them.
 
         `cloud` (m, 3) in m is where the plane was seen.

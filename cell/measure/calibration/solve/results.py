@@ -1,10 +1,8 @@
 """A camera's calibration from its observations, and what it gives, for scan head and target camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 import pinocchio as pin
@@ -50,7 +48,7 @@ class Quality:
     held_out_stripe: float | None
 
     @classmethod
-    def of(cls, joint: Joint) -> Quality:
+    def of(cls, joint: Joint) -> Self:
         """The figures of a joint adjustment."""
         a = joint.adjusted
         lit = a.state.plane is not None
@@ -94,7 +92,7 @@ class ScanCalibration:
     refused: str = ""
 
     @classmethod
-    def of(cls, joint: Joint) -> ScanCalibration:
+    def of(cls, joint: Joint) -> Self:
         """What a joint adjustment with a stripe found."""
         state, reference, bow = joint.adjusted.state, Reference.of(joint.adjusted), joint.adjusted.bow or FLAT
         assert state.plane is not None
@@ -119,7 +117,7 @@ class ScanCalibration:
         """What triangulation needs."""
         return ScanGeometry(self.camera, self.light_plane, self.rail_direction, self.flange_from_camera)
 
-    def pointed(self, pointing: Pointing, exit_point: Array) -> ScanCalibration:
+    def pointed(self, pointing: Pointing, exit_point: Array) -> Self:
         """With the light plane as the laser points now; `exit_point` (3,) of the laser in m, camera frame, as drawn."""
         plane = rolled(turned(self.light_plane, exit_point, pointing.turn), exit_point, pointing.roll)
         return replace(self, light_plane=plane, pointing=pointing, exit_point=exit_point)
@@ -175,7 +173,7 @@ class ScanCalibration:
         )
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> ScanCalibration:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
         """From storage; KeyError, TypeError or ValueError when it is not one."""
         plane, unread = data["light_plane"], []
 
@@ -217,7 +215,7 @@ class TargetCalibration:
     reference: Reference | None = None
 
     @classmethod
-    def of(cls, joint: Joint) -> TargetCalibration:
+    def of(cls, joint: Joint) -> Self:
         """What a joint adjustment found."""
         state = joint.adjusted.state
         return cls(
@@ -240,7 +238,7 @@ class TargetCalibration:
         }
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> TargetCalibration:
+    def from_dict(cls, data: dict[str, Any]) -> Self:
         """From storage; KeyError, TypeError or ValueError when it is not one."""
         return cls(
             CameraModel.read(data["camera"]), from_matrix(data["flange_from_camera"]),

@@ -5,11 +5,10 @@ What is fixed to the surface is wear or oil, what stays with the rows is the sen
 with the pose; BIC compares them (docs/explanation/theory.md, section 8). No scan is accepted for it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Self
 
 import numpy as np
 import pinocchio as pin
@@ -144,7 +143,7 @@ class _Cells:
     @classmethod
     def of(
         cls, cloud: Cloud, nominal: NominalSurface, pose: pin.SE3, times: Array, base_from_vehicle: pin.SE3
-    ) -> _Cells | None:
+    ) -> Self | None:
         scan, (lines, rows) = Scan.of(cloud, MOST_POINTS), cloud.subsample(MOST_POINTS)
         found = correspondences(pose, scan, nominal, GATE_M)
         line, row, normals, points = lines[found.index], rows[found.index], found.normals, scan.points[found.index]

@@ -4,11 +4,9 @@ The kinds of calibration boards and their names, such as `marked_dots:9x7:20mm` 
 
 Board frame: origin at the first dot or inner corner, x along a row, y down the rows, z into the board."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, Self
 
 import cv2
 import numpy as np
@@ -240,7 +238,7 @@ class BoardView:
         """The points (n, 3) in the board frame in m, in the order of `ids`."""
         return self.spec.points()[self.ids]
 
-    def turns(self) -> list[BoardView]:
+    def turns(self) -> list[Self]:
         """This view and those with the other orders that the board's symmetry allows."""
         if not self.order_assumed:
             return [self]

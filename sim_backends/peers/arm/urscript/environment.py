@@ -4,8 +4,6 @@ Lists are added and scaled element by element; a pose is a list of six that prin
 can reach begin with `u_`, so that a script reaches nothing else of an object. Source: the maker's script manual.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 import operator
@@ -13,7 +11,7 @@ import random
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, SupportsIndex, TypeAlias
+from typing import Any, Self, SupportsIndex, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -49,7 +47,7 @@ class List(list[Value]):
         """Change the element at a whole number."""
         list.__setitem__(self, _whole(index), value)
 
-    def _each(self, other: object, act: Callable[[object, object], Value]) -> List:
+    def _each(self, other: object, act: Callable[[object, object], Value]) -> Self:
         if isinstance(other, list):
             if len(other) != len(self):
                 raise TypeError(f"lists of {len(self)} and {len(other)} elements")
@@ -60,22 +58,22 @@ class List(list[Value]):
         """Element by element."""
         return self._each(other, operator.add)
 
-    def __sub__(self, other: object) -> List:
+    def __sub__(self, other: object) -> Self:
         """Element by element."""
         return self._each(other, operator.sub)
 
-    def __mul__(self, other: object) -> List:
+    def __mul__(self, other: object) -> Self:
         """By a number, or element by element."""
         return self._each(other, operator.mul)
 
     __rmul__ = __mul__
     __radd__ = __add__
 
-    def __truediv__(self, other: object) -> List:
+    def __truediv__(self, other: object) -> Self:
         """By a number, or element by element."""
         return self._each(other, operator.truediv)
 
-    def __neg__(self) -> List:
+    def __neg__(self) -> Self:
         """Each element's opposite."""
         values: Iterable[Any] = self
         return type(self)(-value for value in values)
