@@ -56,7 +56,6 @@ class _Switch:
         self._output = output
 
     def identity(self) -> Identity:
-        """The arm's identity, with the output as the address."""
         arm = self._arm.identity()
         return Identity(f"switch on {arm.model}", arm.serial, arm.firmware, f"{arm.address} output {self._output}")
 

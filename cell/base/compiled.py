@@ -55,7 +55,6 @@ def is_kept(function: Callable[..., object]) -> bool:
 
 @cache
 def _numba() -> Any:
-    """The library; None where it cannot compile."""
     try:
         import numba
 

@@ -152,7 +152,6 @@ def seen_faces(job: Job) -> NominalSurface | None:
 
 
 def _sweeps(job: Job, config: CellConfig, base_from_surface: pin.SE3, over: str = "scan, surface") -> Iterator[Goal]:
-    """Where each sweep begins and ends, run-ups included."""
     for k, plan in enumerate(photograph.scan_plans(config, job, base_from_surface, nominal_scan(config))):
         way = plan.base_from_flange_end.translation - plan.base_from_flange.translation
         run_up = RUN_UP_S * job.scan.speed * way / max(float(np.linalg.norm(way)), 1e-9)

@@ -200,7 +200,6 @@ class Planner:
             raise self.collisions.error(f"{what} at {motion.times[touch.sample]:.2f} s", touch.pairs)
 
     def _path(self, start: Joints, end: Joints, allowed: tuple[Pair, ...]) -> NDArray[np.float64]:
-        """Corners (n, 6) rad of a free way, straight between them."""
         direct = np.stack([start, end])
         touch = first_touch(self.collisions, direct, allowed)
         if touch is None:

@@ -121,7 +121,6 @@ def _later(folder: Path) -> Iterator[tuple[Path, JournalRecord]]:
 
 
 def _part(record: JournalRecord) -> object:
-    """What a run tells last of its part."""
     return next((e.data["part"] for e in reversed(record.events) if "part" in e.data), PartState.HELD.value)
 
 

@@ -47,7 +47,6 @@ def table1(seeds: SeedsOption = 20, json: JsonOption = False, out: OutOption = N
 
 
 def _show(result: dict[str, object], json: bool, out: Path | None, name: str) -> None:
-    """Print as JSON or as tables, and keep the numbers in the folder."""
     show(result, json)
     if out is not None:
         from cell.run.folder import write_json

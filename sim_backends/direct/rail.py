@@ -341,7 +341,6 @@ class DirectRail(DirectDevice):
         return CarriageWatch(self.name, self.clock, length)
 
     def _set_up(self) -> None:
-        """Tell the module what it forgets when it is reset."""
         setup = self.setup
         self.model.configure(
             self.clock.now(),

@@ -370,7 +370,6 @@ class ArmModel:
         return np.array([0.0, 0.0, -(params.carried - mass) * GRAVITY, -y * GRAVITY, x * GRAVITY, 0.0])
 
     def _true_pose(self, table: Matrix) -> TruePose:
-        """Where the flange of an arm truly is whose controller computes with `table` (6, 4)."""
         params = self.params
         true = Kinematics(table + params.dh_error)
         bends = params.harmonics.any() or params.compliance > 0.0

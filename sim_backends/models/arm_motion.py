@@ -166,7 +166,6 @@ class LinearMove(SimulatedMotion):
         return done
 
     def _joints(self, drive: JointDrives, time: float, dt: float) -> Vector:
-        """The joint angles at `time` of the profile, `dt` from now."""
         distance, _ = self._profile.at(time)
         fraction = distance / self._profile.length if self._profile.length > 0 else 1.0
         q = drive.kinematics.refine(self._pose(fraction).dot(self._tcp_from_flange), drive.q + dt * drive.qd)

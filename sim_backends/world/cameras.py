@@ -129,7 +129,6 @@ class Cameras:
         return [PlaneInstance(pose, drawing.WITNESS_SIZE, WITNESS_ALBEDO)] if (corners[:, 0] > left).any() else []
 
     def _part(self, station: Station, pose: Pose) -> list[SceneObject]:
-        """The station's part, if it has a shape and the camera may see any of it."""
         mesh, optics = station.part_seen, self._cold["scan"]
         if mesh is None:
             return []

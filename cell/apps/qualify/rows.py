@@ -246,7 +246,6 @@ def _count(path: Path) -> int:
 
 
 def _table(rows: Sequence[Mapping[str, object]]) -> pyarrow.Table:
-    """All columns of all rows, in the order in which they come; figures are numbers of 64 bits."""
     import pyarrow
 
     kinds = {**dict.fromkeys((*TEXTS, "reason"), pyarrow.string()), **dict.fromkeys(WHOLE, pyarrow.int64())}

@@ -222,7 +222,6 @@ def _on_board(
 
 
 def _white(plane: NDArray[np.float32], view: BoardView) -> float:
-    """What the board's white is in a plane, in DN."""
     low, high = np.clip(view.pixels.min(axis=0), 0, None).astype(int), view.pixels.max(axis=0).astype(int) + 1
     return float(np.percentile(plane[low[1] : high[1], low[0] : high[0]], 75))
 

@@ -107,7 +107,6 @@ class Content:
                     self.walk(value, [*place, f"[{k}]"], label)
 
     def _take(self, array: Array, place: Sequence[str], label: str | None) -> None:
-        """Add the pose, the poses or the halves of poses that an array holds."""
         if _is_pose(array):
             self._add(array.ravel(), place, label)
         elif array.ndim >= 2 and _is_pose(array[0]):
@@ -204,14 +203,12 @@ def _yaml(text: str) -> Any:
 
 
 def _numbered(data: Any) -> Any:
-    """Maps, lists and words, those that are numbers as such."""
     if isinstance(data, dict):
         return {key: _numbered(value) for key, value in data.items()}
     return list(map(_numbered, data)) if isinstance(data, list) else _scalar(data)
 
 
 def _scalar(word: str) -> float | str:
-    """The number of a word, or the word."""
     try:
         return float(re.sub(r"\.(?=nan|inf)", "", word, flags=re.IGNORECASE))
     except ValueError:
@@ -219,7 +216,6 @@ def _scalar(word: str) -> float | str:
 
 
 def _of_text(text: str) -> Any:
-    """The number or the numbers of a text, or the text."""
     words = [_scalar(word) for word in text.split()]
     return words if len(words) > 1 and not any(isinstance(word, str) for word in words) else _scalar(text)
 

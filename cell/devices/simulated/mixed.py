@@ -153,12 +153,10 @@ class _Guarded:
 
     @property
     def done(self) -> bool:
-        """True once the motion has ended, however it ended."""
         return self._motion.done
 
     @property
     def contact(self) -> bool:
-        """Whether it ended at its force limit, real or simulated."""
         return self._touched or self._motion.contact
 
     def wait(self, timeout: float) -> None:

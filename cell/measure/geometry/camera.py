@@ -159,7 +159,6 @@ class CameraModel:
 
 
 def _inverse2(m: Array) -> Array:
-    """Inverses of (n, 2, 2) matrices."""
     determinant = m[:, 0, 0] * m[:, 1, 1] - m[:, 0, 1] * m[:, 1, 0]
     inverse = np.empty_like(m)
     inverse[:, 0, 0], inverse[:, 1, 1] = m[:, 1, 1], m[:, 0, 0]

@@ -178,7 +178,6 @@ class RecordDrawing:
 
 
 def _stamped(message: Any, at: int) -> Any:
-    """The message, with its `timestamp`, ns."""
     message.timestamp.seconds, message.timestamp.nanos = divmod(at, 1_000_000_000)
     return message
 

@@ -313,7 +313,6 @@ class _Copy:
         self._channels: dict[int, int] = {}
 
     def take(self, kind: int, content: bytes) -> None:
-        """One record of the old file; a message whose channel was lost is let go."""
         from mcap.data_stream import ReadDataStream
         from mcap.records import Channel, Message, Metadata, Schema
 
@@ -339,7 +338,6 @@ class _Copy:
             self._writer.add_metadata(metadata.name, metadata.metadata)
 
     def finish(self) -> None:
-        """The end of the file."""
         self._writer.finish()
 
 

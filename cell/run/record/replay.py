@@ -194,7 +194,6 @@ class _Kept:
         self._next = 0
 
     def state(self, max_age: float = 0.1) -> ArmState:
-        """Where the flange was at the photograph."""
         nothing = np.zeros(6)
         return ArmState(
             0.0, nothing, nothing, flange=self._flange, wrench=nothing, safety=ArmSafety.NORMAL, moving=False,
@@ -202,7 +201,6 @@ class _Kept:
         )  # fmt: skip
 
     def grab(self, timeout: float = 2.0) -> Frame:
-        """The next of its pictures."""
         path = self._files[self._next]
         self._next += 1
         return Frame(read_image(path, self._shape), self._next, 0.0, device_time=0.0, host_time=0.0, received=0.0)
@@ -211,7 +209,6 @@ class _Kept:
 def _perceive(
     workplace: Workplace, folder: Path, kept: dict[str, Any], sweep: SweepRecord, fix: BoardFix, progress: Progress
 ) -> list[Compared]:
-    """Cloud and pose, or their refusal."""
     compared = []
     refused: dict[str, str] | None = None
     scan = pose = None

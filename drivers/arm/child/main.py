@@ -144,7 +144,6 @@ class Child:
             self._clock.sleep(PERIOD)
 
     def _outputs_off(self) -> None:
-        """Whatever a lost link has left behind."""
         mask = sum(1 << index for index in self._safe_off)
         self._switch_off()
         deadline = time.monotonic() + OFF_S

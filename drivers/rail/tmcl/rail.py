@@ -139,7 +139,6 @@ class TmclRail(RailAxis):
         )  # fmt: skip
 
     def _set_up(self) -> None:
-        """Tell the module what it forgets when it is reset."""
         set_direction(self._link, self._reversed)
         set_checked(self._link, Axis.MICROSTEP_RESOLUTION, self._resolution, EXACT)
         set_ramp(self._link, self._pulses(self._acceleration))

@@ -210,5 +210,4 @@ class _Network(canopen.Network):
         self._over = bus
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
-        """Send what the package has to send."""
         self._over.send(can_id, bytes(data))

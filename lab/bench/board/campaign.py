@@ -127,7 +127,6 @@ def judge(view: View, expect: str, tally: Tally) -> None:
 
 
 def _pitch_px(view: View) -> float:
-    """Smallest distance in px between two points of the board."""
     apart = np.linalg.norm(view.pixels[:, None] - view.pixels[None], axis=2)
     return float(apart[apart > 0].min())
 

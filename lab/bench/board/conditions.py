@@ -250,7 +250,6 @@ def _whole(place: Array) -> tuple[int, int]:
 def _expose(
     albedo: Field, lens: Lens, pixels: Array, has: dict[str, float], rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Light, lens blur, laser, noise and the 8 bits of the sensor."""
     height, width = albedo.shape
     v, u = np.mgrid[0:height, 0:width].astype(np.float32)
     angle = float(rng.uniform(0, 2 * np.pi))

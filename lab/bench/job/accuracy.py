@@ -199,7 +199,6 @@ def _within(result: dict[str, Any]) -> bool:
 
 
 def _short(run: dict[str, Any]) -> dict[str, Any]:
-    """One run in one line: means instead of single distances."""
     lists = ("scan", "aligned", "own", "absolute", "placement")
     return {name: float(np.mean(value)) if name in lists else value for name, value in run.items()}
 

@@ -147,8 +147,6 @@ def on_calibrated(
 
 @dataclass(frozen=True, eq=False)
 class _WholeJob:
-    """Calibration and job of one cell, as the supervisor has them done."""
-
     cell: VirtualCell
     config: CellConfig
     job: Job

@@ -165,7 +165,6 @@ class Day:
         return DayRecord(self._schedule, tuple(ends), tuple(met), tuple(self.oracle.violations))
 
     def _planar(self) -> tuple[float, float, float]:
-        """Where the vehicle truly stands."""
         return self._virtual.world.vehicle.planar(self._clock.now())
 
     def _rung(self, call: Callable[[], None]) -> AbstractContextManager[None]:
@@ -294,7 +293,6 @@ class Day:
                 self._ask(run, "confirm", BY, int(str(event.data["number"])))
 
     def _look(self) -> None:
-        """After a tick: do what is due."""
         if (run := self._run) is None or run.control.over or self._left is not None:
             return
         now = self._clock.now()

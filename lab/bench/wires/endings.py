@@ -175,7 +175,6 @@ def _world(folder: Path, seed: int, speed: float) -> Iterator[str]:
 
 
 def _begun(root: Path, before: set[Path], work: str, process: subprocess.Popen[bytes]) -> Path:
-    """Wait until the command does the work; its run's folder."""
     step = work.removeprefix("jog ") if work in JOGS else work
     deadline = time.monotonic() + _BEGIN_TIMEOUT_S
     while time.monotonic() < deadline:

@@ -156,7 +156,6 @@ def _encode(frame: CanFrame) -> bytes:
 
 
 def _decode(text: str) -> CanFrame | None:
-    """The frame of a `t`, `T`, `r` or `R` line; None when it is malformed."""
     extended, remote = text[0] in "TR", text[0] in "rR"
     digits = 8 if extended else 3
     identifier, length, data = text[1 : 1 + digits], text[1 + digits : 2 + digits], text[2 + digits :]

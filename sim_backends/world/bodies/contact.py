@@ -320,6 +320,5 @@ def _beside_wall(surface: Surface, x: Vector, y: Vector) -> NDArray[np.bool_]:
 
 
 def _moved(points: Vector, a_from_b: Pose) -> Vector:
-    """Points (n, 3) of frame b in frame a."""
     moved: Vector = points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
     return moved

@@ -93,7 +93,6 @@ def _outputs(workplace: CommissionWorkplace, result: Result) -> None:
 
 
 def _no_light(workplace: CommissionWorkplace, result: Result, laser: int, claw: int, enough: float) -> None:
-    """Neither of the two lights the laser, or both do: try the others, if a person agrees."""
     others = [output for output in range(OUTPUTS) if output not in (laser, claw)]
     lit: list[int] = []
     if workplace.person.go_ahead(

@@ -121,7 +121,6 @@ class RunView:
             self.ended = {"run": folder, "kind": self.run.kind, **told, "t": event.at}
 
     def _begin(self, row: dict[str, object]) -> None:
-        """The step of this row is active from now on."""
         # What went before without an end of its own, as a calibration does, has ended.
         for before in self._rows.values():
             before["state"] = "done" if before["state"] == "active" else before["state"]

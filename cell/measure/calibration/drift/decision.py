@@ -305,7 +305,6 @@ _UNITS = {"m": "mm", "rad": "deg"}
 
 
 def _shown(size: float, unit: str) -> float:
-    """A size in m as mm, one in rad as degrees."""
     return 1e3 * size if unit == "m" else float(np.degrees(size))
 
 

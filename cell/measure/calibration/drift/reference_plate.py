@@ -286,7 +286,6 @@ def turned(plane: LightPlane, exit_point: Array, angle: float) -> LightPlane:
 
 
 def _stripe(plane: LightPlane) -> Array:
-    """The stripe's direction (3,)."""
     stripe = np.cross(plane.n, np.cross(plane.along, plane.n))
     return np.asarray(stripe / np.linalg.norm(stripe))
 

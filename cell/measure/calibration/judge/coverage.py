@@ -196,7 +196,6 @@ def influences(by_parameter: Array, covariance: Array) -> dict[str, object]:
 
 
 def _given(covariance: Array, known: Sequence[int]) -> Array:
-    """The covariance of all when some are known exactly."""
     members = np.array([k for k in known if covariance[k, k] > 0], dtype=np.intp)
     if not len(members):
         return covariance

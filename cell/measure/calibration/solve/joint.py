@@ -110,7 +110,6 @@ def _crossed(
 
 
 def _expected(hand_eye: starts.HandEye, o: ScanObservation) -> pin.SE3:
-    """camera_from_board of an observation that does not see it."""
     flange_from_camera = hand_eye.flange_from_camera * from_parts(o.rail_position * hand_eye.rail_direction)
     return (o.base_from_flange * flange_from_camera).inverse() * hand_eye.base_from_board
 

@@ -144,7 +144,6 @@ def range_of(image: NDArray[np.uint16]) -> int:
 
 
 def _grey(image: Taken) -> bool:
-    """True when the three channels are one."""
     few = image[::7, ::7]
     if not (np.array_equal(few[:, :, 0], few[:, :, 1]) and np.array_equal(few[:, :, 0], few[:, :, 2])):
         return False

@@ -290,7 +290,6 @@ def _believed(
 
 
 def _nothing(lines: int) -> StripeProfile:
-    """A profile without a stripe."""
     centres, sigma, amplitude, width, misfit = np.full((5, lines), np.nan)
     no, rival = np.zeros((2, lines), np.bool_), np.zeros(lines)
     return StripeProfile(

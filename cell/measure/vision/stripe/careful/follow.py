@@ -122,7 +122,6 @@ def _take_better(
     response: NDArray[np.float32], noise: np.float32, k: int, best: NDArray[np.float32],
     answer: NDArray[np.float32], of: NDArray[np.uint8],
 ) -> None:  # fmt: skip  # pragma: no cover
-    """Where `response` over `noise` is above `best` (m, n): takes it, and notes the answer and the scale's number."""
     for row in range(response.shape[0]):
         for column in range(response.shape[1]):
             clear = response[row, column] / noise

@@ -243,7 +243,6 @@ def _is_ordinary(fitted: Array, start: Array, work: Image, *, shade: Image, seen
 
 
 def _lags(contrast: float, grain: float | None) -> NDArray[np.float32]:
-    """The speckle's correlation by lag; none where there is no speckle."""
     return correlation(grain) if contrast > 0 and grain else NO_LAGS
 
 
