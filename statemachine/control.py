@@ -97,8 +97,6 @@ class RunControl:
         self._held_since: float | None = None
         self._held_s = 0.0
 
-    # --- asked from outside ---
-
     def abort(self, reason: str, signal: int | None = None) -> None:
         """End the run as aborted: what moves is stopped at once. `signal` is the number of one that asked for it."""
         first = self.token.cancel(reason)
@@ -145,8 +143,6 @@ class RunControl:
                     self.confirm(request.reason, request.number)
                 case "end-batch":
                     self.end_batch = True
-
-    # --- asked by the run ---
 
     def paused(self) -> bool:
         """Whether the run is asked to hold."""

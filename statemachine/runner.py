@@ -220,8 +220,6 @@ class Runner:
             self._attempts = Attempts(self.sequence.steps, self.steps, self._watchman)
             yield
 
-    # --- the walk through the sequence ---
-
     def _drive(self) -> Failure | None:
         """Walk through the steps; None when all are done, else why not."""
         if (end := self._watchman.asked()) is not None:
@@ -276,8 +274,6 @@ class Runner:
         self.sequence.facts.chosen = chosen.step
         self.sequence.fire(JobTrigger.AGAIN)
         return None
-
-    # --- the end ---
 
     def _finish(self, end: Failure | None) -> RunResult:
         outcome = Outcome(self.sequence.success.value) if end is None else end.outcome

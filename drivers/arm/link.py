@@ -144,8 +144,6 @@ class ArmLink:
         self._fail("it was closed")
         self._end()
 
-    # --- inside ---
-
     def _beat(self) -> None:
         """A sign of life; one that cannot be sent is no fault: a child that ends by itself makes the arm safe first."""
         self._raise_if_lost()

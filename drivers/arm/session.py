@@ -131,8 +131,6 @@ class ArmSession:
             self.close()
             raise
 
-    # --- what has to hold ---
-
     def require_link(self) -> None:
         """Raise the error that says why nothing can be asked of the arm, if any."""
         self._require_open()
@@ -172,8 +170,6 @@ class ArmSession:
         # What was just set may not be shown yet.
         if not self.feed.wait_for(lambda snapshot: same_payload(snapshot, self.setup.payload), _TOOL_S):
             require_same_payload(self._name, self.feed.fresh(0.1)[0], self.setup.payload)
-
-    # --- asking ---
 
     def ask(self, name: str, *arguments: object, deadline: float = CALL_S) -> None:
         """Have the child do something; see `ArmLink.call`. `Aborted` when a stop overtook it."""
@@ -223,8 +219,6 @@ class ArmSession:
             self.ask("stop", deadline=_STOP_S)
         except DeviceFault as error:
             self._require_safe_without(error)
-
-    # --- ends and new beginnings ---
 
     def recover(self, confirmed: bool) -> None:
         """See `UrArm.recover`."""
@@ -293,8 +287,6 @@ class ArmSession:
         self._on_broken(NotConnectedError(self._name, "the driver was closed"))
         self._safing.join()
         self.dashboard.close()
-
-    # --- inside ---
 
     def _connect(self, wanted: Callable[[], bool]) -> ArmLink:
         return ArmLink(

@@ -104,8 +104,6 @@ class UrArm:
         self._feed = self._session.feed
         self.statistics = self._session.statistics
 
-    # --- who and how ---
-
     def identity(self) -> Identity:
         """Model, serial number and controller version, asked of the dashboard server."""
         ask = self._session.dashboard.ask
@@ -172,8 +170,6 @@ class UrArm:
             device_time=snapshot.device_time, controlled=snapshot.mode == MODE_RUNNING and snapshot.program_running,
         )  # fmt: skip
 
-    # --- moving ---
-
     def move_joints(self, joints: Vector, speed: float, acceleration: float) -> UrMotion:
         """Straight in joint space to `joints` (rad) at `speed` rad/s of the leading joint."""
         joints = self.limits.check_joints(self.name, joints)
@@ -234,8 +230,6 @@ class UrArm:
             with suppress(DeviceError):
                 link.tell("attend", 0.0)
 
-    # --- settings, inputs and outputs ---
-
     def zero_force(self) -> None:
         """Take the present wrench as zero."""
         self._session.ask("zero_force")
@@ -261,8 +255,6 @@ class UrArm:
         _check_output(self.name, index)
         return bool(self._feed.fresh(0.1)[0].inputs >> index & 1)
 
-    # --- ends and new beginnings ---
-
     def recover(self, *, confirmed: bool = False) -> None:
         """Start the link and the control program afresh, with the safe outputs off.
 
@@ -276,8 +268,6 @@ class UrArm:
     def close(self) -> None:
         """Stop the arm, switch the safe outputs off and end the child process; idempotent, bounded in time."""
         self._session.close()
-
-    # --- inside ---
 
     def _start(self, what: str, name: str, *arguments: object) -> UrMotion:
         self._session.require_control()

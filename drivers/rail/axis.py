@@ -178,8 +178,6 @@ class RailAxis(ABC):
         self._motion_issued = 0
         self._starting = threading.Lock()
 
-    # --- what a make says of its drive ---
-
     @abstractmethod
     def _position(self) -> float:
         """Read the position, m."""
@@ -210,8 +208,6 @@ class RailAxis(ABC):
     @abstractmethod
     def _followed(self) -> tuple[float, bool, bool, Callable[[], bool]]:
         """Position in m, left and right limit switch, and what asks for a stall: as `CarriageWatch` takes them."""
-
-    # --- motions ---
 
     def home(self) -> RailMotion:
         """Search the reference switch; position 0 is there afterwards."""
@@ -328,8 +324,6 @@ class RailAxis(ABC):
             self._link.close()
             if self._motion is not None:
                 self._motion.join(2.0)
-
-    # --- inside ---
 
     def _at_start(self) -> float:
         """How far in m the rail may stand from where a sweep begins."""

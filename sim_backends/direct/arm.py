@@ -304,8 +304,6 @@ class DirectArm(DirectDevice):
         if self._motion is not None and not self._motion.done:
             self._motion.fail(error)
 
-    # --- ticking ---
-
     @property
     def tick_s(self) -> float:
         """Fine while it moves, finest while it feels for contact."""

@@ -316,8 +316,6 @@ class DirectRail(DirectDevice):
         """Stop."""
         self.stop()
 
-    # --- the zero ---
-
     def forget_zero(self) -> None:
         """The count can no longer be trusted."""
         self.homed = False
@@ -334,8 +332,6 @@ class DirectRail(DirectDevice):
         """What is to happen to the module: it starts anew, and has forgotten its zero and its settings."""
         self.lost_zero, self.homed = self.homed or self.model.searching(self.clock.now()), False
         self.model.reset(self.clock.now())
-
-    # --- inside ---
 
     def _watch(self, length: float | None) -> CarriageWatch:
         return CarriageWatch(self.name, self.clock, length)

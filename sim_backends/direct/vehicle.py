@@ -133,8 +133,6 @@ class DirectVehicle(DirectDevice):
         """Stop."""
         self.stop()
 
-    # --- ticking ---
-
     @property
     def tick_s(self) -> float:
         """As often as a driver keeps its command alive, while it drives."""

@@ -139,8 +139,6 @@ class ArmModel:
         self._truth = self._true_pose(params.dh)
         self._truth.update(self.time, 0.0, self.drive.q, moving=False)
 
-    # --- the world's side ---
-
     def shift_zero(self, joint: int, angle: float) -> None:
         """As if the zero of `joint`, 0 to 5, had moved by `angle`, rad, and the controller did not know."""
         with self._lock:
@@ -230,8 +228,6 @@ class ArmModel:
                 self.power = Power.OFF
             self.safety = Safety.NORMAL
             self.fault_text = ""
-
-    # --- the controller's side ---
 
     @property
     def ready(self) -> bool:
@@ -345,8 +341,6 @@ class ArmModel:
                 self.drive.qd = np.zeros(6)
             self.power = power
             return True
-
-    # --- physics ---
 
     def _untold_weight(self) -> Vector:
         """Wrench (6,) at the flange in base axes of the weight that the controller was not told of."""

@@ -106,14 +106,10 @@ class RailModel:
         self._target_velocity = 0
         self._positioning = False
 
-    # --- what the world sees ---
-
     def carriage(self, t: float) -> float:
         """True carriage displacement in m at world time `t` (at most 30 s ago)."""
         with self._lock:
             return self.params.screw.travel(self._nut(self._leg(t), t))
-
-    # --- what the controller sees ---
 
     def position(self, t: float) -> int:
         """Step counter in microsteps."""
@@ -187,8 +183,6 @@ class RailModel:
     def clear(self, t: float) -> None:
         """Take away both faults; steps that were lost stay lost."""
         self._have(t, set())
-
-    # --- commands ---
 
     def move_to(self, t: float, position: int) -> None:
         """Start positioning to `position` (microsteps)."""
@@ -272,8 +266,6 @@ class RailModel:
         """End a running reference search on the ramp; the counter is then not referenced."""
         if self.searching(t):
             self.rotate(t, 0)
-
-    # --- inside ---
 
     @property
     def backwards(self) -> bool:

@@ -121,8 +121,6 @@ class VehicleModel:
         self._drivers = [0] * MOTORS
         self._history.append(0.0, self._pose())
 
-    # --- what the world sees ---
-
     def tick(self, t: float) -> None:
         """Let time pass until world time `t`, taking the suspension's sag as it is now."""
         tilt = self.sag()
@@ -142,8 +140,6 @@ class VehicleModel:
         with self._lock:
             self._advance(t)
             return self._x, self._y, self._yaw
-
-    # --- what the controller sees and does ---
 
     def feedback(self, t: float) -> VehicleReadings:
         """What the vehicle reports at world time `t`."""
@@ -223,8 +219,6 @@ class VehicleModel:
             self._advance(t)
             self._emergency = False
             self._clear()
-
-    # --- inside ---
 
     def _clear(self) -> None:
         self._errors = 0

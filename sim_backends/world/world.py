@@ -174,8 +174,6 @@ class World:
         self._items[self._current] = replace(item, scene=replace(item.scene, world_from_surface=pushed))
         self._make_current(self.collisions.found)
 
-    # --- where things are ---
-
     def world_from_base(self, t: float) -> Pose:
         """True pose (4, 4) of the arm's base at world time `t`, the vehicle's lean and rocking included."""
         drawn, effects = self.scene.workshop, self.scene.effects
@@ -206,8 +204,6 @@ class World:
             made[:3, 3] += droop * made[:3, 2]
             made[:3, :3] = made[:3, :3] @ rotation(ROLL * droop * self.scene.rail_direction)
         return made
-
-    # --- what the cameras see ---
 
     def render(self, camera: str, t_mid: float, exposure: float) -> NDArray[np.uint8]:
         """The picture (height, width) of "scan" or "target": the world as it was at `t_mid`, exposed `exposure` s."""
@@ -255,8 +251,6 @@ class World:
             for target in (self.scene.world_from_surface, self.scene.world_from_board):
                 facing = target @ pose((0.0, 0.0, distance), (1, 0, 0), (0, 0, -1))
                 self._cameras.picture(camera, facing, base, True, 0.002)
-
-    # --- what couples the devices ---
 
     def switched(self, name: str) -> bool:
         """Whether the "laser" is on, or the "claw" closed: by the arm's output, or by its own switch."""

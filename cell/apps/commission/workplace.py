@@ -125,8 +125,6 @@ class CommissionWorkplace:
     _config: CellConfig | None = None
     _confirmed: set[str] = field(default_factory=set)
 
-    # --- the cell ---
-
     @property
     def cell(self) -> Cell:
         """The cell, opened if need be."""
@@ -179,8 +177,6 @@ class CommissionWorkplace:
         else:
             cause_fault(self.cell.config.cell.truth, fault)
 
-    # --- the person ---
-
     def confirm(self, axis: str, moves: str, far: str, fast: str) -> None:
         """A person's word before the first motion of an axis in this session; raises `Declined`."""
         if axis in self._confirmed:
@@ -188,8 +184,6 @@ class CommissionWorkplace:
         if not self.person.go_ahead(f"{axis} moves for the first time: {moves}, {far}, {fast}."):
             raise Declined(f"{axis} was not to move")
         self._confirmed.add(axis)
-
-    # --- motion ---
 
     def look_around(self) -> None:
         """Raise when the work is to end; wait while it is paused."""
@@ -230,8 +224,6 @@ class CommissionWorkplace:
         if not rail.state().homed_here:
             self.confirm("rail", "it searches its home switch", "its whole travel at most", "half its configured speed")
             rail.home().wait(120.0)
-
-    # --- pictures ---
 
     def keep(self, result: Result, name: str, frame: Frame, marks: ArrayLike | None = None) -> None:
         """Keep a picture for the protocol, with points (n, 2) px marked in it, and the whole frame in the run."""

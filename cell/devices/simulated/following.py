@@ -243,8 +243,6 @@ class DeviceFollowing:
                 hint="Sweep more slowly, use a faster line to the rail, or end programs that keep this computer busy.",
             )
 
-    # --- what the simulated part would touch ---
-
     def wrench(self) -> Vector:
         """The newest wrench (6,) on the flange, base axes, of the simulated part on the simulated surface."""
         with self._felt:
@@ -268,8 +266,6 @@ class DeviceFollowing:
         with self._felt:
             self._felt.wait(0.05)
         return self.wrench()
-
-    # --- inside ---
 
     def _compare_clocks(self) -> float:
         """World time less host time, s: both run on this computer's clock, so once is enough."""

@@ -234,8 +234,6 @@ class Recorder(logging.Handler):
             if device.name in DEVICES:
                 device.statistics.traffic.listener = self._wire(device.name)
 
-    # --- who tells ---
-
     def event(self, event: Event) -> None:
         """The run tells something."""
         if event.kind == "progress" and not self._is_due("progress", PROGRESS_S):
@@ -306,8 +304,6 @@ class Recorder(logging.Handler):
             put(topic, time.time_ns(), partial(notify, sent, what))
 
         return listen
-
-    # --- what is made of it ---
 
     def _rail_at(self, at: int, position: float) -> None:
         self._put("/tf", at, lambda draw: draw.scan_camera(at, position))

@@ -122,8 +122,6 @@ class ControlThread:
             problem = self._program.problem() or ("arm.refused", f"the controller did not accept '{request.name}'")
         self._send(ChildReply(request.number, problem))
 
-    # --- moves of the controller's own ---
-
     def _move_joints(self, request: ChildRequest) -> None:
         motion, target, speed, acceleration = request.arguments
 

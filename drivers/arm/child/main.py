@@ -226,8 +226,6 @@ class Child:
                 break
             self._clock.sleep(PERIOD)
 
-    # --- state ---
-
     def _watch_arm(self) -> None:
         every = max(1, round(1.0 / (PERIOD * _PUSHES_PER_S * self._setup.rate)))
         count = 0

@@ -66,8 +66,6 @@ class Streaming:
         """How regularly the points of the newest trajectory were sent."""
         return pace_of(self._sent)
 
-    # --- streaming ---
-
     def stream(self, trajectory: JointTrajectory, force_limit: float | None) -> End:
         """Stream the trajectory, time running `rate` times as fast as the wall, then stand still.
 

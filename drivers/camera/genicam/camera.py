@@ -136,8 +136,6 @@ class GenicamCamera:
             if self._device.open:
                 self._device.close()
 
-    # --- connection ---
-
     def _connect(self) -> None:
         device, self._serial = connect(
             self.name, self._place, self._record, self._wish, look=self._look, serial=self._serial
@@ -161,8 +159,6 @@ class GenicamCamera:
             self._connect()
             self.statistics.count("link_lost")
         return self._device
-
-    # --- acquisition ---
 
     @contextmanager
     def _exclusive(self) -> Iterator[GenicamDevice]:

@@ -111,8 +111,6 @@ class ModbusRail(RailAxis):
             right_switch=drive.says(registers.right_switch),
         )
 
-    # --- as `RailAxis` wants it ---
-
     def _position(self) -> float:
         return self._drive.position()[1]
 

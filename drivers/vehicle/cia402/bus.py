@@ -96,8 +96,6 @@ class CanopenBus(CanLink):
             statistics=statistics, alone=alone,
         )  # fmt: skip
 
-    # --- what a master sends ---
-
     def send(self, identifier: int, data: bytes) -> None:
         """Send a frame; raises as `check` does."""
         self.send_frame(data_frame(identifier, data), f"0x{identifier:03X}")
@@ -114,8 +112,6 @@ class CanopenBus(CanLink):
     def sync(self) -> None:
         """Have the drives tell their state."""
         self.send(SYNC, b"")
-
-    # --- values ---
 
     def read(self, node: int, entry: Entry) -> int:
         """A value of a drive. Raises `Absent`, `DeviceFault` for a refusal, `DeadlineError` when no answer comes."""
@@ -164,8 +160,6 @@ class CanopenBus(CanLink):
                         "no second master asks it",
                     ) from silence
         raise AssertionError
-
-    # --- what comes ---
 
     def _take(self, frame: can.Message) -> None:
         if frame.is_extended_id:

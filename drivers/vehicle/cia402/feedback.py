@@ -171,8 +171,6 @@ class DriveFeedback(Feedback):
         self.proving = False
         """The drives' watchdog is being tried: that it stops them is no fault."""
 
-    # --- what comes ---
-
     def take(self, node: int, service: int, data: bytes, in_pdo: bool = True) -> None:
         """Take a drive's frame, or what it was asked for one by one. Raises ValueError for one of another length."""
         now = self._clock.now()
@@ -232,8 +230,6 @@ class DriveFeedback(Feedback):
                 for service in drive.untold:
                     drive.untold[service] += seconds
 
-    # --- what was commanded ---
-
     def asked(self) -> None:
         """The drives were just asked to tell their state."""
         with self._news:
@@ -248,8 +244,6 @@ class DriveFeedback(Feedback):
             for drive, units in zip(self.drives, self._units, strict=True):
                 drive.waited = 0
                 units.forget()
-
-    # --- what is told ---
 
     @property
     def disturbance(self) -> str:

@@ -116,8 +116,6 @@ class Master:
         self._closed = threading.Event()
         self._keeper = threading.Thread(target=self._keep, name=f"{name} keep-alive", daemon=True)
 
-    # --- beginning and end ---
-
     def begin(self) -> None:
         """Set up drives that nobody else commands, and have them tell their state."""
         self._closed.wait(LISTEN_S)
@@ -174,8 +172,6 @@ class Master:
                 f"the {silent} drive was set up and tells nothing in PDOs. See whether it is operational on the bus, "
                 "and whether it answers SYNC",
             )
-
-    # --- through the drives' states ---
 
     def operate(self) -> None:
         """Both drives to operation enabled, at speed 0; for the first time their watchdog is tried."""
@@ -297,8 +293,6 @@ class Master:
                 self._watchdog.disarm(self.bus, drive)
             self.armed = False
 
-    # --- set points ---
-
     def set_velocity(self, speed: float, yaw_rate: float) -> None:
         """Keep this velocity, m/s and rad/s, until it is not renewed; the caller holds `command`."""
         self._velocity, self._renewed = (speed, yaw_rate), self._clock.now()
@@ -330,8 +324,6 @@ class Master:
         for drive, word, target in zip(self._drives, self._words, targets, strict=True):
             data = od.CONTROLWORD.pack(word | halt) + od.TARGET_VELOCITY.pack(target)
             self.bus.send(od.COMMAND + drive.node, data)
-
-    # --- the thread ---
 
     def _keep(self) -> None:
         beat = -math.inf

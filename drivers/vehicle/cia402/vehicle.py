@@ -113,8 +113,6 @@ class CanopenVehicle:
     def _bus(self) -> CanopenBus:
         return self._master.bus
 
-    # --- looking ---
-
     def identity(self) -> Identity:
         """Names and versions as the drives tell them, and the serial numbers of both."""
         self._bus.check()
@@ -185,8 +183,6 @@ class CanopenVehicle:
                         self._master.quick_stop(fault.message)
                     self._in_command, self._master.lost = False, None
             raise
-
-    # --- commanding ---
 
     def enable(self) -> None:
         """Take command, enable operation and release the brake; opens the bus again if it had failed.

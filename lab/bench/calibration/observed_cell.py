@@ -103,8 +103,6 @@ class ObservedCell:
         self.fine = parse_board(self.config.calibration.fine.board)
         self.large = parse_board(self.config.calibration.large.board)
 
-    # --- motion ---
-
     def move(self, base_from_flange: Array) -> Rest:
         """Bring the arm to rest at a pose (4, 4): what it reports, and where it truly came to rest."""
         self._joints = self._told.ik(from_matrix(base_from_flange), self._joints)
@@ -124,8 +122,6 @@ class ObservedCell:
         side = 0.5 * scene.rail_backlash * self.rng.choice((-1.0, 1.0))
         periodic = scene.rail_periodic_amplitude * np.sin(2 * np.pi * reading / 0.002 + scene.rail_periodic_phase)
         return float(reading + side + periodic + scene.deviations.rail_homing * self.rng.normal())
-
-    # --- what the cameras see ---
 
     def scan_view(self, rest: Rest, carriage: float) -> BoardView:
         """The fine board in a photograph of the scan camera."""
@@ -192,8 +188,6 @@ class ObservedCell:
         return BoardView(
             spec, size, ids, centres[ids], np.full(len(ids), self.noise.dots_px), dot_radius=spec.dot_radius
         )
-
-    # --- a calibration's observations ---
 
     def collect_scan(self, views: Sequence[CalibrationView] | None = None) -> list[ScanObservation]:
         """What `cell.procedures.calibrate.boards.collect_scan` brings, at the same views."""

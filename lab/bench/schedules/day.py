@@ -179,8 +179,6 @@ class Day:
 
         return self._clock.alarm(0.0, ring)
 
-    # --- one session of a program with the cell ---
-
     def _session(self, before: Path | None) -> tuple[str, str, Path | None]:
         """Run the job, or resume the run `before`: outcome and reason, and the run that can be resumed next."""
         self._begin()
@@ -243,8 +241,6 @@ class Day:
         except JournalError:
             return True
         return "full_disk" in self.oracle.acts or "power_cut" in self.oracle.acts
-
-    # --- in the thread of the run ---
 
     def hear(self, run: Run[object], event: Event) -> None:
         """An event of a run, before the run goes on."""

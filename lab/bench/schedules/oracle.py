@@ -104,8 +104,6 @@ class Oracle:
         if not again and len(self.violations) < CROWDED:
             self.violations.append(Violation(rule, round(now, 3), how))
 
-    # --- at every tick ---
-
     def tick(self) -> None:
         """Look at the world as it is now."""
         t = self.world.clock.now()
@@ -159,8 +157,6 @@ class Oracle:
             drop = float(before[2, 3] - pose[2, 3])
             if abs(drop) > DROP_M:
                 self.broken("let go in the air", f"the part fell {1e3 * drop:.2f} mm")
-
-    # --- told ---
 
     def did(self, act: str) -> None:
         """Something was done to the cell by its surroundings."""

@@ -100,8 +100,6 @@ class Context:
         self._operation = 0
         self._changes = 0
 
-    # --- registers and signals ---
-
     def requested(self) -> int:
         """The command in the register."""
         return self.registers.int_in[self.offset]
@@ -147,8 +145,6 @@ class Context:
         if value >= 0:
             word |= min(value, 32767) | 1 << 15
         self.registers.int_out[self.offset + 2] = word
-
-    # --- who moves the arm ---
 
     def wait(self, motion: SimulatedMotion) -> Job:
         """Start `motion` and wait for its end."""
@@ -197,8 +193,6 @@ class Context:
         if not self._recent:
             return self.model.drive.q
         return self._recent[max(0, len(self._recent) - 1 - max(0, steps))]
-
-    # --- kinematics of the tool ---
 
     def forward(self, q: Vector) -> Matrix:
         """Tool pose (4, 4) at joint angles (6,)."""

@@ -301,8 +301,6 @@ class FramePeer(TcpServer):
         if not self.camera.silent:
             connection.sendall(message(header, image.tobytes()))
 
-    # --- requests ---
-
     def _answer(self, session: FrameSession, request: dict[str, object]) -> dict[str, object]:
         operations: dict[str, Callable[[FrameSession, dict[str, object]], dict[str, object]]] = {
             "identify": self._identify, "configure": self._configure, "start": self._start, "stop": self._stop,

@@ -166,8 +166,6 @@ class GigePeer:
         if self._memory.word(memory.TRIGGER_SOURCE) == memory.LINE:
             self._trigger()
 
-    # --- control ---
-
     def _serve(self) -> None:
         self._control.settimeout(0.1)
         while not self._stopping.is_set():

@@ -64,8 +64,6 @@ class ModbusDriveServer:
         )  # fmt: skip
         self.rail.configure(t, settings)
 
-    # --- what is read ---
-
     def read(self, address: int, count: int, inputs: bool) -> list[int] | None:
         """`count` holding or input registers from `address` on; None when one of them does not exist."""
         with self._lock:
@@ -108,8 +106,6 @@ class ModbusDriveServer:
         t = self.clock.now()
         if self._searching and not self.rail.searching(t) and self.rail.velocity(t) == 0:
             self._searching, self._homed = False, True
-
-    # --- what is written ---
 
     def write(self, address: int, values: list[int]) -> bool:
         """Write holding registers; False when one of them does not exist, or cannot be written."""

@@ -142,8 +142,6 @@ class TmclModule:
             _check(motor, 0, 0)
         return self._commands[command](kind, motor, value)
 
-    # --- motion ---
-
     def _rotate(self, kind: int, motor: int, value: int) -> int:
         _check(abs(value), 0, SETTINGS[4][2])
         self.rail.rotate(self.clock.now(), value)
@@ -169,8 +167,6 @@ class TmclModule:
         else:
             raise TmclRefused(BAD_TYPE)
         return 0
-
-    # --- axis parameters ---
 
     def _get_axis(self, kind: int, motor: int, value: int) -> int:
         rail, t = self.rail, self.clock.now()
@@ -231,8 +227,6 @@ class TmclModule:
             raise TmclRefused(BAD_TYPE)
         return self._set_axis(kind, motor, self._stored[kind])
 
-    # --- global parameters ---
-
     def _get_global(self, kind: int, bank: int, value: int) -> int:
         if bank == 0 and kind in self._globals:
             return self._globals[kind]
@@ -267,8 +261,6 @@ class TmclModule:
         if bank == 2 and kind < STORED_VARIABLES:
             self._variables[kind] = self._stored_variables.get(kind, 0)
         return self._get_global(kind, bank, 0)
-
-    # --- inputs and outputs ---
 
     def _set_output(self, kind: int, bank: int, value: int) -> int:
         _check(bank, 2, 2)

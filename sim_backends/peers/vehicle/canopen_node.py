@@ -142,8 +142,6 @@ class CanopenNode:
         elif self.state == OPERATIONAL:
             self._take_pdo(frame)
 
-    # --- signs of life ---
-
     def _manage(self, command: int) -> None:
         if command in (0x01, 0x02, 0x80):
             self.state = {0x01: OPERATIONAL, 0x02: STOPPED, 0x80: PREPARING}[command]
@@ -152,8 +150,6 @@ class CanopenNode:
         elif command in (0x81, 0x82):
             self._lost()
             self.boot()
-
-    # --- PDOs ---
 
     def _communication(self) -> dict[tuple[int, int], Value]:
         found = {
@@ -230,8 +226,6 @@ class CanopenNode:
             for value in mapped:
                 value.set(frame.data[at : at + value.size])
                 at += value.size
-
-    # --- SDO ---
 
     def _serve(self, request: bytes) -> None:
         command, index, sub = struct.unpack_from("<BHB", request)

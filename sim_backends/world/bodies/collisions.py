@@ -184,8 +184,6 @@ class Collisions:
             if len(self._found) < LONGEST:
                 self._found.append(Collision(time, body, obstacle))
 
-    # --- the vehicle ---
-
     def blocks(self, time: float, pose: tuple[float, float, float]) -> bool:
         """Whether the vehicle at x, y, yaw would stand in something; remembered as a collision once a contact."""
         if math.hypot(pose[0], pose[1]) > self._far:
@@ -198,8 +196,6 @@ class Collisions:
             self.note(time, "vehicle", met)
         self._against = met
         return bool(met)
-
-    # --- the arm ---
 
     def due(self, time: float, joints: Vector, world_from_base: Pose) -> bool:
         """Whether the arm is to be looked at now: time has passed since the last look, and something has moved."""

@@ -199,8 +199,6 @@ class ConsoleController:
             "pace": self._pace,
         }
 
-    # --- clients ---
-
     def joined(self, client: str) -> None:
         """A page was opened."""
         self.holders.joined(client)
@@ -270,8 +268,6 @@ class ConsoleController:
         except InterlockError as error:
             return str(error)
         return "the cell is not in manual mode, in which alone something is jogged; switch it on"
-
-    # --- runs ---
 
     def _start(self, client: str, words: Words) -> str:
         job = self.named_job(words["job"])
@@ -394,8 +390,6 @@ class ConsoleController:
     def _clear_stop(self, client: str, words: Words) -> str:
         self.cell.clear_stop(words["by"])
         return f"the stop was cleared by {words['by']}"
-
-    # --- devices ---
 
     def _manual(self, client: str, words: Words) -> str:
         if not words["on"]:

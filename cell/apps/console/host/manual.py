@@ -242,8 +242,6 @@ class Manual:
             return
         self._wanted.put(press)
 
-    # --- the run's own thread ---
-
     def _perform(self, by: str, stops: int) -> None:
         try:
             self._cell.perform("jog", self._work, info={"moved": "manual mode", "by": by}, stops=stops)

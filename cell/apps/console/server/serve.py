@@ -115,8 +115,6 @@ class Server:
         """A new link for the next page."""
         self._notify(link.Ready(None if self._setup.lasting is not None else self.access.link()))
 
-    # --- to the cell ---
-
     def _notify(self, message: object) -> bool:
         """Never waits; False when too much waits already. What ends something is sent in any case."""
         if self._unsent.qsize() >= MOST_UNSENT and not isinstance(message, link.Left | link.Ready):
@@ -183,8 +181,6 @@ class Server:
         if not asked.done():
             asked.set_result(message.trouble)
         self._send_next()
-
-    # --- from the cell ---
 
     def _hear_stops(self) -> None:
         _until_the_end(self._stops, lambda message: self._loop.call_soon_threadsafe(self._stopped, message))

@@ -84,8 +84,6 @@ class _Arm:
     def _model(self) -> ArmModel:
         return self._e.context.model
 
-    # --- moves ---
-
     def movej(self, q: List, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Job:
         goal = self._joints(q)
         limit = self._model.params.joint_limit
@@ -155,8 +153,6 @@ class _Arm:
 
     def sync(self) -> Job:
         yield
-
-    # --- questions ---
 
     def get_actual_joint_positions(self) -> List:
         return numbers(self._model.drive.q)
@@ -241,8 +237,6 @@ class _Arm:
         drive = self._model.drive
         place: Matrix = self._model.kinematics.forward(drive.q if q is None else np.array(q, float))
         return as_pose(place.dot(drive.flange_from_tcp if tcp is None else matrix(tcp)))
-
-    # --- what they share ---
 
     def _joints(self, target: List) -> Vector:
         return self._e.context.solve(matrix(target)) if isinstance(target, ScriptPose) else _six(target)

@@ -215,8 +215,6 @@ class Environment:
         self._closers.clear()
         self.force = None
 
-    # --- moving ---
-
     def move(self, motion: SimulatedMotion) -> Job:
         """Start `motion` and wait for its end. Raises `ProgramError` while another thread moves the arm."""
         model = self.context.model

@@ -115,8 +115,6 @@ class Machine:
                 found.line, found.column = self._places[number - 1]
         return found
 
-    # --- what the program calls ---
-
     def _own(self, value: Value) -> Value:
         copied, count = own(value)
         self._turn(count // _VALUES_A_TURN)

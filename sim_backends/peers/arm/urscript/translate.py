@@ -183,8 +183,6 @@ class _Translator:
                 raise self._error("goes on after its end")
         return Translation("\n".join(self._lines) + "\n", name, self._places)
 
-    # --- words ---
-
     @property
     def _now(self) -> Token:
         return self._words[min(self._at, len(self._words) - 1)]
@@ -215,8 +213,6 @@ class _Translator:
     def _insert(self, at: int, line: str) -> None:
         self._lines.insert(at, "    " * self._indent + line)
         self._places.insert(at, self._place)
-
-    # --- functions ---
 
     def _define(self, outermost: bool = False) -> None:
         self._take()
@@ -269,8 +265,6 @@ class _Translator:
                 self._at += 1
             else:
                 self._statement()
-
-    # --- statements ---
 
     def _statement(self) -> None:
         word = self._now.text
@@ -386,8 +380,6 @@ class _Translator:
                 raise self._error(f"has {kind!r} in a switch")
             self._block("end")
             self._take()
-
-    # --- expressions ---
 
     def _expression(self, level: int = 0) -> str:
         if level == len(_LEVELS):
