@@ -63,7 +63,6 @@ class Lateness:
 
 
 LATENESS = Lateness()
-"""Of this process."""
 
 
 def busy_words() -> str | None:

@@ -143,7 +143,6 @@ class CellSection(Table):
     truth: Annotated[str, AfterValidator(lambda text: text and checked_endpoint(text))] = ""
     confirm: Confirm = "person"
     record: bool = True
-    """Whether runs leave `record.mcap`."""
     frames: bool = True
     """Whether runs keep the pictures that they look at. Without them no sweep is used again after a resume."""
     picture: bool = True

@@ -165,7 +165,6 @@ def station_bodies(
 
 
 Pair = tuple[str, str]
-"""Names of two bodies."""
 ROUNDING = 1e-4
 """Bodies count as touching this much in m before the margin, so that between two looks at a way the margin is kept."""
 

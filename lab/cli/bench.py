@@ -57,10 +57,9 @@ def accuracy(
         done = counted(told, (seeds + 1) * len(levels))
         result = campaign(range(1, seeds + 1), levels, job, done, workers)
     by_level = result["levels"]
-    show(result if json else by_level, json, without=("per_run", "positions"))
     outside = sum(entry["outcomes"]["placed_outside_tolerance"] for entry in by_level.values())
-    if outside or not all(entry.get("within_limits", True) for entry in by_level.values()):
-        raise typer.Exit(1)
+    failed = outside or not all(entry.get("within_limits", True) for entry in by_level.values())
+    show(result if json else by_level, json, without=("per_run", "positions"), failed=failed)
 
 
 @bench.command()
@@ -91,9 +90,7 @@ def board(
     with bar() as told:
         report = campaign(views, seed, kinds, chosen, counted(told, views * len(kinds) * len(chosen)))
     shown = report if json else {**report, "rows": [row for row in report["rows"] if row["kind"] == "all"]}
-    show(shown, json, without=("reasons",))
-    if report["wrong"]:
-        raise typer.Exit(1)
+    show(shown, json, without=("reasons",), failed=report["wrong"])
 
 
 @bench.command()
@@ -142,9 +139,7 @@ def endings(
     with tempfile.TemporaryDirectory(prefix="cell-endings-") as folder, bar() as told:
         found = campaign(Path(folder), count, seed, speed, lambda done, text: told(done, text, 2 * count))
     result = summary(found, seed, speed)
-    show(result, json, without=("endings",))
-    if result["moved_or_shone_after"]:
-        raise typer.Exit(1)
+    show(result, json, without=("endings",), failed=result["moved_or_shone_after"])
 
 
 @bench.command()
@@ -190,9 +185,7 @@ def placed(
             range(1, seeds + 1), level.value, job, chosen, place=place,
             done=counted(told, len(chosen) * seeds), whole=whole, workers=workers,
         )  # fmt: skip
-    show(result, json, without=("runs",))
-    if result["outside_bound"]:
-        raise typer.Exit(1)
+    show(result, json, without=("runs",), failed=result["outside_bound"])
 
 
 @bench.command()
@@ -229,9 +222,7 @@ def realism(
         raise ConfigError(f"--effect {unknown[0]} is none of {', '.join(known)}")
     with bar() as told:
         result = campaign(chosen, range(1, seeds + 1), job, counted(told, len(chosen) * seeds), workers)
-    show(result, json, without=("runs",))
-    if not all(is_well(entry) for entry in result["effects"].values()):
-        raise typer.Exit(1)
+    show(result, json, without=("runs",), failed=not all(is_well(entry) for entry in result["effects"].values()))
 
 
 @bench.command()
@@ -283,9 +274,7 @@ def schedules(
         else:
             jobs = job or ["pot"]
             result = campaign(jobs, levels, count, first_seed, folder=Path(folder), workers=workers, told=progress)
-    show(result, json, without=("schedule",))
-    if result["violations"]:
-        raise typer.Exit(1)
+    show(result, json, without=("schedule",), failed=result["violations"])
 
 
 @bench.command()
@@ -306,9 +295,7 @@ def planner(
 
     with bar() as told:
         result = campaign(str(job), pairs, seed, patience, counted(told, pairs))
-    show(result, json)
-    if not result["within_limits"]:
-        raise typer.Exit(1)
+    show(result, json, failed=not result["within_limits"])
 
 
 @bench.command()
@@ -325,9 +312,7 @@ def servo(
 
     with bar() as told:
         found = measure(seconds, seed, told)
-    show(found, json)
-    if found["verdict"] == "missed":
-        raise typer.Exit(1)
+    show(found, json, failed=found["verdict"] == "missed")
 
 
 @bench.command()
@@ -343,9 +328,7 @@ def outdoor(
     with bar() as told:
         told(0, "the first runs are on their way")
         result = campaign(job, range(1, seeds + 1), KLX, counted(told, 2 * seeds), workers)
-    show(result, json, without=("runs",))
-    if any(row["wrong"] for row in result["rows"].values()):
-        raise typer.Exit(1)
+    show(result, json, without=("runs",), failed=any(row["wrong"] for row in result["rows"].values()))
 
 
 @bench.command()
@@ -361,9 +344,7 @@ def soak(
 
     with bar() as told:
         found = run(minutes, seed, job, told, speed=speed)
-    show(found, json, without=("processes",))
-    if found["verdict"].startswith("grows"):
-        raise typer.Exit(1)
+    show(found, json, without=("processes",), failed=found["verdict"].startswith("grows"))
 
 
 @bench.command()
@@ -407,9 +388,7 @@ def interim(
         found = campaign(
             range(1, seeds + 1), level.value, checks, lambda done, total: told(done, "cells", total), workers
         )
-    show(found, json, without=("runs",))
-    if found["shifts"][UNTOUCHED]["found"]:
-        raise typer.Exit(1)
+    show(found, json, without=("runs",), failed=found["shifts"][UNTOUCHED]["found"])
 
 
 @bench.command()

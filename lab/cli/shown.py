@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from itertools import count
 from typing import TYPE_CHECKING, Protocol
 
+import typer
+
 from cell.apps.cli.options import new_table, print_json, wide_console
 
 if TYPE_CHECKING:
@@ -48,12 +50,14 @@ def counted(told: Told, total: float) -> Callable[[str], None]:
     return lambda text: told(next(number), text, total)
 
 
-def show(result: Mapping[str, object], json: bool, without: Collection[str] = ()) -> None:
-    """The whole result as JSON on standard output, or tables of it, but for the keys `without`."""
+def show(result: Mapping[str, object], json: bool, without: Collection[str] = (), *, failed: object = False) -> None:
+    """The whole result as JSON on standard output, or tables of it without some keys; exit code 1 where it `failed`."""
     if json:
         print_json(result)
     else:
         _show(wide_console(150), "", result, without)
+    if failed:
+        raise typer.Exit(1)
 
 
 def _show(console: Console, title: str, value: object, without: Collection[str]) -> None:

@@ -14,7 +14,6 @@ from sim_backends.optics.mesh import Mesh
 
 Vector = NDArray[np.float64]
 Pose = NDArray[np.float64]
-"""4×4 homogeneous matrix."""
 
 KINDS = ("plain", "marked_dots", "asymmetric_dots", "dots", "chessboard")
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}

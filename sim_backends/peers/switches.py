@@ -17,7 +17,6 @@ from sim_backends.peers.server import Peer, SerialServer, TcpServer
 from sim_backends.world.world import World
 
 COUNT = 8
-"""Relays, and inputs, of a board."""
 VERSION, NUMBER = "00000009", "sim00001"
 
 

@@ -165,7 +165,6 @@ def only(*names: str) -> Effects:
 
 
 CUT = 2.5
-"""Draws lie within this many σ."""
 
 
 def _of(nominal: float, unit: str, meaning: str) -> float:

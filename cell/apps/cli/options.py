@@ -107,7 +107,6 @@ class Level(StrEnum):
 CellClock = Literal["wall", "virtual"]
 """What a simulated cell keeps time with."""
 Confirm = Literal["person", "simulated"]
-"""Who confirms what a person has to."""
 ConfigOption = Annotated[
     Path | None,
     typer.Option(

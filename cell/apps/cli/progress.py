@@ -22,7 +22,6 @@ from statemachine.step import Event
 SAID = ("note", "paused", "going_on")
 """Kinds of events whose text is shown as it is."""
 COMPILE = "compile"
-"""The row of what is compiled."""
 LOOPS = 105
 """About as many loops does a first dry run compile and keep on disk, those of the simulated world among them."""
 LOOK_S = 2.0

@@ -36,7 +36,6 @@ class CheckVerdict(StrEnum):
     FAILED = "failed"
     """It could not be measured; the notes say why and what to do."""
     DECLINED = "declined"
-    """A person did not want it."""
 
 
 @dataclass(frozen=True)

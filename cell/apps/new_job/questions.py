@@ -215,7 +215,6 @@ def _by(adapter: TypeAdapter[Any], value: object) -> Any:
 
 
 LISTED = 9
-"""Bodies that are told one by one."""
 PART_HEIGHT = 0.02
 """How thick a part is taken to be whose size nobody gave, m."""
 WIDEST_PART = (0.1, 0.07)

@@ -34,7 +34,6 @@ from drivers.vehicle.health import can_interface
 
 ROOT = Path("/")
 _CAN_TYPE = "280"
-"""ARPHRD_CAN."""
 _USB3_VISION = ("ef", "05")
 """Class and subclass of a USB interface."""
 _ADAPTERS = ("pcan", "kvaser", "ixxat", "vector", "gs_usb", "canalystii", "usb2can")

@@ -20,7 +20,6 @@ from drivers.errors import ConfigError, InterlockError
 from drivers.interfaces import Arm, ArmMotion, Claw, Laser, TriesOutputs, Vector, Vehicle
 
 PURPOSES = ("sweep", "calibration", "test")
-"""What the laser may be lit for."""
 
 
 @dataclass(frozen=True, eq=False)

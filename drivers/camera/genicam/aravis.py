@@ -23,7 +23,6 @@ PRIMARY_APPLICATION_ADDRESS = 0x0A14
 """Bootstrap register: IPv4 address of the application that controls the camera; GigE Vision 1.1 and later."""
 
 Handle = int
-"""Address of an object of the library."""
 _POINTER, _TEXT, _NOTHING = c_void_p, c_char_p, None
 _OUT_INT = ctypes.POINTER(c_int)
 _OUT_INT64 = ctypes.POINTER(c_int64)

@@ -153,7 +153,6 @@ def decode_firmware(data: bytes) -> str:
 REPLY_TIMEOUT_S = 0.5
 """Wall seconds for a reply: modules answer within a few ms, a loaded machine may add tens."""
 WRONG_CHECKSUM, NO_SUCH_TYPE, WRONG_VALUE = 1, 3, 4
-"""Some of the status codes of a reply."""
 _ATTEMPTS = 2
 _IN_STEP_S = 0.25
 """Wall seconds for the reply to a question that is asked to be in step again."""

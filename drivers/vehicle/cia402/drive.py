@@ -166,7 +166,6 @@ class Entry:
 DEVICE_TYPE = Entry(0x1000, 0, "<I", "device type")
 ERROR_REGISTER = Entry(0x1001, 0, "<B", "error register")
 DEVICE_NAME, SOFTWARE = (0x1008, 0), (0x100A, 0)
-"""Texts."""
 GUARD_TIME = Entry(0x100C, 0, "<H", "guard time")
 LIFE_FACTOR = Entry(0x100D, 0, "<B", "life time factor")
 CONSUMER_HEARTBEAT = Entry(0x1016, 1, "<I", "consumer heartbeat time")
@@ -204,7 +203,6 @@ DRIVE_PROFILE = 402
 """Lower half of the device type."""
 PROFILE_VELOCITY = 3
 PROFILE_VELOCITY_BIT = 1 << 2
-"""Of the supported drive modes."""
 
 NMT, SYNC = 0x000, 0x080
 EMERGENCY, STATUS, MOTION, HEALTH = 0x080, 0x180, 0x280, 0x380
@@ -212,9 +210,7 @@ COMMAND, SDO_REPLY, SDO_REQUEST, HEARTBEAT = 0x200, 0x580, 0x600, 0x700
 """Identifiers of the predefined connection set, to which a node's number is added. `STATUS`, `MOTION` and `HEALTH` are
 the first three PDOs that a drive sends, `COMMAND` the first that it takes."""
 START, PRE_OPERATIONAL = 0x01, 0x80
-"""NMT commands."""
 BOOTED, STOPPED, OPERATIONAL, PREPARING = 0x00, 0x04, 0x05, 0x7F
-"""NMT states in a heartbeat."""
 NMT_STATES = {BOOTED: "booted", STOPPED: "stopped", OPERATIONAL: "operational", PREPARING: "pre-operational"}
 
 

@@ -58,7 +58,6 @@ def _optional(bus: CanopenBus, drive: SideDrive, entry: od.Entry) -> int | None:
 
 
 _EXPEDITED_4 = 0x23
-"""SDO: set four bytes."""
 
 
 def last_words(wheels: WheelDrives) -> list[tuple[int, bytes]]:

@@ -19,7 +19,6 @@ HEARTBEATS_IN_TIME = 5
 """So many of our heartbeats go into the time after which a drive stops without one."""
 DRIVES_HEARTBEAT_MS = 100
 _INVALID, _NO_REMOTE = 1 << 31, 1 << 30
-"""Bits of a PDO's identifier."""
 _EACH_SYNC, _AT_ONCE, _SELDOM = 1, 255, 10
 """Transmission types: with each SYNC, when it comes, with each tenth SYNC."""
 

@@ -212,4 +212,3 @@ EFFECTS: dict[str, PartEffect] = {
     "joint 6 turns 2 mrad as the claw opens": PartEffect((), as_it_opens(lambda world: world.arm.shift_zero(5, 2e-3))),
     "rail's screw has play of .05 mm": PartEffect((), screw_worn),
 }
-"""By name."""

@@ -35,7 +35,6 @@ SWITCHING_S = 0.8
 BLIND_S = 15.0
 """For so long before the part is let go the surface is looked at no more: what is moved then, nobody can know."""
 CROWDED = 20
-"""So many violations are enough."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,6 @@ class Oracle:
     home: str = "held"
     violations: list[Violation] = field(default_factory=list)
     acts: list[str] = field(default_factory=list)
-    """What was done to the cell so far."""
     released: int = 0
     """How often the present part was let go."""
     taken: bool = False

@@ -11,7 +11,6 @@ from sim_backends.direct.cell import NAMES as FAULTS
 
 KILL, POWER_CUT = "kill", "power_cut"
 WORLD_ACTS = ("vehicle_bumped", "surface_moved", "part_taken")
-"""What people do to the world."""
 PERSON_ACTS = ("pause", "abort", "late_word")
 """What people ask of the run; `late_word` is a confirmation, which comes when it is asked for."""
 COMPUTER_ACTS = (KILL, POWER_CUT, "full_disk", "clock_step")

@@ -30,7 +30,6 @@ BATCHES = (0.5, 0.75, 1.0)
 Told = Callable[[str, int, int], None]
 """Called with what is done, how much of it, and of how much."""
 World = tuple[int, str]
-"""A seed and a level."""
 Place = tuple[str, str]
 """A step, "" before the first, and an act."""
 

@@ -50,7 +50,6 @@ USER_VARIABLES = 256
 STORED_VARIABLES = 56
 """The first so many of them can be stored in the EEPROM, from where they come back at power-on."""
 INPUTS = 4
-"""Number of digital inputs."""
 
 
 OK, BAD_CHECKSUM, BAD_COMMAND, BAD_TYPE, BAD_VALUE, LOCKED = 100, 1, 2, 3, 4, 5

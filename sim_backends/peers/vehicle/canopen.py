@@ -21,7 +21,6 @@ from sim_backends.peers.vehicle.canopen_node import WRONG_VALUE, Abort, CanopenN
 from sim_backends.peers.vehicle.slcan import CanFrame, CanPeer
 
 _TURNS = {"rpm": 1 / 60, "0.1 rpm": 1 / 600, "0.01 rpm": 1 / 6000, "0.001 rpm": 1 / 60000}
-"""Turns a second per unit of velocity."""
 _UNITS = {"counts/s": (0, 0xB5, 0x03), "rpm": (0, 0xB4, 0x47), "0.1 rpm": (0xFF, 0xB4, 0x47),
           "0.01 rpm": (0xFE, 0xB4, 0x47), "0.001 rpm": (0xFD, 0xB4, 0x47)}  # fmt: skip
 _MOTORS = ((1, 2), (0, 3))

@@ -18,7 +18,6 @@ NOT_NOW, NO_SUCH_COMMAND = 0x08000022, 0x05040001
 _INVALID = 1 << 31
 _PDOS = 4
 _COMMUNICATION_BIT = 0x10
-"""Of the error register."""
 
 
 class Abort(Exception):

@@ -115,7 +115,6 @@ PERIOD_S = 0.05
 DEEPER_M = 0.005
 """Two bodies that touch already collide anew when they press by this much deeper."""
 LONGEST = 100
-"""So many collisions are kept."""
 
 DECK = np.array([[-0.8, -0.4, -0.30], [0.2, 0.4, -0.01]])
 """Lowest and highest corner (2, 3) of the vehicle, m, in the arm's base, which stands on it."""

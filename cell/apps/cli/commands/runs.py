@@ -28,9 +28,7 @@ NoiseOption = Annotated[
 
 
 Format = Literal["ply", "stl", "mesh"]
-"""What can be written of a cloud."""
 Wires = Literal["candump", "text"]
-"""How raw traffic can be written."""
 
 
 def abort(

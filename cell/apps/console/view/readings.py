@@ -30,7 +30,6 @@ from drivers.errors import CellError, DeviceFault
 from drivers.interfaces import ArmSafety, ArmState, Attended, RailState, VehicleState
 
 OLD_S = 1.0
-"""A reading that is older is not shown."""
 REST_S = 1.0
 """Wall seconds between two questions to a rail that rests."""
 

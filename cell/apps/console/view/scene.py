@@ -34,7 +34,6 @@ LINKS = ("base", "shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wris
 NAMES = (*LINKS, "flange", "vehicle")
 KINDS = (".stl", ".ply", ".obj")
 MOST_TRIANGLES = 8_000
-"""A finer mesh is drawn coarser."""
 SMALLEST_M, LARGEST_M = 0.005, 5.0
 
 
@@ -209,7 +208,6 @@ def _rounded(values: Sequence[float] | NDArray[np.float64]) -> list[float]:
 
 
 MOST_POINTS = 80
-"""Points of a way that are drawn."""
 
 
 class SceneNow:

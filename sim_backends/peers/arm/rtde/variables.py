@@ -201,7 +201,6 @@ INPUTS: dict[str, str] = {
     **{f"input_int_register_{i}": "INT32" for i in range(REGISTERS)},
     **{f"input_double_register_{i}": "DOUBLE" for i in range(REGISTERS)},
 }
-"""Writable variables and their types."""
 
 
 def word(bits: Sequence[bool]) -> int:

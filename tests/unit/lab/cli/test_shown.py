@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
+import typer
 
 from lab.cli.shown import show
 
@@ -32,3 +33,9 @@ def test_people_see_values_and_records_without_what_is_too_long(capsys: pytest.C
 def test_scripts_get_all_of_it(capsys: pytest.CaptureFixture[str]) -> None:
     show(RESULT, json=True, without=("trials",))
     assert json.loads(capsys.readouterr().out) == RESULT
+
+
+def test_a_bench_that_failed_ends_with_1_after_it_was_shown(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(typer.Exit) as ended:
+        show({"worlds": 3}, json=True, failed=["a violation"])
+    assert (ended.value.exit_code, json.loads(capsys.readouterr().out)) == (1, {"worlds": 3})

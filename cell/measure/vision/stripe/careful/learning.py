@@ -14,7 +14,6 @@ Array = NDArray[np.float64]
 
 ROUNDS = 5
 LEAST_LINES = 40
-"""Fewer lines than this teach nothing."""
 MOST_LINES, MOST_SAMPLES, RUN = 512, 9000, 32
 NEAR = 9
 """Lines on either side that say where a line's centre should be."""
