@@ -120,6 +120,13 @@ class CanopenBus(CanLink):
         except struct.error as error:
             raise unfit(self.name, f"the drive with node number {node} tells {entry} in too few bytes") from error
 
+    def read_if_there(self, node: int, entry: Entry) -> int | None:
+        """A value that not every drive has; None when this one has not. Raises as `read` does."""
+        try:
+            return self.read(node, entry)
+        except Absent:
+            return None
+
     def text(self, node: int, index: int, sub: int) -> str:
         """A text of a drive, "" when it has none. Raises as `read` does."""
         try:

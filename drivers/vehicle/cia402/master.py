@@ -22,7 +22,7 @@ from drivers.interfaces import LinkStatistics
 from drivers.vehicle.can_link import data_frame
 from drivers.vehicle.cia402 import drive as od
 from drivers.vehicle.cia402 import drive as states
-from drivers.vehicle.cia402.bus import Absent, CanopenBus
+from drivers.vehicle.cia402.bus import CanopenBus
 from drivers.vehicle.cia402.drive import QUICK_STOP, DriveState, SideDrive
 from drivers.vehicle.cia402.feedback import DriveFeedback, WheelDrives
 from drivers.vehicle.cia402.setup import Watchdog, lock, set_up
@@ -36,8 +36,8 @@ def ask(bus: CanopenBus, feedback: DriveFeedback, wheels: WheelDrives) -> None:
         if wheels.stop_input is not None:
             motion += struct.pack("<I", bus.read(drive.node, od.INPUTS))
         feedback.take(drive.node, od.MOTION, motion, in_pdo=False)
-        health = struct.pack("<H", _optional(bus, drive, od.ERROR_CODE) or 0)
-        if (millivolts := _optional(bus, drive, od.DC_LINK)) is not None:
+        health = struct.pack("<H", bus.read_if_there(drive.node, od.ERROR_CODE) or 0)
+        if (millivolts := bus.read_if_there(drive.node, od.DC_LINK)) is not None:
             health += struct.pack("<I", millivolts)
         feedback.take(drive.node, od.HEALTH, health, in_pdo=False)
         told = [bus.read(drive.node, entry) for entry in (od.STATUSWORD, od.POSITION, od.MODE_DISPLAY)]
@@ -46,15 +46,8 @@ def ask(bus: CanopenBus, feedback: DriveFeedback, wheels: WheelDrives) -> None:
 
 def number(bus: CanopenBus, drive: SideDrive, entry: od.Entry) -> str:
     """A number of the drive as text, "" where it has none."""
-    told = _optional(bus, drive, entry)
+    told = bus.read_if_there(drive.node, entry)
     return "" if told is None else str(told)
-
-
-def _optional(bus: CanopenBus, drive: SideDrive, entry: od.Entry) -> int | None:
-    try:
-        return bus.read(drive.node, entry)
-    except Absent:
-        return None
 
 
 _EXPEDITED_4 = 0x23

@@ -86,13 +86,13 @@ def set_up(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives, watchdog: Wat
 
 def compare_units(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives) -> None:
     """`ConfigError` when the drive says that it counts, or measures speed, otherwise than configured."""
-    counts, turns = (_told(bus, drive, entry) for entry in (od.ENCODER_INCREMENTS, od.ENCODER_TURNS))
+    counts, turns = (bus.read_if_there(drive.node, entry) for entry in (od.ENCODER_INCREMENTS, od.ENCODER_TURNS))
     if counts and turns and abs(counts / turns - wheels.counts) > 0.5:
         raise ConfigError(
             f"the {drive.side} drive (node {drive.node}) counts {counts / turns:g} per turn of its motor by its object "
             f"608Fh; vehicle.counts_per_turn is {wheels.counts}. Correct the one that is wrong"
         )
-    unit = _told(bus, drive, od.VELOCITY_UNIT)
+    unit = bus.read_if_there(drive.node, od.VELOCITY_UNIT)
     named = {code: name for name, code in SI_UNITS.items()}
     if unit in named and named[unit] != wheels.velocity_unit:
         raise ConfigError(
@@ -105,7 +105,7 @@ def lock(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives, *, locked: bool
     """Switch the output of the drive that its brake hangs on, and read it back."""
     assert wheels.brake_output is not None
     bit = 1 << wheels.brake_output
-    mask = _told(bus, drive, od.OUTPUT_MASK)
+    mask = bus.read_if_there(drive.node, od.OUTPUT_MASK)
     if mask is not None and not mask & bit:
         _set(bus, drive, od.OUTPUT_MASK, mask | bit)
     now = bus.read(drive.node, od.OUTPUTS)
@@ -116,7 +116,7 @@ def _require_drive(bus: CanopenBus, drive: SideDrive) -> None:
     profile = bus.read(drive.node, od.DEVICE_TYPE) & 0xFFFF
     if profile != od.DRIVE_PROFILE:
         raise _unfit(bus, drive, f"is no drive: its profile is CiA {profile}, not {od.DRIVE_PROFILE}")
-    modes = _told(bus, drive, od.SUPPORTED_MODES)
+    modes = bus.read_if_there(drive.node, od.SUPPORTED_MODES)
     if modes is not None and not modes & od.PROFILE_VELOCITY_BIT:
         raise _unfit(bus, drive, f"has no profile velocity mode (object 6502h is {modes:08X}h)")
 
@@ -139,7 +139,7 @@ def _require_rest(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives) -> Non
 
 def _map_all(bus: CanopenBus, drive: SideDrive, wheels: WheelDrives) -> None:
     motion = [od.VELOCITY] if wheels.stop_input is None else [od.VELOCITY, od.INPUTS]
-    health = [od.ERROR_CODE] if _told(bus, drive, od.DC_LINK) is None else [od.ERROR_CODE, od.DC_LINK]
+    health = [od.ERROR_CODE] if bus.read_if_there(drive.node, od.DC_LINK) is None else [od.ERROR_CODE, od.DC_LINK]
     _map(bus, drive, 0x1400, service=od.COMMAND, transmission=_AT_ONCE, entries=[od.CONTROLWORD, od.TARGET_VELOCITY])
     _map(bus, drive, 0x1800, od.STATUS, transmission=_EACH_SYNC, entries=[od.STATUSWORD, od.POSITION, od.MODE_DISPLAY])
     _map(bus, drive, 0x1801, service=od.MOTION, transmission=_EACH_SYNC, entries=motion)
@@ -168,23 +168,15 @@ def _set(bus: CanopenBus, drive: SideDrive, entry: Entry, value: int, *, needed:
     try:
         bus.write(drive.node, entry, value)
     except Absent as absent:
-        if needed and _told(bus, drive, entry) != value:
+        if needed and bus.read_if_there(drive.node, entry) != value:
             raise _unfit(bus, drive, f"lets {entry} not be set to {value}: {absent}") from absent
         return
     except DeviceFault as refusal:
         if needed or refusal.code != SETUP:
             raise
         return
-    if (kept := _told(bus, drive, entry)) not in (value, None):
+    if (kept := bus.read_if_there(drive.node, entry)) not in (value, None):
         raise _unfit(bus, drive, f"took {entry} = {value} and keeps {kept}")
-
-
-def _told(bus: CanopenBus, drive: SideDrive, entry: Entry) -> int | None:
-    """A value that not every drive has; None when this one has not."""
-    try:
-        return bus.read(drive.node, entry)
-    except Absent:
-        return None
 
 
 def _unfit(bus: CanopenBus, drive: SideDrive, what: str) -> DeviceFault:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.optics.scene import Board
 from sim_backends.world import drawing
-from sim_backends.world.bodies.contact import PartContact
+from sim_backends.world.bodies.contact import PartContact, moved_by
 from sim_backends.world.drawing import Box, Drawing, inverse
 from sim_backends.world.scene import Scene
 
@@ -83,13 +83,13 @@ class ArmPoints:
         self._share = np.concatenate(shares)[:, None]
         self._offset = np.repeat([row[2] for row in rows], counts)[:, None]
         self._rise = np.repeat([row[3] for row in rows], counts)[:, None]
-        target = _moved(self._TARGET, cell.target.mounting)
+        target = moved_by(self._TARGET, cell.target.mounting)
         self._on_flange = np.concatenate([self._CLAW, target])
         # The camera and its laser, in the camera's frame.
         self._scan = _corners((-cell.baseline - 0.015, -0.02, -0.055), (0.02, 0.02, 0.005))
         x, y, z = station.part_size
         part = _corners((-0.5 * x, -0.5 * y, 0.0), (0.5 * x, 0.5 * y, 0.9 * z))
-        self._part = _moved(part, station.flange_from_part)
+        self._part = moved_by(part, station.flange_from_part)
 
     def at(self, frames: Pose, flange_from_scan: Pose, held: bool) -> Vector:
         """The points (n, 3) in the arm's base; `frames` (7, 4, 4) are those of base and links, the last the flange's.
@@ -101,13 +101,8 @@ class ArmPoints:
         end = frames[self._last, :3, 3] + self._rise * along
         flange = frames[6]
         part = self._part if held else np.zeros_like(self._part)
-        tool = np.concatenate([self._on_flange, _moved(self._scan, flange_from_scan), part])
-        return np.concatenate([start + self._share * (end - start), _moved(tool, flange)])
-
-
-def _moved(points: Vector, a_from_b: Pose) -> Vector:
-    moved: Vector = points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
-    return moved
+        tool = np.concatenate([self._on_flange, moved_by(self._scan, flange_from_scan), part])
+        return np.concatenate([start + self._share * (end - start), moved_by(tool, flange)])
 
 
 PERIOD_S = 0.05
@@ -210,7 +205,7 @@ class Collisions:
 
         The part touches only what is not the ground here.
         """
-        in_base = _moved(_moved(points, inverse(world_from_vehicle)), self._base_from_vehicle)
+        in_base = moved_by(moved_by(points, inverse(world_from_vehicle)), self._base_from_vehicle)
         depths = [self._standing_boxes.depths(points), self._on_vehicle.depths(in_base)]
         if not self._ground.clear(points, self._arm.radius):
             below, on_table = self._ground.below(points)
@@ -253,7 +248,7 @@ def _standing(scene: Scene) -> tuple[dict[str, Vector], dict[str, tuple[Pose, Ve
         centred, size = _box(drawn)
         pose = scene.world_from_place @ inverse(centred)
         boxes[f"station obstacle {name}"] = inverse(pose), size
-        corners = _moved(size * _CORNERS, pose)
+        corners = moved_by(size * _CORNERS, pose)
         if corners[:, 2].min() < top:
             # As seen from above: the corners of its top and bottom together.
             outline = scipy.spatial.ConvexHull(corners[:, :2])

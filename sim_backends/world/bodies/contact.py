@@ -98,7 +98,7 @@ class PartContact:
             underside = np.stack([x, y, surface.height(x, y)], axis=-1)
         else:
             x, y = _grid(part)
-            underside = _moved(np.stack([x, y, -part.relief(x, y)[0]], axis=-1), surface_from_part)
+            underside = moved_by(np.stack([x, y, -part.relief(x, y)[0]], axis=-1), surface_from_part)
             underside = underside[np.isfinite(underside).all(axis=1)]
             x, y = underside[:, 0], underside[:, 1]
         inside = (np.abs(x - surface.centre[0]) <= surface.half_x) & (np.abs(y - surface.centre[1]) <= surface.half_y)
@@ -108,9 +108,9 @@ class PartContact:
                 f"the surface {surface.name!r} lies below {there.sum()} of {len(there)} points of the part's underside "
                 f"(allowed: at least {LEAST_TOUCHING}); give a mesh that is seen from above, z up"
             )
-        self._underside = _moved(underside[there], inverse(surface_from_part))
+        self._underside = moved_by(underside[there], inverse(surface_from_part))
         box = [[sx * surface.half_x, sy * surface.half_y, surface.top] for sx in (-1, 1) for sy in (-1, 1)]
-        corners = _moved(np.array(box) + np.array([*surface.centre, 0.0]), world_from_surface)
+        corners = moved_by(np.array(box) + np.array([*surface.centre, 0.0]), world_from_surface)
         self._highest = max(float(corners[:, 2].max()), float(world_from_surface[2, 3])) + _LEAN
         self._held_box = self._box(held=True)
         self._empty_box = self._box(held=False)
@@ -198,7 +198,7 @@ class PartContact:
         """The part after it fell straight down (or sprang back up) to its first contact, its orientation kept."""
         rest = world_from_part.copy()
         for _ in range(20):
-            depth, _ = self._below(_moved(self._underside, rest))
+            depth, _ = self._below(moved_by(self._underside, rest))
             # Depth counts along z_S, the fall is along world z: repeated, because the table may lean a little.
             step = float(depth.max())
             rest[2, 3] += step
@@ -214,7 +214,7 @@ class PartContact:
         """
         rest = self._rest(world_from_part)
         for _ in range(SETTLING):
-            points = _moved(self._underside, rest)
+            points = moved_by(self._underside, rest)
             depth, _ = self._below(points)
             middle = points.mean(axis=0)
             x, y, _ = (points - middle).T
@@ -233,7 +233,7 @@ class PartContact:
 
     def _box(self, held: bool) -> tuple[list[float], list[float]]:
         """Lowest and highest corner of what may touch the ground, in the flange: fingertips, and the part when held."""
-        part = [_moved(self._underside, self._flange_from_part)] if held else []
+        part = [moved_by(self._underside, self._flange_from_part)] if held else []
         points = np.concatenate([self._fingertips, *part])
         return points.min(axis=0).tolist(), points.max(axis=0).tolist()
 
@@ -244,13 +244,13 @@ class PartContact:
 
     def _under(self, points: Vector) -> tuple[Vector, Vector, NDArray[np.bool_]]:
         """As `_below`, and where (n,) the ground is the table."""
-        local, on_table = _moved(points, self._surface_from_world), self._on_table(points)
+        local, on_table = moved_by(points, self._surface_from_world), self._on_table(points)
         height, normals = self._surface.sample(local[:, 0], local[:, 1])
         return np.where(on_table, height, -self._table_height) - local[:, 2], normals, on_table
 
     def _on_table(self, points: Vector) -> NDArray[np.bool_]:
         made: NDArray[np.bool_] = (
-            np.abs(_moved(points, self._table_from_world)[:, :2]).max(axis=1) <= drawing.TABLE_HALF
+            np.abs(moved_by(points, self._table_from_world)[:, :2]).max(axis=1) <= drawing.TABLE_HALF
         )
         return made
 
@@ -282,9 +282,9 @@ class PartContact:
             )
             if lowest > self._highest or (beside and lowest > _FLOOR):
                 return wrench
-            points = _moved(self._fingertips, world_from_flange)
+            points = moved_by(self._fingertips, world_from_flange)
             if self._world_from_part is None:
-                points = np.concatenate([points, _moved(self._underside, world_from_flange @ self._flange_from_part)])
+                points = np.concatenate([points, moved_by(self._underside, world_from_flange @ self._flange_from_part)])
         depth, normals = self._below(points)
         if self.sticks and self.held and -STICKY < (deepest := float(depth.max())) <= 0.0:
             wrench[2] = -self.sticks * min(1.0, -deepest / STRETCH)
@@ -319,6 +319,7 @@ def _beside_wall(surface: Surface, x: Vector, y: Vector) -> NDArray[np.bool_]:
     return found
 
 
-def _moved(points: Vector, a_from_b: Pose) -> Vector:
+def moved_by(points: Vector, a_from_b: Pose) -> Vector:
+    """Points (n, 3) of frame b in frame a."""
     moved: Vector = points @ a_from_b[:3, :3].T + a_from_b[:3, 3]
     return moved
