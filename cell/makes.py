@@ -4,8 +4,6 @@ A package's make is imported only when a configuration names it, or when somebod
 imported, or that takes another's name, is told in the list with the reason, and keeps nothing else from working.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from importlib.metadata import EntryPoint, entry_points

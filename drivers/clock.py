@@ -6,8 +6,6 @@ The device latched at some instant within the round trip, so half of it bounds t
 latches the shortest is kept; latches far apart show how fast the device's clock runs. A clock that was set meanwhile,
 by a restart or by a time service, contradicts its earlier latches: they are forgotten."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -21,8 +21,6 @@ Limits with units: the checks that every driver makes before it sends anything.
 
 Values are SI; the text of an error shows them in the units that people read off a machine (mm, degrees, ms)."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping

@@ -6,8 +6,6 @@ The makes that come with the cell are in `make.py` beside their drivers. Reading
 The records here hold what the cell has to know of each kind of device: how it is mounted and what it may do. A make's
 record adds where the device is and how it is set up. Ranges are those of the devices."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Mapping

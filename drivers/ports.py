@@ -1,7 +1,5 @@
 """Serial ports, opened for one program alone, and what came unasked over a socket."""
 
-from __future__ import annotations
-
 import socket
 from contextlib import suppress
 from typing import ClassVar, cast

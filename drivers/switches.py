@@ -4,8 +4,6 @@ The arm keeps an output when a program ends, so the laser's interlock has three 
 its context is left for whatever reason, and off again on `stop()` and `close()`.
 """
 
-from __future__ import annotations
-
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterator

@@ -5,8 +5,6 @@ between two ticks of the physics and are rendered later: poses are interpolated.
 sample the nearest pose holds.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """Doing a step until it succeeds: one try after the other, recovering from faults, and what a run waits for."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace

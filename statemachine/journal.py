@@ -6,8 +6,6 @@ live and put requests into it (`request`), which the runner takes out. Times are
 given by the caller.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import sqlite3

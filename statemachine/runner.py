@@ -5,8 +5,6 @@ neither devices nor the cell: `classify` judges exceptions, `safe_stop` brings t
 results between the steps, and decide on a refusal.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping

@@ -3,8 +3,6 @@
 Callbacks only guard and log; no work is done here. `fault` and `abort` lead out of every state.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum, StrEnum

@@ -4,8 +4,6 @@ A policy names exceptions by their class names, so that it imports nothing that 
 this order: an end that was asked for; a retry; a recovery; the end of the run.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

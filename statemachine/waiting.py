@@ -4,8 +4,6 @@ On the wall's clock the work has a thread of its own, so whoever watches can alw
 when somebody waits: the work is done in the thread that watches, so the same work takes the same course.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager

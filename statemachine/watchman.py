@@ -3,8 +3,6 @@
 What ends work: a request of a person or a program, a signal, its deadline, the cell's health. All is told here.
 """
 
-from __future__ import annotations
-
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

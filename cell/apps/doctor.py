@@ -4,8 +4,6 @@ Every cell asks for Python, room, clocks, timing and packages; its configured de
 libraries. Read from the system below `root`. No device is opened or asked.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import resource

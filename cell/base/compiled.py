@@ -5,8 +5,6 @@ called. Where it is missing, broken or switched off, functions stay as they are.
 not to run a job, and is said once.
 """
 
-from __future__ import annotations
-
 import threading
 import warnings
 from collections.abc import Callable

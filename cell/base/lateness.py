@@ -3,8 +3,6 @@
 Not for the virtual clock, on which nobody sleeps.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque

@@ -1,7 +1,5 @@
 """TOML files as typed records: what is wrong in one is told by key and value, in our words, all of it at once."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

@@ -3,8 +3,6 @@
 Everything is reckoned with the geometry as drawn. What stands some millimetres beside the drawing is found on the way.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Whether the vehicle's way to the table makes sense, the place and its mesh, and how the part is put down there."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from itertools import pairwise, product

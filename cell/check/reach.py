@@ -1,8 +1,6 @@
 """Whether the arm reaches every pose of a job and of a calibration without touching anything, as drawn, and whether a
 sweep can see how the part lies once it was placed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

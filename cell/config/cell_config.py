@@ -5,8 +5,6 @@ calibration depends on ties stored calibrations to the configuration that they w
 a configuration (on the vehicle) or a job (at the station) names: arm and vehicle keep away from them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import tomllib

@@ -3,8 +3,6 @@
 What a configuration holds is read and checked in `cell.config`.
 """
 
-from __future__ import annotations
-
 import tomllib
 from contextlib import suppress
 from pathlib import Path

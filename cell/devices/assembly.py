@@ -1,7 +1,5 @@
 """The composition root: from configuration to devices, each of the make that the configuration names."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from contextlib import ExitStack
 from typing import Any

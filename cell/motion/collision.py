@@ -8,8 +8,6 @@ Between the samples of a way: no joint can bring a pair nearer faster than the f
 the next look may be as far along as no pair can have met before.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product

@@ -5,8 +5,6 @@ closed form of the maker's arm, with three parallel axes, lists the branches; Ga
 each of them exact. Sources: docs/reference/protocols.md, section 1.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 

@@ -6,8 +6,6 @@ which ends after so many looks, never by the clock. Where OMPL has no wheel, way
 `limits` says so.
 """
 
-from __future__ import annotations
-
 import itertools
 import threading
 from collections.abc import Callable, Iterator, Sequence

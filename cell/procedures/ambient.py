@@ -5,8 +5,6 @@ whitened by it, the camera exposes no longer than `GatedCamera.longest_exposure`
 begins; before each sweep the scan camera then takes a picture without the laser, which says how long it may expose.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import TypeVar

@@ -1,7 +1,5 @@
 """What the sweep of a job looks for: the surface, or, where a part is to be unloaded, that part as it lies."""
 
-from __future__ import annotations
-
 from itertools import product
 from pathlib import Path
 

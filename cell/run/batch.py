@@ -4,8 +4,6 @@ Between two runs the next part is made ready. A simulated world does that by its
 a recorded run of its own: nothing moves before the answer.
 """
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Callable, Sequence

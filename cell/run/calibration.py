@@ -1,7 +1,5 @@
 """The cell's work on its own calibration: find it, make one over the boards on the deck, see how good it is today."""
 
-from __future__ import annotations
-
 import os
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence

@@ -4,8 +4,6 @@ A subscriber that does not keep up loses only progress: of each step it then fin
 kept for it up to a bound; the journal has everything.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping

@@ -4,8 +4,6 @@ Every module has a logger of its own, `logging.getLogger(__name__)`; they write 
 console. Nothing but the command line prints.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import secrets

@@ -4,8 +4,6 @@ Jobs look at the fine board, which tells of head, joints and board, and at the p
 laser and of the head on its rail. So each part has a series of figures, and a series shows what creeps.
 """
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 import sys

@@ -4,8 +4,6 @@ It has a folder, a journal and a report like a job's run, and listens to the sam
 after a protective stop, and whatever ends it early stops the cell first.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import os

@@ -4,8 +4,6 @@ A plain socket with a deadline on every call, so that it can stop the arm when e
 Source: the maker's dashboard reference; docs/reference/protocols.md, section 1.
 """
 
-from __future__ import annotations
-
 import socket
 import threading
 import time

@@ -6,8 +6,6 @@ Source: docs/reference/protocols.md, section 1.
 
 Whether the arm is the one that its user computes with: flange and payload as reported and as they should be."""
 
-from __future__ import annotations
-
 import math
 import socket
 import struct

@@ -1,7 +1,5 @@
 """What ends the arm's motions: each fault's words, whether a program may clear it, and how a protective stop is."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 

@@ -6,8 +6,6 @@ The driver sends one `ChildSetup`, then `ChildRequest`s; the child answers each 
 `Snapshot`s, `Ended` and `Lost` by itself. Positions in m and rad, forces in N, times in s of the system's monotonic
 clock, which all processes share."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -4,8 +4,6 @@ A connection of its own that only reads: an output recipe sets nothing. Limits t
 Source: the maker's RTDE guide, version 2; docs/reference/protocols.md, section 1.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

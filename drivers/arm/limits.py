@@ -1,7 +1,5 @@
 """What an arm may be asked to do, and the checks before anything is sent. Defaults are those of a UR10e."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

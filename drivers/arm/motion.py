@@ -1,7 +1,5 @@
 """Motions of the arm: a joint trajectory that can be sampled at any time, and the motion as its caller holds it."""
 
-from __future__ import annotations
-
 import math
 import threading
 from bisect import bisect_right

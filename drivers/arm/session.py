@@ -2,8 +2,6 @@
 
 Making the arm safe without its child process: the program ended through the dashboard, the safe outputs off."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator

@@ -5,8 +5,6 @@ Everything is checked here before anything is sent; the child does the talking. 
 ways; `recover()` starts afresh. A cut cable is noticed by the controller's own watchdog, which ends the program.
 """
 
-from __future__ import annotations
-
 import itertools
 import threading
 import time

@@ -4,8 +4,6 @@ Whether a frame's times can be true: each on its own, and against the frame befo
 
 A stamp that is wrong by a frame puts a whole line of a sweep elsewhere, and nothing in the picture shows it."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections import deque

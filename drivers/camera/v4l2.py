@@ -6,8 +6,6 @@ are known to half of that: enough for photographs and not for a sweep, which is 
 
 What a picture of a V4L2 camera is worth: its pixels as grey, and what its time stamp leaves open."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator

@@ -9,8 +9,6 @@ The text protocol of a Robotiq gripper: variables that are read with GET and wri
 Replies have no end mark: `ack` for a SET, `NAME value` for a GET. All of what the gripper knows is in the gripper, so a
 connection that was lost is simply made again by the next request. Source: docs/how-to/other-makes.md, section 3."""
 
-from __future__ import annotations
-
 import re
 import socket
 import threading

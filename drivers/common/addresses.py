@@ -3,8 +3,6 @@
 Only the form is checked here: whether somebody answers is seen when the device is connected.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import re
 from urllib.parse import urlsplit

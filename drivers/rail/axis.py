@@ -3,8 +3,6 @@
 A make derives from it and says how its drive is asked and told.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -5,8 +5,6 @@ taken far longer than its ramp allows. `CarriageWatch` sees whether the carriage
 bounds it; `ZeroCheck` whether the count still has its zero where the reference switch is.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Callable, Iterator, Sequence

@@ -7,8 +7,6 @@ whatever reason; off on `stop()` and `close()`; and a small process that writes 
 Source: docs/how-to/other-makes.md, section 2.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import threading

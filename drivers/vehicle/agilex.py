@@ -5,8 +5,6 @@ itself stops 0.5 s after the last command. Brake feedback is not on the bus: `br
 None before this driver has commanded it, or when somebody else may have changed it since.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -5,8 +5,6 @@ What the vehicle answers when it is asked for its version; descriptions of the p
 The maker's SDK sends 01 to 0x4A1 and reads ten frames of text there. The SCOUT manual 1.3.0 asks at 0x411 and reads
 four numbers at 0x41A. Some firmware answers neither: then the version is unknown, which is no fault."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Mapping
 from importlib.resources import as_file, files

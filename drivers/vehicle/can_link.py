@@ -4,8 +4,6 @@ python-can's own notifier thread ends silently on a bus error; this one keeps th
 link raises it.
 """
 
-from __future__ import annotations
-
 import struct
 import threading
 import time

@@ -4,8 +4,6 @@ Source: AgileX ugv_sdk, `agilex_message.h` (SYSTEM_ERROR_â€¦ and DRIVER_STATE_â€
 as a fault.
 """
 
-from __future__ import annotations
-
 from drivers.errors import DeviceFault
 
 _SYSTEM = {

@@ -4,8 +4,6 @@ Planar odometry of a skid-steered vehicle from the distances of its two sides.
 
 How far the wheels have turned: odometry, when it no longer tells where the vehicle is, and who else moved it."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections import deque

@@ -3,8 +3,6 @@
 It stands and is braked, always; whoever wants to drive it is told that there is nothing to drive.
 """
 
-from __future__ import annotations
-
 from drivers.clock import Clock
 from drivers.errors import InterlockError, NotConnectedError
 from drivers.interfaces import Identity, LinkStatistics, VehicleState

@@ -4,8 +4,6 @@ Limits that nobody publishes are ours. Source: docs/reference/protocols.md, sect
 
 What Linux tells of a CAN interface: its bit rate, its state, its error counters. Read with `ip`; nothing is set."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ python-can's slcan asks for every byte by itself, which on a plain socket costs 
 machine does not run the writer for the length of the timeout.
 """
 
-from __future__ import annotations
-
 import select
 import time
 from typing import Any

@@ -1,7 +1,5 @@
 """Work that is spread over the cores, a process each, and handed on as it ends. It must not depend on its process."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed

@@ -3,8 +3,6 @@
 So nothing of the product imports the laboratory.
 """
 
-from __future__ import annotations
-
 import typer
 
 from lab.cli.bench import bench

@@ -3,8 +3,6 @@
 Each imports its bench only when it runs, so that `cell --help` stays quick.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

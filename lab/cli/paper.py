@@ -1,7 +1,5 @@
 """`cell paper`: the paper's figure and table reproduced, each with what was wrong in it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

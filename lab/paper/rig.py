@@ -4,8 +4,6 @@ The true head is the simulator's (its optics project, its light plane cuts); the
 with noise. Frames: the camera's at rail position 0 for scans, the arm's base for boards.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -4,8 +4,6 @@ Observations come from the simulator's optics with stated noise, the estimators 
 figures were measured on its hardware; ours are simulated and say so.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any

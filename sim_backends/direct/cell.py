@@ -4,8 +4,6 @@ Time moves when somebody waits: a sleep, a motion's `wait`, a picture's exposure
 as fast as the machine computes, and the same for the same seed. Of faults there are those of the models.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Laser and claw in this process that no output of the arm switches: behind their interfaces, straight on the world."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

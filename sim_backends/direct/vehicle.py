@@ -1,7 +1,5 @@
 """The vehicle in this process: commands in steps of 1 mm/s and 1 mrad/s, odometry in those that its bus carries."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

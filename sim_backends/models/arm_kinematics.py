@@ -8,8 +8,6 @@ A strain wave gear repeats its error once and twice a turn of the motor, which t
 joint: over the whole workspace it looks like noise, and yet is the same wherever a joint comes back.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ A motion changes `JointDrives.q` and `JointDrives.qd`; it knows nothing of safet
 trapezoidal speed profile and end by themselves; streams go on until something replaces them.
 """
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """A network camera without its pictures: settings, exposure count, device clock and faults; no bytes, no threads."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import dataclass
 

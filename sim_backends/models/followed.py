@@ -4,8 +4,6 @@ Each keeps what it was told by world time. Between two readings a device is take
 nobody knows, and who wants to know has to wait.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections import deque

@@ -3,8 +3,6 @@
 A ramp is a list of `Piece`s in time order; each is monotone in position, and the last one goes on for ever.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -4,8 +4,6 @@ The wheels do what the controller commands; the ground turns that into motion wi
 small random walk, which odometry cannot see.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Callable

@@ -5,8 +5,6 @@ dot or square; all others take the albedo at their centre. The centroid of a dot
 which is what integrating over square pixels costs by itself.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

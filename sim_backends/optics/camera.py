@@ -3,8 +3,6 @@
 Camera frame: z along the optical axis, x to the right, y down the image; metres. Pixel centres lie at whole numbers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -7,8 +7,6 @@ klx), scaled to the illuminance; η is that of a usual grey CMOS sensor (EMVA 12
 in all of its fan (`LaserOptics.brightness`, the same lens and pixel).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim_backends.optics.lighting import AMBIENT_RATE

@@ -4,8 +4,6 @@ Meshes are splatted from the leaves of their box tree into a coarse depth buffer
 the stripe's background, not for measuring. Silhouettes are true to a few pixels.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ The tree is complete and implicit (children of node i are 2i+1 and 2i+2), so it 
 places in the last leaves that hold no triangle are filled with points at the origin, which nothing can hit.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -3,8 +3,6 @@
 A pattern travels through the kernels as one array of twelve numbers, see `pattern_parameters`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

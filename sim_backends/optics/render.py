@@ -1,7 +1,5 @@
 """One picture of a scene: ambient light on boards, planes and meshes, the laser stripe with speckle, the sensor."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 Whatever a client does (vanish, send garbage, stop reading), it costs its own connection only.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging

@@ -4,8 +4,6 @@ One board has a command line in text, one takes four bytes and says nothing. The
 variables, in text without an end mark. Written from docs/how-to/other-makes.md, sections 2 and 3.
 """
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Callable, Mapping

@@ -9,8 +9,6 @@
 inputs and outputs as bits, for a laser or claw that is simulated beside a real arm; {"op": "figures"}.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import Any
 

@@ -3,8 +3,6 @@
 Poses come in, pictures go out; time and motion are the world's business.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Sequence
 from dataclasses import replace

@@ -4,8 +4,6 @@ A picture of some moment is made once every reading up to that moment is there: 
 late, not wrong. Where they do not come, or leave too long a gap while something moves, there is no picture.
 """
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 Each quantity has its own random stream, named after it, so that a new quantity leaves all others as they were.
 """
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ the vehicle's lean under the arm, and the chain of poses from the floor to the c
 for the report's comparison and for nothing that the cell does; frames are those of `drawing`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, replace

@@ -4,8 +4,6 @@ Exit codes: 0 success, 1 a refused or failed run, 2 a usage or configuration err
 stop).
 """
 
-from __future__ import annotations
-
 import os
 import shlex
 import sys

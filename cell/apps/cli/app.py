@@ -2,8 +2,6 @@
 
 A wrong command line is told in one line, with what was meant to be typed instead."""
 
-from __future__ import annotations
-
 import re
 import sys
 from importlib.metadata import entry_points

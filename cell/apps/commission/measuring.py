@@ -7,8 +7,6 @@ The arm is the measure of length. Shifts of the flange by known ways show how th
 the board's picture takes these ways to be: a wrong pitch makes all ways wrong alike, a wrong focal length only those
 along the optical axis. Turns of the flange then show where the camera sits. No drawn value is believed here."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ First what does not move, then each axis by itself and slowly, then what a wrong
 What was found is written into the TOML file; comments, order and spaces of the rest stay. The new text is parsed again
 and has to say what was meant; else nothing is written. The old file is always kept."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import time

@@ -4,8 +4,6 @@ Nothing is written before the job has passed the checks of `cell check`; nothing
 and what its sweeps see of it, a cut across it, and the arm at the place, from the drawing alone. Lengths in mm.
 """
 
-from __future__ import annotations
-
 import math
 import shlex
 import tempfile

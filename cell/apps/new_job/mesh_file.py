@@ -4,8 +4,6 @@ Put right are triangles without an area, triangles that are there twice, and one
 neighbours or inside out in a closed body. What only a person can decide is asked: which bodies, which unit, which side.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple

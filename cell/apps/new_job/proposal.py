@@ -6,8 +6,6 @@ That is told before anything is swept, by the same inversion that a job does, on
 the drawn surface; and whether what the claw holds is in the way of light and sight, of scan and board's photograph.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field

@@ -7,8 +7,6 @@ person is asked again, an option ends the command. The file that comes of the an
 The unit of a mesh: files such as STL do not say it. It is asked, or told by the size, never assumed in silence.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -7,8 +7,6 @@ Bodies of one mesh that overlap: which do, and which of their faces lie in one a
 What lies inside a body is hidden by its outside and needs no care. Two faces at one place are both seen: one counts.
 """
 
-from __future__ import annotations
-
 import itertools
 import struct
 from collections.abc import Callable, Sequence

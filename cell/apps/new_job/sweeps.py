@@ -10,8 +10,6 @@ Other places at which the sweeps would fit the surface as well: teeth, patterns 
 An inversion that begins near such a place ends there, with small residuals and a small sigma, and is wrong. So the
 points that the sweeps will see are laid onto the surface from every place that the board leaves open."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

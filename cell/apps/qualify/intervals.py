@@ -1,7 +1,5 @@
 """Shares and means with their 95 % intervals, and how far a process keeps from its limits."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The answer of a campaign as tables of text for screen and page, and the page: one HTML file with its plots."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from importlib.resources import files
 from io import BytesIO

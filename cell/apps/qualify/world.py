@@ -4,8 +4,6 @@ The course is that of `cell dry-run -c FOLDER/cell.toml --clock virtual` in the 
 there. Nothing else of a run is kept.
 """
 
-from __future__ import annotations
-
 import gc
 import logging
 import os

@@ -4,8 +4,6 @@ Each reading gives flange poses; with the board as the camera sees it they give 
 board then scatters in the base tells how well they agree. A reading is taken when no other comes near it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ What is kept is what predicts frames that were left out best, and it is checked 
 the same fit.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

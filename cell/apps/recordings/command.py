@@ -4,8 +4,6 @@ With flange poses: camera, hand-eye, light plane and the flatness of the whole c
 with pairs of poses only gives the hand-eye.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ The angle by which the flange turned between two frames is the angle by which th
 the hand-eye. It also settles the order of boards that look the same turned.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -3,8 +3,6 @@
 Nothing is chosen here: `agreement.py` asks the pictures which reading they agree with.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """A camera that is known already, from a file: JSON of an earlier result, YAML or XML as OpenCV, ROS and ViSP write."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

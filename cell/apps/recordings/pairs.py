@@ -1,7 +1,5 @@
 """The hand-eye from a folder that holds pairs of poses only, flange and board, without pictures."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What `cell calibrate --from` found, with one serialiser; lengths in mm, angles in deg unless the name says else."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields

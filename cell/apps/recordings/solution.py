@@ -1,7 +1,5 @@
 """From frames whose boards, stripes and poses were read to a result that has been checked, or refused part by part."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

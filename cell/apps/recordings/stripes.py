@@ -4,8 +4,6 @@ One laser made all pictures of a recording: what it stands out in is chosen from
 be the board's own pattern is not taken.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Which of the stored calibrations holds for the devices and the configuration of now, or why none does."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from pathlib import Path

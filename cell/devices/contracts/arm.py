@@ -1,7 +1,5 @@
 """What the cell relies on in an arm. The suite moves it, by as much as the bench says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

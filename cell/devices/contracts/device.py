@@ -1,7 +1,5 @@
 """How a device is put to a suite, what every device promises, and what the cell relies on in camera, laser and claw."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The devices of a configured cell, put to the contracts of their kinds; the package says how it is started."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """What the cell relies on in a vehicle. The suite moves it, by as much as the bench says."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

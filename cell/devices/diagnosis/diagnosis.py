@@ -1,7 +1,5 @@
 """How every device is: connected, who it is, figures with their limits, errors, state. One's failure hides no other."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, closing

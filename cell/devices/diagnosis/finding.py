@@ -5,8 +5,6 @@ multicast, also not by looking up a name. Nothing moves and no setting changes. 
 `root`. Odd states of it (no /sys, files that cannot be read) find nothing.
 """
 
-from __future__ import annotations
-
 import grp
 import logging
 import os

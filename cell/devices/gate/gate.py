@@ -6,8 +6,6 @@ any more, in whatever thread it still goes on. Then the interlocks are asked whe
 devices behind the gate are in `cell.devices.gate.gated`.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterator

@@ -4,8 +4,6 @@
 checked against arm, tool, vehicle, deck and obstacles, and against part and station once a run has told of them.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Iterator, Sequence

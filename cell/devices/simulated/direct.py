@@ -3,8 +3,6 @@
 It gives `sim_backends.direct` the configuration's values; what is above the devices' interfaces is the product.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ One thread a device, each reading only. A row is the host time at which a readin
 world waits with a picture until it has them: a late reading delays pictures and does not spoil them.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections import deque

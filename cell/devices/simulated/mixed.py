@@ -3,8 +3,6 @@
 A real camera sees the real cell, in which nothing follows a simulated device: what it would need of those is refused.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Collection, Sequence

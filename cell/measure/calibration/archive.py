@@ -4,8 +4,6 @@ A NumPy archive of plain arrays (nothing in it is executed when it is read) and 
 the solution depends on. What is read is checked as if a stranger had written it.
 """
 
-from __future__ import annotations
-
 import json
 import zipfile
 import zlib

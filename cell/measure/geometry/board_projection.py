@@ -4,8 +4,6 @@ The formulas are those of `camera` and `circles`, which take arrays and also go 
 `CameraModel.parameters`; lengths are in m, pixels in px.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from cell.base.compiled import compiled

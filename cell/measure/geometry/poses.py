@@ -4,8 +4,6 @@ A pose named `a_from_b` maps b-coordinates into a. Its 6×6 covariance is of (δ
 b's origin in m, R → exp(δφ) R in rad. Translation first, then rotation, everywhere in the cell.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 Each comparison asks whether the figure is good: one that is no number is refused as well.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

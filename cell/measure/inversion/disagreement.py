@@ -9,8 +9,6 @@ What stands on the place, as the scan saw it: a chip, a burr, a screw that was l
 The place is told by most of the surface, and a robust fit passes over the few points that do not belong to it. The part
 does not: it comes to lie on the highest of them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

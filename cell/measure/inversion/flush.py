@@ -4,8 +4,6 @@ The part's pose says how it lies as a whole. Along its edge each piece is held a
 part or a surface that is bent shows, too.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

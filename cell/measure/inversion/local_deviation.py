@@ -4,8 +4,6 @@ The part's pose follows from all of its faces, and passes over the few points th
 feature are asked by themselves: how much higher they stand than drawn at that pose, and where the part ends.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ The place is told by the surface alone. A part that is drawn in another datum, o
 not lie where its pose says, and nothing but its own underside can tell.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -8,8 +8,6 @@ Small motions of a surface in words: translations along axes, rotations about li
 Motions that are undetermined together come out of an eigendecomposition mixed at will. They are sorted into pure
 translations first and rotations after, along the axes of the surface frame where the mixture allows it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ What the arm's pose and the calibration are off by moves part and surface alike 
 Where too little of the surface shows, it is taken to lie where an earlier sweep found it, with what that is off by.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 

@@ -16,8 +16,6 @@ place ends there, with small residuals and a small sigma, and is wrong. So the s
 place around the one that was found, and the board has to tell them apart.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace

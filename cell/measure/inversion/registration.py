@@ -10,8 +10,6 @@ A placement surface slides and turns onto a wrong place most easily within its o
 of such shifts and turns; all of them are tried against the coarse distance field, and the best, well apart, returned.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -7,8 +7,6 @@ odd number are filtered by themselves as well: what only one of both shows is th
 (docs/explanation/theory.md, section 9).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -4,8 +4,6 @@ A robust fit finds a part by what is left of it, and passes over the rest. Where
 face, that is not there; where it sees nothing but what stands far above, something lies on it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

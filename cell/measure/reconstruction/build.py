@@ -6,8 +6,6 @@ What belongs to the surface and what does not is decided in `outliers`.
 
 How the cloud would move if calibration, flange or vehicle were elsewhere, each within its uncertainty."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ as wide as the hole. Nothing is extrapolated beyond the scan, and nothing is fil
 on one smooth surface: at a depth edge. Compiled.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ The depth of each point is compared with the median of its 5×5 neighbours (line
 the deviations around it, so that near outliers and streaks stand out (docs/explanation/theory.md, section 7). Compiled.
 """
 
-from __future__ import annotations
-
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np

@@ -3,8 +3,6 @@
 Coordinates are in metres. A mesh has triangles between neighbours of the organised cloud, none across a depth edge.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 Each refusal has a short reason for scripts and a text for people. What is in the picture is `board.py`'s business.
 """
 
-from __future__ import annotations
-
 from enum import StrEnum
 from pathlib import Path
 from typing import TypeVar

@@ -4,8 +4,6 @@ The stripe runs on beyond the board, onto its bent edge or the floor, and its ce
 from white to black. Both kinds of points are left out, by geometry first and by the straightness of the rest.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray

@@ -3,8 +3,6 @@
 Where a planned view misses the board, it is aimed anew by what the other views showed, or searched for.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress

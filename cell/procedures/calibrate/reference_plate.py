@@ -1,7 +1,5 @@
 """The plate on the claw: where the laser's line lies on it, and where the rail takes the line over its edge."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial

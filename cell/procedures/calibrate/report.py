@@ -3,8 +3,6 @@
 It is made from adjustments and observations: of a calibration just made or of an archived one. A run never asks for it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sweeps to and fro over the fine board, laser off: they tell how late the camera's stamps come, and its shutter."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

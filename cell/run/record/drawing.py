@@ -4,8 +4,6 @@ Used by the thread that writes the record alone, which loads the packages for it
 in m and quaternions; frames are named after what they are fixed to.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from functools import cached_property

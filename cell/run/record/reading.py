@@ -3,8 +3,6 @@
 `repair` closes the record of a run that was cut off: all whole messages in their order, and the index readers want.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import struct

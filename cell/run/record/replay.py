@@ -6,8 +6,6 @@ pictures in `record.mcap` have to be the same bytes. Everything is compared bit 
 other libraries, or changed files.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import tempfile

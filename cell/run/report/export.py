@@ -1,7 +1,5 @@
 """A finished run's cloud in the formats of other programs, coloured by its deviation from the nominal surface."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

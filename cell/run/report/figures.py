@@ -1,7 +1,5 @@
 """How a measured figure of the report is written for people, on the screen and in the picture."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

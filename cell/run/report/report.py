@@ -3,8 +3,6 @@
 Every key is told in `docs/reference/report.md`. The report alone asks for the world's truth: no step has a way to it.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

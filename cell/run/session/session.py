@@ -3,8 +3,6 @@
 Devices are real or simulated, over wires or on the virtual clock, and a lock holds them.
 """
 
-from __future__ import annotations
-
 import timeit
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager, ExitStack, nullcontext

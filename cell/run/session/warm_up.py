@@ -4,8 +4,6 @@ On a fresh machine that is some 20 s of work for a core that has nothing to do. 
 there is nothing to compile, and no second process.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess

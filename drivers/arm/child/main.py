@@ -10,8 +10,6 @@ An owner that computes may not read for a second, and its pipe fills: neither th
 that commands it may wait for that, or the controller's watchdog ends the program of an arm that is perfectly well.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import queue

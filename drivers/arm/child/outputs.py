@@ -2,8 +2,6 @@
 
 Child side: the state packets of the arm, one every 2 ms, as `Snapshot`s."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -8,8 +8,6 @@ From the pixels that a camera sends to 8-bit grey.
 Formats and their numbers are those of the Pixel Format Naming Convention (EMVA, 2.1); the two packings of GigE Vision
 ("Packed") differ from the convention's own ("p"). What has more than 8 bits keeps its highest 8."""
 
-from __future__ import annotations
-
 import ctypes
 import threading
 from collections.abc import Callable

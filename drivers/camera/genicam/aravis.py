@@ -4,8 +4,6 @@ Aravis (LGPL) speaks GigE Vision and USB3 Vision and reads the camera's own desc
 for cameras: a device is made for one address or one serial number, and no broadcast is ever sent.
 """
 
-from __future__ import annotations
-
 import ctypes
 import socket
 from collections.abc import Callable

@@ -8,8 +8,6 @@ What a camera's time stamps are worth: its clock against the host's, and each tr
 A camera whose clock can be latched is asked before each acquisition. Of one without a latch a triggered picture tells:
 its exposure began after the trigger was sent, and ended before the picture came."""
 
-from __future__ import annotations
-
 import ctypes
 import ipaddress
 import math

@@ -3,8 +3,6 @@
 Its flag goes off when the drive loses its zero; that it stands says neither who homed it nor under which settings.
 """
 
-from __future__ import annotations
-
 from drivers.clock import Clock, timeout_of
 from drivers.errors import DeviceFault, InterlockError, LimitError, shown
 from drivers.rail.axis import Samples

@@ -5,8 +5,6 @@ is thrown away; what may be said twice is tried twice. A stop overtakes: command
 not been sent yet are refused. Source: docs/how-to/other-makes.md, section 1.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 

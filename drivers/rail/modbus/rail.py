@@ -3,8 +3,6 @@
 Positions in m from the reference switch. Limits are checked before anything is sent; what is written is read back.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from drivers.clock import Clock

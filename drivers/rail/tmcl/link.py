@@ -6,8 +6,6 @@ overtakes: commands that were issued before it and have not been sent yet are re
 Source: the maker's TMCL firmware manual; docs/reference/protocols.md, section 2.
 """
 
-from __future__ import annotations
-
 import struct
 import time
 from collections.abc import Callable

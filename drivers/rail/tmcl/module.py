@@ -11,8 +11,6 @@ read with, so that no program takes the zero of another one.
 Source: TMCL firmware manual of the TMCM-1260; docs/reference/protocols.md, section 2.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import zlib

@@ -4,8 +4,6 @@ Positions in m from the reference switch. Limits are checked before anything is 
 what was asked for.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from drivers.clock import Clock

@@ -3,8 +3,6 @@
 The SDO protocol is the `canopen` package's; its frames go over the same `CanLink` as all the others.
 """
 
-from __future__ import annotations
-
 import logging
 import struct
 import threading

@@ -8,8 +8,6 @@ Source: the error code ranges of CiA 301 and the codes that CiA 402 adds. A code
 
 The objects of a drive that are used, by their numbers in CiA 301 and CiA 402, and how their values are packed."""
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ How a vehicle of two wheel drives is built: from its metres a second to its driv
 
 Whether a wheel's speed and its counts tell of the same way: a unit may be wrong, in cell.toml or in the drive."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

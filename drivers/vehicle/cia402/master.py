@@ -7,8 +7,6 @@ Asking both drives by SDO for what they otherwise tell in PDOs: nothing on them 
 
 What is sent to the drives when this process is killed: both quick stops, then the brakes' outputs."""
 
-from __future__ import annotations
-
 import logging
 import math
 import struct

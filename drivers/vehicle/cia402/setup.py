@@ -3,8 +3,6 @@
 Everything that is written is read back. Nothing is stored in the drive: switched off and on it is as it was before.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal

@@ -5,8 +5,6 @@ When this program is gone, the drives stop by their own watchdog. That they do i
 
 How the drives' CAN bus is used, who else commands there, and what the drives tell of their supply."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Sequence
 from functools import partial

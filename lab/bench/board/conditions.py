@@ -3,8 +3,6 @@
 A condition draws one random view of a board and says what is expected of the detection: to find it, or to refuse.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import cv2

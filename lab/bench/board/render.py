@@ -4,8 +4,6 @@ Shares no code with the detection nor with the simulator: the lens is OpenCV's, 
 the boards' description, so that an error in either shows. Pixel centres lie at whole numbers.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

@@ -6,8 +6,6 @@ information of the generator itself, without any derivative of the estimator. Wh
 very noise that was drawn is its linear estimate: so luck is told from loss.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial

@@ -4,8 +4,6 @@ Each seed's cell is calibrated and looked at again as it is, then with one thing
 devices are the simulator's, the check is the product's.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -6,8 +6,6 @@ direction, and with one moved anyhow so that the place of a job is off by a thir
 are `lab.bench.calibration.observed_cell`'s: the simulator's optics, arm and deviations.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any

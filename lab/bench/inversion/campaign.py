@@ -6,8 +6,6 @@ to a wrong place ends within the job's tolerance or in a refusal: deformed and w
 calibrations, a wrong board pose, half a scan, foreign objects. `coverage` shows that good scans' uncertainty is true.
 """
 
-from __future__ import annotations
-
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable

@@ -4,8 +4,6 @@ A part's height is a closed form, its mesh and the noise of its clouds are made 
 the estimator has a say in what is true. Clouds have noise, outliers, foreign objects and missing data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache

@@ -7,8 +7,6 @@ lean. Least squares with these covariances attains the Cramér–Rao bound, save
 adjustment does not know of: for that part the figure is what this estimator is expected to make of it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

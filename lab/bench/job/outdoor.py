@@ -5,8 +5,6 @@ the virtual clock. Beside it stands how far the line's centres scatter in drawn 
 same light: as they are, and less a picture without the laser, which a sweep would take 0.1 mm farther on.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """What may come between a surface and the part on it, and show to nobody before the part was placed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Jobs whose part is drawn on the surface that it is placed onto: a shell of 20 mm above it, in the part frame."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -4,8 +4,6 @@ The jobs' part covers the middle of its surface, or all of it. An effect is well
 was placed lies below the stated bound.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ The arm stands at the station of a job with its part in the claw. A pair has a w
 one of them is given much more time than the others. Each way is looked at by samples, not by the planner's own check.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -5,8 +5,6 @@ runner on the virtual clock. It is well when what was placed lies within what wa
 refused with the effect's name; it is ill when something wrong was told with confidence.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

@@ -7,8 +7,6 @@ is the camera's at rail zero: what is told there holds camera, light plane, rail
 which the hand-eye has part. Beside it, the error after the best rigid motion, which is free of that convention.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

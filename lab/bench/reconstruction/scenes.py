@@ -1,7 +1,5 @@
 """Synthetic organised clouds with known outliers and holes, and how soon a sweep's cloud is there: no optics."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Which words of a reason name which cause: a run that was not done has to name one that was there."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 

@@ -4,8 +4,6 @@ Nothing here asks a device or the cell what it did. Positions are of the world's
 told to the oracle is only what people did, when a run ended, and with which words.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

@@ -3,8 +3,6 @@
 Each runs in a process of its own pool with the calibration of its cell, which is made once for all of them.
 """
 
-from __future__ import annotations
-
 import math
 import shlex
 from collections import Counter

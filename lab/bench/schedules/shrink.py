@@ -1,7 +1,5 @@
 """The fewest entries, and the simplest, by which a schedule still breaks the same rule."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 

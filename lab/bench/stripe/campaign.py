@@ -3,8 +3,6 @@
 Once for Gaussians condition by condition, and once for the stripes of a workshop, which are held to limits.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar

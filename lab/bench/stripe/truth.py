@@ -5,8 +5,6 @@ intensity of a smoothed complex Gaussian field. docs/explanation/theory.md, sect
 0.4 DN.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ profiles are functions of the place, integrated over the pixel by sums; the boun
 centre, height and a linear background unknown.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

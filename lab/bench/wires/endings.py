@@ -4,8 +4,6 @@ Each trial has a served world of its own and a `cell` command in a process of it
 The truth is asked from the ending on: when did something move or shine for the last time?
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import math

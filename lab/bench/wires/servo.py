@@ -4,8 +4,6 @@ A simulated arm in a process of its own is moved through the real driver. Beside
 sleep until the next 2 ms, shows what this machine lets anybody do at that time: no stream can be more regular.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -4,8 +4,6 @@ Counted after each job, for this process and each that it has started: memory, t
 median slope between all pairs of jobs after the first ones, so that one odd job does not make it.
 """
 
-from __future__ import annotations
-
 import itertools
 import os
 import time

@@ -6,8 +6,6 @@ log-normal factor of mean 1 and standard deviation C, new in every frame. It mov
 0.6 C √(grain × stripe width) pixels, the error that no extractor can remove.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

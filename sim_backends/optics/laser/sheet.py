@@ -3,8 +3,6 @@
 The fan's middle is the sheet's direction that is nearest to the camera's axis; y is across it, in the sheet.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

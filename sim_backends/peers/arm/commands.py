@@ -4,8 +4,6 @@ A command is a function of its `Context` that acts at once and returns None, or 
 advanced once per cycle until it ends.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Callable, Generator

@@ -3,8 +3,6 @@
 In local control it refuses whatever changes the arm, as a controller does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -9,8 +9,6 @@ Sources: the maker's client interface guide and `Universal_Robots_Client_Library
 are those of a recorded controller; the internal ones (9, 10) are empty, currents and temperatures usual values.
 """
 
-from __future__ import annotations
-
 import os
 import select
 import socket

@@ -4,8 +4,6 @@ The program follows ur_rtde's control script (MIT, version 1.6): the command in 
 in the output registers. This is the loop around the commands.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 from collections import deque

@@ -5,8 +5,6 @@ rate in world time, whatever rendering takes. A picture is asked for once its ex
 state of the world at its middle is known.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import logging

@@ -5,8 +5,6 @@ that got lost are sent again when they are asked for. It listens to its own addr
 sends nothing to another destination than a loopback address.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

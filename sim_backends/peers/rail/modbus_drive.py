@@ -3,8 +3,6 @@
 Registers that nothing is known of do not exist. Frames are taken apart and made by pymodbus; the drive is ours.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import threading
 from collections.abc import Callable, Mapping

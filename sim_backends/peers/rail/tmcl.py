@@ -5,8 +5,6 @@ Numbers and meanings are the module's, with velocities in pps; 15 to 20 are as t
 number stands in user variable 0 (bank 2), where it is written when a module is put into service.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import struct
 import threading

@@ -5,8 +5,6 @@ ramps are the drives'; the body cannot follow faster than it does under any driv
 m/s, ahead positive.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -3,8 +3,6 @@
 Encoded here from the protocol, without any CANopen library. What the values mean is their owner's business.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass

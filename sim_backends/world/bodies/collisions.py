@@ -5,8 +5,6 @@ boxes for what stands. The part's and the fingertips' contact with the ground is
 deck are left out.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Sequence

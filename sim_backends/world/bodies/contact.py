@@ -5,8 +5,6 @@ point of the underside below the true surface pushes back along the surface's no
 settles once it is let go: its weight turns it until it rests on three points. Friction is left out.
 """
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Callable

@@ -6,8 +6,6 @@ than the scan camera's field. Around them lies the table, z = 0. Of a mesh file 
 is above each place, from a raster fine enough that what lies between its points is less than what a part can feel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache

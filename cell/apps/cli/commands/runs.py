@@ -4,8 +4,6 @@
 `cell replay` for the record of a run.
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

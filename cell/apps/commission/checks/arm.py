@@ -1,7 +1,5 @@
 """The arm: each joint by itself, and what it carries by the force that it feels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

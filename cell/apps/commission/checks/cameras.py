@@ -1,7 +1,5 @@
 """The two cameras: light and focus, how each is mounted, and whether its board is as large as its name says."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

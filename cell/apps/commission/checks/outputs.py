@@ -3,8 +3,6 @@
 Each output is switched by itself; what the picture and the inputs do then tells what hangs on it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

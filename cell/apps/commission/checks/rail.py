@@ -1,7 +1,5 @@
 """The rail: which way and how far it goes, seen by its camera; then its zero, its ends and its limits."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

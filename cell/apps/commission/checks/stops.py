@@ -1,7 +1,5 @@
 """Stops: what moves or shines is stopped from each cause, and the time and the way until it rests are measured."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

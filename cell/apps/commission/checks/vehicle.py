@@ -1,7 +1,5 @@
 """The vehicle: which way and how far its wheels take it, by their counters and by the station's board."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

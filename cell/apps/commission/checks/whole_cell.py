@@ -2,8 +2,6 @@
 
 The last four: calibration, its verification, the first job without a part up to the place, and the first part."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -5,8 +5,6 @@ has a way of its own (`cell.apps.console.host.link`), and asks nobody. What a pe
 step was refused, or a fault waits for somebody's word.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping

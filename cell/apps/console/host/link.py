@@ -4,8 +4,6 @@ It starts the server, hears it, and tells it only as fast as it listens. The sto
 nothing else can be under way, to threads that do nothing else; another one waits for the server's end.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import socket

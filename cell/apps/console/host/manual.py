@@ -6,8 +6,6 @@ A press that has ended, for whatever reason, moves nothing any more: its later b
 late or again after a pause begins no motion. Two watch over it: the thread that began the motion, and beside this
 process the one that `drivers.interfaces.Attended` tells of."""
 
-from __future__ import annotations
-
 import logging
 import math
 import queue

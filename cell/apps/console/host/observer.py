@@ -1,7 +1,5 @@
 """Looks at the cell twenty times a second and tells the server; nothing of the cell ever waits for it."""
 
-from __future__ import annotations
-
 import json
 import logging
 import threading

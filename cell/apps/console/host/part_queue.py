@@ -1,7 +1,5 @@
 """The queue of parts that a page began: a batch, its counters, and what a person wants of the parts to come."""
 
-from __future__ import annotations
-
 import time
 
 from cell.run.runs import Run

@@ -11,8 +11,6 @@ keeps and sends with each request.
 
 Who looks at the cell through a page, and which one of them holds it: one does, the others see."""
 
-from __future__ import annotations
-
 import secrets
 import threading
 import time

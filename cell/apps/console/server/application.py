@@ -1,7 +1,5 @@
 """What the server answers: the page, its data, commands and the live link, to those who may."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import re

@@ -1,7 +1,5 @@
 """The pages that are open: what each is sent, what each says, and what of it goes on to the cell."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import json

@@ -3,8 +3,6 @@
 It ends when that program does. It has no device and no way to one but the pipes.
 """
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import json

@@ -3,8 +3,6 @@
 The server reads a record in a process of its own: `python -m cell.apps.console.view.archive FILE`.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -5,8 +5,6 @@ virtual clock have no time of the wall and are not read here. What a page asks o
 what can be jogged and run, and what it looks like.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -4,8 +4,6 @@ These are taken from what the steps have kept already; who shows them computes w
 shown.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from typing import Any

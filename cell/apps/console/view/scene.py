@@ -6,8 +6,6 @@ what a run has found of the place, the part and the arm's way. Lengths are in m,
 after row.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

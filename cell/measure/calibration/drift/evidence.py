@@ -5,8 +5,6 @@ is taken out; what is left speaks for a change. A hypothesis is a Gaussian chang
 parameters of one camera's chain, against none. A calibration leaves a `Reference` behind to be verified by.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self

@@ -5,8 +5,6 @@ themselves; where the views put the board, before and after. A picture of anothe
 by how much less the points miss when it alone has focal lengths and a principal point of its own.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import combinations

@@ -4,8 +4,6 @@ Camera, rail and laser take their metres from the board, the flange's poses thei
 board would have to be is one more parameter of the adjustment, or of the poses alone.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

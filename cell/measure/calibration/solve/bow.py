@@ -3,8 +3,6 @@
 docs/explanation/theory.md, section 6.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

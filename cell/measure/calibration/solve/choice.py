@@ -5,8 +5,6 @@ say or more, the stripe's points may count all or a tenth; the closed form stand
 bent does not fit left-out pictures at their own best pose as well as before, and is not kept.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 

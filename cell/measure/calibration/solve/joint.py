@@ -1,7 +1,5 @@
 """From observations to the joint adjustment and its cross-checks: the common part of all calibrations with poses."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 The stripe points that are chosen here are those that the joint adjustment uses. The hand-eye's rotation comes first,
 then one linear system for everything that is a translation, the rail's included."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

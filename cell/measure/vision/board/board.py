@@ -4,8 +4,6 @@ The one way in for all kinds of boards; each refusal says why. `view.py` names b
 `markers.py` find them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import cv2

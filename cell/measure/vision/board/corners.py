@@ -5,8 +5,6 @@ all pixels around it, with what does not fit (a laser line, a finger) left out; 
 The deviation comes from what each pixel leaves, as bright ones are noisier than dark ones.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ several scales. A dot's edge is then looked for along rays from its middle, so t
 rays and not the centre (docs/explanation/theory.md, section 6).
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -3,8 +3,6 @@
 Each side is looked at one pitch beyond the outermost points. A board without marks must be seen to end on every side.
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view

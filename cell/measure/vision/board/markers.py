@@ -5,8 +5,6 @@ it counts for nothing. A ChArUco board's points are its chessboard corners, a ta
 four sides meet: corners of tags are rounded by blur, their sides are not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -11,8 +11,6 @@ the first picture of every `BLOCK` and hold for the others of the block, which s
 
 Drawn stripes, to be read and let go: what is loaded or compiled on first use is so before anything waits."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 Its verdict and its tables are text: what was used, what was judged, and nominal beside actual.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime

@@ -4,8 +4,6 @@ Names and types follow the maker's RTDE guide. What the simulated arm has nothin
 connector, is zero or a usual value.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import struct

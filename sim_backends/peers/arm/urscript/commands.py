@@ -5,8 +5,6 @@ not modelled: the arm stops at every way point. Settings that change nothing in 
 effect.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """One URScript program as it runs: its threads, which take turns, each until its cycle ends, and what ends them."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Generator
 from traceback import walk_tb

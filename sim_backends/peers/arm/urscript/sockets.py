@@ -3,8 +3,6 @@
 Reading waits from cycle to cycle and never blocks the controller. Source: the maker's script manual.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import math
 import socket

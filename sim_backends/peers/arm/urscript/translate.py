@@ -6,8 +6,6 @@ Python but what `Machine` gives it. Variables of the program itself, and those d
 Source: the maker's script manual, chapter on the language.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Collection
 from dataclasses import dataclass, field

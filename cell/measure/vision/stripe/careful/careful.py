@@ -8,8 +8,6 @@ or on what shines. Rows that stay without a stripe so are read once more by them
 where it goes on from the rest of the line.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 

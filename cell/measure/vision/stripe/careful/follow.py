@@ -6,8 +6,6 @@ step of the surface makes, costs as much as several clear rows are worth. A coar
 of colours the line stands out.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 

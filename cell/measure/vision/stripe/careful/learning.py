@@ -1,7 +1,5 @@
 """From lines that are found to the profile they share: fit, register, learn, fit again, and judge on held-out lines."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -9,8 +9,6 @@ Registered lines give many samples of one profile at all sub-pixel places. What 
 fitted by a penalised cubic spline. It is kept where it foretells held-out lines better (docs/explanation/theory.md,
 section 5)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

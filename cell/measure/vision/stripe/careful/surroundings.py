@@ -10,8 +10,6 @@ A spot within two pixels of the stripe looks like a stripe that is a little wide
 lines beside it, which the spot does not reach, tell. What departs keeps its centre and is stated to be off by as much.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

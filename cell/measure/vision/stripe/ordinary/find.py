@@ -8,8 +8,6 @@ Loops that run for every line take the whole picture and the line's number: a vi
 by the compiler, which costs as much as the loop. Unsigned indices save the question whether they count from the end.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -7,8 +7,6 @@ Gaussian, the model's derivatives are z g, g, z² g, 1 and z but for factors: so
 under g and three under 1 are the whole normal matrix.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from cell.base.compiled import compiled, compiled_fast

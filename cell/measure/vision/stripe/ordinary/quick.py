@@ -5,8 +5,6 @@ for each picture, or for the first of a stream's block. Which of two peaks in a 
 tell: those that show one peak say where it runs, else the peak with more energy stays, and the line is marked.
 """
 
-from __future__ import annotations
-
 from enum import Enum
 from functools import cache, partial
 from math import sqrt

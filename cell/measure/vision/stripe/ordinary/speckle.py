@@ -6,8 +6,6 @@ nothing is swallowed: round grains correlate a line with the next as they correl
 speckle in the weights a stated σ is 3 to 4 times too small (docs/explanation/theory.md, section 5).
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from math import exp, log, sqrt
 from typing import NamedTuple
