@@ -166,7 +166,7 @@ def perform(
             # A person makes the first item of each round ready, but in a cell that is simulated as a whole.
             more = number < count and (number % len(jobs) > 0 or is_whole(open_cell.simulated))
             last = run(number, replace(before, more=more))
-            before = _known_after(before, last)
+            before = _known_after(before, last, each_job=open_cell.config.calibration.each_job)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()
             notify(Event("note", None, {"text": str(batch), "part": number, "count": count, "counts": batch.counts}))
@@ -199,7 +199,7 @@ def _still_known(before: PartsBefore, *, elsewhere: bool, asked: bool, refill: b
     return replace(before, arrival=None) if asked or refill else before
 
 
-def _known_after(before: PartsBefore, last: RunOutcome) -> PartsBefore:
+def _known_after(before: PartsBefore, last: RunOutcome, *, each_job: bool) -> PartsBefore:
     """What parts tell of the next one; nothing after one that was refused, for whoever saw to it may have mended the
     fingers, changed the part, or moved the station."""
     if last.outcome not in GOOD:
@@ -213,16 +213,21 @@ def _known_after(before: PartsBefore, last: RunOutcome) -> PartsBefore:
     if isinstance(arrival, VehicleArrival) and board is not None:
         stands = replace(arrival, shared=board)
     touch = put.touch.off if isinstance(put, PlaceResult) and put.touch is not None else None
-    return PartsBefore(series, stands, board, _look_after(before, last), touch)
+    return PartsBefore(series, stands, board, _look_after(before, last, each_job), touch)
 
 
-def _look_after(before: PartsBefore, last: RunOutcome) -> HeadLook | None:
+def _look_after(before: PartsBefore, last: RunOutcome, each_job: bool) -> HeadLook | None:
     """The look at the scan head that the next part may go by: none after a fault, for what was hit may sit elsewhere,
-    and where somebody held the run, for whoever did may have reached in."""
-    sweep = last.results.get(laser_sweep.STEP.name)
+    where somebody held the run, for whoever did may have reached in, and where the fine board was to be seen at
+    `each_job` and was not."""
+    arrival, sweep = (last.results.get(step.STEP.name) for step in (drive_to_target, laser_sweep))
     if not isinstance(sweep, SweepRecord) or last.report.get("faults") or last.control.held_s:
         return None
-    return before.look if sweep.looked_s else HeadLook(float(sweep.times[0]), sweep.pointing, sweep.slip)
+    if sweep.looked_s:
+        return before.look
+    if each_job and not (isinstance(arrival, VehicleArrival) and arrival.head is not None):
+        return None
+    return HeadLook(float(sweep.times[0]), sweep.pointing, sweep.slip)
 
 
 def _skipped(open_cell: OpenCell, job: Job, last: RunOutcome) -> bool:

@@ -213,7 +213,7 @@ class JobRun:
             self.config, job, self.ready.nominal, calibration=self.calibration, devices=self.devices, frames=frames,
             folder=folder, whereabouts=whereabouts, earlier=self.earlier, held=self.held,
             needs_part=kind.places and state is PartState.HELD, looks_after=verify.STEP.name in kind.names,
-            looks_again=place.STEP in kind.steps or pick.STEP in kind.steps,
+            looks_again=place.STEP in kind.steps or pick.STEP in kind.steps, shares_look=kind.sees_place,
             sweeping=self._sweeping, registered=self._registered, pace=self.pace, ground=self.ready.ground,
             parts_before=self.parts_before, part=PartProgress(state),
         )  # fmt: skip

@@ -75,6 +75,8 @@ def _part_at(name: str, base_from_part: pin.SE3, job: Job) -> Body:
 
 FAR_SPEED = 0.25
 """m/s, of a straight line where it is not near its place yet, or not any more."""
+HEAVY_KG = 14.0
+"""Claw and part are lighter than half of it: to speed them up takes no more than half the force that ends a motion."""
 RISE_M, RISE_SPEED = 0.05, 0.04
 """How far the arm goes straight up from where it was stopped, m, and how fast, m/s."""
 ROOM_ABOVE = 0.005
@@ -257,9 +259,10 @@ class Mover:
         With `near`, m, only so much of its end, or of its beginning when `leaving`, goes at `speed`; the rest faster.
         """
         far = min(max(speed, FAR_SPEED) if near else speed, self._tool_speed)
+        acceleration = max(0.02, min(3.0 * far, np.inf if force_limit is None else force_limit / HEAVY_KG))
         limits = LineLimits(
-            speed=far, acceleration=max(0.02, 3.0 * far), jerk=8.0, near=near, near_speed=min(speed, far),
-            leaving=leaving,
+            speed=far, acceleration=acceleration, jerk=8.0, near=max(near, near and speed**2 / acceleration),
+            near_speed=min(speed, far), leaving=leaving,
         )  # fmt: skip
         line = self._planner.line(self.joints, base_from_flange, limits, allowed)
         return self.follow(line.at_pace(self.pace.share), force_limit, settle)

@@ -265,12 +265,14 @@ def stand_at_target(
 
 
 def _arrived(
-    job: Job, vehicle_from_base: pin.SE3, whereabouts: Whereabouts, fix: BoardFix
-) -> tuple[VehicleArrival, bool]:
+    job: Job, vehicle_from_base: pin.SE3, whereabouts: Whereabouts, fix: BoardFix,
+    note: Callable[[str], None] = lambda text: None,
+) -> tuple[VehicleArrival, bool]:  # fmt: skip
     """Where a vehicle that was not driven stands by one photograph, and whether that is within the job's tolerance."""
     base_from_place = fix.base_from_board * job.place_from_board.inverse()
     stands = Planar.of((vehicle_from_base * base_from_place).inverse())
-    whereabouts.see(stands)
+    if (doubt := whereabouts.see(stands)) is not None:
+        note(doubt)
     error = Planar.of(job.approach.target.se3()).inverse() * stands
     most, most_angle = job.approach.tolerance, job.approach.tolerance_angle
     near = abs(error.x) <= most and abs(error.y) <= most and abs(error.yaw) <= most_angle
@@ -354,13 +356,19 @@ def _still_there(workplace: Workplace, context: StepContext) -> VehicleArrival |
     try:
         workplace.mover.to(goal, "the photograph pose", near=NEAR)
         workplace.devices.clock.sleep(SETTLE_S)
-        found, near = _arrived(workplace.job, stand, workplace.whereabouts, workplace.photograph())
+        found, near = _arrived(
+            workplace.job,
+            stand,
+            workplace.whereabouts,
+            workplace.photograph(),
+            note=lambda text: context.note(text=text),
+        )
     except RefusedError as unseen:
         context.note(text=f"the board is not seen from where it was for the part before: {unseen}")
         return None
     if near:
         workplace.devices.vehicle.brake()
-        return found
+        return replace(found, driven=workplace.config.vehicle.DRIVES)
     x, y = 1e3 * found.error_along, 1e3 * found.error_across
     context.note(text=f"the vehicle stands ({x:.1f}, {y:.1f}) mm off its target now, and is driven there again")
     return None
@@ -375,12 +383,11 @@ def _checked(workplace: Workplace, context: StepContext) -> InterimCheck | None:
     """
     if workplace.looked or not workplace.config.calibration.each_job:
         return workplace.interim
-    if (look := workplace.look_before) is not None:
+    if (look := workplace.look_before(context)) is not None:
         ago = workplace.devices.clock.now() - look.at
         context.note(
             text=f"fine board and plate on the claw were looked at {ago:.0f} s ago, for a part before this one"
         )
-        workplace.looked = True
         return None
     try:
         found = interim_check(

@@ -60,6 +60,12 @@ class Kind:
         """Whether one of its steps places a part, or sees one in its nest."""
         return any(issubclass(step.makes, place.PlaceResult | PlacedPart) for step in self.steps)
 
+    @property
+    def sees_place(self) -> bool:
+        """Whether it looks at the part in its place on the surface, where a scan head that was bumped shows: a part
+        and the nest that it is set into are both seen by such a head as it gripped."""
+        return verify.STEP in self.steps
+
     def sequence(self) -> Sequence:
         """A sequence at its start; it ends placed only where a step places."""
         return Sequence(self.names, JobState.PLACED if self.places else JobState.DONE)
@@ -93,6 +99,7 @@ class Kind:
 def _enter(workplace: Workplace, step: JobStep, context: StepContext) -> object:
     with workplace.devices.gate.entered(context.token):
         context.check()
+        workplace.retried |= context.attempt > 1
         if (workplace.needs_part or workplace.held is not None) and step is not drive_to_target.STEP:
             note, when = partial(place.note_part, context), f"before the step {step.name}"
             place.require_in_claw(workplace.devices.claw, workplace.part, note, when)

@@ -194,7 +194,7 @@ def _run_step(workplace: Workplace, context: StepContext) -> SweepRecord:
 def _sweep(workplace: Workplace, context: StepContext, fix: BoardFix) -> SweepRecord:
     head = workplace.calibration.scan
     home_rail(workplace.devices, context.progress)
-    look = workplace.look_before if context.attempt == 1 else None
+    look = workplace.look_before(context)
     if look is None:
         (pointing, slip), looked_s = seen_on_plate(workplace, context), 0.0
     else:

@@ -42,7 +42,7 @@ def _picked(workplace: Workplace, context: StepContext) -> HeldPart:
     workplace.mover.avoid_station(arrival.base_from_place, workplace.job, workplace.board, workplace.nominal.extent)
     workplace.mover.avoid_part(belongs, job.grasp.size)
     home_rail(workplace.devices, context.progress)
-    head, look = workplace.calibration.scan, workplace.look_before
+    head, look = workplace.calibration.scan, workplace.look_before(context)
     pointing = look.pointing if look is not None else seen_on_plate(workplace, context)[0]
     if pointing is not None:
         head = head.pointed(pointing, workplace.config.laser.exit_point)

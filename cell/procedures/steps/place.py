@@ -161,7 +161,7 @@ class Placing:
         self.progress(0.05, "approaching")
         # Not held before it: nobody would look at the surface again.
         way = self.mover.plan_to(self._flange_at(self.job.place.approach), "the approach pose")
-        self.mover.follow(way, settle=False)
+        self.mover.follow(way)
         self.check()
         require_in_claw(self.claw, self.part, self.note, "before the descent")
 

@@ -85,7 +85,9 @@ class Workplace:
     `job` changes once: a pick from a nest replaces its grasp by the measured one. `earlier` is the sweep of a run that
     this one resumes, `held` how that had gripped its part. `needs_part`: the claw must hold the part at the beginning.
     `looks_again` is True for a run that looks at the surface once more after its sweep, `looks_after` for one that
-    looks at the placed part. `whereabouts` is kept over retries and runs: the
+    looks at the placed part. `shares_look`: a scan head that was bumped shows in what the run sees of that part, so it
+    may go by a look at the head for a part before. `retried` says whether a step had to be done again.
+    `whereabouts` is kept over retries and runs: the
     vehicle may stand anywhere when a step is done again. `sweeping` is told who takes the frames of each sweep, before
     it begins, and where the surface is by the board (base_from_surface), `registered` where it was found. `pace` is the
     share of the planned speed. `looked` says whether this run has tried to look at the fine board, `interim` what that
@@ -106,6 +108,8 @@ class Workplace:
     needs_part: bool = True
     looks_again: bool = False
     looks_after: bool = False
+    shares_look: bool = False
+    retried: bool = False
     sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None
     registered: Callable[[pin.SE3], None] = lambda base_from_surface: None
     part: PartProgress = field(default_factory=PartProgress)
@@ -147,10 +151,10 @@ class Workplace:
         """Where the surface is by the board."""
         return fix.base_from_board * self.job.place_from_board.inverse() * self.job.surface.place_from_surface.se3()
 
-    @cached_property
-    def look_before(self) -> HeadLook | None:
-        """The look at the scan head that a part before this one had, if this one may go by it."""
-        look = self.parts_before.look if self.looks_after else None
+    def look_before(self, context: StepContext) -> HeadLook | None:
+        """The look at the scan head that a part before this one had, if this one may go by it: none after a hold or a
+        fault of this run either."""
+        look = self.parts_before.look if self.shares_look and not self.retried and not context.held_s else None
         return look if look is not None and self.devices.clock.now() - look.at < AGAIN_S else None
 
     @property

@@ -204,14 +204,18 @@ def test_no_part_goes_by_a_look_at_the_head_from_before_a_fault_or_a_hold(
         control.safe_point(control.token, lambda stays: control.go_on() if stays else None)
     report = {"cell_s": 1.0, "measured": [], "steps": [], "faults": faults}
     last = RunOutcome("placed", "in place", tmp_path, report, placed_pot.results, control)
-    known = _known_after(PartsBefore(), last)
+    known = _known_after(PartsBefore(), last, each_job=True)
     assert (known.look is not None) == (not faults and not held)
     sweep = placed_pot.results["laser_sweep"]
     if known.look is not None:
         assert (known.look.at, known.look.pointing) == (sweep.times[0], sweep.pointing)
         # One that went by an earlier look hands that on, as old as it is.
         shared = {**placed_pot.results, "laser_sweep": replace(sweep, looked_s=30.0)}
-        assert _known_after(known, replace(last, results=shared)).look is known.look
+        assert _known_after(known, replace(last, results=shared), each_job=True).look is known.look
+        # One whose fine board nobody saw is none.
+        unseen = {**placed_pot.results, "drive_to_target": replace(placed_pot.results["drive_to_target"], head=None)}
+        assert _known_after(known, replace(last, results=unseen), each_job=True).look is None
+        assert _known_after(known, replace(last, results=unseen), each_job=False).look is not None
 
 
 @pytest.mark.parametrize("count", [0, 1_000_001])

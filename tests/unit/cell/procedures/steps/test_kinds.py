@@ -40,6 +40,11 @@ LEAN = JobStep(Step("see_lean", 5.0, on_wall=True), tilt, Tilt, needs=(BoardFix,
 LOOK = PLACE.with_step(LEAN, after="board_photo", name="look_and_place")
 
 
+@pytest.mark.parametrize(("job", "sees"), [("shell", True), ("load", True), ("pot", False), ("unload", False)])
+def test_where_the_placed_part_is_seen_on_its_surface_a_bumped_head_shows(job: str, sees: bool) -> None:
+    assert kind_of(load_job(job)[0]).sees_place == sees
+
+
 def test_one_more_step_is_one_step_and_one_line() -> None:
     assert LOOK.names == ("drive_to_target", "board_photo", "see_lean", *PLACE.names[2:])
     assert (LOOK.sequence().success, LOOK.policy().of("see_lean").deadline_s) == ("placed", 5.0)
@@ -100,7 +105,7 @@ def test_what_a_step_makes_serves_whoever_needs_a_base_of_it() -> None:
 
 
 def test_a_step_that_made_something_else_has_failed() -> None:
-    site = cast(Any, SimpleNamespace(needs_part=False, held=None))
+    site = cast(Any, SimpleNamespace(needs_part=False, retried=False, held=None))
     gate = SimpleNamespace(entered=nullcontext)
     site.devices = SimpleNamespace(gate=gate, interlocks=SimpleNamespace(work_with=print))
     site.calibration, site.mover = SimpleNamespace(configuration=""), SimpleNamespace()

@@ -72,16 +72,19 @@ def test_steps_lost_in_a_sweep_with_a_second_look_are_found_after_its_way_back(
 
 
 @pytest.mark.parametrize(
-    ("ago", "seen", "attempt", "shared"),
-    [(590.0, True, 1, True), (601.0, True, 1, False), (5.0, False, 1, False), (5.0, True, 2, False)],
-)
+    ("ago", "seen", "attempt", "held", "shared"),
+    [
+        (590.0, True, 1, False, True), (601.0, True, 1, False, False), (5.0, False, 1, False, False),
+        (5.0, True, 2, False, False), (5.0, True, 1, True, False),
+    ],
+)  # fmt: skip
 def test_a_part_goes_by_the_look_at_the_head_of_a_part_before_for_ten_minutes(
-    placed_pot: JobRecord, tmp_path: Path, ago: float, seen: bool, attempt: int, shared: bool,
+    placed_pot: JobRecord, tmp_path: Path, ago: float, seen: bool, attempt: int, held: bool, shared: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """Where nobody looks at the placed parts, not at all."""
     site = AtStation(placed_pot, tmp_path)
-    site.work.looks_after, kept = seen, list[str]()
+    site.work.shares_look, kept = seen, list[str]()
     monkeypatch.setattr(site.work.frames, "keep", lambda name, frame: kept.append(name.split("-")[0]))
     pointing = Pointing(0.5e-3, 0.02e-3)
     look = HeadLook(site.cell.clock.now() - ago, pointing, placed_pot.results["laser_sweep"].slip)
@@ -89,9 +92,12 @@ def test_a_part_goes_by_the_look_at_the_head_of_a_part_before_for_ten_minutes(
     context = site.context("drive_to_target")
     site.work.whereabouts.enter(site.job)
     site.made["drive_to_target"] = site.kind.work(site.work)["drive_to_target"](context)
-    assert (site.made["drive_to_target"].head is None) == (shared or attempt > 1)
+    assert (site.made["drive_to_target"].head is None) == (shared or attempt > 1 or held)
+    if held:
+        site.control.pause()
+        site.control.safe_point(site.control.token, lambda stays: site.control.go_on() if stays else None)
     swept = site.kind.work(site.work)["laser_sweep"](site.context("laser_sweep", attempt))
-    assert ("witness" in kept) == (not shared) and ("interim" in kept) == (not shared and attempt == 1)
+    assert ("witness" in kept) == (not shared) and ("interim" in kept) == (not shared and attempt == 1 and not held)
     assert (swept.pointing is pointing) == shared
     assert swept.summary().get("head_looked_s_ago", 0.0) == pytest.approx(ago + 30.0 if shared else 0.0, abs=30.0)
     if shared:
