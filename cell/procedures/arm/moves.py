@@ -260,9 +260,11 @@ class Mover:
         """
         far = min(max(speed, FAR_SPEED) if near else speed, self._tool_speed)
         acceleration = max(0.02, min(3.0 * far, np.inf if force_limit is None else force_limit / HEAVY_KG))
+        slow, jerk = min(speed, far), 8.0
+        stopping = 1.1 * (0.5 * slow**2 / acceleration + 0.5 * slow * acceleration / jerk)
         limits = LineLimits(
-            speed=far, acceleration=acceleration, jerk=8.0, near=max(near, near and speed**2 / acceleration),
-            near_speed=min(speed, far), leaving=leaving,
+            speed=far, acceleration=acceleration, jerk=jerk, near=max(near, stopping) if near else 0.0, near_speed=slow,
+            leaving=leaving,
         )  # fmt: skip
         line = self._planner.line(self.joints, base_from_flange, limits, allowed)
         return self.follow(line.at_pace(self.pace.share), force_limit, settle)

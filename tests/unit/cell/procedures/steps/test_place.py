@@ -28,7 +28,7 @@ from cell.procedures.grasp import GraspSeries
 from cell.procedures.part_error import stated_bound
 from cell.procedures.steps import drive_to_target
 from cell.procedures.steps.kinds import PLACE
-from cell.procedures.steps.place import AimedPlace, PlaceResult, Placing, _mated, felt_from
+from cell.procedures.steps.place import FAST_FORCE, NEAR_M, AimedPlace, PlaceResult, Placing, _mated, felt_from
 from cell.procedures.steps.workplace import PartsBefore, Workplace
 from cell.run.report.report import place_error
 from cell.run.resumption import UnfinishedRun
@@ -173,6 +173,16 @@ def test_a_straight_line_gains_its_speed_gently() -> None:
         fast = np.linalg.norm(np.diff(way, axis=0), axis=1) / np.diff(times)
         assert fast.max() == pytest.approx(speed, rel=0.02)
         assert times[np.argmax(fast > 0.9 * speed)] > 0.9 / 3
+
+
+def test_near_its_place_a_line_of_a_higher_speed_takes_no_longer() -> None:
+    mover = Site().mover
+    lines: list[Trajectory] = []
+    mover.follow = lambda line, *_: bool(lines.append(line))  # type: ignore[method-assign]
+    goal = from_parts((0.0, 0.0, 0.05)) * mover.kinematics.fk(mover.joints)
+    for speed in (0.02, 0.04, 0.055, 0.06, 0.08, 0.1, 0.2):
+        mover.line(goal, speed, near=NEAR_M, force_limit=FAST_FORCE * JOB.place.contact_force)
+    assert np.diff([line.duration for line in lines]).max() < 0.01
 
 
 def test_what_the_force_sensor_showed_before_the_descent_is_no_touch(site: Site) -> None:
