@@ -262,7 +262,7 @@ def _shown(left: bool, right: bool) -> str:
 
 LOST_M = 0.05e-3
 """By so much the switch's edge may lie beside 0: more is steps that were lost."""
-AHEAD_M = 0.15e-3
+AHEAD_M = 0.2e-3
 """So far before and behind 0 the carriage creeps."""
 CREEP = 0.5e-3
 """Speed over the edge, m/s."""
