@@ -192,11 +192,11 @@ def _ended_by(open_cell: OpenCell, job: Job, last: RunOutcome, number: int) -> s
 def _still_known(before: PartsBefore, *, elsewhere: bool, asked: bool, refill: bool) -> PartsBefore:
     """What of it still holds for the next part. Whoever was `asked`, or sets the world up anew, may have moved vehicle
     and station, and bumped the scan head; the next stop is `elsewhere`."""
-    if elsewhere:
+    if elsewhere or asked:
         before = replace(before, arrival=None, board=None)
     if asked:
         before = replace(before, look=None)
-    return replace(before, arrival=None) if asked or refill else before
+    return replace(before, arrival=None) if refill else before
 
 
 def _known_after(before: PartsBefore, last: RunOutcome, *, each_job: bool) -> PartsBefore:
@@ -209,7 +209,9 @@ def _known_after(before: PartsBefore, last: RunOutcome, *, each_job: bool) -> Pa
     series, stands = before.series, None
     if isinstance(seen, PlacedPart) and seen.came is not None:
         series = series.after(seen.came, seen.slips)
-    board = photograph if isinstance(photograph, BoardFix) and not photograph.swung else None
+    board = None
+    if isinstance(photograph, BoardFix) and not photograph.swung and not last.control.held_s:
+        board = photograph
     if isinstance(arrival, VehicleArrival) and board is not None:
         stands = replace(arrival, shared=board)
     touch = put.touch.off if isinstance(put, PlaceResult) and put.touch is not None else None

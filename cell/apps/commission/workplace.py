@@ -90,9 +90,9 @@ class SimulatedPerson(Person):
 class SlowMover(Mover):
     """Moves that are planned anew, once, after a fault that a program may clear by itself, such as a lost program."""
 
-    def to(self, base_from_flange: pin.SE3, what: str, near: float = 0.0) -> None:
+    def to(self, base_from_flange: pin.SE3, what: str, within: float = 0.0) -> None:
         """See `Mover.to`."""
-        moved_once_more(self._arm, lambda: Mover.to(self, base_from_flange, what, near))
+        moved_once_more(self._arm, lambda: Mover.to(self, base_from_flange, what, within))
 
     def to_joints(self, joints: Joints, settle: bool = True) -> None:
         """See `Mover.to_joints`."""

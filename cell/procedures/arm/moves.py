@@ -198,11 +198,11 @@ class Mover:
         joints = self._planner.reach(base_from_flange, start if self.near is None else self.near, what)
         return self._planner.free(start, self.kinematics.unwound(joints, start)).at_pace(self.pace.share)
 
-    def to(self, base_from_flange: pin.SE3, what: str, near: float = 0.0) -> None:
-        """Move freely to a flange pose and settle, unless the arm stands there, or as `near`, m and rad."""
+    def to(self, base_from_flange: pin.SE3, what: str, within: float = 0.0) -> None:
+        """Move freely to a flange pose and settle, unless the arm stands there, or `within` so much, m and rad."""
         self.hold()
         off = base_from_flange.inverse() * from_ur(self._arm.state().flange)
-        if np.linalg.norm(off.translation) < near and np.linalg.norm(pin.log3(off.rotation)) < near:
+        if np.linalg.norm(off.translation) < within and np.linalg.norm(pin.log3(off.rotation)) < within:
             return
         way = self.plan_to(base_from_flange, what)
         if np.abs(way.end - self.joints).max() > THERE:

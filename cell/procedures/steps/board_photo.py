@@ -34,7 +34,7 @@ def photographed(workplace: Workplace, goal: pin.SE3, progress: Callable[[float,
     """
     workplace.devices.target_camera.configure(workplace.config.target_camera.photo_exposure, PHOTO_RATE_HZ)
     progress(0.1, "arm to the photograph pose")
-    workplace.mover.to(goal, "the photograph pose", near=NEAR)
+    workplace.mover.to(goal, "the photograph pose", within=NEAR)
     progress(0.7, "photographing the board")
     vehicle, count = workplace.config.arm.vehicle_from_base.se3().inverse(), workplace.job.photo.count
     return until_quiet(vehicle, lambda: workplace.photograph(count), workplace.devices.clock.sleep, progress)

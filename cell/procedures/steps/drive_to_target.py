@@ -354,7 +354,7 @@ def _still_there(workplace: Workplace, context: StepContext) -> VehicleArrival |
     )
     stand = workplace.config.arm.vehicle_from_base.se3()
     try:
-        workplace.mover.to(goal, "the photograph pose", near=NEAR)
+        workplace.mover.to(goal, "the photograph pose", within=NEAR)
         workplace.devices.clock.sleep(SETTLE_S)
         found, near = _arrived(
             workplace.job,
@@ -383,11 +383,7 @@ def _checked(workplace: Workplace, context: StepContext) -> InterimCheck | None:
     """
     if workplace.looked or not workplace.config.calibration.each_job:
         return workplace.interim
-    if (look := workplace.look_before(context)) is not None:
-        ago = workplace.devices.clock.now() - look.at
-        context.note(
-            text=f"fine board and plate on the claw were looked at {ago:.0f} s ago, for a part before this one"
-        )
+    if workplace.look_before(context) is not None:
         return None
     try:
         found = interim_check(

@@ -199,6 +199,7 @@ def _sweep(workplace: Workplace, context: StepContext, fix: BoardFix) -> SweepRe
         (pointing, slip), looked_s = seen_on_plate(workplace, context), 0.0
     else:
         pointing, slip, looked_s = look.pointing, look.slip, workplace.devices.clock.now() - look.at
+        context.note(text=f"the scan head was looked at {looked_s:.0f} s ago, for a part before this one")
     timing, doubts = times_known(head, workplace.config)
     if pointing is not None:
         head = head.pointed(pointing, workplace.config.laser.exit_point)

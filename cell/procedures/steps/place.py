@@ -39,8 +39,6 @@ touch that is allowed: one that comes earlier is then seen to, and what the forc
 ALIKE_M = 0.1e-3
 FAST_FORCE = 3.0
 """Times the contact force at which the faster part of the descent ends: accelerating the part is felt as well."""
-
-
 NEAR_M = 5e-3
 """So far above its end the fast part of the descent, and the way up, go at `place.speed`; beyond, faster."""
 

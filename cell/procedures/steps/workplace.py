@@ -86,13 +86,13 @@ class Workplace:
     this one resumes, `held` how that had gripped its part. `needs_part`: the claw must hold the part at the beginning.
     `looks_again` is True for a run that looks at the surface once more after its sweep, `looks_after` for one that
     looks at the placed part. `shares_look`: a scan head that was bumped shows in what the run sees of that part, so it
-    may go by a look at the head for a part before. `retried` says whether a step had to be done again.
-    `whereabouts` is kept over retries and runs: the
-    vehicle may stand anywhere when a step is done again. `sweeping` is told who takes the frames of each sweep, before
-    it begins, and where the surface is by the board (base_from_surface), `registered` where it was found. `pace` is the
-    share of the planned speed. `looked` says whether this run has tried to look at the fine board, `interim` what that
-    said, None where nothing was to be seen. `ground` is the box around the surface below a part to be unloaded, its
-    lowest and highest corner, m, part frame. `parts_before` is what the parts before this one of its batch tell.
+    may go by a look at the head for a part before. `retried` says whether a step had to be done again. `whereabouts` is
+    kept over retries and runs: the vehicle may stand anywhere when a step is done again. `sweeping` is told who takes
+    the frames of each sweep, before it begins, and where the surface is by the board (base_from_surface), `registered`
+    where it was found. `pace` is the share of the planned speed. `looked` says whether this run has tried to look at
+    the fine board, `interim` what that said, None where nothing was to be seen. `ground` is the box around the surface
+    below a part to be unloaded, its lowest and highest corner, m, part frame. `parts_before` is what the parts before
+    this one of its batch tell.
     """
 
     config: CellConfig

@@ -186,7 +186,8 @@ def test_items_are_made_ready_once_a_round_and_those_not_tried_are_named(
     assert shared == [False, shares, False, shares], "before another stop the vehicle does not stand yet"
     assert [more for *_, more in known] == [True, False, True, False], "a person makes the third ready"
     assert [look for look, *_ in known] == [False, True, False, True], "who was there may have bumped the head"
-    assert [(board, touch) for _, board, touch, _ in known[1:]] == [(shares, True)] * 3
+    assert [touch for *_, touch, _ in known] == [False, True, True, True]
+    assert [board for _, board, *_ in known[1:]] == [shares, False, shares], "nor is the station where it was"
     assert (batch.job, batch.count, batch.reason) == (
         name,
         6,
@@ -206,6 +207,9 @@ def test_no_part_goes_by_a_look_at_the_head_from_before_a_fault_or_a_hold(
     last = RunOutcome("placed", "in place", tmp_path, report, placed_pot.results, control)
     known = _known_after(PartsBefore(), last, each_job=True)
     assert (known.look is not None) == (not faults and not held)
+    assert (known.board is not None, known.arrival is not None) == (not held, not held), (
+        "who held it may have pushed it"
+    )
     sweep = placed_pot.results["laser_sweep"]
     if known.look is not None:
         assert (known.look.at, known.look.pointing) == (sweep.times[0], sweep.pointing)
