@@ -37,7 +37,7 @@ def test_every_look_at_the_board_is_taken_with_the_exposure_that_is_configured(
 
     workplace, fix, asked = AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["board_photo"], []
     monkeypatch.setattr(workplace, "photograph", photograph)
-    monkeypatch.setattr(workplace, "mover", SimpleNamespace(to=lambda *given, within: None))
+    monkeypatch.setattr(workplace, "mover", SimpleNamespace(to=lambda *given, within=0.0: None))
     monkeypatch.setattr(workplace.devices.target_camera, "configure", lambda *given: asked.append(given))
     with pytest.raises(Taken):
         photographed(workplace, fix.base_from_board, lambda share, text: None)
