@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
-from cell.measure.vision.board.view import DEFAULT_DICTIONARY, MARKER_SHARE, BoardSpec, Kind
+from cell.measure.vision.board.view import DEFAULT_DICTIONARY, KINDS, MARKER_SHARE, BoardSpec, Kind
 from lab.bench.board.render import Lens, Placed, paint, true_pixels
 
 LENSES = (
@@ -125,8 +125,7 @@ def draw_view(condition: Condition, kind: Kind, rng: np.random.Generator) -> Vie
             spec.dictionary,
         )  # fmt: skip
     if "instead" in has:
-        others: list[Kind] = ["marked_dots", "asymmetric_dots", "dots", "chessboard", "charuco"]
-        others.remove(kind)
+        others = [other for other in KINDS if other != kind]
         shown = draw_spec(others[int(rng.integers(len(others)))], rng)
     crowd = "other" in has or "twin" in has
     tilt = np.radians(rng.uniform(*condition.tilt))

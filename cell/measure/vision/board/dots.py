@@ -1,8 +1,7 @@
 """A board of dots in a picture: blobs, lattice, identity, then every dot that the board says must be there.
 
 Marked boards may be seen in part, the others must be seen to all their edges. Blobs come from a local threshold at
-several scales. A dot's edge is then looked for along rays from its middle, so that a laser line across it spoils some
-rays and not the centre (docs/explanation/theory.md, section 6).
+several scales; each dot is then measured by its edge (`dot_edges.py`).
 """
 
 import cv2
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array
+from cell.measure.vision.board.dot_edges import measured
 from cell.measure.vision.board.ends import OtherBoard, check_dot_ends
 from cell.measure.vision.board.lattice import LEAST_SHARE, Blobs, Places, PlaneMap, dot_lattices, identify
 from cell.measure.vision.board.view import BoardSpec, BoardView
@@ -23,22 +23,8 @@ AROUND = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
 WINDOWS = (0.06, 0.12, 0.03, 0.25)
 # Thresholds at which the only lattice is another board: further ones would find the same, sixteen times as slowly.
 SURE = 2
-RAYS = 32
-SAMPLES = 33
-REACH = (0.15, 1.75)
 LEAST_AREA_PX = 9.0
 ROUNDS = 4
-UNIT = np.column_stack([f(np.arange(RAYS) * 2 * np.pi / RAYS) for f in (np.cos, np.sin)])
-# Pairs that have to be put in order so that the fourth of seven values is the middle one (Devillard 1998).
-ORDER_OF_SEVEN = (
-    (0, 5), (0, 3), (1, 6), (2, 4), (0, 1), (3, 5), (2, 6), (2, 3), (3, 6), (4, 5), (1, 4), (1, 3), (3, 4),
-)  # fmt: skip
-# Share of the step from dot to board by which light that falls off evenly may depart from a plane.
-MOST_UNEVEN = 0.06
-MOST_SLOPE = 0.3
-WHITE_DN = 253
-# Of the edge, in radii: less is not told from none.
-LEAST_SCATTER = 1e-3
 
 
 def find_dots(image: Image, spec: BoardSpec) -> BoardView:
@@ -111,13 +97,13 @@ def _extended(image: Image, dots: Blobs, places: Places, name: str) -> tuple[Blo
         middles, steps = plane.pixels(flat), plane.steps(flat)
         radius = _relative_radius(dots, plane.steps(places.astype(np.float64)))
         guess = Blobs(middles, radius * steps)
-        measured, sigma = measure_dots(image, guess, rounds=3)
-        ratio = measured.areas / guess.areas
-        away = np.linalg.norm(measured.centres - middles, axis=1)
+        seen, sigma = measure_dots(image, guess, rounds=3)
+        ratio = seen.areas / guess.areas
+        away = np.linalg.norm(seen.centres - middles, axis=1)
         good = np.isfinite(sigma) & (ratio > 0.75) & (ratio < 1.33) & (away < 0.15 * np.linalg.norm(steps, axis=(1, 2)))
         if not good.any():
             break
-        new = measured.take(good)
+        new = seen.take(good)
         dots = Blobs(np.concatenate([dots.centres, new.centres]), np.concatenate([dots.shapes, new.shapes]))
         places = np.concatenate([places, np.array(beside, dtype=np.intp)[good]])
     return dots, places
@@ -148,19 +134,18 @@ def _complete(image: Image, spec: BoardSpec, dots: Blobs, places: Places, assume
         predicted < np.array([width - 1, height - 1]) - reach[:, None]
     ).all(axis=1)
     ids = np.flatnonzero(visible)
-    start = predicted.copy()
-    start[found] = dots.centres
-    begin = Blobs(start[ids], shapes[ids])
-    measured, sigma = measure_dots(image, begin)
-    ratio = measured.areas / begin.areas
-    away = np.linalg.norm(measured.centres - predicted[ids], axis=1)
+    start = Blobs(predicted.copy(), shapes.copy())
+    start.centres[found], start.shapes[found] = dots.centres, dots.shapes
+    seen, sigma = measure_dots(image, start.take(ids))
+    ratio = seen.areas / Blobs(predicted, shapes).areas[ids]
+    away = np.linalg.norm(seen.centres - predicted[ids], axis=1)
     pitch = np.sqrt(np.abs(np.linalg.det(jacobian[ids])))
     good = np.isfinite(sigma) & (ratio > 0.6) & (ratio < 1.6) & (away < 0.25 * pitch)
     if good.sum() < (LEAST_DOTS if spec.kind == "marked_dots" else LEAST_SHARE * len(lattice)):
         raise PictureRefused(Reason.NO_BOARD, f"only {good.sum()} dots of {spec.name} could be measured")
     check_dot_ends(image, spec, plane, ids[good], radius)
     # Pixel (0, 0) is the middle of the upper left pixel at either scale.
-    pixels = (measured.centres[good] + 0.5) / scale - 0.5
+    pixels = (seen.centres[good] + 0.5) / scale - 0.5
     size = (width // scale, height // scale)
     # One dot's rays are few: half of its variance is what the board's other dots say.
     own = np.square(sigma[good] / scale)
@@ -181,7 +166,7 @@ def find_blobs(image: Image, window: int, offset: float) -> Blobs:
     """Dark elliptic blobs: darker by `offset` DN than the mean of a `window` × `window` px neighbourhood."""
     smooth = cv2.GaussianBlur(image, (3, 3), 0)
     mean = cv2.blur(smooth, (window, window), borderType=cv2.BORDER_REPLICATE)
-    dark = (smooth.astype(np.int16) < mean.astype(np.int16) - int(offset)).astype(np.uint8)
+    _, dark = cv2.threshold(cv2.subtract(mean, smooth), int(offset), 255, cv2.THRESH_BINARY)
     # Grains of noise are opened away: what is not three pixels wide is too small for a dot.
     dark = np.asarray(cv2.morphologyEx(dark, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))))
     contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
@@ -249,151 +234,24 @@ def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blob
 
 def tell_dots(image: Image, start: Blobs) -> tuple[Blobs, Array, Array]:
     """Dots measured well enough to tell them apart, the deviations of their centres, and ring scores (n, 2)."""
-    dots, sigma, profiles = _measured(image, start, 2)
-    return dots, sigma, _ring_scores(profiles, np.linspace(*REACH, SAMPLES))
+    dots, sigma, signs = _measured(image, start, 2)
+    return dots, sigma, _ring_scores(signs)
 
 
 def _measured(image: Image, start: Blobs, rounds: int) -> tuple[Blobs, Array, Array]:
-    """As `measure_dots`, with the grey values (n, rays, samples) of the last round."""
-    picture = image.astype(np.float32)
-    centres, shapes = start.centres.copy(), start.shapes.copy()
-    rho = np.linspace(*REACH, SAMPLES)
-    twice = UNIT[:, :1] ** 2 - UNIT[:, 1:] ** 2
-    design = np.column_stack([np.ones(RAYS), UNIT, twice, 2 * UNIT[:, :1] * UNIT[:, 1:]])
-    sigma = np.full(len(centres), np.nan)
-    profiles = np.empty((len(centres), RAYS, SAMPLES))
-    for _ in range(rounds):
-        profiles = _sample(picture, centres, shapes, rho)
-        edge, good = _edges(profiles, rho)
-        coefficients, sigma, kept = _harmonics(edge, good, design)
-        moved = np.clip(coefficients, -0.5, 0.5)
-        moved[:, 0] = np.clip(coefficients[:, 0], 0.5, 1.6)
-        # A circle shifted by (a1, b1) and stretched by the second harmonic, in the dot's own normalised coordinates.
-        stretch = np.empty((len(centres), 2, 2))
-        stretch[:, 0, 0], stretch[:, 1, 1] = moved[:, 0] + moved[:, 3], moved[:, 0] - moved[:, 3]
-        stretch[:, 0, 1] = stretch[:, 1, 0] = moved[:, 4]
-        stretch = np.where(kept[:, None, None], stretch, np.eye(2))
-        centres = centres + np.where(kept[:, None], np.einsum("nij,nj->ni", shapes, moved[:, 1:3]), 0.0)
-        shapes = shapes @ stretch
-        sigma = np.where(kept, sigma * np.sqrt(np.abs(np.linalg.det(shapes))), np.nan)
+    """As `measure_dots`, with what tells a ring (n, 4)."""
+    centres, shapes, sigma, signs = measured(image, start.centres, start.shapes, rounds)
     # A dot that wandered off its blob measures something else.
     wandered = np.linalg.norm(np.linalg.solve(start.shapes, (centres - start.centres)[:, :, None])[:, :, 0], axis=1)
     sigma[wandered > 0.7] = np.nan
-    return Blobs(centres, shapes), sigma, profiles
+    return Blobs(centres, shapes), sigma, signs
 
 
-def _sample(picture: NDArray[np.float32], centres: Array, shapes: Array, rho: Array) -> Array:
-    """Grey values (n, rays, samples) along rays in the dots' normalised coordinates."""
-    directions = np.einsum("nij,kj->ink", shapes, UNIT)
-    # The columns and rows of all places by themselves: neither has to be picked out of pairs again.
-    x, y = (
-        (centres[:, axis, None, None] + directions[axis, :, :, None] * rho)
-        .astype(np.float32)
-        .reshape(len(centres) * RAYS, len(rho))
-        for axis in (0, 1)
-    )
-    sampled = cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return sampled.reshape(len(centres), RAYS, len(rho)).astype(np.float64)
-
-
-def _edges(profiles: Array, rho: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Where each ray (n, rays) leaves the dark, at half of the step, and whether it clearly does."""
-    inside = (rho > 0.55) & (rho < 0.8)
-    outside = (rho > 1.2) & (rho < 1.6)
-    bright = profiles[:, :, outside].mean(axis=2)
-    # Neighbouring rays see the same board; a laser line or a neighbour dot does not move their median.
-    ring = _median_of_seven([np.roll(bright, k, axis=1) for k in range(-3, 4)])
-    dark = np.median(profiles[:, :, inside].reshape(len(profiles), -1), axis=1)[:, None]
-    slope, even = _light(profiles[:, :, inside].mean(axis=2), rho[inside].mean(), ring, rho[outside].mean())
-    dark, bright = dark * (1 + slope), np.where(even, ring.mean(axis=1, keepdims=True) * (1 + slope), ring)
-    step = bright - dark
-    level = dark + 0.5 * step
-    start = int(np.searchsorted(rho, 0.5))
-    below = profiles[:, :, start:-1] < level[:, :, None]
-    above = profiles[:, :, start + 1 :] >= level[:, :, None]
-    crossing = below & above
-    first = crossing.argmax(axis=2) + start
-    rows, rays = np.indices(first.shape)
-    low, high = profiles[rows, rays, first], profiles[rows, rays, first + 1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        edge = rho[first] + (level - low) / (high - low) * (rho[1] - rho[0])
-    good = crossing.any(axis=2) & (crossing.sum(axis=2) <= 2) & (step > 0.4 * np.median(step, axis=1)[:, None])
-    return np.where(good, edge, 1.0), good & (step > 4.0)
-
-
-def _median_of_seven(values: list[Array]) -> Array:
-    """The middle of seven arrays, element by element: by comparisons of whole arrays, as nothing has to be sorted."""
-    v = list(values)
-    for a, b in ORDER_OF_SEVEN:
-        v[a], v[b] = np.minimum(v[a], v[b]), np.maximum(v[a], v[b])
-    return v[3]
-
-
-def _light(dot: Array, within: float, ring: Array, beyond: float) -> tuple[Array, NDArray[np.bool_]]:
-    """By how much more light than its middle a dot's edge gets, a share (n, rays), and whether light falls off evenly.
-
-    `dot` and `ring` (n, rays) are the levels at `within` and `beyond` radii. The ring has the light of its own place,
-    not that of the edge: taken as it is, it moves every dot of a board the same way, which no residual shows.
-    """
-    mean = ring.mean(axis=1, keepdims=True)
-    side = 2 / RAYS * (ring @ UNIT) @ UNIT.T
-    uneven = np.sqrt(np.mean((ring - mean - side) ** 2, axis=1, keepdims=True))
-    even = uneven < MOST_UNEVEN * (mean - dot.mean(axis=1, keepdims=True))
-    # White that saturates tells nothing of the light; the dot, which reflects a little of it, does.
-    saturated = ring.max(axis=1, keepdims=True) >= WHITE_DN
-    level = np.maximum(dot.mean(axis=1, keepdims=True), 1.0)
-    slope = np.where(
-        saturated, 2 / RAYS * (dot @ UNIT) @ UNIT.T / (within * level), side / (beyond * np.maximum(mean, 1.0))
-    )
-    return np.where(even, np.clip(slope, -MOST_SLOPE, MOST_SLOPE), 0.0), even
-
-
-def _harmonics(edge: Array, good: NDArray[np.bool_], design: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Robust Fourier coefficients (n, 5) of the edge, the deviation (n,) of the centre, and which dots are whole."""
-    weight = good.astype(np.float64)
-    coefficients = np.zeros((len(edge), design.shape[1]))
-    scatter, residual, z = np.ones(len(edge)), edge, edge
-    products = (design[:, :, None] * design[:, None, :]).reshape(len(design), -1)
-    for _ in range(4):
-        normal = (weight @ products).reshape(len(edge), *2 * design.shape[1:]) + 1e-9 * np.eye(design.shape[1])
-        right = (weight * edge) @ design
-        coefficients = np.asarray(np.linalg.solve(normal, right[:, :, None])[:, :, 0], dtype=np.float64)
-        residual = edge - coefficients @ design.T
-        scatter = 1.4826 * np.median(np.where(good, np.abs(residual), np.inf), axis=1)
-        scatter = np.clip(np.where(np.isfinite(scatter), scatter, 1.0), LEAST_SCATTER, None)
-        z = residual / (4.0 * scatter[:, None])
-        weight = np.where(good & (np.abs(z) < 1), (1 - z * z) ** 2, 0.0)
-    used = (weight > 0.2).sum(axis=1)
-    # The rays that count must surround the dot: no gap of a third of the circle.
-    gap = _widest_gaps(weight > 0.2)
-    kept = (used >= RAYS // 2) & (gap <= RAYS // 3) & (scatter < 0.15)
-    # The variance of an M-estimator: the mean square of what each ray pulls over the square of how stiffly it holds.
-    within = weight > 0
-    pull = np.where(within, weight * residual, 0.0)
-    hold = np.where(within, (1 - z * z) * (1 - 5 * z * z), 0.0).sum(axis=1)
-    freedom = np.maximum(within.sum(axis=1) - design.shape[1], 1) / np.maximum(within.sum(axis=1), 1)
-    variance = 2 * np.square(pull).sum(axis=1) / np.maximum(hold, 1.0) ** 2 / freedom
-    return coefficients, np.sqrt(variance), kept
-
-
-def _widest_gaps(used: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Longest run of unused rays (n,) around the circle, for rays (n, rays)."""
-    twice = np.concatenate([used, used], axis=1)
-    columns = np.arange(twice.shape[1])
-    last = np.maximum.accumulate(np.where(twice, columns, -1), axis=1)
-    return np.asarray((columns - last).max(axis=1))
-
-
-def _ring_scores(profiles: Array, rho: Array) -> Array:
+def _ring_scores(signs: Array) -> Array:
     """Two signs of a ring (n, 2): brightness of the middle between dot (0) and board (1), and missing darkness.
 
     The second, the dot's whole darkness against the median of all dots, survives blur: a ring lacks a quarter of it.
     """
-    middle = np.median(profiles[:, :, rho < 0.35].reshape(len(profiles), -1), axis=1)
-    dark = np.median(profiles[:, :, (rho > 0.6) & (rho < 0.85)].min(axis=2), axis=1)
-    bright = np.median(profiles[:, :, (rho > 1.25) & (rho < 1.6)].reshape(len(profiles), -1), axis=1)
-    near = rho < 1.5
-    mean = np.median(profiles[:, :, near], axis=1)
-    darkness = ((bright[:, None] - mean) * rho[near]).sum(axis=1) / np.maximum(bright, 1.0)
+    middle, rim, bright, darkness = signs.T
     missing = 1 - darkness / max(float(np.median(darkness)), 1e-9)
-    return np.column_stack([(middle - dark) / np.maximum(bright - dark, 1.0), missing])
+    return np.column_stack([(middle - rim) / np.maximum(bright - rim, 1.0), missing])

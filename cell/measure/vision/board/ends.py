@@ -41,32 +41,31 @@ def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArra
     marked = spec.kind == "marked_dots"
     around = 1.65 * radius * np.column_stack([f(np.arange(8) * np.pi / 4) for f in (np.cos, np.sin)])
     own = lattice[found]
-    level = grey(smooth, plane.pixels(own))
-    for name, beyond in next_places(spec):
-        ends = further = seen = 0
-        spots, outward = _spots(own, beyond, around, radius)
-        there = grey(smooth, plane.pixels(spots.reshape(-1, 2))).reshape(spots.shape[:2])
-        for (dark, between, middle, near_side), rim, out in zip(there[:, :4], there[:, 4:], outward, strict=True):
-            step = between - dark
-            if not step > max(4.0, 0.12 * typical(between - level)):
-                continue
-            seen += 1
-            darker = rim - middle > 0.4 * step
-            beside = np.argsort(np.abs(around @ out))[:2]
-            if darker.all():
-                further += 1
-            elif not darker[beside].any() and np.isfinite(rim[beside]).all():
-                # A line round the board goes on to both sides, which no dot does.
-                ends += 1
-            elif near_side - dark > 0.6 * step or (np.isfinite(rim).all() and darker.sum() < 6):
-                ends += 1
+    level = typical(grey(smooth, plane.pixels(own)))
+    sides = next_places(spec)
+    which = np.repeat(np.arange(len(sides)), [len(beyond) for _, beyond in sides])
+    spots, outward, near = _spots(own, np.concatenate([beyond for _, beyond in sides]), around, radius)
+    there = grey(smooth, plane.pixels(spots.reshape(-1, 2))).reshape(spots.shape[:2])
+    dark, between, middle, near_side = there[:, :4].T
+    rim, step = there[:, 4:], between - dark
+    seen = step > np.maximum(4.0, 0.12 * (between - level))
+    darker = rim - middle[:, None] > 0.4 * step[:, None]
+    beside = np.argsort(np.abs(outward @ around.T), axis=1)[:, :2]
+    goes_on = seen & darker.all(axis=1)
+    # A line round the board goes on to both sides, which no dot does.
+    bare = ~np.take_along_axis(darker, beside, axis=1).any(axis=1)
+    bare &= np.isfinite(np.take_along_axis(rim, beside, axis=1)).all(axis=1)
+    bare |= (near_side - dark > 0.6 * step) | (np.isfinite(rim).all(axis=1) & (darker.sum(axis=1) < 6))
+    for k, (name, _) in enumerate(sides):
+        here = which[near] == k
+        further, ends = int((here & goes_on).sum()), int((here & seen & ~goes_on & bare).sum())
         if further >= MOST_BEYOND:
             raise OtherBoard(
                 Reason.NO_BOARD,
                 f"the board in the picture goes on beyond the {name} of {spec.name}: {further} more dots there; "
                 "is it the board that the set-up names?",
             )
-        if not marked and ends < max(1.0, LEAST_ENDS * seen):
+        if not marked and ends < max(1.0, LEAST_ENDS * (here & seen).sum()):
             raise PictureRefused(
                 Reason.AMBIGUOUS,
                 f"the end of the board beyond the {name} of {spec.name} is not seen; show the whole board",
@@ -75,22 +74,22 @@ def check_dot_ends(image: Image, spec: BoardSpec, plane: PlaneMap, found: NDArra
         check_hidden_sides(smooth, spec, plane, found, 0.5)
 
 
-def _spots(own: NDArray[np.intp], beyond: Array, around: Array, radius: float) -> tuple[Array, Array]:
-    """Where one looks for the end of a side: spots (n, 12, 2) for n of the places `beyond`, and the ways out (n, 2).
+def _spots(
+    own: NDArray[np.intp], beyond: Array, around: Array, radius: float
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Where one looks for the end of a side: spots (n, 12, 2) for n of the m places `beyond`, the ways out (n, 2), and
+    which places (m,) these are: those far from every dot are left out.
 
-    They are the nearest of the board's `own` dots, half way to the place, the place, its near side, and what lies
-    `around` it. Places far from every dot are left out.
+    Spots are the nearest of the board's `own` dots, half way to the place, the place, its near side, and what lies
+    `around` it.
     """
-    spots, outward = [], []
-    for place in beyond:
-        near = own[np.argsort(np.abs(own - place).sum(axis=1))[0]].astype(np.float64)
-        if np.abs(near - place).max() > 2:
-            continue
-        out = (place - near) / np.linalg.norm(place - near)
-        # The near side of the dot that would follow is seen even where the picture or a narrow sheet ends.
-        spots.append(np.vstack([near, 0.5 * (near + place), place, place - 0.75 * radius * out, place + around]))
-        outward.append(out)
-    return np.reshape(spots, (-1, 4 + len(around), 2)), np.reshape(outward, (-1, 2))
+    nearest = own[np.abs(own[None] - beyond[:, None]).sum(axis=2).argmin(axis=1)].astype(np.float64)
+    near = np.abs(nearest - beyond).max(axis=1) <= 2
+    place, dot = beyond[near], nearest[near]
+    out = (place - dot) / np.linalg.norm(place - dot, axis=1, keepdims=True)
+    # The near side of the dot that would follow is seen even where the picture or a narrow sheet ends.
+    along = np.stack([dot, 0.5 * (dot + place), place, place - 0.75 * radius * out], axis=1)
+    return np.concatenate([along, place[:, None] + around], axis=1), out, near
 
 
 def typical(values: Array) -> float:

@@ -142,29 +142,34 @@ def grow(
     found = {(0, 0): seed}
     points: list[tuple[float, float]] = centres.tolist()
     steps = {seed: [(float(basis[0][0]), float(basis[0][1])), (float(basis[1][0]), float(basis[1][1]))]}
-    queue = [(0, 0)]
-    while queue:
-        place = queue.pop(0)
-        here = found[place]
-        (x, y), own = points[here], steps[here]
+    latest = [(0, 0)]
+    while latest:
         ways = [
-            (axis, sign) for axis, sign in WAYS if (place[0] + sign * (not axis), place[1] + sign * axis) not in found
+            (place, axis, sign, (place[0] + sign * (not axis), place[1] + sign * axis))
+            for place in latest
+            for axis, sign in WAYS
         ]
+        ways = [way for way in ways if way[3] not in found]
         if not ways:
-            continue
-        reach = TOLERANCE * min(math.hypot(*own[0]), math.hypot(*own[1]))
-        guesses = np.array([(x + sign * own[axis][0], y + sign * own[axis][1]) for axis, sign in ways])
-        near = [np.asarray(part).tolist() for part in tree.query(guesses)]
-        for (axis, sign), distance, blob in zip(ways, *near, strict=True):
-            if distance > reach or blob in steps or not alike(here, blob):
+            break
+        guesses = [
+            [points[found[place]][k] + sign * steps[found[place]][axis][k] for k in (0, 1)]
+            for place, axis, sign, _ in ways
+        ]
+        near = [np.asarray(part).tolist() for part in tree.query(np.array(guesses))]
+        latest = []
+        for (place, axis, sign, beside), distance, blob in zip(ways, *near, strict=True):
+            here = found[place]
+            (x, y), own = points[here], steps[here]
+            reach = TOLERANCE * min(math.hypot(*own[0]), math.hypot(*own[1]))
+            if distance > reach or beside in found or blob in steps or not alike(here, blob):
                 continue
             there = points[blob]
             local = list(own)
             local[axis] = sign * (there[0] - x), sign * (there[1] - y)
             steps[blob] = local
-            beside = (place[0] + sign * (not axis), place[1] + sign * axis)
             found[beside] = blob
-            queue.append(beside)
+            latest.append(beside)
     return found
 
 
