@@ -10,6 +10,7 @@ from typing import Self
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from cell.base.storage import sync_files
 from drivers.errors import CellError
@@ -29,6 +30,8 @@ PNG = (
     cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
 )  # fmt: skip
 """A third of the time of the default and no larger: choosing a filter for each row of a noisy picture gains nothing."""
+PNG_OF_CUT = (*PNG[:2], cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE, *PNG[4:])
+"""Most of it is black."""
 
 
 class FrameFile:
@@ -50,6 +53,9 @@ class FrameFile:
         return self._png
 
 
+Cut = Callable[[], NDArray[np.uint8]]
+"""What makes of a picture the one that is kept: black where nobody will look."""
+
 Listener = Callable[[str, Frame, FrameFile], None]
 """Told of each frame that is kept: of what, the frame, and its file."""
 
@@ -67,7 +73,7 @@ class FrameStore:
         self._folder = folder
         self._listener = listener
         self._kept = kept
-        self._waiting: queue.Queue[tuple[FrameFile, Frame] | threading.Event | None] = queue.Queue(CAPACITY)
+        self._waiting: queue.Queue[tuple[FrameFile, Frame, Cut | None] | threading.Event | None] = queue.Queue(CAPACITY)
         self._failure: str | None = None
         self._digests: dict[str, str] = {}
         self._thread = threading.Thread(target=self._write, name="frame store", daemon=True)
@@ -78,8 +84,8 @@ class FrameStore:
         self.recent: deque[str] = deque(maxlen=RECENT)
         self.last: tuple[str, Frame] | None = None
 
-    def keep(self, what: str, frame: Frame) -> None:
-        """Queue a frame; raises `CellError` when an earlier one could not be written."""
+    def keep(self, what: str, frame: Frame, cut: Cut | None = None) -> None:
+        """Queue a frame, or what `cut` makes of it; raises `CellError` when an earlier one could not be written."""
         if self._failure is not None:
             raise CellError(f"frames cannot be kept: {self._failure}; make room in {self._folder}")
         self.last = what, frame
@@ -91,7 +97,7 @@ class FrameStore:
         if self._listener is not None:
             self._listener(what, frame, picture)
         try:
-            self._waiting.put((picture, frame), timeout=WRITE_TIMEOUT_S)
+            self._waiting.put((picture, frame, cut), timeout=WRITE_TIMEOUT_S)
         except queue.Full:
             self._failure = f"the disk took no frame for {WRITE_TIMEOUT_S:.0f} s"
             raise CellError(f"frames cannot be kept: {self._failure}; look at {self._folder}") from None
@@ -124,11 +130,12 @@ class FrameStore:
             if isinstance(item, threading.Event):
                 item.set()
                 continue
-            picture, frame = item
+            picture, frame, cut = item
             path, data = self._folder / picture.name, None
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                made, png = cv2.imencode(".png", frame.image, PNG)
+                image = frame.image if cut is None else cut()
+                made, png = cv2.imencode(".png", image, PNG if image is frame.image else PNG_OF_CUT)
                 if made:
                     data = np.asarray(png).tobytes()
                     path.write_bytes(data)

@@ -186,3 +186,6 @@ def _on_one_thread() -> None:
     # What a run warns of is in its row; a worker has nobody who reads it.
     if not (root := logging.getLogger()).handlers:
         root.addHandler(logging.NullHandler())
+        # Modules stay: the collection after each world has not to look at them.
+        gc.collect()
+        gc.freeze()

@@ -20,6 +20,8 @@ from cell.procedures.sweep.sweeping import check_lost_steps
 from drivers.errors import DeviceFault, LimitError, Measured, RefusedError
 
 PICTURES = 12
+KEPT_EACH = 4
+"""Of the pictures over the plate's edge, every so many are kept for people."""
 RATES_HZ = 30.0, 15.0, 10.0
 """The first that the camera can."""
 
@@ -210,12 +212,14 @@ def _passed(
     """Places (n,) of the rail, m, rising, and the share (n,) of the line's light on the plate."""
     rail, camera, laser = devices.rail, devices.scan_camera, devices.laser
     rail.move_to(rail.sweep_start(*ends, speed)).wait(30.0)
-    times, light, dark = [], [], []
+    times: list[float] = []
+    light, dark = [], []
     with devices.interlocks.purpose("calibration"), camera.stream() as frames, laser.lit():
         sweep = rail.sweep(*ends, speed)
         for frame in frames_of(sweep, frames):
             laser.renew()
-            keep("witness-edge", frame)
+            if len(times) % KEPT_EACH == 0:
+                keep("witness-edge", frame)
             times.append(frame.mid_exposure)
             light.append(_light(frame.image, witness))
             some = np.sort(frame.image[::8, ::8].astype(np.float64), axis=None)

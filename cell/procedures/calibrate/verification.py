@@ -48,6 +48,7 @@ from cell.procedures.arm.moves import Mover
 from cell.procedures.arm.photograph import CalibrationView, ScanPlan, rail_ends, references, verification_views
 from cell.procedures.calibrate.boards import PHOTO_RATE, Check, Keep, Progress, look_for, move_to_view
 from cell.procedures.calibrate.reference_plate import require_reference_plate
+from cell.procedures.frame_store import Cut
 from cell.procedures.sweep.swath import SweepCollector, SweepErrors, warm_up
 from cell.procedures.sweep.sweeping import home_rail, rail_sweep
 from drivers.errors import RefusedError
@@ -193,7 +194,7 @@ def collect_verification(
         if k == SCAN_APPROACHES - 1:
             sweep = _sweep(
                 config, devices, mover, geometry=calibration.scan.geometry(), view=scan_view, ends=ends,
-                progress=lambda f, t: progress(0.3 + 0.2 * f, t), keep_frame=lambda frame: keep("stripe", frame),
+                progress=lambda f, t: progress(0.3 + 0.2 * f, t), keep_frame=lambda frame, cut: keep("stripe", frame),
             )  # fmt: skip
         else:
             move_to_view(devices, mover, scan_view, k)
@@ -226,7 +227,7 @@ def _photographs(
 
 def _sweep(
     config: CellConfig, devices: Devices, mover: Mover, geometry: ScanGeometry, view: CalibrationView,
-    ends: tuple[float, float], progress: Callable[[float, str], None], keep_frame: Callable[[Frame], None],
+    ends: tuple[float, float], progress: Callable[[float, str], None], keep_frame: Callable[[Frame, Cut | None], None],
 ) -> list[ScanObservation]:  # fmt: skip
     """To the view and over the board's plate from end to end."""
     length, exposure = f"{1e3 * (ends[1] - ends[0])} mm", f"{1e3 * config.calibration.stripe_exposure} ms"

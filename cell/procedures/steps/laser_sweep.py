@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import chain
 
 import numpy as np
@@ -25,6 +26,7 @@ from cell.measure.calibration.drift.timing import StampTiming
 from cell.procedures.ambient import MOST_WHITE, TRIES, bearable, require_line, shorten
 from cell.procedures.arm.photograph import BoardFix, scan_plans
 from cell.procedures.calibrate.reference_plate import configure_fast, require_edge, require_reference_plate
+from cell.procedures.frame_store import Cut
 from cell.procedures.steps.board_photo import require_board_unmoved
 from cell.procedures.steps.workplace import JobStep, Workplace
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord, save_sweep
@@ -60,7 +62,7 @@ def laser_sweep(
     head: ScanCalibration,
     scan: ScanSection,
     *,
-    keep_frame: Callable[[Frame], None],
+    keep_frame: Callable[[Frame, Cut | None], None],
     check: Callable[[], None],
     progress: Callable[[float, str], None],
     sweeping: Callable[[SweepCollector, pin.SE3], None] = lambda collector, base_from_surface: None,
@@ -128,7 +130,7 @@ def in_few_lines(
     rate = configure_fast(workplace.devices, few.exposure, (few.frame_rate, scan.frame_rate))
     return laser_sweep(
         workplace, over, head, few.model_copy(update={"frame_rate": rate}), most_lost=MOST_LOST, back=back,
-        keep_frame=lambda frame: workplace.frames.keep(keep, frame), check=check, progress=progress, counted=counted,
+        keep_frame=partial(workplace.frames.keep, keep), check=check, progress=progress, counted=counted,
     )  # fmt: skip
 
 
@@ -208,7 +210,7 @@ def _sweep(workplace: Workplace, context: StepContext, fix: BoardFix) -> SweepRe
     again = workplace.looks_again and timing is not None and workplace.job.scan.mode == "rail"
     record = laser_sweep(
         workplace, over, head, slowed_down(workplace.job.scan, context.attempt),
-        check=context.check, progress=context.progress, keep_frame=lambda frame: workplace.frames.keep("stripe", frame),
+        check=context.check, progress=context.progress, keep_frame=partial(workplace.frames.keep, "stripe"),
         sweeping=workplace.sweeping, counted=not again,
     )  # fmt: skip
     rest = workplace.devices.interlocks.situation.last if workplace.job.scan.mode == "rail" else None

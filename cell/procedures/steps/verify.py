@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import pinocchio as pin
 
@@ -220,7 +221,7 @@ def _swept_at_rest(
         try:
             record = laser_sweep(
                 workplace, over, head, workplace.job.scan, check=context.check, counted=False,
-                keep_frame=lambda frame: workplace.frames.keep(frames, frame),
+                keep_frame=partial(workplace.frames.keep, frames),
                 progress=lambda share, text: context.progress(0.85 * share, f"the part: {text}"),
             )  # fmt: skip
             swept = build_cloud(record), record

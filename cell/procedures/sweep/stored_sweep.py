@@ -250,7 +250,7 @@ def _swath(folder: Path, stored: dict[str, Vector], k: int, geometry: ScanGeomet
     if not np.isfinite([lost, residual, shift]).all():
         raise ValueError(f"its figures are {lost}, {residual}, {shift}")
     shape = (geometry.camera.height, geometry.camera.width)
-    collector = SweepCollector(geometry, scan, lambda frame: None, lambda fraction, text: None)
+    collector = SweepCollector(geometry, scan, lambda frame, cut: None, lambda fraction, text: None)
     collector.notes = tuple(str(doubt) for doubt in stored.get("doubts", ()) if str(doubt).startswith(REACHES))
     for frame_id in arrays["seen"]:
         image = read_image(frame_path(folder, int(frame_id)), shape)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -19,9 +20,10 @@ from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.geometry.poses import from_matrix
 from cell.measure.inversion import NominalSurface
 from cell.measure.reconstruction.build import ProfileBuilder, ScanGeometry
-from cell.measure.vision.stripe.extract import StripeStream, drawn
+from cell.measure.vision.stripe.extract import StripeStream, around_stripe, drawn
 from cell.measure.vision.stripe.profile import StripeProfile
 from cell.procedures.ambient import WHITER, bearable
+from cell.procedures.frame_store import Cut
 from drivers.errors import DeviceFault
 from drivers.interfaces import Camera, Frame, FrameStream, Sweep, Vector
 
@@ -207,7 +209,7 @@ class SweepCollector:
 
     geometry: ScanGeometry
     scan: ScanSection
-    keep_frame: Callable[[Frame], None]
+    keep_frame: Callable[[Frame, Cut | None], None]
     progress: Callable[[float, str], None]
     keep_profile: Callable[[StripeProfile], None] | None = None
     times: list[float] = field(default_factory=list)
@@ -232,17 +234,21 @@ class SweepCollector:
             end = ended()
             if end is not None and frame.mid_exposure > end:
                 break
-            self.keep_frame(frame)
-            self.see(frame)
+            cut = None
+            try:
+                cut = self.see(frame)
+            finally:
+                self.keep_frame(frame, cut)
             self.progress(min(0.99, len(self.times) / self.expected), f"{len(self.times)} profiles")
         self.lost = frames.lost
 
-    def see(self, frame: Frame) -> None:
-        """Triangulate the stripe of one frame."""
+    def see(self, frame: Frame) -> Cut | None:
+        """Triangulate the stripe of one frame. Gives what makes the picture that is kept of it; None for the whole."""
         image = frame.image
         if self.notes and bearable(frame) * WHITER <= frame.exposure:
             # A shadow has moved away: nothing is to be seen in white.
             self.white, self.whitest, image = self.white + 1, frame, np.zeros_like(image)
+        like = self.stripes.like
         profile = self.stripes.extract(image)
         if self.keep_profile is not None:
             self.keep_profile(profile)
@@ -252,6 +258,8 @@ class SweepCollector:
         self.frame_ids.append(frame.frame_id)
         if self.middle is None and len(self.times) >= self.expected / 2:
             self.middle = frame, profile
+            return None
+        return None if like is None or self.notes else partial(around_stripe, image, profile, like)
 
     def require_frames(
         self, camera: str, lines: NDArray[np.intp], most_lost: float = MAX_LOST_FRACTION

@@ -51,7 +51,7 @@ COLOURS = {
 GREY = (0.55, 0.58, 0.62, 0.6)
 PICTURE_S = 10.0
 """Wall seconds that a picture may take to be encoded before its message is left out."""
-MOST_POINTS = 60_000
+MOST_POINTS = 20_000
 """Of a cloud that grows; of more, every so many are left out."""
 
 

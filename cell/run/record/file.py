@@ -54,7 +54,7 @@ CHANNELS = (
     Channel("/tf", "foxglove.FrameTransforms", "base, arm's joints, flange, cameras; `tf#/` → `base` is identity"),
     Channel("/joints", "foxglove.JointStates", "the arm's six joints in rad, the rail in m"),
     Channel("/scene", "foxglove.SceneUpdate", "the bodies that the planner keeps apart, when one comes, goes or moves"),
-    Channel("/{device}/image", "foxglove.CompressedImage", "five kept frames a second, PNG as in `frames/`", CAMERAS),
+    Channel("/{device}/image", "foxglove.CompressedImage", "two kept frames a second, PNG as in `frames/`", CAMERAS),
     Channel("/{device}/calibration", "foxglove.CameraCalibration", "its lens, with each frame of a job", CAMERAS),
     Channel("/{device}/frame", "cell.Frame", "that frame's number, file, exposure, device's and host's time", CAMERAS),
     Channel("/cloud/line", "foxglove.PointCloud", "one line of the cloud in the base, at the time that it was taken"),

@@ -140,7 +140,7 @@ class Times:
 
 
 LOGGERS = ("cell", "drivers", "statemachine")
-READINGS_S, PROGRESS_S, PICTURES_S, GROWN_S = 1 / 30, 0.2, 0.2, 1.0
+READINGS_S, PROGRESS_S, PICTURES_S, GROWN_S = 1 / 30, 0.2, 0.5, 1.0
 """Seconds on the wall, or of the virtual clock, between two readings of a device, two words of progress and two
 pictures of a camera; seconds of a sweep between two clouds that grow."""
 

@@ -24,7 +24,7 @@ from cell.procedures.calibrate.boards import collect_scan, collect_target
 from cell.procedures.calibrate.reference_plate import see_reference_plate, with_edge
 from cell.procedures.calibrate.timing import look_at_shutter
 from cell.procedures.drive.way import Whereabouts
-from cell.procedures.frame_store import FrameStore
+from cell.procedures.frame_store import Cut, FrameStore
 from cell.procedures.sought_part import nominal_of, sought
 from cell.procedures.steps.kinds import kind_of
 from cell.procedures.steps.workplace import Workplace
@@ -56,7 +56,7 @@ class NoFrames(FrameStore):
     def __init__(self) -> None:
         """Nothing to write to."""
 
-    def keep(self, what: str, frame: Frame) -> None:
+    def keep(self, what: str, frame: Frame, cut: Cut | None = None) -> None:
         """Let it go."""
 
     def settle(self) -> dict[str, str]:

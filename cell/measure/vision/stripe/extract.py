@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from cell.measure.vision.pictures import Dark, Taken
+from cell.measure.vision.pictures import Dark, PictureRefused, Taken
 from cell.measure.vision.stripe.careful.careful import read_carefully
 from cell.measure.vision.stripe.careful.surroundings import widen_what_departs
 from cell.measure.vision.stripe.ordinary.quick import DOUBLE, QuickVerdict, read_quickly, refuse_white
@@ -31,6 +31,8 @@ from cell.measure.vision.stripe.profile import StripeProfile as StripeProfile
 from cell.measure.vision.stripe.profile import StripeSettings as StripeSettings
 
 TRUSTED_SHARE = 0.98
+KEPT_PX = 32
+"""Of a picture that is kept: the stripe's flanks, and enough beside them to see what it lies on."""
 
 
 def extract(
@@ -144,16 +146,40 @@ class StripeStream:
         self._like: StripeProfile | None = None
         self._seen = 0
 
+    @property
+    def like(self) -> StripeProfile | None:
+        """What holds for the next picture; None where it is measured in it."""
+        return None if self._seen % BLOCK == 0 else self._like
+
     def extract(self, image: Image) -> StripeProfile:
         """The profile of the next picture (h, w); raises what `extract` raises."""
-        if self._seen % BLOCK == 0:
-            self._like = None
-        profile = extract(image, like=self._like)
+        profile = extract(image, like=self.like)
         # A block's first picture that shows too few lines, such as a covered one, says nothing of the others.
         told = profile.speckle is not None or profile.learned is not None
         self._like = profile if told else replace(profile, noise=None)
         self._seen += 1
         return profile
+
+
+def around_stripe(image: Image, profile: StripeProfile, like: StripeProfile) -> Image:
+    """The picture (h, w), black beyond `KEPT_PX` of its stripe: a sixth of its bytes.
+
+    The picture itself where it would not give the same `profile` again, to the last bit, or was read carefully.
+    """
+    rows = profile.rows
+    if not len(rows) or profile.rival is not None:
+        return image
+    middle = np.rint(np.interp(np.arange(len(image)), rows, profile.centres[rows])).astype(np.int16)[:, None]
+    columns = np.arange(image.shape[1], dtype=np.int16)
+    cut = image * ((columns >= middle - KEPT_PX) & (columns <= middle + KEPT_PX))
+    try:
+        again = extract(cut, like=like)
+    except PictureRefused:
+        return image
+    names = ("centres", "sigma", "amplitude", "width", "saturated", "double")
+    same = all(np.array_equal(getattr(again, name), getattr(profile, name), equal_nan=True) for name in names)
+    same &= (again.rival, again.noise, again.speckle) == (None, profile.noise, profile.speckle)
+    return cut if same else image
 
 
 def drawn(height: int, width: int) -> Iterator[NDArray[np.uint8]]:

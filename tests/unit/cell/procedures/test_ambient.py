@@ -98,7 +98,7 @@ def test_white_pictures_of_a_bright_sweep_are_counted_and_not_looked_at() -> Non
     camera = CameraModel(640, 480, 1667.0, 1667.0, 319.5, 239.5, (0.0, 0.0, 0.0, 0.0, 0.0))
     plane = LightPlane.of((1.0, 0.0, -1 / 3.5), -0.035)
     geometry = ScanGeometry(camera, plane, np.array([1.0, 0.0, 0.0]), pin.SE3.Identity())
-    collector = SweepCollector(geometry, load_job("pot")[0].scan, lambda frame: None, lambda share, text: None)
+    collector = SweepCollector(geometry, load_job("pot")[0].scan, lambda frame, cut: None, lambda share, text: None)
     collector.notes = ("ambient light",)
     collector.see(frame(255.0))
     collector.see(replace(frame(120.0), frame_id=2))

@@ -28,6 +28,16 @@ def test_a_frame_is_kept_to_the_last_bit_and_its_digest_is_that_of_its_file(tmp_
     assert digests == {path.name: hashlib.sha256(path.read_bytes()).hexdigest()}
 
 
+def test_of_a_frame_that_is_cut_the_file_holds_what_was_made_of_it(tmp_path: Path) -> None:
+    cut = np.zeros((48, 64), np.uint8)
+    cut[:, 20:30] = 90
+    with FrameStore(tmp_path / "frames") as store:
+        store.keep("stripe", frame(7, np.full((48, 64), 90, np.uint8)), lambda: cut)
+        store.settle()
+    kept = cv2.imread(str(tmp_path / "frames" / "stripe-000007.png"), cv2.IMREAD_GRAYSCALE)
+    np.testing.assert_array_equal(kept, cut)
+
+
 def test_where_no_frames_are_kept_the_last_one_is_still_known(tmp_path: Path) -> None:
     with FrameStore(tmp_path / "frames", kept=False) as store:
         store.keep("stripe", frame(7))

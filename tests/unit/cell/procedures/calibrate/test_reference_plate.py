@@ -14,6 +14,7 @@ from cell.measure.calibration.drift.reference_plate import PlateLine
 from cell.measure.calibration.drift.slip import Slip, slip_since
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
+from cell.procedures.calibrate import reference_plate
 from cell.procedures.calibrate.reference_plate import SPEED, look_at_edge, require_edge, require_reference_plate
 from cell.procedures.steps.laser_sweep import unwatched
 from drivers.errors import DeviceFault, RefusedError
@@ -122,19 +123,20 @@ def test_pictures_that_are_paired_one_off_are_seen(cell, monkeypatch: pytest.Mon
         slip.require()
 
 
-def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell) -> None:
+def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
     virtual, before, since = cell
-    camera, seen = virtual.scan_camera.model, []
+    camera, seen, light = virtual.scan_camera.model, [], reference_plate._light
 
     def lose(after: Callable[[int], bool]) -> PlateLine:
-        def keep(what: str, frame: Frame) -> None:
-            if what == "witness-edge":
-                seen.append(frame)
-                if after(len(seen)):
-                    camera.fault("camera.frame_loss", 1)
+        def taken(image: np.ndarray, witness: PlateLine) -> np.ndarray:
+            seen.append(image)
+            if after(len(seen)):
+                camera.fault("camera.frame_loss", 1)
+            return light(image, witness)
 
         seen.clear()
-        return require_edge(CONFIG, virtual.devices, keep, before, replace(before, edge=None))
+        monkeypatch.setattr(reference_plate, "_light", taken)
+        return require_edge(CONFIG, virtual.devices, let_go, before, replace(before, edge=None))
 
     lose(lambda k: False)
     undisturbed = len(seen)

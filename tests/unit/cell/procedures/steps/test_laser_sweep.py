@@ -49,7 +49,7 @@ def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
     with pytest.raises(DeviceFault, match="lost steps") if fault else nullcontext() as met:
         swept = laser_sweep(
             site.work, site.work.base_from_surface(site.made["board_photo"]), site.work.calibration.scan, few,
-            keep_frame=lambda frame: None, check=lambda: None, progress=lambda share, text: told.append(text),
+            keep_frame=lambda frame, cut: None, check=lambda: None, progress=lambda share, text: told.append(text),
         )  # fmt: skip
         assert swept.doubts == ((UNCHECKED,) if mode == 1 else ())
     if fault:
@@ -85,7 +85,7 @@ def test_a_part_goes_by_the_look_at_the_head_of_a_part_before_for_ten_minutes(
     """Where nobody looks at the placed parts, not at all."""
     site = AtStation(placed_pot, tmp_path)
     site.work.shares_look, kept = seen, list[str]()
-    monkeypatch.setattr(site.work.frames, "keep", lambda name, frame: kept.append(name.split("-")[0]))
+    monkeypatch.setattr(site.work.frames, "keep", lambda name, frame, cut=None: kept.append(name.split("-")[0]))
     pointing = Pointing(0.5e-3, 0.02e-3)
     look = HeadLook(site.cell.clock.now() - ago, pointing, placed_pot.results["laser_sweep"].slip)
     site.work.parts_before = PartsBefore(look=look)

@@ -67,7 +67,7 @@ def sweep(
     cell.rail.late, cell.scan_camera.late = late, camera_late
     taken: list[int] = []
 
-    def keep(frame: Frame) -> None:
+    def keep(frame: Frame, cut: object) -> None:
         taken.append(frame.frame_id)
         if len(taken) == 10:
             meddle(cell)
@@ -209,7 +209,7 @@ def swept_by_arm(
     arm.late = late
     taken: list[int] = []
 
-    def keep(frame: Frame) -> None:
+    def keep(frame: Frame, cut: object) -> None:
         taken.append(frame.frame_id)
         if 18 < len(taken) <= 28:
             meddle(arm)

@@ -30,7 +30,7 @@ def test_perception_fed_again_gives_the_same_bits(folder: Path, placed_pot: JobR
     assert [each.difference for each in compared] == [""] * len(compared)
     names = [each.what for each in compared]
     assert names[:4] == ["board's pose", "cloud", "place pose", "its covariance"]
-    assert 20 < int(names[4].split()[0]) < len(list((folder / "frames").iterdir()))
+    assert 10 < int(names[4].split()[0]) < len(list((folder / "frames").iterdir()))
 
 
 def test_a_pixel_or_a_reading_that_changed_is_found_and_exits_1(copied: Path, typed: Typed) -> None:

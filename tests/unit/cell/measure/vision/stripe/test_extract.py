@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.measure.vision.stripe.extract import extract
+from cell.measure.vision.stripe.extract import KEPT_PX, around_stripe, extract
 from lab.bench.stripe.truth import Cell, draw
 
 SHAPE = (480, 640)
@@ -31,6 +31,19 @@ def test_a_dark_frame_takes_the_scenery_away():
 def test_a_picture_without_a_stripe_has_no_centres():
     image, _ = draw(Cell(2.0, 0.0), SHAPE, 0)
     assert not extract(image).valid.any()
+
+
+def test_a_picture_is_kept_around_its_stripe_where_that_tells_the_same():
+    first, _ = draw(Cell(2.0, 120), SHAPE, 0)
+    image, _ = draw(Cell(2.0, 120), SHAPE, 1)
+    like = extract(first)
+    profile = extract(image, like=like)
+    kept = around_stripe(image, profile, like)
+    assert np.count_nonzero(kept) <= (2 * KEPT_PX + 1) * len(image) < 0.2 * image.size
+    np.testing.assert_array_equal(extract(kept, like=like).centres, profile.centres)
+    # A reflection far from the stripe is seen in the whole picture alone.
+    image[:, 80:84] = np.maximum(image[:, 80:84], 90)
+    assert around_stripe(image, extract(image, like=like), like) is image
 
 
 def test_wrong_input_is_named():
