@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from cell.config.calibrations.store import CellCalibration
@@ -22,6 +23,8 @@ from drivers.errors import DeviceFault, LimitError, Measured, RefusedError
 PICTURES = 12
 KEPT_EACH = 4
 """Of the pictures over the plate's edge, every so many are kept for people."""
+BRIGHT_COLUMN_DN, BESIDE_PX = 5.0, 7
+"""Of the mean of a column of the sensor, over the median of so many to either side."""
 RATES_HZ = 30.0, 15.0, 10.0
 """The first that the camera can."""
 
@@ -47,6 +50,19 @@ def see_reference_plate(config: CellConfig, devices: Devices, keep: Keep) -> Pla
     mean = np.where(seen, columns.mean(axis=0), np.nan)
     found = PlateLine(float(devices.rail.state().position), mean, np.sqrt((sigma**2).mean(axis=0) / PICTURES))
     return _on_the_plate(found)
+
+
+def _require_no_bright_column(dark: NDArray[np.uint8]) -> None:
+    """Raise `RefusedError` where a column of a picture without the laser is bright all along."""
+    mean = np.pad(dark.mean(axis=0), BESIDE_PX, mode="edge")
+    above = mean[BESIDE_PX:-BESIDE_PX] - np.median(sliding_window_view(mean, 2 * BESIDE_PX + 1), axis=1)
+    if above.max() > BRIGHT_COLUMN_DN:
+        raise RefusedError(
+            f"column {above.argmax()} of the scan camera's pictures is {above.max():.0f} DN brighter than those "
+            f"beside it without the laser, too, allowed are {BRIGHT_COLUMN_DN:g} DN: the laser's line on the plate on "
+            "the claw is not told from it. Look at the sensor's hot columns and at other light, and mend it",
+            Measured("column of the sensor brighter by", float(above.max()), "DN", most=BRIGHT_COLUMN_DN),
+        )
 
 
 def configure_fast(devices: Devices, exposure: float, rates: Sequence[float] = RATES_HZ) -> float:
@@ -81,6 +97,7 @@ def require_reference_plate(config: CellConfig, devices: Devices, keep: Keep) ->
                 f"ambient light leaves an exposure of {exposure:.2f} ms, and the laser's line on the plate on the claw "
                 "stands out in too few of the rows", 0.0
             )  # fmt: skip
+        _require_no_bright_column(devices.scan_camera.grab().image)
         check_lost_steps(devices)  # A carriage that stands elsewhere sees it elsewhere.
         raise RefusedError(
             "the laser's witness, which the calibration saw, is not in the picture: see that the plate on the claw is "
@@ -131,6 +148,9 @@ OPEN_M = 4e-6
 """What lost pictures may leave open of where the line leaves the plate: 2 ms."""
 BRIGHTENS = 1.25
 """Surroundings that become so many times as bright as the line leaves the plate follow it: gain is not fixed."""
+STEADY, WHOLE_SHARE = 1.3, 0.33
+"""Brightest over dimmest of the pictures of a passage in which all of the line is on the plate, and how many these are:
+speckle and noise leave a few per cent."""
 PASSES = 3
 """So often the rail takes the line over the edge when pictures are lost there."""
 
@@ -230,12 +250,12 @@ def _passed(
         return np.zeros(0), np.zeros(0)
     _require_fixed_gain(np.array(dark)[inside])
     places = np.array([sweep.position_at(times[k]) for k in inside])
-    lit = np.array(light)[inside]
+    lit, order = np.array(light)[inside], np.argsort(places)
+    _require_steady(lit.sum(axis=1)[order])
     # Each row against its own light on the plate: the plate's colour and the laser's profile fall out.
     bright = np.sort(lit, axis=0)[-BRIGHTEST:].mean(axis=0)
     whole = np.ma.masked_less(lit, 0.75 * bright).mean(axis=0).filled(0.0)
     lit = lit / np.maximum(whole, LEAST_LIGHT_DN)
-    order = np.argsort(places)
     return places[order], np.asarray(lit.mean(axis=1))[order]
 
 
@@ -249,6 +269,20 @@ def _require_fixed_gain(dark: Array) -> None:
             "the room's light changes. Switch the camera's auto gain and auto exposure off; only then look whether the "
             "scan head has slipped",
             Measured("pictures brighter beside the line", high / low, "times", most=BRIGHTENS),
+        )
+
+
+def _require_steady(light: Array) -> None:
+    """Raise `RefusedError` where the line's light (n,), DN, in the order of the rail's places, varies on the plate."""
+    count = int(WHOLE_SHARE * len(light))
+    whole = max(light[:count], light[-count:], key=np.mean)
+    if whole.max() > STEADY * whole.min() > 0.0:
+        times = float(whole.max() / whole.min())
+        raise RefusedError(
+            f"the laser's line on the plate on the claw becomes {times:.1f} times as bright from picture to picture, "
+            f"allowed are {STEADY:g} times: the laser flickers, or the exposure changes. See its supply and its "
+            "modulation input, and switch the camera's auto exposure off",
+            Measured("line brighter from picture to picture", times, "times", most=STEADY),
         )
 
 

@@ -100,7 +100,7 @@ def _retold(refused: RefusedError, text: str) -> RefusedError:
     return type(refused)(text, *refused.numbers).showing(seen=refused.seen)
 
 
-def _slipped(workplace: Workplace, sweep: SweepRecord) -> Vector:
+def slipped(workplace: Workplace, sweep: SweepRecord) -> Vector:
     """What a scan head that has slipped, or pictures that come later, may move the place by, (6, 6), base axes."""
     if sweep.slip is None:
         return np.zeros((6, 6))
@@ -117,7 +117,7 @@ def inverted(workplace: Workplace, sweep: SweepRecord, scan: Reconstruction, fix
     taken = LineTimes(sweep.times, workplace.config.arm.vehicle_from_base.se3().inverse(), head)
     try:
         return invert_pose(
-            scan, fix, workplace.job, workplace.nominal, workplace.kinematic + _slipped(workplace, sweep), taken=taken
+            scan, fix, workplace.job, workplace.nominal, workplace.kinematic + slipped(workplace, sweep), taken=taken
         )
     except NotObservable as refused:
         if not (notes := (*fix.notes, *sweep.notes)):

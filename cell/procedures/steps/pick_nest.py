@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion.part_pose import seen_from_above
 from cell.procedures.arm.moves import PartState
@@ -43,13 +45,14 @@ def _picked(workplace: Workplace, context: StepContext) -> HeldPart:
     workplace.mover.avoid_part(belongs, job.grasp.size)
     home_rail(workplace.devices, context.progress)
     head, look = workplace.calibration.scan, workplace.look_before(context)
-    pointing = look.pointing if look is not None else seen_on_plate(workplace, context)[0]
+    pointing, slip = (look.pointing, look.slip) if look is not None else seen_on_plate(workplace, context)
     if pointing is not None:
         head = head.pointed(pointing, workplace.config.laser.exit_point)
     faces = seen_from_above(part, belongs)
     low, high = faces.extent
     over = belongs * from_parts((0.0, 0.0, 0.5 * float(low[2] + high[2])))
-    fit = part_in_base(workplace, job, faces, swept_part(workplace, head, over, context, frames="nest", cloud=CLOUD))
+    cloud, swept = swept_part(workplace, head, over, context, frames="nest", cloud=CLOUD)
+    fit = part_in_base(workplace, job, faces, (cloud, replace(swept, pointing=pointing, slip=slip)))
     off = 1e3 * moved(belongs.inverse() * fit.base_from_surface, part_points(faces))
     most = 1e3 * job.place.tolerance
     if not off <= most:

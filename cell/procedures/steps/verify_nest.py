@@ -18,6 +18,7 @@ from cell.procedures.part_error import part_points
 from cell.procedures.part_features import by_themselves
 from cell.procedures.placed_part import NEXT_STEP, PlacedPart
 from cell.procedures.sought_part import pose_record
+from cell.procedures.steps.invert_pose import slipped
 from cell.procedures.steps.laser_sweep import head_at
 from cell.procedures.steps.reconstruct import displacements
 from cell.procedures.steps.set_down import SetDown
@@ -66,8 +67,9 @@ def part_in_base(workplace: Workplace, job: Job, faces: NominalSurface, swept: t
     try:
         return register(
             on_part, faces, Prior(belongs, np.diag(SHIFTED**2)),
-            Tolerance(job.place.tolerance, job.place.tolerance_angle), systematic=workplace.kinematic,
-            calibration=by_calibration, sweeps=by_poses, demands=DEMANDS, partly=True,
+            Tolerance(job.place.tolerance, job.place.tolerance_angle),
+            systematic=workplace.kinematic + slipped(workplace, record), calibration=by_calibration, sweeps=by_poses,
+            demands=DEMANDS, partly=True,
         )  # fmt: skip
     except RefusedError as error:
         why = str(error).partition(". ")[0].replace("nominal surface", "drawing of the part")

@@ -120,16 +120,18 @@ class Adjustment:
         self.own_free[6] = bool(free[RAIL].any())
         self.priors = priors
 
-    def solve(self, start: AdjustmentState, variance_rounds: int = VARIANCE_ROUNDS) -> Adjusted:
-        """Levenberg–Marquardt, then variance components, alternating until the noise agrees with the residuals."""
+    def solve(self, start: AdjustmentState, variance_rounds: int = VARIANCE_ROUNDS, settled: float = 1e-9) -> Adjusted:
+        """Levenberg–Marquardt, then variance components, alternating until the noise agrees with the residuals.
+
+        At the end a step that promises less than the share `settled` of the cost is not taken any more.
+        """
         state = replace(
             start, flanges=[v.base_from_flange for v in self.views], rails=np.array([v.rail for v in self.views])
         )
         normal = self.normal_at(state)
         for turn in range(variance_rounds + 1):
             # Until the noise is settled there is no point in the last digits.
-            settled = 1e-3 if turn < variance_rounds else 1e-9
-            state, normal = self._minimise(state, normal, settled)
+            state, normal = self._minimise(state, normal, 1e-3 if turn < variance_rounds else settled)
             if turn < variance_rounds:
                 self._update_noise(normal)
                 normal = self.normal_at(state)

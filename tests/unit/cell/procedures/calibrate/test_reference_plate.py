@@ -19,6 +19,7 @@ from cell.procedures.calibrate.reference_plate import SPEED, look_at_edge, requi
 from cell.procedures.steps.laser_sweep import unwatched
 from drivers.errors import DeviceFault, RefusedError
 from drivers.interfaces import Frame
+from sim_backends.optics.scene import LaserOptics
 
 CONFIG = load_config(None)
 
@@ -121,6 +122,37 @@ def test_pictures_that_are_paired_one_off_are_seen(cell, monkeypatch: pytest.Mon
     assert abs(slip.along) < 2.5e-5
     with pytest.raises(RefusedError, match=r"pictures come 3\d\.\d ms later"):
         slip.require()
+
+
+def test_a_laser_that_flickers_is_named_before_it_looks_like_a_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    light: list[np.ndarray] = []
+    steady = reference_plate._require_steady
+    monkeypatch.setattr(reference_plate, "_require_steady", lambda seen: (light.append(seen), steady(seen)))
+    looked(cell[0], cell[1])
+    whole = [np.sort(seen)[-len(seen) // 3 :] for seen in light]
+    assert len(whole) == 2 and max(seen.max() / seen.min() for seen in whole) < 1.1, "a third of what is allowed"
+    cameras, clock = cell[0].world._cameras, cell[0].devices.clock
+    laser = cameras.laser
+
+    def flickers(warm: float) -> LaserOptics:
+        now = laser(warm)
+        return replace(now, brightness=(0.75 + 0.25 * np.sin(9.0 * clock.now())) * now.brightness)
+
+    monkeypatch.setattr(cameras, "laser", flickers)
+    with pytest.raises(RefusedError, match=r"1\.\d times as bright from picture to picture.*the laser flickers"):
+        looked(cell[0], cell[1])
+
+
+def test_a_bright_column_of_the_sensor_is_named_where_it_hides_the_plate(cell, monkeypatch: pytest.MonkeyPatch) -> None:
+    world, exposed, hot = cell[0].world, cell[0].world._exposed, 80.0 * (np.arange(640) == 430)
+
+    def render(camera: str, t: float, exposure: float) -> np.ndarray:
+        image = exposed(camera, t, exposure)
+        return np.minimum(image + hot, 255.0).astype(np.uint8) if camera == "scan" else image
+
+    monkeypatch.setattr(world, "_exposed", render)
+    with pytest.raises(RefusedError, match=r"column 430 of .* is \d\d DN brighter .* without the laser"):
+        looked(cell[0], cell[1])
 
 
 def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,10 +12,14 @@ import pytest
 from cell import Cell, ConfigError
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
+from cell.measure.calibration.drift.slip import Slip
 from cell.measure.geometry.poses import difference, from_matrix
+from cell.measure.inversion.place_pose import PlacePose
 from cell.motion.collision import PLACED
+from cell.procedures.steps import pick_nest, verify_nest
 from cell.procedures.steps.kinds import PLACE
 from cell.run.record.replay import replay
+from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
 from statemachine.step import Event
@@ -46,6 +50,24 @@ def test_a_part_that_is_not_in_its_nest_is_not_gripped(placed_pot: JobRecord, me
     assert (done.outcome, done.stage) == ("refused", "pick")
     assert re.search(told, done.reason), done.reason
     assert not cells[0].world.part.held and cells[0].world.part.untouched
+
+
+def test_what_a_head_that_slipped_leaves_open_of_the_held_part_is_known(
+    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shares, slips = [], iter([Slip(0.0, 0.0, 0.0), Slip(0.09e-3, 0.0, 0.0)])
+    look = pick_nest.seen_on_plate
+
+    def register(*given: object, systematic: np.ndarray, **named: object) -> PlacePose:
+        shares.append(np.sqrt(np.diag(systematic))[:3])
+        raise RefusedError("seen enough")
+
+    monkeypatch.setattr(pick_nest, "seen_on_plate", lambda *given: (look(*given)[0], next(slips)))
+    monkeypatch.setattr(verify_nest, "register", register)
+    for _ in range(2):
+        assert "seen enough" in unloaded(placed_pot, job=JOB).reason
+    still, slipped = shares
+    assert np.linalg.norm(slipped) > 0.09e-3 > 1.5 * np.linalg.norm(still)
 
 
 def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_resumed(
