@@ -19,7 +19,7 @@ from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts, perturbed
 from cell.measure.reconstruction.build import ScanGeometry
 from cell.measure.vision.board.view import BoardView, centre_of, parse_board
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from lab.bench.calibration.world import Noise, centroids, circle
 from sim_backends.optics import Board, BoardInstance, CameraOptics, LaserOptics, Mesh, MeshInstance
 from sim_backends.optics.laser.sheet import lit

@@ -18,7 +18,7 @@ from cell.apps.recordings.solution import camera_of, solve_frames
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.vision.board.board import board_pose
 from cell.measure.vision.board.view import BoardView, parse_board
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from tests.support import ROOT
 
 SIZE = (1280, 1024)

@@ -36,7 +36,7 @@ from cell.measure.calibration.solve.starts import PlaneStart, plane_from_board, 
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.vision.board.board import board_pose
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from cell.measure.vision.stripe_on_board import on_plane
 from drivers.errors import RefusedError
 

@@ -30,8 +30,8 @@ from cell.measure.geometry.poses import difference, mean
 from cell.measure.vision.board.board import find_board
 from cell.measure.vision.board.view import BoardSpec, BoardView
 from cell.measure.vision.pictures import PictureRefused, Reason, read_picture
-from cell.measure.vision.stripe.extract import LaserChannel, StripeProfile
-from cell.measure.vision.stripe.planes import read_colours
+from cell.measure.vision.stripe.planes import LaserChannel, read_colours
+from cell.measure.vision.stripe.profile import StripeProfile
 from drivers.errors import ConfigError
 
 Small = NDArray[np.float32]

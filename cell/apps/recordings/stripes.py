@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from cell.measure.geometry.camera import Array
 from cell.measure.vision.board.view import BoardView
 from cell.measure.vision.pictures import PictureRefused
-from cell.measure.vision.stripe.extract import LaserChannel, Mark, StripeProfile, StripeSettings, extract, subtracted
-from cell.measure.vision.stripe.planes import MIXES, Picture, read_colours
+from cell.measure.vision.stripe.extract import extract, subtracted
+from cell.measure.vision.stripe.planes import MIXES, LaserChannel, Picture, read_colours
+from cell.measure.vision.stripe.profile import Mark, StripeProfile, StripeSettings
 
 Shot = NDArray[np.uint8] | NDArray[np.uint16]
 

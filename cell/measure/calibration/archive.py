@@ -20,7 +20,7 @@ from cell.measure.calibration.drift.reference_plate import PlateLine, read_edge
 from cell.measure.calibration.solve.adjustment import Priors
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.vision.board.view import BoardView, parse_board
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from drivers.errors import ConfigError
 
 

@@ -29,8 +29,8 @@ def covariance_root(covariance: Array) -> Array:
     return np.asarray(scale[:, None] * vectors[:, kept] * np.sqrt(values[kept]), dtype=np.float64)
 
 
-ROUNDING = 4e-15
-"""What is left of R Rᵀ − 1 when a rotation was brought back to the nearest true one."""
+ROUNDING = 1e-14
+"""What some twenty products of true rotations, such as the steps of an adjustment, leave of R Rᵀ − 1."""
 
 
 def from_matrix(matrix: ArrayLike) -> pin.SE3:

@@ -17,7 +17,7 @@ from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane, triangulate
 from cell.measure.reconstruction.cloud import Array, Cloud
 from cell.measure.reconstruction.outliers import find_outliers
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 
 
 @dataclass(frozen=True)

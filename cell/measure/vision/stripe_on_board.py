@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cell.measure.geometry.camera import Array, CameraModel
 from cell.measure.vision.board.view import DOTS, BoardSpec
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 
 # How far beyond the outermost points there is board for certain, in pitches.
 MARGIN_PITCHES = {"marked_dots": 0.8, "asymmetric_dots": 0.8, "dots": 0.8, "chessboard": 2.0, "charuco": 1.5}

@@ -51,8 +51,6 @@ COLOURS = {
 GREY = (0.55, 0.58, 0.62, 0.6)
 PICTURE_S = 10.0
 """Wall seconds that a picture may take to be encoded before its message is left out."""
-MOST_POINTS = 20_000
-"""Of a cloud that grows; of more, every so many are left out."""
 
 
 class RecordDrawing:
@@ -163,10 +161,6 @@ class RecordDrawing:
         for k, name in enumerate("xyz"):
             message.fields.add(name=name, offset=4 * k, type=PackedElementField.FLOAT32)
         return bytes(message.SerializeToString())
-
-    def thinned(self, at: int, points: NDArray[np.float32]) -> bytes:
-        """The same of no more than about `MOST_POINTS`, evenly."""
-        return self.cloud(at, points[:: max(1, -(-len(points) // MOST_POINTS))])
 
     def log_line(self, at: int, record: logging.LogRecord, text: str) -> bytes:
         """A line of the log; its level is a tenth of Python's."""

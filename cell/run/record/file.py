@@ -58,7 +58,7 @@ CHANNELS = (
     Channel("/{device}/calibration", "foxglove.CameraCalibration", "its lens, with each frame of a job", CAMERAS),
     Channel("/{device}/frame", "cell.Frame", "that frame's number, file, exposure, device's and host's time", CAMERAS),
     Channel("/cloud/line", "foxglove.PointCloud", "one line of the cloud in the base, at the time that it was taken"),
-    Channel("/cloud/grown", "foxglove.PointCloud", "all lines so far, once per second of the sweep, thinned"),
+    Channel("/cloud/whole", "foxglove.PointCloud", "all lines, with the last"),
     Channel("/sequence/state", "cell.State", "the sequence goes from one state to another"),
     Channel("/sequence/event", "cell.Event", "all that the run tells; progress at most five times a second"),
     Channel("/log", "foxglove.Log", "what the modules log"),

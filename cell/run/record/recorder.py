@@ -140,9 +140,9 @@ class Times:
 
 
 LOGGERS = ("cell", "drivers", "statemachine")
-READINGS_S, PROGRESS_S, PICTURES_S, GROWN_S = 1 / 30, 0.2, 0.5, 1.0
+READINGS_S, PROGRESS_S, PICTURES_S = 1 / 30, 0.2, 0.5
 """Seconds on the wall, or of the virtual clock, between two readings of a device, two words of progress and two
-pictures of a camera; seconds of a sweep between two clouds that grow."""
+pictures of a camera."""
 
 log = logging.getLogger(__name__)
 _said: set[str] = set()
@@ -310,22 +310,14 @@ class Recorder(logging.Handler):
         self._put("/joints", at, lambda draw: draw.rail_joint(at))
 
     def _lines(self, lines: TimedCloud) -> None:
-        """Each line of the cloud, and once a second all so far; a place in it that is empty is NaN."""
+        """Each line of the cloud as it was taken, and all of them with the last; a place in it that is empty is NaN."""
         points, times, seen = lines.cloud.points.astype(np.float32), lines.times, lines.cloud.valid
-        order = np.argsort(times, kind="stable")
-        due = float(times[order[0]]) + GROWN_S
-        for done, k in enumerate(order.tolist(), 1):
-            at = self._times.of(float(times[k]))
-            self._line(at, points[k][seen[k]])
-            if times[k] >= due or done == len(order):
-                due = float(times[k]) + GROWN_S
-                self._grown(at, points, seen, np.sort(order[:done]))
+        for k in np.argsort(times, kind="stable").tolist():
+            self._cloud("/cloud/line", self._times.of(float(times[k])), points[k][seen[k]])
+        self._cloud("/cloud/whole", self._times.of(float(times.max())), points[seen])
 
-    def _line(self, at: int, points: NDArray[np.float32]) -> None:
-        self._put("/cloud/line", at, lambda draw: draw.cloud(at, points))
-
-    def _grown(self, at: int, points: NDArray[np.float32], seen: NDArray[np.bool_], lines: NDArray[np.intp]) -> None:
-        self._put("/cloud/grown", at, lambda draw: draw.thinned(at, points[lines][seen[lines]]))
+    def _cloud(self, topic: str, at: int, points: NDArray[np.float32]) -> None:
+        self._put(topic, at, lambda draw: draw.cloud(at, points))
 
     def _look_around(self) -> None:
         """Draw the bodies again where the part or the station changed."""

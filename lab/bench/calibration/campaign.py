@@ -22,7 +22,7 @@ from cell.measure.calibration.solve.normal import tangents
 from cell.measure.calibration.solve.results import PARAMETERS
 from cell.measure.geometry.poses import difference, from_matrix
 from cell.measure.vision.board.view import BoardView
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from lab.bench.calibration.world import (
     HEIGHT,
     OWN,

@@ -17,7 +17,7 @@ from cell.config.cell_config import CellConfig
 from cell.measure.calibration import ScanObservation, TargetObservation
 from cell.measure.geometry.poses import from_matrix
 from cell.measure.vision.board.view import BoardSpec, BoardView, centre_of, parse_board
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from cell.motion.kinematics import HOME, Joints, arm_kinematics
 from cell.procedures.arm.photograph import CalibrationView, scan_calibration_views, target_calibration_views
 from cell.procedures.calibrate.boards import RAIL_MOVE, RAIL_MOVE_VIEWS

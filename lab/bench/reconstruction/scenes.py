@@ -13,7 +13,7 @@ from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts
 from cell.measure.reconstruction.build import ProfileBuilder, ScanGeometry
 from cell.measure.reconstruction.cloud import Cloud
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -21,7 +21,7 @@ from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import covariance_root, transform
 from cell.measure.vision.board.board import board_pose
 from cell.measure.vision.board.view import BoardView
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from cell.measure.vision.stripe_on_board import on_plane
 
 CROOKED_PX, CROOKED_SHARE, CROOKED_SIGMAS = 3.0, 0.005, 8.0

@@ -17,7 +17,7 @@ from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import difference, from_parts, mean, perturbed, transform
 from cell.measure.vision.board.board import predict
 from cell.measure.vision.board.view import BoardView
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from cell.measure.vision.stripe_on_board import on_plane, points_on_board
 from drivers.errors import RefusedError
 

@@ -53,6 +53,9 @@ def measure(image: Image, centres: Array, shapes: Array, rounds: int, sigma: Arr
     for n in range(len(centres)):
         (a, b), (c, d) = shapes[n]
         x, y, deviation = centres[n, 0], centres[n, 1], math.nan
+        # Beyond the board's horizon there is nothing to sample.
+        if not math.isfinite(x + y + a + b + c + d):
+            continue
         for _ in range(rounds):
             _sample(image, x, y, shapes[n], samples)
             _find_edge(samples, edge[0], edge[1])
@@ -239,11 +242,3 @@ def _ring_signs(samples: Array, signs: Array) -> None:
     for k in range(RAYS):
         rays[3, k] = ((bright - samples[k, DARK[0] : DARK[1]]) * RHO[DARK[0] : DARK[1]]).sum() / max(bright, 1.0)
     signs[0], signs[1], signs[3] = _median(rays[0]), _median(rays[1]), _median(rays[3])
-
-
-def measured(image: Image, centres: Array, shapes: Array, rounds: int) -> tuple[Array, Array, Array, Array]:
-    """As `measure`, of arrays that stay as they are: centres, shapes, deviations and signs."""
-    centres, shapes = centres.astype(np.float64), shapes.astype(np.float64)
-    sigma, signs = np.full(len(centres), np.nan), np.zeros((len(centres), 4))
-    measure(np.ascontiguousarray(image), centres, shapes, rounds, sigma, signs)
-    return centres, shapes, sigma, signs

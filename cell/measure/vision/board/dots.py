@@ -6,10 +6,10 @@ several scales; each dot is then measured by its edge (`dot_edges.py`).
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from cv2.typing import MatLike
 
 from cell.measure.geometry.camera import Array
-from cell.measure.vision.board.dot_edges import measured
+from cell.measure.vision.board.dot_edges import measure
 from cell.measure.vision.board.ends import OtherBoard, check_dot_ends
 from cell.measure.vision.board.lattice import LEAST_SHARE, Blobs, Places, PlaneMap, dot_lattices, identify
 from cell.measure.vision.board.view import BoardSpec, BoardView
@@ -159,9 +159,6 @@ def _relative_radius(dots: Blobs, steps: Array) -> float:
     return float(np.median(np.sqrt(dots.areas / (np.pi * np.abs(np.linalg.det(steps))))))
 
 
-Outline = NDArray[np.int32]
-
-
 def find_blobs(image: Image, window: int, offset: float) -> Blobs:
     """Dark elliptic blobs: darker by `offset` DN than the mean of a `window` × `window` px neighbourhood."""
     smooth = cv2.GaussianBlur(image, (3, 3), 0)
@@ -172,47 +169,23 @@ def find_blobs(image: Image, window: int, offset: float) -> Blobs:
     contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     # A contour with a parent is a hole, such as the middle of a ring.
     outer = [c for c, links in zip(contours, hierarchy[0] if contours else (), strict=True) if links[3] < 0]
-    outlines = [c for c in outer if len(c) >= 8]
-    if not outlines:
-        return Blobs(np.zeros((0, 2)), np.zeros((0, 2, 2)))
-    return _ellipses([np.asarray(c, dtype=np.int32) for c in outlines], (image.shape[1], image.shape[0]))
+    return _ellipses([c for c in outer if len(c) >= 8], (image.shape[1], image.shape[0]))
 
 
-def _ellipses(outlines: list[Outline], size: tuple[int, int]) -> Blobs:
-    """Those of the outlines (m, 1, 2), all at once, that are whole and elliptic."""
-    lengths = np.array([len(c) for c in outlines])
-    begins = np.concatenate([[0], np.cumsum(lengths)[:-1]])
-    points = np.concatenate(outlines)[:, 0, :].astype(np.float64)
-    low, high = np.minimum.reduceat(points, begins), np.maximum.reduceat(points, begins)
-    whole = (low > 0).all(axis=1) & (high < np.array(size) - 1).all(axis=1)
-    whole &= (high - low).max(axis=1) < 0.25 * max(size)
-    origin = 0.5 * (low + high)
-    x, y = (points - np.repeat(origin, lengths, axis=0)).T
-    following = np.arange(len(points)) + 1
-    following[begins + lengths - 1] = begins
-    xn, yn = x[following], y[following]
-    # Moments of the polygons by Green's theorem.
-    cross = x * yn - xn * y
-    terms = np.stack(
-        [
-            cross / 2,
-            cross * (x + xn) / 6,
-            cross * (y + yn) / 6,
-            cross * (x * x + x * xn + xn * xn) / 12,
-            cross * (x * (2 * y + yn) + xn * (y + 2 * yn)) / 24,
-            cross * (y * y + y * yn + yn * yn) / 12,
-        ]
-    )
-    area, sx, sy, xx, xy, yy = np.add.reduceat(terms, begins, axis=1)
-    sign = np.where(area < 0, -1.0, 1.0)
-    area, sx, sy, xx, xy, yy = (sign * m for m in (area, sx, sy, xx, xy, yy))
+def _ellipses(outlines: list[MatLike], size: tuple[int, int]) -> Blobs:
+    """Those of the outlines (m, 1, 2) that are whole and elliptic."""
+    # Wholly in the picture, and no larger than a quarter of it.
+    boxes = np.array([cv2.boundingRect(c) for c in outlines]).reshape(-1, 4)
+    low, extent = boxes[:, :2], boxes[:, 2:]
+    whole = (low > 0).all(axis=1) & (low + extent < size).all(axis=1) & (extent.max(axis=1) <= 0.25 * max(size))
+    kept = [outlines[k] for k in np.flatnonzero(whole)]
+    moments = [cv2.moments(c) for c in kept]
+    names = ("m00", "m10", "m01", "mu20", "mu11", "mu02")
+    area, sx, sy, xx, xy, yy = np.array([[m[name] for name in names] for m in moments]).reshape(-1, 6).T
     # A contour runs through pixel middles: it encloses half a pixel less all around.
-    whole &= (area >= 4) & (area + 0.5 * lengths >= LEAST_AREA_PX)
-    area, sx, sy, xx, xy, yy, origin = (m[whole] for m in (area, sx, sy, xx, xy, yy, origin))
-    middle = np.column_stack([sx, sy]) / area[:, None]
-    second = np.empty((len(area), 2, 2))
-    second[:, 0, 0], second[:, 1, 1] = xx / area - middle[:, 0] ** 2, yy / area - middle[:, 1] ** 2
-    second[:, 0, 1] = second[:, 1, 0] = xy / area - middle[:, 0] * middle[:, 1]
+    large = (area >= 4) & (area + 0.5 * np.array([len(c) for c in kept]) >= LEAST_AREA_PX)
+    area, sx, sy, xx, xy, yy = (m[large] for m in (area, sx, sy, xx, xy, yy))
+    second = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2) / area[:, None, None]
     values, vectors = np.linalg.eigh(4 * second)
     # The area of an ellipse of these second moments: the ratio is 1 for ellipses and less for other shapes.
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -220,7 +193,7 @@ def _ellipses(outlines: list[Outline], size: tuple[int, int]) -> Blobs:
     good = (values[:, 0] > 0) & (values[:, 0] >= 0.03 * values[:, 1]) & (roundness > 0.87) & (roundness < 1.1)
     radii = np.sqrt(values[good]) + 0.5
     shapes = np.einsum("nij,nj,nkj->nik", vectors[good], radii, vectors[good])
-    return Blobs((middle + origin)[good], shapes)
+    return Blobs((np.column_stack([sx, sy]) / area[:, None])[good], shapes)
 
 
 def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blobs, Array]:
@@ -240,7 +213,9 @@ def tell_dots(image: Image, start: Blobs) -> tuple[Blobs, Array, Array]:
 
 def _measured(image: Image, start: Blobs, rounds: int) -> tuple[Blobs, Array, Array]:
     """As `measure_dots`, with what tells a ring (n, 4)."""
-    centres, shapes, sigma, signs = measured(image, start.centres, start.shapes, rounds)
+    centres, shapes = start.centres.copy(), start.shapes.copy()
+    sigma, signs = np.full(len(centres), np.nan), np.zeros((len(centres), 4))
+    measure(np.ascontiguousarray(image), centres, shapes, rounds, sigma, signs)
     # A dot that wandered off its blob measures something else.
     wandered = np.linalg.norm(np.linalg.solve(start.shapes, (centres - start.centres)[:, :, None])[:, :, 0], axis=1)
     sigma[wandered > 0.7] = np.nan

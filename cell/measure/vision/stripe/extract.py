@@ -21,14 +21,8 @@ from cell.measure.vision.pictures import Dark, PictureRefused, Taken
 from cell.measure.vision.stripe.careful.careful import read_carefully
 from cell.measure.vision.stripe.careful.surroundings import widen_what_departs
 from cell.measure.vision.stripe.ordinary.quick import DOUBLE, QuickVerdict, read_quickly, refuse_white
-from cell.measure.vision.stripe.planes import FULL, Picture, as_picture
-from cell.measure.vision.stripe.planes import LaserChannel as LaserChannel
-from cell.measure.vision.stripe.profile import Array as Array
-from cell.measure.vision.stripe.profile import Axis as Axis
-from cell.measure.vision.stripe.profile import Image as Image
-from cell.measure.vision.stripe.profile import Mark as Mark
-from cell.measure.vision.stripe.profile import StripeProfile as StripeProfile
-from cell.measure.vision.stripe.profile import StripeSettings as StripeSettings
+from cell.measure.vision.stripe.planes import FULL, LaserChannel, Picture, as_picture
+from cell.measure.vision.stripe.profile import Array, Axis, Image, StripeProfile, StripeSettings
 
 TRUSTED_SHARE = 0.98
 KEPT_PX = 32

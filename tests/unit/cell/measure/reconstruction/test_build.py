@@ -15,7 +15,7 @@ from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.reconstruction.build import ProfileBuilder, ScanGeometry, calibration_motions
 from cell.measure.reconstruction.cloud import Cloud
 from cell.measure.reconstruction.ply import deviation_colours, write_ply
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from drivers.errors import RefusedError
 from lab.bench.reconstruction.scenes import swept
 

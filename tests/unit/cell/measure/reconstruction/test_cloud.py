@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cell.measure.geometry.poses import from_ur, to_ur
 from cell.measure.reconstruction.build import ProfileBuilder, calibration_motions, flange_motions, lean_motions
 from cell.measure.reconstruction.cloud import Cloud, find_seams, merge
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from cell.motion.trajectory import FlangeTrack
 from drivers.clock import ClockMap, Latch
 from drivers.errors import DeviceFault

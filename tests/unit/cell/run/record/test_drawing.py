@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import subprocess
 import sys
 from collections import defaultdict
@@ -15,7 +14,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from cell.measure.reconstruction.ply import read_cloud
-from cell.run.record.drawing import MOST_POINTS
 from lab.bench.job.whole_job import JobRecord
 from tests.unit.cell.run.record.conftest import Messages
 
@@ -68,16 +66,13 @@ def test_pictures_are_the_files_and_carry_the_lens_they_were_taken_with(
     assert not kept
 
 
-def test_the_cloud_that_has_grown_is_the_cloud_of_the_run(read: Messages, folder: Path) -> None:
+def test_the_lines_and_all_of_them_are_the_cloud_of_the_run(read: Messages, folder: Path) -> None:
     stored = read_cloud(folder / "cloud.ply")
     measured = stored.points[~stored.interpolated].astype("<f4")
     lines = [np.frombuffer(message.data, "<f4").reshape(-1, 3) for _, message in sorted(read["/cloud/line"], key=first)]
     assert np.array_equal(np.concatenate(lines), measured)
-    seconds = [stamp for stamp, _ in read["/cloud/grown"]]
-    assert np.diff(seconds[:-1]).min() >= 1e9
-    largest = np.frombuffer(read["/cloud/grown"][-1][1].data, "<f4").reshape(-1, 3)
-    stride = math.ceil(len(measured) / MOST_POINTS)
-    assert np.array_equal(largest, measured[::stride])
+    [(_, whole)] = read["/cloud/whole"]
+    assert np.array_equal(np.frombuffer(whole.data, "<f4").reshape(-1, 3), measured)
 
 
 def first(pair: tuple[int, Any]) -> int:
@@ -151,7 +146,7 @@ def test_rerun_sees_frames_lenses_pictures_and_cloud(folder: Path, tmp_path: Pat
         if " - /" in line:
             found[line.split(" - ")[1].strip()] += line
     assert "Transform3D:parent_frame" in found["/tf"]
-    assert "Points3D:positions" in found["/cloud/line"] and "Points3D:positions" in found["/cloud/grown"]
+    assert "Points3D:positions" in found["/cloud/line"] and "Points3D:positions" in found["/cloud/whole"]
     for camera in ("scan_camera", "target_camera"):
         assert "EncodedImage:blob" in found[f"/{camera}/image"]
         assert "Pinhole:image_from_camera" in found[f"/{camera}/calibration"]

@@ -15,7 +15,7 @@ from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import difference, from_parts, perturbed
 from cell.measure.vision.board.view import BoardView, centre_of, parse_board
-from cell.measure.vision.stripe.extract import StripeProfile
+from cell.measure.vision.stripe.profile import StripeProfile
 from drivers.errors import RefusedError
 from lab.paper.rig import from_axes
 

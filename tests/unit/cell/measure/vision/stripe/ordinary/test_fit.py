@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cell.measure.vision.stripe.extract import StripeSettings, extract
+from cell.measure.vision.stripe.extract import extract
+from cell.measure.vision.stripe.profile import StripeSettings
 from lab.bench.stripe.campaign import measure
 from lab.bench.stripe.truth import Cell, bound, draw
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from cell.measure.vision.pictures import PictureRefused
-from cell.measure.vision.stripe.extract import StripeSettings, extract
+from cell.measure.vision.stripe.extract import extract
+from cell.measure.vision.stripe.profile import StripeSettings
 from lab.bench.stripe.truth import Cell, draw
 from tests.support.recorded_scenes import RECORDED
 
