@@ -22,6 +22,8 @@ LEAST, EVERY = 20, 10
 """The interval is looked at after so many worlds at first, and then after so many more."""
 MOST = 2000
 """Worlds of a campaign that ends by its interval, unless told otherwise."""
+DEATHS = 2
+"""Of a worker in a world that it ran alone, after which that is the world's row."""
 NARROWEST, WIDEST = 0.0005, 0.5
 
 
@@ -154,18 +156,19 @@ class Campaign:
             return prefix
 
     def _run(self, store: RowStore, workers: Workers, prefix: Prefix, shown: Callable[[Prefix], None]) -> None:
-        missing, again, died = self._missing(prefix), deque[WorldTask](), set[str]()
+        missing, again, died = self._missing(prefix), deque[WorldTask](), Counter[str]()
         begun = 0
         while prefix.end is None:
-            # Tried again alone, so that it takes the blame for no other world that kills its worker.
-            room = workers.room if not again else 1 if begun == 0 else 0
+            # Tried again alone: it is not to blame for another world that kills its worker.
+            alone = bool(again) and begun == 0
+            room = 1 if alone else 0 if again else workers.room
             while begun < room and (task := again.popleft() if again else next(missing, None)) is not None:
                 workers.begin(task)
                 begun += 1
             for task, row in workers.ended():
                 begun -= 1
-                if row is None and task.key not in died:
-                    died.add(task.key)
+                died[task.key] += row is None and alone
+                if row is None and died[task.key] < DEATHS:
                     again.append(task)
                     continue
                 row = row or self._died(task)
@@ -183,5 +186,5 @@ class Campaign:
         return WorldTask(self.of, self.job, self.configuration, self.folder, level=self.level, seed=seed)
 
     def _died(self, task: WorldTask) -> Row:
-        reason = "the worker process died in this world, and so did the one that tried it again"
+        reason = f"the worker process died in this world, alone, {DEATHS} times"
         return error_row(self.of, self.level, task.seed, outcome="error", step="", code="WorkerDied", reason=reason)

@@ -114,10 +114,11 @@ def test_a_prefix_waits_for_its_first_seeds() -> None:
 
 
 def test_a_worker_that_dies_is_tried_again_and_then_is_a_row(tmp_path: Path) -> None:
-    workers = Here(2, dies={2: 1, 3: 2})
+    # By others that kill it a worker may die once with a world that then dies once by itself: no reason to give it up.
+    workers = Here(2, dies={2: 2, 3: 3})
     run(tmp_path, Target(4), workers)
-    assert (workers.begun.count(2), workers.begun.count(3)) == (2, 2)
-    assert workers.alone == [2, 3], "whose worker died is tried again with nothing beside it"
+    assert (workers.begun.count(2), workers.begun.count(3)) == (3, 3)
+    assert sorted(workers.alone) == [2, 2, 3, 3], "whose worker died is tried again with nothing beside it"
     rows = {one["seed"]: one for one in RowStore(tmp_path).rows()}
     assert [rows[seed]["outcome"] for seed in (1, 2, 3, 4)] == ["placed", "placed", "error", "placed"]
     assert rows[3]["code"] == "WorkerDied"

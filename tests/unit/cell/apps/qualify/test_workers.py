@@ -7,6 +7,7 @@ import time
 from multiprocessing import active_children
 from pathlib import Path
 
+import distributed
 import pytest
 
 from cell.apps.qualify import workers as module
@@ -86,9 +87,7 @@ def test_by_default_each_core_has_a_process() -> None:
     assert open_workers(None, None, None).room == module.cores()
 
 
-@pytest.mark.campaign
 def test_a_cluster_gives_the_same_rows_although_workers_are_killed(tmp_path: Path) -> None:
-    pytest.importorskip("distributed")
     cluster = open_workers(None, None, "local:2")
     assert isinstance(cluster, Cluster)
     cluster.work = deadly
@@ -96,9 +95,7 @@ def test_a_cluster_gives_the_same_rows_although_workers_are_killed(tmp_path: Pat
     assert (tmp_path / "killed").exists()
 
 
-@pytest.mark.campaign
 def test_a_scheduler_that_goes_away_leaves_the_rows_and_says_how_to_go_on(tmp_path: Path) -> None:
-    distributed = pytest.importorskip("distributed")
     started = distributed.LocalCluster(n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
     cluster = open_workers(None, started.scheduler_address, None)
     assert isinstance(cluster, Cluster)
@@ -115,17 +112,13 @@ def test_a_scheduler_that_goes_away_leaves_the_rows_and_says_how_to_go_on(tmp_pa
     assert 3 <= len(RowStore(tmp_path).rows()) < 500
 
 
-@pytest.mark.campaign
 def test_where_no_scheduler_answers_its_address_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("distributed")
     monkeypatch.setattr(module, "ANSWER_S", "1s")
     with pytest.raises(ConfigError, match=r"no scheduler answers at tcp://127\.0\.0\.1:1"):
         open_workers(None, "tcp://127.0.0.1:1", None)
 
 
-@pytest.mark.campaign
 def test_without_certificates_tls_says_what_is_missing() -> None:
-    pytest.importorskip("distributed")
     with pytest.raises(ConfigError, match="give Dask its certificates"):
         open_workers(None, "tls://127.0.0.1:1", None)
 
