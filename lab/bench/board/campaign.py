@@ -2,7 +2,8 @@
 
 Counts what was found, refused and wrong, compares points and poses with the truth, and holds the stated covariance to
 the errors: z is the RMS of the whitened pose errors, z_axes each component's over its own σ (x, y, z, then the
-rotations about them, in the camera), coverage the share of errors inside the stated 95 % ellipsoid.
+rotations about them, in the camera), coverage the share of errors inside the stated 95 % ellipsoid. OpenCV's own
+detectors look at the same pictures; they have to find all of the board, but for ChArUco.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import cv2
 import numpy as np
 import pinocchio as pin
 from scipy.stats import chi2
@@ -43,6 +45,8 @@ class Tally:
     scores: list[Array] = field(default_factory=list)
     found_s: list[float] = field(default_factory=list)
     refused_s: list[float] = field(default_factory=list)
+    peer_found: list[bool] = field(default_factory=list)
+    peer_s: list[float] = field(default_factory=list)
     reasons: dict[str, int] = field(default_factory=dict)
 
     def row(self) -> dict[str, Any]:
@@ -68,6 +72,8 @@ class Tally:
             "coverage_95": round(float((squares < chi2.ppf(0.95, 6)).mean()), 3) if len(squares) else None,
             "found_ms": middle(self.found_s),
             "refused_ms": middle(self.refused_s),
+            "opencv_found": round(float(np.mean(self.peer_found)), 4) if self.peer_found else None,
+            "opencv_ms": middle(self.peer_s),
             "slowest_ms": round(1e3 * max([*self.found_s, *self.refused_s], default=0.0), 1),
             "reasons": dict(sorted(self.reasons.items())),
         }
@@ -92,9 +98,28 @@ def applies(condition: Condition, kind: Kind) -> bool:
     return "mirrored" not in condition.changes or kind in ("marked_dots", "charuco")
 
 
+def by_opencv(view: View) -> bool | None:
+    """Whether OpenCV's own detector finds the named board in a view; None where it has none for its kind."""
+    spec, picture = view.spec, view.picture
+    if spec.kind == "chessboard":
+        return bool(cv2.findChessboardCornersSB(picture, spec.grid)[0])
+    if spec.kind in ("dots", "asymmetric_dots"):
+        symmetry = cv2.CALIB_CB_SYMMETRIC_GRID if spec.kind == "dots" else cv2.CALIB_CB_ASYMMETRIC_GRID
+        return bool(cv2.findCirclesGrid(picture, (spec.cols, spec.rows), flags=symmetry)[0])
+    if spec.kind == "charuco":
+        printed = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
+        board = cv2.aruco.CharucoBoard((spec.cols, spec.rows), spec.pitch, spec.marker, printed)
+        return cv2.aruco.CharucoDetector(board).detectBoard(picture)[1] is not None
+    return None
+
+
 def judge(view: View, expect: str, tally: Tally) -> None:
     """Look for the named board in a view and add the outcome to the tally."""
     tally.views += 1
+    start = time.perf_counter()
+    if expect == "found" and (found := by_opencv(view)) is not None:
+        tally.peer_found.append(found)
+        tally.peer_s += [time.perf_counter() - start] if found else []
     start = time.perf_counter()
     try:
         seen = find_board(view.picture, view.spec)
