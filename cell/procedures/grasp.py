@@ -56,9 +56,10 @@ def expected_residual(
     turn = np.kron(np.eye(2), pose.base_from_surface.rotation.T)
     # It comes to rest twice: where it grips, and where it lets go.
     rests = turn @ carried @ (2.0 * repeatability) @ carried.T @ turn.T
-    drawn = draws_of(rests + seen + GRIPPED)
-    apart = drawn[:, None, :3] + np.cross(drawn[:, None, 3:], points @ belongs.rotation.T)
-    return best_expected(np.linalg.norm(apart[..., :2], axis=-1).mean(axis=1), corrections)
+    x, y, _, about_x, about_y, about_z = draws_of(rests + seen + GRIPPED).T[..., None]
+    levers = points @ belongs.rotation.T
+    along = x + about_y * levers[:, 2] - about_z * levers[:, 1], y + about_z * levers[:, 0] - about_x * levers[:, 2]
+    return best_expected(np.hypot(*along).mean(axis=1), corrections)
 
 
 def best_expected(drawn: Vector, corrections: int) -> float:
