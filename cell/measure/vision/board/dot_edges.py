@@ -111,11 +111,11 @@ def _find_edge(samples: Array, edge: Array, seen: Array) -> None:
         ring[k] = beside[3]
     dark = _median(own)
     slope = np.zeros(RAYS)
-    even = _slope_of_light(own, ring, slope)
+    even, mean = _slope_of_light(own, ring, slope), ring.mean()
     level, step = np.empty(RAYS), np.empty(RAYS)
     for k in range(RAYS):
         low = dark * (1.0 + slope[k])
-        step[k] = (ring.mean() * (1.0 + slope[k]) if even else ring[k]) - low
+        step[k] = (mean * (1.0 + slope[k]) if even else ring[k]) - low
         level[k] = low + 0.5 * step[k]
     least = max(0.4 * _median(step), 4.0)
     for k in range(RAYS):
