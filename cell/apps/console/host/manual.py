@@ -45,9 +45,7 @@ class Press:
     ended: str | None = None
     beat: Callable[[], None] | None = None
     """Tells the watch beside the device, once that stands."""
-
-    def __post_init__(self) -> None:
-        self._end = threading.Event()
+    _end: threading.Event = field(default_factory=threading.Event)
 
     def renew(self) -> None:
         """A beat has come."""
