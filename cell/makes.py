@@ -5,7 +5,7 @@ imported, or that takes another's name, is told in the list with the reason, and
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -46,10 +46,6 @@ class Installed:
     def ok(self) -> bool:
         """Whether a configuration can name it."""
         return self.state == "ok"
-
-    def as_dict(self) -> dict[str, object]:
-        """For JSON."""
-        return asdict(self)
 
 
 def installed() -> list[Installed]:

@@ -62,16 +62,12 @@ def contact_problems(job: Job, config: CellConfig, mesh: Path) -> Iterator[str]:
                 f"place.{key} {1e3 * asked:g} {unit} cannot be kept: {sigma} and the arm's repeatability alone leave "
                 f"{1e3 * least:.3g} {unit} open, one standard deviation (allowed: more than that)"
             )
-    if place.contact_travel < 3 * grasp.sigma:
-        yield (
-            f"place.contact_travel {1e3 * place.contact_travel:g} mm is less than three times grasp.sigma: the part "
-            f"would often not touch within it (allowed: at least {3e3 * grasp.sigma:g} mm)"
-        )
-    if job.unloads and job.nest is not None and place.contact_travel < 3 * job.nest.sigma:
-        yield (
-            f"place.contact_travel {1e3 * place.contact_travel:g} mm is less than three times nest.sigma: the part "
-            f"would often not touch within it (allowed: at least {3e3 * job.nest.sigma:g} mm)"
-        )
+    for key, holds in (("grasp", grasp), ("nest", job.nest if job.unloads else None)):
+        if holds is not None and place.contact_travel < 3 * holds.sigma:
+            yield (
+                f"place.contact_travel {1e3 * place.contact_travel:g} mm is less than three times {key}.sigma: the "
+                f"part would often not touch within it (allowed: at least {3e3 * holds.sigma:g} mm)"
+            )
     if (blur := job.scan.exposure * job.scan.speed) > 0.5 * place.tolerance:
         yield (
             f"scan.exposure {1e3 * job.scan.exposure:g} ms at scan.speed {1e3 * job.scan.speed:g} mm/s smears a line "

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Collection, Iterable, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal, Protocol, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import pinocchio as pin
@@ -92,16 +92,8 @@ class StationObstacle(Obstacle):
     place_from_centre: Pose
 
 
-class Named(Protocol):
-    """A table that has a name."""
-
-    @property
-    def name(self) -> str: ...
-
-
-def once_each(what: str, tables: Sequence[Named]) -> None:
-    """Raise `ValueError` when two of these tables, `what` in words, have one name."""
-    names = [table.name for table in tables]
+def once_each(what: str, names: Sequence[str]) -> None:
+    """Raise `ValueError` when two tables, `what` in words, have one of these names."""
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"{what} {', '.join(twice)} is there twice; give each a name of its own")
 
@@ -184,7 +176,7 @@ class CellConfig(Table):
 
     @model_validator(mode="after")
     def _distinct_obstacles(self) -> Self:
-        once_each("obstacle", self.obstacle)
+        once_each("obstacle", [obstacle.name for obstacle in self.obstacle])
         return self
 
     @model_validator(mode="after")

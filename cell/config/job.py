@@ -106,7 +106,7 @@ class SurfaceSection(Table):
 
     @model_validator(mode="after")
     def _distinct_areas(self) -> Self:
-        once_each("area", self.area)
+        once_each("area", [area.name for area in self.area])
         return self
 
 
@@ -136,7 +136,7 @@ class PartSection(Table):
 
     @model_validator(mode="after")
     def _distinct_features(self) -> Self:
-        once_each("feature", self.feature)
+        once_each("feature", [feature.name for feature in self.feature])
         return self
 
 
@@ -314,7 +314,7 @@ class Job(Table):
 
     @model_validator(mode="after")
     def _distinct(self) -> Self:
-        once_each("obstacle", self.obstacle)
+        once_each("obstacle", [obstacle.name for obstacle in self.obstacle])
         if self.item and self.nest is None:
             raise ValueError("[[item]] takes parts from nests, or to them: give [nest]")
         if (problem := self._stop_problem()) is not None:
@@ -323,15 +323,15 @@ class Job(Table):
 
     def _stop_problem(self) -> str | None:
         """What is wrong with the stops, or with how items name them."""
-        once_each("stop", self.stop)
         names = [stop.name for stop in self.stop]
+        once_each("stop", names)
         used = {item.stop or (names or [""])[0] for item in self.item} - {""}
         if unknown := sorted(used - set(names)):
             return f'item.stop "{unknown[0]}" is no [[stop]] (there: {", ".join(names) or "none"}); correct its name'
         if idle := [name for name in names if name not in used]:
             return f'stop {idle[0]} has no item: write stop = "{idle[0]}" under an [[item]], or leave the stop out'
         for k, stop in enumerate(self.stop):
-            once_each(f"stop {stop.name}: obstacle", stop.obstacle or ())
+            once_each(f"stop {stop.name}: obstacle", [obstacle.name for obstacle in stop.obstacle or ()])
             if (stop.place_from_stop is None) is not (k == 0):
                 what = "give place_from_stop" if k else "leave out place_from_stop"
                 return (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from typing import TYPE_CHECKING, TypeVar
 
 from cell.devices.gate.gate import Gate
@@ -78,17 +79,16 @@ class Devices:
     @property
     def bright(self) -> bool:
         """Whether ambient light has whitened a picture since `forget_ambient_light`."""
-        return any(camera is not None and camera.longest_exposure < math.inf for camera in self._cameras)
+        return any(camera.longest_exposure < math.inf for camera in self._cameras)
 
     def forget_ambient_light(self) -> None:
         """Forget how bright it was: the cameras expose as long as they are asked to."""
         for camera in self._cameras:
-            if camera is not None:
-                camera.longest_exposure = math.inf
+            camera.longest_exposure = math.inf
 
     @property
-    def _cameras(self) -> tuple[GatedCamera | None, ...]:
-        return self._scan_camera, self._target_camera
+    def _cameras(self) -> list[GatedCamera]:
+        return [camera for camera in (self._scan_camera, self._target_camera) if camera is not None]
 
     @property
     def laser(self) -> GatedLaser:
@@ -105,16 +105,8 @@ class Devices:
 
     def __iter__(self) -> Iterator[Device]:
         """Those that are connected, the arm last because laser and claw may hang on it."""
-        everything: tuple[Device | None, ...] = (
-            self._laser,
-            self._claw,
-            self._rail,
-            self._vehicle,
-            self._scan_camera,
-            self._target_camera,
-            self._arm,
-        )
-        return (device for device in everything if device is not None)
+        order = ("laser", "claw", "rail", "vehicle", "scan_camera", "target_camera", "arm")
+        return (getattr(self, f"_{name}") for name in order if name in self)
 
     def stop(self) -> list[str]:
         """Laser off, vehicle stopped and braked, rail and arm stopped; none waits for another to confirm it.
@@ -175,12 +167,9 @@ def require_healthy(devices: Devices) -> None:
     """
     require_no_emergency_stop(devices)
     _require_arm(devices)
-    if "vehicle" not in devices:
-        return
-    try:
-        devices.vehicle.check()
-    except DeadlineError:
-        return
+    if "vehicle" in devices:
+        with suppress(DeadlineError):
+            devices.vehicle.check()
 
 
 def require_no_emergency_stop(devices: Devices) -> None:

@@ -193,33 +193,29 @@ class CollisionModel:
             if joint == FLANGE:
                 joint, placement = 6, kinematics.joint6_from_flange * placement
             self._geometry.addGeometryObject(pin.GeometryObject(body.name, joint, placement, _shape(body)))
-        self._pairs: list[Pair] = []
+        self.pairs: list[Pair] = []
+        """The pairs of bodies that are looked at, in the order of `distances`."""
         for i, first in enumerate(bodies):
             for j in range(i + 1, len(bodies)):
                 if _may_touch(first, bodies[j]):
                     self._geometry.addCollisionPair(pin.CollisionPair(i, j))
-                    self._pairs.append((first.name, bodies[j].name))
+                    self.pairs.append((first.name, bodies[j].name))
         self._geometry_data = self._geometry.createData()
         for request in self._geometry_data.collisionRequests:
             request.security_margin = margin + ROUNDING
         results = self._geometry_data.distanceResults
-        self._distance_results = [results[i] for i in range(len(self._pairs))]
+        self._distance_results = [results[i] for i in range(len(self.pairs))]
         self.swing = self._swing()
-
-    @property
-    def pairs(self) -> tuple[Pair, ...]:
-        """The pairs of bodies that are looked at, in the order of `distances`."""
-        return tuple(self._pairs)
 
     def distances(self, joints: Joints) -> NDArray[np.float64]:
         """(pairs,) distance in m of each pair at the joint angles (6,) rad, negative where they overlap."""
         pin.computeDistances(self._model, self._data, self._geometry, self._geometry_data, _array(joints))
-        return np.fromiter(map(_least, self._distance_results), np.float64, len(self._pairs))
+        return np.fromiter(map(_least, self._distance_results), np.float64, len(self.pairs))
 
     def excused(self, allowed: Sequence[Pair]) -> NDArray[np.bool_]:
         """(pairs,) which of the pairs are among the `allowed` ones."""
         names = {frozenset(pair) for pair in allowed}
-        return np.array([frozenset(pair) in names for pair in self._pairs], dtype=np.bool_)
+        return np.array([frozenset(pair) in names for pair in self.pairs], dtype=np.bool_)
 
     def _swing(self) -> NDArray[np.float64]:
         """(pairs, 6) by how many m a pair can come nearer, at most, when a joint between the two turns by 1 rad.
@@ -227,10 +223,10 @@ class CollisionModel:
         That is how far from the joint's axis the farther body can reach: its own corners, and the links in between.
         """
         links = [float(np.linalg.norm(self._model.jointPlacements[k].translation)) for k in range(2, 7)]
-        swing = np.zeros((len(self._pairs), 6))
+        swing = np.zeros((len(self.pairs), 6))
         shapes = {body.name: body for body in self.bodies}
         objects = {shape.name: shape for shape in self._geometry.geometryObjects}
-        for row, pair in zip(swing, self._pairs, strict=True):
+        for row, pair in zip(swing, self.pairs, strict=True):
             near, far = sorted((objects[name] for name in pair), key=lambda shape: int(shape.parentJoint))
             corners, radius = _corners(shapes[far.name], far.placement)
             own = int(far.parentJoint)
@@ -248,7 +244,7 @@ class CollisionModel:
         results = self._geometry_data.collisionResults
         return [
             pair
-            for pair, result in zip(self._pairs, results, strict=True)
+            for pair, result in zip(self.pairs, results, strict=True)
             if result.isCollision() and frozenset(pair) not in excused
         ]
 

@@ -188,14 +188,10 @@ class Planner:
     ) -> Trajectory:
         """A straight line of the flange to `base_from_end`, checked; see `trajectory.plan_line` for its errors."""
         motion = plan_line(self.kinematics, start, base_from_end, limits, points=self._points)
-        self.require_clear(motion, "the straight line", allowed)
-        return motion
-
-    def require_clear(self, motion: Trajectory, what: str, allowed: Sequence[Pair] = ()) -> None:
-        """Raise `CollisionError` when bodies touch anywhere along `motion`."""
         touch = first_touch(self.collisions, motion.joints, tuple(allowed))
         if touch is not None:
-            raise self.collisions.error(f"{what} at {motion.times[touch.sample]:.2f} s", touch.pairs)
+            raise self.collisions.error(f"the straight line at {motion.times[touch.sample]:.2f} s", touch.pairs)
+        return motion
 
     def _path(self, start: Joints, end: Joints, allowed: tuple[Pair, ...]) -> NDArray[np.float64]:
         direct = np.stack([start, end])

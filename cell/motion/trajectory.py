@@ -100,14 +100,12 @@ class Trajectory:
     @property
     def start(self) -> Joints:
         """Joint angles at the start."""
-        first: Joints = self.joints[0]
-        return first
+        return np.asarray(self.joints[0])
 
     @property
     def end(self) -> Joints:
         """Joint angles at the end."""
-        last: Joints = self.joints[-1]
-        return last
+        return np.asarray(self.joints[-1])
 
     def at_pace(self, share: float) -> Trajectory:
         """The same way at this share, up to 1, of its speed."""

@@ -133,20 +133,20 @@ def typed(event: Event) -> RunEvent:
         case "state":
             return StateChanged(at, step, str(data["trigger"]), str(data["from"]), str(data["to"]))
         case "step_started":
-            return StepStarted(at, step, _whole(data["attempt"]))
+            return StepStarted(at, step, int(str(data["attempt"])))
         case "progress":
             return StepProgress(at, step, float(str(data["fraction"])), str(data["text"]))
         case "step_done":
             return StepDone(at, step, float(str(data.pop("duration_s"))), data)
         case "step_failed":
-            return StepFailed(at, step, _whole(data["attempt"]), str(data["reason"]))
+            return StepFailed(at, step, int(str(data["attempt"])), str(data["reason"]))
         case "fault":
             return FaultMet(at, step, str(data["code"]), str(data["reason"]), str(data.get("remedy", "noted")))
         case "safe_stop":
             trouble = data["trouble"]
             return SafeStopped(at, step, str(data["reason"]), None if trouble is None else str(trouble))
         case "confirm_needed":
-            return ConfirmNeeded(at, step, str(data["reason"]), str(data["code"]), _whole(data["number"]))
+            return ConfirmNeeded(at, step, str(data["reason"]), str(data["code"]), int(str(data["number"])))
         case "confirmed":
             return Confirmed(at, step, str(data["by"]), str(data["reason"]))
         case "paused":
@@ -233,7 +233,3 @@ class Detached:
                 self.failure = f"{type(error).__name__}: {error}"
                 self._events.close()
                 return
-
-
-def _whole(value: object) -> int:
-    return int(str(value))

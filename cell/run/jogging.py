@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -86,12 +87,8 @@ def jog(cell: Cell, wish: Jog, job: str | Path = "pot", observer: Observer | Non
     """
     stops = cell.stops
     loaded, _ = load_job(job)
-
     begun: list[Begun] = []
-
-    def work(context: WorkContext) -> dict[str, str]:
-        return moved(cell, wish, loaded, context, begun)
-
+    work = partial(moved, cell, wish, loaded, begun=begun)
     return cell.perform("jog", work, observer, {"moved": f"{wish.device} {wish.axis}".strip()}, stops)
 
 

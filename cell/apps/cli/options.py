@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -59,14 +59,9 @@ def devices(incomplete: str) -> list[str]:
     return _beginning(incomplete, DEVICES)
 
 
-def jogged(incomplete: str) -> list[str]:
-    """Devices that are jogged."""
-    return _beginning(incomplete, ("rail", "arm", "vehicle"))
-
-
-def homed(incomplete: str) -> list[str]:
-    """Devices that have a home."""
-    return _beginning(incomplete, ("rail", "arm"))
+def among(*names: str) -> Callable[[str], list[str]]:
+    """These words."""
+    return lambda incomplete: _beginning(incomplete, names)
 
 
 def faults(incomplete: str) -> list[str]:

@@ -161,10 +161,7 @@ class Commissioning:
             finally:
                 workplace.context = None
 
-        try:
-            workplace.cell.perform("commission", work, workplace.heard, {"check": check.name})
-        finally:
-            workplace.context = None
+        workplace.cell.perform("commission", work, workplace.heard, {"check": check.name})
         return name[0] if name else ""
 
     def _mend(self, check: CommissionCheck, result: Result) -> bool:

@@ -21,7 +21,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from cell.apps.new_job.mesh_file import read_drawing
 from cell.apps.new_job.proposal import SEEN_WITHIN, Proposal, known, place_from, propose, sight_problems, told_by_few
-from cell.apps.new_job.questions import Asker, choice, job_name, job_text, laid_mesh, pose_text, station, template
+from cell.apps.new_job.questions import Asker, choice, job_name, job_text, laid_mesh, pose_text, station
 from cell.apps.new_job.surface import Laid, about, as_stl
 from cell.apps.new_job.sweeps import FITS, Array, SeenSurface, rivals
 from cell.check.fit import require_fit
@@ -70,7 +70,8 @@ def make_job(asker: Asker, config: CellConfig, folder: Path, overwrite: bool) ->
     targets = folder / f"{name}.toml", _beside(folder / f"{name}.stl", mesh), folder / f"{name}.png"
     part = _part(asker, folder, name)
     _require_room(asker, targets if part is None or part.same else (*targets, part.target), overwrite)
-    job = _with_part(asker, station(asker, template(asker), name, targets[1].name, laid), part)
+    like, _ = asker.get("like", "A job at the same station (its way, photograph and speeds)", "pot", load_job)
+    job = _with_part(asker, station(asker, like, name, targets[1].name, laid), part)
     step = asker.get("step", "Lines of the scan, how far apart", "0.5 mm", lambda t: parse_quantity(t, "mm", *STEP_MM))
 
     laid, proposal = _proposed(asker, laid, job, config, step=step)

@@ -21,7 +21,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from cell.apps.new_job.mesh_file import Drawn, MeshBody
 from cell.apps.new_job.surface import METRES, UP, Laid, centred, faces_down, lay, open_side, overlapping, raised
 from cell.base.toml_file import wording
-from cell.config.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection, load_job
+from cell.config.job import BoardSection, GraspSection, Job, JobSection, PlaceSection, SurfaceSection
 from cell.measure.geometry.poses import from_parts
 from cell.measure.vision.board.view import centre_of, parse_board
 from cell.procedures.sought_part import pose_record
@@ -265,20 +265,13 @@ def _bodies(asker: Asker, drawn: Drawn) -> list[MeshBody]:
         if text.strip() == "all":
             return list(drawn.bodies)
         try:
-            return [drawn.bodies[_number(word, len(drawn.bodies)) - 1] for word in text.split(",")]
+            return [drawn.bodies[range(1, len(drawn.bodies) + 1).index(int(word))] for word in text.split(",")]
         except ValueError as error:
             raise ValueError(
                 f'{shown(text)}: write "all" or numbers from 1 to {len(drawn.bodies)}, such as 1,2'
             ) from error
 
     return asker.get("bodies", "Which of them are the surface", "all", parse)
-
-
-def _number(word: str, most: int) -> int:
-    number = int(word)
-    if not 1 <= number <= most:
-        raise ValueError(word)
-    return number
 
 
 def _unit(asker: Asker, drawn: Drawn, longest: float) -> tuple[str, str]:
@@ -299,12 +292,6 @@ def _unit(asker: Asker, drawn: Drawn, longest: float) -> tuple[str, str]:
 
 def _turn(text: str) -> float | None:
     return None if text.strip() == "auto" else parse_quantity(text, "deg", -360, 360)
-
-
-def template(asker: Asker) -> Job:
-    """The job whose station, way and speeds the new one shares."""
-    like, _ = asker.get("like", "A job at the same station (its way, photograph and speeds)", "pot", load_job)
-    return like
 
 
 def station(asker: Asker, like: Job, name: str, mesh: str, laid: Laid) -> Job:

@@ -335,10 +335,6 @@ class PairedComparison:
     figures: Sequence[FigureDifference]
     changed: Sequence[ChangedWorld]
 
-    def as_dict(self) -> dict[str, object]:
-        """JSON-ready."""
-        return asdict(self)
-
 
 def other_rows(campaign: Campaign, folder: Path) -> list[Row]:
     """The rows in `folder` to compare with: of the same job and level, from the version that ran last.

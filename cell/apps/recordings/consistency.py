@@ -51,7 +51,7 @@ def orders(flanges: Sequence[pin.SE3], options: Sequence[Sequence[pin.SE3]]) -> 
     first = np.concatenate([[0], np.cumsum([len(poses) for poses in options])[:-1]])
     seen = [pose for poses in options for pose in poses]
     apart = np.abs(turns_between([flanges[k] for k in of.tolist()]) - turns_between(seen))
-    best: tuple[float, int, list[int]] | None = None
+    found: list[tuple[float, int, list[int]]] = []
     references: list[int] = np.unique(np.linspace(0, len(options) - 1, REFERENCES).astype(int)).tolist()
     for k in references:
         for right in range(len(options[k])):
@@ -65,10 +65,8 @@ def orders(flanges: Sequence[pin.SE3], options: Sequence[Sequence[pin.SE3]]) -> 
                     break
             among = first + chosen
             misfit = float(np.sum(np.median(apart[np.ix_(among, among)], axis=1)))
-            if best is None or (round(misfit, 9), chosen[0]) < best[:2]:
-                best = round(misfit, 9), chosen[0], chosen
-    assert best is not None
-    return best[2]
+            found.append((round(misfit, 9), chosen[0], chosen))
+    return min(found, key=lambda one: one[:2])[2]
 
 
 def refuse_odd_ones(frames: Sequence[RecordedFrame], camera: CameraModel) -> list[RecordedFrame]:

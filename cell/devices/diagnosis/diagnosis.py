@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
@@ -170,25 +169,18 @@ def _diagnose(config: CellConfig, only: Collection[str]) -> list[Diagnosis]:
             if config.make(name).on_arm and arm is None:
                 rows.append(Diagnosis(name, False, record.place, state="the arm that it hangs on is not connected"))
                 continue
-            connect = partial(assembly.connect_one, config, name, clock, arm=arm, look=True)
-            row, device = _open_and_ask(name, record.place, connect, clock)
-            if name == "arm":
-                arm = device
-            if device is not None and not config.make(name).on_arm:
-                opened.callback(device.close)
+            try:
+                device = assembly.connect_one(config, name, clock, arm=arm, look=True)
+            except CellError as error:
+                row = Diagnosis(name, False, record.place, state=str(error))
+            else:
+                if not config.make(name).on_arm:
+                    opened.callback(device.close)
+                arm = device if name == "arm" else arm
+                row = ask(name, record.place, device, clock)
             if name in wanted:
                 rows.append(row)
     return rows
-
-
-def _open_and_ask(
-    name: str, address: str, build: Callable[[], interfaces.Device], clock: Clock
-) -> tuple[Diagnosis, Any]:
-    try:
-        device = build()
-    except CellError as error:
-        return Diagnosis(name, False, address, state=str(error)), None
-    return ask(name, address, device, clock), device
 
 
 def ask(name: str, address: str, device: interfaces.Device, clock: Clock) -> Diagnosis:

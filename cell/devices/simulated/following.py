@@ -8,8 +8,8 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from typing import Any, Protocol
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -23,6 +23,8 @@ from drivers.interfaces import ArmState, Vector
 from drivers.make import OnArm
 
 Rows = list[list[float]]
+Feed = Callable[[], AbstractContextManager[Callable[[], Rows]]]
+"""The readings of one device; inside the context a function gives the rows since it was called last, oldest first."""
 
 PERIOD_S, AT_REST_S = 0.008, 0.02
 """Wall seconds between two looks for readings, of what moves and of what stands; the world waits for them with its
@@ -31,13 +33,6 @@ FINEST_S = 0.0039
 """Of an arm's states, which come each 2 ms, so many are told while it moves."""
 DRIFT_S = 0.2e-6
 """What an arm's clock may drift from one state to the next: 100 ppm of 2 ms."""
-
-
-class Feed(Protocol):
-    """The readings of one device."""
-
-    def open(self) -> AbstractContextManager[Callable[[], Rows]]:
-        """While it is open: a function that gives the rows since it was called last, oldest first."""
 
 
 class ArmFeed:
@@ -52,7 +47,7 @@ class ArmFeed:
 
     @contextmanager
     def open(self) -> Iterator[Callable[[], Rows]]:
-        """See `Feed.open`."""
+        """See `Feed`."""
         with self._arm.record() as states:
             yield lambda: self._rows(states)
 
@@ -91,7 +86,7 @@ class RailFeed:
 
     @contextmanager
     def open(self) -> Iterator[Callable[[], Rows]]:
-        """See `Feed.open`."""
+        """See `Feed`."""
         self._arrived = self._seen = self._rail.motion
         self._told, self._position = 0, self._rail.state().position
         self._looked = self._clock.now()
@@ -126,7 +121,7 @@ class VehicleFeed:
 
     @contextmanager
     def open(self) -> Iterator[Callable[[], Rows]]:
-        """See `Feed.open`."""
+        """See `Feed`."""
         yield self._rows
 
     def _rows(self) -> Rows:
@@ -136,18 +131,6 @@ class VehicleFeed:
         self._newest = state.stamp
         numbers = (state.stamp, state.x, state.y, state.yaw, state.speed, state.yaw_rate, bool(state.braked))
         return [[float(number) for number in numbers]]
-
-
-class SwitchFeed:
-    """Whether a laser or claw is on that does not hang on the arm."""
-
-    def __init__(self, devices: Devices, is_on: Callable[[], bool]) -> None:
-        self._clock, self._is_on = devices.clock, is_on
-
-    @contextmanager
-    def open(self) -> Iterator[Callable[[], Rows]]:
-        """See `Feed.open`."""
-        yield lambda: [[self._clock.now(), float(self._is_on())]]
 
 
 LATEST_S = 0.25
@@ -177,11 +160,11 @@ class DeviceFollowing:
         self._wrenches: deque[tuple[float, Vector]] = deque(maxlen=_KEPT)
         self._felt = threading.Condition()
         feeds: dict[str, Callable[[], Feed]] = {
-            "arm": lambda: self._arm,
-            "rail": lambda: RailFeed(devices),
-            "vehicle": lambda: VehicleFeed(devices),
-            "laser": lambda: SwitchFeed(devices, lambda: devices.laser.is_on),
-            "claw": lambda: SwitchFeed(devices, lambda: devices.claw.holding),
+            "arm": lambda: self._arm.open,
+            "rail": lambda: RailFeed(devices).open,
+            "vehicle": lambda: VehicleFeed(devices).open,
+            "laser": lambda: self._switch(lambda: devices.laser.is_on),
+            "claw": lambda: self._switch(lambda: devices.claw.holding),
         }
         if "arm" in followed:
             self._arm = ArmFeed(devices)
@@ -267,16 +250,15 @@ class DeviceFollowing:
 
     def _compare_clocks(self) -> float:
         """World time less host time, s: both run on this computer's clock, so once is enough."""
-        best: tuple[float, float] | None = None
+        trips: list[tuple[float, float]] = []
         for _ in range(30):
             before = self._clock.now()
             world = float(self._link.ask(op="time")["time"])
             after = self._clock.now()
-            if best is None or after - before < best[0]:
-                best = after - before, world - 0.5 * (before + after)
-        assert best is not None
-        self._clocks_known = self._clock.wall(0.5 * best[0])
-        return best[1]
+            trips.append((after - before, world - 0.5 * (before + after)))
+        shortest, ahead = min(trips, key=lambda trip: trip[0])
+        self._clocks_known = self._clock.wall(0.5 * shortest)
+        return ahead
 
     def _require_in_time(self) -> None:
         """Watch for a moment; `DeviceFault` (sim.late) when a device is not told of, or too late."""
@@ -318,9 +300,13 @@ class DeviceFollowing:
         finally:
             link.close()
 
+    def _switch(self, is_on: Callable[[], bool]) -> Feed:
+        """Of a laser or claw that does not hang on the arm: whether it is on."""
+        return lambda: nullcontext(lambda: [[self._clock.now(), float(is_on())]])
+
     def _tell_all(self, link: WorldLink, name: str, feed: Feed) -> None:
         period = AT_REST_S if name == "vehicle" else PERIOD_S
-        with feed.open() as newest:
+        with feed() as newest:
             while not self._closed.wait(period):
                 if not (rows := newest()):
                     continue

@@ -73,13 +73,6 @@ class SurfacePanel(NamedTuple):
     features: tuple[FeatureSeen, ...] = ()
 
 
-class StripePanel(NamedTuple):
-    """A frame of the sweep (h, w), 8 bit, and the stripe found in it, (n, 2) px of column and row."""
-
-    image: Image
-    stripe: Vector | None
-
-
 def draw_board(axes: Axes, board: BoardPanel) -> None:
     """The photograph, cut to the board's surroundings, with every point found drawn over it."""
     axes.imshow(board.image, **GREY)
@@ -188,16 +181,16 @@ def seam_words(seam: Mapping[str, Any]) -> str:
     )
 
 
-def draw_stripe(axes: Axes, stripe: StripePanel) -> None:
-    """A frame of the sweep with its stripe."""
-    axes.imshow(stripe.image, **GREY)
+def draw_stripe(axes: Axes, image: Image, stripe: Vector | None) -> None:
+    """A frame of the sweep (h, w), 8 bit, and the stripe found in it, (n, 2) px of column and row."""
+    axes.imshow(image, **GREY)
     axes.set_xlabel("column in px")
     axes.set_ylabel("row in px")
-    if stripe.stripe is None:
+    if stripe is None:
         _title(axes, ["the last frame of the sweep"])
         return
-    axes.plot(stripe.stripe[:, 0], stripe.stripe[:, 1], ",", color="tab:red")
-    _title(axes, [f"the middle of the sweep: the stripe found in {len(stripe.stripe)} rows"])
+    axes.plot(stripe[:, 0], stripe[:, 1], ",", color="tab:red")
+    _title(axes, [f"the middle of the sweep: the stripe found in {len(stripe)} rows"])
 
 
 def draw_error(
@@ -307,7 +300,7 @@ def draw_run(
             areas=job.surface.area,
         )  # fmt: skip
     elif stripe is not None:
-        draw_stripe(middle[0], stripe)
+        draw_stripe(middle[0], *stripe)
     if report["outcome"] == "placed":
         draw_error(right, report["truth"], report["place_bound_95"], report["tolerance"]["translation_mm"], seen)
     else:
@@ -349,13 +342,13 @@ def _surface(job: Job, nominal: NominalSurface, result: RunResult, evidence: Ref
     return SurfacePanel(points, None, believed=False)
 
 
-def _stripe(result: RunResult, frames: FrameStore) -> StripePanel | None:
+def _stripe(result: RunResult, frames: FrameStore) -> tuple[Image, Vector | None] | None:
     """The middle of the sweep, or the last frame of one that broke off."""
     sweep = result.results.get("laser_sweep")
     if isinstance(sweep, SweepRecord):
         profile = sweep.middle_profile
         rows = profile.rows.astype(float)
-        return StripePanel(sweep.middle.image, np.column_stack([profile.centres[profile.rows], rows]))
+        return sweep.middle.image, np.column_stack([profile.centres[profile.rows], rows])
     if frames.last is not None and frames.last[0] == "stripe":
-        return StripePanel(frames.last[1].image, None)
+        return frames.last[1].image, None
     return None

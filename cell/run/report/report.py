@@ -149,7 +149,8 @@ class FinishedJob:
         # Where something creeps, the part went elsewhere than where the sweep saw the place.
         pose = getattr(self.result.results.get("place"), "pose", None) or pose
         report["place_pose"] = _pose(pose, self.job)
-        report["place_sigma"] = _sigma(pose)
+        sigma = _mm_mrad(np.sqrt(np.diag(pose.covariance)), digits=5)
+        report["place_sigma"] = {"frame": "arm base, about the surface's origin", **sigma}
         if (seen := seen_placed(self.result)) is not None:
             # What was seen says more than what was stated before.
             frame = "surface" if not self.job.unloads else "arm base"
@@ -170,13 +171,15 @@ class FinishedJob:
         if isinstance(pose, PlacePose) and witness.at_sweep is not None:
             # Arm base axes, at the sweep; also where the place was refused.
             sought = "base_from_part" if job.unloads else "base_from_surface"
-            report["pose_error"] = _apart(difference(pose.base_from_surface, pose_of(witness.at_sweep, sought)))
+            report["pose_error"] = _mm_mrad(difference(pose.base_from_surface, pose_of(witness.at_sweep, sought)))
             report["pose_error_units"] = {"translation_mm": "mm", "rotation_mrad": "mrad"}
         if report["outcome"] not in ("placed", "misplaced") or not isinstance(pose, PlacePose):
             return
         if job.unloads:
             if (nested := seen_placed(result)) is not None:
-                report["nest_error"] = _apart(difference(nested.seen.surface_from_part, pose_of(now, "base_from_part")))
+                report["nest_error"] = _mm_mrad(
+                    difference(nested.seen.surface_from_part, pose_of(now, "base_from_part"))
+                )
             return
         truth = place_error(job, nominal, now)
         assert isinstance(sweep, SweepRecord)
@@ -193,7 +196,7 @@ class FinishedJob:
             truth["sensor_mm"] = sensor_error(made.cloud, nominal, witness.at_sweep)
         report["truth"] = truth
         if (seen := seen_placed(result)) is not None:
-            truth["seen_error"] = _apart(difference(seen.seen.surface_from_part, pose_of(now, "surface_from_part")))
+            truth["seen_error"] = _mm_mrad(difference(seen.seen.surface_from_part, pose_of(now, "surface_from_part")))
 
 
 def _write(folder: Path, report: dict[str, object]) -> None:
@@ -206,16 +209,14 @@ def _write(folder: Path, report: dict[str, object]) -> None:
 
 
 def _steps(result: RunResult) -> list[dict[str, object]]:
-    rows = []
-    for step in result.steps:
-        made = result.results.get(step.name)
-        rows.append(
-            {
-                "name": step.name, "state": step.state, "duration_s": round(step.duration_s, 3),
-                "wall_s": round(step.wall_s, 3), "retries": step.retries, "result": summary_of(made),
-            }
-        )  # fmt: skip
-    return rows
+    return [
+        {
+            "name": step.name, "state": step.state, "duration_s": round(step.duration_s, 3),
+            "wall_s": round(step.wall_s, 3), "retries": step.retries,
+            "result": summary_of(result.results.get(step.name)),
+        }
+        for step in result.steps
+    ]  # fmt: skip
 
 
 def _faults(result: RunResult) -> list[dict[str, object]]:
@@ -233,15 +234,6 @@ def _pose(pose: PlacePose, job: Job) -> dict[str, object]:
     }
 
 
-def _sigma(pose: PlacePose) -> dict[str, object]:
-    sigma = np.sqrt(np.diag(pose.covariance))
-    return {
-        "frame": "arm base, about the surface's origin",
-        "translation_mm": [round(1e3 * float(v), 5) for v in sigma[:3]],
-        "rotation_mrad": [round(1e3 * float(v), 5) for v in sigma[3:]],
-    }
-
-
 def _configured_noise(config: CellConfig) -> dict[str, object]:
     arm = config.arm
     return {
@@ -254,11 +246,11 @@ def _configured_noise(config: CellConfig) -> dict[str, object]:
     }  # fmt: skip
 
 
-def _apart(error: Vector) -> dict[str, list[float]]:
-    """A difference (6,) of two poses, m and rad, as the report has it."""
+def _mm_mrad(motion: Vector, digits: int = 4) -> dict[str, list[float]]:
+    """Six numbers of a motion, m and rad, as the report has them."""
     return {
-        "translation_mm": [round(1e3 * float(v), 4) for v in error[:3]],
-        "rotation_mrad": [round(1e3 * float(v), 4) for v in error[3:]],
+        "translation_mm": [round(1e3 * float(v), digits) for v in motion[:3]],
+        "rotation_mrad": [round(1e3 * float(v), digits) for v in motion[3:]],
     }
 
 
@@ -304,10 +296,8 @@ def expected_error(
     the covariance was stated with. The arm's kinematic error is in it as configured, which is part of the pose's
     covariance.
     """
-    sigma = {
-        name: truth["assumed_noise"][name]["sigma"] for name in ("arm_repeatability", "arm_repeatability_rotation")
-    }
-    radial, angle = sigma["arm_repeatability"], sigma["arm_repeatability_rotation"]
+    noise = truth["assumed_noise"]
+    radial, angle = (noise[name]["sigma"] for name in ("arm_repeatability", "arm_repeatability_rotation"))
     assumed = np.diag([radial**2 / 3] * 3 + [angle**2] * 3)
     points, _ = placed_points(job, nominal, pose)
     covariance = point_covariances(job, nominal, pose, pose.covariance, assumed)

@@ -130,7 +130,7 @@ def test_a_jog_that_was_stopped_goes_on_to_its_goal_and_no_further(cell: Cell) -
 
 def test_manual_mode_asks_at_the_desk_takes_no_step_meanwhile_and_goes_on(cell: Cell) -> None:
     controller = ConsoleController(cell, "pot", lambda client, words: None)
-    controller.joined("c1")
+    controller.holders.joined("c1")
     controller.do("c1", {"do": "hold", "name": "Ann"})
     controller.do("c1", {"do": "manual", "on": True})
     step = {"do": "jog_step", "device": "arm", "axis": "z", "amount": 0.01}
@@ -158,7 +158,7 @@ def test_manual_mode_asks_at_the_desk_takes_no_step_meanwhile_and_goes_on(cell: 
 
 def test_an_arm_that_stopped_while_nothing_runs_is_unlocked_by_a_person_alone(cell: Cell) -> None:
     controller = ConsoleController(cell, "pot", lambda client, words: None)
-    controller.joined("c1")
+    controller.holders.joined("c1")
     simulated(cell).fault("arm.protective_stop")
     with pytest.raises(InterlockError, match="does not hold it"):
         controller.do("c1", {"do": "recover"})

@@ -131,7 +131,6 @@ def _options(
 
 
 def _from_folder(folder: Path, board: str | None, said: Options, json: bool, details: bool) -> None:
-    from cell.apps.cli.calibration.calibrate import print_recorded
     from cell.apps.recordings.command import calibrate_folder
     from cell.base.storage import sealed
     from cell.measure.vision.board.view import parse_board

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -19,7 +20,9 @@ if TYPE_CHECKING:
 
 
 def jog(
-    device: Annotated[str | None, typer.Argument(help="rail, arm or vehicle.", autocompletion=options.jogged)] = None,
+    device: Annotated[
+        str | None, typer.Argument(help="rail, arm or vehicle.", autocompletion=options.among("rail", "arm", "vehicle"))
+    ] = None,
     motion: Annotated[
         list[str] | None,
         typer.Argument(help="rail: +5mm · arm: z -10mm, rx +2deg or j3 +5deg · vehicle: +0.1m or +5deg."),
@@ -61,7 +64,8 @@ def jog(
 
 def home(
     device: Annotated[
-        str | None, typer.Argument(help="rail or arm alone; without it both.", autocompletion=options.homed)
+        str | None,
+        typer.Argument(help="rail or arm alone; without it both.", autocompletion=options.among("rail", "arm")),
     ] = None,
     config: ConfigOption = None,
     sim: options.SimOption = None,
@@ -182,7 +186,7 @@ def devices(json: JsonOption = False) -> None:
 
     rows = installed()
     if json:
-        print_json([row.as_dict() for row in rows])
+        print_json([asdict(row) for row in rows])
         return
     from rich.text import Text
 

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -93,7 +94,7 @@ def qualify(
     page, line = write_page(campaign.folder, answer, rows, more), keep_line(answer, job, path)
     if json:
         told = answer.as_dict() | {"folder": str(campaign.folder), "page": str(page), "kept": str(line)}
-        print_json(told if compared is None else {**told, "compared": compared.as_dict()})
+        print_json(told if compared is None else {**told, "compared": asdict(compared)})
     else:
         _print([*tables_of(answer), *more], answer, page, line)
     raise typer.Exit(EXIT_FAILED if answer.unnoticed.count or "error" in answer.shares else 0)

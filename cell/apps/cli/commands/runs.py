@@ -200,7 +200,6 @@ def export(
     json: JsonOption = False,
 ) -> None:
     """Write a run's cloud as PLY or mesh, coloured by its deviation from the nominal surface, in metres."""
-    from cell.config.cell_config import beside, find_config, load_config
     from cell.run.folder import find_run
     from cell.run.report.export import SUFFIXES, export_run
     from drivers.common.units import parse_quantity
@@ -209,8 +208,7 @@ def export(
         end = parse_quantity(limit, "mm", 0.001, 100)
     except ValueError as error:
         raise ConfigError(f"--limit: {error}") from error
-    source = find_config(config, simulated=True)
-    folder = find_run(beside(source) / load_config(source).cell.runs, name, "job")
+    folder = find_run(folder_of_runs(config), name, "job")
     path = out or folder / f"export-{kind}{SUFFIXES[kind]}"
     if path.suffix.lower() != SUFFIXES[kind]:
         raise ConfigError(f"--out {path}: a file of format {kind} ends in {SUFFIXES[kind]}")

@@ -196,7 +196,7 @@ class Console:
                     self.controller.jog_end(client)
                     self._say(client, {"type": "jog", "press": 0, "state": "refused", "text": str(error)[:400]})
             case Joined(client):
-                self.controller.joined(client)
+                self.controller.holders.joined(client)
             case Left(client):
                 self.controller.left(client)
             case Do(number, client, words):

@@ -197,10 +197,6 @@ class ConsoleController:
             "pace": self._pace,
         }
 
-    def joined(self, client: str) -> None:
-        """A page was opened."""
-        self.holders.joined(client)
-
     def left(self, client: str) -> None:
         """A page is gone: what it held stops."""
         self.presses.left(client)

@@ -12,6 +12,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, wait
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -45,9 +46,7 @@ class Press:
     ended: str | None = None
     beat: Callable[[], None] | None = None
     """Tells the watch beside the device, once that stands."""
-
-    def __post_init__(self) -> None:
-        self._end = threading.Event()
+    _end: threading.Event = field(default_factory=threading.Event)
 
     def renew(self) -> None:
         """A beat has come."""
@@ -161,8 +160,7 @@ Told = Callable[[Press, str, str], None]
 @dataclass(frozen=True, eq=False)
 class _Step:
     wish: Jog
-    done: threading.Event
-    answer: list[dict[str, str] | BaseException]
+    answer: Future[dict[str, str]] = field(default_factory=Future)
 
 
 class Manual:
@@ -220,15 +218,12 @@ class Manual:
         """One step, to its end; where the device is then, in words. Raises what refuses it."""
         _require_small(wish)
         self._require_on()
-        step = _Step(wish, threading.Event(), [])
+        step = _Step(wish)
         self._wanted.put(step)
-        while not step.done.wait(0.05):
+        while not wait([step.answer], 0.05).done:
             if not self.on:
                 raise Aborted("manual mode has ended; the step was not done")
-        (answer,) = step.answer
-        if isinstance(answer, BaseException):
-            raise answer
-        return answer
+        return step.answer.result()
 
     def press(self, press: Press) -> None:
         """A button is held: move until it is not."""
@@ -268,21 +263,19 @@ class Manual:
             wanted.end(NOT_DONE)
             self._notify(wanted, "refused", NOT_DONE)
         else:
-            wanted.answer.append(Aborted(NOT_DONE))
-            wanted.done.set()
+            wanted.answer.set_exception(Aborted(NOT_DONE))
 
     def _do_step(self, step: _Step, context: WorkContext) -> None:
         wish = step.wish
         try:
-            answer: dict[str, str] | BaseException = moved(self._cell, wish, self._job, context)
+            step.answer.set_result(moved(self._cell, wish, self._job, context))
         except (Aborted, CellError) as error:
-            answer = error
-        log.info("jog step: %s %s %+g: %s", wish.device, wish.axis, wish.amount, answer)
-        step.answer.append(answer)
-        step.done.set()
+            step.answer.set_exception(error)
+        failure = step.answer.exception()
+        log.info("jog step: %s %s %+g: %s", wish.device, wish.axis, wish.amount, failure or step.answer.result())
         context.check()
-        if _needs_person(answer):
-            raise answer
+        if _needs_person(failure):
+            raise failure
 
     def _hold(self, press: Press, context: WorkContext) -> None:
         if press.over() is not None:

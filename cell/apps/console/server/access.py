@@ -249,9 +249,6 @@ def _same(known: str, given: str) -> bool:
     return secrets.compare_digest(known.encode(), given.encode("utf-8", "surrogatepass"))
 
 
-LONGEST_NAME = 40
-
-
 class Holders:
     """The clients by their ids, with their names, and the one that holds. Callable from any thread.
 
@@ -301,7 +298,7 @@ class Holders:
                     "cell", f"{self.name(str(self._holder))} holds it; ask them to hand it over, or to leave it"
                 )
             # As it is shown to others and written to journals: one short line.
-            self._names[client] = " ".join("".join(c for c in name if c.isprintable()).split())[:LONGEST_NAME]
+            self._names[client] = " ".join("".join(c for c in name if c.isprintable()).split())
             self._holder = client
             return f"{self.name(client)} holds the cell"
 

@@ -47,6 +47,6 @@ def test_names_are_offered_and_nothing_where_something_is_wrong(here: Path) -> N
     assert completing.jobs("p") == [name for name in shipped_jobs() if name.startswith("p")]
     assert (completing.devices(""), completing.effects("rolling")) == (list(DEVICES), ["rolling_shutter"])
     assert (set(completing.effects("")), completing.steps("laser")) == (set(Effects.names()), ["laser_sweep"])
-    assert (completing.jogged("v"), completing.homed("v")) == (["vehicle"], [])
+    assert completing.among("rail", "arm", "vehicle")("v") == ["vehicle"]
     context = type("Context", (), {"params": {"config": Path("broken.toml")}})()
     assert completing.runs(context, "") == []

@@ -27,8 +27,8 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cell]:
 @pytest.fixture
 def controller(cell: Cell) -> Iterator[ConsoleController]:
     made = ConsoleController(cell, "pot", lambda client, words: None)
-    made.joined("c1")
-    made.joined("c2")
+    made.holders.joined("c1")
+    made.holders.joined("c2")
     yield made
     made.close()
 

@@ -40,8 +40,8 @@ def test_a_message_that_goes_wrong_ends_nothing(cell: Cell, console: Console, mo
         raise OverflowError("int too large to convert to float")
 
     ann = Browser(console.link)
-    for name in ("beat", "joined"):
-        monkeypatch.setattr(console.controller, name, fail)
+    monkeypatch.setattr(console.controller, "beat", fail)
+    monkeypatch.setattr(console.controller.holders, "joined", fail)
     with ann.live() as page:
         key = json.loads(page.recv(timeout=20))["key"]
         page.send(json.dumps({"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1}))
@@ -67,7 +67,8 @@ def test_a_killed_server_is_noticed_whatever_the_other_threads_do(
     gone, held = threading.Event(), threading.Event()
     with Console(cell, "pot", gone=gone.set) as console:
         console._heard(Beat("c1", {"type": "jog", "press": 1, "at": 10**400}))
-        monkeypatch.setattr(console.controller, hung, lambda *_: held.wait(60))
+        owner = console.controller.holders if hung == "joined" else console.controller
+        monkeypatch.setattr(owner, hung, lambda *_: held.wait(60))
         browser = Browser(console.link)
         with browser.live() as page:
             page.send(json.dumps({"type": "jog", "press": 1, "device": "arm", "axis": "z", "sign": 1}))

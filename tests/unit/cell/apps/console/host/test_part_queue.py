@@ -26,7 +26,7 @@ def controller(calibrated_folder: Path) -> Iterator[ConsoleController]:
     true = described(calibrated_folder / "true", MOVED)[0]
     with Cell.open(config, sim="all", clock="virtual", seed=2, job=own, truth=true) as cell:
         made = ConsoleController(cell, "own", lambda client, words: None)
-        made.joined("c1")
+        made.holders.joined("c1")
         made.do("c1", {"do": "hold", "name": "Ann"})
         yield made
         made.close()
