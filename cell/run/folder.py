@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 from cell.base.storage import EditedError, read_json
-from cell.base.storage import write_json as write_json
 from drivers.errors import CellError, ConfigError
 from statemachine.journal import FILE_NAME as JOURNAL
 from statemachine.journal import JournalError, JournalRecord, read

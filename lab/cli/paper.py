@@ -47,7 +47,7 @@ def table1(seeds: SeedsOption = 20, json: JsonOption = False, out: OutOption = N
 def _show(result: dict[str, object], json: bool, out: Path | None, name: str) -> None:
     show(result, json)
     if out is not None:
-        from cell.run.folder import write_json
+        from cell.base.storage import write_json
 
         out.mkdir(parents=True, exist_ok=True)
         write_json(out / f"{name}.json", result)

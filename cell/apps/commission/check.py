@@ -16,9 +16,10 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from cell.base.storage import write_json
 from cell.config.cell_config import CellConfig
 from cell.config.job import Job
-from cell.run.folder import release, write_json
+from cell.run.folder import release
 from cell.run.report.page import render
 from drivers.errors import CellError, ConfigError
 from drivers.interfaces import Reading

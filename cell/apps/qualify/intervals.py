@@ -40,11 +40,6 @@ class Share:
         return float(betaincinv(self.count + 1.0, self.of - self.count, 1.0 - TAIL))
 
     @property
-    def between(self) -> tuple[float, float]:
-        """Both ends of the interval."""
-        return self.low, self.high
-
-    @property
     def half_width(self) -> float:
         """Half of the interval."""
         return 0.5 * (self.high - self.low)

@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Protocol
 
 from cell.apps.qualify.rows import Row
-from cell.apps.qualify.world import ONE_THREAD, WorldTask, run_world
+from cell.apps.qualify.world import WorldTask, limit_threads, run_world
 from drivers.errors import CellError, ConfigError
 
 if TYPE_CHECKING:
@@ -59,12 +59,6 @@ def require_workers(count: int) -> None:
         raise ConfigError(f"{count} workers are none (allowed: 1 to {MOST_WORKERS}); give another number")
 
 
-def _on_one_thread() -> None:
-    """Before any process starts, which inherits it."""
-    for name in ONE_THREAD:
-        os.environ.setdefault(name, "1")
-
-
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0))
@@ -82,7 +76,7 @@ class Processes:
 
     def __post_init__(self) -> None:
         require_workers(self.room)
-        _on_one_thread()
+        limit_threads()
 
     def begin(self, task: WorldTask) -> None:
         """See `Workers`."""
@@ -227,7 +221,7 @@ def _prepare() -> None:
     import dask
 
     dask.config.set({"distributed.scheduler.allowed-failures": 0, "distributed.comm.timeouts.connect": ANSWER_S})
-    _on_one_thread()
+    limit_threads()
 
 
 def _connected(scheduler: str) -> Cluster:

@@ -72,7 +72,7 @@ def run_world(task: WorldTask) -> Row | None:
     None where a signal ended it. What the run raises becomes a row. Raises `ConfigError` where this worker has another
     code, job or configuration than the campaign: its row would be of something else.
     """
-    _on_one_thread()
+    _be_a_worker()
     begun = time.monotonic()
     try:
         with tempfile.TemporaryDirectory(prefix="cell-qualify-") as scratch:
@@ -177,11 +177,16 @@ def _require_same(task: WorldTask, config: CellConfig) -> None:
         )
 
 
-def _on_one_thread() -> None:
-    import cv2
-
+def limit_threads() -> None:
+    """One thread for linear algebra, in this process and those that inherit its environment."""
     for name in ONE_THREAD:
         os.environ.setdefault(name, "1")
+
+
+def _be_a_worker() -> None:
+    import cv2
+
+    limit_threads()
     cv2.setNumThreads(1)
     # What a run warns of is in its row; a worker has nobody who reads it.
     if not (root := logging.getLogger()).handlers:

@@ -155,14 +155,6 @@ class CellCalibration:
     kinematics: str = ""
     edits: tuple[dict[str, Any], ...] = ()
 
-    @classmethod
-    def solve(
-        cls, scan: list[ScanObservation], target: list[TargetObservation], identities: dict[str, str],
-        config: CellConfig, kinematics: str = "", witness: PlateLine | None = None,
-    ) -> CellCalibration:  # fmt: skip
-        """From the observations; raises `RefusedError` when they do not determine it."""
-        return solve_observations(gathered(scan, target, identities, config, kinematics, witness=witness)).calibration
-
     def __str__(self) -> str:
         return f"calibration of {self.date}, hash {self.hash()}"
 

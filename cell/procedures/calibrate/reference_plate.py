@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
+import scipy
 from numpy.typing import NDArray
 
 from cell.config.calibrations.store import CellCalibration
@@ -54,13 +54,13 @@ def see_reference_plate(config: CellConfig, devices: Devices, keep: Keep) -> Pla
 
 def _require_no_bright_column(dark: NDArray[np.uint8]) -> None:
     """Raise `RefusedError` where a column of a picture without the laser is bright all along."""
-    mean = np.pad(dark.mean(axis=0), BESIDE_PX, mode="edge")
-    above = mean[BESIDE_PX:-BESIDE_PX] - np.median(sliding_window_view(mean, 2 * BESIDE_PX + 1), axis=1)
+    mean = dark.mean(axis=0)
+    above = mean - scipy.ndimage.median_filter(mean, 2 * BESIDE_PX + 1)
     if above.max() > BRIGHT_COLUMN_DN:
         raise RefusedError(
             f"column {above.argmax()} of the scan camera's pictures is {above.max():.0f} DN brighter than those "
-            f"beside it without the laser, too, allowed are {BRIGHT_COLUMN_DN:g} DN: the laser's line on the plate on "
-            "the claw is not told from it. Look at the sensor's hot columns and at other light, and mend it",
+            f"beside it without the laser (allowed: {BRIGHT_COLUMN_DN:g}): it hides the line on the plate on the claw. "
+            "Look at the sensor and at other light",
             Measured("column of the sensor brighter by", float(above.max()), "DN", most=BRIGHT_COLUMN_DN),
         )
 

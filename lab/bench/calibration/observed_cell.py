@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from cell.config.calibrations.store import CellCalibration, gathered, solve_observations
 from cell.config.cell_config import CellConfig
 from cell.measure.calibration import ScanObservation, TargetObservation
 from cell.measure.geometry.poses import from_matrix
@@ -203,6 +204,11 @@ class ObservedCell:
                 seen = self.scan_view(rest, self.carriage(position))
                 made.append(ScanObservation(seen, None, reported, position, f"fine {k + 1} {way}", same_rest=True))
         return made
+
+    def calibrated(self, arm: str) -> CellCalibration:
+        """The calibration by what it observes; the arm has this serial number."""
+        observed = self.collect_scan(), self.collect_target(), {"arm": arm}
+        return solve_observations(gathered(*observed, self.config)).calibration
 
     def collect_target(self) -> list[TargetObservation]:
         """What `cell.procedures.calibrate.boards.collect_target` brings, at the same views."""

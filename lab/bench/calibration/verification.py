@@ -205,7 +205,7 @@ def campaign(
     for seed in seeds:
         progress(f"seed {seed}: calibrating")
         cell = ObservedCell(draw(seed, level), config, np.random.default_rng([seed, 20]))
-        calibration = CellCalibration.solve(cell.collect_scan(), cell.collect_target(), {"arm": str(seed)}, config)
+        calibration = cell.calibrated(str(seed))
         truth, effect = cell.truth, at_place(calibration, job)
         alarms = result.alarms
         for _ in range(CHECKS_OF_A_GOOD_ONE):

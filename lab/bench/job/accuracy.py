@@ -224,8 +224,14 @@ def _covered(runs: Sequence[dict[str, Any]], name: str) -> float | None:
     return _average([run["covered"][name] for run in runs])
 
 
+def interval(count: int, of: int) -> tuple[float, float]:
+    """Both ends of the 95 % interval of a share."""
+    share = Share(count, of)
+    return share.low, share.high
+
+
 def _between(runs: Sequence[dict[str, Any]], name: str) -> tuple[float, float] | None:
-    return Share(sum(run["covered"][name] for run in runs), len(runs)).between if runs else None
+    return interval(sum(run["covered"][name] for run in runs), len(runs)) if runs else None
 
 
 def _average(values: Sequence[float] | Vector) -> float | None:

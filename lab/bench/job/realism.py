@@ -18,7 +18,7 @@ from cell.measure.geometry.poses import difference
 from cell.measure.inversion import PlacePose
 from cell.procedures.part_error import part_covariance
 from cell.run.report.report import pose_of
-from lab.bench.job.accuracy import WANTED, figures
+from lab.bench.job.accuracy import WANTED, figures, interval
 from lab.bench.job.scan_errors import COVERED
 from lab.bench.job.whole_job import JobRecord, job_and_surface, run_whole_job
 from lab.bench.over_cores import over_cores
@@ -129,7 +129,7 @@ def summed_up(effect: str, runs: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "size": noise.get(effect),
         "worlds": len(runs),
         **count,
-        "between": Share(count["inside"] + count["named"], len(runs)).between,
+        "between": interval(count["inside"] + count["named"], len(runs)),
         "pose_inside": _mean(runs, "pose_inside"),
         "part_inside": _mean(runs, "part_inside"),
         "outside_tolerance": sum(run["within_tolerance"] is False for run in runs),
@@ -145,7 +145,7 @@ def pooled(by_effect: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     """What was placed in all effects together. The effects share their seeds, so this is no more than a hint."""
     placed = [run for entry in by_effect.values() for run in entry["runs"] if run["outcome"] == "placed"]
     inside = sum(run["verdict"] == "inside" for run in placed)
-    return {"worlds": len(placed), "inside": inside, "between": Share(inside, len(placed)).between}
+    return {"worlds": len(placed), "inside": inside, "between": interval(inside, len(placed))}
 
 
 def is_well(entry: dict[str, Any]) -> bool:

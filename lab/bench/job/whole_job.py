@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from cell.config.calibrations.store import CellCalibration
+from cell.config.calibrations.store import CellCalibration, gathered, solve_observations
 from cell.config.cell_config import NO_FILES, CellConfig
 from cell.config.job import Job, load_job
 from cell.devices.simulated.described import Described
@@ -197,7 +197,7 @@ class _WholeJob:
         named = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
         identities = {device.name: device.identity().serial for device in named}
         known = identities, self.config, arm_table(self.config, self.cell.devices), witness
-        made = CellCalibration.solve(scan, target, *known)
+        made = solve_observations(gathered(scan, target, *known)).calibration
         made = look_at_shutter(self.config, devices, mover, made, context.check, keep)
         return with_edge(self.config, devices, keep, made)
 

@@ -17,8 +17,7 @@ RHO = np.linspace(0.15, 1.75, 33)
 """Where a ray is sampled, in radii."""
 STEP = float(RHO[1] - RHO[0])
 UNIT = np.column_stack([f(np.arange(RAYS) * 2 * np.pi / RAYS) for f in (np.cos, np.sin)])
-TWICE = np.column_stack([UNIT[:, 0] ** 2 - UNIT[:, 1] ** 2, 2 * UNIT[:, 0] * UNIT[:, 1]])
-DESIGN = np.column_stack([np.ones(RAYS), UNIT, TWICE])
+DESIGN = np.column_stack([np.ones(RAYS), UNIT, UNIT[:, 0] ** 2 - UNIT[:, 1] ** 2, 2 * UNIT[:, 0] * UNIT[:, 1]])
 """A circle of the dot's own coordinates, shifted and stretched: its radius along each ray."""
 TERMS = DESIGN.shape[1]
 INSIDE, OUTSIDE, SEARCHED = (9, 13), (22, 29), (7, len(RHO) - 1)

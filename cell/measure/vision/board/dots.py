@@ -61,14 +61,13 @@ def _attempt(
     views, reasons = [], []
     for index, places in dot_lattices(blobs, min(least, len(spec.lattice()))):
         try:
+            grown = blobs.take(index)
             if spec.kind != "marked_dots":
-                grown, places = _extended(image, blobs.take(index), places, spec.name)
-            else:
-                grown = blobs.take(index)
-            dots, sigma, scores = tell_dots(image, grown)
-            board_places, assumed = identify(
-                spec, _upright(places, dots.centres), np.where(np.isnan(sigma)[:, None], 0.0, scores)
-            )
+                grown, places = _extended(image, grown, places, spec.name)
+            # Well enough to tell them apart.
+            dots, sigma, signs = _measured(image, grown, 2)
+            scores = np.where(np.isnan(sigma)[:, None], 0.0, _ring_scores(signs))
+            board_places, assumed = identify(spec, _upright(places, dots.centres), scores)
             known = np.asarray((board_places >= 0).all(axis=1), dtype=np.bool_)
             views.append(_complete(image, spec, dots.take(known), board_places[known], assumed=assumed, scale=scale))
         except PictureRefused as refused:
@@ -113,10 +112,7 @@ def _upright(places: Places, pixels: Array) -> Places:
     """Lattice places turned by quarter turns so that the first step runs to the right in the picture."""
     fit = np.linalg.lstsq(np.column_stack([places, np.ones(len(places))]).astype(np.float64), pixels, rcond=None)[0]
     turns = int(np.round(np.arctan2(fit[0, 1], fit[0, 0]) / (np.pi / 2))) % 4
-    turned = places
-    for _ in range(turns):
-        turned = np.column_stack([-turned[:, 1], turned[:, 0]])
-    return turned
+    return np.asarray(places @ np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), turns))
 
 
 def _complete(image: Image, spec: BoardSpec, dots: Blobs, places: Places, assumed: bool, scale: int) -> BoardView:
@@ -199,23 +195,16 @@ def _ellipses(outlines: list[MatLike], size: tuple[int, int]) -> Blobs:
 def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blobs, Array]:
     """Dots re-measured from their edges, and one standard deviation (n,) of each centre in px.
 
-    A dot whose edge is not found all around gets the deviation NaN. `rounds` of refinement: two to tell dots apart,
-    more to measure them.
+    A dot whose edge is not found all around gets the deviation NaN.
     """
     return _measured(image, start, rounds)[:2]
-
-
-def tell_dots(image: Image, start: Blobs) -> tuple[Blobs, Array, Array]:
-    """Dots measured well enough to tell them apart, the deviations of their centres, and ring scores (n, 2)."""
-    dots, sigma, signs = _measured(image, start, 2)
-    return dots, sigma, _ring_scores(signs)
 
 
 def _measured(image: Image, start: Blobs, rounds: int) -> tuple[Blobs, Array, Array]:
     """As `measure_dots`, with what tells a ring (n, 4)."""
     centres, shapes = start.centres.copy(), start.shapes.copy()
     sigma, signs = np.full(len(centres), np.nan), np.zeros((len(centres), 4))
-    measure(np.ascontiguousarray(image), centres, shapes, rounds, sigma, signs)
+    measure(np.ascontiguousarray(image), centres, shapes, rounds, sigma=sigma, signs=signs)
     # A dot that wandered off its blob measures something else.
     wandered = np.linalg.norm(np.linalg.solve(start.shapes, (centres - start.centres)[:, :, None])[:, :, 0], axis=1)
     sigma[wandered > 0.7] = np.nan

@@ -219,7 +219,7 @@ class PlaneMap:
 def identify(spec: BoardSpec, places: Places, ring_scores: Array) -> tuple[Places, bool]:
     """Board places (n, 2) of lattice places (n, 2), and whether the order rests on an assumption.
 
-    `ring_scores` (n, 2) are the signs of rings of `tell_dots`. Entries that do not belong to the board get
+    `ring_scores` (n, 2) are the signs of rings. Entries that do not belong to the board get
     (−1, −1). Raises PictureRefused.
     """
     if spec.kind != "marked_dots":

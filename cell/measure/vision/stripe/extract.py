@@ -137,21 +137,17 @@ class StripeStream:
     """`extract` for one picture after the other of a stream, all of one size, with the stripe along rows."""
 
     def __init__(self) -> None:
-        self._like: StripeProfile | None = None
-        self._seen = 0
-
-    @property
-    def like(self) -> StripeProfile | None:
+        self.like: StripeProfile | None = None
         """What holds for the next picture; None where it is measured in it."""
-        return None if self._seen % BLOCK == 0 else self._like
+        self._seen = 0
 
     def extract(self, image: Image) -> StripeProfile:
         """The profile of the next picture (h, w); raises what `extract` raises."""
         profile = extract(image, like=self.like)
+        self._seen += 1
         # A block's first picture that shows too few lines, such as a covered one, says nothing of the others.
         told = profile.speckle is not None or profile.learned is not None
-        self._like = profile if told else replace(profile, noise=None)
-        self._seen += 1
+        self.like = None if self._seen % BLOCK == 0 else profile if told else replace(profile, noise=None)
         return profile
 
 

@@ -50,7 +50,7 @@ def job(root: Path, day: float, off: list[float] | None = None, shared: bool = F
 def placed_calibration() -> CellCalibration:
     config, rng = load_config(None), np.random.default_rng([3, 31])
     cell = ObservedCell(draw(3, "nominal"), config, rng)
-    return CellCalibration.solve(cell.collect_scan(), cell.collect_target(), {"arm": "3"}, config)
+    return cell.calibrated("3")
 
 
 def series(values: list[list[float]], limit: float = 0.18) -> DriftSeries:

@@ -10,8 +10,9 @@ from typing import Any
 import pytest
 
 from cell.apps.cli.display import HEIGHT, duration, end_screen, next_step, print_report
+from cell.base.storage import write_json
 from cell.config.job import job_path
-from cell.run.folder import new_run, read_report, run_row, write_json
+from cell.run.folder import new_run, read_report, run_row
 from drivers.errors import CellError
 from statemachine.journal import Journal
 from tests.support import Typed, report_runs

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from cell.base.storage import write_json
 from cell.measure.reconstruction.ply import read_cloud, write_cloud
-from cell.run.folder import write_json
 from cell.run.report.export import SUFFIXES, export_run
 from drivers.errors import ConfigError
 from lab.bench.job.whole_job import JobRecord

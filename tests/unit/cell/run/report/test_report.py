@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cell.base.storage import strict
+from cell.base.storage import strict, write_json
 from cell.config.job import SwathSection
-from cell.run.folder import write_json
 from drivers.errors import CellError
 from lab.bench.job.whole_job import JobRecord
 from tests.support import ROOT, report_runs

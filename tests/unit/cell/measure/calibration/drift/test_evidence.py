@@ -32,7 +32,7 @@ SEED = 5
 def calibrated():
     """A harsh world; from the drawn pose its fine board lies half out of the picture."""
     cell = ObservedCell(draw(SEED, "harsh"), CONFIG, np.random.default_rng([SEED, 7]))
-    return cell, CellCalibration.solve(cell.collect_scan(), cell.collect_target(), {"arm": "1"}, CONFIG)
+    return cell, cell.calibrated("1")
 
 
 def true_state(cell: ObservedCell, calibration: CellCalibration, chain: str) -> AdjustmentState:

@@ -51,7 +51,7 @@ def test_what_is_small_is_silent_what_is_more_is_stated_and_the_rest_is_refused(
 @pytest.fixture(scope="module")
 def calibrated() -> tuple[ObservedCell, CellCalibration]:
     cell = ObservedCell(draw(3, "nominal"), CONFIG, np.random.default_rng([3, 31]))
-    return cell, CellCalibration.solve(cell.collect_scan(), cell.collect_target(), {"arm": "3"}, CONFIG)
+    return cell, cell.calibrated("3")
 
 
 def look(cell: ObservedCell, calibration: CellCalibration, rests: int) -> HeadShift:

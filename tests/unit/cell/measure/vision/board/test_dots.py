@@ -36,17 +36,6 @@ def noisy(view, rng):
     return replace(view, pixels=view.pixels + view.sigma[:, None] * rng.normal(0, 1, view.pixels.shape))
 
 
-@pytest.mark.parametrize("aside", [-4.0, 0.0, 6.0])
-def test_a_laser_line_across_a_dot_moves_its_centre_by_little(aside):
-    y, x = np.mgrid[:64, :64]
-    dot = 200.0 - 160.0 * ndtr(12.0 - np.hypot(x - 31.3, y - 30.8))
-    line = 150.0 * np.exp(-0.5 * ((x - 31.3 - aside) / 1.5) ** 2)
-    start = Blobs(np.array([[31.0, 31.0]]), 12.5 * np.eye(2)[None])
-    for picture in (dot, np.minimum(dot + line, 255.0)):
-        found, sigma = measure_dots(np.rint(picture).astype(np.uint8), start)
-        assert np.abs(found.centres[0] - (31.3, 30.8)).max() < 0.06 and sigma[0] < 0.1
-
-
 @pytest.mark.parametrize("degrees", [5, 30, 50])
 def test_the_covariance_is_true_where_points_are_not_alike(degrees):
     rng = np.random.default_rng(degrees)

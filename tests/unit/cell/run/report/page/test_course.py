@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from cell.run.folder import write_json
+from cell.base.storage import write_json
 from cell.run.record.file import RecordFile
 from cell.run.report.page.course import (
     RAIL_M_S,

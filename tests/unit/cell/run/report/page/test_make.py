@@ -13,9 +13,9 @@ import pytest
 from typer.testing import CliRunner
 
 from cell.apps.cli.app import app
+from cell.base.storage import write_json
 from cell.measure.reconstruction.ply import write_cloud
 from cell.procedures.steps.reconstruct import Reconstruction
-from cell.run.folder import write_json
 from cell.run.report.page.make import MOST_BYTES, compared, identities, judged, make_page, verdict, write_page
 from drivers.errors import CellError
 from lab.bench.job.whole_job import JobRecord
