@@ -148,9 +148,10 @@ OPEN_M = 4e-6
 """What lost pictures may leave open of where the line leaves the plate: 2 ms."""
 BRIGHTENS = 1.25
 """Surroundings that become so many times as bright as the line leaves the plate follow it: gain is not fixed."""
-STEADY, WHOLE_SHARE = 1.3, 0.33
-"""Brightest over dimmest of the pictures of a passage in which all of the line is on the plate, and how many these are:
-speckle and noise leave a few per cent."""
+STEADY = 1.3
+"""Of the line's light at a place of the plate, from passage to passage: speckle and noise leave a few per cent."""
+Passage = tuple[Array, Array, Array]
+"""Places (n,) of the rail, m, rising; the share (n,) of the line's light on the plate; and that light, DN."""
 PASSES = 3
 """So often the rail takes the line over the edge when pictures are lost there."""
 
@@ -198,25 +199,26 @@ def look_at_edge(
     way = 1.0 if high - witness.rail > witness.rail - low else -1.0
     if near is None:
         begin, end = (float(np.clip(witness.rail + way * far, low, high)) for far in (0.0, REACH_M))
-        near = _crossing(*passed((begin, end), search), way)
+        near = _crossing(passed((begin, end), search), way)
         if near is None:
             return None
     begin, end = (float(np.clip(near + way * beside, low, high)) for beside in (-BESIDE_M, BESIDE_M))
-    fro = _crossing(*_whole(lambda: passed((begin, end), speed)), way)
-    to = _crossing(*_whole(lambda: passed((end, begin), speed)), way)
+    passages = [_whole(partial(passed, ends, speed)) for ends in ((begin, end), (end, begin))]
+    _require_steady(passages, way)
+    fro, to = (_crossing(passage, way) for passage in passages)
     if fro is None or to is None:
         return None
     return Edge(0.5 * (fro + to), way * (fro - to) / (2.0 * speed))
 
 
-def _whole(passed: Callable[[], tuple[Array, Array]]) -> tuple[Array, Array]:
+def _whole(passed: Callable[[], Passage]) -> Passage:
     """What `passed` gives, again where pictures were lost at the edge; `RefusedError` when they always are."""
     left_open = 0.0
     for _ in range(PASSES):
-        places, shares = passed()
-        left_open = _left_open(places, shares)
+        passage = passed()
+        left_open = _left_open(*passage[:2])
         if left_open <= OPEN_M:
-            return places, shares
+            return passage
     raise RefusedError(
         f"pictures were lost each of the {PASSES} times that the rail took the laser's line over the edge of the plate "
         f"on the claw: where the edge is stays open by {1e3 * left_open:.3f} mm, allowed are {1e3 * OPEN_M:g} mm. See "
@@ -226,10 +228,8 @@ def _whole(passed: Callable[[], tuple[Array, Array]]) -> tuple[Array, Array]:
     )
 
 
-def _passed(
-    devices: Devices, keep: Keep, witness: PlateLine, ends: tuple[float, float], speed: float
-) -> tuple[Array, Array]:
-    """Places (n,) of the rail, m, rising, and the share (n,) of the line's light on the plate."""
+def _passed(devices: Devices, keep: Keep, witness: PlateLine, ends: tuple[float, float], speed: float) -> Passage:
+    """One passage of the line over the edge."""
     rail, camera, laser = devices.rail, devices.scan_camera, devices.laser
     rail.move_to(rail.sweep_start(*ends, speed)).wait(30.0)
     times: list[float] = []
@@ -247,16 +247,16 @@ def _passed(
     begin, end = sweep.window
     inside = np.flatnonzero((np.array(times) >= begin) & (np.array(times) <= end))
     if len(inside) < LEAST_FRAMES:
-        return np.zeros(0), np.zeros(0)
+        return np.zeros(0), np.zeros(0), np.zeros(0)
     _require_fixed_gain(np.array(dark)[inside])
     places = np.array([sweep.position_at(times[k]) for k in inside])
     lit, order = np.array(light)[inside], np.argsort(places)
-    _require_steady(lit.sum(axis=1)[order])
+    whole_line = lit.mean(axis=1)
     # Each row against its own light on the plate: the plate's colour and the laser's profile fall out.
     bright = np.sort(lit, axis=0)[-BRIGHTEST:].mean(axis=0)
     whole = np.ma.masked_less(lit, 0.75 * bright).mean(axis=0).filled(0.0)
     lit = lit / np.maximum(whole, LEAST_LIGHT_DN)
-    return places[order], np.asarray(lit.mean(axis=1))[order]
+    return places[order], np.asarray(lit.mean(axis=1))[order], whole_line[order]
 
 
 def _require_fixed_gain(dark: Array) -> None:
@@ -272,15 +272,18 @@ def _require_fixed_gain(dark: Array) -> None:
         )
 
 
-def _require_steady(light: Array) -> None:
-    """Raise `RefusedError` where the line's light (n,), DN, in the order of the rail's places, varies on the plate."""
-    count = int(WHOLE_SHARE * len(light))
-    whole = max(light[:count], light[-count:], key=np.mean)
-    if whole.max() > STEADY * whole.min() > 0.0:
-        times = float(whole.max() / whole.min())
+def _require_steady(passages: Sequence[Passage], way: float) -> None:
+    """Raise `RefusedError` where the line is brighter in one of two passages than in the other at a place of the plate,
+    which ends in direction `way`."""
+    (here, _, light), (there, _, other) = passages
+    half = max(LEAST_LIGHT_DN, 0.5 * light.max(initial=0.0), 0.5 * other.max(initial=0.0))
+    end = min((way * at[lit > half]).max(initial=-np.inf) for at, lit in ((here, light), (there, other)))
+    on = way * here < end - BESIDE_M / 3
+    ratio = light[on] / np.interp(here[on], there, other) if on.any() else np.ones(1)
+    if (times := float(max(ratio.max(), 1.0 / ratio.min()))) > STEADY:
         raise RefusedError(
-            f"the laser's line on the plate on the claw becomes {times:.1f} times as bright from picture to picture, "
-            f"allowed are {STEADY:g} times: the laser flickers, or the exposure changes. See its supply and its "
+            f"the laser's line on the plate on the claw is {times:.1f} times as bright in one passage over it as in "
+            f"the next, allowed are {STEADY:g} times: the laser flickers, or the exposure changes. See its supply and its "
             "modulation input, and switch the camera's auto exposure off",
             Measured("line brighter from picture to picture", times, "times", most=STEADY),
         )
@@ -305,8 +308,9 @@ def _left_open(places: Array, shares: Array) -> float:
     return float(np.sum((0.5 * apart * np.abs(np.diff(shares)))[lost]))
 
 
-def _crossing(places: Array, shares: Array, way: float) -> float | None:
-    """Where by `places` the line leaves the plate, in direction `way`, by the area under its `shares`."""
+def _crossing(passage: Passage, way: float) -> float | None:
+    """Where the line leaves the plate, in direction `way`, by the area under its shares."""
+    places, shares, _ = passage
     if len(places) < LEAST_FRAMES:
         return None
     on, off = (shares[:2], shares[-2:]) if way > 0 else (shares[-2:], shares[:2])

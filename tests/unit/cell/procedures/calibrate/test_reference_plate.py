@@ -125,12 +125,6 @@ def test_pictures_that_are_paired_one_off_are_seen(cell, monkeypatch: pytest.Mon
 
 
 def test_a_laser_that_flickers_is_named_before_it_looks_like_a_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
-    light: list[np.ndarray] = []
-    steady = reference_plate._require_steady
-    monkeypatch.setattr(reference_plate, "_require_steady", lambda seen: (light.append(seen), steady(seen)))
-    looked(cell[0], cell[1])
-    whole = [np.sort(seen)[-len(seen) // 3 :] for seen in light]
-    assert len(whole) == 2 and max(seen.max() / seen.min() for seen in whole) < 1.1, "a third of what is allowed"
     cameras, clock = cell[0].world._cameras, cell[0].devices.clock
     laser = cameras.laser
 
@@ -139,7 +133,9 @@ def test_a_laser_that_flickers_is_named_before_it_looks_like_a_slip(cell, monkey
         return replace(now, brightness=(0.75 + 0.25 * np.sin(9.0 * clock.now())) * now.brightness)
 
     monkeypatch.setattr(cameras, "laser", flickers)
-    with pytest.raises(RefusedError, match=r"1\.\d times as bright from picture to picture.*the laser flickers"):
+    with pytest.raises(
+        RefusedError, match=r"\d\.\d times as bright in one passage over it as in the next.*the laser flickers"
+    ):
         looked(cell[0], cell[1])
 
 
