@@ -283,8 +283,8 @@ def _require_steady(passages: Sequence[Passage], way: float) -> None:
     if (times := float(max(ratio.max(), 1.0 / ratio.min()))) > STEADY:
         raise RefusedError(
             f"the laser's line on the plate on the claw is {times:.1f} times as bright in one passage over it as in "
-            f"the next, allowed are {STEADY:g} times: the laser flickers, or the exposure changes. See its supply and its "
-            "modulation input, and switch the camera's auto exposure off",
+            f"the next, allowed are {STEADY:g} times: the laser flickers, or the exposure changes. See its supply and "
+            "its modulation input, and switch the camera's auto exposure off",
             Measured("line brighter from picture to picture", times, "times", most=STEADY),
         )
 
