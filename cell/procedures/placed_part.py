@@ -16,7 +16,7 @@ from cell.measure.inversion.local_deviation import LocalDeviation
 from cell.measure.inversion.mating import MatingGap
 from cell.measure.inversion.part_pose import SHIFTED, PartPose, of_part
 from cell.measure.inversion.whole_face import MOST_UNLIKE, FacePatch
-from cell.procedures.part_error import draws_of
+from cell.procedures.part_error import DRAWS, draws_of
 from cell.procedures.part_features import NOT_SEEN, FeatureSeen
 from drivers.errors import Measured, MisplacedError
 from drivers.interfaces import Vector
@@ -32,7 +32,7 @@ NO_FLUSH = "how flush its edge is was not seen: no surface shows near it, or a v
 BENT = "the part, or the surface beside it, is bent: look along its edge"
 NEXT_STEP = "See to it, take the part away, then run the job with the next part"
 OFF_DRAWING = "the part itself is not as drawn there: bent, worn, cut, or another one"
-INTERFERENCE_M = 15e-6
+INTERFERENCE_M = 5e-6
 """Interference that form and dirt explain, m, beyond noise and what the pose of the part is off by."""
 HANGS_M = 10e-6
 """Clearance that form explains, m: whatever bears a part, some of the squares are closed there."""
@@ -121,10 +121,10 @@ class PlacedPart:
         found = replace(self, gap=gap, before=before)
         if gap is None or self.unseen:
             return found
-        interference, off = 0.0, np.zeros(6)
-        if gap.interference > INTERFERENCE_M + self.unsure:
-            interference = gap.interference
-            off = ASIDE * gap.off_contact(self.seen.surface_from_part.translation, SHIFTED)
+        interference, off, about = 0.0, np.zeros(6), self.seen.surface_from_part.translation
+        by_pose = gap.by_motions(draws_of(self.covariance)[:DRAWS], about, SURE_PERCENT)
+        if gap.interference > INTERFERENCE_M + by_pose:
+            interference, off = gap.interference, ASIDE * gap.off_contact(about, SHIFTED)
         elif before and gap.clearance > HANGS_M + self.unsure:
             interference, off[:2] = -gap.clearance, before[-1]
         return replace(found, interference=interference, covariance=self.covariance + np.diag(off**2))

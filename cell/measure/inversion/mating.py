@@ -61,10 +61,18 @@ class MatingGap:
         """What 98 % of the squares are apart by or more, m: more of them are nearly closed about what bears a part."""
         return float(np.percentile(self.gaps, 2))
 
+    def _opened(self, about: Array) -> Array:
+        """How much each gap opens (n, 6), m, with the part's motion, m and rad, surface axes, about a point (3,) m."""
+        return np.hstack([self.opening, np.cross(self.places - about, self.opening)])
+
+    def by_motions(self, motions: Array, about: Array, percent: float) -> float:
+        """Below what, m, `interference` stays for `percent` of these motions (n, 6) of a part that just touches."""
+        return float(np.percentile(np.percentile(-self._opened(about) @ motions.T, 95, axis=0), percent))
+
     def off_contact(self, about: Array, sigmas: Array) -> Array:
         """The motion (6,), m and rad, surface axes, about a point (3,) m, that would close all gaps: least squares with
         the prior `sigmas` (6,)."""
-        rows = np.hstack([self.opening, np.cross(self.places - about, self.opening)]) * sigmas
+        rows = self._opened(about) * sigmas
         normal = rows.T @ rows + FORM_M**2 * np.eye(6)
         return np.asarray(sigmas * np.linalg.solve(normal, rows.T @ self.gaps))
 

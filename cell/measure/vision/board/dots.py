@@ -6,6 +6,7 @@ several scales; each dot is then measured by its edge (`dot_edges.py`).
 
 import cv2
 import numpy as np
+import scipy
 from cv2.typing import MatLike
 
 from cell.measure.geometry.camera import Array
@@ -18,7 +19,6 @@ from cell.measure.vision.pictures import Image, PictureRefused, Reason, counts_o
 LEAST_SIGMA_PX = 0.004
 LEAST_DOTS = 12
 SMALL_PX = 400_000
-AROUND = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1) if (a, b) != (0, 0)]
 # Window of the local threshold as a share of the picture's larger side, most common first.
 WINDOWS = (0.06, 0.12, 0.03, 0.25)
 # Thresholds at which the only lattice is another board: further ones would find the same, sixteen times as slowly.
@@ -35,9 +35,7 @@ def find_dots(image: Image, spec: BoardSpec) -> BoardView:
     contrast = percentile(few, 97) - percentile(few, 3)
     # Enlarging helps small pictures of small dots, and only those.
     for scale in (1, 2) if image.size <= SMALL_PX else (1,):
-        picture = (
-            image if scale == 1 else np.asarray(cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC))
-        )
+        picture = image if scale == 1 else cv2.resize(image, None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
         for share in WINDOWS:
             window = int(share * max(picture.shape)) | 1
             for offset in (max(4.0, 0.12 * contrast), max(2.0, 0.03 * contrast)):
@@ -64,7 +62,6 @@ def _attempt(
             grown = blobs.take(index)
             if spec.kind != "marked_dots":
                 grown, places = _extended(image, grown, places, spec.name)
-            # Well enough to tell them apart.
             dots, sigma, signs = _measured(image, grown, 2)
             scores = np.where(np.isnan(sigma)[:, None], 0.0, _ring_scores(signs))
             board_places, assumed = identify(spec, _upright(places, dots.centres), scores)
@@ -82,17 +79,14 @@ def _extended(image: Image, dots: Blobs, places: Places, name: str) -> tuple[Blo
     """The lattice with the dots in its gaps and next to it that the threshold missed, as in a shadow's edge."""
     for _ in range(2):
         plane = PlaneMap.fit(places, dots.centres, 0.1 * float(np.ptp(dots.centres, axis=0).max()), name)
-        low, high = places.min(axis=0) - 1, places.max(axis=0) + 1
-        grid = np.stack(np.meshgrid(*(np.arange(a, b + 1) for a, b in zip(low, high, strict=True))), -1).reshape(-1, 2)
-        held = {tuple(p) for p in places.tolist()}
-        beside = [
-            p
-            for p in grid.tolist()
-            if tuple(p) not in held and sum((p[0] + a, p[1] + b) in held for a, b in AROUND) >= 2
-        ]
-        if not beside:
+        low = places.min(axis=0) - 1
+        held = np.zeros(np.ptp(places, axis=0) + 3)
+        held[tuple((places - low).T)] = 1.0
+        neighbours = scipy.ndimage.convolve(held, np.ones((3, 3)), mode="constant")
+        beside = np.argwhere((held == 0.0) & (neighbours > 1.5)) + low
+        if not len(beside):
             break
-        flat = np.array(beside, dtype=np.float64)
+        flat = beside.astype(np.float64)
         middles, steps = plane.pixels(flat), plane.steps(flat)
         radius = _relative_radius(dots, plane.steps(places.astype(np.float64)))
         guess = Blobs(middles, radius * steps)
@@ -104,7 +98,7 @@ def _extended(image: Image, dots: Blobs, places: Places, name: str) -> tuple[Blo
             break
         new = seen.take(good)
         dots = Blobs(np.concatenate([dots.centres, new.centres]), np.concatenate([dots.shapes, new.shapes]))
-        places = np.concatenate([places, np.array(beside, dtype=np.intp)[good]])
+        places = np.concatenate([places, beside[good]])
     return dots, places
 
 
@@ -130,10 +124,12 @@ def _complete(image: Image, spec: BoardSpec, dots: Blobs, places: Places, assume
         predicted < np.array([width - 1, height - 1]) - reach[:, None]
     ).all(axis=1)
     ids = np.flatnonzero(visible)
-    start = Blobs(predicted.copy(), shapes.copy())
-    start.centres[found], start.shapes[found] = dots.centres, dots.shapes
-    seen, sigma = measure_dots(image, start.take(ids))
-    ratio = seen.areas / Blobs(predicted, shapes).areas[ids]
+    start = predicted.copy()
+    start[found] = dots.centres
+    # The shapes are the whole board's: each dot's own would turn and stretch its rays by its noise.
+    begin = Blobs(start[ids], shapes[ids])
+    seen, sigma = measure_dots(image, begin)
+    ratio = seen.areas / begin.areas
     away = np.linalg.norm(seen.centres - predicted[ids], axis=1)
     pitch = np.sqrt(np.abs(np.linalg.det(jacobian[ids])))
     good = np.isfinite(sigma) & (ratio > 0.6) & (ratio < 1.6) & (away < 0.25 * pitch)
@@ -193,10 +189,7 @@ def _ellipses(outlines: list[MatLike], size: tuple[int, int]) -> Blobs:
 
 
 def measure_dots(image: Image, start: Blobs, rounds: int = ROUNDS) -> tuple[Blobs, Array]:
-    """Dots re-measured from their edges, and one standard deviation (n,) of each centre in px.
-
-    A dot whose edge is not found all around gets the deviation NaN.
-    """
+    """Dots re-measured from their edges, and the deviation (n,) of each centre in px; NaN for an edge not all seen."""
     return _measured(image, start, rounds)[:2]
 
 

@@ -98,7 +98,7 @@ def candidates(
             continue
         response = respond(part, scale, along)
         # Noise: how what answers where nothing is, the middle of all answers, scatters.
-        few = response[:: max(1, len(response) // 64), :: max(1, response.shape[1] // 256)]
+        few = response[:: max(1, len(response) // 128), :: max(1, response.shape[1] // 512)]
         low, middle = np.percentile(few, (30, 50))
         _take_better(response, np.float32(max(float(middle - low) / 0.5244, 0.05)), k, best=best, answer=answer, of=of)
     edge = 2
