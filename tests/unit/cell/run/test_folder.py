@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cell.apps.cli.commands.runs import abort
-from cell.base.storage import sealed
+from cell.base.storage import sealed, write_json
 from cell.run.folder import (
     Question,
     awaited_word,
@@ -23,7 +23,6 @@ from cell.run.folder import (
     read_report,
     run_log,
     run_row,
-    write_json,
 )
 from drivers.errors import CellError, ConfigError
 from statemachine.journal import Journal
