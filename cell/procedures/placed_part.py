@@ -122,8 +122,8 @@ class PlacedPart:
         if gap is None or self.unseen:
             return found
         interference, off, about = 0.0, np.zeros(6), self.seen.surface_from_part.translation
-        by_pose = gap.by_motions(draws_of(self.covariance)[:DRAWS], about, SURE_PERCENT)
-        if gap.interference > INTERFERENCE_M + by_pose:
+        into = gap.interference - INTERFERENCE_M
+        if into > 0.0 and into > gap.by_motions(draws_of(self.covariance)[:DRAWS], about, SURE_PERCENT):
             interference, off = gap.interference, ASIDE * gap.off_contact(about, SHIFTED)
         elif before and gap.clearance > HANGS_M + self.unsure:
             interference, off[:2] = -gap.clearance, before[-1]

@@ -5,7 +5,6 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 
 from cell.config.calibrations.store import CellCalibration
@@ -23,8 +22,6 @@ from drivers.errors import DeviceFault, LimitError, Measured, RefusedError
 PICTURES = 12
 KEPT_EACH = 4
 """Of the pictures over the plate's edge, every so many are kept for people."""
-BRIGHT_COLUMN_DN, BESIDE_PX = 5.0, 7
-"""Of the mean of a column of the sensor, over the median of so many to either side."""
 RATES_HZ = 30.0, 15.0, 10.0
 """The first that the camera can."""
 
@@ -50,19 +47,6 @@ def see_reference_plate(config: CellConfig, devices: Devices, keep: Keep) -> Pla
     mean = np.where(seen, columns.mean(axis=0), np.nan)
     found = PlateLine(float(devices.rail.state().position), mean, np.sqrt((sigma**2).mean(axis=0) / PICTURES))
     return _on_the_plate(found)
-
-
-def _require_no_bright_column(dark: NDArray[np.uint8]) -> None:
-    """Raise `RefusedError` where a column of a picture without the laser is bright all along."""
-    mean = dark.mean(axis=0)
-    above = mean - scipy.ndimage.median_filter(mean, 2 * BESIDE_PX + 1)
-    if above.max() > BRIGHT_COLUMN_DN:
-        raise RefusedError(
-            f"column {above.argmax()} of the scan camera's pictures is {above.max():.0f} DN brighter than those "
-            f"beside it without the laser (allowed: {BRIGHT_COLUMN_DN:g}): it hides the line on the plate on the claw. "
-            "Look at the sensor and at other light",
-            Measured("column of the sensor brighter by", float(above.max()), "DN", most=BRIGHT_COLUMN_DN),
-        )
 
 
 def configure_fast(devices: Devices, exposure: float, rates: Sequence[float] = RATES_HZ) -> float:
@@ -97,7 +81,6 @@ def require_reference_plate(config: CellConfig, devices: Devices, keep: Keep) ->
                 f"ambient light leaves an exposure of {exposure:.2f} ms, and the laser's line on the plate on the claw "
                 "stands out in too few of the rows", 0.0
             )  # fmt: skip
-        _require_no_bright_column(devices.scan_camera.grab().image)
         check_lost_steps(devices)  # A carriage that stands elsewhere sees it elsewhere.
         raise RefusedError(
             "the laser's witness, which the calibration saw, is not in the picture: see that the plate on the claw is "
@@ -150,6 +133,8 @@ BRIGHTENS = 1.25
 """Surroundings that become so many times as bright as the line leaves the plate follow it: gain is not fixed."""
 STEADY = 1.3
 """Of the line's light at a place of the plate, from passage to passage: speckle and noise leave a few per cent."""
+DARK_DN = 0.1
+"""Of a line that is out: what is beside it is as bright."""
 Passage = tuple[Array, Array, Array]
 """Places (n,) of the rail, m, rising; the share (n,) of the line's light on the plate; and that light, DN."""
 PASSES = 3
@@ -276,11 +261,12 @@ def _require_steady(passages: Sequence[Passage], way: float) -> None:
     """Raise `RefusedError` where the line is brighter in one of two passages than in the other at a place of the plate,
     which ends in direction `way`."""
     (here, _, light), (there, _, other) = passages
-    half = max(LEAST_LIGHT_DN, 0.5 * light.max(initial=0.0), 0.5 * other.max(initial=0.0))
-    end = min((way * at[lit > half]).max(initial=-np.inf) for at, lit in ((here, light), (there, other)))
-    on = way * here < end - BESIDE_M / 3
-    ratio = light[on] / np.interp(here[on], there, other) if on.any() else np.ones(1)
-    if (times := float(max(ratio.max(), 1.0 / ratio.min()))) > STEADY:
+    # The plate ends where either passage last shows half of its light; where one shows none, that is told as such.
+    halves = [max(LEAST_LIGHT_DN, 0.5 * lit.max(initial=0.0)) for lit in (light, other)]
+    seen = ((here, light, halves[0]), (there, other, halves[1]))
+    on = way * here < min((way * at[lit > half]).max(initial=-np.inf) for at, lit, half in seen) - BESIDE_M / 3
+    pair = np.maximum([light[on], np.interp(here[on], there, other)], DARK_DN) if on.any() else np.ones((2, 1))
+    if (times := float((pair.max(axis=0) / pair.min(axis=0)).max())) > STEADY:
         raise RefusedError(
             f"the laser's line on the plate on the claw is {times:.1f} times as bright in one passage over it as in "
             f"the next, allowed are {STEADY:g} times: the laser flickers, or the exposure changes. See its supply and "

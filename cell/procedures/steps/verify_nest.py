@@ -33,19 +33,20 @@ from statemachine.step import OnFailure, Step
 def _run_step(workplace: Workplace, context: StepContext) -> PlacedPart:
     job, sweep = where_seen(workplace.job), context.made(SweepRecord)
     belongs = job.place.surface_from_part.se3()
-    swept = swept_part(
+    cloud, swept = swept_part(
         workplace, head_at(workplace, sweep), belongs, context, lying=PartOnGround(workplace.nominal, belongs)
     )
+    swept = replace(swept, pointing=sweep.pointing, slip=sweep.slip)
     try:
-        fit = part_in_base(workplace, job, workplace.nominal, swept)
+        fit = part_in_base(workplace, job, workplace.nominal, (cloud, swept))
     except RefusedError as error:
         raise MisplacedError(f"{error}. {NEXT_STEP}", *error.numbers) from error
     stated = context.made(SetDown).covariance
     # The arm's base takes the place of a surface here.
     seen = PartPose(pin.SE3.Identity(), fit.base_from_surface, fit.covariance, fit, beside=fit.n_points)
     found = PlacedPart.of(job, seen, part_points(workplace.nominal), stated)
-    own = by_themselves(job, swept[0], found.seen, workplace.nominal)
-    unlike = unlike_patch(swept[0], pin.SE3.Identity(), found.seen.surface_from_part, workplace.nominal)
+    own = by_themselves(job, cloud, found.seen, workplace.nominal)
+    unlike = unlike_patch(cloud, pin.SE3.Identity(), found.seen.surface_from_part, workplace.nominal)
     found = replace(found, own=own, unlike=unlike, axes="axes of the arm base, in its nest")
     for note in found.notes:
         context.note(text=f"in its nest: {note}")

@@ -259,7 +259,9 @@ class SweepCollector:
         if self.middle is None and len(self.times) >= self.expected / 2:
             self.middle = frame, profile
             return None
-        return None if like is None or self.notes else partial(around_stripe, image, profile, like)
+        if self.notes or like is None or like.noise is None:
+            return None
+        return partial(around_stripe, image, profile, like)
 
     def require_frames(
         self, camera: str, lines: NDArray[np.intp], most_lost: float = MAX_LOST_FRACTION

@@ -20,6 +20,9 @@ from cell.measure.inversion.registration import candidates
 from cell.measure.reconstruction.cloud import Cloud
 from cell.measure.reconstruction.holes import fill_holes
 from cell.measure.reconstruction.outliers import find_outliers
+from cell.measure.vision.board.dot_edges import measure
+from cell.measure.vision.board.dots import measure_dots
+from cell.measure.vision.board.lattice import Blobs
 from cell.measure.vision.stripe.extract import read_drawn
 
 LINES = 40
@@ -36,7 +39,7 @@ _second: list[subprocess.Popen[bytes]] = []
 
 def begin() -> None:
     """Compile in a second process what is not kept on disk yet. It ends with this one, if not before."""
-    if _second or is_kept(closest):
+    if _second or (is_kept(closest) and is_kept(measure)):
         return
     mine, nowhere = [sys.executable, "-m", "cell.run.session.warm_up"], subprocess.DEVNULL
     # Nothing is written to the pipe; it closes when this process ends, in whatever way.
@@ -49,6 +52,7 @@ def begin() -> None:
 def compile_all() -> None:
     """What reads a stripe, makes a cloud, and finds a surface in it, in the order in which they come to be used."""
     read_drawn()
+    measure_dots(np.zeros((9, 9), np.uint8), Blobs(np.full((1, 2), 4.0), np.eye(2)[None]))
     x, y = np.meshgrid(np.linspace(0.0, 0.02, LINES), np.linspace(0.0, 0.02, LINES))
     points = np.dstack([x, y, 20.0 * x * y])
     holed = points.copy()

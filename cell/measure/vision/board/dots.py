@@ -197,7 +197,7 @@ def _measured(image: Image, start: Blobs, rounds: int) -> tuple[Blobs, Array, Ar
     """As `measure_dots`, with what tells a ring (n, 4)."""
     centres, shapes = start.centres.copy(), start.shapes.copy()
     sigma, signs = np.full(len(centres), np.nan), np.zeros((len(centres), 4))
-    measure(np.ascontiguousarray(image), centres, shapes, rounds, sigma=sigma, signs=signs)
+    measure(np.require(image, requirements=("C", "W")), centres, shapes, rounds, sigma=sigma, signs=signs)
     # A dot that wandered off its blob measures something else.
     wandered = np.linalg.norm(np.linalg.solve(start.shapes, (centres - start.centres)[:, :, None])[:, :, 0], axis=1)
     sigma[wandered > 0.7] = np.nan

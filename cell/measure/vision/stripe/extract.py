@@ -164,7 +164,7 @@ def around_stripe(image: Image, profile: StripeProfile, like: StripeProfile) -> 
     cut = image * ((columns >= middle - KEPT_PX) & (columns <= middle + KEPT_PX))
     try:
         again = extract(cut, like=like)
-    except PictureRefused:
+    except (PictureRefused, ValueError):
         return image
     names = ("centres", "sigma", "amplitude", "width", "saturated", "double")
     same = all(np.array_equal(getattr(again, name), getattr(profile, name), equal_nan=True) for name in names)

@@ -137,16 +137,16 @@ def test_a_laser_that_flickers_is_named_before_it_looks_like_a_slip(cell, monkey
         looked(cell[0], cell[1])
 
 
-def test_a_bright_column_of_the_sensor_is_named_where_it_hides_the_plate(cell, monkeypatch: pytest.MonkeyPatch) -> None:
-    world, exposed, hot = cell[0].world, cell[0].world._exposed, 80.0 * (np.arange(640) == 430)
-
-    def render(camera: str, t: float, exposure: float) -> np.ndarray:
-        image = exposed(camera, t, exposure)
-        return np.minimum(image + hot, 255.0).astype(np.uint8) if camera == "scan" else image
-
-    monkeypatch.setattr(world, "_exposed", render)
-    with pytest.raises(RefusedError, match=r"column 430 of .* is \d\d DN brighter .* without the laser"):
-        looked(cell[0], cell[1])
+@pytest.mark.parametrize("share", [0.0, 0.4, 0.7])
+def test_a_laser_that_goes_out_or_dims_for_one_passage_is_named(share: float) -> None:
+    places = np.linspace(0.0, 1.2e-3, 18)
+    light = 19.0 / (1.0 + np.exp((places - 0.6e-3) / 4e-5)) + np.random.default_rng(0).normal(0.0, 0.1, 18)
+    whole, dim = (places, light, light), (places, light, light.copy())
+    dim[2][: 3 if share == 0.0 else None] *= share
+    reference_plate._require_steady((whole, whole), 1.0)
+    for passages in ((whole, dim), (dim, whole)):
+        with pytest.raises(RefusedError, match="the laser flickers"):
+            reference_plate._require_steady(passages, 1.0)
 
 
 def test_pictures_lost_at_the_edge_make_neither_a_lag_nor_a_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
