@@ -25,11 +25,6 @@ SETTLE_S = 60.0
 """Wall seconds that a full queue has to reach the disk."""
 RECENT = 12
 """Names of a step's frames that are remembered, the newest."""
-PNG = (
-    cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE,
-    cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE,
-)  # fmt: skip
-"""Half of the time of the default and no larger: choosing a filter for each row of a noisy picture gains nothing."""
 
 
 class FrameFile:
@@ -132,7 +127,7 @@ class FrameStore:
             path, data = self._folder / picture.name, None
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                made, png = cv2.imencode(".png", frame.image if cut is None else cut(), PNG)
+                made, png = cv2.imencode(".png", frame.image if cut is None else cut())
                 if made:
                     data = np.asarray(png).tobytes()
                     path.write_bytes(data)

@@ -236,12 +236,12 @@ def _passed(devices: Devices, keep: Keep, witness: PlateLine, ends: tuple[float,
     _require_fixed_gain(np.array(dark)[inside])
     places = np.array([sweep.position_at(times[k]) for k in inside])
     lit, order = np.array(light)[inside], np.argsort(places)
-    whole_line = lit.mean(axis=1)
+    level = lit.mean(axis=1)
     # Each row against its own light on the plate: the plate's colour and the laser's profile fall out.
     bright = np.sort(lit, axis=0)[-BRIGHTEST:].mean(axis=0)
     whole = np.ma.masked_less(lit, 0.75 * bright).mean(axis=0).filled(0.0)
     lit = lit / np.maximum(whole, LEAST_LIGHT_DN)
-    return places[order], np.asarray(lit.mean(axis=1))[order], whole_line[order]
+    return places[order], np.asarray(lit.mean(axis=1))[order], level[order]
 
 
 def _require_fixed_gain(dark: Array) -> None:
@@ -261,10 +261,14 @@ def _require_steady(passages: Sequence[Passage], way: float) -> None:
     """Raise `RefusedError` where the line is brighter in one of two passages than in the other at a place of the plate,
     which ends in direction `way`."""
     (here, _, light), (there, _, other) = passages
-    # The plate ends where either passage last shows half of its light; where one shows none, that is told as such.
-    halves = [max(LEAST_LIGHT_DN, 0.5 * lit.max(initial=0.0)) for lit in (light, other)]
-    seen = ((here, light, halves[0]), (there, other, halves[1]))
-    on = way * here < min((way * at[lit > half]).max(initial=-np.inf) for at, lit, half in seen) - BESIDE_M / 3
+
+    def end(places: Array, lit: Array) -> float:
+        """The last place with half of the passage's light, in direction `way`; without any, before all."""
+        bright = lit > max(LEAST_LIGHT_DN, 0.5 * lit.max(initial=0.0))
+        return float((way * places[bright]).max(initial=-np.inf))
+
+    # Where a passage shows no light at all, that is told otherwise.
+    on = way * here < min(end(here, light), end(there, other)) - BESIDE_M / 3
     pair = np.maximum([light[on], np.interp(here[on], there, other)], DARK_DN) if on.any() else np.ones((2, 1))
     if (times := float((pair.max(axis=0) / pair.min(axis=0)).max())) > STEADY:
         raise RefusedError(
