@@ -7,11 +7,11 @@ is above each place, from a raster fine enough that what lies between its points
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, lru_cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -227,41 +227,51 @@ class OwnSurface:
         return SurfaceMesh(vertices, faces.astype(np.int32))
 
 
+@dataclass(frozen=True)
+class _MeshFile:
+    """A mesh file: two that say the same by the same name are one, wherever they lie."""
+
+    path: str = field(compare=False)
+    unit: str
+    name: str
+    content: bytes
+
+    @classmethod
+    def at(cls, path: str, unit: str) -> Self:
+        """The file as it is now. Raises ValueError where it cannot be read."""
+        try:
+            return cls(path, unit, Path(path).name, sha256(Path(path).read_bytes()).digest())
+        except OSError as error:
+            raise ValueError(f"the mesh {path} cannot be read: {error.strerror}") from error
+
+
 def own_surface(path: str, unit: str) -> OwnSurface:
     """The surface in a mesh file; the last few are kept. Raises ValueError when there is no mesh in it."""
-    return _read(path, _content(path), unit)
+    return _read(_MeshFile.at(path, unit))
 
 
 def part_mesh(path: str, unit: str) -> SurfaceMesh:
     """The part in a mesh file as a camera above it sees it: walls are as drawn, they only hide what is behind them."""
-    return _part(path, _content(path), unit)
-
-
-def _content(path: str) -> bytes:
-    try:
-        return sha256(Path(path).read_bytes()).digest()
-    except OSError as error:
-        raise ValueError(f"the mesh {path} cannot be read: {error.strerror}") from error
+    return _part(_MeshFile.at(path, unit))
 
 
 def underside(path: str, unit: str) -> Surface:
     """The lowest that the part in a mesh file has above each place of its frame, as heights turned over: z = -h."""
-    own = own_surface(path, unit)
-    return _ground(own.ground.name, own.vertices * [1.0, 1.0, -1.0], own.triangles)
+    return _turned_over(own_surface(path, unit))
 
 
 @lru_cache(maxsize=4)
-def _read(path: str, content: bytes, unit: str) -> OwnSurface:
+def _read(file: _MeshFile) -> OwnSurface:
     import trimesh
 
-    merged = trimesh.Trimesh(*_divided(*_loaded(path, unit), COARSEST), process=True)
+    merged = trimesh.Trimesh(*_divided(*_loaded(file), COARSEST), process=True)
     vertices, faces = np.asarray(merged.vertices, dtype=np.float64), np.asarray(merged.faces, dtype=np.int64)
-    return OwnSurface(_ground(Path(path).stem, vertices, faces), vertices, faces)
+    return OwnSurface(_ground(Path(file.name).stem, vertices, faces), vertices, faces)
 
 
 @lru_cache(maxsize=4)
-def _part(path: str, content: bytes, unit: str) -> SurfaceMesh:
-    vertices, faces = _loaded(path, unit)
+def _part(file: _MeshFile) -> SurfaceMesh:
+    vertices, faces = _loaded(file)
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     up = np.cross(b - a, c - a)[:, 2] > 0.0
     if not up.any():
@@ -272,18 +282,23 @@ def _part(path: str, content: bytes, unit: str) -> SurfaceMesh:
     )
 
 
-def _loaded(path: str, unit: str) -> tuple[Floats, Faces]:
+@lru_cache(maxsize=4)
+def _turned_over(own: OwnSurface) -> Surface:
+    return _ground(own.ground.name, own.vertices * [1.0, 1.0, -1.0], own.triangles)
+
+
+def _loaded(file: _MeshFile) -> tuple[Floats, Faces]:
     """Vertices (n, 3), m, and triangles (m, 3) of a mesh file."""
     import trimesh
 
     try:
-        mesh = trimesh.load_mesh(path, process=True)
-        vertices = UNITS[unit] * np.asarray(mesh.vertices, dtype=np.float64)
+        mesh = trimesh.load_mesh(file.path, process=True)
+        vertices = UNITS[file.unit] * np.asarray(mesh.vertices, dtype=np.float64)
         faces = np.asarray(mesh.faces, dtype=np.int64)
         if not len(faces) or not np.isfinite(vertices).all():
             raise ValueError(f"{len(faces)} triangles, or corners that are not numbers")
     except Exception as error:  # every reader of trimesh raises its own
-        raise ValueError(f"the mesh {path} cannot be read: {error}") from error
+        raise ValueError(f"the mesh {file.path} cannot be read: {error}") from error
     return vertices, faces
 
 
