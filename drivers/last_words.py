@@ -6,8 +6,6 @@ ends. It also says them while the owner is frozen (stopped, swapped out, in a de
 `attended` as soon as nobody attends it. It does nothing else while the owner lives, and nothing after `close()`.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess
@@ -37,7 +35,7 @@ def descriptor_of(port: Any) -> int | None:
         return None
 
 
-def attended_by(name: str, helper: LastWords | None) -> AbstractContextManager[Callable[[], None]]:
+def attended_by(name: str, helper: "LastWords | None") -> AbstractContextManager[Callable[[], None]]:
     """`LastWords.attended` of the device's helper; `InterlockError` for a port that is no file, which has none."""
     if helper is None:
         raise InterlockError(

@@ -4,8 +4,6 @@ There is one object for every way to ask: the run's handle, another process, a s
 cancelled once and for ever, by whoever asks first. After that nothing of the run begins anything new.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterable
@@ -19,7 +17,7 @@ class Cancelled(RuntimeError):
 class CancelToken:
     """Whether a run is to end, and why. Every method may be called from any thread."""
 
-    def __init__(self, parent: CancelToken | None = None) -> None:
+    def __init__(self, parent: "CancelToken | None" = None) -> None:
         """A token of its own, or a part of `parent` (one attempt at a step, a recovery) that ends with it."""
         self._lock = threading.Lock()
         self._reason: str | None = None

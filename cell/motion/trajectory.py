@@ -8,8 +8,6 @@ A packet's arrival tells the time of a state only roughly, and late. The arm's o
 to the host's.
 """
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -107,7 +105,7 @@ class Trajectory:
         """Joint angles at the end."""
         return np.asarray(self.joints[-1])
 
-    def at_pace(self, share: float) -> Trajectory:
+    def at_pace(self, share: float) -> "Trajectory":
         """The same way at this share, up to 1, of its speed."""
         return Trajectory(self.times / share, self.joints)
 

@@ -4,8 +4,6 @@ A worn finger, or parts that lie askew where they are loaded, bring each part of
 so much the next is put down to the other side.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -88,7 +86,7 @@ class GraspSeries:
     aside: Vector = field(default_factory=lambda: np.zeros((0, 3)))
     opening: Vector = field(default_factory=lambda: np.zeros((0, 3)))
 
-    def after(self, came: pin.SE3, slips: Sequence[pin.SE3]) -> GraspSeries:
+    def after(self, came: pin.SE3, slips: Sequence[pin.SE3]) -> "GraspSeries":
         """With one part more, which first `came` to lie so, and in its corrections by `slips`."""
         opening = [self.opening, *map(_row, slips)]
         return GraspSeries(np.vstack([self.aside, _row(came)])[-NEWEST:], np.vstack(opening)[-NEWEST:])

@@ -1,7 +1,5 @@
 """Where a placed part was seen, whether it lies in its place, and what most likely happened to one that does not."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
@@ -84,7 +82,7 @@ class PlacedPart:
     axes: str = "the surface's axes"
 
     @classmethod
-    def of(cls, job: Job, seen: PartPose, points: Vector, stated: Vector) -> PlacedPart:
+    def of(cls, job: Job, seen: PartPose, points: Vector, stated: Vector) -> "PlacedPart":
         """The part as `seen`, with what is not seen of it as it was `stated`, (6, 6), surface axes.
 
         Raises `MisplacedError` where something is not seen, and the job does not content itself with the rest.
@@ -111,7 +109,7 @@ class PlacedPart:
             named=() if job.part is None else job.part.feature,
         )  # fmt: skip
 
-    def over(self, gap: MatingGap | None, before: tuple[float, ...] = ()) -> PlacedPart:
+    def over(self, gap: MatingGap | None, before: tuple[float, ...] = ()) -> "PlacedPart":
         """With the `gap` below it, as it was seen, and how far off it lay `before` each correction.
 
         No part goes into its surface. One that seems to has its underside elsewhere than drawn below its upper side. It
@@ -158,7 +156,7 @@ class PlacedPart:
         return float(np.linalg.norm(transform(motion, self.points) - self.points, axis=1).mean())
 
     @property
-    def not_aside(self) -> PlacedPart:
+    def not_aside(self) -> "PlacedPart":
         """The same part, moved along the surface to where it belongs."""
         motion = self.belongs.inverse() * self.seen.surface_from_part
         there = self.belongs * along_surface(motion).inverse() * motion

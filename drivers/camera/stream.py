@@ -4,8 +4,6 @@ Frames carry the device's time of the start of their exposure, which is mapped t
 taken before each acquisition. A frame is handed out once and never as an answer to a later question.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import socket
@@ -180,14 +178,14 @@ class StreamCamera:
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise self._unusable("identify", repr(error)) from error
 
-    def _number(self, reply: Header, op: str, key: str) -> float:
+    def _number(self, reply: "Header", op: str, key: str) -> float:
         """A finite number of a reply; `DeviceFault` (camera.protocol) where there is none."""
         value = reply.get(key)
         if not isinstance(value, int | float) or not math.isfinite(value):
             raise self._unusable(op, f"{key} is {value!r}")
         return float(value)
 
-    def _first_id(self, op: str, reply: Header) -> int | None:
+    def _first_id(self, op: str, reply: "Header") -> int | None:
         """The id of an acquisition's first frame, where the camera tells it."""
         return None if reply.get("next_frame_id") is None else int(self._number(reply, op, "next_frame_id"))
 
@@ -224,7 +222,7 @@ class StreamCamera:
             self._queues = tuple(other for other in self._queues if other is not queue)
             queue.close()
 
-    def _take(self, header: Header, payload: bytearray, received: float) -> None:
+    def _take(self, header: "Header", payload: bytearray, received: float) -> None:
         if not self._queues:
             return
         width, height = int(header["width"]), int(header["height"])

@@ -3,8 +3,6 @@
 A protective stop waits for a person's word, an emergency stop for the power.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -35,7 +33,7 @@ class ArmMove:
 
     tick_s = TICK_S
 
-    def __init__(self, arm: DirectArm, motion: SimulatedMotion) -> None:
+    def __init__(self, arm: "DirectArm", motion: SimulatedMotion) -> None:
         self.contact = False
         self.motion = motion
         self._arm = arm
@@ -84,7 +82,7 @@ class Streamed(ArmMove):
     """A joint trajectory that is streamed into a servo, with a force limit or without."""
 
     def __init__(
-        self, arm: DirectArm, times: Vector, joints: Vector, force_limit: float | None, force_before: Vector
+        self, arm: "DirectArm", times: Vector, joints: Vector, force_limit: float | None, force_before: Vector
     ) -> None:
         self._servo = Servo(joints[0], _SERVO_LAG_S)
         super().__init__(arm, self._servo)

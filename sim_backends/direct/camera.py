@@ -3,8 +3,6 @@
 That clock has drift and latency. It is compared with the host's by latches, answered somewhere within their round trip.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -96,7 +94,7 @@ class DirectCamera(DirectDevice):
         return frame
 
     @contextmanager
-    def stream(self) -> Iterator[DirectStream]:
+    def stream(self) -> "Iterator[DirectStream]":
         """Free-running acquisition for as long as the context is open."""
         self._require_free()
         self._compare_clocks()

@@ -1,7 +1,5 @@
 """The rail in this process: positions are read as a driver on a wire reads them, somewhere in a round trip."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Callable
@@ -41,7 +39,7 @@ class RailMove:
     `asked` is what tells that a motion in several legs has ended."""
 
     def __init__(
-        self, rail: DirectRail, target: int | None, watch: CarriageWatch | None = None,
+        self, rail: "DirectRail", target: int | None, watch: CarriageWatch | None = None,
         asked: Callable[[], bool] | None = None,
     ) -> None:  # fmt: skip
         self._rail = rail
@@ -149,7 +147,7 @@ class RailMove:
 class DirectSweep(EvenSweep, RailMove):
     """A sweep with a reading every 10 ms; between them the line that is fitted to them."""
 
-    def __init__(self, rail: DirectRail, target: int, start: float, stop: float) -> None:
+    def __init__(self, rail: "DirectRail", target: int, start: float, stop: float) -> None:
         super().__init__(rail, target)
         self._name, self._start, self._stop = rail.name, start, stop
         self._readings: list[tuple[float, float]] = []

@@ -7,8 +7,6 @@ Frames: world W (z up, floor z = 0), vehicle V, arm base B, flange F (z out of t
 camera T (z along the optical axis), part, surface S, place frame P, boards D (x right, y down, z into the board).
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Sequence
@@ -186,7 +184,7 @@ class StationDrawing:
     """base_from_part in a nest on the vehicle: the part lies on the surface at first, and the claw is empty."""
     nest_filled: bool = False
     """The part lies in the nest at first."""
-    beside: tuple[StationDrawing, ...] = ()
+    beside: "tuple[StationDrawing, ...]" = ()
     """Of a job with several items the station of each, this one's as well, none of which has another beside it."""
     stop: str = ""
     """Of a job with several stations the name of this one."""
@@ -207,11 +205,11 @@ class Drawing:
     cell: CellDrawing
     station: StationDrawing
 
-    def with_surface(self, name: str) -> Drawing:
+    def with_surface(self, name: str) -> "Drawing":
         """The same with the closed form `name` on the station."""
         return replace(self, station=replace(self.station, surface=name, mesh=""))
 
-    def with_arm(self, model: str) -> Drawing:
+    def with_arm(self, model: str) -> "Drawing":
         """The same with another arm."""
         return replace(self, cell=replace(self.cell, arm=model))
 

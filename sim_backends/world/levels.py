@@ -6,8 +6,6 @@ tolerances leave out, `outdoor` what the open adds. Each such effect is off at t
 "nominal+rocking+grasp". Sizes marked "assumed" are of the usual order; nobody measured them on this cell.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass, field
 
@@ -20,7 +18,7 @@ def _row(size: float, unit: str, meaning: str, source: str, option: bool = False
     return made
 
 
-def _told(rows: Deviations | Effects) -> dict[str, dict[str, float | str]]:
+def _told(rows: "Deviations | Effects") -> dict[str, dict[str, float | str]]:
     """Every row that is not off, with its size, unit and meaning, for reports that state what was assumed."""
     return {
         f.name: {"sigma": getattr(rows, f.name), "unit": f.metadata["unit"], "of": f.metadata["meaning"]}

@@ -4,8 +4,6 @@ Some pictures belong together: copies, what a program drew into, those of one pl
 of one stop of the arm. How a stripe is read is the business of `stripes.py`.
 """
 
-from __future__ import annotations
-
 import hashlib
 import re
 from collections import Counter
@@ -81,7 +79,7 @@ class RecordedFrame:
     stripe_text: str = ""
     stripe_left_out: dict[str, int] = field(default_factory=dict)
     rms_px: float | None = None
-    shows: RecordedFrame | None = None
+    shows: "RecordedFrame | None" = None
 
     def refuse(self, reason: Reason, text: str) -> None:
         """Set the frame aside."""

@@ -4,8 +4,6 @@ The digest of its file shows an edit. Its figures are checked besides, by themse
 shows what no calibration says, whoever wrote it.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import time
@@ -39,7 +37,7 @@ MOUNT_M, MOUNT_RAD = 0.05, float(np.deg2rad(15.0))
 """How far mounts, the rail's way and the light plane may be from their drawing: ten times what mounting leaves."""
 
 
-def require_valid(calibration: CellCalibration) -> None:
+def require_valid(calibration: "CellCalibration") -> None:
     """Raise `ValueError` with the value and its allowed range where the figures by themselves cannot be."""
     scan, target = calibration.scan, calibration.target
     for name, found in (("made", calibration), ("timing.made", scan.timing), ("confirmed.made", scan.confirmed)):
@@ -87,7 +85,7 @@ def require_covariance(name: str, covariance: Array, fixed: range) -> None:
         raise ValueError(f"{name} is not positive definite: an eigenvalue of its correlations is {least:.2g}")
 
 
-def require_as_configured(calibration: CellCalibration, config: CellConfig) -> None:
+def require_as_configured(calibration: "CellCalibration", config: CellConfig) -> None:
     """Raise `CalibrationStale` where it is no calibration of the cell as drawn: a unit or a sign is wrong."""
     scan, laser = calibration.scan, config.laser
     try:

@@ -6,8 +6,6 @@ for every point; the grid also serves as a coarse distance field. Points whose f
 the surface.
 """
 
-from __future__ import annotations
-
 from copy import copy
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -233,7 +231,7 @@ class NominalSurface:
         self.radius = float(np.sqrt(np.mean(np.sum((self.samples - self.centre) ** 2, axis=1))))
 
     @classmethod
-    def load(cls, path: Path, unit: Literal["m", "mm"] = "m", rim: float = 0.0006) -> NominalSurface:
+    def load(cls, path: Path, unit: Literal["m", "mm"] = "m", rim: float = 0.0006) -> "NominalSurface":
         """Read an STL or PLY (or another format that trimesh knows); `ConfigError` when it is no usable mesh.
 
         The last few are kept: one job after another is placed on the same surface, and preparing it takes a while.
@@ -298,7 +296,7 @@ class _MeshFile:
     content: bytes
 
     @classmethod
-    def of(cls, path: Path) -> _MeshFile:
+    def of(cls, path: Path) -> "_MeshFile":
         """The file as it is now; `ConfigError` when it cannot be read."""
         suffix = path.suffix.lower()
         try:
@@ -416,13 +414,13 @@ class Scan:
     lines: NDArray[np.intp]
 
     @classmethod
-    def of(cls, cloud: Cloud, most: int = 10_000) -> Scan:
+    def of(cls, cloud: Cloud, most: int = 10_000) -> "Scan":
         """At most `most` points, spread evenly over the cloud."""
         lines, rows = cloud.subsample(most)
         spread = cloud.stripe_spread[lines, rows].astype(np.float64)
         return cls(cloud.points[lines, rows], spread, cloud.rail_spread[lines], lines)
 
-    def thinned(self, most: int) -> Scan:
+    def thinned(self, most: int) -> "Scan":
         """At most `most` points, drawn evenly: a regular stride would fall into step with the rows of the cloud."""
         if len(self.points) <= most:
             return self

@@ -1,7 +1,5 @@
 """Moves of the arm as the steps ask for them: free of collisions, jerk-limited, at a pace that a person may lower."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -320,7 +318,7 @@ class PartState(Enum):
         return self in (PartState.LIES, PartState.NESTED)
 
     @classmethod
-    def first(cls, job: Job) -> PartState:
+    def first(cls, job: Job) -> "PartState":
         """Where the part of a job is before it."""
         return cls.HELD if job.nest is None else cls.LIES if job.unloads else cls.NESTED
 

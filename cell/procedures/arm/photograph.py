@@ -4,8 +4,6 @@ Poses for looking, photographing, scanning and calibrating are pure geometry. Wh
 `cell.motion`'s business.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -200,7 +198,7 @@ class ScanPlan:
     rail_stop: float
 
     @property
-    def back(self) -> ScanPlan:
+    def back(self) -> "ScanPlan":
         """The same way in the other direction."""
         return ScanPlan(self.base_from_flange_end, self.base_from_flange, self.rail_stop, self.rail_start)
 

@@ -3,8 +3,6 @@
 Nothing else tells what went wrong after the scan: a laser that turned, an arm that sags, a part that slipped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Driving on odometry: poses in the plane, along a line to its end, and turning on the spot. Units: m, rad, s."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -46,17 +44,17 @@ class Planar:
     yaw: float
 
     @classmethod
-    def of(cls, pose: pin.SE3) -> Planar:
+    def of(cls, pose: pin.SE3) -> "Planar":
         """The planar part of a spatial pose."""
         return cls(pose.translation[0], pose.translation[1], math.atan2(pose.rotation[1, 0], pose.rotation[0, 0]))
 
-    def __mul__(self, other: Planar) -> Planar:
+    def __mul__(self, other: "Planar") -> "Planar":
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return Planar(
             self.x + c * other.x - s * other.y, self.y + s * other.x + c * other.y, wrap(self.yaw + other.yaw)
         )
 
-    def inverse(self) -> Planar:
+    def inverse(self) -> "Planar":
         """The pose that undoes this one."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return Planar(-c * self.x - s * self.y, s * self.x - c * self.y, wrap(-self.yaw))

@@ -5,8 +5,6 @@ place only from an anchor on: a sighting of the board, or a person's word. The r
 the vehicle has gone, and turned on the spot, since then.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -192,7 +190,7 @@ class Upright:
     high: float
 
     @classmethod
-    def of(cls, body: Body, frame_from_parent: pin.SE3) -> Upright:
+    def of(cls, body: Body, frame_from_parent: pin.SE3) -> "Upright":
         """Around a body whose parent is at `frame_from_parent`."""
         pose = frame_from_parent * body.placement
         dx, dy, dz = np.abs(pose.rotation) @ (0.5 * np.array(body.size)) + (body.radius or 0.0)
@@ -216,7 +214,7 @@ class Upright:
         """Of the circle about the middle through the corners, m."""
         return math.dist(self.middle, self.corners[0])
 
-    def beside(self, other: Upright) -> bool:
+    def beside(self, other: "Upright") -> bool:
         """Whether the two could meet if one were moved over the floor."""
         return self.low - ROOM_ABOVE < other.high and other.low - ROOM_ABOVE < self.high
 

@@ -5,8 +5,6 @@ sweep the surface again, and look at the board again where that leaves a motion 
 shift to the side. Several items of a job share a photograph, as long as the vehicle stands.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

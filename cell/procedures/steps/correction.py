@@ -1,7 +1,5 @@
 """Correction: a part that was placed and seen is gripped again where it lies, and placed anew by what was seen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pinocchio as pin

@@ -1,7 +1,5 @@
 """Drive to the target: along the planned approach on odometry, then closed on the board that the camera sees."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress

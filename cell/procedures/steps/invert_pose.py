@@ -1,7 +1,5 @@
 """Invert the place pose: the nominal surface registered in the cloud, with the board's pose as anchored prior."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 

@@ -4,8 +4,6 @@ A step is one file with a `JobStep`; a kind is one line that lists steps. Kinds 
 of the group `assembly_cell.kinds`, each a `Kind`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -83,14 +81,14 @@ class Kind:
         if unknown := [name for name in names if name not in self.names]:
             raise ConfigError(f"there is no step {', '.join(unknown)}; the steps are {', '.join(self.names)}")
 
-    def until(self, name: str | None) -> Kind:
+    def until(self, name: str | None) -> "Kind":
         """This kind up to the step of that name; all of it without one. `ConfigError` when there is no such step."""
         if name is None:
             return self
         self.require_steps([name])
         return replace(self, steps=self.steps[: self.names.index(name) + 1])
 
-    def with_step(self, step: JobStep, after: str, name: str) -> Kind:
+    def with_step(self, step: JobStep, after: str, name: str) -> "Kind":
         """The kind `name`: this one with one more step, after the one of the name `after`."""
         at = self.names.index(after) + 1
         return replace(self, name=name, steps=(*self.steps[:at], step, *self.steps[at:]))

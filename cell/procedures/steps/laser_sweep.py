@@ -4,8 +4,6 @@ Before a part is put down or taken, the way back is a second look, in few lines:
 needs the lateness of the camera's stamps (`cell calibrate timing`); without it, the step that goes down looks.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

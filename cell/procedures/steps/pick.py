@@ -2,8 +2,6 @@
 
 The open claw goes down to a part that lies, closes on it and lifts it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -127,7 +125,7 @@ class HeldPart:
         return {"base_from_flange": to_ur(self.base_from_flange).tolist(), "covariance": self.covariance.tolist()}
 
     @classmethod
-    def of(cls, told: Mapping[str, object]) -> HeldPart:
+    def of(cls, told: Mapping[str, object]) -> "HeldPart":
         """As `as_dict` told; ValueError or KeyError for what is no such record."""
         covariance = np.array(told["covariance"], dtype=np.float64)
         if covariance.shape != (6, 6) or not np.linalg.eigvalsh(covariance)[0] >= 0.0:

@@ -1,7 +1,5 @@
 """Pick from the nest: the part is found by its mesh where it lies on the vehicle, gripped there, felt, and lifted."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from cell.measure.geometry.poses import from_parts

@@ -1,7 +1,5 @@
 """Place: approach, guarded descent until contact, release, retreat."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -324,7 +322,7 @@ class AimedPlace:
     touching: tuple[pin.SE3, ...]
 
     @classmethod
-    def of(cls, workplace: Workplace, pose: PlacePose) -> AimedPlace:
+    def of(cls, workplace: Workplace, pose: PlacePose) -> "AimedPlace":
         """By the parts of the batch before; straight at the place where they do not tell."""
         points, grasp, belongs = (
             part_points(workplace.nominal),
@@ -345,7 +343,7 @@ class AimedPlace:
 
     def fitted(
         self, workplace: Workplace, pose: PlacePose, context: StepContext
-    ) -> tuple[AimedPlace, MatingGap | None]:
+    ) -> "tuple[AimedPlace, MatingGap | None]":
         """This, and the gap where the part touches first; straight at the place where it would not fit aside.
 
         Raises `RefusedError` where it does not fit at its place.

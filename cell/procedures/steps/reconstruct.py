@@ -1,7 +1,5 @@
 """Reconstruct: from the sweeps' profiles to the organised cloud in the arm base, written as PLY."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

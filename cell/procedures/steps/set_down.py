@@ -1,7 +1,5 @@
 """Set down: the part that was taken from its surface goes into its nest on the vehicle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

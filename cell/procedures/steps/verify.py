@@ -1,7 +1,5 @@
 """Verify: the placed part and what shows of the surface around it are swept; it lies in its place, or the run fails."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

@@ -1,7 +1,5 @@
 """Verify, after unloading: the part is swept in its nest, and lies there as it should, or the run fails."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -4,8 +4,6 @@ The surface may slide while the board stands firm. Nothing that the arm feels te
 is looked at again on the rail's way back: it may still slide, sink or turn.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import partial

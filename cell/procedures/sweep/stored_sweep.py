@@ -4,8 +4,6 @@ The frames are the run's PNG files, from which the stripe is extracted again. A 
 base and station have not moved against each other, which a new photograph of the board must confirm.
 """
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 import zipfile
@@ -50,7 +48,7 @@ class SweepRecord:
     slip: Slip | None = None
     earlier: str = ""
     rest: ArmMotion | None = None
-    back: SweepRecord | None = None
+    back: "SweepRecord | None" = None
     held_s: float = 0.0
     looked_s: float = 0.0
 
@@ -146,7 +144,7 @@ class StoredSweep:
     @classmethod
     def load(
         cls, folder: Path, head: ScanCalibration, scan: ScanSection, exit_point: Vector, *, as_written: bool = True
-    ) -> StoredSweep:
+    ) -> "StoredSweep":
         """Read it, and extract the stripe from the frames again.
 
         `RefusedError` when anything of it is missing, no number, or, with `as_written`, was changed: a figure or a

@@ -5,8 +5,6 @@ the middle of a sweep. A step shows twice: the stamps leave their even pace, and
 sooner or later. A camera that paces unevenly shows only the first, a busy network only the second.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -92,7 +90,7 @@ class SweepErrors:
     lost: float = MAX_LOST_FRACTION
 
     @property
-    def by_rail(self) -> SweepErrors:
+    def by_rail(self) -> "SweepErrors":
         """For a sweep by the rail: `late` with the variance of what was measured."""
         return self if self.timing is None else replace(self, late=float(np.sqrt(3.0)) * self.timing.sigma)
 
@@ -106,7 +104,7 @@ class TimeBound:
     bound: float
 
     @classmethod
-    def of(cls, camera: Camera) -> TimeBound:
+    def of(cls, camera: Camera) -> "TimeBound":
         """Of a camera's frames."""
         return cls(camera.name, "camera", camera.time_bound)
 

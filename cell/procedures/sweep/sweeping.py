@@ -5,8 +5,6 @@ two clocks shifts the whole sweep along its way; round trips bound it. How long 
 its time on it cannot be known.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial

@@ -6,8 +6,6 @@ are, and the rest is little. Geometry is in Foxglove's Protobuf schemas; what on
 knows is JSON with a schema.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -168,7 +166,7 @@ class RecordFile:
             self._waiting.clear()
             log.warning("the record of this run cannot be written: %s", self.failure)
 
-    def _write(self, out: _Out) -> None:
+    def _write(self, out: "_Out") -> None:
         flushed = time.monotonic()
         while True:
             ending = self._ending.wait(LOOK_S)
@@ -184,7 +182,7 @@ class RecordFile:
         out.writer.finish()
         self.cpu_s = time.thread_time()
 
-    def _drain(self, out: _Out) -> int:
+    def _drain(self, out: "_Out") -> int:
         while self._waiting:
             topic, at, make = self._waiting.popleft()
             try:

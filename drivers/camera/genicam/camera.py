@@ -6,8 +6,6 @@ picture is also held against that interval, every other one against its end: a c
 refused. Nothing of this has run on a camera of any maker yet; docs/how-to/cameras.md says with what it was tested.
 """
 
-from __future__ import annotations
-
 import ctypes
 import threading
 from collections.abc import Iterator
@@ -237,7 +235,7 @@ class GenicamCamera:
         host_time = self._stamps.host_time(device_time, latest=received - self._wish.exposure)
         return Frame(picture.image, count, self._wish.exposure, device_time, host_time=host_time, received=received)
 
-    def _timing(self, device: GenicamDevice) -> Wish:
+    def _timing(self, device: GenicamDevice) -> "Wish":
         """What is set; before the first `configure` whatever the camera has."""
         if self._wish is None:
             self._wish = set_timing(device, None, paced=self._record.paced)

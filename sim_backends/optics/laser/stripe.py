@@ -6,8 +6,6 @@ sees it on the slope, widened by point spread and defocus, integrated over pixel
 4).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -37,7 +35,7 @@ class Crossings:
     points: Vector
     normals: Vector
 
-    def keep(self, mask: NDArray[np.bool_]) -> Crossings:
+    def keep(self, mask: NDArray[np.bool_]) -> "Crossings":
         """Only those crossings where `mask` (n,) holds."""
         return Crossings(self.rows[mask], self.columns[mask], self.slopes[mask], self.points[mask], self.normals[mask])
 

@@ -5,8 +5,6 @@ from 0x10000 on. Pixel Format Naming Convention 2.1, 10 and 12 bits being the gr
 (schema 1.1) and Standard Features Naming Convention 2.4 for the description.
 """
 
-from __future__ import annotations
-
 import math
 import socket
 import struct
@@ -71,7 +69,7 @@ class GvcpRequest:
     answered: bool
 
     @classmethod
-    def of(cls, packet: bytes) -> GvcpRequest | None:
+    def of(cls, packet: bytes) -> "GvcpRequest | None":
         """None for bytes that are no request."""
         if len(packet) < _COMMAND.size:
             return None

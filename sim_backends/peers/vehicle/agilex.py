@@ -5,8 +5,6 @@ Feedback keeps its cycles in world time; in a fast world a frame is sent at most
 time, with the newest values.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 import time
@@ -78,7 +76,7 @@ class AgilexPeer(CanPeer):
         if frames:
             self._bus.send(frames)
 
-    def _of_others(self, cyclic: _Cyclic, feedback: VehicleReadings) -> list[CanFrame]:
+    def _of_others(self, cyclic: "_Cyclic", feedback: VehicleReadings) -> list[CanFrame]:
         """What others put on the bus beside this frame of the vehicle's."""
         frames = []
         if SECOND_VEHICLE in self._others and cyclic.id in (SYSTEM_STATE, MOTION_STATE, ODOMETRY):

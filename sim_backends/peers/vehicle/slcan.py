@@ -4,8 +4,6 @@ Every client is an adapter on the same bus. What one client sends reaches the ow
 adapter that is not open, is set to another bit rate or listens only takes no part in sending.
 """
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import threading
@@ -50,7 +48,7 @@ class SlcanBus(TcpServer):
         self._adapters: list[_Adapter] = []
         self.channel = f"socket://{self.address}"
 
-    def send(self, frames: list[CanFrame], sender: _Adapter | None = None) -> None:
+    def send(self, frames: list[CanFrame], sender: "_Adapter | None" = None) -> None:
         """Put frames on the bus: all adapters but `sender` get them."""
         lines = b"".join(_encode(frame) for frame in frames)
         with self._adapters_lock:
@@ -75,7 +73,7 @@ class SlcanBus(TcpServer):
             with self._adapters_lock:
                 self._adapters.remove(adapter)
 
-    def _command(self, adapter: _Adapter, line: bytes) -> None:
+    def _command(self, adapter: "_Adapter", line: bytes) -> None:
         text = line.decode("ascii", "replace").strip("\n\0")
         kind, rest = text[:1], text[1:]
         if kind in ("t", "T", "r", "R"):

@@ -7,8 +7,6 @@ all checks. The most probable part is named. `detectable` says what a good verdi
 and the calibration's own covariance hide small changes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -76,7 +74,7 @@ class DriftVerdict:
     fit: dict[str, float]
     suspects: list[Suspect]
     figures: list[Figure]
-    detectable: list[Detectable]
+    detectable: "list[Detectable]"
 
     @property
     def badly_fitting(self) -> list[str]:

@@ -4,8 +4,6 @@ Which terms of the lens are free is decided on views that were left out: a few p
 A bent board moves focal length and principal point by many times their formal deviation, and leaves small residuals.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -88,7 +86,7 @@ class Intrinsics:
     covariance: Array = field(default_factory=lambda: np.zeros((9, 9)))
     model: LensModel = PLAIN
     tried: dict[str, float] = field(default_factory=dict)
-    bend: Bend | None = None
+    bend: "Bend | None" = None
     pull: Array = field(default_factory=lambda: np.zeros(0))
 
 
@@ -98,7 +96,7 @@ class _LensFit:
     camera: CameraModel
     covariance: Array
     left: LeftOut | None
-    bend: Bend | None
+    bend: "Bend | None"
     untold: Array = field(default_factory=lambda: np.zeros((0, 9)))
     """What a bend that is not believed may have moved the camera (n, 9)."""
 

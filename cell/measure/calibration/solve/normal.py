@@ -6,8 +6,6 @@ Rests of the arm touch each other only through the shared parameters, so their o
 complement): the work grows with the number of views, not its cube.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
@@ -67,7 +65,7 @@ class AdjustmentState:
     flanges: list[pin.SE3] = field(default_factory=list)
     rails: Array = field(default_factory=lambda: np.zeros(0))
 
-    def moved(self, step: Array) -> AdjustmentState:
+    def moved(self, step: Array) -> "AdjustmentState":
         """The state after a step (27 + 7 per view,)."""
         plane = self.plane
         if plane is not None:

@@ -11,8 +11,6 @@ An arm that has not moved between two sweeps sees the surface in one place, or s
 or the arm itself. The rate is taken as even; half of it is counted as unknown, as it may not be
 (docs/explanation/theory.md, section 8). A placed part may still move while what is beside it does not."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -134,7 +132,7 @@ def surface_motion(
     return seen
 
 
-def _compared(before: _Beside, tree: scipy.spatial.cKDTree, now: _Beside, radius: float) -> SurfaceMotion:
+def _compared(before: "_Beside", tree: scipy.spatial.cKDTree, now: "_Beside", radius: float) -> SurfaceMotion:
     """How far the points of `now` have risen over those of `before`, whose feet are in the `tree`, as a motion."""
     # As far as the gate lets it be told, where the points tell nothing.
     free = np.array([GATE_M] * 3 + [GATE_M / radius] * 3)
@@ -195,7 +193,7 @@ class _Beside:
     share: float
 
     @classmethod
-    def of(cls, cloud: Cloud, nominal: NominalSurface, pose: pin.SE3, by_poses: Motions) -> _Beside:
+    def of(cls, cloud: Cloud, nominal: NominalSurface, pose: pin.SE3, by_poses: Motions) -> "_Beside":
         scan, (lines, rows) = Scan.of(cloud, MOST_POINTS), cloud.subsample(MOST_POINTS)
         found = correspondences(pose, scan, nominal, GATE_M)
         feet = found.arms - found.heights[:, None] * found.normals
@@ -228,7 +226,7 @@ class Creep:
     since: float
 
     @classmethod
-    def of(cls, moved: SurfaceMotion, unsure: Array, origin: Array, since: float, until: float) -> Creep | None:
+    def of(cls, moved: SurfaceMotion, unsure: Array, origin: Array, since: float, until: float) -> "Creep | None":
         """From a motion between two sweeps, their middles at `since` and `until`, s; None where none shows.
 
         `unsure` (6, 6) is what the sweeps' times leave open of the motion.

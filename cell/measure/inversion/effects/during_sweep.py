@@ -13,8 +13,6 @@ constant and the even slope of that go into the pose, unseen. The bow tells how 
 bent along the sweep looks the same, so the pose is not corrected: what the carriage may have done to it is added to
 its covariance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,7 +83,7 @@ def find_rocking(cloud: Cloud, nominal: NominalSurface, base_from_surface: pin.S
     return Rocking(hz, height, float(np.median([sweep.speed for sweep in known])) / hz)
 
 
-def _strongest(known: list[_Sweep]) -> tuple[float, float]:
+def _strongest(known: "list[_Sweep]") -> tuple[float, float]:
     """The frequency, Hz, that explains most of the sweeps' heights, after the evidence for it."""
     fastest = min(FASTEST_HZ, *(0.45 / sweep.apart for sweep in known))
     best, hz = 0.0, 0.0
@@ -110,7 +108,7 @@ class _Sweep:
     speed: float
 
     @classmethod
-    def of(cls, times: Array, heights: Array, places: Array) -> _Sweep | None:
+    def of(cls, times: Array, heights: Array, places: Array) -> "_Sweep | None":
         """None for one that is too short or whose times do not tell its lines apart."""
         t = times - times.mean()
         steps = np.diff(t)
@@ -243,7 +241,7 @@ class Head:
     @classmethod
     def of(
         cls, cloud: Cloud, base_from_flange: pin.SE3, flange_from_camera: pin.SE3, rail_direction: Array, travel: float
-    ) -> Head:
+    ) -> "Head":
         """`rail_direction` is the camera's travel per metre of the rail in its own frame; `base_from_flange` holds
         where the cloud does not tell the flange of each line."""
         flanges = cloud.flanges if len(cloud.flanges) else np.tile(base_from_flange.homogeneous, (cloud.shape[0], 1, 1))

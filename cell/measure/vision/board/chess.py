@@ -3,8 +3,6 @@
 Corners come in one order: x along the columns, y down the rows, z into the board, the first square black.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -70,7 +68,7 @@ def find_chessboard(image: Image, spec: BoardSpec) -> BoardView:
 
 
 def _view(
-    image: Image, lit: Image, spec: BoardSpec, corners: Corners, index: NDArray[np.intp], places: Places
+    image: Image, lit: Image, spec: BoardSpec, corners: "Corners", index: NDArray[np.intp], places: Places
 ) -> BoardView:
     index, places = _extended(corners, index, places, spec.name)
     pixels = corners.places[index]
@@ -116,7 +114,9 @@ def _check_none_beyond(image: Image, spec: BoardSpec, plane: PlaneMap, contrast:
             )
 
 
-def _extended(corners: Corners, index: NDArray[np.intp], places: Places, name: str) -> tuple[NDArray[np.intp], Places]:
+def _extended(
+    corners: "Corners", index: NDArray[np.intp], places: Places, name: str
+) -> tuple[NDArray[np.intp], Places]:
     """The lattice with the corners beyond a gap, such as a cable, that fit it."""
     tree = scipy.spatial.cKDTree(corners.places)
     for _ in range(3):

@@ -5,8 +5,6 @@ settle which point is which on marked boards, even for a part of one; the others
 `PlaneMap` takes a board's lattice to the picture: a homography, and what the lens adds near known points.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterator
@@ -52,7 +50,7 @@ class Blobs:
         """Areas (n,) of the ellipses in px²."""
         return np.asarray(np.pi * np.abs(np.linalg.det(self.shapes)), dtype=np.float64)
 
-    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> Blobs:
+    def take(self, index: NDArray[np.intp] | NDArray[np.bool_]) -> "Blobs":
         """The blobs of an index or a mask."""
         return Blobs(self.centres[index], self.shapes[index])
 
@@ -182,7 +180,7 @@ class PlaneMap:
     residuals: Array
 
     @classmethod
-    def fit(cls, places: Array | NDArray[np.intp], pixels: Array, tolerance: float, what: str) -> PlaneMap:
+    def fit(cls, places: Array | NDArray[np.intp], pixels: Array, tolerance: float, what: str) -> "PlaneMap":
         """Robust fit to places (n, 2) and pixels (n, 2); `tolerance` in px. Raises PictureRefused."""
         homography, used = cv2.findHomography(places.astype(np.float64), pixels, cv2.RANSAC, tolerance)
         if homography is None or used is None or used.sum() < 4:

@@ -4,8 +4,6 @@ A plane is in DN of an 8-bit picture, as numbers with a fraction, whatever the c
 
 The noise of one pixel, seen in the picture: what a line's neighbours differ by, above the declared photon noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -68,11 +66,11 @@ class Picture:
         """True when the three colours differ."""
         return self.value.ndim == 3
 
-    def rows(self, part: slice) -> Picture:
+    def rows(self, part: slice) -> "Picture":
         """Some rows of it."""
         return Picture(self.value[part], self.saturated[part], self.plain, self.full)
 
-    def turned(self) -> Picture:
+    def turned(self) -> "Picture":
         """The picture with its columns as rows."""
         turn = (1, 0, 2) if self.coloured else (1, 0)
         value = np.ascontiguousarray(self.value.transpose(turn))

@@ -1,7 +1,5 @@
 """The course of a run along its time, what each device did meanwhile, and how it stands among the runs before it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime

@@ -6,8 +6,6 @@ times a second, and an input recipe without one as well. Sources: the maker's RT
 section 1. Physics is elsewhere.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import signal
@@ -46,7 +44,7 @@ _FLOOD = 65536
 class RtdeSession:
     """One RTDE connection: its recipes and whether it has been started."""
 
-    def __init__(self, controller: RtdePeer, client: Client) -> None:
+    def __init__(self, controller: "RtdePeer", client: Client) -> None:
         self._controller = controller
         self._client = client
         self._buffer = b""
@@ -162,7 +160,7 @@ class RtdeSession:
         if recipe is not None:
             recipe.apply(payload)
 
-    _HANDLERS: dict[str, Callable[[RtdeSession, bytes], None]] = {  # noqa: RUF012
+    _HANDLERS: "dict[str, Callable[[RtdeSession, bytes], None]]" = {  # noqa: RUF012
         "V": _on_protocol,
         "v": _on_version,
         "O": _on_outputs,
