@@ -228,7 +228,7 @@ class OwnSurface:
 
 
 @dataclass(frozen=True)
-class _MeshFile:
+class _DrawnFile:
     """A mesh file: two that say the same by the same name are one, wherever they lie."""
 
     path: str = field(compare=False)
@@ -247,12 +247,12 @@ class _MeshFile:
 
 def own_surface(path: str, unit: str) -> OwnSurface:
     """The surface in a mesh file; the last few are kept. Raises ValueError when there is no mesh in it."""
-    return _read(_MeshFile.at(path, unit))
+    return _read(_DrawnFile.at(path, unit))
 
 
 def part_mesh(path: str, unit: str) -> SurfaceMesh:
     """The part in a mesh file as a camera above it sees it: walls are as drawn, they only hide what is behind them."""
-    return _part(_MeshFile.at(path, unit))
+    return _part(_DrawnFile.at(path, unit))
 
 
 def underside(path: str, unit: str) -> Surface:
@@ -261,7 +261,7 @@ def underside(path: str, unit: str) -> Surface:
 
 
 @lru_cache(maxsize=4)
-def _read(file: _MeshFile) -> OwnSurface:
+def _read(file: _DrawnFile) -> OwnSurface:
     import trimesh
 
     merged = trimesh.Trimesh(*_divided(*_loaded(file), COARSEST), process=True)
@@ -270,7 +270,7 @@ def _read(file: _MeshFile) -> OwnSurface:
 
 
 @lru_cache(maxsize=4)
-def _part(file: _MeshFile) -> SurfaceMesh:
+def _part(file: _DrawnFile) -> SurfaceMesh:
     vertices, faces = _loaded(file)
     a, b, c = np.moveaxis(vertices[faces], 1, 0)
     up = np.cross(b - a, c - a)[:, 2] > 0.0
@@ -287,7 +287,7 @@ def _turned_over(own: OwnSurface) -> Surface:
     return _ground(own.ground.name, own.vertices * [1.0, 1.0, -1.0], own.triangles)
 
 
-def _loaded(file: _MeshFile) -> tuple[Floats, Faces]:
+def _loaded(file: _DrawnFile) -> tuple[Floats, Faces]:
     """Vertices (n, 3), m, and triangles (m, 3) of a mesh file."""
     import trimesh
 
