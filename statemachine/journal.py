@@ -183,7 +183,9 @@ class Journal:
             try:
                 return int(self._base.execute(statement, values).lastrowid or 0)
             except sqlite3.Error as error:
-                raise JournalError(f"the journal {self.path} cannot be written: {error}. Is the disk full?") from error
+                raise JournalError(
+                    f"the journal {self.path} cannot be written: {error}. `df -h` tells whether the disk is full"
+                ) from error
 
 
 @dataclass(frozen=True)
@@ -314,7 +316,7 @@ def request(folder: Path, kind: str, reason: str, number: int | None = None) -> 
 def _in_existing(folder: Path, use: Callable[[sqlite3.Connection], Result]) -> Result:
     path = folder / FILE_NAME
     if not path.exists():
-        raise JournalError(f"there is no journal {path}. Is {folder} a run's folder?")
+        raise JournalError(f"there is no journal {path}; see that the folder is that of a run")
     try:
         base = sqlite3.connect(path, timeout=5.0, isolation_level=None)
         try:

@@ -32,6 +32,8 @@ GRID = 21
 FAR_M = 1.0
 BESIDE_PART_M = 2e-3
 """A pin or a hole's rim may stand out of the mesh of a part so far."""
+OUT_OF_BOX_M = 0.5e-3
+"""So much of the mesh of a part outside its box is not worth a word."""
 
 
 def contact_problems(job: Job, config: CellConfig, mesh: Path) -> Iterator[str]:
@@ -101,10 +103,7 @@ def mating_problems(job: Job, mesh: Path) -> Iterator[str]:
     if job.part is None:
         return
     found = _drawn(job, mesh)
-    problem = f"{APART}. {NEXT_STEP}"
-    if found is not None:
-        problem = found.problem(job.place.tolerance) or ""
-    if problem:
+    if problem := f"{APART}. {NEXT_STEP}" if found is None else found.problem(job.place.tolerance):
         yield f'part.mesh "{Path(job.part.mesh).name}": {problem}'
     yield from _feature_problems(job, job.part)
 
@@ -116,8 +115,6 @@ def _feature_problems(job: Job, part: PartSection) -> Iterator[str]:
             f"part.feature {part.feature[0].name}: nobody looks at the placed part. Write place.verify, a kind of job "
             "with the step verify, or no feature"
         )
-    if not part.feature:
-        return
     low, high = NominalSurface.load(Path(part.mesh), unit=part.mesh_unit).extent
     for feature in part.feature:
         at = np.array(feature.at)
@@ -148,6 +145,10 @@ def contact_notes(job: Job, mesh: Path) -> Iterator[str]:
             "was placed, is not looked at"
         )
         return
+    low, high = NominalSurface.load(Path(job.part.mesh), unit=job.part.mesh_unit).extent
+    x, y, z = job.grasp.size
+    if (out := float(max(*(np.maximum(-low, high)[:2] - (x / 2, y / 2)), high[2] - z, -low[2]))) > OUT_OF_BOX_M:
+        yield f"the part's mesh goes {1e3 * out:.1f} mm beyond its box, grasp.size: the arm keeps only that box clear"
     if (found := _drawn(job, mesh)) is not None:
         yield f"the part's mating face, as drawn: {found.words}"
     if verify.STEP.name not in kind_of(job).names:

@@ -23,14 +23,14 @@ from cell.procedures.calibrate.boards import collect_scan, collect_target
 from cell.procedures.calibrate.reference_plate import see_reference_plate, with_edge
 from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
 from cell.procedures.calibrate.verification import Verification, collect_verification, keep_confirmed
-from cell.run.folder import REPORT, new_run, release, run_log, when
+from cell.run.folder import REPORT, new_folder, release, run_log, when
 from cell.run.recorded_work import WorkContext
 from cell.run.runs import Run
 from cell.run.session import warm_up as ahead
 from cell.run.session.session import OpenCell
-from drivers.errors import CalibrationStale, CellError
+from drivers.errors import CalibrationStale
 from drivers.interfaces import Device, why_untold
-from statemachine.journal import Journal, JournalError
+from statemachine.journal import Journal
 from statemachine.step import Event
 
 
@@ -179,11 +179,8 @@ def recorded_maintenance(root: Path, facts: Mapping[str, object], reason: str, l
     """A run of kind "maintenance" below `root` for as long as the context is open. `CellError` if it cannot be kept."""
     started = time.time()
     facts = {"kind": "maintenance", "pid": os.getpid(), **facts, "maintenance": reason, "lifted": list(lift)}
-    try:
-        folder = new_run(root)
+    with new_folder(root) as folder:
         journal = Journal(folder, folder.name, facts)
-    except (OSError, JournalError) as error:
-        raise CellError(f"no maintenance can be recorded in {root}, so nothing is lifted: {error}") from error
     outcome, said = "done", f"maintenance done: {reason}"
     try:
         with run_log(folder):

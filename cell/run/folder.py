@@ -7,6 +7,7 @@ console. Nothing but the command line prints.
 import logging
 import re
 import secrets
+import shutil
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -43,6 +44,21 @@ def new_run(root: Path) -> Path:
         return folder
 
 
+@contextmanager
+def new_folder(root: Path) -> Iterator[Path]:
+    """The folder of a new run, which goes again, lest it be taken for the newest, where it cannot be written into."""
+    folder = None
+    try:
+        folder = new_run(root)
+        yield folder
+    except (OSError, JournalError) as error:
+        if folder is not None:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise CellError(
+            f"no run can be recorded in {root}: {error}. `df -h` tells whether the disk is full, `ls -ld` who may write"
+        ) from error
+
+
 def list_runs(root: Path) -> list[Path]:
     """All run folders below `root`, oldest first."""
     if not root.is_dir():
@@ -61,7 +77,7 @@ def find_run(root: Path, name: str | None, kind: str | None = None) -> Path:
         matching = [run for run in runs if run.name == name or run.name.endswith(f"-{name}")]
     if not matching:
         wanted = f"no {kind or 'run'} at all" if name is None else f"no run {name}"
-        raise ConfigError(f"{wanted} in {root}; `cell runs` lists them")
+        raise ConfigError(f"{wanted} in {root}; `cell runs` lists them, -c names the cell.toml of another cell")
     return matching[-1]
 
 

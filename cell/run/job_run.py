@@ -33,7 +33,7 @@ from cell.procedures.steps.workplace import PartsBefore, Workplace
 from cell.procedures.sweep.stored_sweep import StoredSweep
 from cell.procedures.sweep.swath import SweepCollector, Sweeping
 from cell.run import calibration as sessions
-from cell.run.folder import new_run, read_report, run_log
+from cell.run.folder import new_folder, read_report, run_log
 from cell.run.record.recorder import Recorder, recorded
 from cell.run.record.replay import save as save_perception
 from cell.run.recorded_work import classify, clear, outcome_of
@@ -46,7 +46,7 @@ from cell.run.session.session import OpenCell
 from drivers.errors import CalibrationStale, CellError
 from drivers.interfaces import Vector
 from statemachine.control import RunControl
-from statemachine.journal import Journal, JournalError
+from statemachine.journal import Journal
 from statemachine.runner import Event, Runner, Script
 from statemachine.step import Outcome
 
@@ -161,14 +161,11 @@ class JobRun:
 
     def perform(self, root: Path, whereabouts: Whereabouts) -> RunOutcome:
         """Run the job in a new folder below `root`. Raises `CellError` only when no run can be recorded there."""
-        try:
-            folder = new_run(root)
+        with new_folder(root) as folder:
             write_json(folder / "configuration.json", self.config.model_dump(mode="json"))
             write_json(folder / "job.json", self.ready.job.model_dump(mode="json"))
             save_calibration(self.calibration, folder / "calibration.json")
             journal = Journal(folder, folder.name, self._facts())
-        except (OSError, JournalError) as error:
-            raise CellError(f"no run can be recorded in {root}: {error}") from error
         self.run.folder = folder
         try:
             with run_log(folder), recorded(folder, self.run, self.config, self.devices, self.calibration) as record:

@@ -20,7 +20,7 @@ from cell.config.cell_config import CellConfig
 from cell.devices.devices import Devices, require_healthy, stop_not_confirmed
 from cell.devices.simulated.following import DeviceFollowing
 from cell.procedures.frame_store import FrameStore
-from cell.run.folder import REPORT, new_run, release, run_log, timeless, when
+from cell.run.folder import REPORT, new_folder, release, run_log, timeless, when
 from cell.run.record.recorder import begin_record
 from cell.run.runs import Run
 from drivers import errors
@@ -140,12 +140,9 @@ class RecordedWork:
         confirmed, else what `work` raised; the cell is stopped first.
         """
         started, begun = time.time(), self.devices.clock.now()
-        try:
-            folder = new_run(self.root)
+        with new_folder(self.root) as folder:
             facts = {"kind": self.kind, "pid": os.getpid(), **self.info}
             journal = Journal(folder, folder.name, facts)
-        except (OSError, JournalError) as error:
-            raise errors.CellError(f"no run can be recorded in {self.root}: {error}") from error
         outer, self.run.folder = self.run.folder, folder
         outcome, reason = "done", f"{self.kind} done"
         ended: BaseException | None = None

@@ -30,7 +30,7 @@ _SLCAN_KBIT = (10, 20, 50, 83.3, 100, 125, 250, 500, 750, 1000)
 def checked_host(text: str) -> str:
     """A host's name or IPv4 address; `ValueError` says what it should look like."""
     form = 'write an IPv4 address such as "10.0.0.5" or a host\'s name'
-    if re.fullmatch(r"[0-9.]+", text):
+    if re.fullmatch(r"[0-9.]+|([0-9]+\.){3}\w+", text):
         try:
             found = ipaddress.IPv4Address(text)
         except ValueError as error:

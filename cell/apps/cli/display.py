@@ -75,7 +75,7 @@ def next_step(report: Mapping[str, object], folder: Path) -> str | None:
     again, see = (_dry_run(report), "") if report.get("simulated") is True else ("cell run", look)
     again += where
     if job := report.get("for_job"):
-        other = "another --seed draws another world; " if report.get("simulated") is True else look
+        other = see or "another --seed draws another world; " * (outcome == "refused")
         return f"{other}put that right, then {again} -j {_job({'job_file': job})}"
     if kind != "job":
         if outcome == "done":
@@ -108,7 +108,8 @@ def _where(folder: Path) -> str:
 
 
 def _dry_run(report: Mapping[str, object]) -> str:
-    """The command that runs in the same simulated world; what is the default is not named."""
+    """The command for the same simulated world, without defaults; after a busy computer's fault on the other clock."""
+    report = {**report, "clock": "virtual"} if ".owner_frozen)" in str(report.get("reason")) else report
     usual = {"seed": 1, "level": "nominal", "clock": "wall"}
     options = (f"--{key} {report[key]}" for key, value in usual.items() if report.get(key, value) != value)
     return " ".join(["cell dry-run", *options])
@@ -121,8 +122,7 @@ def _next_item(report: Mapping[str, object]) -> object:
 
 def _next_job(report: Mapping[str, object]) -> str:
     """Another one of that job, or its next item."""
-    item = _next_item(report)
-    return _job({"job_file": item} if item else report)
+    return _job({"job_file": item} if (item := _next_item(report)) else report)
 
 
 def _job(report: Mapping[str, object]) -> str:

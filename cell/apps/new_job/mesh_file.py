@@ -96,7 +96,7 @@ def _loaded(path: Path) -> tuple[Array, Faces]:
             import cascadio  # noqa: F401
         except ImportError as error:
             raise ConfigError(
-                f"{path} is a STEP file, which the package cascadio reads: pip install -e '.[step]', or export an STL"
+                f"{path} is a STEP file, read by cascadio: in the checkout pip install -e '.[step]', or export an STL"
             ) from error
         settings = {"tol_linear": STEP_CHORD, "tol_angular": STEP_ANGLE}
     try:

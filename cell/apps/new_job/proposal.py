@@ -295,8 +295,8 @@ def _stand_off(low: float, high: float) -> float:
         deepest = 2 * min(best - NEAREST, FARTHEST - best)
         raise ConfigError(
             f"the surface is {1e3 * (high - low):.0f} mm deep as seen from above (allowed: at most {1e3 * deepest:.0f} "
-            "mm: the stripe is sharp and calibrated so far); cut the mesh to what the part is placed onto, or turn it "
-            "with --up"
+            "mm: the stripe is sharp and calibrated so far); give its --unit, cut the mesh to what the part is placed "
+            "onto, or turn it with --up"
         )
     return stand_off
 

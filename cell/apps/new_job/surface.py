@@ -238,8 +238,8 @@ def _required(laid: Laid) -> Laid:
     )
     if area < LEAST_SEEN:
         raise ConfigError(
-            f"{1e6 * area:.3g} mm² of the mesh can be seen from above (at least {1e6 * LEAST_SEEN:g} mm²): it stands "
-            "on edge, or its triangles face down; turn it with --up, or its triangles round with --flip"
+            f"{1e6 * area:.3g} mm² of the mesh can be seen from above (at least {1e6 * LEAST_SEEN:g} mm²): it has "
+            "another --unit, stands on edge, or faces down; turn it with --up, or its triangles round with --flip"
         )
     return laid
 

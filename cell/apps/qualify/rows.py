@@ -157,7 +157,7 @@ SMALL = 256
 def require_installed() -> None:
     """`ConfigError` where the package is missing that writes Parquet."""
     if find_spec("pyarrow") is None:
-        raise ConfigError("the rows of a campaign need pyarrow; install: pip install -e '.[qualify]'")
+        raise ConfigError("the rows of a campaign need pyarrow; in the checkout: pip install -e '.[qualify]'")
 
 
 class RowStore:

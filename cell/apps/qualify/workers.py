@@ -217,7 +217,7 @@ def open_workers(count: int | None, scheduler: str | None, cluster: str | None) 
 def _prepare() -> None:
     """`ConfigError` without Dask, which then leaves it to the campaign to try a world again whose worker died."""
     if find_spec("distributed") is None:
-        raise ConfigError("a cluster needs Dask; install: pip install -e '.[cluster]'")
+        raise ConfigError("a cluster needs Dask; in the checkout: pip install -e '.[cluster]'")
     import dask
 
     dask.config.set({"distributed.scheduler.allowed-failures": 0, "distributed.comm.timeouts.connect": ANSWER_S})

@@ -27,7 +27,7 @@ FIVE_PERCENT = 1.645
 APART = "below the part as drawn there is nothing of the surface, or the triangles of part.mesh face inwards"
 NEXT_STEP = (
     "See that part.mesh is the drawing of this part, in the datum of grasp.flange_from_part and "
-    "place.surface_from_part, and that part and surface are of one revision"
+    "place.surface_from_part (--grasp and --part-place of `cell new-job`), and that both are of one revision"
 )
 
 

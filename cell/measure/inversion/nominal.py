@@ -351,7 +351,7 @@ def _read(file: _MeshFile, unit: str) -> tuple[Array, NDArray[np.int64]]:
     if not 0.001 < extent < 5.0:
         raise ConfigError(
             f"mesh {path} measures {1e3 * extent:.3g} mm with mesh_unit = {unit!r} (allowed: 1 to 5000 mm); "
-            "check surface.mesh_unit, or part.mesh_unit, in the job"
+            "check surface.mesh_unit, or part.mesh_unit, in the job; --unit or --part-unit of `cell new-job`"
         )
     if not alike:
         raise ConfigError(

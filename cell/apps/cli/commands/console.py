@@ -68,7 +68,7 @@ def require_installed() -> None:
     from importlib.util import find_spec
 
     if missing := [name for name in ("starlette", "uvicorn", "websockets") if find_spec(name) is None]:
-        raise ConfigError(f"the page's server needs {', '.join(missing)}; install: pip install -e '.[console]'")
+        raise ConfigError(f"the page's server needs {', '.join(missing)}; in the checkout: pip install -e '.[console]'")
 
 
 def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:

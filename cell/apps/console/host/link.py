@@ -241,7 +241,7 @@ class ServerProcess:
             threading.Thread(target=work, name=f"console {work.__name__.strip('_')}", daemon=True).start()
         if not self._ready.wait(START_S):
             self.close()
-            raise CellError("the console's server did not start; install it with: pip install -e '.[console]'")
+            raise CellError("the console's server did not start; in the checkout: pip install -e '.[console]'")
 
     def notify(self, message: object) -> None:
         """To the server, when it listens; never waits."""

@@ -38,7 +38,8 @@ def changed(key: str, value: Any) -> Job:
 def test_the_drawing_of_the_part_is_held_against_that_of_the_surface(tmp_path: Path) -> None:
     job, mesh = load_job(job_with_part(tmp_path, "pot"))
     assert list(mating_problems(job, mesh)) == []
-    *_, face, looked = contact_notes(job, mesh)
+    *_, boxed, face, looked = contact_notes(job, mesh)
+    assert re.fullmatch(r"the part's mesh goes \d+\.\d mm beyond its box, grasp\.size: .*", boxed)
     assert face.startswith("the part's mating face, as drawn: gap 0.00 to 0.00 mm")
     assert looked.startswith("nobody looks how the part lies once it was placed")
     wrong, mesh = load_job(job_with_part(tmp_path, "pot", lambda corners: corners - np.array([0.0, 0.0, 0.4e-3])))

@@ -19,6 +19,7 @@ from cell.run.folder import (
     find_run,
     is_going,
     list_runs,
+    new_folder,
     new_run,
     read_report,
     run_log,
@@ -181,3 +182,9 @@ def test_a_log_that_cannot_be_written_ends_nothing(
         logging.getLogger("cell.run").warning("nothing but this")
         raise ConfigError("the board is not seen")
     assert capfd.readouterr().err == ""
+
+
+def test_a_folder_that_nothing_can_be_written_into_goes_again_and_hides_no_run(tmp_path: Path) -> None:
+    with pytest.raises(CellError, match="`df -h` tells"), new_folder(tmp_path) as folder:
+        raise OSError(28, f"No space left on device: {folder}")
+    assert list_runs(tmp_path) == []

@@ -21,6 +21,7 @@ from drivers.common.addresses import (
     [
         (checked_host, "300.1.2.3", "0 to 255"),
         (checked_host, "192.168.0", "four numbers"),
+        (checked_host, "192.0.2.1O", "four numbers"),
         (checked_host, "arm one", "is no address"),
         (checked_host, "10.0.0.5:30004", "leave out port"),
         (checked_host, "http://10.0.0.5", "leave out port, scheme"),

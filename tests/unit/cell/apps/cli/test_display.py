@@ -267,3 +267,17 @@ def test_the_next_command_names_a_cell_that_is_elsewhere(tmp_path: Path) -> None
         held = {**report, "part": "held", "job_kind": kind, "outcome": outcome}
         assert str(next_step(held, folder)).startswith("take the part out of the claw; ")
     assert next_step(report, folder) == f"cell resume aaaa -c '{tmp_path}/my cell/cell.toml': go on with the job"
+
+
+@pytest.mark.parametrize(
+    ("outcome", "reason", "words"),
+    [
+        ("faulted", "no life (rail.owner_frozen). End", "put that right, then cell dry-run --clock virtual -j pot"),
+        ("refused", "no board", "another --seed draws another world; put that right, then cell dry-run -j pot"),
+    ],
+)  # fmt: skip
+def test_after_a_simulated_calibration_the_next_command_fits_its_end(
+    tmp_path: Path, outcome: str, reason: str, words: str
+) -> None:
+    report = {"kind": "calibration", "outcome": outcome, "reason": reason, "simulated": True, "for_job": "pot"}
+    assert next_step(report, tmp_path / "runs" / "20261124T120000-aaaa") == words
