@@ -1,6 +1,7 @@
 """The cell's work on its own calibration: find it, make one over the boards on the deck, see how good it is today."""
 
 import os
+import tempfile
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -28,7 +29,7 @@ from cell.run.recorded_work import WorkContext
 from cell.run.runs import Run
 from cell.run.session import warm_up as ahead
 from cell.run.session.session import OpenCell
-from drivers.errors import CalibrationStale
+from drivers.errors import CalibrationStale, CellError
 from drivers.interfaces import Device, why_untold
 from statemachine.journal import Journal
 from statemachine.step import Event
@@ -70,8 +71,9 @@ def stored(cell: OpenCell) -> CellCalibration:
 def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibration:
     """Move through the calibration poses, solve, and store the result and what it came from, recorded in `run`.
 
-    `job` names the part that may be in the claw.
+    `job` names the part that may be in the claw. Raises `CellError`, before anything moves, where it cannot be stored.
     """
+    _require_writable(cell.calibrations_folder)
     ahead.begin()
     part_of, _ = load_job(job)
     config, devices = cell.config, cell.devices
@@ -103,6 +105,18 @@ def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibrat
     store.save_calibration(calibration, cell.calibrations_folder / f"{calibration.name}.json")
     notify(1.0, "stored")
     return calibration
+
+
+def _require_writable(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise CellError(
+            f"no calibration can be stored in {folder}: {error}. `df -h` tells whether the disk is full, `ls -ld` who "
+            "may write"
+        ) from error
 
 
 @contextmanager
