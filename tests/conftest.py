@@ -28,7 +28,7 @@ GROUPS = (
     # One device at a time; they mostly wait.
     ("unit/drivers/rail/tmcl/test_rail.py", "integration/wire/vehicle/test_vehicle_driver.py",
      "unit/drivers/rail/modbus/test_rail.py", "unit/cell/devices/contracts/test_test_configured.py",
-     "unit/drivers/vehicle/cia402/test_vehicle.py", "integration/wire/rail/test_other_module.py",
+     "unit/drivers/vehicle/cia402/test_vehicle.py",
      "integration/wire/vehicle/test_other_vehicle.py", "integration/wire/rail/test_other_drives.py",
      "integration/wire/vehicle/test_canopen_contract.py"),
     # The arm; last those whose times are compared most closely: at first others still compile.
