@@ -34,20 +34,6 @@ def test_it_drives_as_told_and_odometry_follows(enabled: Bench) -> None:
     assert state.yaw == pytest.approx(yaw, abs=0.005)
 
 
-def test_a_motor_fault_is_told_in_words_and_cleared_by_enabling(enabled: Bench) -> None:
-    enabled.peer.fault("vehicle.motor_fault")
-    enabled.until(lambda: len(enabled.vehicle.state().trouble) == 2)
-    assert enabled.vehicle.state().trouble == ("a motor driver fails", "motor 1: driver fails")
-    for refused in (enabled.vehicle.check, lambda: enabled.vehicle.drive(0.1, 0.0)):
-        with pytest.raises(DeviceFault, match="0x0100: a motor driver fails; motor 1: driver fails") as caught:
-            refused()
-        assert caught.value.code == "vehicle.error"
-        assert caught.value.recoverable
-    enabled.vehicle.enable()
-    enabled.vehicle.check()
-    assert enabled.vehicle.state().error_bits == 0
-
-
 def test_recovering_clears_the_error_with_the_brake_locked_all_along(enabled: Bench) -> None:
     enabled.vehicle.brake()
     enabled.until(lambda: enabled.model.feedback(enabled.world.now()).braked)

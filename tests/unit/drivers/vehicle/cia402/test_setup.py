@@ -75,6 +75,23 @@ def test_a_value_that_is_not_needed_may_be_refused_and_one_that_is_may_not(apart
     assert met.value.code == "vehicle.setup"
 
 
+def test_drives_of_few_objects_drive_and_what_is_missing_is_named(apart: Bench) -> None:
+    """No options, no inputs and outputs, no supply voltage; they say neither how they count nor in what unit."""
+    for drive in apart.peer.drives:
+        for index in (0x605A, 0x605D, 0x605E, 0x6079, 0x608F, 0x60A9, 0x60FD, 0x60FE):
+            for key in [key for key in drive.node._values if key[0] == index]:
+                del drive.node._values[key]
+    with pytest.raises(DeviceFault, match=r"digital inputs.*cannot be mapped") as met:
+        apart.connect()
+    assert met.value.code == "vehicle.setup"
+    vehicle = apart.connect(replace(WHEELS, stop_input=None))
+    vehicle.enable()
+    apart.drive_until_fast()
+    vehicle.brake()
+    assert (vehicle.state().braked, vehicle.state().battery_volts) == (True, None)
+    vehicle.close()
+
+
 def test_a_drive_that_was_switched_off_is_set_up_again_and_its_counts_are_not_trusted(bench: Bench) -> None:
     bench.drive_until_fast()
     node = bench.peer.drives[0].node
