@@ -8,9 +8,7 @@ import time
 import can
 import pytest
 
-from cell.config.job import load_job
-from cell.procedures.drive.way import Whereabouts
-from drivers.errors import DeviceFault, InterlockError, RefusedError
+from drivers.errors import DeviceFault, InterlockError
 from tests.support.wire.vehicle_bench import STANDSTILL, Bench, benched
 from tests.unit.drivers.vehicle import conftest
 
@@ -127,19 +125,3 @@ def test_a_driver_that_never_took_command_knows_nothing_of_the_brake_and_sends_n
         while (message := observer.recv(0.3)) is not None and len(seen) < 12:
             seen.add(message.arbitration_id)
     assert 0x111 not in seen
-
-
-def test_where_it_stands_is_not_known_any_more_after_its_link_was_lost(enabled: Bench) -> None:
-    job = load_job("pot")[0]
-    whereabouts = Whereabouts(enabled.vehicle)
-    whereabouts.say_at_start()
-    whereabouts.enter(job)
-    enabled.drive_for(1.0, 0.3)
-    enabled.vehicle.stop()
-    start = job.approach.start.se3().translation[0]
-    assert whereabouts.pose().x == pytest.approx(start + enabled.truth()[0], abs=0.01)
-    enabled.peer.fault("can.bus_off")
-    enabled.until(lambda: enabled.vehicle.statistics.errors.get("link_lost") == 1)
-    enabled.vehicle.enable()
-    with pytest.raises(RefusedError, match="bus failed and was opened again"):
-        whereabouts.pose()

@@ -315,3 +315,12 @@ def test_a_version_text_shorter_than_its_frames_is_that_text_and_no_row_of_zeros
         answer.take("VersionResponse", dict(zip(names, words, strict=True)))
     assert answer.is_complete()
     assert answer.describe() == "SCOUT V2.3-1"
+
+
+@pytest.mark.parametrize("message", ["VersionNumbers", "VersionResponse"])
+def test_a_version_may_be_told_in_numbers_under_either_identifier(message: str) -> None:
+    answer = VersionAnswer()
+    numbers = {"ControllerHardware": 2, "DriverHardware": 1, "ControllerSoftware": 0x2041, "DriverSoftware": 110}
+    answer.take(message, numbers)
+    assert answer.is_complete()
+    assert answer.describe() == "hardware 2/1, controller 8257, drivers 110"

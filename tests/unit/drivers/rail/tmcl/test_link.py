@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,10 +18,7 @@ from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
 from drivers.rail.tmcl.link import Axis, TelegramError, TmclLink, TmclRequest, decode_firmware, decode_reply
-from sim_backends.clock import WorldClock
-from sim_backends.models.rail import RailModel, RailParams
-from sim_backends.peers.rail.tmcl import TmclPeer
-from tests.support.wire.rail_bench import SPEED, Bench, connect, reply
+from tests.support.wire.rail_bench import Bench, connect, reply
 
 BYTE = st.integers(0, 255)
 VALUE = st.integers(-(2**31), 2**31 - 1)
@@ -99,21 +95,6 @@ def test_a_peer_that_dies_in_mid_move_is_a_fault_at_once(homed: Bench) -> None:
     homed.rail.close()
     with pytest.raises(NotConnectedError):
         homed.rail.state()
-
-
-@pytest.mark.wire
-def test_a_pseudo_terminal_does_as_well() -> None:
-    clock = Clock(SPEED)
-    peer = TmclPeer(RailModel(RailParams(), np.random.default_rng(1)), WorldClock(SPEED), pty=True)
-    peer.start()
-    try:
-        assert peer.pty is not None
-        rail = connect(peer.pty, clock)
-        rail.home().wait(20.0)
-        assert rail.state().position == 0.0
-        rail.close()
-    finally:
-        peer.stop()
 
 
 def test_a_port_that_is_not_there_is_named() -> None:
