@@ -9,8 +9,6 @@ from pathlib import Path
 import pytest
 
 from cell import Cell
-from cell.procedures.arm.photograph import scan_calibration_views
-from cell.procedures.calibrate import boards
 from cell.run.folder import list_runs, read_report
 from tests.project.test_readme import block
 from tests.support.wire.cells import Supervised
@@ -22,8 +20,6 @@ def supervised(tmp_path_factory: pytest.TempPathFactory) -> Supervised:
     folder = tmp_path_factory.mktemp("cell")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        # Every second view does: nothing here is compared more closely than to half a millimetre.
-        patch.setattr(boards, "scan_calibration_views", lambda *about: scan_calibration_views(*about)[::2])
         with Cell.open(sim="all", seed=3, clock="virtual") as virtual:
             virtual.calibrate()
     (folder / "supervise.py").write_text(block("python"), encoding="utf-8")

@@ -79,19 +79,9 @@ def test_a_frame_that_was_exposed_as_for_another_setting_is_refused(
     bench.camera.grab()
 
 
-def test_a_frame_that_is_lost_while_the_camera_is_examined_is_told_with_a_remedy() -> None:
-    world = WorldClock(1.0)
-    peer = FramePeer("scan_camera", world, render, SPEC)
-    peer.start()
-    camera = StreamCamera("scan_camera", peer.address, clock=Clock())
-    later = threading.Timer(0.4, peer.fault, ("camera.frame_loss",))
-    try:
-        later.start()
-        found = {reading.what: reading for reading in examine("camera", camera, [0.001], Clock())}
-    finally:
-        later.cancel()
-        camera.close()
-        peer.stop()
+def test_a_frame_that_is_lost_while_the_camera_is_examined_is_told_with_a_remedy(bench: Bench) -> None:
+    bench.peer.fault("camera.frame_loss")
+    found = {reading.what: reading for reading in examine("camera", bench.camera, [0.001], Clock())}
     assert found["frames lost"].value == 1.0
     assert not found["frames lost"].ok
     assert "cable" in found["frames lost"].remedy

@@ -80,11 +80,12 @@ def test_the_nodes_of_a_bus_are_found_by_one_question_each_and_the_others_only_h
     apart: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither a network command nor anything for a node that the configuration does not name is sent."""
-    monkeypatch.setattr(make, "LISTEN_S", 0.4)
+    monkeypatch.setattr(make, "LISTEN_S", 0.8)
     record = config(tmp_path).model_copy(update={"interface": "virtual", "channel": apart.channel})
     with apart.other() as other:
-        sender = other.send_periodic(frame(0x709, b"\x05"), 0.05)
+        sender = other.send_periodic(frame(0x709, b"\x05"), 0.5)
         text, ok = look_at_nodes(record)
+        monkeypatch.setattr(make, "LISTEN_S", 0.1)
         missing, found = look_at_nodes(record.model_copy(update={"right_node": 7}))
         taken = look_at_nodes(record.model_copy(update={"own_node": 1, "left_node": 2, "right_node": 1}))
         sender.stop()
