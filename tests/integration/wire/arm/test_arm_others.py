@@ -155,14 +155,11 @@ def test_an_input_that_another_client_holds_is_named_at_connecting(bench, name, 
 
 
 def test_a_port_that_tells_no_kinematics_costs_two_seconds_and_is_named(bench):
-    begun = time.monotonic()
-    connect(bench.address).close()
-    usual = time.monotonic() - begun
     with Cable(bench.address, but=(30001,), silent=(30001,)) as cable:
         begun = time.monotonic()
         arm = connect(cable.address)
         arm.close()
-        assert time.monotonic() - begun < usual + 4.0
+        assert time.monotonic() - begun < 6.0
         assert "port 30001" in arm.untold and "sent none within 2 s" in arm.untold
 
 

@@ -28,6 +28,16 @@ def test_a_drive_that_does_not_watch_us_is_refused_before_anything_moves(apart: 
     assert apart.braked()
 
 
+def test_a_drive_that_somebody_else_turns_is_told_and_left_alone(apart: Bench) -> None:
+    values = apart.peer.drives[0].node._values
+    values[0x6041, 0].read, values[0x606C, 0].read = lambda: 0x0237, lambda: 3000
+    with pytest.raises(DeviceFault, match=r"left drive turns its wheel at 0\.157 m/s") as met:
+        apart.connect()
+    assert met.value.code == "vehicle.disturbed"
+    # Uploads and the parts of a text: nothing is set.
+    assert {message.data[0] >> 5 for message in apart.bus.frames} <= {2, 3}
+
+
 def test_a_drive_that_counts_otherwise_than_configured_is_refused(apart: Bench) -> None:
     with pytest.raises(ConfigError, match=r"counts 4096 per turn.*counts_per_turn is 1024"):
         apart.connect(replace(WHEELS, counts=1024))
