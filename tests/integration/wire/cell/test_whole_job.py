@@ -13,19 +13,21 @@ from pathlib import Path
 import pytest
 from can.io.canutils import CanutilsLogReader
 
+from cell.config.cell_config import default_toml
 from cell.run.record.reading import as_candump, information
 from drivers.vehicle.agilex_link import load_database
 from tests.support import Typed
-from tests.support.described_cells import LEAN, described
+from tests.support.described_cells import LEAN, changed
 from tests.support.wire.cells import Supervised, assert_safe, served, started, wait_for_step
 
 pytestmark = pytest.mark.wire
 
 
 @pytest.fixture
-def lean(tmp_path: Path) -> Path:
-    """A configuration whose runs leave their report and journal alone."""
-    return described(tmp_path, LEAN)[0]
+def lean(place: Path) -> str:
+    """The name of a configuration in `place` whose runs leave their report and journal alone."""
+    (place / "lean.toml").write_text(changed(default_toml(), LEAN), encoding="utf-8")
+    return "lean.toml"
 
 
 def test_the_supervisor_script_of_the_readme_runs_as_printed(supervised: Supervised) -> None:
@@ -70,9 +72,9 @@ def test_the_record_holds_what_passed_on_the_wires(supervised: Supervised, tmp_p
 
 
 def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
-    place: Path, lean: Path, tmp_path: Path, typed: Typed
+    place: Path, lean: str, tmp_path: Path, typed: Typed
 ) -> None:
-    with served(place, "-c", str(lean), "--seed", "3") as endpoints:
+    with served(place, "-c", lean, "--seed", "3") as endpoints:
         # No calibration lies beside this copy.
         shutil.copy(place / "sim.toml", tmp_path)
         code, _, error = typed("run", "-c", str(tmp_path / "sim.toml"))
@@ -89,8 +91,8 @@ def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
         assert_safe(endpoints)
 
 
-def test_a_killed_simulation_is_reported_within_ten_seconds(place: Path, lean: Path) -> None:
-    with started("dry-run", "-c", str(lean), "--seed", "3", "--json", folder=place) as run:
+def test_a_killed_simulation_is_reported_within_ten_seconds(place: Path, lean: str) -> None:
+    with started("dry-run", "-c", lean, "--seed", "3", "--json", folder=place) as run:
         wait_for_step(place, "drive_to_target", run)
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
         world = next(pid for pid in children if b"sim_backends" in Path(f"/proc/{pid}/cmdline").read_bytes())
