@@ -23,14 +23,11 @@ from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
 GROUPS = (
     # One cell at a time, as an engineer runs it; those first that need little of what the job compiles.
     ("integration/wire/cell/test_commands.py", "unit/sim_backends/test_serve.py",
-     "integration/wire/cell/test_one_authority.py", "integration/wire/cell/test_whole_job.py",
-     "integration/browser/test_screen.py"),
+     "integration/wire/cell/test_whole_job.py", "integration/browser/test_screen.py"),
     # One device at a time; they mostly wait.
     ("unit/drivers/rail/tmcl/test_rail.py", "integration/wire/vehicle/test_vehicle_driver.py",
      "unit/drivers/rail/modbus/test_rail.py", "unit/cell/devices/contracts/test_test_configured.py",
-     "unit/drivers/vehicle/cia402/test_vehicle.py", "integration/wire/rail/test_other_module.py",
-     "integration/wire/vehicle/test_other_vehicle.py", "integration/wire/rail/test_other_drives.py",
-     "integration/wire/vehicle/test_canopen_contract.py"),
+     "unit/drivers/vehicle/cia402/test_vehicle.py", "integration/wire/vehicle/test_canopen_contract.py"),
     # The arm; last those whose times are compared most closely: at first others still compile.
     ("integration/wire/arm/test_arm_others.py", "integration/wire/arm/test_factory_kinematics.py",
      "unit/drivers/test_last_words.py", "integration/wire/safety/test_safe_stop_over_wires.py",

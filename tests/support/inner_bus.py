@@ -57,8 +57,8 @@ class InnerBus:
         while not self._closing.is_set():
             if (message := self._bus.recv(0.05)) is not None:
                 self.frames.append(message)
-                data = bytes(message.data)
-                self._receive(CanFrame(message.arbitration_id, data, False, message.is_remote_frame, message.dlc))
+                number, data = message.arbitration_id, bytes(message.data)
+                self._receive(CanFrame(number, data, message.is_extended_id, message.is_remote_frame, message.dlc))
 
 
 def on_inner_bus(peer: Any, channel: str) -> InnerBus:

@@ -22,11 +22,6 @@ def supervised(tmp_path_factory: pytest.TempPathFactory) -> Supervised:
         patch.chdir(folder)
         with Cell.open(sim="all", seed=3, clock="virtual") as virtual:
             virtual.calibrate()
-    return supervise(folder)
-
-
-def supervise(folder: Path) -> Supervised:
-    """Run the script that the README prints in `folder`; without a calibration there it calibrates first."""
     (folder / "supervise.py").write_text(block("python"), encoding="utf-8")
     done = subprocess.run([sys.executable, "supervise.py"], cwd=folder, capture_output=True, text=True, timeout=900.0)
     # Here, so that it is tried again as any other test over the wires.

@@ -11,8 +11,10 @@ import json
 import os
 import signal
 import socket
+import struct
 import subprocess
 import sys
+from contextlib import contextmanager
 
 import numpy as np
 
@@ -89,6 +91,18 @@ def dashboard(address, *commands):
             connection.sendall(command.encode() + b"\n")
             answers.append(lines.readline().strip())
     return answers[1:] if commands else answers
+
+
+@contextmanager
+def held_input(address, name):
+    """Another client that has taken this input of the controller for itself."""
+    with socket.create_connection((address, 30004), timeout=5.0) as link:
+        link.sendall(struct.pack(">HBH", 5, ord("V"), 2) + struct.pack(">HB", 3 + len(name), ord("I")) + name)
+        # The reply to V, and the head of that to I.
+        got = b""
+        while len(got) < 4 + 4:
+            got += link.recv(64)
+        yield
 
 
 def _table(height: float):

@@ -18,13 +18,7 @@ from sim_backends.models.rail import RailModel, RailParams
 from sim_backends.peers.rail.tmcl import TmclPeer
 from tests.support.wire.clocks import ahead
 
-SPEED = 5.0
-
-
-MAX_SPEED = 0.05
-
-
-ACCELERATION = 0.25
+SPEED, MAX_SPEED, ACCELERATION = 5.0, 0.05, 0.25
 
 
 @dataclass

@@ -15,12 +15,7 @@ from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
 
-SPEED = 5.0
-
-
-TRACK = 0.583
-
-
+SPEED, TRACK = 5.0, 0.583
 STANDSTILL = 0.0025
 """Up to 2 mm/s count as standstill, m/s, and the vehicle reports whole mm/s."""
 
@@ -58,12 +53,6 @@ class Bench:
             self.clock.sleep(0.02)
 
 
-def connect(peer: AgilexPeer, clock: Clock) -> AgilexVehicle:
-    return AgilexVehicle(
-        "vehicle", peer.interface, peer.channel, track=TRACK, max_speed=0.5, max_yaw_rate=0.8, clock=clock
-    )
-
-
 def threads() -> list[str]:
     return [
         thread.name for thread in threading.enumerate() if thread.name in ("vehicle receiver", "vehicle keep-alive")
@@ -76,7 +65,9 @@ def benched(speed: float) -> Iterator[Bench]:
     model = VehicleModel(VehicleParams(start=(0.0, 0.0, 0.0), track=TRACK), np.random.default_rng(5))
     peer = AgilexPeer(model, world)
     peer.start()
-    vehicle = connect(peer, clock)
+    vehicle = AgilexVehicle(
+        "vehicle", peer.interface, peer.channel, track=TRACK, max_speed=0.5, max_yaw_rate=0.8, clock=clock
+    )
     try:
         yield Bench(vehicle, model, peer, world, clock)
     finally:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cell.config.cell_config import default_toml
-from tests.support.wire.cells import cell
+from tests.support.wire.cells import cell, named
 from tests.support.wire.gige_bench import require_aravis
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
@@ -16,9 +15,7 @@ pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
 def test_a_dry_run_with_the_scan_camera_on_gige_vision_ends_placed(tmp_path: Path) -> None:
     require_aravis()
-    before, camera, after = default_toml().partition("[scan_camera]")
-    after = after.replace('driver = "stream"', 'driver = "gige"', 1).replace("192.0.2.20:5000", "192.0.2.20", 1)
-    (tmp_path / "cell.toml").write_text(before + camera + after, encoding="utf-8")
+    named(tmp_path, "gige", 'address = "192.0.2.20"')
     done = cell("dry-run", "-c", "cell.toml", "--seed", "1", "--json", folder=tmp_path, timeout=900.0)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)

@@ -18,7 +18,7 @@ from cell import Cell
 from cell.config.cell_config import default_toml, load_config
 from cell.devices.assembly import connect
 from cell.devices.lock import CellLock
-from cell.run.folder import awaited_word
+from cell.run.folder import awaited_word, list_runs, read_report
 from cell.run.jogging import jog, needed_for, parse_jog
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, InterlockError, NotConnectedError
@@ -26,7 +26,7 @@ from statemachine.journal import request
 from tests.support import Typed, until
 from tests.support.packages import RAIL, install, with_acme_rail
 from tests.support.wire import cells
-from tests.support.wire.cells import ask, cell, started, wait_for_step
+from tests.support.wire.cells import ask, assert_safe, cell, started, wait_for_step
 
 pytestmark = pytest.mark.wire
 
@@ -249,3 +249,46 @@ def test_an_arm_that_froze_is_used_again_by_the_same_program(endpoints: dict[str
         opened.recover("Ann")
         opened.home("arm", lambda event: event.kind == "confirm_needed" and word(opened))
         assert opened.devices.arm.state().controlled
+
+
+# --- a stop from anywhere ends the run that is going on ---
+
+
+def test_cell_abort_ends_a_calibration(endpoints: dict[str, Any], here: Path, typed: Typed) -> None:
+    with started("calibrate", folder=here) as work:
+        wait_for_step(here, "calibration", work)
+        code, _, said = typed("abort")
+        _, error = work.communicate(timeout=60)
+    assert code == 0, said
+    assert work.returncode == 1, error
+    assert "cell abort" in error
+    assert_safe(endpoints)
+    assert [read_report(run)["outcome"] for run in list_runs(here / "runs")] == ["aborted"]
+
+
+def test_a_jog_is_ended_by_a_request_and_stops_on_its_way(endpoints: dict[str, Any], here: Path) -> None:
+    with started("jog", "arm", "j1", "+80deg", folder=here) as work:
+        request(wait_for_step(here, "jog", work), "abort", "enough")
+        _, error = work.communicate(timeout=60)
+    assert work.returncode == 1, error
+    assert "enough" in error
+    assert not ask(endpoints, op="truth")["truth"]["arm"]["moving"]
+    (folder,) = list_runs(here / "runs")
+    assert read_report(folder)["outcome"] == "aborted"
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGTERM, pytest.param(signal.SIGHUP, marks=pytest.mark.campaign), signal.SIGINT]
+)
+def test_a_signal_while_the_cell_starts_is_told_and_leaves_no_process(tmp_path: Path, number: signal.Signals) -> None:
+    with started("dry-run", "--seed", "3", folder=tmp_path) as run:
+        started_by_it = Path(f"/proc/{run.pid}/task/{run.pid}/children")
+        assert until(started_by_it.read_text, 60.0)
+        children = started_by_it.read_text().split()
+        os.kill(run.pid, number)
+        _, error = run.communicate(timeout=60)  # a loop that is just being compiled is finished
+    assert run.returncode == 130
+    assert "asked to end" in error or "interrupted from the keyboard" in error
+    assert "Traceback" not in error
+    # A world whose start the signal cut in two ends by itself, because its standard input has ended.
+    assert until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children), 20.0)

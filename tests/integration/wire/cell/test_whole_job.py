@@ -9,31 +9,33 @@ import signal
 import sqlite3
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 from can.io.canutils import CanutilsLogReader
 
+from cell.config.cell_config import default_toml
 from cell.run.record.reading import as_candump, information
 from drivers.vehicle.agilex_link import load_database
 from tests.support import Typed
+from tests.support.described_cells import LEAN, changed
 from tests.support.wire.cells import Supervised, assert_safe, served, started, wait_for_step
 
 pytestmark = pytest.mark.wire
 
 
-@pytest.fixture(scope="module")
-def placed(supervised: Supervised) -> dict[str, Any]:
-    """The report of a run over the wires that ended placed."""
-    return supervised.report
+@pytest.fixture
+def lean(place: Path) -> str:
+    """The name of a configuration in `place` whose runs leave their report and journal alone."""
+    (place / "lean.toml").write_text(changed(default_toml(), LEAN), encoding="utf-8")
+    return "lean.toml"
 
 
 def test_the_supervisor_script_of_the_readme_runs_as_printed(supervised: Supervised) -> None:
-    assert supervised.printed.startswith("placed")
     assert "mean D" in supervised.printed
 
 
-def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound_and_ends_safe(placed: dict[str, Any]) -> None:
+def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound_and_ends_safe(supervised: Supervised) -> None:
+    placed = supervised.report
     assert placed["outcome"] == "placed"
     assert placed["truth"]["error_mm"]["d"]["mean"] <= 0.60
     assert placed["truth"]["sensor_mm"]["p85"] <= 0.15
@@ -42,19 +44,19 @@ def test_a_run_over_the_wires_places_the_part_within_the_nominal_bound_and_ends_
     assert not end["part"]["held"]
 
 
-def test_the_run_folder_holds_everything(place: Path, placed: dict[str, Any]) -> None:
-    folder = place / "runs" / placed["run"]
+def test_the_run_folder_holds_everything(supervised: Supervised) -> None:
+    folder = supervised.folder / "runs" / supervised.report["run"]
     names = {path.name for path in folder.iterdir()}
     assert {"report.json", "picture.png", "cloud.ply", "journal.sqlite", "frames", "configuration.json", "job.json",
             "calibration.json"} <= names  # fmt: skip
     assert len(list((folder / "frames").glob("stripe-*.png"))) > 50
     base = sqlite3.connect(folder / "journal.sqlite")
     done = [name for (name,) in base.execute("SELECT name FROM steps WHERE state = 'done' ORDER BY id")]
-    assert done == [step["name"] for step in placed["steps"]]
+    assert done == [step["name"] for step in supervised.report["steps"]]
 
 
-def test_the_record_holds_what_passed_on_the_wires(place: Path, placed: dict[str, Any], tmp_path: Path) -> None:
-    record = place / "runs" / placed["run"] / "record.mcap"
+def test_the_record_holds_what_passed_on_the_wires(supervised: Supervised, tmp_path: Path) -> None:
+    record = supervised.folder / "runs" / supervised.report["run"] / "record.mcap"
     told = information(record)
     messages = {channel["topic"]: channel["messages"] for channel in told["channels"]}
     assert told["whole"] and told["dropped"] == {}
@@ -70,9 +72,9 @@ def test_the_record_holds_what_passed_on_the_wires(place: Path, placed: dict[str
 
 
 def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
-    place: Path, tmp_path: Path, typed: Typed
+    place: Path, lean: str, tmp_path: Path, typed: Typed
 ) -> None:
-    with served(place, "--seed", "3") as endpoints:
+    with served(place, "-c", lean, "--seed", "3") as endpoints:
         # No calibration lies beside this copy.
         shutil.copy(place / "sim.toml", tmp_path)
         code, _, error = typed("run", "-c", str(tmp_path / "sim.toml"))
@@ -89,8 +91,8 @@ def test_ctrl_c_in_the_sweep_ends_safe_with_130_and_uncalibrated_it_is_refused(
         assert_safe(endpoints)
 
 
-def test_a_killed_simulation_is_reported_within_ten_seconds(place: Path) -> None:
-    with started("dry-run", "--seed", "3", "--json", folder=place) as run:
+def test_a_killed_simulation_is_reported_within_ten_seconds(place: Path, lean: str) -> None:
+    with started("dry-run", "-c", lean, "--seed", "3", "--json", folder=place) as run:
         wait_for_step(place, "drive_to_target", run)
         children = Path(f"/proc/{run.pid}/task/{run.pid}/children").read_text().split()
         world = next(pid for pid in children if b"sim_backends" in Path(f"/proc/{pid}/cmdline").read_bytes())

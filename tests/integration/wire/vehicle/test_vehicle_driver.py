@@ -8,9 +8,7 @@ import time
 import can
 import pytest
 
-from cell.config.job import load_job
-from cell.procedures.drive.way import Whereabouts
-from drivers.errors import DeviceFault, InterlockError, RefusedError
+from drivers.errors import DeviceFault, InterlockError
 from tests.support.wire.vehicle_bench import STANDSTILL, Bench, benched
 from tests.unit.drivers.vehicle import conftest
 
@@ -32,20 +30,6 @@ def test_it_drives_as_told_and_odometry_follows(enabled: Bench) -> None:
     state = enabled.vehicle.state()
     assert (state.x, state.y) == pytest.approx((x, y), abs=0.005)
     assert state.yaw == pytest.approx(yaw, abs=0.005)
-
-
-def test_a_motor_fault_is_told_in_words_and_cleared_by_enabling(enabled: Bench) -> None:
-    enabled.peer.fault("vehicle.motor_fault")
-    enabled.until(lambda: len(enabled.vehicle.state().trouble) == 2)
-    assert enabled.vehicle.state().trouble == ("a motor driver fails", "motor 1: driver fails")
-    for refused in (enabled.vehicle.check, lambda: enabled.vehicle.drive(0.1, 0.0)):
-        with pytest.raises(DeviceFault, match="0x0100: a motor driver fails; motor 1: driver fails") as caught:
-            refused()
-        assert caught.value.code == "vehicle.error"
-        assert caught.value.recoverable
-    enabled.vehicle.enable()
-    enabled.vehicle.check()
-    assert enabled.vehicle.state().error_bits == 0
 
 
 def test_recovering_clears_the_error_with_the_brake_locked_all_along(enabled: Bench) -> None:
@@ -141,19 +125,3 @@ def test_a_driver_that_never_took_command_knows_nothing_of_the_brake_and_sends_n
         while (message := observer.recv(0.3)) is not None and len(seen) < 12:
             seen.add(message.arbitration_id)
     assert 0x111 not in seen
-
-
-def test_where_it_stands_is_not_known_any_more_after_its_link_was_lost(enabled: Bench) -> None:
-    job = load_job("pot")[0]
-    whereabouts = Whereabouts(enabled.vehicle)
-    whereabouts.say_at_start()
-    whereabouts.enter(job)
-    enabled.drive_for(1.0, 0.3)
-    enabled.vehicle.stop()
-    start = job.approach.start.se3().translation[0]
-    assert whereabouts.pose().x == pytest.approx(start + enabled.truth()[0], abs=0.01)
-    enabled.peer.fault("can.bus_off")
-    enabled.until(lambda: enabled.vehicle.statistics.errors.get("link_lost") == 1)
-    enabled.vehicle.enable()
-    with pytest.raises(RefusedError, match="bus failed and was opened again"):
-        whereabouts.pose()

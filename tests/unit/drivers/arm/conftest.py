@@ -4,26 +4,44 @@ from __future__ import annotations
 
 import itertools
 import socket
+import threading
+from contextlib import suppress
 
 import pytest
 
+from drivers.arm.dashboard import Dashboard
 from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from tests.support.wire.shared_arm import shared_arm
 
 
 @pytest.fixture
-def server():
-    """A dashboard server on a free loopback address whose behaviour a test sets."""
+def dashboard():
+    """Starts a dashboard server on a free loopback address that says `answer(question)`; None: nothing.
+
+    Gives a connected dashboard of the driver's, and what it asks.
+    """
     for number in itertools.count(200):
-        listener = socket.socket()
-        try:
-            listener.bind((f"127.0.0.{number}", 29999))
+        with suppress(OSError):
+            listener = socket.create_server((f"127.0.0.{number}", 29999))
             break
-        except OSError:
-            listener.close()
-    listener.listen()
-    yield listener
+
+    def start(answer, timeout=1.0):
+        asked = []
+
+        def serve():
+            client, _ = listener.accept()
+            with client:
+                client.sendall(b"Connected\n")
+                for question in client.makefile("r"):
+                    asked.append(question.strip())
+                    if (told := answer(asked[-1])) is not None:
+                        client.sendall(f"{told}\n".encode())
+
+        threading.Thread(target=serve, daemon=True).start()
+        return Dashboard("arm", listener.getsockname()[0], timeout=timeout), asked
+
+    yield start
     listener.close()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 
 import pytest
@@ -11,27 +10,19 @@ from drivers.arm.dashboard import Dashboard
 from drivers.errors import DeadlineError, NotConnectedError
 
 
-def test_the_dashboard_answers_line_by_line_over_one_connection(server):
-    def serve():
-        client, _ = server.accept()
-        with client:
-            client.sendall(b"Connected\n")
-            for question in client.makefile("rb"):
-                client.sendall(b"you said " + question)
-                if question == b"stop\n":
-                    client.sendall(b"nobody asked for this\n")
-
-    threading.Thread(target=serve, daemon=True).start()
-    dashboard = Dashboard("arm", server.getsockname()[0])
-    assert (dashboard.ask("robotmode"), dashboard.ask("stop")) == ("you said robotmode", "you said stop")
+def test_the_dashboard_answers_line_by_line_over_one_connection(dashboard):
+    unasked = {"stop": "you said stop\nnobody asked for this"}
+    board, asked = dashboard(lambda question: unasked.get(question, f"you said {question}"))
+    assert (board.ask("robotmode"), board.ask("stop")) == ("you said robotmode", "you said stop")
     time.sleep(0.1)
-    assert dashboard.ask("robotmode") == "you said robotmode"
-    dashboard.close()
+    assert board.ask("robotmode") == "you said robotmode"
+    assert asked == ["robotmode", "stop", "robotmode"]
+    board.close()
 
 
-def test_a_silent_dashboard_is_a_deadline_and_a_missing_one_is_not_connected(server):
-    dashboard = Dashboard("arm", server.getsockname()[0], timeout=0.05)
+def test_a_silent_dashboard_is_a_deadline_and_a_missing_one_is_not_connected(dashboard):
+    board, _ = dashboard(lambda question: None, timeout=0.05)
     with pytest.raises(DeadlineError, match=r"did not answer 'stop' within 0\.05 s"):
-        dashboard.ask("stop")
+        board.ask("stop")
     with pytest.raises(NotConnectedError, match=r"127\.255\.0\.9:29999 is not reachable"):
         Dashboard("arm", "127.255.0.9").ask("stop")

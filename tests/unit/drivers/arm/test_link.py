@@ -19,7 +19,7 @@ from drivers.arm.ur import UrArm
 from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceFault, NotConnectedError
 from tests.support import running
-from tests.support.wire.arm_bench import ArmBench, joints_away, keep_outputs, soon
+from tests.support.wire.arm_bench import ArmBench, held_input, joints_away, keep_outputs, soon
 
 pytestmark = pytest.mark.wire
 
@@ -161,7 +161,10 @@ def test_a_latch_of_its_clock_bounds_by_how_much_all_its_states_are_late(rate):
 
 
 def test_a_latch_needs_its_register(arm, bench):
-    with held_register(bench.address), pytest.raises(DeviceFault, match="end the program that holds it") as caught:
+    with (
+        held_input(bench.address, b"input_int_register_47"),
+        pytest.raises(DeviceFault, match="end the program that holds it") as caught,
+    ):
         arm.latch_clock()
     assert caught.value.code == "arm.refused"
 
@@ -170,16 +173,3 @@ def lateness(arm, latch):
     """By how many seconds the newest state came later than the arm's own clock says."""
     state = arm.state()
     return (state.stamp - state.device_time) - (latch.host - latch.device)
-
-
-@contextmanager
-def held_register(address):
-    """Another client that has taken the register for itself."""
-    name = b"input_int_register_47"
-    with socket.create_connection((address, 30004), timeout=5.0) as link:
-        link.sendall(struct.pack(">HBH", 5, ord("V"), 2) + struct.pack(">HB", 3 + len(name), ord("I")) + name)
-        # The reply to V, and the head of that to I.
-        got = b""
-        while len(got) < 4 + 4:
-            got += link.recv(64)
-        yield

@@ -429,27 +429,22 @@ def test_a_dead_link_to_the_arm_ends_what_another_device_does(arm, closes):
     assert caught.value.code == "arm.link_lost"
 
 
-def test_an_arm_of_another_model_is_refused_when_it_connects_and_nothing_moves():
-    with ArmBench(model="UR5e") as bench:
-        assert dashboard(bench.address, "get robot model") == ["UR5e"]
-        before = bench.ask("show")["q"]
-        with pytest.raises(DeviceFault, match=r"mm and .* mrad away from where the cell's model") as caught:
-            connect(bench.address, forward=drawn)
-        assert caught.value.code == "arm.wrong_kinematics"
-        assert not caught.value.recoverable
-        assert bench.ask("show")["q"] == before
-        assert dashboard(bench.address, "running") == ["Program running: false"]
-
-
 @pytest.mark.parametrize("error", [[60e-6, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 0.12e-3]])
-def test_the_model_is_compared_before_every_motion(bench, error):
-    pose_error = np.zeros(6)
+def test_the_model_is_compared_when_it_connects_and_before_every_motion(bench, error):
+    pose_error = np.array(error)
 
     def model(joints):
         pose = drawn(joints)
         turn = pin.log3(pin.exp3(pose_error[3:]) @ pin.exp3(pose[3:]))
         return np.concatenate((pose[:3] + pose_error[:3], turn))
 
+    before = bench.ask("show")["q"]
+    with pytest.raises(DeviceFault, match=r"mm and .* mrad away from where the cell's model") as caught:
+        connect(bench.address, forward=model)
+    assert (caught.value.code, caught.value.recoverable) == ("arm.wrong_kinematics", False)
+    assert bench.ask("show")["q"] == before
+    assert dashboard(bench.address, "running") == ["Program running: false"]
+    pose_error[:] = 0.0
     arm = connect(bench.address, forward=model)
     state = arm.state()
     arm.move_joints(state.joints, 1.0, 1.0).wait(5.0)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from pyrobotiqur import RobotiqGripper
 
+from drivers.claw import robotiq
 from drivers.claw.make import RobotiqClawConfig
 from drivers.claw.robotiq import RobotiqClaw
 from drivers.clock import Clock
@@ -135,7 +136,8 @@ def test_who_only_looks_moves_no_finger(bench: Bench) -> None:
     claw.close()
 
 
-def test_what_is_no_gripper_is_told(bench: Bench) -> None:
+def test_what_is_no_gripper_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robotiq, "REPLY_TIMEOUT_S", 0.2)
     silly = TcpServer("silly", lambda link: [link.sendall(b"hello") for _ in iter(lambda: link.recv(99), b"")])  # type: ignore[arg-type, return-value]
     silly.start()
     with pytest.raises(DeadlineError, match="b'hello' came"):

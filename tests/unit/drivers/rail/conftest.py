@@ -25,24 +25,27 @@ def homed(bench: Bench) -> Bench:
 
 
 @pytest.fixture
-def module() -> Iterator[Callable[[Callable[[bytes], bytes]], str]]:
+def module() -> Iterator[Callable[..., str]]:
     """Starts a module that gives `answer(request)` to each request, but tells its settings as they were set.
 
-    Returns its URL.
+    `settings` are those that it begins with, `stubborn` those that it keeps. Returns its URL.
     """
     listener = socket.create_server(("127.0.0.1", 0))
-    settings = {255: 1}
     threads: list[threading.Thread] = []
 
-    def start(answer: Callable[[bytes], bytes]) -> str:
+    def start(
+        answer: Callable[[bytes], bytes], settings: dict[int, int] | None = None, stubborn: tuple[int, ...] = ()
+    ) -> str:
+        kept = {255: 1} if settings is None else settings
+
         def serve() -> None:
             connection, _ = listener.accept()
             with connection:
                 while request := connection.recv(9):
-                    if request[1] == 5:
-                        settings[request[2]] = int.from_bytes(request[4:8], "big", signed=True)
-                    told = request[1] == 6 and request[2] in settings
-                    connection.sendall(reply(request, settings[request[2]]) if told else answer(request))
+                    if request[1] == 5 and request[2] not in stubborn:
+                        kept[request[2]] = int.from_bytes(request[4:8], "big", signed=True)
+                    told = request[1] == 6 and request[2] in kept
+                    connection.sendall(reply(request, kept[request[2]]) if told else answer(request))
 
         threads.append(threading.Thread(target=serve, daemon=True))
         threads[-1].start()

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -137,19 +137,6 @@ def test_late_replies_shift_a_sweep_within_the_bound_that_it_states(homed: Bench
     assert sweep.unevenness == 0.0
 
 
-@pytest.mark.wire
-def test_a_sweep_that_somebody_slowed_down_is_a_fault_with_both_velocities(homed: Bench) -> None:
-    homed.rail.move_to(homed.rail.sweep_start(0.02, 0.06, 0.04)).wait(10.0)
-    sweep = homed.rail.sweep(0.02, 0.06, 0.04)
-    settings = homed.model.settings
-    slower = replace(settings, max_velocity=round(0.9 * settings.max_velocity))
-    homed.model.configure(homed.world.now(), slower)
-    sweep.wait(10.0)
-    with pytest.raises(DeviceFault, match=r"ran at 3[567]\.\d+ mm/s instead of 40\.000 mm/s") as caught:
-        _ = sweep.window
-    assert caught.value.code == "rail.velocity"
-
-
 FAST = 100.0
 
 
@@ -202,22 +189,22 @@ def test_a_sweep_tells_nothing_before_its_end_nor_after_a_failed_one() -> None:
 
 
 @pytest.mark.parametrize(
-    ("made", "code"),
+    ("made", "told"),
     [
-        ({"ran": 0.0188}, "rail.velocity"),
-        ({"ran": 0.0212}, "rail.velocity"),
-        ({"count": 4}, "rail.velocity"),
-        ({"bend": 0.5e-3}, "rail.uneven"),
-        ({"bend": -0.5e-3}, "rail.uneven"),
+        ({"ran": 0.0188}, r"rail\.velocity: .*ran at 18\.800 mm/s instead of 20\.000 mm/s"),
+        ({"ran": 0.0212}, r"rail\.velocity: .*ran at 21\.200 mm/s instead of 20\.000 mm/s"),
+        ({"count": 4}, r"rail\.velocity"),
+        ({"bend": 0.5e-3}, r"rail\.uneven: .*up to 0\.\d{3} mm off every even motion.*allowed 0\.022 mm: 2 counts"),
+        ({"bend": -0.5e-3}, r"rail\.uneven"),
     ],
     ids=str,
 )
-def test_a_sweep_that_was_not_as_commanded_has_no_window(made: dict[str, float], code: str) -> None:
+def test_a_sweep_that_was_not_as_commanded_has_no_window(made: dict[str, float], told: str) -> None:
     ended = sweep(**made)  # type: ignore[arg-type]
     ended.wait(50.0)
     with pytest.raises(DeviceFault) as caught:
         _ = ended.window
-    assert caught.value.code == code
+    assert re.match(told, f"{caught.value.code}: {caught.value}")
 
 
 @pytest.mark.parametrize("ran", [0.0192, 0.0208])

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 
 import can
 import numpy as np
@@ -14,13 +16,14 @@ import pytest
 from cell.devices.gate.interlocks import DeviceCommand, Interlocks, Situation
 from cell.devices.gate.rules import RULES
 from drivers.clock import Clock
-from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, LimitError
+from drivers.errors import Aborted, CellError, DeadlineError, DeviceFault, InterlockError, LimitError, NotConnectedError
 from drivers.vehicle.agilex import DEAD_MAN_S, AgilexVehicle
 from drivers.vehicle.agilex_link import load_database
 from drivers.vehicle.feedback import QUIET_S
 from sim_backends.clock import WorldClock
 from sim_backends.models.vehicle import VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
+from sim_backends.peers.vehicle.slcan import CanFrame
 from tests.support.inner_bus import Driven, on_inner_bus
 
 RATE = 4.0
@@ -37,9 +40,22 @@ class Bench(Driven):
         self.peer = AgilexPeer(VehicleModel(params, np.random.default_rng(5)), self.world)
         self.bus = on_inner_bus(self.peer, channel)
         self.peer.start()
-        self.vehicle = AgilexVehicle(
-            "vehicle", "virtual", channel, track=TRACK, max_speed=0.5, max_yaw_rate=0.8, clock=self.clock
+        self.vehicle = self.connect()
+
+    def connect(self) -> AgilexVehicle:
+        return AgilexVehicle(
+            "vehicle", "virtual", self.channel, track=TRACK, max_speed=0.5, max_yaw_rate=0.8, clock=self.clock
         )
+
+    @contextmanager
+    def sending(self, sent: Callable[[CanFrame], CanFrame | None]) -> Iterator[None]:
+        """The vehicle's frames come as `sent` makes them, None: not at all."""
+        send, frames = self.bus.send, lambda given: [made for frame in given if (made := sent(frame)) is not None]
+        self.bus.send = lambda given: send(frames(given))  # type: ignore[method-assign]
+        try:
+            yield
+        finally:
+            self.bus.send = send  # type: ignore[method-assign]
 
     def velocities(self) -> list[bytes]:
         """The commanded velocities that came, as their bytes; zeros are standstill."""
@@ -232,3 +248,58 @@ def test_who_was_stopped_while_it_was_enabled_keeps_its_brake(
     assert bench.braked()
     with pytest.raises(CellError):
         bench.vehicle.drive(0.1, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("answers", "firmware"),
+    [
+        (0x4A1, "SIMULATED HW2.1 CONTROLLER 204 DRIVERS 110"),
+        (0x41A, "hardware 2/1, controller 204, drivers 110"),
+        (None, "unknown"),
+    ],
+    ids=["as the SDK asks", "as the manual has it", "not at all"],
+)
+def test_its_version_is_told_however_it_answers_and_not_answering_is_no_fault(
+    bench: Bench, answers: int | None, firmware: str
+) -> None:
+    with bench.sending(lambda frame: None if frame.id in {0x4A1, 0x41A} - {answers} else frame):
+        assert bench.vehicle.identity().firmware == firmware
+    assert bench.vehicle.statistics.errors == {}
+    bench.vehicle.check()
+
+
+def test_frames_of_another_length_are_not_read_and_are_told(bench: Bench) -> None:
+    def short(frame: CanFrame) -> CanFrame:
+        return replace(frame, data=frame.data[:-1]) if frame.id == 0x311 else frame
+
+    told = pytest.raises(NotConnectedError, match=r"Odometry did not come; \d+ frames had another length")
+    with bench.sending(short), told:
+        bench.connect()
+
+
+def test_a_person_at_the_remote_control_is_in_charge(bench: Bench) -> None:
+    def remote(frame: CanFrame) -> CanFrame:
+        return replace(frame, data=frame.data[:1] + b"\x03" + frame.data[2:]) if frame.id == 0x211 else frame
+
+    with bench.sending(remote), pytest.raises(DeadlineError, match="remote control"):
+        bench.vehicle.enable()
+
+
+def test_what_other_nodes_send_is_not_the_vehicles(bench: Bench) -> None:
+    """Long identifiers of its own numbers that say it is fast and in emergency stop, remote requests, errors."""
+    wild = {0x211: bytes([1, 3, 0, 1, 255, 255, 0, 9]), 0x221: b"\x7f\xff" * 4, 0x311: b"\x7f\xff\xff\xff" * 2}
+    wild |= {0x111: b"\x01\xf4" * 4, 0x131: bytes(8)}
+    bench.drive_until_fast()
+    with can.Bus(channel=bench.channel, interface="virtual") as other:
+        for _ in range(20):
+            for identifier, data in wild.items():
+                other.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=True))
+                other.send(can.Message(arbitration_id=identifier, dlc=8, is_remote_frame=True, is_extended_id=False))
+            other.send(can.Message(arbitration_id=0x20000004, dlc=8, data=b"\x00\x04" * 4, is_error_frame=True))
+            other.send(can.Message(arbitration_id=0x7FF, data=b"", is_extended_id=False))
+            bench.vehicle.drive(0.3, 0.0)
+            time.sleep(0.01)
+    state = bench.vehicle.state()
+    assert state.speed == pytest.approx(0.3, abs=0.005)
+    assert state.interruptions == 0 and not state.emergency_stop
+    assert bench.vehicle.statistics.errors == {"error_frames": 20}

@@ -9,10 +9,7 @@ import pytest
 from drivers.clock import Clock
 from drivers.errors import ConfigError, DeviceFault, NotConnectedError
 from drivers.vehicle.agilex import AgilexVehicle
-from sim_backends.clock import WorldClock
-from sim_backends.models.vehicle import VehicleModel, VehicleParams
-from sim_backends.peers.vehicle.agilex import AgilexPeer
-from tests.support.wire.vehicle_bench import TRACK, Bench, benched, connect, threads
+from tests.support.wire.vehicle_bench import TRACK, Bench, benched, threads
 
 pytestmark = pytest.mark.wire
 
@@ -30,6 +27,7 @@ def test_a_dead_bus_is_a_fault_and_enabling_opens_it_again(enabled: Bench) -> No
     # Without commands the vehicle stops by itself.
     enabled.until(lambda: enabled.true_speed() == 0.0)
     enabled.vehicle.enable()
+    assert enabled.vehicle.state().interruption == "the CAN bus failed and was opened again"
     enabled.drive_for(0.5, 0.3)
     assert enabled.true_speed() > 0.0
     x, _, _ = enabled.truth()
@@ -55,27 +53,20 @@ def test_an_adapter_that_refuses_every_frame_is_a_fault_within_half_a_second() -
 
 
 def test_commands_come_every_20_ms_and_closing_ends_them() -> None:
-    world = WorldClock(1.0)
-    peer = AgilexPeer(VehicleModel(VehicleParams(), np.random.default_rng(1)), world)
-    peer.start()
-    observer = can.Bus(interface=peer.interface, channel=peer.channel, sleep_after_open=0, timeout=0.005)
-    vehicle = connect(peer, Clock())
-    try:
-        vehicle.enable()
-        stamps = []
+    with (
+        benched(1.0) as made,
+        can.Bus(interface="slcan", channel=made.peer.channel, sleep_after_open=0, timeout=0.005) as observer,
+    ):
+        made.vehicle.enable()
+        stamps: list[float] = []
         while len(stamps) < 20:
             message = observer.recv(1.0)
             assert message is not None
             if message.arbitration_id == 0x111:
                 stamps.append(message.timestamp)
         assert np.median(np.diff(stamps)) == pytest.approx(0.020, abs=0.006)
-        vehicle.close()
+        made.vehicle.close()
         assert threads() == []
-    finally:
-        # One that misses a time must not spoil the next try.
-        vehicle.close()
-        observer.shutdown()
-        peer.stop()
 
 
 def test_nobody_on_the_bus_is_named() -> None:

@@ -85,8 +85,9 @@ def test_a_motor_drivers_overload_is_a_fault_and_being_enabled_is_none() -> None
         bench.feedback.check(in_command=False, driving=False)
 
 
-def test_whoever_took_command_away_is_for_a_person_to_find_out(bench: Bench) -> None:
-    bench.notify(0, 0, mode=0)
+@pytest.mark.parametrize("mode", [0, 3])
+def test_whoever_took_command_away_is_for_a_person_to_find_out(bench: Bench, mode: int) -> None:
+    bench.notify(0, 0, mode=mode)
     bench.feedback.check(in_command=False, driving=False)
     with pytest.raises(DeviceFault, match="left CAN command") as caught:
         bench.feedback.check(in_command=True, driving=False)
@@ -110,10 +111,11 @@ def test_silence_is_a_fault_at_once_for_one_who_drives_and_when_it_is_sure_for_o
 
 def test_a_message_that_stopped_is_missed_though_the_others_go_on(bench: Bench) -> None:
     for _ in range(25):
+        bench.clock.time += 0.001
         bench.feedback.idle(0.1)
         bench.feedback.take("Odometry", {"Left": 0, "Right": 0})
         bench.feedback.take("MotionState", {"Speed": 0.0, "YawRate": 0.0})
-    with pytest.raises(DeviceFault, match="no feedback"):
+    with pytest.raises(DeviceFault, match=r"no feedback .*\(SystemState"):
         bench.feedback.check(in_command=True, driving=False)
     assert bench.interruption() == (0, "")
 
@@ -179,10 +181,22 @@ def test_two_series_of_counts_are_two_vehicles(bench: Bench, other: int, step: i
     bench.feedback.check(in_command=True, driving=True)
 
 
+def test_a_speed_that_wavers_by_three_millimetres_a_second_is_standstill(bench: Bench) -> None:
+    bench.feedback.commanded_to_move()
+    for waver in (0.003, -0.003, 0.001, -0.002, 0.003, 0.0, -0.003, 0.002):
+        bench.notify(0, 0, speed=waver)
+    assert bench.feedback.stands(0.0)
+
+
+def test_a_low_battery_and_a_missing_remote_control_are_warnings(bench: Bench) -> None:
+    bench.notify(0, 0, bits=0x0002 | 0x0004)
+    assert bench.feedback.state(1.0, None).warnings == ("the battery is low", "no signal of the remote control")
+
+
 def test_command_is_taken_only_once_the_vehicle_says_so_afterwards_and_without_a_fault(bench: Bench) -> None:
     asked = bench.clock.time
     assert not bench.feedback.commanded(asked)
-    for wrong in ({"mode": 0}, {"state": 1}, {"state": 2}, {"bits": 0x0100}):
+    for wrong in ({"mode": 0}, {"mode": 3}, {"state": 1}, {"state": 2}, {"bits": 0x0100}):
         bench.notify(0, 0, **wrong)
         assert not bench.feedback.commanded(asked), wrong
     bench.notify(0, 0)
@@ -301,3 +315,12 @@ def test_a_version_text_shorter_than_its_frames_is_that_text_and_no_row_of_zeros
         answer.take("VersionResponse", dict(zip(names, words, strict=True)))
     assert answer.is_complete()
     assert answer.describe() == "SCOUT V2.3-1"
+
+
+@pytest.mark.parametrize("message", ["VersionNumbers", "VersionResponse"])
+def test_a_version_may_be_told_in_numbers_under_either_identifier(message: str) -> None:
+    answer = VersionAnswer()
+    numbers = {"ControllerHardware": 2, "DriverHardware": 1, "ControllerSoftware": 0x2041, "DriverSoftware": 110}
+    answer.take(message, numbers)
+    assert answer.is_complete()
+    assert answer.describe() == "hardware 2/1, controller 8257, drivers 110"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -27,10 +26,9 @@ from drivers.clock import Clock
 from drivers.errors import ConfigError, InterlockError, NotConnectedError, RefusedError
 from drivers.interfaces import Vehicle
 from drivers.vehicle.fixed import FixedVehicle
-from tests.support import ROOT
+from tests.support.described_cells import described, pose
 
 JOB = load_job("pot")[0]
-JOB_FILE = ROOT / "cell" / "jobs" / "pot.toml"
 
 
 class TestFixedVehicle(DeviceContract):
@@ -67,32 +65,27 @@ def fixed_cell(folder: Path) -> Path:
     return path
 
 
-def job_at(folder: Path, *, target: str = "-1050 mm", start: str = "-600 mm") -> Path:
-    """The job `pot` with its target so far from the place, and its start so high."""
-    shutil.copy(JOB_FILE.parent / "pot.ply", folder)
-    text = JOB_FILE.read_text(encoding="utf-8")
-    text = text.replace('target = { translation = ["-1050 mm"', f'target = {{ translation = ["{target}"')
-    text = text.replace('["-3050 mm", "0 mm", "-600 mm"]', f'["-3050 mm", "0 mm", "{start}"]')
-    path = folder / "pot.toml"
-    path.write_text(text, encoding="utf-8")
-    return path
+def job_at(folder: Path, *, target_x: float = -1050.0, start_z: float = -600.0) -> Path:
+    """The job `pot` with its target so far from the place, and its start so high, mm."""
+    level = (0.0, 0.0, 0.0)
+    approach = {"target": pose((target_x, 0.0, -600.0), level), "start": pose((-3050.0, 0.0, start_z), level)}
+    return described(folder / f"{target_x:g} {start_z:g}", job={"approach": approach})[1]
 
 
 def test_a_place_out_of_reach_is_refused_with_how_much_is_missing(tmp_path: Path) -> None:
     """And start and staging, which nothing drives over, are not looked at."""
     config = load_config(fixed_cell(tmp_path))
-    job, _ = load_job(job_at(tmp_path, start="-100 mm"))
+    job, _ = load_job(job_at(tmp_path, start_z=-100.0))
     assert list(way_problems(job, config)) == []
     assert "they need one height" in next(way_problems(job, load_config(None)))
-    far, mesh = load_job(job_at(tmp_path, target="-1800 mm"))
+    far, mesh = load_job(job_at(tmp_path, target_x=-1800.0))
     with pytest.raises(ConfigError, match=r"out of reach; the nearest pose found stays \d+\.\d mm"):
         require_fit(far, config, mesh)
 
 
-@pytest.mark.parametrize("level", ["nominal", "workshop"])
-def test_in_a_simulated_cell_it_stands_still_where_the_job_has_it(tmp_path: Path, level: str) -> None:
+def test_in_a_simulated_cell_it_stands_still_where_the_job_has_it(tmp_path: Path) -> None:
     config = load_config(fixed_cell(tmp_path))
-    cell = VirtualCell(config, 3, level, Described.of("pot"))
+    cell = VirtualCell(config, 3, "workshop", Described.of("pot"))
     assert cell.devices.vehicle.bare.identity().address == "fixed"
     x, y, yaw = cell.world.vehicle.planar(0.0)
     assert math.hypot(x + 1.05, y) < JOB.approach.tolerance

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import can
+import struct
 
-from drivers.vehicle.health import CanInterface, most_bits, parse_interface
+import can
+import pytest
+
+from drivers.vehicle.agilex_link import load_database
+from drivers.vehicle.health import CanInterface, most_bits, parse_interface, readings
 
 
 def test_the_longest_can_frames_are_as_long_as_known() -> None:
@@ -28,3 +32,22 @@ def test_what_linux_tells_of_a_can_interface_is_read_and_what_is_odd_is_not_made
     assert parse_interface("vcan0", virtual) == CanInterface("vcan0", False)
     for odd in ("", "{}", "[null]", '[{"ifname":"can0","linkinfo":null}', "no such device"):
         assert parse_interface("can0", odd) is None
+
+
+def test_readings_are_of_the_vehicles_newest_frames_and_of_no_other_nodes() -> None:
+    def frame(identifier: int, data: bytes, extended: bool = False) -> can.Message:
+        return can.Message(arbitration_id=identifier, data=data, is_extended_id=extended)
+
+    heard = [
+        frame(0x361, struct.pack(">BBhhh", 99, 98, 245, -15, 450)),
+        frame(0x361, struct.pack(">BBhhh", 12, 98, 245, -15, 253)),
+        frame(0x361, b"\x7f" * 8, extended=True),
+        frame(0x261, b"\x7f" * 8, extended=True),
+        can.Message(arbitration_id=0x20000004, dlc=8, data=bytes(8), is_error_frame=True),
+    ]
+    told = readings([(0.1 * k, frame) for k, frame in enumerate(heard)], 0.5, 500_000, load_database(), None, True)
+    found = {reading.what: reading for reading in told}
+    assert (found["charge"].value, found["charge"].ok) == (12, False)
+    assert found["battery's temperature"].value == pytest.approx(25.3)
+    assert "hottest motor or its driver" not in found
+    assert (found["error frames"].value, found["error frames"].ok) == (1, False)

@@ -8,7 +8,7 @@ import socket
 import struct
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -29,7 +29,7 @@ from cell.devices.diagnosis.finding import (
 )
 from cell.devices.lock import CellLock, who_holds
 from tests.support import Typed
-from tests.support.wire.other_module import OtherModule
+from tests.support.wire.rail_bench import benched
 
 
 def write(root: Path, **files: str) -> Path:
@@ -186,9 +186,10 @@ def test_a_device_that_a_run_holds_is_left_alone(tmp_path: Path) -> None:
 
 
 def test_a_module_is_asked_only_where_the_user_says_so(tmp_path: Path) -> None:
-    with closing(OtherModule()) as module:
-        found = ask_module(module.url, None)
-    assert (found.ok, found.state) == (True, "version 1241V144")
+    with benched() as made:
+        made.rail.close()
+        found = ask_module(made.peer.url, None)
+    assert (found.ok, found.state) == (True, "version 1260V112")
     missing = ask_module("/dev/ttyNONE9", None)
     assert "plug it in" in missing.state
     assert not [each for each in find(None, root=tmp_path) if each.what == "TMCL module"]

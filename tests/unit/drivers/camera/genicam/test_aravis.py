@@ -26,14 +26,17 @@ from tests.support.wire.gige_bench import require_aravis
 pytestmark = pytest.mark.wire
 
 
+PICTURE = (np.arange(480 * 640) % 251).astype(np.uint8).reshape(480, 640)
+"""No pixel has the grey of its neighbours."""
+
+
 class TestContract(CameraContract):
     """What the cell relies on in any camera."""
 
     @pytest.fixture(scope="class")
     @classmethod
     def bench(cls) -> Iterator[Bench[Camera]]:
-        grey = np.full((480, 640), 90, np.uint8)
-        with fake_camera(lambda exposure: grey) as host:
+        with fake_camera(lambda exposure: PICTURE) as host:
             clock = Clock()
             made: Bench[Camera] = Bench(lambda: opened(host, clock), clock)
             yield made
@@ -53,6 +56,16 @@ class TestContract(CameraContract):
         assert np.median(periods) == pytest.approx(1.0, abs=0.2)
         assert periods.min() > 0.5 and periods.max() < 2.5
         assert [frame.received for frame in made] == sorted(frame.received for frame in made)
+
+    def test_a_trigger_tells_the_time_of_a_picture_that_comes_unchanged(self, bench: Bench[Camera]) -> None:
+        """Its clock has no latch: the exposure lay between the trigger and the picture, and that bounds the time."""
+        camera = bench.device
+        camera.configure(EXPOSURE_S, RATE_HZ)
+        called = bench.clock.now()
+        frame = camera.grab(TIMEOUT_S)
+        assert (frame.image == PICTURE).all()
+        assert 0.0 < camera.time_bound <= 0.5 * (frame.received - frame.exposure - called) + 1e-3
+        assert called <= frame.host_time <= frame.received - frame.exposure
 
 
 class InProcess:

@@ -2,30 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 
-from cell.devices.contracts import Bench as ContractBench
-from cell.devices.contracts import CameraContract
 from drivers.errors import DeadlineError, DeviceFault, LimitError
-from drivers.interfaces import Camera
-from tests.support.wire.gige_bench import Bench, served
+from tests.support.wire.gige_bench import Bench
 
 pytestmark = pytest.mark.wire
-
-
-class TestContract(CameraContract):
-    """What the cell relies on in any camera."""
-
-    @pytest.fixture(scope="class")
-    @classmethod
-    def bench(cls) -> Iterator[ContractBench[Camera]]:
-        with served() as made:
-            contract: ContractBench[Camera] = ContractBench(made.open, made.clock)
-            yield contract
-            contract.over()
 
 
 def test_times_are_those_that_the_pictures_show(bench: Bench) -> None:

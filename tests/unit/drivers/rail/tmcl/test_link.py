@@ -9,7 +9,6 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,10 +18,7 @@ from drivers.clock import Clock
 from drivers.errors import DeadlineError, DeviceError, DeviceFault, NotConnectedError
 from drivers.interfaces import LinkStatistics
 from drivers.rail.tmcl.link import Axis, TelegramError, TmclLink, TmclRequest, decode_firmware, decode_reply
-from sim_backends.clock import WorldClock
-from sim_backends.models.rail import RailModel, RailParams
-from sim_backends.peers.rail.tmcl import TmclPeer
-from tests.support.wire.rail_bench import SPEED, Bench, connect, reply
+from tests.support.wire.rail_bench import Bench, connect, reply
 
 BYTE = st.integers(0, 255)
 VALUE = st.integers(-(2**31), 2**31 - 1)
@@ -101,21 +97,6 @@ def test_a_peer_that_dies_in_mid_move_is_a_fault_at_once(homed: Bench) -> None:
         homed.rail.state()
 
 
-@pytest.mark.wire
-def test_a_pseudo_terminal_does_as_well() -> None:
-    clock = Clock(SPEED)
-    peer = TmclPeer(RailModel(RailParams(), np.random.default_rng(1)), WorldClock(SPEED), pty=True)
-    peer.start()
-    try:
-        assert peer.pty is not None
-        rail = connect(peer.pty, clock)
-        rail.home().wait(20.0)
-        assert rail.state().position == 0.0
-        rail.close()
-    finally:
-        peer.stop()
-
-
 def test_a_port_that_is_not_there_is_named() -> None:
     with pytest.raises(NotConnectedError, match="/dev/no-such-port"):
         connect("/dev/no-such-port", Clock())
@@ -123,7 +104,7 @@ def test_a_port_that_is_not_there_is_named() -> None:
 
 @pytest.mark.wire
 def test_a_silent_module_is_a_deadline(bench: Bench) -> None:
-    with pytest.raises(DeadlineError, match="module address 9"):
+    with pytest.raises(DeadlineError, match=r"module address 9 \(rail\.address\), rail\.baud \(9600"):
         connect(bench.peer.url, bench.clock, address=9)
 
 
@@ -187,6 +168,43 @@ def test_answers_to_another_command_are_refused_twice_then_reported(module: Call
         rail.state()
     assert rail.statistics.errors["bad_replies"] == 2
     rail.close()
+
+
+@pytest.mark.wire
+@pytest.mark.parametrize(
+    "spoilt",
+    [
+        lambda good: good[:5],
+        lambda good: good[:4] + bytes([good[4] ^ 0x10]) + good[5:],
+        lambda good: bytes(TMCLReply(2, 9, 100, 6, 5).to_buffer()) + good,
+        lambda good: bytes(TMCLReply(2, 1, 1, 6, 0).to_buffer()),
+    ],
+    ids=["half", "a bit", "another module's before it", "the request had a wrong sum"],
+)
+def test_a_spoilt_reply_is_asked_for_once_more(module: Callable[..., str], spoilt: Callable[[bytes], bytes]) -> None:
+    positions = itertools.count()
+
+    def answer(request: bytes) -> bytes:
+        good = reply(request, 512_000 if request[1:3] == b"\x06\x01" else 0)
+        return spoilt(good) if request[1:3] == b"\x06\x01" and next(positions) == 0 else good
+
+    rail = connect(module(answer), Clock())
+    assert (rail.state().position, rail.statistics.errors["retries"]) == (0.02, 1)
+    rail.close()
+
+
+@pytest.mark.wire
+def test_an_adapter_that_hears_itself_is_understood(module: Callable[..., str]) -> None:
+    rail = connect(module(lambda request: request + reply(request, 1), {}), Clock())
+    assert rail.state().position == pytest.approx(0.002 / 51_200)
+    assert list(rail.statistics.errors) == ["echoes"]
+    rail.close()
+
+
+@pytest.mark.wire
+def test_an_adapter_that_hears_itself_alone_is_named(module: Callable[..., str]) -> None:
+    with pytest.raises(DeadlineError, match="0 of 9 bytes came after the adapter's echo"):
+        connect(module(lambda request: request, {}), Clock())
 
 
 @pytest.mark.wire

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from drivers.clock import Clock
-from drivers.errors import DeviceFault, InterlockError
+from drivers.errors import ConfigError, DeviceFault, InterlockError
 from drivers.interfaces import Rail
 from tests.support.wire.rail_bench import ACCELERATION, Bench, connect, reply, telegram
 
@@ -138,6 +138,43 @@ def test_a_target_changed_by_another_is_not_reported_as_arrival(homed: Bench) ->
     homed.model.move_to(homed.world.now(), 1000)
     with pytest.raises(DeviceFault, match="changed the module's target"):
         motion.wait(20.0)
+
+
+@pytest.mark.parametrize("refused", [(), (15,), (16,)])
+def test_the_ramp_is_a_trapezium_also_where_its_first_acceleration_may_not_be_zero(
+    module: Callable[..., str], refused: tuple[int, ...]
+) -> None:
+    """Of 15, 16 and 19 one is the first acceleration, two are speeds, and modules differ in which."""
+    settings = {255: 0}  # speeds in units of its own
+
+    def answer(request: bytes) -> bytes:
+        wrong = request[1] == 5 and request[2] in refused and not any(request[4:8])
+        return reply(request, status=4 if wrong else 100)
+
+    connect(module(answer, settings), Clock()).close()
+    wanted = round(ACCELERATION * 200 * 256 / 0.002)
+    first = {kind: wanted if kind in refused else 0 for kind in (15, 16, 19)}
+    ramp = {5: wanted, 17: wanted, 18: wanted, **first, 20: 10, 255: 1}
+    assert {kind: settings[kind] for kind in ramp} == ramp
+
+
+@pytest.mark.parametrize("parameter", [5, 17, 140, 193])
+def test_a_setting_that_the_module_does_not_take_is_a_fault_with_both_values(
+    module: Callable[..., str], parameter: int
+) -> None:
+    with pytest.raises(DeviceFault, match=rf"keeps 3 for axis parameter {parameter} instead of \d+") as met:
+        connect(module(reply, {255: 1, parameter: 3}, (parameter,)), Clock())
+    assert met.value.code == "rail.setting"
+
+
+@pytest.mark.parametrize("model", [b"1110V109", b"1140V145", b"0012V102", b"hello   "])
+def test_a_module_that_counts_in_other_units_or_is_none_is_refused_before_anything_is_set(
+    module: Callable[..., str], model: bytes
+) -> None:
+    settings: dict[int, int] = {}
+    with pytest.raises(ConfigError, match=r"TMCM-1260.*nothing was set"):
+        connect(module(lambda request: b"\x02" + model, settings), Clock())
+    assert settings == {}
 
 
 def test_a_module_that_lets_neither_first_phase_be_off_gets_no_acceleration_for_a_speed(

@@ -41,5 +41,6 @@ def test_an_emergency_has_words_and_a_remedy_and_an_unknown_one_its_range() -> N
     assert meaning(0x8130) == (
         "our heartbeat stayed away, 8130h: see what keeps this computer busy, or raise vehicle.watchdog"
     )
+    assert meaning(0x7305).startswith("the encoder fails, 7305h: check the encoder's cable")
     assert meaning(0x2399) == "current, 2399h: see the drive's manual"
     assert meaning(0xFF07) == "a fault of its maker's own, FF07h: see the drive's manual"

@@ -11,9 +11,10 @@ import pytest
 from cell.config.cell_config import default_toml, load_config
 from cell.makes import make_of
 from drivers.errors import ConfigError
-from drivers.vehicle.cia402.make import CanopenVehicleConfig
+from drivers.vehicle.cia402 import make
+from drivers.vehicle.cia402.make import CanopenVehicleConfig, look_at_nodes
 from tests.support import ROOT
-from tests.support.canopen_bench import WHEELS
+from tests.support.canopen_bench import WHEELS, Bench, frame
 
 
 def test_the_page_prints_a_vehicle_that_is_valid(tmp_path: Path) -> None:
@@ -72,3 +73,27 @@ def test_a_configuration_describes_the_drives(tmp_path: Path) -> None:
 def test_what_cannot_be_is_refused_with_its_range(tmp_path: Path, changed: dict[str, str], told: str) -> None:
     with pytest.raises(ConfigError, match=told):
         config(tmp_path, **changed)
+
+
+@pytest.mark.wire
+def test_the_nodes_of_a_bus_are_found_by_one_question_each_and_the_others_only_heard(
+    apart: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither a network command nor anything for a node that the configuration does not name is sent."""
+    monkeypatch.setattr(make, "LISTEN_S", 0.8)
+    record = config(tmp_path).model_copy(update={"interface": "virtual", "channel": apart.channel})
+    with apart.other() as other:
+        sender = other.send_periodic(frame(0x709, b"\x05"), 0.5)
+        text, ok = look_at_nodes(record)
+        monkeypatch.setattr(make, "LISTEN_S", 0.1)
+        missing, found = look_at_nodes(record.model_copy(update={"right_node": 7}))
+        taken = look_at_nodes(record.model_copy(update={"own_node": 1, "left_node": 2, "right_node": 1}))
+        sender.stop()
+    assert ok
+    assert text == (
+        "node 1 answers: profile 402 (vendor 0x31f, product 0x192); node 2 answers: profile 402 (vendor 0x31f, "
+        "product 0x192); heard besides: node 9"
+    )
+    assert not found and "node 7 does not answer: see its number" in missing
+    assert not taken[1] and "node 1, which is to be this program's, is taken" in taken[0]
+    assert {message.arbitration_id for message in apart.bus.frames} == {0x601, 0x602, 0x607, 0x709}

@@ -79,17 +79,6 @@ def test_what_is_said_when_this_program_is_killed_stops_both_and_locks_their_bra
         bench.vehicle._closed.set()
 
 
-def test_an_emergency_stop_is_told_and_cleared_by_a_person_alone(bench: Bench) -> None:
-    bench.drive_until_fast()
-    bench.peer.fault("vehicle.emergency_stop")
-    assert fault_of(bench).code == "vehicle.emergency_stop"
-    with pytest.raises(DeviceFault, match="emergency stop is pressed"):
-        bench.vehicle.enable()
-    bench.peer.clear()
-    bench.vehicle.enable()
-    bench.drive_until_fast()
-
-
 def test_drives_that_ignore_a_halt_are_stopped_with_the_quick_stop(bench: Bench) -> None:
     bench.drive_until_fast()
     before = bench.vehicle.statistics.errors.get("quick_stop", 0)

@@ -28,6 +28,16 @@ def test_a_drive_that_does_not_watch_us_is_refused_before_anything_moves(apart: 
     assert apart.braked()
 
 
+def test_a_drive_that_somebody_else_turns_is_told_and_left_alone(apart: Bench) -> None:
+    values = apart.peer.drives[0].node._values
+    values[0x6041, 0].read, values[0x606C, 0].read = lambda: 0x0237, lambda: 3000
+    with pytest.raises(DeviceFault, match=r"left drive turns its wheel at 0\.157 m/s") as met:
+        apart.connect()
+    assert met.value.code == "vehicle.disturbed"
+    # Uploads and the parts of a text: nothing is set.
+    assert {message.data[0] >> 5 for message in apart.bus.frames} <= {2, 3}
+
+
 def test_a_drive_that_counts_otherwise_than_configured_is_refused(apart: Bench) -> None:
     with pytest.raises(ConfigError, match=r"counts 4096 per turn.*counts_per_turn is 1024"):
         apart.connect(replace(WHEELS, counts=1024))
@@ -73,6 +83,23 @@ def test_a_value_that_is_not_needed_may_be_refused_and_one_that_is_may_not(apart
     with pytest.raises(DeviceFault, match=r"node number 1 refuses 6085h \(quick stop deceleration\)") as met:
         apart.connect()
     assert met.value.code == "vehicle.setup"
+
+
+def test_drives_of_few_objects_drive_and_what_is_missing_is_named(apart: Bench) -> None:
+    """No options, no inputs and outputs, no supply voltage; they say neither how they count nor in what unit."""
+    for drive in apart.peer.drives:
+        for index in (0x605A, 0x605D, 0x605E, 0x6079, 0x608F, 0x60A9, 0x60FD, 0x60FE):
+            for key in [key for key in drive.node._values if key[0] == index]:
+                del drive.node._values[key]
+    with pytest.raises(DeviceFault, match=r"digital inputs.*cannot be mapped") as met:
+        apart.connect()
+    assert met.value.code == "vehicle.setup"
+    vehicle = apart.connect(replace(WHEELS, stop_input=None))
+    vehicle.enable()
+    apart.drive_until_fast()
+    vehicle.brake()
+    assert (vehicle.state().braked, vehicle.state().battery_volts) == (True, None)
+    vehicle.close()
 
 
 def test_a_drive_that_was_switched_off_is_set_up_again_and_its_counts_are_not_trusted(bench: Bench) -> None:

@@ -60,7 +60,8 @@ def test_who_only_looks_sets_nothing(apart: Bench) -> None:
     vehicle = apart.connect(look=True)
     state = vehicle.state()
     assert (state.battery_volts, state.braked, state.emergency_stop) == (26.4, None, False)
-    assert vehicle.identity().model == "CiA 402, Simulated wheel drive"
+    who = vehicle.identity()
+    assert (who.model, who.serial, who.firmware) == ("CiA 402, Simulated wheel drive", "7001 and 7002", "1.4")
     assert vehicle.ping() < 0.5
     vehicle.examine(0.1)
     vehicle.stop()
