@@ -15,13 +15,14 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from cell.apps.new_job.make import COLOURS, draw_proposal
+from cell.apps.new_job.make import COLOURS, _PartFile, _with_part, draw_proposal
 from cell.apps.new_job.proposal import Proposal
+from cell.apps.new_job.questions import Asker
 from cell.apps.new_job.surface import Laid
 from cell.apps.new_job.sweeps import Rays, visible_surfaces
 from cell.check.fit import require_fit
 from cell.config.cell_config import load_config
-from cell.config.job import SwathSection, load_job
+from cell.config.job import PartSection, SwathSection, load_job
 from cell.measure.geometry.poses import transform
 from cell.measure.inversion.nominal import read_mesh
 from drivers.errors import ConfigError
@@ -38,6 +39,7 @@ def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path: Path) -
     trimesh.load_mesh(mesh).apply_scale(1e-3).export(mesh)
     made = from_options(tmp_path, mesh=str(mesh), name="lid")
     assert (made.job.name, made.mesh.name, made.picture.name) == ("lid.toml", "lid.stl", "lid.png")
+    assert made.picture.is_file()
     job, surface = load_job(made.job)
     require_fit(job, load_config(None), surface, calibrates=True)
     assert len(job.scan.swath) == 2 and made.seen > 0.97
@@ -47,7 +49,10 @@ def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path: Path) -
     assert made.job.read_text(encoding="utf-8") == written
 
 
-def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(tmp_path: Path) -> None:
+def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("cell.apps.new_job.make.draw_proposal", lambda *_: None)  # takes longest
     mesh = relief(
         tmp_path / "m.ply", lambda x, y: 8 + 3 * np.sin(x / 9 + 0.3) * np.cos(y / 11 - 0.5) + np.sin((x + 2 * y) / 16),
         half=14.0,
@@ -70,9 +75,10 @@ def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(tmp
     require_fit(job, load_config(None), surface, calibrates=True)
     assert job.place.verify == "all"
     # A flat cover does not show how it lies along itself: the rest of it is looked at.
-    body(transform(lies, vertices), faces, flat=True).export(tmp_path / "drawings" / "cover.ply")
-    cover = from_options(tmp_path, True, **{**given, "name": "cover", "part": str(tmp_path / "drawings" / "cover.ply")})
-    assert load_job(cover.job)[0].place.verify == "seen"
+    cover = tmp_path / "drawings" / "cover.ply"
+    body(transform(lies, vertices), faces, flat=True).export(cover)
+    part = _PartFile(cover, cover, PartSection(mesh=str(cover), mesh_unit="m"))
+    assert _with_part(Asker({}, None, lambda _: None), job, part).place.verify == "seen"
     with pytest.raises(ConfigError, match=r"lid-part\.ply: there already"):
         from_options(tmp_path, part=str(tmp_path / "drawings" / "lid.ply"), **given)
     with pytest.raises(ConfigError, match=r"--part: .*none\.ply cannot be read as a mesh"):

@@ -18,7 +18,6 @@ from cell.config.cell_config import default_toml, load_config
 from drivers.errors import Aborted, ConfigError, RefusedError
 from tests.support import Typed
 from tests.support.described_cells import quick_job
-from tests.support.qualified import compared
 
 SEED = 2
 
@@ -55,13 +54,9 @@ def test_of_its_runs_nothing_is_kept_but_the_calibration(row: Row, task: WorldTa
     assert kept[0].endswith("-TARGET.json")
 
 
-def test_again_it_is_the_same_without_another_calibration(
-    row: Row, task: WorldTask, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_it_is_calibrated_once(row: Row, task: WorldTask, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Cell, "calibrate", None)
-    again = run_world(task)
-    assert again is not None
-    assert compared(again) == compared(row)
+    world._calibrate(task, world._config(task, tmp_path))
 
 
 def test_its_command_repeats_it(row: Row, task: WorldTask, here: Path, typed: Typed) -> None:
