@@ -1,7 +1,5 @@
 """What a script can take from `cell` itself, and what the command line says of itself."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The operator's screen in a real browser, before a cell that is simulated behind its real protocols."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """What takes longer: a whole dry run on the screen with a person's word, every end of a held button, a lost server."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The processes of a console: when one of them ends, in whatever way, nothing is left behind and the cell stands."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Makes of devices: `driver` chooses one, packages bring more, and what is wrong with one harms no other."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

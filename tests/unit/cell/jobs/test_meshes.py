@@ -1,7 +1,5 @@
 """The meshes of the shipped jobs are small, and a part is placed on them where the closed form has it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a person sees: a run's end on one screen of 80 by 24, and a list of the runs that nothing spoils."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`cell commission` finds by name what is not as the configuration says, writes it, and then finds nothing more."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Callable

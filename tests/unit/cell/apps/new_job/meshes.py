@@ -1,7 +1,5 @@
 """Meshes for `cell new-job`, and a job made of one by its options."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

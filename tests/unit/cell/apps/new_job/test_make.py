@@ -1,7 +1,5 @@
 """Promises of `cell new-job` as a whole: the job fits the cell, and no file is lost."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

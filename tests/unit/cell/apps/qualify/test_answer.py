@@ -1,7 +1,5 @@
 """What rows say: shares, figures beside their limits, reasons, the worst worlds and the commands that repeat them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

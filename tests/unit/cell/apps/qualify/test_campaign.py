@@ -1,7 +1,5 @@
 """The course of a campaign: what is missing, when it ends, what becomes of a worker's death."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

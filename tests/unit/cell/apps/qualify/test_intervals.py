@@ -1,7 +1,5 @@
 """Intervals and Cpk against scipy, tables of others, and numbers reckoned by hand."""
 
-from __future__ import annotations
-
 import pytest
 from scipy import stats
 

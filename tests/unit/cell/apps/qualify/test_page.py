@@ -1,7 +1,5 @@
 """The tables that people read, and the page: one file that asks nobody for anything, what was typed escaped."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Processes and clusters: the same rows, whoever dies; clear words for what cannot be."""
 
-from __future__ import annotations
-
 import threading
 import time
 from multiprocessing import active_children

@@ -1,7 +1,5 @@
 """One world by the product's runner: its row, what is kept of it, and the command that repeats it to the bit."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

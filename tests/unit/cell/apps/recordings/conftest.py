@@ -1,7 +1,5 @@
 """A recording of eight pictures, and the boards that were seen in them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

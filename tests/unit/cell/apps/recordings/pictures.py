@@ -1,7 +1,5 @@
 """A recording of a chessboard from eight poses: warped by OpenCV, written by numpy and scipy, by nothing under test."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Promises on the laser in colour pictures, and on pictures without it."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

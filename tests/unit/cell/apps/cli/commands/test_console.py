@@ -1,7 +1,5 @@
 """`cell console`: the link to its page is nowhere where others of this computer see it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """`cell jog`, `recover`, `doctor`: what they ask for first, and how they end."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`cell qualify` as it is typed, with worlds that cost nothing."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

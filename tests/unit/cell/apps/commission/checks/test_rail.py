@@ -1,7 +1,5 @@
 """Which way and how far a rail goes is judged by its camera, its switches by what they do."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The console of a cell, its server and a page together: STOP before all; and where it listens."""
 
-from __future__ import annotations
-
 import json
 import threading
 from pathlib import Path

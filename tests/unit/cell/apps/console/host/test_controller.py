@@ -1,7 +1,5 @@
 """What pages may ask of a cell on the virtual clock: who holds, what is refused in which words, what is begun."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A held button: what begins a motion, what goes on with it, and what ends it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from contextlib import nullcontext

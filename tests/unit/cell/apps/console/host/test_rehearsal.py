@@ -1,7 +1,5 @@
 """The dry run of a console: how far it is, and that it ends with who asked for it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Who may talk to the console's server: by clients that know nothing of it (docs/reference/console.md, "Who may")."""
 
-from __future__ import annotations
-
 import json
 import queue
 import random

@@ -1,7 +1,5 @@
 """Nobody can deny a STOP: pages that say anything a thousand times a second, and another one's STOP meanwhile."""
 
-from __future__ import annotations
-
 import os
 import threading
 import time

@@ -1,7 +1,5 @@
 """A run as the page shows it."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 
