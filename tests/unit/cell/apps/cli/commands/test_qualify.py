@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from cell.apps.qualify import workers
-from cell.apps.qualify.rows import Row
 from cell.apps.qualify.workers import Ended
 from cell.apps.qualify.world import WorldTask
 from tests.support import Typed
@@ -19,25 +18,15 @@ pytest.importorskip("pyarrow")
 class Quick:
     """Runs worlds in this process; `ends_at` is a seed at which Ctrl-C is pressed."""
 
-    room = 1
-
-    def __init__(self, ends_at: int | None = None, error_mm: float = 0.1) -> None:
-        self.ends_at = ends_at
-        self.error_mm = error_mm
-        self.outcome = "placed"
-        self.task: WorldTask | None = None
+    room, ends_at, error_mm, outcome = 1, 0, 0.1, "placed"
 
     def begin(self, task: WorldTask) -> None:
         self.task = task
 
     def ended(self) -> Iterator[Ended]:
-        assert self.task is not None
         if self.task.seed == self.ends_at:
             raise KeyboardInterrupt
-        yield self.task, self._row(self.task)
-
-    def _row(self, task: WorldTask) -> Row:
-        return row(task.seed, self.outcome, self.error_mm, of=task.of)
+        yield self.task, row(self.task.seed, self.outcome, self.error_mm, of=self.task.of)
 
     def close(self) -> None:
         pass

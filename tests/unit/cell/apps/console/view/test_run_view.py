@@ -49,7 +49,6 @@ def test_a_run_is_followed_by_its_own_events() -> None:
     assert [step["state"] for step in told["steps"][1:]] == ["active", "open", "open"]
     assert view.faults[0]["device"] == "arm"
     question = Questions().present(view)
-    assert question is not None
     assert [choice["choice"] for choice in question["choices"]] == ["confirm", "abort"]
     end.set()
     run.ended(5)
