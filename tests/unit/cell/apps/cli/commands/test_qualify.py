@@ -36,6 +36,7 @@ class Quick:
 def quick(here: Path, monkeypatch: pytest.MonkeyPatch) -> Quick:
     made = Quick()
     monkeypatch.setattr(workers, "open_workers", lambda *_: made)
+    monkeypatch.setattr("cell.apps.qualify.page.plots_of", lambda *_: [])
     return made
 
 
