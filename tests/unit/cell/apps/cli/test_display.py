@@ -110,18 +110,17 @@ def test_what_became_of_the_part_of_a_killed_run_is_in_its_journal(tmp_path: Pat
     assert read_report(tmp_path)["part"] == "unknown"
 
 
-def test_a_stale_calibration_asks_for_a_new_one(tmp_path: Path) -> None:
-    report = {"outcome": "refused", "code": "CalibrationStale", "reason": "too old", "job": "pot", "simulated": False}
-    assert "cell calibrate, then cell run -j pot" in "\n".join(end_screen(report, tmp_path))
-
-
-def test_a_simulated_run_is_repeated_in_its_own_world(tmp_path: Path) -> None:
-    report = {
-        "outcome": "refused", "reason": "no", "job": "pot", "simulated": True, "seed": 7, "level": "workshop",
-        "clock": "virtual",
-    }  # fmt: skip
-    text = " ".join("\n".join(end_screen(report, tmp_path)).split())
-    assert "then cell dry-run --seed 7 --level workshop --clock virtual -j pot" in text
+@pytest.mark.parametrize(
+    ("about", "words"),
+    [
+        ({"code": "CalibrationStale", "simulated": False}, "cell calibrate, then cell run -j pot"),
+        ({"simulated": True, "seed": 7, "level": "workshop", "clock": "virtual"},
+         "then cell dry-run --seed 7 --level workshop --clock virtual -j pot"),
+    ],
+)  # fmt: skip
+def test_a_refused_run_is_done_again_calibrated_or_in_its_own_world(tmp_path: Path, about: Any, words: str) -> None:
+    report = {"outcome": "refused", "reason": "no", "job": "pot", **about}
+    assert words in " ".join("\n".join(end_screen(report, tmp_path)).split())
 
 
 def test_what_a_screen_leaves_out_is_counted_and_the_report_has_it(ends: Ends) -> None:
