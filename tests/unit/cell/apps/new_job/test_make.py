@@ -29,11 +29,13 @@ from tests.support.report_runs import CONFIG, pot
 from tests.unit.cell.apps.new_job.meshes import from_options, relief
 
 
+def waves(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return 8 + 3 * np.sin(x / 9 + 0.3) * np.cos(y / 11 - 0.5) + np.sin((x + 2 * y) / 16)
+
+
 def test_a_job_from_its_mesh_fits_the_cell_and_no_file_is_lost(tmp_path: Path) -> None:
     """In metres, wider than one sweep; written twice: only when that is said."""
-    mesh = relief(
-        tmp_path / "m.ply", lambda x, y: 8 + 3 * np.sin(x / 9 + 0.3) * np.cos(y / 11 - 0.5) + np.sin((x + 2 * y) / 16)
-    )
+    mesh = relief(tmp_path / "m.ply", waves)
     trimesh.load_mesh(mesh).apply_scale(1e-3).export(mesh)
     made = from_options(tmp_path, mesh=str(mesh), name="lid")
     assert (made.job.name, made.mesh.name, made.picture.name) == ("lid.toml", "lid.stl", "lid.png")
@@ -51,10 +53,7 @@ def test_the_mesh_of_the_part_goes_beside_the_job_and_has_to_fit_its_surface(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cell.apps.new_job.make.draw_proposal", lambda *_: None)  # takes longest
-    mesh = relief(
-        tmp_path / "m.ply", lambda x, y: 8 + 3 * np.sin(x / 9 + 0.3) * np.cos(y / 11 - 0.5) + np.sin((x + 2 * y) / 16),
-        half=14.0,
-    )  # fmt: skip
+    mesh = relief(tmp_path / "m.ply", waves, half=14.0)
     job, surface = load_job(from_options(tmp_path, mesh=str(mesh), name="lid", like="shell").job)
     assert job.part is None and job.place.accept is None, "that of `shell` is another part"
     vertices, faces = read_mesh(surface, "mm")

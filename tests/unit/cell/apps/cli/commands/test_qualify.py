@@ -65,18 +65,15 @@ def test_ctrl_c_keeps_the_rows(quick: Quick, here: Path, typed: Typed) -> None:
     assert "interrupted: 3 worlds are kept in qualify/pot; the same command goes on" in complaints
 
 
-def test_a_part_outside_its_tolerance_that_nobody_noticed_fails(quick: Quick, typed: Typed) -> None:
-    quick.error_mm = 0.7
-    code, out, _ = typed("qualify", "--seeds", "2", "--json")
-    assert (code, json.loads(out)["unnoticed"]["count"]) == (1, 2)
-
-
-@pytest.mark.parametrize(("outcome", "code"), [("refused", 0), ("error", 1)])
-def test_a_program_that_fails_in_a_world_fails_and_a_part_that_is_refused_does_not(
-    quick: Quick, typed: Typed, outcome: str, code: int
+@pytest.mark.parametrize(
+    ("outcome", "error_mm", "code", "unnoticed"), [("refused", 0.1, 0, 0), ("error", 0.1, 1, 0), ("placed", 0.7, 1, 2)]
+)
+def test_an_error_and_a_part_that_nobody_noticed_outside_its_tolerance_fail(
+    quick: Quick, typed: Typed, outcome: str, error_mm: float, code: int, unnoticed: int
 ) -> None:
-    quick.outcome = outcome
-    assert typed("qualify", "--seeds", "2")[0] == code
+    quick.outcome, quick.error_mm = outcome, error_mm
+    ended, out, _ = typed("qualify", "--seeds", "2", "--json")
+    assert (ended, json.loads(out)["unnoticed"]["count"]) == (code, unnoticed)
 
 
 def test_campaigns_are_compared(quick: Quick, here: Path, typed: Typed) -> None:
