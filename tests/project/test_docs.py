@@ -1,7 +1,5 @@
 """What comments cite stands in the repository, with the numbered section that they name."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """The pages that `python docs/generate.py` writes are as it would write them now."""
 
-from __future__ import annotations
-
 import importlib.util
 import re
 from typing import Any

@@ -1,7 +1,5 @@
 """Which test files run on one worker."""
 
-from __future__ import annotations
-
 import re
 
 from tests.conftest import HERE, VIRTUAL_JOB, place

@@ -1,7 +1,5 @@
 """Planted bugs can be planted: each stands once where it says, and the tests that it names exist."""
 
-from __future__ import annotations
-
 import re
 from functools import cache
 

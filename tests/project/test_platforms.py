@@ -1,7 +1,5 @@
 """Where a package has no wheel the cell says so by name, with the remedy, and does what it can without it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from functools import partial

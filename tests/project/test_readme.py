@@ -1,7 +1,5 @@
 """What the README and the pages of docs/ show is what the project does."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from typing import Any

@@ -1,7 +1,5 @@
 """The packages that tutorials and docs/how-to/makes.md print are ones that the cell takes."""
 
-from __future__ import annotations
-
 import tomllib
 from importlib.metadata import EntryPoint
 from pathlib import Path

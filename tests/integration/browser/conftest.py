@@ -1,7 +1,5 @@
 """One browser and one simulated cell with its screen for all tests that look at it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """What takes longer: a whole dry run on the screen with a person's word, every end of a held button, a lost server."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -122,7 +120,6 @@ def test_stop_is_in_sight_and_nothing_is_cut_off(
     screen = Screen.of(browser, console.link(), size)
     page = screen.page
     box = page.locator("#stop").bounding_box()
-    assert box is not None
     assert (
         box["x"] >= 0 and box["y"] >= 0 and box["x"] + box["width"] <= size[0] and box["y"] + box["height"] <= size[1]
     )

@@ -1,7 +1,5 @@
 """What the server costs: the processor's time of its process, user and system, against the wall's."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

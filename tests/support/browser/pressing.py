@@ -1,7 +1,5 @@
 """A held button, and what somebody else sees of the arm meanwhile."""
 
-from __future__ import annotations
-
 import os
 import signal
 from typing import Any

@@ -1,5 +1,5 @@
 """Pages that flood a console, in a process of their own: `python -m tests.support.console.flood HOST` with cookie and
-key of each on standard input, a line each. It prints what was said so far, ten times a second, until its input ends."""
+key of each on standard input, a line each. It prints that it begins and, when its input ends, how much was said."""
 
 from __future__ import annotations
 
@@ -23,36 +23,30 @@ RUBBISH = ("[]", "x" * 2000)
 
 
 class Flood:
-    """`SESSIONS` browsers of `server`, each with its own link, that try to say `PER_S` things a second; a context."""
+    """`SESSIONS` browsers of `server`, each with its own link, that try to say `PER_S` things a second; a context.
+
+    At its end `rate` is how many they said a second.
+    """
 
     def __init__(self, server: Served) -> None:
         keys = [server.enter() for _ in range(SESSIONS)]
+        self._keys = "".join(f"{cookie}\n{key}\n" for cookie, key in keys) + "\n"
         self._process = subprocess.Popen(
             [sys.executable, "-m", "tests.support.console.flood", server.host],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
-        assert self._process.stdin is not None
-        self._process.stdin.write("".join(f"{cookie}\n{key}\n" for cookie, key in keys) + "\n")
-        self._process.stdin.flush()
-        self.said = 0
-        self._reader = threading.Thread(target=self._read)
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self.said = int(line)
 
     def __enter__(self) -> Flood:
-        self._reader.start()
-        while not self.said:
-            time.sleep(0.05)
+        self._process.stdin.write(self._keys)
+        self._process.stdin.flush()
+        self._process.stdout.readline()
+        self._begun = time.monotonic()
         return self
 
     def __exit__(self, *_: object) -> None:
-        assert self._process.stdin is not None
-        self._process.stdin.close()
-        self._process.wait(20)
-        self._reader.join(20)
+        seconds = time.monotonic() - self._begun
+        said, _ = self._process.communicate(timeout=20)
+        self.rate = int(said) / seconds
 
 
 class _Page(Served):
@@ -86,11 +80,9 @@ def _main(host: str) -> None:
     pages = [_Page(host, *of) for of in zip(given[::2], given[1::2], says, strict=True)]
     for page in pages:
         threading.Thread(target=page.flood, daemon=True).start()
-    over = threading.Thread(target=sys.stdin.read, daemon=True)
-    over.start()
-    while over.is_alive():
-        print(sum(page.said for page in pages), flush=True)
-        over.join(0.1)
+    print("begun", flush=True)
+    sys.stdin.read()
+    print(sum(page.said for page in pages), flush=True)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,8 @@
 """Makes of devices: `driver` chooses one, packages bring more, and what is wrong with one harms no other."""
 
-from __future__ import annotations
-
-import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -22,18 +20,18 @@ from drivers.make import KINDS
 from drivers.rail.tmcl.make import TmclRailConfig
 from tests.support.packages import RAIL, install, with_acme_rail
 
-TWIN = """
+OTHER = """
 from typing import Literal
 from cell.makes import BUILT_IN
-from drivers.rail.tmcl.make import TmclRailConfig
+from {module} import {record}
 from drivers.make import Make
 
-class TwinConfig(TmclRailConfig):
-    driver: Literal["twin"] = "twin"
+class OtherConfig({record}):
+    driver: Literal["other"] = "other"
 
-MAKE = Make("rail", "twin", TwinConfig, BUILT_IN[0].connect, BUILT_IN[0].calibrated)
+MAKE = Make("{kind}", "other", OtherConfig, BUILT_IN[{k}].connect, {more})
 """
-"""A rail with the built-in one's record, from another package."""
+"""A make with a built-in one's record, from another package."""
 
 
 @pytest.fixture
@@ -83,44 +81,27 @@ def test_what_a_calibration_depends_on_comes_from_the_make(site: Path, tmp_path:
     assert loaded(tmp_path, belt="3 mm").calibration_hash() != own
 
 
-def test_a_calibration_of_one_make_does_not_fit_another_with_the_same_values(site: Path, tmp_path: Path) -> None:
-    install(site, "twin-rail", "1.0", "rail.twin = twin_rail:MAKE", twin_rail=TWIN)
-    path = tmp_path / "twin.toml"
-    path.write_text(default_toml().replace('driver = "tmcl"', 'driver = "twin"'))
-    own = load_config(None)
-    twin = load_config(path)
-    assert twin.rail.model_dump(exclude={"driver"}) == own.rail.model_dump(exclude={"driver"})
-    assert twin.calibration_hash() != own.calibration_hash()
-
-
-BEAM = """
-from typing import Literal
-from cell.makes import BUILT_IN
-from drivers.arm.make import ArmOutputLaserConfig
-from drivers.make import Make
-
-class BeamConfig(ArmOutputLaserConfig):
-    driver: Literal["beam"] = "beam"
-
-MAKE = Make("laser", "beam", BeamConfig, BUILT_IN[4].connect, on_arm=True)
-"""
-"""A laser on the arm from another package, on whose values no calibration depends."""
-
-
-def test_a_make_of_which_nothing_is_calibrated_still_changes_what_a_calibration_fits(
-    site: Path, tmp_path: Path
+@pytest.mark.parametrize(
+    ("kind", "k", "module", "record", "more"),
+    [
+        ("rail", 0, "drivers.rail.tmcl.make", "TmclRailConfig", "BUILT_IN[0].calibrated"),
+        # No calibration depends on its values.
+        ("laser", 4, "drivers.arm.make", "ArmOutputLaserConfig", "on_arm=True"),
+    ],
+)
+def test_a_calibration_of_one_make_does_not_fit_another_with_the_same_values(
+    site: Path, tmp_path: Path, kind: str, k: int, module: str, record: str, more: str
 ) -> None:
-    install(site, "beam", "1.0", "laser.beam = beam:MAKE", beam=BEAM)
-    before, laser, after = default_toml().partition("\n[laser]")
-    path = tmp_path / "beam.toml"
-    path.write_text(before + laser + after.replace('"arm_output"', '"beam"', 1))
-    beam = load_config(path)
-    without = {"calibration": beam.calibration.model_dump(include={"fine", "large"})}
-    for name in ("rail", "arm", "scan_camera", "target_camera"):
-        without[name] = beam.device(name).model_dump(include=set(beam.make(name).calibrated))
-    unnamed = hashlib.sha256(json.dumps(without, sort_keys=True).encode()).hexdigest()[:16]
-    assert beam.calibration_hash() not in (unnamed, load_config(None).calibration_hash())
-    assert safe_off_outputs(beam) == (beam.laser.output,)
+    text = OTHER.format(kind=kind, k=k, module=module, record=record, more=more)
+    install(site, "other", "1.0", f"{kind}.other = other_{kind}:MAKE", **{f"other_{kind}": text})
+    before, table, after = default_toml().partition(f"\n[{kind}]")
+    path = tmp_path / "other.toml"
+    path.write_text(before + table + re.sub(r'(?m)^driver = "\w+"', 'driver = "other"', after, count=1))
+    own, other = load_config(None), load_config(path)
+    assert other.device(kind).driver == "other"
+    assert other.device(kind).model_dump(exclude={"driver"}) == own.device(kind).model_dump(exclude={"driver"})
+    assert other.calibration_hash() != own.calibration_hash()
+    assert safe_off_outputs(other) == (own.laser.output,)
 
 
 def test_its_values_are_checked_as_those_of_the_built_in_ones(site: Path, tmp_path: Path) -> None:

@@ -1,7 +1,5 @@
 """`cell doctor`: what is wrong with a computer is found, with what mends it, and only what the cell needs counts."""
 
-from __future__ import annotations
-
 import os
 import pty
 from importlib.metadata import PackageNotFoundError, version

@@ -1,7 +1,5 @@
 """The meshes of the shipped jobs are small, and a part is placed on them where the closed form has it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +24,6 @@ def test_all_meshes_together_take_no_more_than_300_kb() -> None:
 
 def test_the_part_that_ships_fits_its_surface_and_shows_how_it_lies() -> None:
     job, mesh = load_job("shell")
-    assert job.part is not None
     part, belongs = NominalSurface.load(Path(job.part.mesh)), job.place.surface_from_part.se3()
     gap = drawn_gap(NominalSurface.load(mesh), belongs, part)
     assert gap is not None and np.abs(gap.gaps).max() < 1e-6 and gap.seen == 1.0

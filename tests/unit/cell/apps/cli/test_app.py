@@ -1,7 +1,5 @@
 """What the command line says of itself, and of what is wrong with it."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """What a shell offers at tab, asked as bash asks it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

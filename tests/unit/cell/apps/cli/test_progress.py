@@ -1,7 +1,5 @@
 """Rows of a run's progress: one line each at 80 columns, their bars in one place, ended ones told from others."""
 
-from __future__ import annotations
-
 import io
 import os
 import subprocess

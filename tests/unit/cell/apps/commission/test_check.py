@@ -1,7 +1,5 @@
 """What a check leaves: figures beside their limits, and a record that tells when it counts no more."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

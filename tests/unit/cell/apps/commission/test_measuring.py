@@ -1,7 +1,5 @@
 """What `cell commission` measures by, against closed forms: mountings and board sizes."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

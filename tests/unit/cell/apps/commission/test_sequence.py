@@ -1,7 +1,5 @@
 """`cell commission` finds by name what is not as the configuration says, writes it, and then finds nothing more."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Callable
@@ -10,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from cell.apps.commission.check import CommissionCheck
 from cell.apps.commission.sequence import CHECKS, chosen, edited, write_changes
 from cell.config.cell_config import default_toml, load_config
 from drivers.errors import ConfigError
@@ -139,7 +136,6 @@ def test_the_old_file_is_kept_each_time(tmp_path: Path) -> None:
 def test_every_check_says_what_moves_and_needs_only_earlier_ones() -> None:
     before: set[str] = set()
     for check in CHECKS:
-        assert isinstance(check, CommissionCheck)
         assert check.title and check.limit and check.moves
         assert check.moves == "nothing" or (check.far and check.fast)
         assert set(check.needs) <= before, check.name

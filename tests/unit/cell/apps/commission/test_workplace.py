@@ -1,7 +1,5 @@
 """Where checks work: nothing moves there without a person's word."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from tests.support.commissioning import commissioned, files

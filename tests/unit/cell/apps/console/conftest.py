@@ -1,7 +1,5 @@
 """One cell on the virtual clock and what pages ask of it, and one server without a cell."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 

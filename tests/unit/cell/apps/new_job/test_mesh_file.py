@@ -1,7 +1,5 @@
 """Promises of `cell.apps.new_job.mesh_file`; the STEP files are written here from the standard."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Promises of `cell.apps.new_job.proposal`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +22,7 @@ def test_a_disc_is_refused_by_its_free_turn_however_coarsely_it_is_drawn(tmp_pat
 
 def test_what_takes_long_is_told_while_it_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cell.apps.new_job.questions.PROGRESS_S", 0.0)
+    monkeypatch.setattr("cell.apps.new_job.make.draw_proposal", lambda *_: None)
     told: list[str] = []
     mesh = str(relief(tmp_path / "wave.stl", lambda x, y: 6 + 2 * np.sin(x / 6)))
     with pytest.raises(NotObservable):

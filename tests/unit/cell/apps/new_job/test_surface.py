@@ -1,7 +1,5 @@
 """Promises of `cell.apps.new_job.surface`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

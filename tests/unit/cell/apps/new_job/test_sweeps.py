@@ -1,7 +1,5 @@
 """Promises of `cell.apps.new_job.sweeps`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

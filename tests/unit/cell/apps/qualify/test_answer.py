@@ -1,7 +1,5 @@
 """What rows say: shares, figures beside their limits, reasons, the worst worlds and the commands that repeat them."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -61,7 +59,6 @@ def test_parts_outside_the_tolerance_that_nobody_noticed_are_counted() -> None:
 
 def test_the_stated_bounds_are_held_against_the_truth() -> None:
     covered = answer(row(1, points_covered=1.0), row(2, points_covered=0.8), row(3, "refused")).covered
-    assert covered is not None
     assert (covered.count, covered.of) == pytest.approx((1.8, 2))
     assert answer(row(3, "refused")).covered is None
 
@@ -82,7 +79,6 @@ def test_the_worst_worlds_are_those_that_failed_then_those_nearest_a_limit() -> 
 
 def test_times_are_of_good_worlds() -> None:
     told = some()
-    assert told.cycle is not None
     assert (told.cycle.n, told.cycle.mean_s) == (6, pytest.approx(53.5))
     assert [(step.name, round(step.share, 3)) for step in told.steps] == [("place", 0.667), ("laser_sweep", 0.333)]
 
@@ -96,7 +92,7 @@ def test_a_world_is_repeated_by_a_command() -> None:
 
 def test_it_is_json() -> None:
     told = json.loads(json.dumps(some().as_dict(), allow_nan=False))
-    assert told["shares"]["placed"] == {**told["shares"]["placed"], "count": 6, "of": 10, "share": 0.6}
+    assert told["shares"]["placed"].items() >= {"count": 6, "of": 10, "share": 0.6}.items()
     assert json.dumps(answer(row(1, "refused")).as_dict(), allow_nan=False)
 
 

@@ -1,7 +1,5 @@
 """What a row is of: every hash changes with what it stands for, and with nothing else."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Rows from reports: worst item, figure nearest its limit, columns with their units."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A recording of eight pictures, and the boards that were seen in them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -12,7 +10,7 @@ from cell.apps.recordings.series import list_folder
 from tests.unit.cell.apps.recordings.pictures import BOARD, POSES, photograph
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def pictures(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("pictures")
     for k, pose in enumerate(POSES):
@@ -20,7 +18,7 @@ def pictures(tmp_path_factory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def seen(pictures) -> dict[str, RecordedFrame]:
     frames, _ = read_frames(list_folder(pictures), BOARD)
     assert all(f.reason is None for f in frames), [f.text for f in frames]

@@ -1,7 +1,5 @@
 """A recording of a chessboard from eight poses: warped by OpenCV, written by numpy and scipy, by nothing under test."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -25,15 +23,8 @@ BASE_FROM_BOARD = np.eye(4)
 BASE_FROM_BOARD[:3, :3] = Rotation.from_euler("xyz", (178, 3, 20), degrees=True).as_matrix()
 BASE_FROM_BOARD[:3, 3] = 0.45, -0.1, 0.02
 VIEWS = (
-    (0, 0, 0),
-    (25, 5, 10),
-    (-20, 15, -30),
-    (8, -28, 60),
-    (-15, -18, 120),
-    (20, 22, -75),
-    (-28, 4, 35),
-    (5, 30, -140),
-)
+    (0, 0, 0), (25, 5, 10), (-20, 15, -30), (8, -28, 60), (-15, -18, 120), (20, 22, -75), (-28, 4, 35), (5, 30, -140),
+)  # fmt: skip
 
 
 def flange_poses() -> list[np.ndarray]:
@@ -53,7 +44,7 @@ POSES = flange_poses()
 
 def photograph(base_from_flange: np.ndarray) -> np.ndarray:
     """The board as CAMERA sees it, warped at four times the size and averaged."""
-    cell, half = 40, 20
+    cell = 40
     squares = np.indices((6, 8)).sum(axis=0) % 2 * 200 + 25
     sheet = np.full((6 * cell + 2 * cell, 8 * cell + 2 * cell), 225, np.uint8)
     sheet[cell:-cell, cell:-cell] = np.kron(squares, np.ones((cell, cell)))
@@ -65,7 +56,6 @@ def photograph(base_from_flange: np.ndarray) -> np.ndarray:
     large = np.diag([4.0, 4.0, 1.0])
     large[:2, 2] = 1.5
     wide = cv2.warpPerspective(sheet, large @ into, (4 * SIZE[0], 4 * SIZE[1]), flags=cv2.INTER_LINEAR, borderValue=90)
-    assert half * 2 == cell
     return cv2.resize(cv2.GaussianBlur(wide, (0, 0), 2.5), SIZE, interpolation=cv2.INTER_AREA)
 
 

@@ -1,7 +1,5 @@
 """Promises on what poses may mean: the reading that agrees with the pictures is taken, or the choice is asked for."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Promises of the whole chain on recordings that are spoilt: right within what is stated, or refused by name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,7 +1,5 @@
 """Promises on a folder as a whole: what is asked, what is told of each picture and of copies."""
 
-from __future__ import annotations
-
 import cv2
 import pytest
 

@@ -1,7 +1,5 @@
 """Promises on frames that disagree with the others: they are named, and views that do not turn have no vote."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Promises on conventions: each of the table is found by the pictures, any other is read by its name."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

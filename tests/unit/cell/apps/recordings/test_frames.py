@@ -1,7 +1,5 @@
 """Promises on pictures that belong together: copies, what was drawn into, and a second one with the laser."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

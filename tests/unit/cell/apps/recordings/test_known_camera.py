@@ -1,7 +1,5 @@
 """Promise: a camera from a file is read as it was meant, or refused with key, value and next step."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Promise: more pictures of the same stop do not make a calibration look better known than the stops allow."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Promises on what is printed of a hand-eye: its angles, and what the poses cannot tell."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

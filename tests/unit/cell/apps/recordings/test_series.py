@@ -1,7 +1,5 @@
 """Promises on which pose belongs to which picture, and on what lies in a folder."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

@@ -1,7 +1,5 @@
 """Promises on the camera of recorded pictures: pictures that are of another are named, what it is off by is stated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

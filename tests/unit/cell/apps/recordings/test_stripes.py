@@ -1,7 +1,5 @@
 """Promises on the laser in colour pictures, and on pictures without it."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 
@@ -12,20 +10,18 @@ from tests.unit.cell.apps.recordings.pictures import BOARD, lit
 
 
 def test_a_red_laser_on_white_paper_is_read_in_colour_and_never_wrongly_in_grey(tmp_path, pictures):
-    for path in sorted(pictures.iterdir())[:2]:
-        cv2.imwrite(str(tmp_path / path.name), lit(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) * 0.8, 60))
+    path = min(pictures.iterdir())
+    cv2.imwrite(str(tmp_path / path.name), lit(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) * 0.8, 60))
     frames, channel = read_frames(list_folder(tmp_path), BOARD)
     assert channel.chosen is not LaserChannel.GREY
-    assert sum(channel.votes.values()) == 2
-    for frame in frames:
-        assert frame.profile is not None, frame.stripe_text
+    assert sum(channel.votes.values()) == 1
+    (frame,) = frames
+    rows = frame.profile.rows
+    assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 0.3
+    (frame,), _ = read_frames(list_folder(tmp_path), BOARD, laser=LaserChannel.GREY)
+    if frame.profile is not None:
         rows = frame.profile.rows
-        assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 0.3
-    in_grey, _ = read_frames(list_folder(tmp_path), BOARD, laser=LaserChannel.GREY)
-    for frame in in_grey:
-        if frame.profile is not None:
-            rows = frame.profile.rows
-            assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 2.0
+        assert np.median(np.abs(frame.profile.centres[rows] - (300 + 0.1 * rows))) < 2.0
 
 
 def test_the_picture_without_the_laser_is_taken_off(tmp_path, pictures):

@@ -1,7 +1,5 @@
 """Promises on poses as people have them: any spelling is read as it was meant, and what is broken is named."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Promises of `cell calibrate --from` on recordings: what it prints, when it fails, and where a camera is mounted."""
 
-from __future__ import annotations
-
 import ast
 import json
 import re

@@ -1,7 +1,5 @@
 """`cell commission`: how the checks stand is told without a device; what is for a simulated cell stays there."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

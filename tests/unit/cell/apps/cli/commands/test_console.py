@@ -1,12 +1,11 @@
 """`cell console`: the link to its page is nowhere where others of this computer see it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 
-from cell.apps.cli.commands.console import page_notifier
+from cell.apps.cli.commands.console import page_notifier, require_installed
+from drivers.errors import ConfigError
 
 
 def test_the_link_is_in_no_process_s_arguments(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -20,3 +19,9 @@ def test_the_link_is_in_no_process_s_arguments(monkeypatch: pytest.MonkeyPatch) 
     page = Path(url.removeprefix("file://"))
     assert "token" not in url and "token=first" in page.read_text()
     assert [path.stat().st_mode & 0o077 for path in (page, page.parent)] == [0, 0]
+
+
+def test_without_its_server_s_packages_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"websockets; install: pip install -e '\.\[console\]'"):
+        require_installed()

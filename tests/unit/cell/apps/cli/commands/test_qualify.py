@@ -1,7 +1,5 @@
 """`cell qualify` as it is typed, with worlds that cost nothing."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from cell.apps.qualify import workers
-from cell.apps.qualify.rows import Row
 from cell.apps.qualify.workers import Ended
 from cell.apps.qualify.world import WorldTask
 from tests.support import Typed
@@ -21,25 +18,15 @@ pytest.importorskip("pyarrow")
 class Quick:
     """Runs worlds in this process; `ends_at` is a seed at which Ctrl-C is pressed."""
 
-    room = 1
-
-    def __init__(self, ends_at: int | None = None, error_mm: float = 0.1) -> None:
-        self.ends_at = ends_at
-        self.error_mm = error_mm
-        self.outcome = "placed"
-        self.task: WorldTask | None = None
+    room, ends_at, error_mm, outcome = 1, 0, 0.1, "placed"
 
     def begin(self, task: WorldTask) -> None:
         self.task = task
 
     def ended(self) -> Iterator[Ended]:
-        assert self.task is not None
         if self.task.seed == self.ends_at:
             raise KeyboardInterrupt
-        yield self.task, self._row(self.task)
-
-    def _row(self, task: WorldTask) -> Row:
-        return row(task.seed, self.outcome, self.error_mm, of=task.of)
+        yield self.task, row(self.task.seed, self.outcome, self.error_mm, of=self.task.of)
 
     def close(self) -> None:
         pass
@@ -49,6 +36,7 @@ class Quick:
 def quick(here: Path, monkeypatch: pytest.MonkeyPatch) -> Quick:
     made = Quick()
     monkeypatch.setattr(workers, "open_workers", lambda *_: made)
+    monkeypatch.setattr("cell.apps.qualify.page.plots_of", lambda *_: [])
     return made
 
 
@@ -77,18 +65,15 @@ def test_ctrl_c_keeps_the_rows(quick: Quick, here: Path, typed: Typed) -> None:
     assert "interrupted: 3 worlds are kept in qualify/pot; the same command goes on" in complaints
 
 
-def test_a_part_outside_its_tolerance_that_nobody_noticed_fails(quick: Quick, typed: Typed) -> None:
-    quick.error_mm = 0.7
-    code, out, _ = typed("qualify", "--seeds", "2", "--json")
-    assert (code, json.loads(out)["unnoticed"]["count"]) == (1, 2)
-
-
-@pytest.mark.parametrize(("outcome", "code"), [("refused", 0), ("error", 1)])
-def test_a_program_that_fails_in_a_world_fails_and_a_part_that_is_refused_does_not(
-    quick: Quick, typed: Typed, outcome: str, code: int
+@pytest.mark.parametrize(
+    ("outcome", "error_mm", "code", "unnoticed"), [("refused", 0.1, 0, 0), ("error", 0.1, 1, 0), ("placed", 0.7, 1, 2)]
+)
+def test_an_error_and_a_part_that_nobody_noticed_outside_its_tolerance_fail(
+    quick: Quick, typed: Typed, outcome: str, error_mm: float, code: int, unnoticed: int
 ) -> None:
-    quick.outcome = outcome
-    assert typed("qualify", "--seeds", "2")[0] == code
+    quick.outcome, quick.error_mm = outcome, error_mm
+    ended, out, _ = typed("qualify", "--seeds", "2", "--json")
+    assert (ended, json.loads(out)["unnoticed"]["count"]) == (code, unnoticed)
 
 
 def test_campaigns_are_compared(quick: Quick, here: Path, typed: Typed) -> None:

@@ -1,7 +1,5 @@
 """A job that was interrupted too late keeps its outcome, and the program says so and exits 130."""
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext

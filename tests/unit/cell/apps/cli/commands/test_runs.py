@@ -1,7 +1,5 @@
 """`cell confirm` answers one question: the one that was named, or the one that it has just shown."""
 
-from __future__ import annotations
-
 import io
 import os
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`cell init` and `cell check`: what is written is complete and right, and nothing is ever overwritten."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

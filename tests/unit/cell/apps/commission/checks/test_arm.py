@@ -1,7 +1,5 @@
 """Promises of `cell.apps.commission.checks.arm`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,7 +1,5 @@
 """Figures of a picture of a board, and the words and TOML for what a camera has shown."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 

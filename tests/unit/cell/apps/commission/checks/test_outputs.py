@@ -1,7 +1,5 @@
 """Promises of `cell.apps.commission.checks.outputs`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from cell.apps.commission.checks.outputs import bright_rows

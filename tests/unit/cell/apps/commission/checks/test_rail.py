@@ -1,7 +1,5 @@
 """Which way and how far a rail goes is judged by its camera, its switches by what they do."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 
@@ -59,7 +57,6 @@ def test_limit_switches_that_are_exchanged_are_found_by_name_short_of_the_end_st
     made, result = opened(tmp_path, Shown()), Result()
     with closing(made.workplace):
         simulated = made.workplace.cell.simulated
-        assert isinstance(simulated, VirtualCell)
         simulated.fault("rail.exchanged_switches")
         by_name("rail_limits").work(made.workplace, result)
         (finding,) = result.findings

@@ -1,7 +1,5 @@
 """Each cause stops what moves or shines in a simulated cell, and a stop that comes late is measured."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

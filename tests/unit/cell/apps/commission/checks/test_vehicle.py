@@ -1,7 +1,5 @@
 """What the board of a station says of the job and of the wheels."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The first check of a cell, and a whole commissioning up to its first part."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The console of a cell, its server and a page together: STOP before all; and where it listens."""
 
-from __future__ import annotations
-
 import json
 import threading
 from pathlib import Path
@@ -76,7 +74,6 @@ def test_a_token_that_others_know_or_guess_is_refused_and_not_shown(tmp_path: Pa
 def test_a_question_about_a_job_that_a_command_began_ends_with_it(cell: Cell, console: Console) -> None:
     run, made = cell.begin("jog", lambda run: until(lambda: run.control.token.reason is not None)), list[object]()
     decide = console.script("pot").on_refusal
-    assert decide is not None
     with Browser(console.link).live():
         assert until(lambda: console.seen)
         failure = Failure(Outcome.REFUSED, "no board")

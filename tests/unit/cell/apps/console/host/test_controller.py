@@ -1,7 +1,5 @@
 """What pages may ask of a cell on the virtual clock: who holds, what is refused in which words, what is begun."""
 
-from __future__ import annotations
-
 import os
 import threading
 from pathlib import Path
@@ -29,7 +27,6 @@ def asked(questions: Questions, run: Run[Any]) -> tuple[list[object], threading.
     number = Measured("stripe, rows seen", 12, "rows", least=200)
     failure = Failure(Outcome.REFUSED, "too little stripe", "RefusedError", error=RefusedError("x", number))
     decide = questions.script(STEPS).on_refusal
-    assert decide is not None
     questions.hold(run)
 
     def ask() -> None:
@@ -49,7 +46,6 @@ def test_a_refusal_is_shown_with_its_numbers_and_the_choices_that_the_policy_all
     run: Run[Any] = Run("job", lambda run: end.wait(10))
     made, thread = asked(questions, run)
     shown = questions.present(None)
-    assert shown is not None
     assert shown["numbers"] == [{"name": "stripe, rows seen", "value": 12, "limit": 200, "unit": "rows", "ok": False}]
     again, abort = shown["choices"]
     assert again == {"choice": "again", "steps": ["board_photo", "laser_sweep"]}
@@ -71,7 +67,6 @@ def test_a_refusal_is_shown_with_its_numbers_and_the_choices_that_the_policy_all
 
     made, thread = asked(questions, run)
     later = questions.present(None)
-    assert later is not None
     questions.decide(run, later["number"], "abort", None, "Bob", "the part is scrap")
     thread.join(5)
     assert isinstance(made[0], RefusedError)
@@ -91,7 +86,6 @@ def test_a_run_that_is_ended_asks_no_more() -> None:
 
 def test_nobody_is_asked_where_nobody_looks() -> None:
     decide = Questions().script(STEPS, seen=lambda: False).on_refusal
-    assert decide is not None
     assert decide("board_photo", Failure(Outcome.REFUSED, "no board")) is None
 
 
@@ -229,16 +223,8 @@ def test_jobs_are_named_never_addressed(
     os.mkfifo(here / "pipe.toml")
     monkeypatch.chdir(here)
     assert controller.named_job("mine") == "mine" and controller.named_job("seat") == "seat"
-    wrong = [
-        "../elsewhere/mine",
-        "../elsewhere/mine.toml",
-        str(here / "mine.toml"),
-        "mine.toml",
-        "plain",
-        "linked",
-        "pipe",
-    ]
-    for name in [*wrong, "pipe", "pipe.toml", "/dev/zero", "/etc/passwd", "", ".", "..", "x" * 300]:
+    elsewheres = ["../elsewhere/mine", "../elsewhere/mine.toml", str(here / "mine.toml"), "/dev/zero", "/etc/passwd"]
+    for name in [*elsewheres, "mine.toml", "plain", "linked", "pipe", "pipe.toml", "", ".", "..", "x" * 300]:
         with pytest.raises(ConfigError) as refused:
             controller.named_job(name)
         assert "secret" not in str(refused.value)

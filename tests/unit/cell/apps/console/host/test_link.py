@@ -1,7 +1,5 @@
 """The pipes between a program and its server: whatever happens to one of them, the program hears of it."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """A held button: what begins a motion, what goes on with it, and what ends it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from contextlib import nullcontext
@@ -23,7 +21,6 @@ Z_UP = ("arm", "z", 1)
 def test_a_press_lives_by_its_beats_and_never_twice() -> None:
     presses, beaten = Presses(), []
     press = presses.beat("c1", 7, *Z_UP)
-    assert press is not None
     press.beat = lambda: beaten.append(time.monotonic())
     assert presses.beat("c1", 7, *Z_UP) is None
     assert len(beaten) == 1
@@ -39,19 +36,16 @@ def test_a_press_lives_by_its_beats_and_never_twice() -> None:
 def test_release_and_a_second_button_end_it() -> None:
     presses = Presses()
     first = presses.beat("c1", 1, *Z_UP)
-    assert first is not None
     presses.end("c1", "the button was let go of")
     assert first.over() == "the button was let go of"
     assert presses.beat("c1", 1, *Z_UP) is None
 
     second = presses.beat("c1", 2, *Z_UP)
-    assert second is not None
     # Neither another axis, nor the other way, nor another press of the same button goes on with it or begins anything.
     assert presses.beat("c1", 3, "arm", "x", 1) is None
     assert second.over() is not None
     assert presses.beat("c1", 3, "arm", "x", 1) is None
     third = presses.beat("c1", 4, *Z_UP)
-    assert third is not None
     assert presses.beat("c1", 4, "arm", "z", -1) is None
     assert third.over() is not None
 
@@ -59,7 +53,6 @@ def test_release_and_a_second_button_end_it() -> None:
 def test_another_page_ends_what_a_page_holds_and_begins_nothing() -> None:
     presses = Presses()
     press = presses.beat("c1", 1, *Z_UP)
-    assert press is not None
     assert presses.beat("c2", 1, *Z_UP) is None
     assert press.over() is not None
     presses.left("c1")
@@ -85,7 +78,6 @@ def test_a_press_ends_when_the_watch_beside_the_device_is_lost() -> None:
 
     presses = Presses()
     press = presses.beat("c1", 1, "rail", "", 1)
-    assert press is not None
     press.beat = lost
     presses.beat("c1", 1, "rail", "", 1)
     assert "the helper is gone" in str(press.over())
@@ -94,7 +86,6 @@ def test_a_press_ends_when_the_watch_beside_the_device_is_lost() -> None:
 def test_who_waits_for_the_end_hears_it_at_once() -> None:
     presses = Presses()
     press = presses.beat("c1", 1, *Z_UP)
-    assert press is not None
     threading.Timer(0.02, lambda: presses.end_all("stopped")).start()
     begun = time.monotonic()
     press.wait(5.0)

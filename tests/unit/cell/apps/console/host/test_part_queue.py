@@ -1,7 +1,5 @@
 """A batch that a page began: counted part by part, held between two parts, ended there by the page or by a stop."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

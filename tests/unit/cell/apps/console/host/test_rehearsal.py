@@ -1,7 +1,5 @@
 """The dry run of a console: how far it is, and that it ends with who asked for it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path
@@ -21,7 +19,6 @@ def test_a_dry_run_tells_how_far_it_is_and_can_be_cancelled(cell: Cell) -> None:
     rehearsals.begin("pot", 3)
     assert until(lambda: (rehearsals.present or {}).get("text") == "simulating the cell", 60.0)
     process = rehearsals._process
-    assert process is not None
     rehearsals.cancel()
     assert until(lambda: rehearsals.present is not None and rehearsals.present["state"] == "done")
     assert rehearsals.present["outcome"] == "cancelled"

@@ -1,10 +1,9 @@
 """Who may talk to the console's server: by clients that know nothing of it (docs/reference/console.md, "Who may")."""
 
-from __future__ import annotations
-
 import json
 import queue
 import random
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -224,15 +223,12 @@ def test_a_browser_that_says_that_another_site_asks_is_refused(server: Served) -
     assert server.ask("GET", "/api/cell", sec_fetch_site="same-origin").status == 200
 
 
-@pytest.mark.parametrize("headers", [{"cookie": "x=y"}, {"host": "evil.example"}])
-def test_the_live_link_asks_the_same(server: Served, headers: dict[str, str]) -> None:
-    request = {"Host": server.host, "Cookie": server.cookie, "Origin": server.origin}
-    request["Sec-WebSocket-Protocol"] = f"cell, {server.key}"
-    request |= {name.title(): value for name, value in headers.items()}
-    lines = [f"{name}: {value}" for name, value in request.items()]
-    upgrade = ["GET /live HTTP/1.1", "Upgrade: websocket", "Connection: Upgrade", "Sec-WebSocket-Version: 13"]
-    said = server.raw("\r\n".join([*upgrade, "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==", *lines, "", ""]).encode())
-    assert said.startswith(b"HTTP/1.1 403")
+def test_the_live_link_asks_the_same(server: Served) -> None:
+    link = socket.create_connection(("127.0.0.1", server.port))
+    for options in ({"headers": {"cookie": "x=y"}}, {"url": f"ws://evil.example:{server.port}/live", "sock": link}):
+        with pytest.raises(InvalidStatus) as refused:
+            server.live(**options)
+        assert refused.value.response.status_code == 403
 
 
 def test_the_token_is_in_no_output_and_no_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -1,7 +1,5 @@
 """What the server answers, and what it refuses: sizes, forms, paths; a STOP waits for nothing."""
 
-from __future__ import annotations
-
 import json
 import socket
 import time

@@ -1,7 +1,5 @@
 """Pages that talk nonsense, too much or not at all, read slowly, or are too many."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import socket

@@ -1,7 +1,5 @@
 """Runs and their replay, read from their folders."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

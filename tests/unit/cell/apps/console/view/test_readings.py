@@ -1,7 +1,5 @@
 """What a page is told of the cell: what can be held, and jobs by their names."""
 
-from __future__ import annotations
-
 from cell.apps.console.view.readings import cell_facts
 from cell.run.session.supervisor import Cell
 

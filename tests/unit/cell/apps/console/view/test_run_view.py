@@ -1,7 +1,5 @@
 """A run as the page shows it."""
 
-from __future__ import annotations
-
 import threading
 from typing import Any
 
@@ -23,14 +21,10 @@ def test_a_run_is_followed_by_its_own_events() -> None:
         run.notify(Event("progress", "calibrate", {"fraction": 1.0, "text": "stored"}))
         run.notify(Event("step_started", "board_photo", {"attempt": 1}))
         run.notify(Event("progress", "board_photo", {"fraction": 0.5, "text": "to the board"}))
-        run.notify(
-            Event(
-                "fault", "board_photo", {"attempt": 1, "code": "arm.link_lost", "reason": "cut", "remedy": "recovered"}
-            )
-        )
-        run.notify(
-            Event("confirm_needed", "board_photo", {"reason": "look", "code": "arm.protective_stop", "number": 1})
-        )
+        fault = {"attempt": 1, "code": "arm.link_lost", "reason": "cut", "remedy": "recovered"}
+        run.notify(Event("fault", "board_photo", fault))
+        question = {"reason": "look", "code": "arm.protective_stop", "number": 1}
+        run.notify(Event("confirm_needed", "board_photo", question))
         begun.set()
         end.wait(10)
         run.notify(Event("run_ended", None, {"outcome": "placed", "reason": "all steps done"}))
@@ -42,16 +36,12 @@ def test_a_run_is_followed_by_its_own_events() -> None:
     view.news()
     told = view.as_dict()
     # A first calibration stands before the steps, and has ended with the first of them.
-    assert [(step["name"], step["state"]) for step in told["steps"][:2]] == [
-        ("calibrate", "done"),
-        (STEPS[0], "active"),
-    ]
+    assert told["steps"][0]["name"] == "calibrate"
     assert (told["state"], told["step"], told["fraction"]) == ("asking", "board_photo", 0.5)
     assert told["left_s"] == pytest.approx(16.0, abs=1.0)
-    assert [step["state"] for step in told["steps"][1:]] == ["active", "open", "open"]
+    assert [step["state"] for step in told["steps"]] == ["done", "active", "open", "open"]
     assert view.faults[0]["device"] == "arm"
     question = Questions().present(view)
-    assert question is not None
     assert [choice["choice"] for choice in question["choices"]] == ["confirm", "abort"]
     end.set()
     run.ended(5)

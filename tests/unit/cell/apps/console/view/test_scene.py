@@ -1,7 +1,5 @@
 """What the page draws of the cell is where the simulator, which the planner knows nothing of, has it."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
