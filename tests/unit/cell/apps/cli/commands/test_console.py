@@ -23,5 +23,5 @@ def test_the_link_is_in_no_process_s_arguments(monkeypatch: pytest.MonkeyPatch) 
 
 def test_without_its_server_s_packages_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"websockets; install: pip install -e '\.\[console\]'"):
+    with pytest.raises(ConfigError, match=r"websockets; in the checkout: pip install -e '\.\[console\]'"):
         require_installed()
