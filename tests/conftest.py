@@ -58,7 +58,8 @@ GROUPS = (
      "unit/cell/measure/inversion/test_mating.py", "unit/drivers/vehicle/test_fixed.py",
      "unit/lab/bench/job/test_cycle.py", "unit/cell/run/record"),
     # Each worker gets two groups at first: a short one for the first, the screens for that of the arm.
-    ("unit/cell/measure/calibration/test_archive.py",),
+    tuple(f"unit/cell/measure/calibration/{name}.py" for name in (
+        "test_archive", "judge/test_coverage", "judge/test_scale", "solve/test_results", "solve/test_adjustment")),
     ("unit/lab/bench/board/test_campaign.py",),
     (*(f"unit/cell/apps/console/{folder}" for folder in ("host", "server", "view")), "integration/console",
      "integration/browser"),
@@ -66,7 +67,7 @@ GROUPS = (
     ("integration/recorded/test_recorded_calibration.py", "unit/cell/apps/cli/calibration/test_calibrate.py"),
     ("unit/cell/measure/inversion/test_registration.py",),
     ("unit/cell/devices/gate/test_interlocks.py",),
-    ("unit/cell/measure/calibration/solve/test_joint.py", "unit/cell/measure/calibration/judge/test_scale.py"),
+    ("unit/cell/measure/calibration/solve/test_joint.py",),
 )  # fmt: skip
 """Groups of files or folders in the order in which they begin, the wires first. Any other file over the wires, wherever
 it is, ends the group of its device, or the first; what only computes is a group of its own, after them."""
