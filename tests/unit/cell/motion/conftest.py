@@ -11,6 +11,7 @@ from cell.motion.collision import CollisionModel
 from cell.motion.kinematics import ArmKinematics, DenavitHartenberg, JointLimits, Joints
 from cell.motion.planning import Planner
 from cell.motion.trajectory import Trajectory
+from drivers.interfaces import LinkTable
 
 WORKING = np.array([2.8, -1.25, 2.0, -2.3, -1.57, 2.8])
 """Posture over the placement area: tool down, elbow up."""
@@ -29,9 +30,9 @@ def down(x: float, y: float, z: float) -> pin.SE3:
     return pin.SE3(DOWN, np.array([x, y, z]))
 
 
-def independent_fk(joints: Joints) -> np.ndarray:
-    """The maker's table multiplied out with plain matrices, without Pinocchio."""
-    table, pose = DenavitHartenberg(), np.eye(4)
+def independent_fk(joints: Joints, table: DenavitHartenberg | LinkTable | None = None) -> np.ndarray:
+    """A table, as drawn that of the UR10e, multiplied out with plain matrices, without Pinocchio."""
+    table, pose = table or DenavitHartenberg(), np.eye(4)
     for q, d, a, alpha in zip(joints, table.d, table.a, table.alpha, strict=True):
         c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
         pose = pose @ [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
