@@ -106,9 +106,6 @@ def inverted(height: Height, cloud: Cloud, prior: Prior, **options: object) -> P
     return invert_pose(cloud, nominal(height), prior, JOB, **options)  # type: ignore[arg-type]
 
 
-# --- the closest point ---
-
-
 def test_distances_to_the_mesh_are_those_to_the_closed_form_surface() -> None:
     surface = nominal(freeform, 0.015, 0.01, step=0.00025)
     rng = np.random.default_rng(0)
@@ -137,9 +134,6 @@ def test_a_mesh_is_read_in_its_unit_and_refused_in_the_wrong_one(tmp_path: Path)
     (tmp_path / "broken.stl").write_bytes(b"solid nonsense")
     with pytest.raises(ConfigError, match=r"broken\.stl"):
         NominalSurface.load(tmp_path / "broken.stl")
-
-
-# --- the pose ---
 
 
 @pytest.mark.parametrize("height", [freeform, seat])
@@ -200,12 +194,11 @@ def test_sweeps_that_do_not_fit_each_other_do_not_tilt_the_surface() -> None:
     """Two strips that overlap by 8 mm, the second one 35 µm too high and 20 µm aside, as the arm's rest leaves them."""
     error, sigma = np.array([2e-5, -1.5e-5, 3.5e-5]), 3e-5
     strips = []
-    for seed, side in ((2, 1.0), (3, -1.0)):
+    for seed, side, off in ((2, 1.0, 0.0), (3, -1.0, error)):
         strip = scanned(freeform, seed, outliers=0.0, sigma=1e-5)
-        across = ((strip.points - TRUE.translation) @ TRUE.rotation)[:, :, 1]
-        strip.points[side * across > 0.004] = np.nan
-        strips.append(replace(strip, flanges=np.tile(np.eye(4), (len(strip.points), 1, 1))))
-    strips[1].points[:] += error
+        across = ((strip.points - TRUE.translation) @ TRUE.rotation)[:, :, 1:2]
+        points = np.where(side * across > 0.004, np.nan, strip.points + off)
+        strips.append(replace(strip, points=points, flanges=np.tile(np.eye(4), (len(points), 1, 1))))
     cloud, prior = merge(strips), Prior(TRUE, BOARD)
 
     def sweeps(lines: Indices, rows: Indices) -> Array:
@@ -222,9 +215,6 @@ def test_sweeps_that_do_not_fit_each_other_do_not_tilt_the_surface() -> None:
     # The mean of two independent errors is what remains.
     assert told_apart.sigma[:3] == pytest.approx([sigma / np.sqrt(2)] * 3, rel=0.05)
     assert told_apart.sigma[3:].max() < 1e-4
-
-
-# --- what cannot be known ---
 
 
 def test_the_spin_of_a_bowl_is_not_determined_and_named() -> None:
@@ -270,9 +260,6 @@ def test_a_freeform_surface_leaves_nothing_to_the_board() -> None:
     assert not pose.verdict.weak
 
 
-# --- refusals ---
-
-
 SHARP = np.diag([0.0002**2] * 3 + [0.001**2] * 3)
 
 
@@ -293,9 +280,6 @@ def test_a_scan_that_does_not_fit_is_refused(
 ) -> None:
     with pytest.raises(RefusedError, match=words):
         inverted(freeform, scanned(height, 1, missing=missing), prior, demands=demands)
-
-
-# --- the campaigns of `cell bench inversion`, small ---
 
 
 @pytest.mark.parametrize("part", list(PARTS))
