@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pinocchio as pin
-import pytest
 
-from cell.measure.geometry import poses
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane, triangulate
 from tests.unit.cell.measure.geometry.test_board_projection import CAMERA, numerical
@@ -97,26 +94,3 @@ def test_plane_fit_finds_the_plane_of_its_points():
     rays = CAMERA.rays(np.random.default_rng(1).uniform(0, 480, (30, 2)))
     fitted = LightPlane.fit(truth.intersect(rays))
     np.testing.assert_allclose([*fitted.normal, fitted.distance], [*truth.normal, truth.distance], atol=1e-9)
-
-
-def test_arm_vectors_and_quaternions_round_trip():
-    vector = np.array([0.1, -0.4, 0.7, 1.2, -0.5, 2.0])
-    np.testing.assert_allclose(poses.to_ur(poses.from_ur(vector)), vector, atol=1e-12)
-    half = np.sqrt(0.5)
-    turn = poses.from_quaternion([1, 2, 3], [0, 0, half, half])
-    np.testing.assert_allclose(poses.transform(turn, [1.0, 0.0, 0.0]), [1, 3, 3], atol=1e-12)
-
-
-def test_a_mirror_is_no_pose():
-    with pytest.raises(ValueError, match="rotation"):
-        poses.from_matrix(np.diag([1.0, 1.0, -1.0, 1.0]))
-
-
-def test_covariances_travel_as_the_finite_differences_of_the_poses_say():
-    a_from_b, b_from_c = pin.SE3.Random(), pin.SE3.Random()
-    first, second = (mix @ mix.T for mix in np.random.default_rng(7).normal(size=(2, 6, 6)))
-    nominal, still = a_from_b * b_from_c, np.zeros(6)
-    by_first = numerical(lambda d: poses.difference(poses.perturbed(a_from_b, d) * b_from_c, nominal), still)
-    by_second = numerical(lambda d: poses.difference(a_from_b * poses.perturbed(b_from_c, d), nominal), still)
-    expected = by_first @ first @ by_first.T + by_second @ second @ by_second.T
-    np.testing.assert_allclose(poses.compose_covariance(a_from_b, first, b_from_c, second), expected, atol=1e-6)
