@@ -38,7 +38,7 @@ def test_arm_vectors_and_quaternions_round_trip():
     ids=["a mirror", "a scale", "no translation", "a wrong last row"],
 )
 def test_what_is_no_rotation_and_translation_is_no_pose(wrong):
-    with pytest.raises(ValueError, match="rotation|last row"):
+    with pytest.raises(ValueError, match=r"rotation|last row"):
         poses.from_matrix(wrong)
 
 
