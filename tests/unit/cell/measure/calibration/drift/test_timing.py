@@ -29,13 +29,12 @@ from cell.measure.calibration.drift.timing import (
     refuse_rolling,
     roughly_late,
 )
-from cell.measure.calibration.solve.results import KEPT, Quality, TargetCalibration
 from cell.measure.geometry.camera import CameraModel
-from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.vision.board.view import BoardView, parse_board
 from cell.procedures.steps.laser_sweep import times_known
 from cell.run.calibration import kept_if_refused
 from drivers.errors import CalibrationStale, RefusedError
+from tests.unit.cell.config.calibrations.test_store import made
 from tests.unit.cell.procedures.sweep.test_sweeping import ERRORS, sweep
 
 CONFIG = load_config(None)
@@ -50,11 +49,7 @@ FOUND = StampTiming(1.4e-3, 0.05e-3, 10e-6, 2e-6, 0.0, 1e-5, 0.0, 1e9, link_of(C
 def calibration() -> ScanCalibration:
     """A head that looks square at the board, a hair off where the board is, as calibrations are."""
     board = pin.SE3(np.eye(3), np.array([-12e-3 + 2e-4, -9e-3, 1e-3 * FAR_MM + 3e-4]))
-    reference = Reference(board, np.eye(27), 1e-4, 1e-4, 1e-5, 1.0, 1.0)
-    plane, along = LightPlane.of((1.0, 0.0, -0.29), -0.035), np.array([1.0, 0.0, 0.0])
-    return ScanCalibration(
-        CAMERA, plane, along, HERE, np.eye(KEPT), Quality(20, 1.0, 0.05, 1e-5, 0.05, 1e-5), reference
-    )
+    return replace(made().scan, camera=CAMERA, reference=Reference(board, np.eye(27), 1e-4, 1e-4, 1e-5, 1.0, 1.0))
 
 
 def sweeps(
@@ -65,7 +60,7 @@ def sweeps(
     up to ±`jitter` s."""
     rng = np.random.default_rng(seed)
     corners = BOARD.points()
-    made = []
+    swept = []
     fast, slow = [(0.04, 10e-3), (0.04, 5e-3)], [(0.01, 10e-3), (0.01, 5e-3)]
     for speed, exposure in [*fast, slow[0], *fast, slow[1], *fast]:
         for velocity in (speed, -speed):
@@ -82,12 +77,12 @@ def sweeps(
                 pixels += rng.normal(0.0, 0.03, pixels.shape)
                 seen = BoardView(BOARD, (640, 480), np.arange(len(corners)), pixels, np.full(len(corners), 0.03))
                 frames.append(TimedFrame(seen, float(read)))
-            made.append(TimedSweep(velocity, exposure, bound, frames))
-    return made
+            swept.append(TimedSweep(velocity, exposure, bound, frames))
+    return swept
 
 
-def timing(made: list[TimedSweep]) -> StampTiming:
-    return find_timing(calibration(), HERE, made, MOST_LATE_S, LEAD_M, {})
+def timing(swept: list[TimedSweep]) -> StampTiming:
+    return find_timing(calibration(), HERE, swept, MOST_LATE_S, LEAD_M, {})
 
 
 def test_it_is_known_to_a_tenth_of_a_millisecond_and_no_better_than_it_says() -> None:
@@ -155,9 +150,7 @@ def test_one_sweep_to_and_fro_tells_roughly_how_late_stamps_come(late: float) ->
 
 def test_what_is_refused_of_the_times_later_ends_the_stored_calibration_too(tmp_path: Path) -> None:
     """Else the job after a refused `cell calibrate` would go on with the calibration before it."""
-    head = replace(calibration(), bow_gain=np.zeros(KEPT))
-    target = TargetCalibration(CAMERA, HERE, np.eye(6), head.quality)
-    old = CellCalibration(head, target, {"scan_camera": "7"}, "as set up", time.time())
+    old = made(0.0)
     save_calibration(old, tmp_path / f"{old.name}.json")
 
     def found() -> CellCalibration:
