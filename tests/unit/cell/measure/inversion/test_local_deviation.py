@@ -45,9 +45,7 @@ def about(
 
 
 def rim(at: list[float], cloud: Cloud, edge: list[float] = ACROSS, faces: NominalSurface = TOP) -> Span:
-    found = about(at, cloud, edge, faces).rim
-    assert found is not None
-    return found.farther
+    return about(at, cloud, edge, faces).rim.farther
 
 
 @pytest.mark.parametrize("seed", [0, 3, 6])
@@ -56,7 +54,6 @@ def test_of_a_part_as_drawn_the_points_about_each_feature_say_no_more_than_its_p
     cloud = scanned(lambda x, y: np.where(np.abs(x) < HALF, THICK, 0.0 * y), seed, shift=shift)
     for at, edge, apart in ((RIGHT, ACROSS, LINES_M), (LEFT, ACROSS, LINES_M), (FRONT, ALONG, ROWS_M)):
         found = about(at, cloud, edge)
-        assert found.higher is not None and found.rim is not None
         assert found.higher.off == 0.0 and found.higher.more == 0.0 and found.higher.most < 0.1e-3
         farther, outward = found.rim
         assert farther.off == 0.0 and farther.most - farther.least < 2.0 * BLUR_M + 1.3 * apart
@@ -152,7 +149,6 @@ def test_a_rim_that_something_higher_may_hide_is_not_told_to_end_too_soon() -> N
 def test_a_vehicle_that_rocks_hides_as_much_of_a_height() -> None:
     cloud = swept(0.0)
     still, rocked = (about(MIDDLE, cloud, rocks=rocks).higher for rocks in (0.0, 0.1e-3))
-    assert still is not None and rocked is not None
     assert rocked.most == pytest.approx(still.most + 0.2e-3) and rocked.least == pytest.approx(still.least - 0.2e-3)
 
 

@@ -54,7 +54,6 @@ def part() -> NominalSurface:
 def test_a_part_of_the_same_drawing_lies_on_the_surface(name: str) -> None:
     nominal, above = drawn(name)
     found = drawn_gap(nominal, HERE, surface_of(above))
-    assert found is not None
     assert np.abs(found.gaps).max() < 1e-6 and found.seen > 0.95
     assert found.problem(TOLERANCE) is None and found.notes == ()
 
@@ -63,7 +62,6 @@ def test_the_gap_is_what_a_ray_measures() -> None:
     """A part that is shifted and turned: rays from the surface along the part's z axis meet it so far off."""
     lies = pin.SE3(pin.rpy.rpyToMatrix(0.004, -0.003, 0.01), np.array([0.4e-3, -0.2e-3, 0.3e-3]))
     found = drawn_gap(POT, lies, part())
-    assert found is not None
     inner = np.linalg.norm(found.places[:, :2] / [0.030, 0.015], axis=1) < 1.0
     places, gaps = found.places[inner], found.gaps[inner]
     below = (places - lies.translation) @ lies.rotation
@@ -83,7 +81,6 @@ def test_the_gap_is_what_a_ray_measures() -> None:
 )
 def test_a_mesh_in_another_datum_is_refused_with_how_much_and_what_to_see_to(height: float, told: str) -> None:
     found = drawn_gap(POT, moved(z=height), part())
-    assert found is not None
     with pytest.raises(RefusedError, match=told) as refused:
         found.require(TOLERANCE)
     (number,) = refused.value.numbers
@@ -94,7 +91,6 @@ def test_a_mesh_in_another_datum_is_refused_with_how_much_and_what_to_see_to(hei
 def test_a_wrong_revision_is_refused_where_it_differs() -> None:
     other = surface_of(body(POT.vertices, POT.triangles, stepped))
     found = drawn_gap(POT, HERE, other)
-    assert found is not None
     assert found.overlap == pytest.approx(0.5e-3, abs=2e-6)
     assert found.places[np.argmin(found.gaps), 0] > 0.009
     assert "goes 0.50 mm into the surface at (1" in str(found.problem(TOLERANCE))
@@ -127,7 +123,6 @@ def test_the_scanned_surface_tells_the_same(placed_pot: JobRecord) -> None:
     assert fits.seen > 0.75 and fits.problem(TOLERANCE) is None
     for height in (-0.5e-3, 0.5e-3):
         found = scanned_gap(cloud, pose, POT, moved(z=height), part())
-        assert found is not None
         assert np.median(found.gaps) == pytest.approx(height, abs=0.03e-3)
         assert found.problem(TOLERANCE) is not None
     half = replace(cloud, points=np.where(np.arange(cloud.shape[0])[:, None, None] < 30, cloud.points, np.nan))

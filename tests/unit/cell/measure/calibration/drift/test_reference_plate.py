@@ -130,7 +130,6 @@ def test_a_line_that_says_nothing_of_the_laser_is_refused_with_the_next_step(now
 def test_it_is_kept_with_the_calibration() -> None:
     witness = seen(0.0, 9)
     again = PlateLine.read(witness.as_dict())
-    assert again is not None
     assert np.array_equal(again.columns, witness.columns, equal_nan=True)
     assert PlateLine.read(None) is None
     assert "mrad" in Pointing(0.4e-3, 0.02e-3).words

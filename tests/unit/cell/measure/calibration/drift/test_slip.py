@@ -57,7 +57,6 @@ def calibrated() -> Calibrated:
 
 def look(cell: ObservedCell, calibration: CellCalibration, rests: int) -> HeadShift:
     scan = calibration.scan
-    assert scan.reference is not None
     view = interim_view(CONFIG, cell.fine, scan)
     seen = []
     for k in range(rests):

@@ -25,7 +25,6 @@ def adjusted(archived: Observations, larger: float) -> Joint:
 @pytest.mark.parametrize("larger", [0.0, 5.5e-3])
 def test_its_size_is_found_and_what_is_noted_is_stated(archived: Observations, larger: float) -> None:
     joint = adjusted(archived, larger)
-    assert joint.size is not None
     assert joint.size.share == pytest.approx(larger, abs=1.5e-3)
     notes = joint.size.notes
     if not larger:

@@ -40,7 +40,6 @@ def solved(off: float, seed: int) -> tuple[HeadWorld, Joint]:
 def test_a_bow_is_known_to_three_micrometres_and_as_stated(off: float, seed: int) -> None:
     _, joint = solved(off, seed)
     bow, plane = joint.adjusted.bow, joint.adjusted.state.plane
-    assert bow is not None and plane is not None
     found, sigma = (abs(value) * BESIDE**2 / DEPTH for value in (bow.value, bow.sigma))
     # Along the axis instead of along the fan: the distance is shorter by the cosine.
     found *= np.hypot(plane.normal[0], plane.normal[1]) ** -1

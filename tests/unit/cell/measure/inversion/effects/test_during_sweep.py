@@ -83,7 +83,6 @@ PRIOR = np.diag([1e-3**2] * 3 + [5e-3**2] * 3)
 def placed(cloud: Cloud, hz: float | None) -> pin.SE3:
 
     def shaken(lines: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        assert hz is not None
         return rocking_motions(cloud, lines, rows, VEHICLE, TIMES, hz)
 
     sweeps = None if hz is None else shaken
@@ -100,7 +99,6 @@ def placed(cloud: Cloud, hz: float | None) -> pin.SE3:
 def test_rocking_is_seen_with_its_frequency_and_the_pose_is_freed_of_it(roll: float, pitch: float, hz: float) -> None:
     cloud = scanned(roll, pitch, hz)
     found = find_rocking(cloud, NOMINAL, placed(cloud, None), TIMES)
-    assert found is not None
     assert found.hz == pytest.approx(hz, abs=0.1)
     beside = SURFACE.translation - VEHICLE.translation
     assert found.height == pytest.approx(abs(roll * beside[1] - pitch * beside[0]), rel=0.25)

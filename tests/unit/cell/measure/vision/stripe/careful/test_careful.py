@@ -93,6 +93,5 @@ def test_where_little_of_a_picture_shows_a_line_nothing_is_added_to_it():
 def test_a_line_is_looked_for_that_is_narrower_than_any_as_a_bright_column_of_the_sensor_teaches():
     image, _ = line_of(np.linspace(1.5, 8, 480))
     taught = extract(image).learned
-    assert taught is not None
     picture, narrow = as_picture(image, 250.0), replace(taught, scale=0.3)
     assert read_carefully(picture, None, LaserChannel.AUTO, StripeSettings(), like=narrow).valid.any()
