@@ -5,9 +5,7 @@ Boxes that a configuration or a job names are kept away from: by planned ways, b
 from __future__ import annotations
 
 import tomllib
-from functools import reduce
 from itertools import product
-from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -157,26 +155,16 @@ def edited(**changes: Any) -> dict[str, Any]:
     """The shipped configuration with "table__key" set to another value."""
     data = tomllib.loads(default_toml())
     for path, value in changes.items():
-        *tables, key = path.split("__")
-        reduce(getitem, tables, data)[key] = value
+        table, key = path.split("__")
+        data[table][key] = value
     return data
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"rail__laed": "2 mm"}, ["rail.laed", "unknown key"]),
-        ({"rail__lead": "50.1 mm"}, ["rail.lead", "0.1 to 50 mm"]),
-        ({"rail__lead": "0.09 mm"}, ["rail.lead", "0.1 to 50 mm"]),
-        ({"calibration__fine__board": "marked_dots:11"}, ["calibration.fine.board"]),
-        ({"vehicle__driver": "tank"}, ["vehicle.driver", '"tank"', '"agilex"']),
-    ],
-)
-def test_a_wrong_configuration_is_refused_by_key_and_value(changes: dict[str, Any], words: list[str]) -> None:
-    with pytest.raises(ConfigError) as caught:
-        validate(CellConfig, edited(**changes), "cell.toml")
-    for word in words:
-        assert word in str(caught.value)
+@pytest.mark.parametrize("lead", ["50.1 mm", "0.09 mm"])
+def test_a_wrong_configuration_is_refused_by_key_and_value(lead: str) -> None:
+    """Wrong values of all other keys: `integration/virtual/test_wrong_inputs.py`."""
+    with pytest.raises(ConfigError, match=r"rail\.lead: .*0\.1 to 50 mm"):
+        validate(CellConfig, edited(rail__lead=lead), "cell.toml")
 
 
 def test_addresses_do_not_make_a_calibration_foreign_but_optics_do() -> None:

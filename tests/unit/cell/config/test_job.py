@@ -11,13 +11,6 @@ from cell.config.job import item_names, job_path, load_job
 from drivers.errors import ConfigError
 
 
-def test_a_missing_mesh_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "mine.toml"
-    path.write_text(job_path("pot").read_text().replace("pot.ply", "gone.ply"))
-    with pytest.raises(ConfigError, match=r"gone\.ply"):
-        load_job(path)
-
-
 @pytest.mark.usefixtures("here")
 def test_the_job_of_the_present_folder_wins_over_the_one_that_ships() -> None:
     shipped = job_path("pot")
