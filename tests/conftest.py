@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import typer.main
 from xdist.scheduler import LoadFileScheduling
 
 from cell.apps.cli import main
@@ -90,6 +91,9 @@ MISSED = 75
 """The exit code of such a run where only tests with deadlines on the wall failed: EX_TEMPFAIL, try again."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Linear algebra of more workers than cores waits for itself where each has as many threads as there are cores."""
+
+
+PUT_TOGETHER = cache(typer.main.get_command)
 
 
 @cache
@@ -218,6 +222,9 @@ def calibrated_folder(placed_pot: JobRecord, here: Path) -> Path:
 @pytest.fixture
 def typed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Typed:
     """Gives what a `cell` command comes to, run in this process and folder: exit code, output, complaints."""
+
+    # A process runs one command; typer puts all of them together anew for each.
+    monkeypatch.setattr("typer.main.get_command", PUT_TOGETHER)
 
     def run(*words: str) -> tuple[int, str, str]:
         monkeypatch.setattr("sys.argv", ["cell", *words])
