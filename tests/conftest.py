@@ -59,8 +59,7 @@ GROUPS = (
      "unit/cell/measure/inversion/test_mating.py", "unit/drivers/vehicle/test_fixed.py",
      "unit/lab/bench/job/test_cycle.py", "unit/cell/run/record"),
     # Each worker gets two groups at first: a short one for the first, the screens for that of the arm.
-    tuple(f"unit/cell/measure/calibration/{name}.py" for name in (
-        "test_archive", "judge/test_coverage", "judge/test_scale", "solve/test_results", "solve/test_adjustment")),
+    ("unit/cell/measure/calibration/solve/test_joint.py",),
     ("unit/lab/bench/board/test_campaign.py",),
     (*(f"unit/cell/apps/console/{folder}" for folder in ("host", "server", "view")), "integration/console",
      "integration/browser"),
@@ -68,7 +67,9 @@ GROUPS = (
     ("integration/recorded/test_recorded_calibration.py", "unit/cell/apps/cli/calibration/test_calibrate.py"),
     ("unit/cell/measure/inversion/test_registration.py",),
     ("unit/cell/devices/gate/test_interlocks.py",),
-    ("unit/cell/measure/calibration/solve/test_joint.py",),
+    # They share what is solved of one head.
+    tuple(f"unit/cell/measure/calibration/{name}.py" for name in (
+        "test_archive", "judge/test_coverage", "judge/test_scale", "solve/test_results", "solve/test_adjustment")),
 )  # fmt: skip
 """Groups of files or folders in the order in which they begin, the wires first. Any other file over the wires, wherever
 it is, ends the group of its device, or the first; what only computes is a group of its own, after them."""
