@@ -37,21 +37,7 @@ LOOSE = np.diag([0.008**2] * 3 + [np.radians(20) ** 2] * 3)
 BOARD = np.diag([0.002**2] * 3 + [np.radians(0.6) ** 2] * 3)
 
 
-def freeform(x: Array, y: Array) -> Array:
-    """A pot-like relief without any symmetry, closed form, m."""
-    return 0.006 + 0.0015 * np.sin(150 * x + 70 * y + 0.4) + 0.0011 * np.sin(230 * y - 90 * x + 1.3) + 4 * x * y
-
-
-def seat(x: Array, y: Array) -> Array:
-    """A curved seat with two oblique steps, closed form, m."""
-    steps = 0.0012 * np.tanh((0.97 * x - 0.24 * y - 0.01) / 0.0008) - 0.001 * np.tanh((y - 0.15 * x - 0.006) / 0.0008)
-    return 0.005 + 3 * x**2 + 6 * y**2 + 0.05 * x + steps
-
-
-def bowl(x: Array, y: Array) -> Array:
-    """A surface of revolution about z, m."""
-    r2 = x**2 + y**2
-    return 0.003 + 6 * r2 + 0.001 * np.cos(np.sqrt(r2) * 300)
+freeform, seat, bowl = (PARTS[name].height for name in ("pot", "seat", "turned"))
 
 
 def flat(x: Array, y: Array) -> Array:
