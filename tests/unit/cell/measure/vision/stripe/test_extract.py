@@ -1,4 +1,4 @@
-"""Promises of the stripe extraction, on pictures drawn from a formula; how near to its bound: `ordinary/test_fit.py`."""
+"""Promises of the stripe extraction, on pictures drawn from a formula; how near to its bound: `test_fit.py`."""
 
 from __future__ import annotations
 
