@@ -12,6 +12,7 @@ from functools import cache
 from pathlib import Path
 
 import pytest
+import typer.main
 from xdist.scheduler import LoadFileScheduling
 
 from cell.apps.cli import main
@@ -55,7 +56,7 @@ GROUPS = (
      "unit/cell/measure/inversion/test_mating.py", "unit/drivers/vehicle/test_fixed.py",
      "unit/lab/bench/job/test_cycle.py", "unit/cell/run/record"),
     # Each worker gets two groups at first: a short one for the first, the screens for that of the arm.
-    ("unit/cell/measure/calibration/test_archive.py",),
+    ("unit/cell/measure/calibration/solve/test_joint.py",),
     ("unit/lab/bench/board/test_campaign.py",),
     (*(f"unit/cell/apps/console/{folder}" for folder in ("host", "server", "view")), "integration/console",
      "integration/browser"),
@@ -63,7 +64,9 @@ GROUPS = (
     ("integration/recorded/test_recorded_calibration.py", "unit/cell/apps/cli/calibration/test_calibrate.py"),
     ("unit/cell/measure/inversion/test_registration.py",),
     ("unit/cell/devices/gate/test_interlocks.py",),
-    ("unit/cell/measure/calibration/solve/test_joint.py", "unit/cell/measure/calibration/judge/test_scale.py"),
+    # They share what is solved of one head.
+    tuple(f"unit/cell/measure/calibration/{name}.py" for name in (
+        "test_archive", "judge/test_coverage", "judge/test_scale", "solve/test_results", "solve/test_adjustment")),
 )  # fmt: skip
 """Groups of files or folders in the order in which they begin, the wires first. Any other file over the wires, wherever
 it is, ends the group of its device, or the first; what only computes is a group of its own, after them."""
@@ -86,6 +89,9 @@ MISSED = 75
 """The exit code of such a run where only tests with deadlines on the wall failed: EX_TEMPFAIL, try again."""
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Linear algebra of more workers than cores waits for itself where each has as many threads as there are cores."""
+
+
+PUT_TOGETHER = cache(typer.main.get_command)
 
 
 @cache
@@ -214,6 +220,9 @@ def calibrated_folder(placed_pot: JobRecord, here: Path) -> Path:
 @pytest.fixture
 def typed(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Typed:
     """Gives what a `cell` command comes to, run in this process and folder: exit code, output, complaints."""
+
+    # A process runs one command; typer puts all of them together anew for each.
+    monkeypatch.setattr("typer.main.get_command", PUT_TOGETHER)
 
     def run(*words: str) -> tuple[int, str, str]:
         monkeypatch.setattr("sys.argv", ["cell", *words])

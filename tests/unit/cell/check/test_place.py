@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Any
 
@@ -12,26 +14,22 @@ import pytest
 from cell.base.toml_file import read_toml, validate
 from cell.check.fit import require_fit
 from cell.check.place import contact_notes, contact_problems, mating_problems, mesh_box, surface_problems, under_part
-from cell.config.cell_config import CellConfig, load_config
+from cell.config.cell_config import load_config
 from cell.config.job import Job, load_job, shipped_jobs
 from drivers.errors import ConfigError
 from lab.bench.job.part_jobs import job_with_part
 
-POT = load_job("pot")[1].with_suffix(".toml")
+MESH = load_job("pot")[1]
+POT = MESH.with_suffix(".toml")
 
 
-@pytest.fixture(scope="module")
-def config() -> CellConfig:
-    return load_config(None)
+CONFIG = load_config(None)
 
 
 def changed(key: str, value: Any) -> Job:
     raw = read_toml(POT, "job", "")
-    section = raw
     *parents, last = key.split(".")
-    for parent in parents:
-        section = section[parent]
-    section[last] = value
+    reduce(getitem, parents, raw)[last] = value
     return validate(Job, raw, "job")
 
 
@@ -49,22 +47,20 @@ def test_the_drawing_of_the_part_is_held_against_that_of_the_surface(tmp_path: P
     (told,) = mating_problems(aside, mesh)
     assert "nothing of the surface, or the triangles of part.mesh face inwards" in told
     with pytest.raises(ConfigError, match=r"does not fit this cell:\n.*part\.mesh"):
-        require_fit(wrong, load_config(None), mesh)
+        require_fit(wrong, CONFIG, mesh)
 
 
 def test_without_a_mesh_of_the_part_it_is_told_what_is_not_looked_at() -> None:
     job, mesh = load_job("pot")
     assert list(mating_problems(job, mesh)) == []
-    assert (
-        "whether its underside fits the surface, and how it lies once it was placed, is not looked at"
-        in list(contact_notes(job, mesh))[-1]
-    )
+    told = "whether its underside fits the surface, and how it lies once it was placed, is not looked at"
+    assert told in list(contact_notes(job, mesh))[-1]
 
 
 @pytest.mark.parametrize("name", shipped_jobs())
-def test_the_jobs_that_ship_make_sense(name: str, config: CellConfig) -> None:
+def test_the_jobs_that_ship_make_sense(name: str) -> None:
     job, mesh = load_job(name)
-    assert list(contact_problems(job, config, mesh)) == []
+    assert list(contact_problems(job, CONFIG, mesh)) == []
 
 
 @pytest.mark.parametrize(
@@ -85,26 +81,24 @@ def test_the_jobs_that_ship_make_sense(name: str, config: CellConfig) -> None:
         ("place.surface_from_part.translation", ["300 mm", "0 mm", "0 mm"], "0 % of the part's footprint"),
     ],
 )
-def test_a_senseless_put_down_is_refused_with_its_number(key: str, value: Any, told: str, config: CellConfig) -> None:
-    problems = list(contact_problems(changed(key, value), config, POT.with_suffix(".ply")))
+def test_a_senseless_put_down_is_refused_with_its_number(key: str, value: Any, told: str) -> None:
+    problems = list(contact_problems(changed(key, value), CONFIG, MESH))
     assert any(re.search(told, problem) for problem in problems), problems
 
 
-def test_a_part_whose_lowest_plane_ends_over_the_surface_comes_down_onto_it(config: CellConfig) -> None:
+def test_a_part_whose_lowest_plane_ends_over_the_surface_comes_down_onto_it() -> None:
     """The surface lies 0.1 mm below that plane, within `place.contact_travel`."""
     higher = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "8.49 mm"])
-    assert under_part(higher, POT.with_suffix(".ply"))[1] == pytest.approx(-0.1e-3, abs=0.02e-3)
-    assert list(contact_problems(higher, config, POT.with_suffix(".ply"))) == []
+    assert under_part(higher, MESH)[1] == pytest.approx(-0.1e-3, abs=0.02e-3)
+    assert list(contact_problems(higher, CONFIG, MESH)) == []
 
 
 def test_how_deep_the_surface_reaches_into_the_part_is_noted() -> None:
-    mesh: Path = POT.with_suffix(".ply")
     deeper = changed("place.surface_from_part.translation", ["0 mm", "0 mm", "-5 mm"])
-    assert "13.4 mm into the part's box of 20 mm" in next(contact_notes(deeper, mesh))
+    assert "13.4 mm into the part's box of 20 mm" in next(contact_notes(deeper, MESH))
 
 
 @pytest.mark.parametrize(("turn", "wrong"), [("0 deg", False), ("180 deg", True)])
 def test_a_surface_that_faces_away_from_the_part_is_refused(turn: str, wrong: bool) -> None:
-    mesh: Path = POT.with_suffix(".ply")
     job = changed("place.surface_from_part.rotation", [turn, "0 deg", "0 deg"])
-    assert any("face away" in text for text in surface_problems(job, mesh_box(mesh, "m"), mesh)) == wrong
+    assert any("face away" in text for text in surface_problems(job, mesh_box(MESH, "m"), MESH)) == wrong

@@ -11,7 +11,7 @@ import trimesh
 
 from cell.check.fit import require_fit
 from cell.check.reach import _sweeps, _unreached, nominal_scan, seen_faces, verify_problems
-from cell.config.cell_config import CellConfig, load_config
+from cell.config.cell_config import load_config
 from cell.config.job import load_job
 from cell.measure.inversion.nominal import read_mesh
 from cell.motion.kinematics import Unreachable
@@ -21,26 +21,21 @@ from drivers.errors import ConfigError
 from lab.bench.job.part_jobs import body, job_with_part
 from tests.unit.cell.check.test_place import changed
 
-
-@pytest.fixture(scope="module")
-def config() -> CellConfig:
-    return load_config(None)
+CONFIG = load_config(None)
 
 
-def test_sweeps_are_planned_with_the_scan_head_as_drawn(config: CellConfig) -> None:
-    head = nominal_scan(config)
+def test_sweeps_are_planned_with_the_scan_head_as_drawn() -> None:
+    head = nominal_scan(CONFIG)
     np.testing.assert_array_equal(head.rail_direction, [1.0, 0.0, 0.0])
     assert not head.covariance.any()
 
 
 @pytest.mark.parametrize(("mode", "run_up"), [("rail", 0.0), ("arm", RUN_UP_S * 0.015)])
-def test_a_sweep_by_the_arm_reaches_from_its_run_up_to_its_run_out(
-    mode: str, run_up: float, config: CellConfig
-) -> None:
+def test_a_sweep_by_the_arm_reaches_from_its_run_up_to_its_run_out(mode: str, run_up: float) -> None:
     job = changed("scan.mode", mode)
     surface = pin.SE3(np.eye(3), np.array([0.7, 0.3, 0.1]))
-    (plan,) = scan_plans(config, job, surface, nominal_scan(config))
-    (_, begin, _), (_, end, _) = _sweeps(job, config, surface)
+    (plan,) = scan_plans(CONFIG, job, surface, nominal_scan(CONFIG))
+    (_, begin, _), (_, end, _) = _sweeps(job, CONFIG, surface)
     ahead = [surface.actInv(pose).translation[0] for pose in (begin, plan.base_from_flange, plan.base_from_flange_end)]
     ahead.append(surface.actInv(end).translation[0])
     assert np.diff(ahead) == pytest.approx([run_up, job.scan.length * (mode == "arm"), run_up], abs=1e-9)
@@ -58,34 +53,22 @@ def test_of_many_poses_out_of_reach_three_are_told() -> None:
     assert told == [f"{what}: out of reach" for what in "abc"]
 
 
-CONFIG = load_config(None)
-
-
-@pytest.mark.parametrize(
-    ("verify", "flat", "told"),
-    [
-        ("all", False, None),
-        ("all", True, r'pot-part\.ply": the faces of the placed part do not show .*x axis.*place\.verify = "seen"'),
-        ("seen", True, None),
-        ("none", True, None),
-    ],
-)
-def test_motions_that_would_not_be_seen_are_told_unless_the_job_says_so(
-    tmp_path: Path, verify: str, flat: bool, told: str | None
-) -> None:
-    job, mesh = load_job(job_with_part(tmp_path, "pot", verify=verify, flat=flat))
-    if told is None:
-        require_fit(job, CONFIG, mesh)
-        return
+def test_motions_that_would_not_be_seen_are_told_unless_the_job_says_so(tmp_path: Path) -> None:
+    job, mesh = load_job(job_with_part(tmp_path, "pot", verify="all"))
+    require_fit(job, CONFIG, mesh)
+    flat, mesh = load_job(job_with_part(tmp_path, "pot", verify="all", flat=True))
+    told = r'pot-part\.ply": the faces of the placed part do not show .*x axis.*place\.verify = "seen"'
     with pytest.raises(ConfigError, match=told):
-        require_fit(job, CONFIG, mesh)
+        require_fit(flat, CONFIG, mesh)
+    for verify in ("seen", "none"):
+        agreed = flat.model_copy(update={"place": flat.place.model_copy(update={"verify": verify})})
+        assert list(verify_problems(agreed, CONFIG)) == []
 
 
 def test_a_part_too_high_for_the_picture_and_one_that_faces_down_are_told(tmp_path: Path) -> None:
     job, _ = load_job(job_with_part(tmp_path, "pot", verify="all"))
     low = job.model_copy(update={"scan": job.scan.model_copy(update={"stand_off": 0.06})})
     assert any("leaves the scan camera's picture" in told for told in verify_problems(low, CONFIG))
-    assert job.part is not None
     sheet = tmp_path / "sheet.ply"
     trimesh.Trimesh(np.array([[0.0, 0, 0], [0.02, 0, 0], [0, 0.02, 0]]), [[0, 2, 1]]).export(sheet)
     down = job.model_copy(update={"part": job.part.model_copy(update={"mesh": str(sheet)})})

@@ -11,6 +11,7 @@ from cell.motion.collision import CollisionModel
 from cell.motion.kinematics import ArmKinematics, DenavitHartenberg, JointLimits, Joints
 from cell.motion.planning import Planner
 from cell.motion.trajectory import Trajectory
+from drivers.interfaces import LinkTable
 
 WORKING = np.array([2.8, -1.25, 2.0, -2.3, -1.57, 2.8])
 """Posture over the placement area: tool down, elbow up."""
@@ -29,13 +30,21 @@ def down(x: float, y: float, z: float) -> pin.SE3:
     return pin.SE3(DOWN, np.array([x, y, z]))
 
 
-def independent_fk(joints: Joints) -> np.ndarray:
-    """The maker's table multiplied out with plain matrices, without Pinocchio."""
-    table, pose = DenavitHartenberg(), np.eye(4)
+def link_frames(joints: Joints, table: DenavitHartenberg | LinkTable | None = None) -> list[np.ndarray]:
+    """Base, the six frames that turn with a joint, and the flange, (4, 4).
+
+    By a table, as drawn that of the UR10e, multiplied out with plain matrices, without Pinocchio.
+    """
+    table, frames, pose = table or DenavitHartenberg(), [np.eye(4)], np.eye(4)
     for q, d, a, alpha in zip(joints, table.d, table.a, table.alpha, strict=True):
         c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
+        frames.append(pose @ [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
         pose = pose @ [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
-    return pose
+    return [*frames, pose]
+
+
+def independent_fk(joints: Joints, table: DenavitHartenberg | LinkTable | None = None) -> np.ndarray:
+    return link_frames(joints, table)[-1]
 
 
 def assert_within(trajectory: Trajectory, limits: JointLimits) -> None:

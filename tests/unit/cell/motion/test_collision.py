@@ -42,7 +42,6 @@ def test_a_fin_thinner_than_a_step_is_found_where_it_stands(arm: ArmKinematics) 
     start = end.copy()
     start[0] -= 0.5
     touch = first_touch(model, np.stack([start, end]))
-    assert touch is not None
     assert touch.pairs == [("fin", "pole")]
     y = float(arm.fk(touch.joints).translation[1])
     assert abs(y) - 0.0105 == pytest.approx(0.005, abs=4e-4)

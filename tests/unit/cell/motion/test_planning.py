@@ -10,10 +10,10 @@ import pytest
 
 from cell.motion import collision
 from cell.motion.collision import CollisionError, CollisionModel, first_touch
-from cell.motion.kinematics import ArmKinematics, DenavitHartenberg, Joints
+from cell.motion.kinematics import ArmKinematics, Joints
 from cell.motion.planning import EFFORTS, Planner
 from cell.motion.trajectory import LineLimits, plan_joint
-from tests.unit.cell.motion.conftest import DOWN, FLANGE_FROM_PART, RESTING, WORKING, assert_within, down
+from tests.unit.cell.motion.conftest import DOWN, FLANGE_FROM_PART, RESTING, WORKING, assert_within, down, link_frames
 from tests.unit.cell.motion.test_trajectory import fastest_point
 
 FLANGE_FROM_TARGET = pin.SE3(pin.utils.rotate("z", np.pi / 2), np.array([-0.10, 0.0, 0.03]))
@@ -105,16 +105,6 @@ def spheres(body: collision.Body, flange_frames: list[np.ndarray], step: float =
         local = grid[(np.abs(grid) >= np.array([x, y, z]) / 2 - 1e-9).any(axis=1)]
     pose = flange_frames[body.parent] @ body.placement.homogeneous
     return local @ pose[:3, :3].T + pose[:3, 3], body.radius or 0.0
-
-
-def link_frames(joints: Joints) -> list[np.ndarray]:
-    """Base, the six frames that turn with a joint, and the flange, (4, 4), by plain matrices."""
-    table, frames, pose = DenavitHartenberg(), [np.eye(4)], np.eye(4)
-    for q, d, a, alpha in zip(joints, table.d, table.a, table.alpha, strict=True):
-        c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
-        frames.append(pose @ [[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-        pose = pose @ [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d], [0, 0, 0, 1]]
-    return [*frames, pose]
 
 
 def nearest_station_body(solids: list[collision.Body], joints: Joints) -> float:

@@ -34,17 +34,15 @@ CONFIGURATION = "0123456789abcdef"
 DAY = 86400.0
 
 
-def made(
-    age: float = 1 * DAY, devices: dict[str, str] = DEVICES, configuration: str = CONFIGURATION
-) -> CellCalibration:
+CELL = load_config(None)
+
+
+def made(age: float = DAY, devices: dict[str, str] = DEVICES, configuration: str = CONFIGURATION) -> CellCalibration:
     """A calibration that was made `age` s ago."""
-    quality = Quality(20, 1.0, 0.03, 1e-5, 0.03, 1e-5)
-    config = load_config(None)
-    plane = LightPlane.of((1.0, 0.0, -1 / 3.5), -0.035)
-    scan = ScanCalibration(
-        nominal_camera(config.scan_camera), plane, np.array([1.0, 0.0, 0.0]), pin.SE3.Identity(), np.eye(KEPT), quality
-    )
-    target = TargetCalibration(nominal_camera(config.target_camera), pin.SE3.Identity(), np.eye(6), quality)
+    quality, mount = Quality(20, 1.0, 0.03, 1e-5, 0.03, 1e-5), pin.SE3.Identity()
+    plane, along = LightPlane.of((1.0, 0.0, -1 / 3.5), -0.035), np.array([1.0, 0.0, 0.0])
+    scan = ScanCalibration(nominal_camera(CELL.scan_camera), plane, along, mount, np.eye(KEPT), quality)
+    target = TargetCalibration(nominal_camera(CELL.target_camera), mount, np.eye(6), quality)
     return CellCalibration(scan, target, dict(devices), configuration, time.time() - age)
 
 
@@ -59,9 +57,6 @@ def test_a_kept_pose_that_is_mirrored_sheared_or_scaled_is_none() -> None:
     for wrong in (np.diag([1.0, 1.0, -1.0, 1.0]), np.diag([1.001, 1.0, 1.0, 1.0]), np.eye(4) + np.eye(4, k=1) * 1e-3):
         with pytest.raises(ValueError, match="view 1 is no rotation and translation"):
             _pose(wrong, "view 1")
-
-
-# --- edits and figures that cannot be ---
 
 
 def edited(path: Path, *keys: object, value: object) -> None:
@@ -90,9 +85,8 @@ def test_an_edit_is_refused_by_name_until_a_person_accepts_it(
     path = tmp_path / "own.json"
     save_calibration(made(), path)
     edited(path, *keys, value=value)
-    with pytest.raises(
-        CalibrationEdited, match=rf"changed after it was written: {part}\. .*`cell calibrate accept own"
-    ):
+    told = rf"changed after it was written: {part}\. .*`cell calibrate accept own"
+    with pytest.raises(CalibrationEdited, match=told):
         find_calibration(tmp_path, DEVICES, CONFIGURATION, 1e9)
     accepted = accept_calibration(path, "ann", "measured by hand")
     assert [(e["who"], e["why"], e["changed"]) for e in accepted.edits] == [("ann", "measured by hand", [part])]
@@ -164,18 +158,14 @@ def test_a_figure_that_is_no_number_is_an_error_in_our_words(tmp_path: Path, tex
         (_scan(flange_from_camera=pin.SE3.Identity()), r"scan\.flange_from_camera against its drawing"),
         (_scan(rail_direction=np.array([-1.0, 0.0, 0.0])), "rail_direction against"),
         (_scan(light_plane=LightPlane.of((1.0, 0.0, -1 / 3.5), -0.135)), "exit off it"),
-        (_scan(camera=replace(nominal_camera(load_config(None).scan_camera), fx=800.0)), "fx and fy over the drawn"),
+        (_scan(camera=replace(nominal_camera(CELL.scan_camera), fx=800.0)), "fx and fy over the drawn"),
     ],
 )
 def test_one_that_does_not_fit_the_drawing_is_not_used(spoilt: CellCalibration, says: str) -> None:
-    config = load_config(None)
-    drawn = {"flange_from_camera": config.scan_camera.flange_from_camera.se3()}
-    spoilt = replace(
-        spoilt, target=replace(spoilt.target, flange_from_camera=config.target_camera.flange_from_camera.se3())
-    )
-    fits = replace(spoilt, scan=replace(made().scan, **drawn))
-    require_as_configured(fits, config)
+    scan, target = (camera.flange_from_camera.se3() for camera in (CELL.scan_camera, CELL.target_camera))
+    spoilt = replace(spoilt, target=replace(spoilt.target, flange_from_camera=target))
+    require_as_configured(replace(spoilt, scan=replace(made().scan, flange_from_camera=scan)), CELL)
     if "flange_from_camera" not in says:
-        spoilt = replace(spoilt, scan=replace(spoilt.scan, **drawn))
+        spoilt = replace(spoilt, scan=replace(spoilt.scan, flange_from_camera=scan))
     with pytest.raises(CalibrationStale, match=says):
-        require_as_configured(spoilt, config)
+        require_as_configured(spoilt, CELL)

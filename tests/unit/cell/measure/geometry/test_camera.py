@@ -22,7 +22,5 @@ def test_a_pixel_beyond_the_fold_of_a_lens_has_no_ray_and_all_within_it_have(len
     points = np.column_stack([inside, np.ones(len(inside))])
     pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), camera.matrix, np.array(lens))[0].reshape(-1, 2)
     np.testing.assert_allclose(camera.normalised(pixels), inside, atol=1e-9)
-    outside = camera.matrix[:2, 2] + 400.0 * (circles * np.linspace(1.02, 3.0, 60) * seen[fold]).transpose(
-        0, 2, 1
-    ).reshape(-1, 2)
-    assert np.isnan(camera.normalised(outside)).all()
+    outside = (circles * np.linspace(1.02, 3.0, 60) * seen[fold]).transpose(0, 2, 1).reshape(-1, 2)
+    assert np.isnan(camera.normalised(camera.matrix[:2, 2] + 400.0 * outside)).all()

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pinocchio as pin
-import pytest
 
-from cell.measure.geometry import poses
 from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane, triangulate
 from tests.unit.cell.measure.geometry.test_board_projection import CAMERA, numerical
@@ -20,17 +17,13 @@ def points_in_front(n: int = 50) -> np.ndarray:
     return np.column_stack([rng.uniform(-0.02, 0.02, n), rng.uniform(-0.015, 0.015, n), rng.uniform(0.11, 0.15, n)])
 
 
-def test_projection_is_opencvs():
+def test_projection_is_opencvs_and_rays_undo_it():
     points = points_in_front()
-    ours = CAMERA.project(points)
+    seen = CAMERA.project(points)
     theirs, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), CAMERA.matrix, np.array(CAMERA.dist))
-    np.testing.assert_allclose(ours, theirs[:, 0], atol=1e-9)
-
-
-def test_rays_undo_the_projection():
-    points = points_in_front()
-    rays = CAMERA.rays(CAMERA.project(points))
-    np.testing.assert_allclose(rays, points / np.linalg.norm(points, axis=1, keepdims=True), atol=1e-12)
+    np.testing.assert_allclose(seen, theirs[:, 0], atol=1e-9)
+    rays = points / np.linalg.norm(points, axis=1, keepdims=True)
+    np.testing.assert_allclose(CAMERA.rays(seen), rays, atol=1e-12)
 
 
 def test_a_point_behind_the_camera_has_no_pixel():
@@ -71,19 +64,15 @@ def test_pixel_to_point_jacobian_is_that_of_finite_differences():
     np.testing.assert_allclose(jacobian[0], expected, rtol=1e-6, atol=1e-10)
 
 
-def closed_form(x, y, baseline, focal, theta):
-    """The paper's equation (1), corrected: points (n, 3) in m from image coordinates x', y' in m on the sensor."""
-    d = focal / np.tan(theta) - x
-    return np.column_stack([baseline * x / d, baseline * y / d, baseline * focal / d])
-
-
 def test_the_papers_closed_form_is_a_case_of_the_general_one():
+    """Its equation (1), corrected, of image coordinates x', y' in m on the sensor."""
     f, baseline, pixel = 8e-3, 0.035, 4.8e-6
     camera = CameraModel(640, 480, f / pixel, f / pixel, 319.5, 239.5)
     pixels = np.column_stack([np.linspace(0, 639, 40), np.linspace(10, 470, 40)])
-    sensor = (pixels - (319.5, 239.5)) * pixel
+    x, y = pixel * (pixels - (319.5, 239.5)).T
+    closed_form = baseline * np.stack([x, y, np.full(40, f)], axis=1) / (f / np.tan(THETA) - x)[:, None]
     general = LightPlane.from_baseline(baseline, THETA).intersect(camera.rays(pixels))
-    np.testing.assert_allclose(closed_form(sensor[:, 0], sensor[:, 1], baseline, f, THETA), general, rtol=1e-12)
+    np.testing.assert_allclose(closed_form, general, rtol=1e-12)
 
 
 def test_rays_at_the_vanishing_line_are_rejected():
@@ -95,7 +84,7 @@ def test_rays_at_the_vanishing_line_are_rejected():
 
 
 def test_a_plane_that_was_kept_comes_back_to_the_last_bit():
-    for normal in np.random.default_rng(3).normal(size=(2000, 3)):
+    for normal in np.random.default_rng(3).normal(size=(300, 3)):
         plane = LightPlane.of(normal, 0.0333)
         assert LightPlane.of(list(plane.normal), plane.distance) == plane
 
@@ -105,35 +94,3 @@ def test_plane_fit_finds_the_plane_of_its_points():
     rays = CAMERA.rays(np.random.default_rng(1).uniform(0, 480, (30, 2)))
     fitted = LightPlane.fit(truth.intersect(rays))
     np.testing.assert_allclose([*fitted.normal, fitted.distance], [*truth.normal, truth.distance], atol=1e-9)
-
-
-def test_arm_vectors_and_quaternions_round_trip():
-    vector = np.array([0.1, -0.4, 0.7, 1.2, -0.5, 2.0])
-    np.testing.assert_allclose(poses.to_ur(poses.from_ur(vector)), vector, atol=1e-12)
-    half = np.sqrt(0.5)
-    turn = poses.from_quaternion([1, 2, 3], [0, 0, half, half])
-    np.testing.assert_allclose(poses.transform(turn, [1.0, 0.0, 0.0]), [1, 3, 3], atol=1e-12)
-
-
-def test_a_mirror_is_no_pose():
-    with pytest.raises(ValueError, match="rotation"):
-        poses.from_matrix(np.diag([1.0, 1.0, -1.0, 1.0]))
-
-
-def test_covariances_travel_like_random_perturbations():
-    rng = np.random.default_rng(7)
-    a_from_b, b_from_c = pin.SE3.Random(), pin.SE3.Random()
-    scale = np.array([1, 2, 3, 2, 1, 3]) * 1e-4
-    mix = rng.normal(size=(6, 6))
-    cov_ab, cov_bc = np.diag(scale**2), mix @ mix.T * 1e-8
-    first = rng.multivariate_normal(np.zeros(6), cov_ab, 20000)
-    second = rng.multivariate_normal(np.zeros(6), cov_bc, 20000)
-    nominal = a_from_b * b_from_c
-    draws = np.array(
-        [
-            poses.difference(poses.perturbed(a_from_b, d) * poses.perturbed(b_from_c, e), nominal)
-            for d, e in zip(first, second, strict=True)
-        ]
-    )
-    expected = poses.compose_covariance(a_from_b, cov_ab, b_from_c, cov_bc)
-    assert np.abs(np.cov(draws.T) - expected).max() < 0.05 * np.abs(expected).max()

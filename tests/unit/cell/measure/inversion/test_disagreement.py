@@ -44,22 +44,23 @@ EDGE = -0.0175
 """A quarter of the pot lies at smaller x, m."""
 
 
-def asked(deformed: Callable[[Array], Array]) -> Dissent:
-    """Dissent at the true pose of a pot whose height has changed by a function of x."""
-    cloud = scan(PARTS["pot"], np.random.default_rng(3), height=lambda x, y: POT(x, y) + deformed(x))
-    return dissent(Scan.of(cloud), TRUE, nominal("pot"), TOLERANCE)
+def deformed_pot(by: Callable[[Array], Array]) -> Cloud:
+    """A scan of a pot whose height has changed by a function of x."""
+    return scan(PARTS["pot"], np.random.default_rng(3), height=lambda x, y: POT(x, y) + by(x))
 
 
-def test_a_quarter_that_has_sunk_is_found_with_its_depth() -> None:
-    found = asked(lambda x: -0.0004 * (x < EDGE))
-    assert found.shift == pytest.approx(0.0004, abs=1e-4)
-    assert found.middle[0] < -0.015 and found.excess > 0.5
+def asked(by: Callable[[Array], Array]) -> Dissent:
+    return dissent(Scan.of(deformed_pot(by)), TRUE, nominal("pot"), TOLERANCE)
 
 
-def test_a_quarter_that_is_tilted_is_found_with_its_angle() -> None:
-    found = asked(lambda x: 0.006 * np.minimum(x - EDGE, 0.0))
-    assert (found.turn, found.shift) == (pytest.approx(0.006, rel=0.1), pytest.approx(0.006 * -EDGE, rel=0.15))
-    assert found.middle[0] < EDGE
+def test_a_quarter_that_has_sunk_or_is_tilted_is_found_with_its_depth_and_its_angle() -> None:
+    sunk = asked(lambda x: -0.0004 * (x < EDGE))
+    assert sunk.shift == pytest.approx(0.0004, abs=1e-4)
+    assert sunk.middle[0] < -0.015 and sunk.excess > 0.5
+    tilted = asked(lambda x: 0.006 * np.minimum(x - EDGE, 0.0))
+    assert (tilted.turn, tilted.shift) == (pytest.approx(0.006, rel=0.1), pytest.approx(0.006 * -EDGE, rel=0.15))
+    assert tilted.middle[0] < EDGE
+    assert asked(lambda x: 0.0 * x).excess < 0.05, "noise alone"
 
 
 @pytest.mark.parametrize("axis", range(6))
@@ -71,28 +72,19 @@ def test_a_motion_along_any_axis_counts_beyond_three_sigma(axis: int) -> None:
 
 
 def test_how_much_of_the_area_lies_off_is_told_by_squares() -> None:
-    cloud = scan(PARTS["pot"], np.random.default_rng(3), height=lambda x, y: POT(x, y) + 0.001 * (x < EDGE))
-    seen = Scan.of(cloud)
+    seen = Scan.of(deformed_pot(lambda x: 0.001 * (x < EDGE)))
     medians = _squares(seen, TRUE, nominal("pot"))
     raised = ((seen.points - TRUE.translation) @ TRUE.rotation)[:, 0] < EDGE
     assert len(medians) > 50
     assert np.mean(np.abs(medians) > 0.5e-3) == pytest.approx(raised.mean(), abs=0.1)
-    away = TRUE.copy()
-    away.translation = away.translation + 1.0
-    assert len(_squares(seen, away, nominal("pot"))) == 0
-
-
-def test_noise_alone_is_no_dissent() -> None:
-    assert asked(lambda x: 0.0 * x).excess < 0.05
+    assert len(_squares(seen, from_parts((1.0, 1.0, 1.0)) * TRUE, nominal("pot"))) == 0
 
 
 @pytest.mark.parametrize("part", list(PARTS))
 def test_foreign_objects_and_missing_data_are_no_dissent(part: str) -> None:
-    rng = np.random.default_rng(8)
-    for setting in (Setting(clutter=0.2), Setting(clutter=0.2, missing=0.4)):
-        seen = Scan.of(scan(PARTS[part], rng, setting))
-        pose = register(seen, nominal(part), Prior(TRUE, BOARD)).base_from_surface
-        assert dissent(seen, pose, nominal(part), TOLERANCE).excess < 0.25
+    seen = Scan.of(scan(PARTS[part], np.random.default_rng(8), Setting(clutter=0.2, missing=0.4)))
+    pose = register(seen, nominal(part), Prior(TRUE, BOARD)).base_from_surface
+    assert dissent(seen, pose, nominal(part), TOLERANCE).excess < 0.25
 
 
 def test_what_the_calibration_explains_is_no_dissent() -> None:
@@ -108,10 +100,9 @@ def test_what_the_calibration_explains_is_no_dissent() -> None:
 
 @pytest.mark.parametrize("worn", [0.1e-3, 0.2e-3])
 def test_a_wear_too_small_to_be_refused_is_stated_as_a_tilt_that_is_less_well_known(worn: float) -> None:
-    cloud = scan(
-        PARTS["pot"], np.random.default_rng(3), height=lambda x, y: POT(x, y) + worn * np.maximum(x, 0) / 0.035
+    found = invert_pose(
+        deformed_pot(lambda x: worn * np.maximum(x, 0) / 0.035), nominal("pot"), Prior(TRUE, BOARD), TOLERANCE
     )
-    found = invert_pose(cloud, nominal("pot"), Prior(TRUE, BOARD), TOLERANCE)
     tilt = np.abs(difference(found.base_from_surface, TRUE)[4])
     assert 0.1 < found.parts_differ < 0.5
     assert tilt > 5.0 * np.sqrt(found.random[4, 4]) and tilt > 0.5 * worn / 0.07
@@ -119,7 +110,7 @@ def test_a_wear_too_small_to_be_refused_is_stated_as_a_tilt_that_is_less_well_kn
 
 
 def test_a_surface_worn_like_a_ramp_is_not_taken_for_a_tilted_one() -> None:
-    for seed in (0, 2, 4, 12):
+    for seed in (0, 12):
         judged = judge_case("worn 0.3 to 2 mm on one side", seed)
         assert judged.ended == "refused"
         assert "the parts of the surface do not agree" in judged.reason

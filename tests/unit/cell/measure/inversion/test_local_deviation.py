@@ -15,13 +15,18 @@ from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.flush import heights_over
 from cell.measure.inversion.local_deviation import BLUR_M, LocalDeviation, Span, higher_about, seen_middle, seen_rim
 from cell.measure.reconstruction.cloud import Cloud
-from tests.unit.cell.measure.inversion.test_flush import BELONGS, HALF, THICK, TOP, swept
+from tests.unit.cell.measure.inversion.test_flush import BELONGS, HALF, THICK, TOP, in_surface, swept, with_local
 from tests.unit.cell.measure.inversion.test_registration import TRUE, scanned
 
 Array = NDArray[np.float64]
 MIDDLE, RIGHT, LEFT, FRONT = ([0.0, 0.0, 0.0], [HALF, 0.0, 0.0], [-HALF, 0.0, 0.0], [0.0, 0.018, 0.0])
 ACROSS, ALONG = [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]
 LINES_M, ROWS_M = 0.072 / 159, 0.04 / 239
+
+
+def without(cloud: Cloud, gone: NDArray[np.bool_]) -> Cloud:
+    """The cloud without some of its points (lines, rows)."""
+    return replace(cloud, points=np.where(gone[..., None], np.nan, cloud.points))
 
 
 def ends(right: float, seed: int = 5) -> Cloud:
@@ -40,18 +45,15 @@ def about(
 
 
 def rim(at: list[float], cloud: Cloud, edge: list[float] = ACROSS, faces: NominalSurface = TOP) -> Span:
-    found = about(at, cloud, edge, faces).rim
-    assert found is not None
-    return found.farther
+    return about(at, cloud, edge, faces).rim.farther
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [0, 3, 6])
 def test_of_a_part_as_drawn_the_points_about_each_feature_say_no_more_than_its_pose(seed: int) -> None:
     shift = 0.0015 + 0.1 * seed * LINES_M, -0.001 + 0.1 * seed * ROWS_M
     cloud = scanned(lambda x, y: np.where(np.abs(x) < HALF, THICK, 0.0 * y), seed, shift=shift)
     for at, edge, apart in ((RIGHT, ACROSS, LINES_M), (LEFT, ACROSS, LINES_M), (FRONT, ALONG, ROWS_M)):
         found = about(at, cloud, edge)
-        assert found.higher is not None and found.rim is not None
         assert found.higher.off == 0.0 and found.higher.more == 0.0 and found.higher.most < 0.1e-3
         farther, outward = found.rim
         assert farther.off == 0.0 and farther.most - farther.least < 2.0 * BLUR_M + 1.3 * apart
@@ -60,10 +62,9 @@ def test_of_a_part_as_drawn_the_points_about_each_feature_say_no_more_than_its_p
 
 
 def test_a_flat_that_is_worn_about_a_feature_is_so_much_lower_there_and_nowhere_else() -> None:
-    cloud = swept(0.0)
-    local = (cloud.points - TRUE.translation) @ TRUE.rotation
+    local = in_surface(swept(0.0))
     local[np.hypot(local[..., 0], local[..., 1]) < 5e-3, 2] -= 0.3e-3
-    worn = replace(cloud, points=local @ TRUE.rotation.T + TRUE.translation)
+    worn = with_local(swept(0.0), local)
     found = about(MIDDLE, worn).higher
     assert found is not None and found.least < -0.3e-3 < found.most < -0.25e-3
     assert found.off == found.most and found.more == pytest.approx(found.most - found.least)
@@ -84,8 +85,7 @@ def test_an_end_that_is_cut_off_farther_than_is_looked_is_gone() -> None:
     assert found.most < -5e-3 and found.off == found.most
     # Where the sweep shows nothing at all, nobody knows.
     cloud = ends(-9e-3)
-    over = ((cloud.points - TRUE.translation) @ TRUE.rotation)[..., 0] > HALF - 9e-3
-    assert about(RIGHT, replace(cloud, points=np.where(over[..., None], np.nan, cloud.points)), ACROSS).rim is None
+    assert about(RIGHT, without(cloud, in_surface(cloud)[..., 0] > HALF - 9e-3), ACROSS).rim is None
 
 
 def test_an_edge_at_an_angle_to_the_lines_is_looked_for_square_to_itself() -> None:
@@ -112,19 +112,17 @@ def test_what_is_no_rim_in_the_drawing_or_does_not_show_says_nothing() -> None:
     assert about(RIGHT, cloud, [0.0, 0.0, 1.0]).rim is None, "upright"
     thin = about(RIGHT, swept(0.0, thick=0.2e-3), ACROSS, lies=from_parts((0.0, 0.0, 0.2e-3)))
     assert thin.rim is None, "the ground beside it is as high"
-    nothing = replace(cloud, points=np.full_like(cloud.points, np.nan))
-    assert about(RIGHT, nothing, ACROSS).spans == ()
+    assert about(RIGHT, without(cloud, np.ones(cloud.shape, dtype=bool)), ACROSS).spans == ()
 
 
 def test_a_sweep_that_ends_before_the_rim_says_nothing_of_it() -> None:
     cloud = swept(0.0)
-    over = ((cloud.points - TRUE.translation) @ TRUE.rotation)[..., 1] > 17e-3
-    assert rim(FRONT, replace(cloud, points=np.where(over[..., None], np.nan, cloud.points)), ALONG).off == 0.0
+    assert rim(FRONT, without(cloud, in_surface(cloud)[..., 1] > 17e-3), ALONG).off == 0.0
     cut = scanned(lambda x, y: np.where((np.abs(x) < HALF) & (y < 17e-3), THICK, 0.0 * y), 5)
     assert rim(FRONT, cut, ALONG).off < -0.5e-3, "the ground shows beyond it"
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_side_that_leans_outward_is_no_part_of_the_face_above_it(seed: int) -> None:
     """By 15 deg: between the face and the ground the sweep sees it."""
     side = np.tan(np.radians(75.0))
@@ -151,7 +149,6 @@ def test_a_rim_that_something_higher_may_hide_is_not_told_to_end_too_soon() -> N
 def test_a_vehicle_that_rocks_hides_as_much_of_a_height() -> None:
     cloud = swept(0.0)
     still, rocked = (about(MIDDLE, cloud, rocks=rocks).higher for rocks in (0.0, 0.1e-3))
-    assert still is not None and rocked is not None
     assert rocked.most == pytest.approx(still.most + 0.2e-3) and rocked.least == pytest.approx(still.least - 0.2e-3)
 
 
@@ -201,7 +198,7 @@ def middle(cloud: Cloud, faces: NominalSurface, at: tuple[float, float, float] =
     return [Span(*sorted((sign * span.least, sign * span.most))) for _, (span, sign) in sorted(order.items())]
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(("drawn", "faces"), KINDS, ids=["hole", "pin"])
 def test_a_hole_and_a_pin_as_drawn_lie_in_their_place(drawn: partial[Array], faces: NominalSurface, seed: int) -> None:
     shift = 0.0015 + 0.1 * seed * LINES_M, -0.001 + 0.1 * seed * ROWS_M
@@ -246,10 +243,8 @@ def beside_a_bar(seed: int) -> tuple[Cloud, NominalSurface]:
     low, high = (PLACE + np.array(corner) for corner in ((RADIUS + 2.4e-3, -1.5e-3), (RADIUS + 3.2e-3, 1.5e-3)))
     corners = np.array([[*low, 0.0], [high[0], low[1], 0.0], [*high, 0.0], [low[0], high[1], 0.0]])
     count = len(PIN.vertices)
-    faces = NominalSurface(
-        np.vstack([PIN.vertices, corners]),
-        [*PIN.triangles, [count, count + 1, count + 2], [count, count + 2, count + 3]],
-    )
+    bar = [[count, count + 1, count + 2], [count, count + 2, count + 3]]
+    faces = NominalSurface(np.vstack([PIN.vertices, corners]), [*PIN.triangles, *bar])
 
     def height(x: Array, y: Array) -> Array:
         on_bar = (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
@@ -262,8 +257,7 @@ def test_where_no_hole_is_drawn_or_too_little_of_it_shows_nothing_is_told() -> N
     cloud = scanned(pierced, 5)
     assert middle(cloud, TOP) == [], "the plate goes on"
     assert middle(cloud, HOLE, (-0.012, 0.0, 0.0)) == [], "the rim is too far away"
-    half = ((cloud.points - TRUE.translation) @ TRUE.rotation)[..., 0] > PLACE[0]
-    assert middle(replace(cloud, points=np.where(half[..., None], np.nan, cloud.points)), HOLE) == []
+    assert middle(without(cloud, in_surface(cloud)[..., 0] > PLACE[0]), HOLE) == [], "half of it shows"
     tower = np.array([[12, -6, 12], [14, -6, 12], [14, 2, 12], [12, 2, 12]]) * 1e-3
     beside = NominalSurface(np.concatenate([HOLE.vertices, tower]), [*HOLE.triangles, [192, 193, 194], [192, 194, 195]])
     assert middle(cloud, beside) == [], "something rises over it"

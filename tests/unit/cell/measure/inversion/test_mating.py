@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
+from functools import cache
 
 import numpy as np
 import pinocchio as pin
@@ -42,14 +42,18 @@ def surface_of(part: trimesh.Trimesh) -> NominalSurface:
     return NominalSurface(part.vertices, part.faces)
 
 
-POT, PART = drawn("pot")
+POT, BODY = drawn("pot")
+
+
+@cache
+def part() -> NominalSurface:
+    return surface_of(BODY)
 
 
 @pytest.mark.parametrize("name", ["pot", "seat", "panel"])
 def test_a_part_of_the_same_drawing_lies_on_the_surface(name: str) -> None:
-    nominal, part = drawn(name)
-    found = drawn_gap(nominal, HERE, surface_of(part))
-    assert found is not None
+    nominal, above = drawn(name)
+    found = drawn_gap(nominal, HERE, surface_of(above))
     assert np.abs(found.gaps).max() < 1e-6 and found.seen > 0.95
     assert found.problem(TOLERANCE) is None and found.notes == ()
 
@@ -57,14 +61,13 @@ def test_a_part_of_the_same_drawing_lies_on_the_surface(name: str) -> None:
 def test_the_gap_is_what_a_ray_measures() -> None:
     """A part that is shifted and turned: rays from the surface along the part's z axis meet it so far off."""
     lies = pin.SE3(pin.rpy.rpyToMatrix(0.004, -0.003, 0.01), np.array([0.4e-3, -0.2e-3, 0.3e-3]))
-    found = drawn_gap(POT, lies, surface_of(PART))
-    assert found is not None
+    found = drawn_gap(POT, lies, part())
     inner = np.linalg.norm(found.places[:, :2] / [0.030, 0.015], axis=1) < 1.0
     places, gaps = found.places[inner], found.gaps[inner]
     below = (places - lies.translation) @ lies.rotation
     # From well below, so that no ray begins inside the part.
     starts = below - [0.0, 0.0, 0.004]
-    hits, rays, _ = PART.ray.intersects_location(starts, np.tile([0.0, 0.0, 1.0], (len(starts), 1)))
+    hits, rays, _ = BODY.ray.intersects_location(starts, np.tile([0.0, 0.0, 1.0], (len(starts), 1)))
     first = np.full(len(starts), np.inf)
     np.minimum.at(first, rays, hits[:, 2] - below[rays, 2])
     assert len(gaps) > 300 and np.isfinite(first).all()
@@ -77,8 +80,7 @@ def test_the_gap_is_what_a_ray_measures() -> None:
     [(-0.5e-3, r"goes 0\.50 mm into the surface at .*Allowed are 0\.30 mm.*datum"), (0.5e-3, r"lies 0\.50 mm or more")],
 )
 def test_a_mesh_in_another_datum_is_refused_with_how_much_and_what_to_see_to(height: float, told: str) -> None:
-    found = drawn_gap(POT, moved(z=height), surface_of(PART))
-    assert found is not None
+    found = drawn_gap(POT, moved(z=height), part())
     with pytest.raises(RefusedError, match=told) as refused:
         found.require(TOLERANCE)
     (number,) = refused.value.numbers
@@ -87,9 +89,8 @@ def test_a_mesh_in_another_datum_is_refused_with_how_much_and_what_to_see_to(hei
 
 
 def test_a_wrong_revision_is_refused_where_it_differs() -> None:
-    part = surface_of(body(POT.vertices, POT.triangles, stepped))
-    found = drawn_gap(POT, HERE, part)
-    assert found is not None
+    other = surface_of(body(POT.vertices, POT.triangles, stepped))
+    found = drawn_gap(POT, HERE, other)
     assert found.overlap == pytest.approx(0.5e-3, abs=2e-6)
     assert found.places[np.argmin(found.gaps), 0] > 0.009
     assert "goes 0.50 mm into the surface at (1" in str(found.problem(TOLERANCE))
@@ -105,7 +106,7 @@ def test_one_square_of_noise_is_no_overlap() -> None:
 
 def test_what_is_off_contact_brings_a_part_back_that_goes_into_the_surface() -> None:
     off = pin.SE3(pin.exp3(np.array([0.002, -0.001, 0.003])), np.array([0.2e-3, -0.15e-3, -0.05e-3]))
-    found = drawn_gap(POT, off, surface_of(PART))
+    found = drawn_gap(POT, off, part())
     assert found is not None and 0.05e-3 < found.interference < found.overlap
     motion = found.off_contact(off.translation, np.array([2e-3] * 3 + [20e-3] * 3))
     assert motion == pytest.approx([0.2e-3, -0.15e-3, -0.05e-3, 0.002, -0.001, 0.003], rel=0.03, abs=5e-6)
@@ -117,25 +118,24 @@ def test_what_is_off_contact_brings_a_part_back_that_goes_into_the_surface() -> 
 
 def test_the_scanned_surface_tells_the_same(placed_pot: JobRecord) -> None:
     cloud, pose = placed_pot.results["reconstruct"].cloud, placed_pot.results["invert_pose"].base_from_surface
-    fits = scanned_gap(cloud, pose, POT, HERE, surface_of(PART))
+    fits = scanned_gap(cloud, pose, POT, HERE, part())
     assert fits is not None and max(fits.overlap, np.abs(np.median(fits.gaps))) < 0.03e-3
     assert fits.seen > 0.75 and fits.problem(TOLERANCE) is None
     for height in (-0.5e-3, 0.5e-3):
-        found = scanned_gap(cloud, pose, POT, moved(z=height), surface_of(PART))
-        assert found is not None
+        found = scanned_gap(cloud, pose, POT, moved(z=height), part())
         assert np.median(found.gaps) == pytest.approx(height, abs=0.03e-3)
         assert found.problem(TOLERANCE) is not None
     half = replace(cloud, points=np.where(np.arange(cloud.shape[0])[:, None, None] < 30, cloud.points, np.nan))
-    part = scanned_gap(half, pose, POT, HERE, surface_of(PART))
-    assert part is not None and part.seen < 0.5
-    assert "lie over what was scanned" in part.notes[0] and "scan.length" in part.notes[0]
+    less = scanned_gap(half, pose, POT, HERE, part())
+    assert less is not None and less.seen < 0.5
+    assert "lie over what was scanned" in less.notes[0] and "scan.length" in less.notes[0]
 
 
 def test_a_part_that_lies_elsewhere_has_nothing_below_it() -> None:
-    assert drawn_gap(POT, moved(x=0.2), surface_of(PART)) is None
+    assert drawn_gap(POT, moved(x=0.2), part()) is None
 
 
-def test_figures_are_for_people_and_for_the_journal(tmp_path: Path) -> None:
+def test_figures_are_for_people_and_for_the_journal() -> None:
     found = MatingGap(np.zeros((3, 3)), np.array([-0.12e-3, 0.0, 0.3e-3]), np.zeros(3), 0.87, np.zeros((3, 3)))
     assert found.words == "gap -0.12 to 0.30 mm, 0.00 mm in the middle; 87 % of it seen"
     assert found.as_dict() == {"least_mm": -0.12, "median_mm": 0.0, "largest_mm": 0.3, "seen": 0.87}

@@ -55,10 +55,9 @@ def test_a_mesh_whose_sides_or_corners_are_not_told_is_refused(
 
 def test_a_tube_of_long_thin_triangles_has_no_more_samples_than_another_mesh() -> None:
     angle = np.linspace(0.0, np.pi, 33)
-    ends = np.stack([[np.full(33, x), 0.02 * np.cos(angle), 0.02 * np.sin(angle)] for x in (0.0, 0.3)]).transpose(
-        2, 0, 1
-    )
-    strips = ends[:-1, 0], ends[:-1, 1], ends[1:, 1], ends[1:, 0]
-    corners = np.concatenate([np.stack(strips[:3], axis=1), np.stack([strips[0], *strips[2:]], axis=1)])
+    near = 0.02 * np.stack([0.0 * angle, np.cos(angle), np.sin(angle)], axis=1)
+    far = near + np.array([0.3, 0.0, 0.0])
+    strips = (near[:-1], far[:-1], far[1:]), (near[:-1], far[1:], near[1:])
+    corners = np.concatenate([np.stack(strip, axis=1) for strip in strips])
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     assert len(_samples(corners, areas)[0]) < 5 * MOST_SAMPLES

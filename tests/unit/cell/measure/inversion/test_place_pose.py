@@ -13,7 +13,16 @@ from cell.measure.inversion.place_pose import PATCH_M, shared_by_patches
 from cell.measure.inversion.registration import register
 from cell.measure.reconstruction.cloud import Cloud
 from drivers.errors import RefusedError
-from tests.unit.cell.measure.inversion.test_registration import BOARD, JOB, TRUE, freeform, ledges, nominal, scanned
+from tests.unit.cell.measure.inversion.test_registration import (
+    BOARD,
+    JOB,
+    TRUE,
+    Height,
+    freeform,
+    ledges,
+    nominal,
+    scanned,
+)  # fmt: skip
 
 Array = NDArray[np.float64]
 PITCH = 0.005
@@ -48,13 +57,11 @@ def test_the_same_pattern_is_found_where_the_board_knows_better() -> None:
 
 
 @pytest.mark.parametrize("height", [waves_with_an_end, freeform])
-def test_what_comes_once_only_tells_the_place(height: object) -> None:
-    assert callable(height)
+def test_what_comes_once_only_tells_the_place(height: Height) -> None:
     found = invert_pose(scanned(height, 3), nominal(height), board(0.002, off=0.0015), JOB)
     assert np.linalg.norm(found.base_from_surface.translation - TRUE.translation) < 1e-4
 
 
-Array = NDArray[np.float64]
 FORM = np.random.default_rng(5).standard_normal((40, 40))
 
 
@@ -64,9 +71,8 @@ def uneven(size: float) -> Cloud:
 
     def height(x: Array, y: Array) -> Array:
         i, j = (np.clip(np.floor(v / PATCH_M).astype(int) + 20, 0, 39) for v in (x, y))
-        step = 1e-6
-        slope_x = (ledges(x + step, y) - ledges(x - step, y)) / (2 * step)
-        slope_y = (ledges(x, y + step) - ledges(x, y - step)) / (2 * step)
+        slope_x = (ledges(x + 1e-6, y) - ledges(x - 1e-6, y)) / 2e-6
+        slope_y = (ledges(x, y + 1e-6) - ledges(x, y - 1e-6)) / 2e-6
         return ledges(x, y) + size * FORM[i, j] * np.sqrt(1 + slope_x**2 + slope_y**2)
 
     return scanned(height, 4)

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
 from cell.measure.geometry.poses import difference, perturbed
@@ -36,21 +37,7 @@ LOOSE = np.diag([0.008**2] * 3 + [np.radians(20) ** 2] * 3)
 BOARD = np.diag([0.002**2] * 3 + [np.radians(0.6) ** 2] * 3)
 
 
-def freeform(x: Array, y: Array) -> Array:
-    """A pot-like relief without any symmetry, closed form, m."""
-    return 0.006 + 0.0015 * np.sin(150 * x + 70 * y + 0.4) + 0.0011 * np.sin(230 * y - 90 * x + 1.3) + 4 * x * y
-
-
-def seat(x: Array, y: Array) -> Array:
-    """A curved seat with two oblique steps, closed form, m."""
-    steps = 0.0012 * np.tanh((0.97 * x - 0.24 * y - 0.01) / 0.0008) - 0.001 * np.tanh((y - 0.15 * x - 0.006) / 0.0008)
-    return 0.005 + 3 * x**2 + 6 * y**2 + 0.05 * x + steps
-
-
-def bowl(x: Array, y: Array) -> Array:
-    """A surface of revolution about z, m."""
-    r2 = x**2 + y**2
-    return 0.003 + 6 * r2 + 0.001 * np.cos(np.sqrt(r2) * 300)
+freeform, seat, bowl = (PARTS[name].height for name in ("pot", "seat", "turned"))
 
 
 def flat(x: Array, y: Array) -> Array:
@@ -68,19 +55,9 @@ def nominal(height: Height, half_x: float = 0.035, half_y: float = 0.018, step: 
     nx, ny = int(2 * half_x / step) + 1, int(2 * half_y / step) + 1
     x, y = np.meshgrid(np.linspace(-half_x, half_x, nx), np.linspace(-half_y, half_y, ny), indexing="ij")
     index = np.arange(nx * ny).reshape(nx, ny)
-    a, b, c, d = (index[s, t].ravel() for s, t in _QUAD)
-    return NominalSurface(
-        np.stack([x.ravel(), y.ravel(), height(x.ravel(), y.ravel())], -1),
-        np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]),
-    )
-
-
-_QUAD = (
-    (slice(-1), slice(-1)),
-    (slice(1, None), slice(-1)),
-    (slice(1, None), slice(1, None)),
-    (slice(-1), slice(1, None)),
-)
+    a, b, c, d = (each.ravel() for each in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    corners = np.stack([x.ravel(), y.ravel(), height(x.ravel(), y.ravel())], -1)
+    return NominalSurface(corners, np.concatenate([np.stack([a, b, c], -1), np.stack([a, c, d], -1)]))
 
 
 def scanned(
@@ -115,17 +92,14 @@ def inverted(height: Height, cloud: Cloud, prior: Prior, **options: object) -> P
     return invert_pose(cloud, nominal(height), prior, JOB, **options)  # type: ignore[arg-type]
 
 
-# --- the closest point ---
-
-
 def test_distances_to_the_mesh_are_those_to_the_closed_form_surface() -> None:
-    surface = nominal(freeform, step=0.00025)
+    surface = nominal(freeform, 0.015, 0.01, step=0.00025)
     rng = np.random.default_rng(0)
-    x, y = rng.uniform(-0.033, 0.033, 3000), rng.uniform(-0.016, 0.016, 3000)
+    x, y = rng.uniform(-0.014, 0.014, 1000), rng.uniform(-0.009, 0.009, 1000)
     gx, gy = (freeform(x + dx, y + dy) - freeform(x - dx, y - dy) for dx, dy in ((1e-6, 0), (0, 1e-6)))
     normal = np.stack([-gx / 2e-6, -gy / 2e-6, np.ones_like(x)], -1)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    height = rng.uniform(-0.0004, 0.0004, 3000)
+    height = rng.uniform(-0.0004, 0.0004, 1000)
     found = surface.deviations(np.stack([x, y, freeform(x, y)], -1) + height[:, None] * normal)
     assert np.abs(found - height).max() < 2e-6
 
@@ -136,8 +110,6 @@ def test_points_beside_the_surface_have_no_deviation() -> None:
 
 
 def test_a_mesh_is_read_in_its_unit_and_refused_in_the_wrong_one(tmp_path: Path) -> None:
-    import trimesh
-
     surface = nominal(seat)
     path = tmp_path / "seat.stl"
     trimesh.Trimesh(surface.vertices * 1e3, surface.triangles).export(path)
@@ -148,9 +120,6 @@ def test_a_mesh_is_read_in_its_unit_and_refused_in_the_wrong_one(tmp_path: Path)
     (tmp_path / "broken.stl").write_bytes(b"solid nonsense")
     with pytest.raises(ConfigError, match=r"broken\.stl"):
         NominalSurface.load(tmp_path / "broken.stl")
-
-
-# --- the pose ---
 
 
 @pytest.mark.parametrize("height", [freeform, seat])
@@ -185,8 +154,7 @@ def test_sweeps_that_can_have_no_error_leave_the_pose_where_board_and_scan_have_
 
 def test_an_uncertainty_that_all_points_share_is_added() -> None:
     arm = np.diag([1e-4**2] * 3 + [2e-4**2] * 3)
-    prior = Prior(TRUE, BOARD)
-    pose = inverted(freeform, scanned(freeform, 2), prior, systematic=arm)
+    pose = inverted(freeform, scanned(freeform, 2), Prior(TRUE, BOARD), systematic=arm)
     assert np.allclose(pose.systematic, arm, rtol=0.02)
     assert np.allclose(pose.covariance, pose.random + pose.systematic)
 
@@ -201,10 +169,7 @@ def test_the_calibrations_part_is_what_a_disturbed_calibration_does() -> None:
     stated = inverted(freeform, cloud, prior, calibration=lambda lines, rows: moved[lines, rows])
     seen = np.zeros((6, 6))
     for k in range(2):
-        other = Cloud(
-            cloud.points + moved[:, :, :, k], cloud.stripe_spread, cloud.rail_spread, cloud.centres, cloud.rail,
-            cloud.rejected,
-        )  # fmt: skip
+        other = replace(cloud, points=cloud.points + moved[:, :, :, k])
         step = difference(inverted(freeform, other, prior).base_from_surface, plain.base_from_surface)
         seen += np.outer(step, step)
     unit = np.sqrt(np.maximum(np.diag(seen), 1e-14))
@@ -215,12 +180,11 @@ def test_sweeps_that_do_not_fit_each_other_do_not_tilt_the_surface() -> None:
     """Two strips that overlap by 8 mm, the second one 35 µm too high and 20 µm aside, as the arm's rest leaves them."""
     error, sigma = np.array([2e-5, -1.5e-5, 3.5e-5]), 3e-5
     strips = []
-    for seed, side in ((2, 1.0), (3, -1.0)):
+    for seed, side, off in ((2, 1.0, 0.0), (3, -1.0, error)):
         strip = scanned(freeform, seed, outliers=0.0, sigma=1e-5)
-        across = ((strip.points - TRUE.translation) @ TRUE.rotation)[:, :, 1]
-        strip.points[side * across > 0.004] = np.nan
-        strips.append(replace(strip, flanges=np.tile(np.eye(4), (len(strip.points), 1, 1))))
-    strips[1].points[:] += error
+        across = ((strip.points - TRUE.translation) @ TRUE.rotation)[:, :, 1:2]
+        points = np.where(side * across > 0.004, np.nan, strip.points + off)
+        strips.append(replace(strip, points=points, flanges=np.tile(np.eye(4), (len(points), 1, 1))))
     cloud, prior = merge(strips), Prior(TRUE, BOARD)
 
     def sweeps(lines: Indices, rows: Indices) -> Array:
@@ -237,9 +201,6 @@ def test_sweeps_that_do_not_fit_each_other_do_not_tilt_the_surface() -> None:
     # The mean of two independent errors is what remains.
     assert told_apart.sigma[:3] == pytest.approx([sigma / np.sqrt(2)] * 3, rel=0.05)
     assert told_apart.sigma[3:].max() < 1e-4
-
-
-# --- what cannot be known ---
 
 
 def test_the_spin_of_a_bowl_is_not_determined_and_named() -> None:
@@ -271,7 +232,7 @@ def test_a_shift_that_only_a_wall_tells_is_left_to_the_board() -> None:
     assert abs(off[2]) < 1e-5 < 2e-5 < off[0] < 1.1e-4
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_prior_that_is_off_does_not_pull_the_pose_from_steep_walls(seed: int) -> None:
     """Their points are known to micrometres along their normals; a coarse pose is not."""
     prior = Prior(perturbed(TRUE, [0.005, 0.001, 0.001, 0.0, 0.0, 0.0]), BOARD)
@@ -285,43 +246,32 @@ def test_a_freeform_surface_leaves_nothing_to_the_board() -> None:
     assert not pose.verdict.weak
 
 
-# --- refusals ---
+SHARP = np.diag([0.0002**2] * 3 + [0.001**2] * 3)
 
 
-def test_another_surface_is_refused() -> None:
-    with pytest.raises(RefusedError, match="nominal surface"):
-        inverted(freeform, scanned(seat, 1), Prior(TRUE, BOARD))
-
-
-def test_a_scan_of_too_little_of_the_surface_is_refused() -> None:
-    with pytest.raises(RefusedError, match="covers"):
-        inverted(freeform, scanned(freeform, 1, missing=0.8), Prior(TRUE, BOARD))
-
-
-def test_a_scan_beside_the_surface_is_refused() -> None:
-    away = Prior(perturbed(TRUE, [0.2, 0, 0, 0, 0, 0]), BOARD)
-    with pytest.raises(RefusedError, match="is the scan over it"):
-        inverted(freeform, scanned(freeform, 1), away)
-
-
-def test_noise_beyond_the_demands_is_refused() -> None:
-    with pytest.raises(RefusedError, match=r"off the nominal surface, at most 0\.020 mm"):
-        inverted(freeform, scanned(freeform, 1), Prior(TRUE, BOARD), demands=Demands(rms=2e-5))
-
-
-def test_a_scan_that_contradicts_the_board_is_refused() -> None:
-    sharp = np.diag([0.0002**2] * 3 + [0.001**2] * 3)
-    with pytest.raises(RefusedError, match=r"scan and board disagree: the surface lies 3\.0\d mm"):
-        inverted(freeform, scanned(freeform, 1), Prior(perturbed(TRUE, [0.003, 0, 0, 0, 0, 0]), sharp))
-
-
-# --- the campaigns of `cell bench inversion`, small ---
+@pytest.mark.parametrize(
+    ("height", "missing", "prior", "demands", "words"),
+    [
+        (seat, 0.0, Prior(TRUE, BOARD), Demands(), "nominal surface"),
+        (freeform, 0.8, Prior(TRUE, BOARD), Demands(), "covers"),
+        (freeform, 0.0, Prior(perturbed(TRUE, [0.2, 0, 0, 0, 0, 0]), BOARD), Demands(), "is the scan over it"),
+        (freeform, 0.0, Prior(TRUE, BOARD), Demands(rms=2e-5), r"off the nominal surface, at most 0\.020 mm"),
+        (freeform, 0.0, Prior(perturbed(TRUE, [0.003, 0, 0, 0, 0, 0]), SHARP), Demands(),
+         r"scan and board disagree: the surface lies 3\.0\d mm"),
+    ],
+    ids=["another surface", "too little", "beside", "noise", "the board contradicts"],
+)  # fmt: skip
+def test_a_scan_that_does_not_fit_is_refused(
+    height: Height, missing: float, prior: Prior, demands: Demands, words: str
+) -> None:
+    with pytest.raises(RefusedError, match=words):
+        inverted(freeform, scanned(height, 1, missing=missing), prior, demands=demands)
 
 
 @pytest.mark.parametrize("part", list(PARTS))
 def test_every_part_is_found_from_far_away_with_foreign_objects_on_it_and_40_percent_missing(part: str) -> None:
     rng = np.random.default_rng(17)
-    for setting in (Setting(), Setting(clutter=0.2), Setting(clutter=0.1, missing=0.4)):
+    for setting in (Setting(clutter=0.2), Setting(clutter=0.1, missing=0.4)):
         cloud = Scan.of(scan(PARTS[part], rng, setting), 4000)
         found = register(cloud, part_surface(part), Prior(start_away(rng, 0.008, 20.0), LOOSE))
         off, turn = PARTS[part].error(found.base_from_surface, TRUE)
@@ -359,8 +309,6 @@ def test_a_verdict_names_what_is_known_worst_with_three_of_its_deviations() -> N
         "rotation about the z axis of the surface frame is not determined: 3σ 12 mrad > 6 mrad",
     ]
     assert [motion.excess for motion in verdict.weak] == pytest.approx([2.5, 2.0])
-    for motion in verdict.weak:
-        assert (motion.shift.shape, motion.turn.shape) == ((3,), (3,))
 
 
 @pytest.mark.parametrize("case", ["bent 0.3 to 3 mm", "turned by 180°", "mirrored"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pinocchio as pin
@@ -14,8 +13,8 @@ from cell.measure.geometry.poses import from_parts
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.whole_face import FacePatch, unlike_patch
 from cell.measure.reconstruction.cloud import Cloud
-from tests.unit.cell.measure.inversion.test_flush import BELONGS, HALF, THICK, TOP
-from tests.unit.cell.measure.inversion.test_local_deviation import HOLE, PIN, pierced, pinned
+from tests.unit.cell.measure.inversion.test_flush import BELONGS, HALF, THICK, TOP, in_surface
+from tests.unit.cell.measure.inversion.test_local_deviation import HOLE, PIN, pierced, pinned, without
 from tests.unit.cell.measure.inversion.test_registration import TRUE, scanned
 
 Array = NDArray[np.float64]
@@ -40,7 +39,7 @@ def looked(cloud: Cloud, faces: NominalSurface = TOP, lies: pin.SE3 = BELONGS) -
     return unlike_patch(cloud, TRUE, lies, faces)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_a_part_as_drawn_and_one_that_is_a_little_short_are_all_there(seed: int) -> None:
     for height, faces in ((part, TOP), (pierced, HOLE), (pinned, PIN)):
         assert looked(scanned(height, seed, outliers=0.05), faces) is None
@@ -67,19 +66,16 @@ def test_what_is_gone_or_covered_is_told_with_its_size_and_place(
 def test_a_part_that_is_turned_and_shifted_is_told_in_its_own_frame() -> None:
     turn = pin.exp3(np.array([0.0, 0.0, 0.5 * np.pi]))
     lies = from_parts((2e-3, -1e-3, THICK), turn)
-    faces = NominalSurface(
-        TOP.vertices @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]).T, TOP.triangles
-    )
-    there = lies.inverse() * pin.SE3(np.eye(3), np.array([HALF - 5e-3 + 2e-3, 12e-3 - 1e-3, THICK]))
+    there = lies.actInv(np.array([HALF - 5e-3 + 2e-3, 12e-3 - 1e-3, THICK]))
     cloud = scanned(lambda x, y: corner(x - 2e-3, y + 1e-3), 5)
     found = looked(cloud, NominalSurface(TOP.vertices @ turn, TOP.triangles), lies)
-    assert found is not None and np.linalg.norm((found.at - there.translation)[:2]) < 3e-3, faces
+    assert found is not None and np.linalg.norm((found.at - there)[:2]) < 3e-3
 
 
-@pytest.mark.parametrize("wide", [1.2e-3, 1.8e-3, 2.3e-3])
+@pytest.mark.parametrize("wide", [1.2e-3, 2.3e-3])
 def test_a_slot_through_the_part_is_no_face_that_is_gone(wide: float) -> None:
     """Of which a sliver of a square is left to either side."""
-    for k in range(8):
+    for k in range(0, 8, 2):
         left = 0.25e-3 * k + 0.1e-3
         right = left + wide
         x, y = [-HALF, left, right, HALF], [-0.018, -0.012, 0.012, 0.018]
@@ -115,8 +111,7 @@ def test_long_thin_triangles_are_asked_as_closely_as_others() -> None:
 
 def test_what_the_sweep_does_not_show_is_not_told_as_gone() -> None:
     cloud = scanned(corner, 5)
-    local = (cloud.points - TRUE.translation) @ TRUE.rotation
-    dark = (local[..., 0] > HALF - 10e-3) & (local[..., 1] > 6e-3)
-    assert looked(replace(cloud, points=np.where(dark[..., None], np.nan, cloud.points))) is None
+    local = in_surface(cloud)
+    assert looked(without(cloud, (local[..., 0] > HALF - 10e-3) & (local[..., 1] > 6e-3))) is None
     small = scanned(lambda x, y: np.where(np.hypot(x, y) < 2.2e-3, 0.0, part(x, y)), 5)
     assert looked(small) is None, "so little may be a reflection"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pinocchio as pin
@@ -14,7 +12,6 @@ from cell.measure.geometry.camera import CameraModel
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.reconstruction.build import ProfileBuilder, ScanGeometry, calibration_motions
 from cell.measure.reconstruction.cloud import Cloud
-from cell.measure.reconstruction.ply import deviation_colours, write_ply
 from cell.measure.vision.stripe.profile import StripeProfile
 from drivers.errors import RefusedError
 from lab.bench.reconstruction.scenes import swept
@@ -34,11 +31,9 @@ TABLE = 0.05
 """Height of the scanned plane in the base, m."""
 
 
-def profile(centres: Array, sigma: float | Array = 0.07) -> StripeProfile:
-    n = len(centres)
-    none = np.zeros(n, dtype=bool)
-    filled = np.broadcast_to(np.asarray(sigma, dtype=float), (n,)).copy()
-    return StripeProfile("rows", centres, filled, np.full(n, 150.0), np.full(n, 2.0), none, none)
+def profile(centres: Array, sigma: float = 0.07) -> StripeProfile:
+    one, none = np.ones(len(centres)), np.zeros(len(centres), dtype=bool)
+    return StripeProfile("rows", centres, sigma * one, 150 * one, 2 * one, none, none)
 
 
 def table_stripe(rail: float) -> Array:
@@ -65,9 +60,6 @@ def built(noise: float = 0.0, lines: int = 60) -> Cloud:
         for rail in np.linspace(0.02, 0.08, lines)
     )
     return swept(GEOMETRY, profiles, 1e-6, BASE_FROM_FLANGE)
-
-
-# --- triangulation and frames ---
 
 
 def test_the_table_is_where_an_independent_projection_puts_it() -> None:
@@ -119,12 +111,9 @@ def test_rows_without_a_stripe_are_holes_and_lines_are_sorted() -> None:
     assert cloud.size == 5 * 380
 
 
-def test_a_profile_of_another_camera_is_refused() -> None:
+def test_a_profile_of_another_camera_and_a_sweep_without_points_are_refused() -> None:
     with pytest.raises(ValueError, match="camera of 480 rows"):
         ProfileBuilder(GEOMETRY).see(profile(np.full(1024, 300.0)))
-
-
-def test_a_sweep_without_points_is_refused() -> None:
     with pytest.raises(RefusedError, match="gave 0 points in 1 profiles"):
         swept(GEOMETRY, [(profile(np.full(480, np.nan)), 0.0)], 1e-5, BASE_FROM_FLANGE)
 
@@ -135,27 +124,3 @@ def test_a_subsample_is_spread_over_all_lines_and_rows() -> None:
     assert len(lines) <= 2000
     assert np.bincount(lines, minlength=60).min() > 20
     assert np.histogram(rows, bins=10, range=(0, 480))[0].min() > 150
-
-
-# --- PLY ---
-
-
-def test_a_ply_is_read_back_by_another_library(tmp_path: Path) -> None:
-    import trimesh
-
-    cloud = built(lines=12)
-    points = cloud.points.copy()
-    points[3, 100:120] = np.nan
-    quality = points[:, :, 2] - TABLE
-    colours = deviation_colours(quality, 1e-4)
-    path = tmp_path / "cloud.ply"
-    count = write_ply(path, points, quality=quality, colours=colours, comment="frame: arm base")
-    kept = np.isfinite(points[:, :, 0])
-    assert count == kept.sum()
-    loaded = trimesh.load(path)
-    assert np.allclose(loaded.vertices, points[kept], atol=1e-6)
-    assert np.array_equal(loaded.colors[:, :3], colours[kept])
-    header = path.read_bytes().split(b"end_header")[0].decode()
-    for line in ("format binary_little_endian 1.0", "comment coordinates in metres", "comment frame: arm base"):
-        assert line in header.splitlines()
-    assert path.stat().st_size == len(header) + len("end_header\n") + count * (4 * 4 + 3)

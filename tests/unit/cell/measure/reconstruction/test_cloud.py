@@ -9,7 +9,7 @@ import pinocchio as pin
 import pytest
 from numpy.typing import NDArray
 
-from cell.measure.geometry.poses import from_ur, to_ur
+from cell.measure.geometry.poses import from_parts, from_ur, to_ur
 from cell.measure.reconstruction.build import ProfileBuilder, calibration_motions, flange_motions, lean_motions
 from cell.measure.reconstruction.cloud import Cloud, find_seams, merge
 from cell.measure.vision.stripe.profile import StripeProfile
@@ -18,7 +18,7 @@ from drivers.clock import ClockMap, Latch
 from drivers.errors import DeviceFault
 from drivers.interfaces import ArmSafety, ArmState
 from lab.bench.reconstruction.scenes import swept
-from tests.unit.cell.measure.reconstruction.test_build import BASE_FROM_FLANGE, GEOMETRY, MOUNT, RAIL, TABLE
+from tests.unit.cell.measure.reconstruction.test_build import BASE_FROM_FLANGE, GEOMETRY, MOUNT, RAIL, TABLE, profile
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -33,7 +33,6 @@ def relief(x: Array, y: Array) -> Array:
 def stripe(base_from_camera: pin.SE3) -> Array:
     """Columns (480,) at which the laser line on the relief is seen: each image row's ray in the light plane, by
     bisection between the heights that the relief stays within."""
-    columns = np.full(480, np.nan)
     camera, plane = GEOMETRY.camera, GEOMETRY.light_plane
     low, high = np.zeros(480), np.full(480, 639.0)
 
@@ -47,27 +46,21 @@ def stripe(base_from_camera: pin.SE3) -> Array:
         middle = 0.5 * (low + high)
         same = np.sign(above(middle)) == sign
         low, high = np.where(same, middle, low), np.where(same, high, middle)
-    columns[:] = 0.5 * (low + high)
-    return columns
+    return np.asarray(0.5 * (low + high))
 
 
-def profile(centres: Array, rng: np.random.Generator) -> StripeProfile:
-    none, one = np.zeros(480, dtype=bool), np.ones(480)
-    return StripeProfile(
-        "rows", centres + NOISE * rng.standard_normal(480), NOISE * one, 150 * one, 2 * one, none, none
-    )
+def noisy(centres: Array, rng: np.random.Generator) -> StripeProfile:
+    return profile(centres + NOISE * rng.standard_normal(480), NOISE)
 
 
 def scanned(shift: tuple[float, float, float], error: Array, seed: int, lines: int = 16) -> Cloud:
     """A rail sweep from a flange moved by `shift`, which is told to stand `error` (translation) from where it is."""
     rng = np.random.default_rng(seed)
-    true = pin.SE3(BASE_FROM_FLANGE.rotation, BASE_FROM_FLANGE.translation + shift)
-    told = pin.SE3(true.rotation, true.translation + error)
+    true = from_parts(shift) * BASE_FROM_FLANGE
     profiles = (
-        (profile(stripe(true * MOUNT * pin.SE3(np.eye(3), rail * RAIL)), rng), rail)
-        for rail in np.linspace(0.047, 0.053, lines)
+        (noisy(stripe(true * MOUNT * from_parts(rail * RAIL)), rng), rail) for rail in np.linspace(0.047, 0.053, lines)
     )
-    return swept(GEOMETRY, profiles, 1e-6, told)
+    return swept(GEOMETRY, profiles, 1e-6, from_parts(error) * true)
 
 
 ERROR = np.array([0.0, 0.0, 4e-5])
@@ -166,38 +159,31 @@ def test_a_sweep_by_the_arm_lies_where_one_by_the_rail_does() -> None:
     builder = ProfileBuilder(GEOMETRY)
     flanges = []
     for k in range(24):
-        turn = pin.exp3(np.array([0.0, 2e-4 * k, -1e-4 * k]))
-        flange = pin.SE3(
-            BASE_FROM_FLANGE.rotation @ turn, BASE_FROM_FLANGE.translation + np.array([0.0005 * k, 1e-5 * k, 0.0])
-        )
-        builder.see(profile(stripe(flange * MOUNT * pin.SE3(np.eye(3), 0.05 * RAIL)), rng))
+        turn = from_parts((0.0, 0.0, 0.0), pin.exp3(np.array([0.0, 2e-4 * k, -1e-4 * k])))
+        flange = from_parts((0.0005 * k, 1e-5 * k, 0.0)) * BASE_FROM_FLANGE * turn
+        builder.see(noisy(stripe(flange * MOUNT * from_parts(0.05 * RAIL)), rng))
         flanges.append(flange.homogeneous)
     cloud = builder.place(np.arange(24), np.array(flanges), np.full(24, 0.05), np.full((24, 3), 1e-7))
     lines, rows = np.nonzero(cloud.valid)
     assert len(lines) > 11_000
     points = cloud.points[lines, rows]
-    height = points[:, 2] - relief(points[:, 0], points[:, 1])
-    slope = [
-        (relief(points[:, 0] + a, points[:, 1] + b) - relief(points[:, 0], points[:, 1])) / 1e-7
-        for a, b in ((1e-7, 0), (0, 1e-7))
-    ]
-    normals = np.column_stack([-slope[0], -slope[1], np.ones(len(points))])
-    z = height / cloud.sigma_along(lines, rows, normals)
+
+    x, y = points[:, 0], points[:, 1]
+    slope_x, slope_y = (relief(x + 1e-7, y) - relief(x, y)) / 1e-7, (relief(x, y + 1e-7) - relief(x, y)) / 1e-7
+    normals = np.column_stack([-slope_x, -slope_y, np.ones(len(points))])
+    z = (points[:, 2] - relief(x, y)) / cloud.sigma_along(lines, rows, normals)
     assert np.std(z) == pytest.approx(1.0, abs=0.03)
     assert abs(np.mean(z)) < 0.05
 
 
 def test_clouds_that_do_not_belong_together_are_not_merged() -> None:
     one = scanned((0, 0, 0), np.zeros(3), 1, 8)
-    without = Cloud(one.points, one.stripe_spread, one.rail_spread, one.centres, one.rail, one.rejected)
+    without = replace(one, flanges=np.empty((0, 4, 4)))
     with pytest.raises(ValueError, match="does not know where the flange stood"):
         merge([one, without])
     with pytest.raises(ValueError, match="no clouds"):
         merge([])
     assert merge([one]) is one
-
-
-# --- the flange's track ---
 
 
 def states(delays: Array, period: float = 0.008) -> list[ArmState]:

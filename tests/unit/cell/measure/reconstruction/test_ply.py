@@ -6,9 +6,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from cell.measure.reconstruction.ply import deviation_colours, read_cloud, write_ply
 from drivers.errors import ConfigError
+
+
+def test_a_ply_is_read_back_by_another_library(tmp_path: Path) -> None:
+    points = np.random.default_rng(1).normal(size=(12, 40, 3))
+    points[3, 10:20] = np.nan
+    colours = deviation_colours(points[:, :, 2], 1e-4)
+    path = tmp_path / "cloud.ply"
+    count = write_ply(path, points, quality=points[:, :, 2], colours=colours, comment="frame: arm base")
+    kept = np.isfinite(points[:, :, 0])
+    assert count == kept.sum()
+    loaded = trimesh.load(path)
+    assert np.allclose(loaded.vertices, points[kept], atol=1e-6)
+    assert np.array_equal(loaded.colors[:, :3], colours[kept])
+    header = path.read_bytes().split(b"end_header")[0].decode()
+    for line in ("format binary_little_endian 1.0", "comment coordinates in metres", "comment frame: arm base"):
+        assert line in header.splitlines()
+    assert path.stat().st_size == len(header) + len("end_header\n") + count * (4 * 4 + 3)
 
 
 def test_a_ply_with_columns_of_different_length_is_refused(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from cell.config.cell_config import load_config
 from cell.measure.calibration.drift.decision import verdict
 from cell.measure.calibration.drift.evidence import Reference, evidence
 from cell.measure.calibration.solve.normal import BOARD, SHARED, AdjustmentState
-from cell.measure.calibration.solve.results import ScanCalibration, TargetCalibration
 from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import covariance_root, from_matrix
 from cell.procedures.calibrate.verification import scan_looks, target_looks, verify
@@ -25,27 +24,24 @@ from sim_backends.world.scene import draw
 CONFIG = load_config(None)
 
 
-SEED = 5
-
-
 @pytest.fixture(scope="module")
 def calibrated():
-    """A harsh world; from the drawn pose its fine board lies half out of the picture."""
-    cell = ObservedCell(draw(SEED, "harsh"), CONFIG, np.random.default_rng([SEED, 7]))
+    cell = ObservedCell(draw(5, "harsh"), CONFIG, np.random.default_rng([5, 7]))
     return cell, cell.calibrated("1")
 
 
 def true_state(cell: ObservedCell, calibration: CellCalibration, chain: str) -> AdjustmentState:
     t = cell.truth
     if chain == "target":
-        lens = calibration.target.camera.with_parameters(t.target_lens)
-        return AdjustmentState(
-            lens, None, np.zeros(3), from_matrix(t.flange_from_target), from_matrix(t.base_from_large)
+        lens, plane, rail = calibration.target.camera.with_parameters(t.target_lens), None, np.zeros(3)
+        mount, board = t.flange_from_target, t.base_from_large
+    else:
+        lens, plane = (
+            calibration.scan.camera.with_parameters(t.scan_lens),
+            LightPlane.of(t.plane_normal, t.plane_distance),
         )
-    lens, plane = calibration.scan.camera.with_parameters(t.scan_lens), LightPlane.of(t.plane_normal, t.plane_distance)
-    return AdjustmentState(
-        lens, plane, t.rail_direction, from_matrix(t.flange_from_scan), from_matrix(t.base_from_fine)
-    )
+        rail, mount, board = t.rail_direction, t.flange_from_scan, t.base_from_fine
+    return AdjustmentState(lens, plane, rail, from_matrix(mount), from_matrix(board))
 
 
 @pytest.mark.parametrize(("checks", "most_alarms"), [(7, 1), pytest.param(42, 4, marks=pytest.mark.campaign)])
@@ -58,30 +54,29 @@ def test_the_evidence_of_a_good_calibration_scatters_as_it_says(calibrated, chec
     rail = np.sqrt(sigma.rail_homing**2 + cell.scene.rail_backlash**2 / 4 + cell.scene.rail_periodic_amplitude**2 / 2)
     squares, alarms = [], 0
     for _ in range(checks):
-        drawn = {}
+        states, references = {}, {}
         for name, of in (("scan", calibration.scan), ("target", calibration.target)):
-            step = covariance_root(of.reference.covariance)
-            step = step @ quiet.rng.normal(size=step.shape[1])
-            state = true_state(quiet, calibration, name).moved(step)
-            reference = Reference(
+            root = covariance_root(of.reference.covariance)
+            step = root @ quiet.rng.normal(size=root.shape[1])
+            states[name] = state = true_state(quiet, calibration, name).moved(step)
+            references[name] = Reference(
                 state.base_from_board, of.reference.covariance, sigma.arm_repeatability / np.sqrt(3),
                 sigma.arm_repeatability_rotation, float(rail), 1.0, 1.0,
             )  # fmt: skip
-            drawn[name] = state, reference
-        scan, target = (state for state, _ in drawn.values())
+        scan, target = states["scan"], states["target"]
         made = CellCalibration(
-            ScanCalibration(scan.camera, scan.plane, scan.rail_direction, scan.flange_from_camera,
-                            calibration.scan.covariance, calibration.scan.quality, drawn["scan"][1]),
-            TargetCalibration(target.camera, target.flange_from_camera, calibration.target.hand_eye_covariance,
-                              calibration.target.quality, drawn["target"][1]),
+            replace(calibration.scan, camera=scan.camera, light_plane=scan.plane, rail_direction=scan.rail_direction,
+                    flange_from_camera=scan.flange_from_camera, reference=references["scan"]),
+            replace(calibration.target, camera=target.camera, flange_from_camera=target.flange_from_camera,
+                    reference=references["target"]),
             {}, "", 0.0,
         )  # fmt: skip
         seen = look_again(quiet, made)
         evidences = {
-            "scan": evidence(scan, drawn["scan"][1], scan_looks(scan, seen)),
-            "target": evidence(target, drawn["target"][1], target_looks(seen.target)),
+            "scan": evidence(scan, references["scan"], scan_looks(scan, seen)),
+            "target": evidence(target, references["target"], target_looks(seen.target)),
         }
-        alarms += not verdict(evidences, {"scan": scan, "target": target}).good
+        alarms += not verdict(evidences, states).good
         for weighed in evidences.values():
             moved, covariance = weighed.change(np.eye(SHARED)[:, BOARD])
             squares.append(moved @ np.linalg.solve(covariance, moved))

@@ -5,49 +5,26 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pinocchio as pin
 import pytest
 
-from cell.measure.calibration import TargetObservation
+from cell.measure.calibration.archive import Observations
 from cell.measure.calibration.solve.joint import Joint
 from cell.measure.calibration.solve.results import adjust_target
-from cell.measure.geometry.poses import from_parts
 from drivers.errors import RefusedError
-from tests.unit.cell.measure.calibration.solve.test_results import (
-    BOARD,
-    FLANGE_FROM_CAMERA,
-    NOMINAL,
-    PRIORS,
-    RAIL,
-    observe,
-)
 
 
-@pytest.fixture(scope="module")
-def observations() -> list[TargetObservation]:
-    """Through one camera, the rail standing still."""
-    seen = [o for o in observe(np.random.default_rng(5), 30) if o.view is not None]
-    return [TargetObservation(o.view, o.base_from_flange * still(o.rail_position), o.name) for o in seen]
-
-
-def still(position: float) -> pin.SE3:
-    """What the flange would have moved to take the camera where the rail took it."""
-    return FLANGE_FROM_CAMERA * from_parts(position * RAIL) * FLANGE_FROM_CAMERA.inverse()
-
-
-def adjusted(observations: list[TargetObservation], larger: float) -> Joint:
-    """Of a board that is larger by that share than its name says."""
-    named = replace(BOARD, pitch=BOARD.pitch / (1.0 + larger))
+def adjusted(archived: Observations, larger: float) -> Joint:
+    """Of a board that is larger by that share than its name says, seen through one camera, without the rail."""
     made = []
-    for o in observations:
+    for o in archived.target:
+        named = replace(o.view.spec, pitch=o.view.spec.pitch / (1.0 + larger))
         made.append(replace(o, view=replace(o.view, spec=named, dot_radius=named.dot_radius)))
-    return adjust_target(made, NOMINAL, PRIORS)
+    return adjust_target(made, archived.target_camera, archived.priors)
 
 
-@pytest.mark.parametrize("larger", [0.0, 5.5e-3, -6.5e-3])
-def test_its_size_is_found_and_what_is_noted_is_stated(observations: list[TargetObservation], larger: float) -> None:
-    joint = adjusted(observations, larger)
-    assert joint.size is not None
+@pytest.mark.parametrize("larger", [0.0, 5.5e-3])
+def test_its_size_is_found_and_what_is_noted_is_stated(archived: Observations, larger: float) -> None:
+    joint = adjusted(archived, larger)
     assert joint.size.share == pytest.approx(larger, abs=1.5e-3)
     notes = joint.size.notes
     if not larger:
@@ -61,13 +38,10 @@ def test_its_size_is_found_and_what_is_noted_is_stated(observations: list[Target
 
 
 @pytest.mark.parametrize("larger", [0.01, -0.01])
-def test_one_of_another_size_is_refused_with_the_pitch_that_fits(
-    observations: list[TargetObservation], larger: float
-) -> None:
+def test_one_of_another_size_is_refused_with_the_pitch_that_fits(archived: Observations, larger: float) -> None:
     # Named so, the true pitch of 3 mm is the one that the refusal tells.
-    with pytest.raises(
-        RefusedError, match=r"large board is \d\.\d+ ± .*pitch would be (2\.99|3\.00|3\.01|3)\d* mm"
-    ) as told:
-        adjusted(observations, larger)
-    assert "[calibration.large]" in str(told.value)
-    assert abs(told.value.numbers[0].value) == pytest.approx(1.0, abs=0.2)
+    told = r"large board is \d\.\d+ ± .*pitch would be (2\.99|3\.00|3\.01|3)\d* mm"
+    with pytest.raises(RefusedError, match=told) as refused:
+        adjusted(archived, larger)
+    assert "[calibration.large]" in str(refused.value)
+    assert abs(refused.value.numbers[0].value) == pytest.approx(1.0, abs=0.2)

@@ -23,9 +23,8 @@ def test_what_is_not_known_of_a_rate_grows_with_the_time(placed_pot: JobRecord) 
     later = creep.carried(pose, times[0] + 4.0)
     np.testing.assert_allclose(later.covariance - pose.covariance, 9.0 * unsure, atol=1e-16)
     np.testing.assert_allclose(later.systematic - pose.systematic, 9.0 * unsure, atol=1e-16)
-    np.testing.assert_allclose(
-        difference(later.base_from_surface, pose.base_from_surface), 3.0 * creep.rate, atol=1e-12
-    )
+    crept = difference(later.base_from_surface, pose.base_from_surface)
+    np.testing.assert_allclose(crept, 3.0 * creep.rate, atol=1e-12)
     lines, rows = (each[::997] for each in np.nonzero(cloud.valid))
     moved = creep.motions(cloud, lines, rows, times)
     arms, seconds = cloud.points[lines, rows] - creep.origin, (times[lines] - creep.since)[:, None]

@@ -55,9 +55,8 @@ def planted(record: JobRecord, effect: str, seed: int) -> Cloud:
         geometry, made = sweep.swaths[0].builder.geometry, np.zeros(cloud.points.shape)
         line, row = np.nonzero(cloud.valid)
         at = np.column_stack([cloud.centres[line, row], row.astype(float)])
-        there, here = (
-            geometry.solve(at + shift, cloud.rail[line])[0] for shift in (px[line, row, None] * np.array([1, 0]), 0.0)
-        )
+        moved = at + px[line, row, None] * np.array([1, 0])
+        there, here = (geometry.solve(pixels, cloud.rail[line])[0] for pixels in (moved, at))
         made[line, row] = np.einsum("nij,nj->ni", cloud.flanges[line, :3, :3], there - here)
         return made
 
@@ -98,17 +97,13 @@ def planted(record: JobRecord, effect: str, seed: int) -> Cloud:
 
 def inverted(record: JobRecord, cloud: Cloud) -> tuple[pin.SE3, str]:
     """The pose by the job's step, and the text of the refusal, if it is one."""
-    job, nominal = pot()
-    made, sweep = record.results, record.results["laser_sweep"]
+    made, times = record.results, LineTimes(record.results["laser_sweep"].times, VEHICLE)
     assert record.kinematic is not None
     try:
         scan = replace(made["reconstruct"], cloud=cloud)
-        pose = step(
-            scan, made["board_photo"], job, nominal, record.kinematic, LineTimes(sweep.times, VEHICLE)
-        ).base_from_surface
+        return step(scan, made["board_photo"], *pot(), record.kinematic, times).base_from_surface, ""
     except RefusedError as refused:
         return refused.seen["pose"], str(refused)
-    return pose, ""
 
 
 def causes(record: JobRecord, cloud: Cloud, pose: pin.SE3) -> list[Cause]:

@@ -54,8 +54,7 @@ def scanned(roll: float, pitch: float, hz: float, seed: int = 0, times: np.ndarr
     for k in range(LINES):
         turn = pin.exp3(wave[k] * np.array([roll, pitch, 0.0]))
         points[k] = (points[k] - VEHICLE.translation) @ turn.T + VEHICLE.translation
-    spread = np.zeros((LINES, 90, 3), dtype=np.float32)
-    spread[:, :, 2] = NOISE
+    spread = np.broadcast_to(np.array([0.0, 0.0, NOISE], dtype=np.float32), points.shape)
     flanges = np.tile(np.eye(4), (LINES, 1, 1))
     return Cloud(points, spread, np.zeros((LINES, 3)), np.zeros((LINES, 90)), np.arange(LINES) * 5e-4,
                  np.zeros((LINES, 90), dtype=bool), flanges)  # fmt: skip
@@ -78,50 +77,48 @@ def test_each_sweep_rocks_by_itself() -> None:
         np.testing.assert_allclose(columns[k], expected, atol=1e-12)
 
 
+PRIOR = np.diag([1e-3**2] * 3 + [5e-3**2] * 3)
+
+
 def placed(cloud: Cloud, hz: float | None) -> pin.SE3:
-    prior = Prior(SURFACE, np.diag([1e-3**2] * 3 + [5e-3**2] * 3))
 
     def shaken(lines: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        assert hz is not None
         return rocking_motions(cloud, lines, rows, VEHICLE, TIMES, hz)
 
     sweeps = None if hz is None else shaken
     try:
-        return invert_pose(cloud, NOMINAL, prior, Tolerance(6e-4, 6e-3), sweeps=sweeps).base_from_surface
+        found = invert_pose(cloud, NOMINAL, Prior(SURFACE, PRIOR), Tolerance(6e-4, 6e-3), sweeps=sweeps)
+        return found.base_from_surface
     except RefusedError as refused:
         # Unexplained, it may bend the surface too much; that pose is where the looking begins.
         assert hz is None
-        pose = refused.seen["pose"]
-        assert isinstance(pose, pin.SE3)
-        return pose
+        return refused.seen["pose"]
 
 
 @pytest.mark.parametrize(("roll", "pitch", "hz"), [(0.0, 1e-4, 4.0), (7e-5, -7e-5, 2.7), (1e-4, 0.0, 9.3)])
 def test_rocking_is_seen_with_its_frequency_and_the_pose_is_freed_of_it(roll: float, pitch: float, hz: float) -> None:
     cloud = scanned(roll, pitch, hz)
     found = find_rocking(cloud, NOMINAL, placed(cloud, None), TIMES)
-    assert found is not None
     assert found.hz == pytest.approx(hz, abs=0.1)
     beside = SURFACE.translation - VEHICLE.translation
     assert found.height == pytest.approx(abs(roll * beside[1] - pitch * beside[0]), rel=0.25)
     before, after = (difference(placed(cloud, f), SURFACE) for f in (None, found.hz))
-    points = 0.03
-    assert np.linalg.norm(after[:3]) + points * np.linalg.norm(after[3:]) < 15e-6
+    # The surface reaches 30 mm from its middle.
+    assert np.linalg.norm(after[:3]) + 0.03 * np.linalg.norm(after[3:]) < 15e-6
     assert np.linalg.norm(after) <= np.linalg.norm(before) + 5e-6
 
 
 def test_a_vehicle_that_stands_is_not_said_to_rock() -> None:
-    for seed in range(4):
+    for seed in range(2):
         cloud = scanned(0.0, 0.0, 4.0, seed)
         assert find_rocking(cloud, NOMINAL, placed(cloud, None), TIMES) is None
 
 
-@pytest.mark.parametrize("slower", [1, 2, 4])
+@pytest.mark.parametrize("slower", [1, 4])
 def test_a_sweep_repeated_more_slowly_shows_the_same_frequency(slower: int) -> None:
     times = 512.0 + slower * TIMES
     found = find_rocking(scanned(0.0, 1e-4, 2.6, times=times), NOMINAL, SURFACE, times)
-    assert found is not None
-    assert found.hz == pytest.approx(2.6, abs=0.1)
+    assert found is not None and found.hz == pytest.approx(2.6, abs=0.1)
 
 
 @pytest.mark.parametrize("pause", [0.0, 5.13, -LINES / RATE])
@@ -130,36 +127,30 @@ def test_several_sweeps_have_a_phase_each(pause: float) -> None:
     # With -LINES / RATE the clock begins anew.
     clouds = [scanned(0.0, 1e-4, 4.0, 0), scanned(0.0, 1e-4, 4.0, 1, later + 0.125)]
     found = find_rocking(merge(clouds), NOMINAL, SURFACE, np.concatenate([TIMES, later]))
-    assert found is not None
-    assert found.hz == pytest.approx(4.0, abs=0.1)
+    assert found is not None and found.hz == pytest.approx(4.0, abs=0.1)
 
 
 def test_sweeps_that_lie_on_each_other_by_a_step_do_not_rock() -> None:
     clouds = [scanned(0.0, 0.0, 4.0, seed) for seed in range(3)]
-    clouds = [
-        replace(c, points=c.points + up * np.array([0, 0, 1])) for c, up in zip(clouds, (0, 6e-5, 0), strict=True)
-    ]
+    clouds[1].points[:, :, 2] += 6e-5
     times = np.concatenate([TIMES + 5.0 * k for k in range(3)])
     assert find_rocking(merge(clouds), NOMINAL, SURFACE, times) is None
 
 
-def test_times_that_tell_no_lines_apart_tell_of_no_rocking() -> None:
-    assert find_rocking(scanned(0.0, 1e-4, 4.0), NOMINAL, SURFACE, np.zeros(LINES)) is None
-
-
-@pytest.mark.parametrize("kept", [0, 20])
-def test_few_lines_tell_of_no_rocking(kept: int) -> None:
+@pytest.mark.parametrize(
+    ("kept", "times"), [(0, TIMES), (20, TIMES), (LINES, np.zeros(LINES))], ids=["none", "few", "no times"]
+)
+def test_few_lines_and_times_that_tell_none_apart_tell_of_no_rocking(kept: int, times: np.ndarray) -> None:
     cloud = scanned(0.0, 1e-4, 4.0)
     cloud.points[kept:] = np.nan
-    assert find_rocking(cloud, NOMINAL, SURFACE, TIMES) is None
+    assert find_rocking(cloud, NOMINAL, SURFACE, times) is None
 
 
 @pytest.mark.parametrize("times", [2, 3])
 def test_an_overtone_is_told_by_its_size(times: int) -> None:
     heights = 1e-5 * (np.sin(2 * np.pi * 2.0 * TIMES) + 0.4 * np.sin(2 * np.pi * 2.0 * times * TIMES + 0.3))
     sweep = _Sweep.of(TIMES, heights, np.outer(TIMES, [0.015, 0.0, 0.0]))
-    assert sweep is not None
-    assert sweep.overtones(2.0) == pytest.approx(0.4, abs=0.02)
+    assert sweep is not None and sweep.overtones(2.0) == pytest.approx(0.4, abs=0.02)
 
 
 def test_what_is_stated_for_the_moment_of_placing_is_the_mean_square() -> None:
@@ -200,16 +191,15 @@ def test_lands_and_ridges_are_not_taken_for_rocking() -> None:
     for seed, length in enumerate((6e-3, 9.5e-3)):
         cloud = worn(350e-6, length, sharp=True, seed=seed)
         assert find_rocking(cloud, NOMINAL, SURFACE, TIMES) is None
-        with pytest.raises(RefusedError, match=r"^(?!.*rocks)"):
-            inverted(cloud)
+    with pytest.raises(RefusedError, match=r"^(?!.*rocks)"):
+        inverted(cloud)
 
 
 def test_where_it_is_accepted_the_note_names_the_waves_that_look_the_same() -> None:
     (note,) = inverted(scanned(0.0, 3e-5, 4.0)).notes
     pace = 0.93 * np.ptp(NOMINAL.extent, axis=0)[0] / (LINES - 1) * RATE
     told = re.search(r"rocks, or the surface has waves of ([\d.]+) mm", note)
-    assert told is not None
-    assert float(told[1]) == pytest.approx(1e3 * pace / 4.0, rel=0.05)
+    assert told is not None and float(told[1]) == pytest.approx(1e3 * pace / 4.0, rel=0.05)
 
 
 def worn(height: float, length: float, *, sharp: bool = False, seed: int = 0) -> Cloud:
@@ -223,8 +213,7 @@ def worn(height: float, length: float, *, sharp: bool = False, seed: int = 0) ->
 def inverted(cloud: Cloud) -> PlacePose:
     """By the job's step, with a board that is where it is."""
     base_from_board = SURFACE * JOB.surface.place_from_surface.se3().inverse() * JOB.place_from_board
-    covariance = np.diag([1e-3**2] * 3 + [5e-3**2] * 3)
-    fix = BoardFix(base_from_board, covariance, 0.1, 0.0, ())
+    fix = BoardFix(base_from_board, PRIOR, 0.1, 0.0, ())
 
     def still(lines: np.ndarray, rows: np.ndarray) -> np.ndarray:
         return np.zeros((len(lines), 3, 1))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -56,7 +58,7 @@ def test_a_blurred_or_dark_board_is_found(blur, share):
     assert np.sqrt(np.mean((view.pixels - true_pixels(TARGET, pose, view)) ** 2)) < 0.1
 
 
-@pytest.mark.parametrize("distance", [0.8, 1.0, 1.3])
+@pytest.mark.parametrize("distance", [0.8, 1.3])
 def test_the_pose_is_right_and_its_covariance_honest(distance):
     pose = placed(LARGE, distance, 30)
     found = board_pose(find_board(photograph(TARGET, LARGE, pose), parse_board(LARGE)), model(TARGET))
@@ -72,33 +74,23 @@ def test_two_poses_that_fit_alike_are_refused():
     view = find_board(photograph(TARGET, LARGE, placed(LARGE, 1.0, 30)), parse_board(LARGE))
     pixels = camera.project(seen_centres(transform(pose, view.object_points), pose.rotation[:, 2], 5e-3))
     noisy = pixels + np.random.default_rng(1).normal(0, 0.5, pixels.shape)
-    doubtful = type(view)(view.spec, view.size, view.ids, noisy, view.sigma, False, view.dot_radius)
     with pytest.raises(PictureRefused) as refused:
-        board_pose(doubtful, camera)
+        board_pose(replace(view, pixels=noisy), camera)
     assert refused.value.reason is Reason.AMBIGUOUS
 
 
-def spoilt(kind: str) -> np.ndarray:
-    picture = photograph(TARGET, LARGE, placed(LARGE, 1.0, 30))
-    return {
-        "black": picture // 30,
-        "saturated": np.full_like(picture, 255),
-        "no_board": np.full_like(picture, 90),
-        "mirrored": np.ascontiguousarray(picture[:, ::-1]),
-    }[kind]
-
-
 @pytest.mark.parametrize(
-    ("kind", "reason"),
+    ("spoilt", "reason"),
     [
-        ("black", Reason.BLACK),
-        ("saturated", Reason.SATURATED),
-        ("no_board", Reason.NO_BOARD),
-        ("mirrored", Reason.MIRRORED),
+        (lambda picture: picture // 30, Reason.BLACK),
+        (lambda picture: np.full_like(picture, 255), Reason.SATURATED),
+        (lambda picture: np.full_like(picture, 90), Reason.NO_BOARD),
+        (lambda picture: np.ascontiguousarray(picture[:, ::-1]), Reason.MIRRORED),
     ],
+    ids=["black", "saturated", "no board", "mirrored"],
 )
-def test_a_useless_picture_is_refused_with_its_reason(kind, reason):
+def test_a_useless_picture_is_refused_with_its_reason(spoilt, reason):
     with pytest.raises(PictureRefused) as refused:
-        find_board(spoilt(kind), parse_board(LARGE))
+        find_board(spoilt(photograph(TARGET, LARGE, placed(LARGE, 1.0, 30))), parse_board(LARGE))
     assert refused.value.reason is reason
     assert len(str(refused.value)) > 20

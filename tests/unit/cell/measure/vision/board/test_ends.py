@@ -35,7 +35,6 @@ def view_of(name, kind, seed=0):
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        ("mirrored", "marked_dots"),
         ("mirrored", "charuco"),
         ("a smaller board instead", "marked_dots"),
         ("a larger board instead", "marked_dots"),

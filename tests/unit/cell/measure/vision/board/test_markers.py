@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ TAG, GAP = 80, 24
 TURN = np.array([[0.9, 0.1, 30], [-0.05, 0.8, 60], [1e-4, 2e-4, 1]])
 
 
+@cache
 def photograph(squares: bool) -> np.ndarray:
     """Six columns and five rows of tags, numbered from the last row up, warped by OpenCV at four times the size."""
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
@@ -84,8 +87,7 @@ def test_markers_beyond_the_named_board_propose_the_right_counts():
 
 
 def test_charuco_corners_are_read_also_in_part():
-    text = "charuco:8x6:15mm"
-    spec = parse_board(text)
+    spec = parse_board("charuco:8x6:15mm")
     dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
     drawn = cv2.aruco.CharucoBoard((8, 6), 0.015, 0.0105, dictionary).generateImage((800, 600), marginSize=0)
     picture = np.full((768, 1024), 180, np.uint8)

@@ -1,4 +1,4 @@
-"""Promises of the stripe extraction, on pictures drawn from a formula; how near to its bound: test_stripe_bound."""
+"""Promises of the stripe extraction, on pictures drawn from a formula; how near to its bound: `test_fit.py`."""
 
 from __future__ import annotations
 
@@ -16,16 +16,6 @@ def test_a_stripe_along_columns_is_that_along_rows_turned():
     rows, columns = extract(image), extract(np.ascontiguousarray(image.T), axis="columns")
     np.testing.assert_array_equal(rows.centres, columns.centres)
     np.testing.assert_array_equal(rows.pixels(), columns.pixels()[:, ::-1])
-
-
-def test_a_dark_frame_takes_the_scenery_away():
-    image, centres = draw(Cell(2.0, 100), SHAPE, 0)
-    scenery = np.zeros_like(image)
-    scenery[:, 50:90] = 120
-    lit = np.minimum(image.astype(int) + scenery, 255).astype(np.uint8)
-    profile = extract(lit, dark=scenery)
-    assert np.sqrt(np.nanmean((profile.centres - centres) ** 2)) < 0.05
-    assert profile.valid.all()
 
 
 def test_a_picture_without_a_stripe_has_no_centres():

@@ -10,12 +10,13 @@ from cell.measure.vision.stripe.profile import Mark
 from lab.bench.stripe.workshop import Scene, draw
 
 SHAPE = (384, 480)
+ROW_COLUMN = np.indices(SHAPE)
 
 
 def board(laser: float, seed: int, extra: float | np.ndarray = 0.0, ambient: float = 70.0):
     """A stripe (peak `laser` DN) across printed squares of albedo .3 and 1, blurred by the lens; the true centres."""
     rng = np.random.default_rng(seed)
-    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    row, column = ROW_COLUMN
     squares = (column * np.cos(0.5) + row * np.sin(0.5)) // 40 + (row * np.cos(0.5) - column * np.sin(0.5)) // 40
     centres = 240 + 0.13 * (np.arange(SHAPE[0]) - 192)
     stripe = laser * np.exp(-0.5 * ((column - centres[:, None]) / 1.7) ** 2)
@@ -40,7 +41,7 @@ def test_edges_of_the_albedo_are_marked_and_a_picture_without_the_laser_takes_th
 
 
 def test_a_second_line_is_marked_where_it_is_and_not_taken():
-    row, column = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    row, column = ROW_COLUMN
     second = 70 * np.exp(-0.5 * ((column - 300) / 2.5) ** 2) * ((row > 120) & (row < 250))
     image, centres = board(120, 3, second, ambient=5.0)
     profile = extract(image)

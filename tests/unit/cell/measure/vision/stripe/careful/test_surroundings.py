@@ -40,10 +40,9 @@ def scores(cell: Cell, seeds: range) -> np.ndarray:
 
 
 def test_a_spot_that_the_fit_absorbs_is_in_the_stated_deviation():
-    """In both pictures spots lie 1 to 4 px beside the stripe: their lines fit, and are off by up to 2 px."""
-    for cell in (Cell(2, 100), Cell(3, 100)):
-        score = scores(cell, range(2))
-        assert np.sqrt(np.mean(score**2)) < 1.3 and np.abs(score).max() < 5.0
+    """Spots lie 1 to 4 px beside the stripe: their lines fit, and are off by up to 2 px."""
+    score = scores(Cell(2, 100), range(2))
+    assert np.sqrt(np.mean(score**2)) < 1.3 and np.abs(score).max() < 5.0
 
 
 @pytest.mark.campaign

@@ -36,11 +36,11 @@ def test_in_a_stream_the_speckle_of_a_block_is_that_of_its_first_picture_with_a_
 
 def test_the_stated_deviation_is_true_with_the_speckle_of_an_earlier_picture():
     ratios = []
-    for seed in range(4):
-        pictures = [draw(Cell(2, 120, 0.2), (512, 384), 10 * seed + k) for k in range(BLOCK)]
+    for seed in range(3):
         stream = StripeStream()
-        for k, (image, centres) in enumerate(pictures):
+        stream.extract(draw(Cell(2, 120, 0.2), (512, 384), 10 * seed)[0])
+        for k in range(1, BLOCK, 2):
+            image, centres = draw(Cell(2, 120, 0.2), (512, 384), 10 * seed + k)
             profile = stream.extract(image)
-            if k > 0:
-                ratios.append(np.sqrt(np.mean((profile.centres - centres) ** 2) / np.mean(profile.sigma**2)))
+            ratios.append(np.sqrt(np.mean((profile.centres - centres) ** 2) / np.mean(profile.sigma**2)))
     assert 0.85 < np.mean(ratios) < 1.05
