@@ -38,8 +38,3 @@ def test_history_forgets_what_is_older_than_it_keeps() -> None:
         history.append(t, turned((0, 0, 0), (t, 0, 0)))
     assert history.at(0.0)[0, 3] == pytest.approx(4.0, abs=0.02)
     assert (history.at(4.005)[0, 3], history.at(4.985)[0, 3]) == (pytest.approx(4.005), pytest.approx(4.985))
-
-
-def test_an_empty_history_says_so() -> None:
-    with pytest.raises(LookupError, match="empty"):
-        History().at(0.0)

@@ -9,7 +9,6 @@ import struct
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import closing
 from typing import Any
 
 import can
@@ -19,7 +18,6 @@ from sim_backends import serve
 from sim_backends.clock import SteppedClock
 from sim_backends.serve import main
 from sim_backends.world.world import World
-from tests.support.simulator.rtde_client import Rtde
 
 pytestmark = pytest.mark.wire
 
@@ -37,7 +35,6 @@ class Served:
         )  # fmt: skip
         assert self.process.stdout is not None
         self.endpoints: dict[str, Any] = json.loads(self.process.stdout.readline())
-        self._ended: tuple[int, str] | None = None
 
     def ask_truth(self, **request: Any) -> dict[str, Any]:
         host, port = self.endpoints["truth"]["address"].split(":")
@@ -48,13 +45,11 @@ class Served:
 
     def end(self, number: signal.Signals | None = None) -> tuple[int, str]:
         """Send it a signal, or close its input; exit code and what it wrote to stderr."""
-        if self._ended is None:
-            if number is not None:
-                self.process.send_signal(number)
-                self.process.wait(15)
-            _, error = self.process.communicate(timeout=15)
-            self._ended = self.process.returncode, error
-        return self._ended
+        if number is not None:
+            self.process.send_signal(number)
+            self.process.wait(15)
+        _, error = self.process.communicate(timeout=15)
+        return self.process.returncode, error
 
     def close(self) -> None:
         if self.process.poll() is None:
@@ -128,23 +123,6 @@ def test_two_cells_share_no_endpoint_and_no_world(pair: tuple[Served, Served]) -
     assert truths[0]["poses"]["world_from_surface"] != truths[1]["poses"]["world_from_surface"]
 
 
-def test_switching_outputs_turns_the_laser_on_and_drops_the_part(served: Served) -> None:
-    before = served.ask_truth(op="truth")["truth"]
-    assert before["part"]["held"]
-    assert before["digital_outputs"][:2] == [False, True]
-    rtde = Rtde(served.endpoints["arm"]["address"])
-    recipe = rtde.ask("I", b"standard_digital_output_mask,standard_digital_output")[0]
-    for index, on in ((0, True), (1, False)):
-        rtde.notify(bytes([recipe, 1 << index, int(on) << index]))
-    # A request is answered in the period after its writes took effect.
-    rtde.ask("v")
-    rtde.ask("v")
-    after = served.ask_truth(op="truth")["truth"]
-    rtde.notify(bytes([recipe, 1, 0]))
-    rtde.socket.close()
-    assert after["laser_on"] and not after["part"]["held"]
-
-
 def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served) -> None:
     assert served.ask_truth(op="fault", name="arm.protective_stop")["ok"]
     assert served.ask_truth(op="truth")["truth"]["arm"]["safety"] == "protective_stop"
@@ -153,11 +131,6 @@ def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served
     refused = served.ask_truth(op="fault", name="arm.coffee")
     assert not refused["ok"]
     assert "arm.protective_stop" in refused["error"] and "can.bus_off" in refused["error"]
-
-
-def test_it_ends_with_its_input_so_that_it_cannot_outlive_its_owner() -> None:
-    with closing(Served()) as served:
-        assert served.end() == (0, "")
 
 
 @pytest.mark.parametrize(
@@ -181,9 +154,9 @@ def test_wrong_options_end_with_code_2_and_say_what_is_allowed(
     assert says in capsys.readouterr().err.splitlines()[-1]
 
 
-@pytest.mark.parametrize(("which", "number"), [(0, signal.SIGINT), (1, signal.SIGTERM)])
-def test_a_signal_ends_it_cleanly(pair: tuple[Served, Served], which: int, number: signal.Signals) -> None:
-    """The last of this file: it ends those that the others ask."""
+@pytest.mark.parametrize(("which", "number"), [(0, None), (1, signal.SIGTERM)], ids=["its input ends", "signal"])
+def test_it_ends_cleanly(pair: tuple[Served, Served], which: int, number: signal.Signals | None) -> None:
+    """It ends with its input so that it cannot outlive its owner. Those that were asked above end here."""
     assert pair[which].end(number) == (0, "")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from drivers.errors import DeviceFault, LimitError
+from drivers.errors import DeviceFault
 from drivers.interfaces import ArmSafety
 from tests.support.simulator.virtual_devices import CONFIG, ideal_cell
 
@@ -30,10 +30,3 @@ def test_a_protective_stop_is_unlocked_on_a_persons_word_after_its_delay_with_th
     with pytest.raises(DeviceFault) as caught:
         arm.recover(confirmed=True)
     assert (caught.value.code, caught.value.recoverable) == ("arm.emergency_stop", False)
-
-
-def test_an_output_or_input_that_there_is_not_is_refused_with_those_that_there_are():
-    arm = ideal_cell().arm
-    for ask in (lambda: arm.set_digital_output(18, True), lambda: arm.digital_input(-1)):
-        with pytest.raises(LimitError, match="does not exist: 0-7 standard, 8-15 configurable, 16-17 tool"):
-            ask()

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
 from sim_backends.models.arm import ArmModel, ArmParams, Power, Safety
-from sim_backends.models.arm_kinematics import UR10E_DH, matrix_from_pose, pose_error, pose_from_matrix
+from sim_backends.models.arm_kinematics import UR10E_DH, pose_error
 from sim_backends.models.arm_motion import JointMove, JointSpeed, LinearSpeed, Servo
 from tests.support.simulator.simulated_arm import TICK, finish, make_arm, pinocchio_flange, run
 
@@ -159,22 +159,3 @@ def test_an_emergency_stop_brakes_then_switches_off_until_it_is_cleared_and_powe
     assert arm.set_power(Power.RUNNING) and arm.ready
     run(arm, 0.5)
     assert arm.idle and not arm.moving
-
-
-def test_unknown_faults_and_inputs_are_refused() -> None:
-    arm = make_arm()
-    with pytest.raises(ValueError, match="protective_stop"):
-        arm.fault("lightning")
-    with pytest.raises(ValueError, match=r"0…17"):
-        arm.set_digital_input(18, True)
-
-
-def test_the_past_of_the_true_pose_can_be_asked_for() -> None:
-    arm = make_arm()
-    arm.start(JointSpeed(np.array([0.0, 0, 0, 0, 0, 0.5]), 40.0))
-    run(arm, 0.1)
-    between = arm.time - 1.5 * TICK
-    expected = arm.drive.q - [0, 0, 0, 0, 0, 0.5 * 1.5 * TICK]
-    np.testing.assert_allclose(arm.base_from_flange(between), pinocchio_flange(UR10E_DH, expected), atol=1e-9)
-    pose = pose_from_matrix(arm.base_from_flange(between))
-    np.testing.assert_allclose(matrix_from_pose(pose), arm.base_from_flange(between), atol=1e-12)

@@ -15,8 +15,6 @@ from sim_backends.models.arm import ArmModel, ArmParams
 from sim_backends.models.arm_kinematics import TABLES
 from sim_backends.peers.arm.ports import robot_mode, robot_state, version_message
 from tests.support.simulator.script_controller import Controller
-from tests.support.simulator.ur_client import dashboard
-from tests.support.wire.arm_bench import ArmBench
 
 pytestmark = pytest.mark.wire
 PARTS = [
@@ -109,16 +107,6 @@ def test_a_program_that_does_not_compile_is_told_as_a_controller_tells_it(addres
         error = next(package for package in told(primary) if package[4] == 20 and package[14] == 10)
     assert struct.unpack_from(">ii", error, 15) == (2, 3)
     assert error[23:] == b"compile_error_name_not_found:calldoesntexist:"
-
-
-def test_in_local_control_no_command_is_taken(address: str, running: ArmBench) -> None:
-    running.ask("local_control")
-    with socket.create_connection((address, 30001), timeout=5.0) as primary:
-        primary.sendall(b"power off\n")
-        heard = b""
-        while b"local control" not in heard:
-            heard += primary.recv(4096)
-    assert dashboard(address, "robotmode") == ["Robotmode: RUNNING"]
 
 
 def test_the_secondary_port_greets_with_packages_as_the_maker_describes_them(controller: Controller) -> None:

@@ -16,7 +16,6 @@ from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
 from tests.support import ROOT
 from tests.support.simulator.can_bus import message, open_bus, receive
-from tests.support.wire.clocks import until
 
 pytestmark = pytest.mark.wire
 DBC = ROOT / "drivers" / "vehicle" / "agilex_v2.dbc"
@@ -61,24 +60,6 @@ def test_feedback_means_the_same_in_the_shared_dbc(bus: can.BusABC, model: Vehic
     assert read["MotorDriver2"]["DriverStatus"] == 0x40
     assert state["BatteryVoltage"] == read["BatteryState"]["Voltage"] == read["MotorDriver1"]["Voltage"]
     assert state["BatteryVoltage"] == pytest.approx(26.4)
-
-
-def test_the_shared_dbc_commands_the_vehicle(bus: can.BusABC, model: VehicleModel, clock: WorldClock) -> None:
-    database = cantools.database.load_file(DBC)
-
-    def send(name: str, **signals: float) -> None:
-        entry = database.get_message_by_name(name)
-        bus.send(message(entry.frame_id, list(entry.encode(signals))))
-
-    send("ControlModeCommand", Mode=1)
-    end = clock.now() + 1.0
-    while clock.now() < end:
-        send("MotionCommand", Speed=-0.2, YawRate=0.1, LateralSpeed=0, Steering=0)
-        clock.sleep(0.02)
-    feedback = model.feedback(clock.now())
-    assert (feedback.speed, feedback.yaw_rate) == pytest.approx((-0.2, 0.1))
-    send("BrakeCommand", Locked=1)
-    until(clock, lambda: model.feedback(clock.now()).braked)
 
 
 @pytest.mark.parametrize(("speed", "fast", "slow"), [(1.0, 50, 50), (50.0, 200, 50)])

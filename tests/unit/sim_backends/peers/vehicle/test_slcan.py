@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import socket
 import struct
 from collections.abc import Iterator
@@ -37,23 +36,6 @@ def test_all_clients_share_the_bus(peer: AgilexPeer, bus: can.BusABC) -> None:
     bus.send(message(0x7AB, [1, 2, 3]))
     assert receive(other, lambda f: f.arbitration_id == 0x7AB).data == b"\x01\x02\x03"
     other.shutdown()
-
-
-def test_bus_off_ends_the_connection_and_it_can_be_opened_again(peer: AgilexPeer) -> None:
-    bus = open_bus(peer)
-    with pytest.raises(ValueError, match=r"can\.bus_off"):
-        peer.fault("can.nonsense")
-    # An adapter that was not accepted yet would not lose anything.
-    receive(bus, lambda f: f.arbitration_id == 0x211)
-    peer.fault("can.bus_off")
-    with pytest.raises(can.CanError):
-        receive(bus, lambda f: False)
-    # Closing it says goodbye to an adapter that is no longer there.
-    with contextlib.suppress(can.CanError):
-        bus.shutdown()
-    again = open_bus(peer)
-    receive(again, lambda f: f.arbitration_id == 0x211)
-    again.shutdown()
 
 
 def test_an_adapter_answers_as_the_lawicel_protocol_says(adapter: socket.socket, peer: AgilexPeer) -> None:

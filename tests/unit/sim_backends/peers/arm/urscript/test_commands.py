@@ -78,16 +78,6 @@ def test_a_circle_goes_past_its_via_point_and_on_after_a_pause(controller: Contr
     assert turned == pytest.approx(quarter if mode else 0.0, abs=2e-2 if mode else 1e-6)
 
 
-def test_points_of_a_circle_on_a_line_stop_the_arm(controller: Controller) -> None:
-    line = (
-        "here = get_actual_tcp_pose()",
-        "movec(pose_add(here, p[0,0,-0.05,0,0,0]), pose_add(here, p[0,0,-0.1,0,0,0]))",
-    )
-    controller.program.load(program(*line))
-    controller.cycles(20)
-    assert "lie on a line" in controller.model.fault_text
-
-
 def test_a_speed_that_nobody_repeats_and_a_killed_thread_come_to_rest(controller: Controller) -> None:
     controller.program.load(program("speedj([0.2, 0, 0, 0, 0, 0], 2.0, 0.3)", "sleep(1)"))
     controller.cycles(150)

@@ -99,10 +99,3 @@ def test_a_script_that_would_never_give_way_ends_and_the_controller_goes_on(
     controller.run(text, 60)
     assert reason in controller.failed()[-1]
     controller.run(program("sync()"))
-
-
-def test_a_function_changes_only_its_own_copy_of_a_list(controller: Controller) -> None:
-    controller.run(
-        "def program():\n  def f(a):\n    a[0] = 7\n  end\n  b = [1]\n  f(b)\n  textmsg(to_str(b[0]))\nend\n"
-    )
-    assert controller.said() == ["1"]
