@@ -1,7 +1,5 @@
 """The cell on the virtual clock without deviations, whose devices are looked at one by one."""
 
-from __future__ import annotations
-
 from cell.config.cell_config import load_config
 from cell.devices.simulated.direct import VirtualCell
 

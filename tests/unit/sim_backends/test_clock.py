@@ -1,7 +1,5 @@
 """The world's clock, and the recent past of moving bodies."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

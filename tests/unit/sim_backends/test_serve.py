@@ -1,7 +1,5 @@
 """The served simulated cell: one command, every endpoint, clean ends, and several at once."""
 
-from __future__ import annotations
-
 import json
 import signal
 import socket

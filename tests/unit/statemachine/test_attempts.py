@@ -1,7 +1,5 @@
 """A step is repeated or recovered as its policy says, from a cell that is known to stand; a person is asked first."""
 
-from __future__ import annotations
-
 import threading
 import time
 

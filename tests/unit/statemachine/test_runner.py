@@ -1,7 +1,5 @@
 """The runner: every run ends safe, with the outcome that its steps deserve, and everything is in the journal."""
 
-from __future__ import annotations
-
 import signal
 
 import pytest

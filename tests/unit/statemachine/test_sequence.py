@@ -1,7 +1,5 @@
 """The sequence: order, guards, and the two ways out of every state."""
 
-from __future__ import annotations
-
 import pytest
 
 from statemachine.sequence import JobState, JobTrigger, Sequence, SequenceError

@@ -1,7 +1,5 @@
 """The cell on the virtual clock whose devices the tests of this folder look at."""
 
-from __future__ import annotations
-
 import pytest
 
 from cell.devices.simulated.direct import VirtualCell

@@ -1,7 +1,5 @@
 """The arm in this process keeps an arm's promises."""
 
-from __future__ import annotations
-
 import pytest
 
 from drivers.errors import DeviceFault

@@ -1,7 +1,5 @@
 """The cameras in this process keep a camera's promises."""
 
-from __future__ import annotations
-
 import pytest
 
 from drivers.errors import DeadlineError

@@ -1,7 +1,5 @@
 """The rail in this process keeps a rail's promises."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

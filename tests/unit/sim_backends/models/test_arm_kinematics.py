@@ -1,7 +1,5 @@
 """Promises of `sim_backends.models.arm_kinematics`."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

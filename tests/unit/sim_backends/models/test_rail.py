@@ -1,7 +1,5 @@
 """The simulated rail's physics against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

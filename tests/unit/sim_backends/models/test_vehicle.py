@@ -1,7 +1,5 @@
 """The simulated vehicle's physics against closed forms."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Where compiled kernels are kept: those of the optics in their own folder, all others beside their files."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A relay board of four-byte commands, without its wire. The other boards have clients of their makers."""
 
-from __future__ import annotations
-
 from sim_backends.peers.switches import LcusPeer, RelayBoard
 
 

@@ -1,7 +1,5 @@
 """The truth endpoint, spoken to by a client of a few lines."""
 
-from __future__ import annotations
-
 import json
 import socket
 

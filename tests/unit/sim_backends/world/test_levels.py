@@ -1,7 +1,5 @@
 """The workshop's effects in the simulated world: each is off unless asked for, and as large as told."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Devices of any make behind the gate: once it is shut nothing begins; looking, stopping and closing still work."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, cast
 

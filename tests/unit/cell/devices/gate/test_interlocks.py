@@ -1,7 +1,5 @@
 """Each interlock refuses what it is for, over the simulated world: with its name, what was found, what to do next."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 

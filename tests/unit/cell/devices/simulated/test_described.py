@@ -3,8 +3,6 @@
 What is expected comes from the files' own numbers and closed forms, not from the code that reads them.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The commands of the control script, given by the real ur_rtde."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

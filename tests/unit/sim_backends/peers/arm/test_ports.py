@@ -1,7 +1,5 @@
 """What the script ports tell and take, for clients that are not ours."""
 
-from __future__ import annotations
-
 import socket
 import struct
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """The program memory without its network: pauses, safeguard, watchdog, secondary programs, outputs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

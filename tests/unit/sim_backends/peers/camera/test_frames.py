@@ -1,7 +1,5 @@
 """The simulated camera, spoken to by a client of a few lines written for this test."""
 
-from __future__ import annotations
-
 import json
 import socket
 import struct

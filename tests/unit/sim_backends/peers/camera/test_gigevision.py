@@ -1,7 +1,5 @@
 """What a GigE Vision camera says and keeps, against the standard's own pictures of the bytes."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The simulated Modbus drive without its line: registers as a map describes them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The simulated stepper module at its wire, driven by the vendor's own client."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 

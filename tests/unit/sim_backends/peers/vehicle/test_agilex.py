@@ -1,7 +1,5 @@
 """The simulated AgileX vehicle on its bus, through python-can and the shared DBC."""
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from typing import Any

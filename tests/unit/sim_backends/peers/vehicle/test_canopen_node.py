@@ -1,7 +1,5 @@
 """One CANopen node without its bus: what a master reads, writes and maps, and what happens when it stays away."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

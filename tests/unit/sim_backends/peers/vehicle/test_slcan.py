@@ -1,7 +1,5 @@
 """The adapters of the simulated bus, spoken to directly and through python-can."""
 
-from __future__ import annotations
-
 import socket
 import struct
 from collections.abc import Iterator

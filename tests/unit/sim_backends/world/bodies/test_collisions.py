@@ -1,7 +1,5 @@
 """Solid things stop each other in the simulated world, and the truth says what met what."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The part on the surface: forces of contact, where it comes to rest, and when the claw grips it."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

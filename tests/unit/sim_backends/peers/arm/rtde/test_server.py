@@ -1,7 +1,5 @@
 """The simulated controller under the real ur_rtde: stops, outputs, time, clients that misbehave."""
 
-from __future__ import annotations
-
 import socket
 import struct
 

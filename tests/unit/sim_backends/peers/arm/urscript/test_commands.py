@@ -1,7 +1,5 @@
 """URScript's commands that move the arm and ask it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

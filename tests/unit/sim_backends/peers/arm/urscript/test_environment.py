@@ -1,7 +1,5 @@
 """What a URScript program computes with: numbers, lists, texts, poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """A URScript program as it runs: its threads, its errors, and what ends one that would never give way."""
 
-from __future__ import annotations
-
 import pytest
 
 from sim_backends.peers.arm.program import RuntimeState

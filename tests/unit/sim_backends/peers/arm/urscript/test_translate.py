@@ -1,7 +1,5 @@
 """URScript as it is translated: control flow, what does not compile, texts that arrive in parts."""
 
-from __future__ import annotations
-
 import pytest
 
 from sim_backends.peers.arm.program import RuntimeState
