@@ -143,15 +143,6 @@ def test_a_described_filter_takes_its_share_of_the_laser_and_most_of_the_room(tm
     assert dark[1] < 0.2 * dark[0]
 
 
-def test_the_stripe_of_a_described_head_is_where_the_closed_form_puts_it(tmp_path: Path) -> None:
-    """x' = f (cot θ − l/Z), docs/explanation/theory.md, section 2, on the bare table at Z = 130 mm."""
-    camera = {"focal_length": '"6 mm"', "pixel": '"3.45 um"', "width": "800", "height": "600"}
-    laser = {"baseline": '"45 mm"', "tan_theta": "2.8"}
-    light = light_on(ideal(tmp_path, {"scan_camera": camera, "laser": laser}).world, (0.15, 0.0, 0.60))[100:500]
-    centres = (light * np.arange(800)).sum(axis=1) / light.sum(axis=1)
-    assert np.median(centres) == pytest.approx(399.5 + 0.006 / 3.45e-6 * (1 / 2.8 - 0.045 / 0.130), abs=0.1)
-
-
 def test_station_vehicle_and_arm_stand_where_job_and_configuration_put_them(tmp_path: Path) -> None:
     job = {
         "approach": {

@@ -71,18 +71,3 @@ def test_kinematics_answers_agree_with_an_independent_chain(arm: Client) -> None
 def test_a_pose_out_of_reach_ends_the_program_and_the_call_says_so(arm: Client) -> None:
     assert arm.control.getInverseKinematics([2.0, 0, 0, 0, 0, 0]) == []
     assert not arm.control.isProgramRunning() and not arm.control.moveJ(HOME.tolist(), 1.0, 1.0)
-
-
-def test_tool_and_payload_are_taken(arm: Client) -> None:
-    tool = [0.01, -0.02, 0.15, 0.0, 0.0, 0.3]
-    assert arm.control.setTcp(tool)
-    until(lambda: distance(se3(arm.receive.getActualTCPPose()), flange(HOME) * se3(tool)) < 1e-9)
-    np.testing.assert_allclose(arm.control.getTCPOffset(), tool, atol=1e-12)
-    target = arm.receive.getActualTCPPose()
-    target[5] += 0.1
-    assert arm.control.moveL(target, 0.5, 2.0)
-    until(lambda: distance(se3(arm.receive.getActualTCPPose()), se3(target)) < 1e-8)
-    assert arm.control.setPayload(3.5, [0.0, 0.01, 0.05])
-    until(lambda: arm.receive.getPayload() == pytest.approx(3.5))
-    np.testing.assert_allclose(arm.receive.getPayloadCog(), [0.0, 0.01, 0.05])
-    assert arm.control.zeroFtSensor()

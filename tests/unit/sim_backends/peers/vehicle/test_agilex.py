@@ -81,11 +81,3 @@ def test_feedback_keeps_its_cycles_and_does_not_flood_a_fast_world(speed: float,
     finally:
         bus.shutdown()
         peer.stop()
-
-
-def test_the_version_is_answered(bus: can.BusABC, model: VehicleModel) -> None:
-    bus.send(message(0x411, [1]))
-    assert receive(bus, lambda f: f.arbitration_id == 0x41A).data == struct.pack(">4H", *model.params.versions)
-    bus.send(message(0x4A1, [1]))
-    text = b"".join(receive(bus, lambda f: f.arbitration_id == 0x4A1).data for _ in range(10))
-    assert text.split() == [b"SIMULATED", b"HW2.1", b"CONTROLLER", b"204", b"DRIVERS", b"110"]
