@@ -62,7 +62,7 @@ def test_slip_is_seen_by_the_world_and_not_by_the_odometers() -> None:
 
 def test_the_random_walk_grows_with_the_root_of_the_way() -> None:
     headings = []
-    for seed in range(60):
+    for seed in range(30):
         model = vehicle(seed, yaw_walk=0.01)
         model.set_mode(0.0, Mode.CAN)
         drive(model, 0.0, 4.0, 0.5)

@@ -97,7 +97,7 @@ SAME_NAME_TWICE = "def program():\n  def f(a, a):\n  end\nend\n"
         NESTED,
         SAME_NAME_TWICE,
         program("x = " + "(" * 3000 + "1" + ")" * 3000),
-        program("x = " + "+".join(["1"] * 20000)),
+        program("x = " + "+".join(["1"] * 5000)),
         program("break"),
         program("3 = 3"),
     ],
