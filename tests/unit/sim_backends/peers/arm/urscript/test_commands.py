@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sim_backends.peers.arm.program import RuntimeState
-from tests.support.simulator.script_controller import TICK, Controller, program
+from tests.support.simulator.script_controller import Controller, program
 
 
 def test_moves_arrive_in_the_time_they_are_given(controller: Controller) -> None:
@@ -95,20 +95,3 @@ def test_a_watched_input_that_is_not_written_to_pauses_or_stops(
     assert controller.program.runtime_state is RuntimeState.PLAYING
     controller.cycles(60)
     assert controller.program.runtime_state is state
-
-
-def test_actual_values_are_those_of_the_arm(controller: Controller) -> None:
-    controller.run(
-        program(
-            "set_tcp(p[0, 0, 0.1, 0, 0, 0])",
-            "q = get_actual_joint_positions()",
-            "again = get_inverse_kin(get_forward_kin(q), q)",
-            "write_output_float_register(0, norm(again - q))",
-            "write_output_float_register(1, point_dist(get_actual_tcp_pose(), get_actual_tool_flange_pose()))",
-            "write_output_float_register(2, get_steptime())",
-        )
-    )
-    error, length, step = controller.registers.double_out[:3]
-    assert error < 1e-8
-    assert math.isclose(length, 0.1, abs_tol=1e-12)
-    assert step == TICK

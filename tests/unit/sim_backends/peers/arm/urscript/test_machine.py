@@ -37,16 +37,6 @@ end"""
     assert controller.program.runtime_state is RuntimeState.STOPPED
 
 
-def test_a_run_time_error_names_the_statement_that_brought_it_about(controller: Controller) -> None:
-    lines = ("def half(x):", "  y = 1", "  return y / x", "end", "a = 2", "if a == 3:", "  a = 4", "elif half(0) > 1:")
-    controller.run(program(*lines, "  a = 5", "end"))
-    (failed,) = [one for one in controller.program.announcements if one.kind == "failed"]
-    assert (failed.line, failed.column) == (4, 5) and "division by zero" in failed.words
-    controller.run(program("a = 1", "", "movej(p[10, 0, 0, 0, 0, 0])"))
-    failed = [one for one in controller.program.announcements if one.kind == "failed"][-1]
-    assert (failed.line, failed.column) == (4, 3) and "no solution" in failed.words
-
-
 @pytest.mark.parametrize(
     ("line", "reason"),
     [
