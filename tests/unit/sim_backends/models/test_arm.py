@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.arm import ArmModel, ArmParams, Power, Safety
+from sim_backends.models.arm import ArmModel, ArmParams, Safety
 from sim_backends.models.arm_kinematics import UR10E_DH, pose_error
 from sim_backends.models.arm_motion import JointMove, JointSpeed, LinearSpeed, Servo
 from tests.support.simulator.simulated_arm import TICK, finish, make_arm, pinocchio_flange, run
@@ -144,18 +144,3 @@ def test_a_protective_stop_can_be_unlocked_after_its_delay_and_the_motion_resume
     arm.resume()
     finish(arm)
     np.testing.assert_array_equal(arm.drive.q, target)
-
-
-def test_an_emergency_stop_brakes_then_switches_off_until_it_is_cleared_and_powered() -> None:
-    arm = make_arm()
-    arm.start(JointMove(arm.drive.q + 0.5, 0.5, 1.0))
-    run(arm, 0.5)
-    arm.fault("emergency_stop")
-    run(arm, 0.5)
-    assert (arm.safety, arm.power, arm.moving) == (Safety.EMERGENCY_STOP, Power.OFF, False)
-    assert not arm.set_power(Power.RUNNING)
-    arm.clear()
-    assert (arm.safety, arm.power, arm.ready) == (Safety.NORMAL, Power.OFF, False)
-    assert arm.set_power(Power.RUNNING) and arm.ready
-    run(arm, 0.5)
-    assert arm.idle and not arm.moving

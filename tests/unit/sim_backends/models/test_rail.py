@@ -14,19 +14,6 @@ def rail(seed: int = 1, **params: object) -> RailModel:
     return RailModel(RailParams(**params), np.random.default_rng(seed))  # type: ignore[arg-type]
 
 
-def test_a_move_takes_the_time_of_its_trapezoid() -> None:
-    model = rail()
-    model.set_position(0.0, 0)
-    model.configure(0.0, RailSettings(max_velocity=5 * STEPS, max_acceleration=20 * STEPS))
-    model.move_to(1.0, 10 * STEPS)
-    arrival = 1.0 + 10.0 / 5.0 + 5.0 / 20.0
-    assert not model.reached(arrival - 1e-3) and model.reached(arrival + 1e-9)
-    assert model.velocity(2.0) == 5 * STEPS
-    start = model.carriage(1.0)
-    assert model.carriage(2.0) - start == pytest.approx(LEAD * (5.0 * 0.875), abs=1e-12)
-    assert model.carriage(9.0) - start == pytest.approx(10 * LEAD, abs=1e-12)
-
-
 def test_a_stop_on_the_way_ends_the_motion_on_the_ramp_and_the_past_stays_as_it_was() -> None:
     model = rail()
     model.configure(0.0, RailSettings(max_velocity=5 * STEPS, max_acceleration=20 * STEPS))
@@ -77,11 +64,3 @@ def test_a_limit_switch_stops_the_motor_at_once_or_on_the_ramp(soft: bool) -> No
     beyond = LEAD * 5.0**2 / (2 * 20.0) if soft else 0.0
     assert model.carriage(29.0) == pytest.approx(0.102 + beyond, abs=1e-9)
     assert not model.stalled(29.0)
-
-
-@pytest.mark.parametrize(("mode", "turns"), [(1, 0), (2, 52), (3, 52), (6, 0)])
-def test_a_search_of_both_switches_finds_their_distance(mode: int, turns: int) -> None:
-    model = rail()
-    model.configure(0.0, RailSettings(search_mode=mode))
-    model.search(0.0)
-    assert model.switch_distance() == turns * STEPS
