@@ -3,7 +3,6 @@
 What is expected comes from the files' own numbers and closed forms, not from the code that reads them.
 """
 
-import math
 import time
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from cell import Cell
 from cell.check.fit import require_fit
@@ -39,13 +39,7 @@ def ideal(folder: Path, config: Changes | None = None, job: Changes | None = Non
 
 
 def about(axis: str, degrees: float) -> np.ndarray:
-    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
-    turns = {
-        "x": [[1, 0, 0], [0, c, -s], [0, s, c]],
-        "y": [[c, 0, s], [0, 1, 0], [-s, 0, c]],
-        "z": [[c, -s, 0], [s, c, 0], [0, 0, 1]],
-    }
-    return np.array(turns[axis])
+    return np.asarray(Rotation.from_euler(axis, degrees, degrees=True).as_matrix())
 
 
 def light_on(world: World, place: tuple[float, float, float]) -> np.ndarray:
