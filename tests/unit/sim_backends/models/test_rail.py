@@ -64,3 +64,11 @@ def test_a_limit_switch_stops_the_motor_at_once_or_on_the_ramp(soft: bool) -> No
     beyond = LEAD * 5.0**2 / (2 * 20.0) if soft else 0.0
     assert model.carriage(29.0) == pytest.approx(0.102 + beyond, abs=1e-9)
     assert not model.stalled(29.0)
+
+
+@pytest.mark.parametrize(("mode", "turns"), [(1, 0), (2, 52), (3, 52), (6, 0)])
+def test_a_search_of_both_switches_finds_their_distance(mode: int, turns: int) -> None:
+    model = rail()
+    model.configure(0.0, RailSettings(search_mode=mode))
+    model.search(0.0)
+    assert model.switch_distance() == turns * STEPS

@@ -97,6 +97,24 @@ def client(peer: FramePeer) -> Iterator[Client]:
     client.socket.close()
 
 
+def test_a_frame_is_stamped_by_the_devices_clock_a_latency_after_its_exposure_began(clock: WorldClock) -> None:
+    middles: list[float] = []
+
+    def render(t_mid: float, exposure: float) -> NDArray[np.uint8]:
+        middles.append(t_mid)
+        return np.zeros((48, 64), np.uint8)
+
+    peer = FramePeer("scan", clock, render, SPEC)
+    peer.start()
+    client = Client(peer.address)
+    client.ask(op="configure", exposure_s=0.01, frame_rate_hz=50.0)
+    client.ask(op="trigger")
+    began = (1e-9 * client.frame()["device_ns"] - SPEC.epoch) / (1.0 + 1e-6 * SPEC.drift_ppm) - SPEC.latency
+    peer.stop()
+    client.socket.close()
+    assert middles == [pytest.approx(began + 0.005, abs=1e-6)]
+
+
 def test_slow_rendering_drops_exposures_beyond_the_backlog_and_says_so(
     client: Client, shutter: threading.Event, clock: WorldClock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
