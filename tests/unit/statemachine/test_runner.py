@@ -5,7 +5,7 @@ import signal
 import pytest
 
 from drivers.clock import Clock
-from statemachine.journal import read
+from statemachine.journal import JournalError, read
 from statemachine.runner import Again, Runner, Script
 from statemachine.sequence import Sequence
 from statemachine.step import Outcome
@@ -296,3 +296,16 @@ def test_a_recovery_that_fails_alone_is_stopped_after(tmp_path):
     result = bench.runner.run_alone()
     assert "the recovery failed: jammed" in result.end.reason
     assert [line.split(":")[0] for line in bench.log] == ["place", "stop", "stop"]
+
+
+@pytest.mark.parametrize(("error", "end"), [(None, None), (ValueError("no"), "no")], ids=["done", "failed"])
+def test_a_step_alone_ends_as_it_did_though_that_cannot_be_written_down(tmp_path, error, end):
+    def work(context):
+        bench.runner.journal.close()
+        return failing(*[error] if error else [])(context)
+
+    bench = alone(tmp_path, work)
+    result = bench.runner.run_alone()
+    assert isinstance(result.unrecorded, JournalError)
+    assert (result.end and result.end.reason) == end
+    assert result.made == (None if error else "made in attempt 1")
