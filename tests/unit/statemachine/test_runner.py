@@ -270,7 +270,7 @@ def alone(folder, work=None):
 def test_a_step_alone_that_succeeds_leaves_the_cell_and_the_run_as_they_are(tmp_path):
     bench = alone(tmp_path)
     result = bench.runner.run_alone()
-    assert (result.made, result.end) == ("made by place", None)
+    assert (result.made, result.end, result.judged) == ("made by place", None, None)
     assert bench.log == ["place"]
     assert not bench.control.over
 
@@ -279,6 +279,7 @@ def test_after_a_step_alone_that_fails_the_cell_is_brought_to_rest_once(tmp_path
     bench = alone(tmp_path, failing(ValueError("no")))
     result = bench.runner.run_alone()
     assert (result.end.outcome, result.end.reason, str(result.error)) == (Outcome.REFUSED, "no", "no")
+    assert result.judged.reason == "no"
     assert bench.log == ["place", "stop: place failed"]
 
 

@@ -18,12 +18,10 @@ Array = NDArray[np.float64]
 @pytest.mark.parametrize(
     ("name", "fastest"),
     [
-        ("UR3e", (180, 180, 180, 360, 360, 360)),
-        ("UR5e", (180, 180, 180, 180, 180, 180)),
-        ("UR10e", (120, 120, 180, 180, 180, 180)),
-        ("UR30", (120, 120, 150, 210, 210, 210)),
+        ("UR3e", (180, 180, 180, 360, 360, 360)), ("UR5e", (180, 180, 180, 180, 180, 180)),
+        ("UR10e", (120, 120, 180, 180, 180, 180)), ("UR30", (120, 120, 150, 210, 210, 210)),
     ],
-)
+)  # fmt: skip
 def test_each_models_joints_turn_as_fast_as_the_maker_says_and_no_faster(name: str, fastest: tuple[float, ...]) -> None:
     for joint, limit in enumerate(fastest):
         model = ArmModel(ArmParams.of(name), np.random.default_rng(3), WorldClock())
