@@ -123,6 +123,19 @@ def test_parameters_are_kept_and_range_checked(module: TMCM1260, client: SerialT
         assert refusal.value.status_code == status
 
 
+def test_a_locked_eeprom_refuses_to_store(module: TMCM1260) -> None:
+    axis = module.motors[0]
+    axis.set_axis_parameter(axis.AP.MaxCurrent, 77)
+    module.store_axis_parameter(axis.AP.MaxCurrent, 0)
+    axis.set_axis_parameter(axis.AP.MaxCurrent, 10)
+    module.restore_axis_parameter(axis.AP.MaxCurrent, 0)
+    assert axis.get_axis_parameter(axis.AP.MaxCurrent) == 77
+    module.set_global_parameter(73, 0, 1234)
+    with pytest.raises(TMCLReplyStatusError) as refusal:
+        module.store_axis_parameter(axis.AP.MaxCurrent, 0)
+    assert refusal.value.status_code == 5
+
+
 def test_garbage_parts_and_foreign_addresses_do_no_harm(peer: TmclPeer, port: serial.SerialBase) -> None:
     port.write(b"\xff" * 5)
     WorldClock().sleep(0.2)
