@@ -1,7 +1,5 @@
 """What tests share: benches, scenes, runs that ended, peers of others. Nothing here is a test."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from pathlib import Path

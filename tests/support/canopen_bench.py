@@ -1,7 +1,5 @@
 """The CANopen vehicle's driver and its simulated drives on a bus inside this process."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections.abc import Iterator

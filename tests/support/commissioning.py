@@ -3,8 +3,6 @@
 The world is built from one configuration, the product works with another: it knows the truth from its devices alone.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Cells and jobs that are described otherwise than those that ship: files of their own, changed in a few values."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

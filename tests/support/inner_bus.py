@@ -1,7 +1,5 @@
 """What the tests of both vehicles share: a clock moved by hand, a CAN bus in this process, a vehicle driven over it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -5,8 +5,6 @@ long where the surface bends in one direction only, so that the seat's edges sta
 put every facet of a dome below it. Heights of least squares leave facets on both sides: a place pose sees their mean.
 """
 
-from __future__ import annotations
-
 from importlib.resources import files
 from pathlib import Path
 

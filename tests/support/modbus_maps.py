@@ -1,7 +1,5 @@
 """Register maps of two drives that have nothing in common, as they stand in `cell.toml`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 PATHS: dict[str, Any] = {

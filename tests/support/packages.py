@@ -1,7 +1,5 @@
 """Packages as an installer leaves them: modules beside a dist-info folder that names their entry points."""
 
-from __future__ import annotations
-
 import textwrap
 from pathlib import Path
 

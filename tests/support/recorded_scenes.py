@@ -1,7 +1,5 @@
 """Frames as if recorded, made by OpenCV's projection and by nothing of this project: boards, stripes, flange poses."""
 
-from __future__ import annotations
-
 import os
 import warnings
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A runner on a journal in a folder, whose steps a test sets: for tests of the runner, attempts and the watch."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 

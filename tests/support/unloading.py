@@ -1,7 +1,5 @@
 """Loading and unloading: whole virtual jobs that take a part from its nest or its surface."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

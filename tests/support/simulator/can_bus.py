@@ -1,7 +1,5 @@
 """Frames on the simulated vehicle's bus, through python-can."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import can

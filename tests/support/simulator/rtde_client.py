@@ -1,7 +1,5 @@
 """An RTDE client that knows nothing of the simulated arm's code."""
 
-from __future__ import annotations
-
 import socket
 import struct
 

@@ -1,7 +1,5 @@
 """A simulated arm, its program memory and their common tick, without a network."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim_backends.clock import WorldClock

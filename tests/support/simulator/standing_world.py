@@ -1,7 +1,5 @@
 """A world whose arm stands wherever a test wants it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim_backends.world import drawing

@@ -3,8 +3,6 @@
 ur_rtde's constructors hold the interpreter's lock, and it does not survive the loss of its link: the arm outlives it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

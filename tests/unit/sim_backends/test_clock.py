@@ -1,18 +1,10 @@
 """The world's clock, and the recent past of moving bodies."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from sim_backends.clock import History, WorldClock
 from tests.support.simulator.optics_scene import pose as turned
-
-
-@pytest.mark.parametrize("speed", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_clock_refuses_a_speed_that_does_not_advance(speed: float) -> None:
-    with pytest.raises(ValueError, match="greater than 0"):
-        WorldClock(speed)
 
 
 def test_a_fast_clock_reaches_a_time_that_many_times_sooner() -> None:
@@ -38,8 +30,3 @@ def test_history_forgets_what_is_older_than_it_keeps() -> None:
         history.append(t, turned((0, 0, 0), (t, 0, 0)))
     assert history.at(0.0)[0, 3] == pytest.approx(4.0, abs=0.02)
     assert (history.at(4.005)[0, 3], history.at(4.985)[0, 3]) == (pytest.approx(4.005), pytest.approx(4.985))
-
-
-def test_an_empty_history_says_so() -> None:
-    with pytest.raises(LookupError, match="empty"):
-        History().at(0.0)

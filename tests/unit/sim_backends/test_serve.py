@@ -1,30 +1,21 @@
-"""The served simulated cell: one command, every endpoint, clean ends, and several at once."""
-
-from __future__ import annotations
+"""The served simulated cell: one command, clean ends, and several at once. Drivers speak with its devices elsewhere."""
 
 import json
 import signal
 import socket
-import struct
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import closing
 from typing import Any
 
-import can
 import pytest
 
 from sim_backends import serve
 from sim_backends.clock import SteppedClock
 from sim_backends.serve import main
 from sim_backends.world.world import World
-from tests.support.simulator.rtde_client import Rtde
 
 pytestmark = pytest.mark.wire
-
-
-SERVE = [sys.executable, "-m", "sim_backends.serve"]
 
 
 class Served:
@@ -32,12 +23,11 @@ class Served:
 
     def __init__(self, *options: str) -> None:
         self.process = subprocess.Popen(
-            [*SERVE, "--json", "--exit-with-stdin", *options], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE, text=True,
+            [sys.executable, "-m", "sim_backends.serve", "--json", "--exit-with-stdin", *options],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         assert self.process.stdout is not None
         self.endpoints: dict[str, Any] = json.loads(self.process.stdout.readline())
-        self._ended: tuple[int, str] | None = None
 
     def ask_truth(self, **request: Any) -> dict[str, Any]:
         host, port = self.endpoints["truth"]["address"].split(":")
@@ -48,18 +38,11 @@ class Served:
 
     def end(self, number: signal.Signals | None = None) -> tuple[int, str]:
         """Send it a signal, or close its input; exit code and what it wrote to stderr."""
-        if self._ended is None:
-            if number is not None:
-                self.process.send_signal(number)
-                self.process.wait(15)
-            _, error = self.process.communicate(timeout=15)
-            self._ended = self.process.returncode, error
-        return self._ended
-
-    def close(self) -> None:
-        if self.process.poll() is None:
-            self.process.kill()
-            self.process.communicate(timeout=15)
+        if number is not None:
+            self.process.send_signal(number)
+            self.process.wait(15)
+        _, error = self.process.communicate(timeout=15)
+        return self.process.returncode, error
 
 
 @pytest.fixture(scope="module")
@@ -68,54 +51,13 @@ def pair() -> Iterator[tuple[Served, Served]]:
     b = Served("--seed", "4", "--surface", "seat", "--level", "ideal", "--speed", "2")
     yield a, b
     for served in (a, b):
-        served.close()
+        served.process.kill()
+        served.process.communicate(timeout=15)
 
 
 @pytest.fixture
 def served(pair: tuple[Served, Served]) -> Served:
     return pair[0]
-
-
-def camera_request(address: str, operation: str) -> dict[str, Any]:
-    host, port = address.split(":")
-    with socket.create_connection((host, int(port)), 5.0) as connection:
-        text = json.dumps({"op": operation, "id": 1}).encode()
-        connection.sendall(b"CFS1" + struct.pack(">II", len(text), 0) + text)
-        stream = connection.makefile("rb")
-        magic, length, _ = struct.unpack(">4sII", stream.read(12))
-        assert magic == b"CFS1"
-        reply: dict[str, Any] = json.loads(stream.read(length))
-    return reply
-
-
-def test_every_device_answers_at_its_endpoint_in_its_own_protocol(served: Served) -> None:
-    endpoints = served.endpoints
-    scan = camera_request(endpoints["scan_camera"]["address"], "identify")
-    target = camera_request(endpoints["target_camera"]["address"], "identify")
-    assert (scan["width"], scan["height"], scan["serial"]) == (640, 480, "SIM0000031-SCAN")
-    assert (target["width"], target["height"], target["serial"]) == (1280, 1024, "SIM0000031-TARGET")
-
-    host, port = endpoints["rail"]["url"].removeprefix("socket://").split(":")
-    with socket.create_connection((host, int(port)), 5.0) as rail:
-        request = bytes([1, 6, 1, 0, 0, 0, 0, 0])
-        rail.sendall(request + bytes([sum(request) & 0xFF]))
-        reply = rail.makefile("rb").read(9)
-    assert reply[2:4] == bytes([100, 6])
-
-    with socket.create_connection((endpoints["arm"]["address"], 29999), 5.0) as dashboard:
-        lines = dashboard.makefile("rw", newline="\n")
-        assert "Dashboard Server" in lines.readline()
-        lines.write("robotmode\n")
-        lines.flush()
-        assert lines.readline().strip() == "Robotmode: RUNNING"
-
-    vehicle = endpoints["vehicle"]
-    with can.Bus(interface=vehicle["interface"], channel=vehicle["channel"], sleep_after_open=0) as bus:
-        seen = set()
-        while 0x211 not in seen:
-            message = bus.recv(2.0)
-            assert message is not None, f"no system state among {seen}"
-            seen.add(message.arbitration_id)
 
 
 def test_two_cells_share_no_endpoint_and_no_world(pair: tuple[Served, Served]) -> None:
@@ -128,23 +70,6 @@ def test_two_cells_share_no_endpoint_and_no_world(pair: tuple[Served, Served]) -
     assert truths[0]["poses"]["world_from_surface"] != truths[1]["poses"]["world_from_surface"]
 
 
-def test_switching_outputs_turns_the_laser_on_and_drops_the_part(served: Served) -> None:
-    before = served.ask_truth(op="truth")["truth"]
-    assert before["part"]["held"]
-    assert before["digital_outputs"][:2] == [False, True]
-    rtde = Rtde(served.endpoints["arm"]["address"])
-    recipe = rtde.ask("I", b"standard_digital_output_mask,standard_digital_output")[0]
-    for index, on in ((0, True), (1, False)):
-        rtde.notify(bytes([recipe, 1 << index, int(on) << index]))
-    # A request is answered in the period after its writes took effect.
-    rtde.ask("v")
-    rtde.ask("v")
-    after = served.ask_truth(op="truth")["truth"]
-    rtde.notify(bytes([recipe, 1, 0]))
-    rtde.socket.close()
-    assert after["laser_on"] and not after["part"]["held"]
-
-
 def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served) -> None:
     assert served.ask_truth(op="fault", name="arm.protective_stop")["ok"]
     assert served.ask_truth(op="truth")["truth"]["arm"]["safety"] == "protective_stop"
@@ -153,11 +78,6 @@ def test_faults_are_caused_and_taken_away_over_the_truth_endpoint(served: Served
     refused = served.ask_truth(op="fault", name="arm.coffee")
     assert not refused["ok"]
     assert "arm.protective_stop" in refused["error"] and "can.bus_off" in refused["error"]
-
-
-def test_it_ends_with_its_input_so_that_it_cannot_outlive_its_owner() -> None:
-    with closing(Served()) as served:
-        assert served.end() == (0, "")
 
 
 @pytest.mark.parametrize(
@@ -181,9 +101,9 @@ def test_wrong_options_end_with_code_2_and_say_what_is_allowed(
     assert says in capsys.readouterr().err.splitlines()[-1]
 
 
-@pytest.mark.parametrize(("which", "number"), [(0, signal.SIGINT), (1, signal.SIGTERM)])
-def test_a_signal_ends_it_cleanly(pair: tuple[Served, Served], which: int, number: signal.Signals) -> None:
-    """The last of this file: it ends those that the others ask."""
+@pytest.mark.parametrize(("which", "number"), [(0, None), (1, signal.SIGTERM)], ids=["its input ends", "signal"])
+def test_it_ends_cleanly(pair: tuple[Served, Served], which: int, number: signal.Signals | None) -> None:
+    """It ends with its input so that it cannot outlive its owner. Those that were asked above end here."""
     assert pair[which].end(number) == (0, "")
 
 

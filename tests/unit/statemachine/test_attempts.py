@@ -1,7 +1,5 @@
 """A step is repeated or recovered as its policy says, from a cell that is known to stand; a person is asked first."""
 
-from __future__ import annotations
-
 import threading
 import time
 
@@ -23,6 +21,8 @@ def test_a_named_exception_is_retried_from_a_cell_at_rest(tmp_path):
     stops = ["stop: board_photo failed", "stop: before board_photo is tried again"]
     assert bench.log[start : start + 7] == ["board_photo", *stops, "board_photo", *stops, "board_photo"]
     assert [row.state for row in bench.record.steps if row.name == "board_photo"] == ["failed", "failed", "done"]
+    changes = [(event.data["from"], event.data["to"]) for event in bench.record.events if event.kind == "state"]
+    assert changes.count(("board_photo", "board_photo")) == 2
 
 
 @pytest.mark.parametrize(("error", "tries"), [(TimeoutError("no frame"), 3), (OSError("broken"), 1)])

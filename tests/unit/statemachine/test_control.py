@@ -1,7 +1,5 @@
 """Promises of `statemachine.control`."""
 
-from __future__ import annotations
-
 import signal
 import threading
 import time

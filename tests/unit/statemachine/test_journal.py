@@ -1,7 +1,5 @@
 """The journal: what was written is there, whatever happened to the writer."""
 
-from __future__ import annotations
-
 import signal
 import sqlite3
 import subprocess

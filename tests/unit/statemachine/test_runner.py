@@ -1,13 +1,11 @@
 """The runner: every run ends safe, with the outcome that its steps deserve, and everything is in the journal."""
 
-from __future__ import annotations
-
 import signal
 
 import pytest
 
 from drivers.clock import Clock
-from statemachine.journal import read
+from statemachine.journal import JournalError, read
 from statemachine.runner import Again, Runner, Script
 from statemachine.sequence import Sequence
 from statemachine.step import Outcome
@@ -272,7 +270,7 @@ def alone(folder, work=None):
 def test_a_step_alone_that_succeeds_leaves_the_cell_and_the_run_as_they_are(tmp_path):
     bench = alone(tmp_path)
     result = bench.runner.run_alone()
-    assert (result.made, result.end) == ("made by place", None)
+    assert (result.made, result.end, result.judged) == ("made by place", None, None)
     assert bench.log == ["place"]
     assert not bench.control.over
 
@@ -281,6 +279,7 @@ def test_after_a_step_alone_that_fails_the_cell_is_brought_to_rest_once(tmp_path
     bench = alone(tmp_path, failing(ValueError("no")))
     result = bench.runner.run_alone()
     assert (result.end.outcome, result.end.reason, str(result.error)) == (Outcome.REFUSED, "no", "no")
+    assert result.judged.reason == "no"
     assert bench.log == ["place", "stop: place failed"]
 
 
@@ -298,3 +297,16 @@ def test_a_recovery_that_fails_alone_is_stopped_after(tmp_path):
     result = bench.runner.run_alone()
     assert "the recovery failed: jammed" in result.end.reason
     assert [line.split(":")[0] for line in bench.log] == ["place", "stop", "stop"]
+
+
+@pytest.mark.parametrize(("error", "end"), [(None, None), (ValueError("no"), "no")], ids=["done", "failed"])
+def test_a_step_alone_ends_as_it_did_though_that_cannot_be_written_down(tmp_path, error, end):
+    def work(context):
+        bench.runner.journal.close()
+        return failing(*[error] if error else [])(context)
+
+    bench = alone(tmp_path, work)
+    result = bench.runner.run_alone()
+    assert isinstance(result.unrecorded, JournalError)
+    assert (result.end and result.end.reason) == end
+    assert result.made == (None if error else "made in attempt 1")

@@ -1,7 +1,5 @@
 """The sequence: order, guards, and the two ways out of every state."""
 
-from __future__ import annotations
-
 import pytest
 
 from statemachine.sequence import JobState, JobTrigger, Sequence, SequenceError
@@ -10,26 +8,20 @@ STEPS = ("drive_to_target", "board_photo", "laser_sweep", "reconstruct", "invert
 STATES = [state for state in JobState if state is not JobState.DONE]
 
 
+WAYS = {
+    JobState.IDLE: (), JobState.REFUSED: (JobTrigger.REFUSE,), JobState.ABORTED: (JobTrigger.ABORT,),
+    JobState.PAUSED: (JobTrigger.START, JobTrigger.PAUSE), JobState.FAULTED: (JobTrigger.START, JobTrigger.FAULT),
+    JobState.RECOVERING: (JobTrigger.START, JobTrigger.FAULT, JobTrigger.RECOVER),
+    JobState.MISPLACED: (JobTrigger.START, JobTrigger.MISPLACE),
+}  # fmt: skip
+
+
 def at(state: str) -> Sequence:
     """A sequence that was led to `state` along its own transitions."""
     sequence = Sequence(STEPS)
-    if state is JobState.IDLE:
-        return sequence
-    if state is JobState.REFUSED:
-        sequence.fire(JobTrigger.REFUSE)
-    elif state is JobState.ABORTED:
-        sequence.fire(JobTrigger.ABORT)
-    else:
-        sequence.fire(JobTrigger.START)
-    if state is JobState.PAUSED:
-        sequence.fire(JobTrigger.PAUSE)
-    elif state in (JobState.FAULTED, JobState.RECOVERING):
-        sequence.fire(JobTrigger.FAULT)
-    if state is JobState.RECOVERING:
-        sequence.facts.recoverable, sequence.facts.retries_left = True, 1
-        sequence.fire(JobTrigger.RECOVER)
-    if state is JobState.MISPLACED:
-        sequence.fire(JobTrigger.MISPLACE)
+    sequence.facts.recoverable, sequence.facts.retries_left = True, 1
+    for trigger in WAYS.get(state, (JobTrigger.START,)):
+        sequence.fire(trigger)
     while sequence.state != state and sequence.state in STEPS:
         sequence.facts.done.add(sequence.state)
         sequence.fire(JobTrigger.NEXT)
@@ -67,7 +59,6 @@ def test_pause_and_recovery_come_back_to_the_step_they_left(step):
     sequence = at(step)
     sequence.fire(JobTrigger.PAUSE)
     assert sequence.fire(JobTrigger.RESUME) == step
-    sequence.facts.recoverable, sequence.facts.retries_left = True, 1
     sequence.fire(JobTrigger.FAULT)
     sequence.fire(JobTrigger.RECOVER)
     assert sequence.fire(JobTrigger.RECOVERED) == step

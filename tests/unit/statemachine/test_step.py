@@ -1,7 +1,5 @@
 """Promises of `statemachine.step`."""
 
-from __future__ import annotations
-
 import pytest
 
 from statemachine.step import Policy, Step

@@ -1,7 +1,5 @@
 """Work in line on the virtual clock: who waits looks around, what ends work comes out of its wait, after the stop."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

@@ -1,7 +1,5 @@
 """Promises of `statemachine.watch`."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

@@ -1,7 +1,5 @@
 """What ends a step that goes on: its deadline, a person, a signal, the cell's health; and the safe stop after it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import sqlite3

@@ -1,7 +1,5 @@
 """The composition root: which devices a command connects, and what becomes of them where one fails."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, cast
 

@@ -1,7 +1,5 @@
 """The safe stop brings every device to rest, whatever it does, and bars whoever works; by the world's truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The lock: one holder at a time, none left behind, and a held cell says who holds it."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

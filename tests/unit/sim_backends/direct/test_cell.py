@@ -1,7 +1,5 @@
 """Time on the virtual clock passes while somebody waits, and only then."""
 
-from __future__ import annotations
-
 import pytest
 
 from sim_backends.clock import SteppedClock

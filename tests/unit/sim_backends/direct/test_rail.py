@@ -1,12 +1,9 @@
 """The rail in this process keeps a rail's promises."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from drivers.errors import Aborted, InterlockError
-from tests.support.simulator.virtual_devices import ideal_cell
 
 
 def test_a_sweep_knows_where_the_rail_was_at_any_time_of_it(cell):
@@ -35,8 +32,8 @@ def test_a_stop_of_the_rail_ends_its_motion_and_lasts_until_it_stands(cell):
     assert rail.state().homed
 
 
-def test_a_search_that_was_stopped_has_found_no_zero():
-    rail = ideal_cell().rail
+def test_a_search_that_was_stopped_has_found_no_zero(fresh):
+    rail = fresh.rail
     search = rail.home()
     rail.clock.sleep(0.2)
     rail.stop()

@@ -1,7 +1,5 @@
 """Laser and claw in this process keep their promises."""
 
-from __future__ import annotations
-
 
 def test_the_laser_is_seen_only_while_it_is_lit(cell):
     lit_before = cell.world.laser.at(cell.clock.now())

@@ -1,7 +1,5 @@
 """The vehicle in this process keeps a vehicle's promises."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

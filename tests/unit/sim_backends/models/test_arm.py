@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sim_backends.clock import WorldClock
-from sim_backends.models.arm import ArmModel, ArmParams, Power, Safety
-from sim_backends.models.arm_kinematics import UR10E_DH, matrix_from_pose, pose_error, pose_from_matrix
+from sim_backends.models.arm import ArmModel, ArmParams, Safety
+from sim_backends.models.arm_kinematics import UR10E_DH, pose_error
 from sim_backends.models.arm_motion import JointMove, JointSpeed, LinearSpeed, Servo
 from tests.support.simulator.simulated_arm import TICK, finish, make_arm, pinocchio_flange, run
 
@@ -18,12 +18,10 @@ Array = NDArray[np.float64]
 @pytest.mark.parametrize(
     ("name", "fastest"),
     [
-        ("UR3e", (180, 180, 180, 360, 360, 360)),
-        ("UR5e", (180, 180, 180, 180, 180, 180)),
-        ("UR10e", (120, 120, 180, 180, 180, 180)),
-        ("UR30", (120, 120, 150, 210, 210, 210)),
+        ("UR3e", (180, 180, 180, 360, 360, 360)), ("UR5e", (180, 180, 180, 180, 180, 180)),
+        ("UR10e", (120, 120, 180, 180, 180, 180)), ("UR30", (120, 120, 150, 210, 210, 210)),
     ],
-)
+)  # fmt: skip
 def test_each_models_joints_turn_as_fast_as_the_maker_says_and_no_faster(name: str, fastest: tuple[float, ...]) -> None:
     for joint, limit in enumerate(fastest):
         model = ArmModel(ArmParams.of(name), np.random.default_rng(3), WorldClock())
@@ -53,7 +51,7 @@ def test_each_rest_has_its_own_error_of_the_stated_size_and_keeps_it() -> None:
     arm = make_arm(repeatability=(30e-6, 20e-6))
     home, away = arm.drive.q.copy(), arm.drive.q + 0.1
     rests = []
-    for _ in range(150):
+    for _ in range(80):
         for target in (away, home):
             arm.start(JointMove(target, 2.0, 10.0))
             while not arm.idle:
@@ -64,7 +62,7 @@ def test_each_rest_has_its_own_error_of_the_stated_size_and_keeps_it() -> None:
         np.testing.assert_array_equal(arm.base_from_flange(arm.time), first)
         rests.append(pose_error(first, pinocchio_flange(UR10E_DH, home)))
     spread = np.std(rests, axis=0)
-    # 150 samples give a standard deviation to 6 %; five of those for six axes.
+    # 80 samples give a standard deviation to 8 %; nearly four of those for six axes.
     np.testing.assert_allclose(spread[:3], 30e-6, rtol=0.3)
     np.testing.assert_allclose(spread[3:], 20e-6, rtol=0.3)
     assert abs(np.corrcoef(np.array(rests)[:-1, 0], np.array(rests)[1:, 0])[0, 1]) < 0.3
@@ -144,37 +142,3 @@ def test_a_protective_stop_can_be_unlocked_after_its_delay_and_the_motion_resume
     arm.resume()
     finish(arm)
     np.testing.assert_array_equal(arm.drive.q, target)
-
-
-def test_an_emergency_stop_brakes_then_switches_off_until_it_is_cleared_and_powered() -> None:
-    arm = make_arm()
-    arm.start(JointMove(arm.drive.q + 0.5, 0.5, 1.0))
-    run(arm, 0.5)
-    arm.fault("emergency_stop")
-    run(arm, 0.5)
-    assert (arm.safety, arm.power, arm.moving) == (Safety.EMERGENCY_STOP, Power.OFF, False)
-    assert not arm.set_power(Power.RUNNING)
-    arm.clear()
-    assert (arm.safety, arm.power, arm.ready) == (Safety.NORMAL, Power.OFF, False)
-    assert arm.set_power(Power.RUNNING) and arm.ready
-    run(arm, 0.5)
-    assert arm.idle and not arm.moving
-
-
-def test_unknown_faults_and_inputs_are_refused() -> None:
-    arm = make_arm()
-    with pytest.raises(ValueError, match="protective_stop"):
-        arm.fault("lightning")
-    with pytest.raises(ValueError, match=r"0…17"):
-        arm.set_digital_input(18, True)
-
-
-def test_the_past_of_the_true_pose_can_be_asked_for() -> None:
-    arm = make_arm()
-    arm.start(JointSpeed(np.array([0.0, 0, 0, 0, 0, 0.5]), 40.0))
-    run(arm, 0.1)
-    between = arm.time - 1.5 * TICK
-    expected = arm.drive.q - [0, 0, 0, 0, 0, 0.5 * 1.5 * TICK]
-    np.testing.assert_allclose(arm.base_from_flange(between), pinocchio_flange(UR10E_DH, expected), atol=1e-9)
-    pose = pose_from_matrix(arm.base_from_flange(between))
-    np.testing.assert_allclose(matrix_from_pose(pose), arm.base_from_flange(between), atol=1e-12)

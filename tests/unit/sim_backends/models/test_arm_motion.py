@@ -6,7 +6,7 @@ import pytest
 
 from sim_backends.models.arm import Safety
 from sim_backends.models.arm_kinematics import UR10E_DH
-from sim_backends.models.arm_motion import ForceMode, JointMove, JointSpeed, LinearMove, LinearSpeed, Servo, StopMotion
+from sim_backends.models.arm_motion import ForceMode, JointMove, LinearMove, Servo
 from tests.support.simulator.simulated_arm import TICK, finish, make_arm, pinocchio_flange, run
 
 
@@ -51,27 +51,6 @@ def test_a_servo_target_that_moves_evenly_is_followed_with_the_lag() -> None:
     np.testing.assert_allclose(servo.target - arm.drive.q, rate * (0.05 - TICK / 2), atol=1e-6)
     run(arm, 1.0)
     np.testing.assert_allclose(arm.drive.q, servo.target, atol=1e-8)
-
-
-@pytest.mark.parametrize("tick", [TICK, 0.016])
-def test_speed_commands_ramp_up_hold_and_stop(tick: float) -> None:
-    arm = make_arm()
-    before = arm.drive.q.copy()
-    arm.start(JointSpeed(np.array([0.0, 0, 0, 0, 0, 0.5]), 1.0))
-    run(arm, 1.6, tick)
-    assert arm.drive.qd[5] == pytest.approx(0.5)
-    assert arm.drive.q[5] - before[5] == pytest.approx(0.5 * 1.6 - 0.5 * 0.5 * 0.5, abs=2e-3)
-    arm.start(StopMotion(2.0))
-    finish(arm)
-    assert arm.drive.q[5] - before[5] == pytest.approx(0.5 * 1.6 - 0.125 + 0.5**2 / 4, abs=2e-2)
-
-
-def test_a_tool_speed_moves_the_tool_at_that_speed() -> None:
-    arm = make_arm()
-    before = arm.reported_flange()
-    arm.start(LinearSpeed(np.array([0.0, 0.0, -0.05, 0, 0, 0]), 10.0))
-    run(arm, 1.0)
-    np.testing.assert_allclose(arm.reported_flange()[:3, 3] - before[:3, 3], [0, 0, -0.05], atol=2e-4)
 
 
 def test_force_mode_settles_at_the_wanted_force() -> None:

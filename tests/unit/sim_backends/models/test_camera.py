@@ -1,7 +1,5 @@
 """Promises of `sim_backends.models.camera`."""
 
-from __future__ import annotations
-
 import pytest
 
 from sim_backends.models.camera import CameraSpec, CameraState

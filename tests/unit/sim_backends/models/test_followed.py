@@ -1,7 +1,5 @@
 """Promises of `sim_backends.models.followed`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

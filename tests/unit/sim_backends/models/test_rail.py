@@ -1,7 +1,5 @@
 """The simulated rail's physics against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -14,19 +12,6 @@ LEAD = 0.002
 
 def rail(seed: int = 1, **params: object) -> RailModel:
     return RailModel(RailParams(**params), np.random.default_rng(seed))  # type: ignore[arg-type]
-
-
-def test_a_move_takes_the_time_of_its_trapezoid() -> None:
-    model = rail()
-    model.set_position(0.0, 0)
-    model.configure(0.0, RailSettings(max_velocity=5 * STEPS, max_acceleration=20 * STEPS))
-    model.move_to(1.0, 10 * STEPS)
-    arrival = 1.0 + 10.0 / 5.0 + 5.0 / 20.0
-    assert not model.reached(arrival - 1e-3) and model.reached(arrival + 1e-9)
-    assert model.velocity(2.0) == 5 * STEPS
-    start = model.carriage(1.0)
-    assert model.carriage(2.0) - start == pytest.approx(LEAD * (5.0 * 0.875), abs=1e-12)
-    assert model.carriage(9.0) - start == pytest.approx(10 * LEAD, abs=1e-12)
 
 
 def test_a_stop_on_the_way_ends_the_motion_on_the_ramp_and_the_past_stays_as_it_was() -> None:

@@ -1,7 +1,5 @@
 """The rail's ramps and its screw against closed forms."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

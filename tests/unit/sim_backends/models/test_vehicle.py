@@ -1,7 +1,5 @@
 """The simulated vehicle's physics against closed forms."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -29,24 +27,6 @@ def test_one_that_is_bumped_into_stands_elsewhere_and_its_wheels_do_not_tell() -
     assert model.world_from_vehicle(1.0)[:2, 3] == pytest.approx((-3.04, -0.02))
 
 
-def test_power_on_is_standby_where_commands_are_ignored() -> None:
-    model = vehicle()
-    drive(model, 0.0, 2.0, 0.5)
-    assert model.feedback(2.0).mode is Mode.STANDBY
-    assert model.planar(2.0) == (-3.05, 0.0, 0.0)
-
-
-def test_without_commands_it_stops_after_half_a_second() -> None:
-    model = vehicle(acceleration=0.6)
-    model.set_mode(0.0, Mode.CAN)
-    drive(model, 0.0, 2.0, 0.3)
-    x = model.planar(2.0)[0]
-    assert model.feedback(2.47).speed == pytest.approx(0.3)
-    rest = 0.3 * 0.48 + 0.3**2 / (2 * 0.6)
-    assert model.planar(10.0)[0] - x == pytest.approx(rest, abs=3e-3)
-    assert model.feedback(10.0).speed == 0.0
-
-
 def test_slip_is_seen_by_the_world_and_not_by_the_odometers() -> None:
     model = vehicle(distance_scale=1.03, yaw_scale=0.9)
     model.set_mode(0.0, Mode.CAN)
@@ -64,7 +44,7 @@ def test_slip_is_seen_by_the_world_and_not_by_the_odometers() -> None:
 
 def test_the_random_walk_grows_with_the_root_of_the_way() -> None:
     headings = []
-    for seed in range(60):
+    for seed in range(30):
         model = vehicle(seed, yaw_walk=0.01)
         model.set_mode(0.0, Mode.CAN)
         drive(model, 0.0, 4.0, 0.5)

@@ -1,6 +1,5 @@
 """Promises of the simulated lens and sensor."""
 
-import cv2
 import numpy as np
 import pytest
 
@@ -28,11 +27,3 @@ def test_sensor_noise_has_the_stated_mean_and_variance(level):
     picture = sensor(np.full((480, 640), level, np.float32), SCAN, np.random.default_rng(3)).astype(float)
     assert picture.mean() == pytest.approx(level, abs=0.01)
     assert picture.var() == pytest.approx(level / 40 + 0.4**2 + 1 / 12, rel=0.02)
-
-
-def test_undistortion_undoes_the_lens_to_a_nanopixel():
-    pixels = np.array([[0.0, 0.0], [639.0, 479.0], [319.5, 239.5], [17.3, 440.2]])
-    rays = np.column_stack([SCAN.undistort(pixels), np.ones(4)])
-    matrix = np.array([[SCAN.fx, 0, SCAN.cx], [0, SCAN.fy, SCAN.cy], [0, 0, 1.0]])
-    back, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), matrix, np.array(SCAN.distortion))
-    np.testing.assert_allclose(back[:, 0], pixels, atol=1e-9)

@@ -1,7 +1,5 @@
 """Daylight on the sensor: how bright, and how much of it a band-pass filter leaves."""
 
-from __future__ import annotations
-
 import pytest
 
 from sim_backends.optics.daylight import LASER, laser_passed, share_passed

@@ -1,7 +1,5 @@
 """Promises of `sim_backends.optics.pattern`."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sim_backends.optics.pattern import grain_at, grain_parameters

@@ -1,7 +1,5 @@
 """Promises of `sim_backends.optics.scene`."""
 
-from __future__ import annotations
-
 import pytest
 
 from sim_backends.optics import Board

@@ -1,7 +1,5 @@
 """What peers serve with: a client costs its own connection only, and nothing is left once a peer has stopped."""
 
-from __future__ import annotations
-
 import json
 import socket
 import struct

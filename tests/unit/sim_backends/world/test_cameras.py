@@ -1,7 +1,5 @@
 """What the cameras of an ideal world see is where closed forms put it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

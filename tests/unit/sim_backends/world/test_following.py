@@ -1,7 +1,5 @@
 """The world after real devices: a picture is of where they were, or there is none."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

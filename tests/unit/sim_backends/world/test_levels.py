@@ -1,7 +1,5 @@
 """The workshop's effects in the simulated world: each is off unless asked for, and as large as told."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np
@@ -15,21 +13,7 @@ from sim_backends.optics.pattern import grain_at, grain_parameters
 from sim_backends.optics.scene import Grain
 from sim_backends.world import drawing
 from sim_backends.world.cameras import SKY
-from sim_backends.world.levels import (
-    ALONE,
-    CUT,
-    HARSH,
-    IDEAL,
-    LEVELS,
-    NOMINAL,
-    OUTDOOR,
-    Effects,
-    assumed_noise,
-    deviations,
-    effects_of,
-    number_of,
-    only,
-)
+from sim_backends.world.levels import ALONE, CUT, HARSH, IDEAL, NOMINAL, OUTDOOR, Effects, deviations, effects_of, only
 from sim_backends.world.scene import draw
 from sim_backends.world.world import World
 
@@ -46,17 +30,6 @@ def test_every_effect_can_be_had_alone_and_workshop_has_all_but_the_options() ->
     assert effects_of("outdoor") == only(*OUTDOOR)
     for level in ("ideal", "nominal", "harsh"):
         assert effects_of(level) == Effects()
-
-
-def test_each_row_says_its_unit_meaning_and_source() -> None:
-    for row in dataclasses.fields(Effects):
-        assert all(row.metadata[key] for key in ("unit", "meaning", "source")), row.name
-    assert set(assumed_noise("nominal+rocking")) - set(assumed_noise("nominal")) == {"rocking"}
-
-
-def test_no_two_levels_share_a_serial_number() -> None:
-    levels = [*LEVELS, *(f"nominal+{name}" for name in Effects.names()), "nominal+grasp+sag", "harsh+grasp"]
-    assert len({number_of(level) for level in levels}) == len(levels)
 
 
 def test_the_sun_has_20_to_100_klx_by_seed() -> None:
@@ -194,17 +167,6 @@ def test_ideal_deviates_in_nothing_but_read_noise() -> None:
 def test_harsh_is_two_and_a_half_times_nominal() -> None:
     for name, value in dataclasses.asdict(NOMINAL).items():
         assert getattr(HARSH, name) == pytest.approx(2.5 * value), name
-
-
-def test_assumed_noise_states_value_unit_and_meaning_of_everything() -> None:
-    table = assumed_noise("nominal")
-    assert set(table) == set(dataclasses.asdict(NOMINAL))
-    assert table["arm_repeatability"] == {
-        "sigma": 0.04e-3,
-        "unit": "m",
-        "of": "radial (1/√3 of it per axis), anew each time the arm settles",
-    }
-    assert all(entry["unit"] and entry["of"] for entry in table.values())
 
 
 def test_unknown_levels_and_seeds_are_refused_with_the_choices() -> None:

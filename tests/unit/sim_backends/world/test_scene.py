@@ -1,7 +1,5 @@
 """Promises of `sim_backends.world.scene`."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

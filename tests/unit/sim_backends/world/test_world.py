@@ -1,7 +1,5 @@
 """The whole world, without its peers: what couples the devices, and its truth."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Cameras, laser and claw in this process, on the virtual clock, keep the contracts of their kinds."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

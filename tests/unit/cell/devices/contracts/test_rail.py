@@ -1,7 +1,5 @@
 """The rail in this process keeps the contract of its kind as those on wires do."""
 
-from __future__ import annotations
-
 from cell.devices.contracts import RailContract
 from tests.unit.cell.devices.contracts.test_device import Direct
 

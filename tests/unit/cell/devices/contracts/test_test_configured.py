@@ -1,7 +1,5 @@
 """Every built-in make keeps the contract of its kind over its simulated wire, run as a third party runs the suites."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

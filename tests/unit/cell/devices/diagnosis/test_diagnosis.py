@@ -1,7 +1,5 @@
 """Figures of `cell diag` against closed forms: what is outside of its limit is told, and nothing else."""
 
-from __future__ import annotations
-
 import math
 import struct
 

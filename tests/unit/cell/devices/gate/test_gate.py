@@ -1,7 +1,5 @@
 """Nothing begins after a stop: whoever was working is barred for ever, new work is not."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Devices of any make behind the gate: once it is shut nothing begins; looking, stopping and closing still work."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -27,14 +25,17 @@ def devices() -> Devices:
     return VirtualCell(CONFIG, seed=4, level="ideal").devices
 
 
-def test_who_listens_hears_what_a_camera_is_asked_for() -> None:
-    devices, heard = VirtualCell(CONFIG, seed=4, level="ideal").devices, []
+def test_who_listens_hears_what_laser_and_camera_are_asked_for() -> None:
+    devices, heard = at_rest().devices, []
     devices.gate.listener = cast(Any, SimpleNamespace(command=lambda command, refused: heard.append(str(command))))
     devices.scan_camera.configure(0.002, 50.0)
     devices.scan_camera.grab()
     with devices.scan_camera.stream() as frames:
         frames.next(1.0)
-    assert heard == [f"scan_camera.{asked}" for asked in ("configure", "grab", "stream", "stream ended")]
+    with devices.interlocks.purpose("test"), devices.laser.lit():
+        pass
+    asked = [f"scan_camera.{name}" for name in ("configure", "grab", "stream", "stream ended")]
+    assert heard == [*asked, "laser.lit", "laser.off"]
 
 
 def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: Devices) -> None:
@@ -70,6 +71,19 @@ def test_after_the_stop_nothing_begins_and_all_can_be_read_and_stopped(devices: 
     assert not devices.laser.is_on
     assert [device.identity().model for device in devices]
     assert devices.stop() == devices.close() == []
+
+
+def test_after_a_stop_an_output_that_is_the_lasers_can_still_be_switched_off_and_no_other() -> None:
+    devices = VirtualCell(CONFIG, seed=4, level="ideal").devices
+    arm, laser = devices.arm, CONFIG.laser.output
+    devices.gate.enter(CancelToken())
+    arm.set_digital_output(7, True)
+    devices.stop()
+    arm.bare.set_digital_output(laser, True)
+    arm.set_digital_output(laser, False)
+    with pytest.raises(Aborted):
+        arm.set_digital_output(7, False)
+    assert [arm.state().digital_outputs >> output & 1 for output in (7, laser)] == [1, 0]
 
 
 def test_a_stop_that_comes_while_a_rule_of_the_claw_waits_leaves_the_part_held() -> None:

@@ -1,7 +1,5 @@
 """The interlocks' rules by readings that are written down here: each direction, each part of a reading, each limit."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor

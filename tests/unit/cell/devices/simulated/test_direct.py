@@ -1,7 +1,5 @@
 """The whole job on the cell without wires is as good as its declared noise allows."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 What is real is known to the cell by its measured states alone, as on hardware: nobody tells it that world's truth.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

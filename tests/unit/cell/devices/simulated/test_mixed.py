@@ -1,7 +1,5 @@
 """Which devices may be simulated beside real ones: what physics does not allow is refused before anything is opened."""
 
-from __future__ import annotations
-
 import pytest
 
 from cell import Cell

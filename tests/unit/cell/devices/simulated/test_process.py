@@ -1,7 +1,5 @@
 """Scheduled faults: how they are written, and when they happen. That they do happen is shown with the whole job."""
 
-from __future__ import annotations
-
 import pytest
 
 from cell.devices.simulated.process import Injection, Injector

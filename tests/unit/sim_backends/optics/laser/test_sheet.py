@@ -1,7 +1,5 @@
 """Promises of the light sheet: what shades it, where it ends, how it bends."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

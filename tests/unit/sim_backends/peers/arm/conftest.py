@@ -1,7 +1,5 @@
 """A simulated arm and the real ur_rtde at it, and a controller without a network."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,35 +1,14 @@
 """The commands of the control script, given by the real ur_rtde."""
 
-from __future__ import annotations
-
-import math
-
 import numpy as np
 import pinocchio as pin
 import pytest
 from rtde_control import Path as MovePath
 from rtde_control import PathEntry, RTDEControlInterface
 
-from tests.support.simulator.ur_client import CLOCK, HOME, SPEED, Client, distance, flange, se3, until
+from tests.support.simulator.ur_client import HOME, Client, distance, flange, se3, until
 
 pytestmark = pytest.mark.wire
-
-
-def test_a_joint_move_arrives_and_the_reported_pose_is_that_of_the_joints(arm: Client) -> None:
-    target = HOME + np.array([0.3, -0.2, 0.1, 0.2, -0.1, 0.4])
-    assert arm.control.moveJ(target.tolist(), 1.5, 5.0)
-    until(lambda: bool(np.allclose(arm.q(), target, atol=1e-9)))
-    assert distance(flange(target), se3(arm.receive.getActualTCPPose())) < 1e-9
-    until(lambda: bool(arm.control.isSteady()))
-
-
-def test_a_linear_move_arrives(arm: Client) -> None:
-    target = arm.receive.getActualTCPPose()
-    target[0] -= 0.05
-    target[2] += 0.08
-    assert arm.control.moveL(target, 0.5, 2.0)
-    until(lambda: distance(se3(target), se3(arm.receive.getActualTCPPose())) < 1e-8)
-    assert distance(flange(arm.q()), se3(target)) < 1e-8
 
 
 def test_moves_to_a_pose_and_along_a_line_to_joints(arm: Client) -> None:
@@ -39,42 +18,6 @@ def test_moves_to_a_pose_and_along_a_line_to_joints(arm: Client) -> None:
     until(lambda: distance(goal, se3(arm.receive.getActualTCPPose())) < 1e-7)
     assert arm.control.moveL_FK(HOME.tolist(), 0.5, 2.0)
     until(lambda: distance(flange(HOME), se3(arm.receive.getActualTCPPose())) < 1e-7)
-
-
-def test_an_asynchronous_move_shows_progress_and_can_be_stopped(arm: Client) -> None:
-    target = HOME + np.array([1.0, 0, 0, 0, 0, 0])
-    before = arm.control.getAsyncOperationProgressEx().operationId()
-    assert arm.control.moveJ(target.tolist(), 0.5, 5.0, True)
-    until(lambda: bool(arm.control.getAsyncOperationProgressEx().isAsyncOperationRunning()))
-    assert arm.control.getAsyncOperationProgressEx().operationId() == (before + 1) % 128
-    assert arm.control.getAsyncOperationProgress() >= 0
-    until(lambda: arm.q()[0] > 0.1)
-    arm.control.stopJ(10.0)
-    assert not arm.control.getAsyncOperationProgressEx().isAsyncOperationRunning()
-    assert arm.control.getAsyncOperationProgress() < 0
-    until(lambda: not any(arm.receive.getActualQd()))
-    assert 0.1 < arm.q()[0] < 0.95
-    assert arm.control.moveJ(HOME.tolist(), 1.0, 5.0, True)
-    until(lambda: arm.control.getAsyncOperationProgress() < 0)
-    until(lambda: bool(np.allclose(arm.q(), HOME)))
-
-
-def test_a_streamed_joint_trajectory_is_tracked_with_a_small_lag(arm: Client) -> None:
-    lag, gain, period = 0.05, 300.0, 0.002
-    behind = []
-    begun = CLOCK.now()
-    for k in range(400):
-        phase = 0.5 * math.pi * k * period * SPEED
-        target = HOME + 0.1 * (1 - math.cos(phase))
-        assert arm.control.servoJ(target.tolist(), 0.0, 0.0, period, lag, gain)
-        if math.sin(phase) > 0.5:
-            behind.append((target - arm.q()).mean() / (0.1 * 0.5 * math.pi * math.sin(phase)))
-        CLOCK.sleep(begun + (k + 1) * period - CLOCK.now())
-    # The lag and a few packets' age. The median: a moment in which this process was not run is no lag of the arm.
-    assert 0.3 * lag < np.median(behind) < lag + 0.02 * SPEED
-    until(lambda: bool(np.abs(target - arm.q()).max() < 0.001))
-    assert arm.control.servoStop(10.0)
-    assert arm.control.moveJ(HOME.tolist(), 1.5, 5.0), "the arm must obey moves again after the stream"
 
 
 def test_a_move_during_a_stream_ends_the_program_as_on_the_controller(arm: Client) -> None:
@@ -128,27 +71,3 @@ def test_kinematics_answers_agree_with_an_independent_chain(arm: Client) -> None
 def test_a_pose_out_of_reach_ends_the_program_and_the_call_says_so(arm: Client) -> None:
     assert arm.control.getInverseKinematics([2.0, 0, 0, 0, 0, 0]) == []
     assert not arm.control.isProgramRunning() and not arm.control.moveJ(HOME.tolist(), 1.0, 1.0)
-
-
-def test_tool_and_payload_are_taken(arm: Client) -> None:
-    tool = [0.01, -0.02, 0.15, 0.0, 0.0, 0.3]
-    assert arm.control.setTcp(tool)
-    until(lambda: distance(se3(arm.receive.getActualTCPPose()), flange(HOME) * se3(tool)) < 1e-9)
-    np.testing.assert_allclose(arm.control.getTCPOffset(), tool, atol=1e-12)
-    target = arm.receive.getActualTCPPose()
-    target[5] += 0.1
-    assert arm.control.moveL(target, 0.5, 2.0)
-    until(lambda: distance(se3(arm.receive.getActualTCPPose()), se3(target)) < 1e-8)
-    assert arm.control.setPayload(3.5, [0.0, 0.01, 0.05])
-    until(lambda: arm.receive.getPayload() == pytest.approx(3.5))
-    np.testing.assert_allclose(arm.receive.getPayloadCog(), [0.0, 0.01, 0.05])
-    assert arm.control.zeroFtSensor()
-
-
-def test_a_watchdog_that_is_not_kicked_stops_the_program(arm: Client) -> None:
-    assert arm.control.setWatchdog(10.0)
-    for _ in range(5):
-        CLOCK.sleep(0.05)
-        assert arm.control.kickWatchdog()
-    assert arm.control.isProgramRunning()
-    until(lambda: not arm.control.isProgramRunning(), timeout=1.0)

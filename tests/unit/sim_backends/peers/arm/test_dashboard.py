@@ -1,7 +1,5 @@
 """The dashboard's answers, without its network, and over it those of the arm that is served on its own."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

@@ -1,22 +1,11 @@
 """What the script ports tell and take, for clients that are not ours."""
 
-from __future__ import annotations
-
 import socket
 import struct
 from collections.abc import Iterator
 from itertools import islice, pairwise
 
-import numpy as np
 import pytest
-
-from sim_backends.clock import WorldClock
-from sim_backends.models.arm import ArmModel, ArmParams
-from sim_backends.models.arm_kinematics import TABLES
-from sim_backends.peers.arm.ports import robot_mode, robot_state, version_message
-from tests.support.simulator.script_controller import Controller
-from tests.support.simulator.ur_client import dashboard
-from tests.support.wire.arm_bench import ArmBench
 
 pytestmark = pytest.mark.wire
 PARTS = [
@@ -109,41 +98,3 @@ def test_a_program_that_does_not_compile_is_told_as_a_controller_tells_it(addres
         error = next(package for package in told(primary) if package[4] == 20 and package[14] == 10)
     assert struct.unpack_from(">ii", error, 15) == (2, 3)
     assert error[23:] == b"compile_error_name_not_found:calldoesntexist:"
-
-
-def test_in_local_control_no_command_is_taken(address: str, running: ArmBench) -> None:
-    running.ask("local_control")
-    with socket.create_connection((address, 30001), timeout=5.0) as primary:
-        primary.sendall(b"power off\n")
-        heard = b""
-        while b"local control" not in heard:
-            heard += primary.recv(4096)
-    assert dashboard(address, "robotmode") == ["Robotmode: RUNNING"]
-
-
-def test_the_secondary_port_greets_with_packages_as_the_maker_describes_them(controller: Controller) -> None:
-    greeting, mode = version_message((5, 15, 2, 7)), robot_mode(controller.model, 2)
-    assert len(greeting) + len(mode) >= 79, "so much has to be read before the socket is closed"
-    assert struct.unpack_from(">iB", greeting) == (len(greeting), 20)
-    source, kind, length = struct.unpack_from(">bbb", greeting, 13)
-    assert (source, kind) == (-2, 3)
-    assert struct.unpack_from(">BBii", greeting, 16 + length) == (5, 15, 2, 7)
-    assert struct.unpack_from(">iB", mode) == (len(mode), 16)
-    assert struct.unpack_from(">IB", mode, 5) == (len(mode) - 5, 0)
-    assert list(mode[18:25]) == [1, 1, 1, 0, 0, 1, 0], "powered, no stop, a program runs"
-    assert mode[25] == 7
-
-
-def test_every_model_tells_its_number() -> None:
-    """UR7e and UR12e are told as what they were called before."""
-    told = {}
-    for name in TABLES:
-        state = robot_state(ArmModel(ArmParams.of(name), np.random.default_rng(1), WorldClock()), 1, [0.0, 0.0])
-        at = 5
-        while state[at + 4] != 6:
-            at += struct.unpack_from(">I", state, at)[0]
-        told[name] = struct.unpack_from(">i", state, at + 445 - 8)[0]
-    assert told == {
-        "UR3": 3, "UR3e": 3, "UR5": 1, "UR5e": 1, "UR7e": 1, "UR10": 2, "UR10e": 2, "UR12e": 2, "UR16e": 4, "UR20": 7,
-        "UR30": 8,
-    }  # fmt: skip

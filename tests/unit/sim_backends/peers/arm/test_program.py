@@ -1,7 +1,5 @@
 """The program memory without its network: pauses, safeguard, watchdog, secondary programs, outputs."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -134,19 +132,3 @@ def test_an_output_that_is_low_when_no_program_runs_cannot_be_raised_then(
     controller.model.write_digital_outputs(both, both)
     controller.run_for(0.01)
     assert controller.outputs == both, "kept, once that is asked for"
-
-
-def test_the_other_choices_set_an_output_high(controller: Controller) -> None:
-    controller.program.load(
-        secondary(
-            "set_runstate_standard_digital_output_to_value(0, 2)", "set_runstate_standard_digital_output_to_value(1, 3)"
-        )
-    )
-    controller.run_for(0.01)
-    assert controller.outputs == 0b01
-    controller.program.load(MOVE)
-    controller.run_for(0.1)
-    assert controller.outputs == 0b11
-    controller.program.stop("test")
-    controller.run_for(0.01)
-    assert controller.outputs == 0b01

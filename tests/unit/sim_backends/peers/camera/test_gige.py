@@ -1,7 +1,5 @@
 """The simulated GigE Vision camera, spoken to by a client of a few lines written for this test."""
 
-from __future__ import annotations
-
 import socket
 import struct
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """What a GigE Vision camera says and keeps, against the standard's own pictures of the bytes."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np
@@ -52,13 +50,3 @@ def test_pixels_are_packed_as_the_standards_lay_them_out() -> None:
     }  # fmt: skip
     made = {name: encode(image) for name, _, encode in g.ENCODERS.values()}
     assert {name: made[name][: len(data)] for name, data in expected.items()} == expected
-
-
-def test_a_picture_is_a_leader_its_pixels_in_order_and_a_trailer() -> None:
-    leader = g.Leader(5, 0x01080001, 64, height=48, left=0, top=0)
-    made = list(g.packets(7, leader, bytes(64 * 48), 576))
-    heads = [struct.unpack_from(">HHI", packet) for packet in made]
-    assert [head[2] >> 24 for head in heads] == [1, *[3] * (len(made) - 2), 2]
-    assert [head[2] & 0xFFFFFF for head in heads] == list(range(len(made)))
-    assert {head[1] for head in heads} == {7} and max(map(len, made)) <= 576 - 28
-    assert sum(len(packet) - 8 for packet in made[1:-1]) == 64 * 48

@@ -1,7 +1,5 @@
 """The simulated stepper module at its wire, driven by the vendor's own client."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 
@@ -101,47 +99,6 @@ def test_the_ramp_has_the_names_of_the_vendors_library_and_is_none_until_it_is_s
     assert ramp_of_module == (1000, 2000, 3000, 4000)
 
 
-def test_the_switches_stop_the_motion_and_let_it_go_the_other_way(
-    module: TMCM1260, model: RailModel, clock: WorldClock
-) -> None:
-    axis = module.motors[0]
-    axis.linear_ramp.max_acceleration = 40 * STEPS
-    module.rotate(0, 10 * STEPS)
-    until(clock, lambda: axis.get_axis_parameter(axis.AP.RightEndstop))
-    assert axis.actual_velocity == 0
-    assert model.carriage(clock.now()) == pytest.approx(0.102, abs=1e-8)
-    module.rotate(0, 10 * STEPS)
-    clock.sleep(1.0)
-    assert model.carriage(clock.now()) == pytest.approx(0.102, abs=1e-8)
-    module.rotate(0, -10 * STEPS)
-    until(clock, lambda: axis.get_axis_parameter(axis.AP.LeftEndstop))
-    assert model.carriage(clock.now()) == pytest.approx(-0.002, abs=1e-8)
-
-
-def test_a_soft_stop_and_the_distance_of_the_switches_are_axis_parameters(
-    client: SerialTmclInterface, module: TMCM1260, model: RailModel
-) -> None:
-    axis = module.motors[0]
-    axis.set_axis_parameter(axis.AP.SoftStop, 1)
-    assert (model.settings.soft_stop, axis.get_axis_parameter(axis.AP.SoftStop)) == (True, 1)
-    assert axis.get_axis_parameter(axis.AP.ReferenceSwitchDistance) == 0
-    axis.set_axis_parameter(axis.AP.ReferenceSearchMode, 2)
-    client.reference_search(0, 0)
-    assert axis.get_axis_parameter(axis.AP.ReferenceSwitchDistance) == 52 * STEPS
-
-
-def test_without_its_switches_the_rail_stalls_at_its_mechanical_end(
-    module: TMCM1260, model: RailModel, clock: WorldClock
-) -> None:
-    axis = module.motors[0]
-    axis.set_axis_parameter(axis.AP.LeftLimitSwitchDisable, 1)
-    module.rotate(0, -10 * STEPS)
-    until(clock, lambda: axis.get_axis_parameter(axis.AP.DrvStatusFlags) & 1)
-    assert model.carriage(clock.now()) == pytest.approx(-0.004, abs=1e-8)
-    assert axis.get_axis_parameter(axis.AP.ExtendedErrorFlags) == 1
-    assert axis.get_axis_parameter(axis.AP.ExtendedErrorFlags) == 0
-
-
 def test_parameters_are_kept_and_range_checked(module: TMCM1260, client: SerialTmclInterface) -> None:
     axis = module.motors[0]
     for parameter, value in ((axis.AP.MaxCurrent, 200), (axis.AP.MicrostepResolution, 6), (axis.AP.MaxVelocity, 51200)):
@@ -179,11 +136,6 @@ def test_a_locked_eeprom_refuses_to_store(module: TMCM1260) -> None:
     assert refusal.value.status_code == 5
 
 
-def test_a_wrong_checksum_is_answered_with_status_1(port: serial.SerialBase) -> None:
-    port.write(request(1, 6, 1)[:-1] + b"\x00")
-    assert port.read(9)[2] == 1
-
-
 def test_garbage_parts_and_foreign_addresses_do_no_harm(peer: TmclPeer, port: serial.SerialBase) -> None:
     port.write(b"\xff" * 5)
     WorldClock().sleep(0.2)
@@ -192,17 +144,6 @@ def test_garbage_parts_and_foreign_addresses_do_no_harm(peer: TmclPeer, port: se
     reply = port.read(9)
     assert struct.unpack(">BBBBi", reply[:8]) == (2, 1, 100, 6, 512_000)
     assert sum(reply[:8]) % 256 == reply[8]
-
-
-def test_a_dropped_reply_is_the_next_one_only(peer: TmclPeer, port: serial.SerialBase, model: RailModel) -> None:
-    with pytest.raises(ValueError, match=r"rail\.drop_reply"):
-        peer.fault("rail.nonsense")
-    peer.fault("rail.drop_reply")
-    port.timeout = 0.2
-    port.write(request(1, 9, 3, 2, 123))
-    assert port.read(9) == b""
-    port.write(request(1, 10, 3, 2))
-    assert struct.unpack(">i", port.read(9)[4:8]) == (123,)
 
 
 def test_a_reset_takes_what_is_not_in_the_eeprom(peer: TmclPeer, module: TMCM1260, model: RailModel) -> None:

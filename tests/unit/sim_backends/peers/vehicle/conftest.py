@@ -1,7 +1,5 @@
 """A simulated AgileX vehicle on its bus, and python-can at it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import can

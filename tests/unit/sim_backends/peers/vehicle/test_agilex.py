@@ -1,7 +1,5 @@
 """The simulated AgileX vehicle on its bus, through python-can and the shared DBC."""
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from typing import Any
@@ -16,7 +14,6 @@ from sim_backends.models.vehicle import Mode, VehicleModel, VehicleParams
 from sim_backends.peers.vehicle.agilex import AgilexPeer
 from tests.support import ROOT
 from tests.support.simulator.can_bus import message, open_bus, receive
-from tests.support.wire.clocks import until
 
 pytestmark = pytest.mark.wire
 DBC = ROOT / "drivers" / "vehicle" / "agilex_v2.dbc"
@@ -63,24 +60,6 @@ def test_feedback_means_the_same_in_the_shared_dbc(bus: can.BusABC, model: Vehic
     assert state["BatteryVoltage"] == pytest.approx(26.4)
 
 
-def test_the_shared_dbc_commands_the_vehicle(bus: can.BusABC, model: VehicleModel, clock: WorldClock) -> None:
-    database = cantools.database.load_file(DBC)
-
-    def send(name: str, **signals: float) -> None:
-        entry = database.get_message_by_name(name)
-        bus.send(message(entry.frame_id, list(entry.encode(signals))))
-
-    send("ControlModeCommand", Mode=1)
-    end = clock.now() + 1.0
-    while clock.now() < end:
-        send("MotionCommand", Speed=-0.2, YawRate=0.1, LateralSpeed=0, Steering=0)
-        clock.sleep(0.02)
-    feedback = model.feedback(clock.now())
-    assert (feedback.speed, feedback.yaw_rate) == pytest.approx((-0.2, 0.1))
-    send("BrakeCommand", Locked=1)
-    until(clock, lambda: model.feedback(clock.now()).braked)
-
-
 @pytest.mark.parametrize(("speed", "fast", "slow"), [(1.0, 50, 50), (50.0, 200, 50)])
 def test_feedback_keeps_its_cycles_and_does_not_flood_a_fast_world(speed: float, fast: int, slow: int) -> None:
     peer = AgilexPeer(VehicleModel(VehicleParams(), np.random.default_rng(1)), WorldClock(speed))
@@ -102,11 +81,3 @@ def test_feedback_keeps_its_cycles_and_does_not_flood_a_fast_world(speed: float,
     finally:
         bus.shutdown()
         peer.stop()
-
-
-def test_the_version_is_answered(bus: can.BusABC, model: VehicleModel) -> None:
-    bus.send(message(0x411, [1]))
-    assert receive(bus, lambda f: f.arbitration_id == 0x41A).data == struct.pack(">4H", *model.params.versions)
-    bus.send(message(0x4A1, [1]))
-    text = b"".join(receive(bus, lambda f: f.arbitration_id == 0x4A1).data for _ in range(10))
-    assert text.split() == [b"SIMULATED", b"HW2.1", b"CONTROLLER", b"204", b"DRIVERS", b"110"]

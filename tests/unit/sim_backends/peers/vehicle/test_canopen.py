@@ -1,7 +1,5 @@
 """The simulated wheel drives under a master that others wrote: `BaseNode402` of the `canopen` package."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

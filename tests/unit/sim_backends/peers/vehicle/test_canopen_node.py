@@ -1,7 +1,5 @@
 """One CANopen node without its bus: what a master reads, writes and maps, and what happens when it stays away."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest
@@ -53,24 +51,6 @@ def test_values_are_read_written_and_refused_by_their_codes(bus: Bus) -> None:
         ((0x2F, 0x60FF, 0, 1), 0x06070010), ((0xE0, 0x6041, 0), 0x05040001),
     ):  # fmt: skip
         assert bus.sdo(*request) == (0x80, code)
-
-
-def test_a_text_comes_in_segments_with_a_toggle(bus: Bus) -> None:
-    assert bus.sdo(0x40, 0x1008, 0) == (0x41, 16)
-    parts = [bus.hear(0x600 + NODE, bytes([0x60 | toggle, *[0] * 7]))[0].data for toggle in (0, 0x10, 0)]
-    assert b"".join(part[1:] for part in parts)[:16] == b"a name of 16 chr"
-    assert [part[0] for part in parts] == [0x00, 0x10, 0x0B]
-
-
-def test_a_pdo_is_mapped_while_it_is_invalid_and_told_with_a_sync(bus: Bus) -> None:
-    assert bus.sdo(0x2F, 0x1A00, 0, 2) == (0x80, 0x06040041), "nothing is mapped yet"
-    assert bus.sdo(0x23, 0x1A00, 1, 0x60410010)[0] == 0x60
-    assert bus.sdo(0x2F, 0x1A00, 0, 1)[0] == bus.sdo(0x2F, 0x1800, 2, 1)[0] == 0x60
-    assert bus.sdo(0x23, 0x1800, 1, 0x180 + NODE)[0] == 0x60
-    assert bus.sdo(0x2F, 0x1A00, 0, 0) == (0x80, 0x08000022), "it is valid now"
-    assert bus.hear(0x080) == []
-    bus.hear(0x000, bytes([0x01, NODE]))
-    assert bus.hear(0x080) == [CanFrame(0x180 + NODE, b"\x50\x02")]
 
 
 def test_a_master_whose_heartbeat_stays_away_is_lost_once(bus: Bus) -> None:

@@ -1,7 +1,5 @@
 """Solid things stop each other in the simulated world, and the truth says what met what."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -63,20 +61,6 @@ def test_a_vehicle_that_drives_into_the_table_stays_before_it_and_reports_an_exc
     assert [(row["body"], row["obstacle"]) for row in met] == [("vehicle", "table")]
     # From -3.05 m to -0.75 m: 0.4 m/s after 0.67 s of ramp.
     assert met[0]["time"] == pytest.approx(2.3 / 0.4 + 0.5 * 0.4 / 0.6, abs=0.05)
-
-
-def test_cleared_of_its_error_it_can_go_back_and_not_ahead(world: World) -> None:
-    world.vehicle.set_mode(0.0, Mode.CAN)
-    advance(world, 8.0, speed=0.4)
-    stood = world.vehicle.planar(world.clock.now())[0]
-    world.vehicle.clear_errors(world.clock.now())
-    advance(world, 1.0, speed=0.2)
-    assert world.vehicle.planar(world.clock.now())[0] == pytest.approx(stood, abs=0.002)
-    assert world.vehicle.feedback(world.clock.now()).state is ChassisState.EXCEPTION
-    world.vehicle.clear_errors(world.clock.now())
-    advance(world, 2.0, speed=-0.2)
-    assert world.vehicle.planar(world.clock.now())[0] < stood - 0.2
-    assert world.vehicle.feedback(world.clock.now()).state is ChassisState.OK
 
 
 def test_a_vehicle_may_stand_a_millimetre_before_the_table_and_not_one_in_it(world: World) -> None:

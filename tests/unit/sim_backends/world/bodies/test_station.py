@@ -1,7 +1,5 @@
 """A station's bodies: with a mesh of the part the part's own underside, without one the surface's."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The placement surfaces: what a registration and a scan may rely on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

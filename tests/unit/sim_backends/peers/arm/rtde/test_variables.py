@@ -1,7 +1,5 @@
 """RTDE to the byte, for clients that are not ours."""
 
-from __future__ import annotations
-
 import struct
 from itertools import pairwise
 

@@ -1,10 +1,6 @@
 """What a URScript program computes with: numbers, lists, texts, poses."""
 
-from __future__ import annotations
-
-import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from tests.support.simulator.script_controller import Controller, program
 
@@ -40,24 +36,3 @@ from tests.support.simulator.script_controller import Controller, program
 def test_expressions_have_the_values_of_arithmetic(controller: Controller, expression: str, value: str) -> None:
     controller.run(program(f"textmsg({expression})"))
     assert controller.said() == [value]
-
-
-def test_poses_are_combined_as_an_independent_library_does_it(controller: Controller) -> None:
-    a, b = [0.1, -0.2, 0.3, 0.5, -1.1, 0.7], [0.4, 0.0, -0.1, -0.2, 0.3, 2.0]
-    controller.run(
-        program(
-            f"c = pose_trans(p{a}, p{b})",
-            "i = 0",
-            "while i < 6:",
-            "  write_output_float_register(i, c[i])",
-            "  i = i + 1",
-            "end",
-        )
-    )
-    turn = Rotation.from_rotvec(a[3:])
-    np.testing.assert_allclose(controller.registers.double_out[:3], np.array(a[:3]) + turn.apply(b[:3]), atol=1e-12)
-    np.testing.assert_allclose(
-        Rotation.from_rotvec(controller.registers.double_out[3:6]).as_matrix(),
-        (turn * Rotation.from_rotvec(b[3:])).as_matrix(),
-        atol=1e-12,
-    )

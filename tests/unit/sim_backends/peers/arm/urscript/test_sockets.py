@@ -1,7 +1,5 @@
 """URScript's socket commands at a server of the test."""
 
-from __future__ import annotations
-
 import socket
 
 from sim_backends.peers.arm.program import RuntimeState
