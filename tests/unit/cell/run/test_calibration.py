@@ -1,4 +1,4 @@
-"""A calibration is made for the devices that are there, and what is refused of their times is kept."""
+"""A calibration is made for the devices that are there."""
 
 from __future__ import annotations
 
