@@ -53,10 +53,7 @@ def _moved(cloud: Cloud, motions: Array) -> Cloud:
 
 
 def _warped(warp: Callable[[Array, Array, np.random.Generator], Array]) -> Draw:
-    def draw(rng: np.random.Generator) -> Drawn:
-        return scan(PARTS["pot"], rng, height=lambda x, y: _POT(x, y) + warp(x, y, rng)), TRUE, (TRUE,)
-
-    return draw
+    return lambda rng: (scan(PARTS["pot"], rng, height=lambda x, y: _POT(x, y) + warp(x, y, rng)), TRUE, (TRUE,))
 
 
 def _bent(x: Array, y: Array, rng: np.random.Generator) -> Array:
@@ -83,17 +80,11 @@ def _sunk(setting: Setting) -> Draw:
 
 
 def _other(name: str) -> Draw:
-    def draw(rng: np.random.Generator) -> Drawn:
-        return scan(PARTS["pot"], rng, height=PARTS[name].height), TRUE, (TRUE,)
-
-    return draw
+    return lambda rng: (scan(PARTS["pot"], rng, height=PARTS[name].height), TRUE, (TRUE,))
 
 
 def _flipped(sx: int, sy: int) -> Draw:
-    def draw(rng: np.random.Generator) -> Drawn:
-        return scan(PARTS["pot"], rng, height=lambda x, y: _POT(sx * x, sy * y)), TRUE, (TRUE,)
-
-    return draw
+    return lambda rng: (scan(PARTS["pot"], rng, height=lambda x, y: _POT(sx * x, sy * y)), TRUE, (TRUE,))
 
 
 def _scaled(rng: np.random.Generator) -> Drawn:

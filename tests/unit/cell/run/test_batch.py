@@ -1,7 +1,5 @@
 """A batch on the virtual clock: its figures are those of its runs, and what ends it leaves what was done whole."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +13,6 @@ from cell import Cell, ConfigError
 from cell.base.storage import read_json
 from cell.config.job import job_path, load_job
 from cell.devices.simulated.described import Described
-from cell.devices.simulated.direct import VirtualCell
 from cell.procedures.steps.workplace import PartsBefore
 from cell.run.batch import _known_after, _question, perform
 from cell.run.folder import list_runs, read_report
@@ -57,7 +54,6 @@ def test_the_figures_are_those_of_the_runs_and_what_the_parts_have_alike_is_allo
     file.write_text(quick(file.read_text(), rate=25.0))
     aside = held(motion(0.0, 0.3))
     with opened() as cell:
-        assert isinstance(cell.simulated, VirtualCell)
         world = cell.simulated.world
 
         def observe(event: Event) -> None:
@@ -233,7 +229,6 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
 
         def person(what: str) -> None:
             asked.append(what.split()[0])
-            assert isinstance(cell.simulated, VirtualCell)
             assert claw.holding == cell.simulated.world.switched("claw") == (asked[-1] == "The")
             if asked == ["Hold", "Hold"]:
                 cell.simulated.make_ready(Described.of("own.toml"))
@@ -243,7 +238,6 @@ def test_the_claw_closes_and_the_arm_moves_only_after_a_word_each(opened: Callab
                 claw.release()
             assert _question(open_cell, job, "part 2 of 2", last, refill=False) is None
             question = _question(open_cell, job, "part 2 of 2", last, refill=True)
-            assert question is not None
             question(replace(context, ask=person))
 
         cell.perform("loading", work)

@@ -1,7 +1,5 @@
 """A calibration is made for the devices that are there."""
 
-from __future__ import annotations
-
 from cell.config.cell_config import load_config
 from cell.devices.simulated.direct import VirtualCell
 from cell.run.calibration import serial_numbers

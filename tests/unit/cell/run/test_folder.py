@@ -1,7 +1,5 @@
 """Run folders: found by name, number or as the newest, and what goes on in them is told."""
 
-from __future__ import annotations
-
 import logging
 import os
 import sqlite3

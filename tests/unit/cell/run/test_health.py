@@ -1,7 +1,5 @@
 """How good the cell is today: series of figures of reports, their trends against closed forms, and what is due."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 from dataclasses import replace

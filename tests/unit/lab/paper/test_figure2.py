@@ -1,7 +1,5 @@
 """The paper's design study, against the figures of docs/explanation/theory.md, section 3, and traced rays."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

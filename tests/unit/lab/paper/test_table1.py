@@ -1,7 +1,5 @@
 """Small versions of the campaigns behind `cell paper`: on their bounds, reproducible, and outliers found."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,7 +1,5 @@
 """What is drawn of a job: frames, lenses, pictures, bodies and points tell one story."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections import defaultdict
@@ -46,7 +44,6 @@ def matrix(transform: Any) -> np.ndarray[Any, Any]:
 def test_pictures_are_the_files_and_carry_the_lens_they_were_taken_with(
     read: Messages, folder: Path, placed_pot: JobRecord
 ) -> None:
-    assert placed_pot.calibration is not None
     lenses = {"scan_camera": placed_pot.calibration.scan.camera, "target_camera": placed_pot.calibration.target.camera}
     kept = {path.name for path in (folder / "frames").iterdir()}
     for name, camera in lenses.items():

@@ -1,7 +1,5 @@
 """Promises of `cell.run.record.reading`."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A run's record: what others' readers find in it, how it survives being cut off, and perception fed with it again."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math

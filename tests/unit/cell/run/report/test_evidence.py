@@ -1,7 +1,5 @@
 """A refusal leaves what it looked at, and a run is measured against its limits."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

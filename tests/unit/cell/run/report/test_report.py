@@ -1,7 +1,5 @@
 """What a run says at its end: the report is strict and documented, and keeps its contract."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Acceptance figures: form, size and spacing against shapes with known errors, and against a head without any."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

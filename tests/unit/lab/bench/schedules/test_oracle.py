@@ -1,7 +1,5 @@
 """The oracle sees each violation, on a world that is driven by hand: the devices without the cell's gate."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A run's page: one file that asks for nothing, says what the report says, and what it cannot show."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -15,7 +13,6 @@ from typer.testing import CliRunner
 from cell.apps.cli.app import app
 from cell.base.storage import write_json
 from cell.measure.reconstruction.ply import write_cloud
-from cell.procedures.steps.reconstruct import Reconstruction
 from cell.run.report.page.make import MOST_BYTES, compared, identities, judged, make_page, verdict, write_page
 from drivers.errors import CellError
 from lab.bench.job.whole_job import JobRecord
@@ -63,7 +60,6 @@ def folder(placed_pot: JobRecord, ends: Ends, tmp_path_factory: pytest.TempPathF
     folder = tmp_path_factory.mktemp("page") / ends(report_runs.placed).folder.name
     shutil.copytree(ends(report_runs.placed).folder, folder)
     made = placed_pot.results["reconstruct"]
-    assert isinstance(made, Reconstruction)
     write_cloud(folder / "cloud.ply", made.cloud)
     write_json(folder / "job.json", pot()[0].model_dump(mode="json"))
     journal = Journal(folder, folder.name, {"clock": "virtual"})
