@@ -32,6 +32,7 @@ def test_runs_are_found_by_name_id_or_as_the_newest(tmp_path: Path) -> None:
         find_run(root, None)
     first = new_run(root)
     second = new_run(root)
+    (root / "notes").mkdir()
     assert set(list_runs(root)) == {first, second}
     assert find_run(root, None) == sorted((first, second))[-1]
     assert find_run(root, first.name.split("-")[1]) == first
@@ -159,6 +160,14 @@ def test_the_newest_run_is_the_last_whatever_the_clock_says(tmp_path: Path) -> N
     made = [new_run(tmp_path) for _ in range(3)]
     assert [folder.name[:15] for folder in made] == ["21000101T000000", "21000101T000001", "21000101T000002"]
     assert find_run(tmp_path, None) == made[-1]
+
+
+def test_what_is_logged_in_a_run_stands_in_its_folder(tmp_path: Path) -> None:
+    with run_log(tmp_path):
+        logging.getLogger("cell.run").warning("the lamp flickers")
+    logging.getLogger("cell.run").warning("after it")
+    told = (tmp_path / "run.log").read_text(encoding="utf-8")
+    assert "the lamp flickers" in told and "after it" not in told
 
 
 def test_a_log_that_cannot_be_written_ends_nothing(
