@@ -3,7 +3,7 @@
 import os
 import tempfile
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
@@ -68,6 +68,19 @@ def stored(cell: OpenCell) -> CellCalibration:
     return found
 
 
+def observe_boards(
+    config: CellConfig, devices: Devices, mover: Mover, context: WorkContext, notify: Callable[[float, str], None]
+) -> Observations:
+    """Photograph the boards on the deck from the calibration poses, and the reference plate between them."""
+    given = config, devices, mover, context.check
+    scan = collect_scan(*given, lambda f, t: notify(0.65 * f, t), context.keep)
+    witness = see_reference_plate(config, devices, context.keep)
+    target = collect_target(*given, lambda f, t: notify(0.65 + 0.3 * f, t), context.keep)
+    return store.gathered(
+        scan, target, serial_numbers(devices), config=config, kinematics=arm_table(config, devices), witness=witness
+    )
+
+
 def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibration:
     """Move through the calibration poses, solve, and store the result and what it came from, recorded in `run`.
 
@@ -84,14 +97,8 @@ def calibrate(cell: OpenCell, run: Run[object], job: str | Path) -> CellCalibrat
         mover = cell.mover(part_of, context.safe_point)
         # In command, so that a vehicle that somebody else moves or releases is noticed.
         devices.vehicle.recover()
-        given = config, devices, mover, context.check
-        scan = collect_scan(*given, lambda f, t: notify(0.65 * f, t), context.keep)
-        witness = see_reference_plate(config, devices, context.keep)
-        target = collect_target(*given, lambda f, t: notify(0.65 + 0.3 * f, t), context.keep)
+        observations = observe_boards(config, devices, mover, context, notify)
         notify(0.96, "solving")
-        observations = store.gathered(
-            scan, target, serial_numbers(devices), config=config, kinematics=arm_table(config, devices), witness=witness
-        )
         made = store.solve_observations(observations).calibration
         notify(0.98, "looking at the scan camera's shutter")
         with kept_if_refused(cell.calibrations_folder, made.name):

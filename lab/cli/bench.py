@@ -24,10 +24,11 @@ def acceptance(seed: SeedOption = 1, level: LevelOption = Level.nominal, json: J
 
     A ball at ten places of the measuring volume, a ball bar at seven, a flat at six; the worst place counts.
     """
+    from lab.bench.acceptance.campaign import PLACES
     from lab.bench.acceptance.campaign import acceptance as campaign
 
     with bar() as told:
-        result = campaign(seed, level.value, lambda done, total: told(done, "places", total))
+        result = campaign(seed, level.value, counted(told, PLACES))
     show(result, json, without=("positions",))
 
 
@@ -104,7 +105,7 @@ def calibration(
     from lab.bench.calibration.world import Noise
 
     with bar() as told:
-        result = campaign(range(1, seeds + 1), Noise(), lambda done: told(done, f"{done} of {seeds} heads", seeds))
+        result = campaign(range(1, seeds + 1), Noise(), counted(told, seeds))
     show(result, json, without=("trials",))
 
 
@@ -147,10 +148,11 @@ def inversion(
     json: JsonOption = False,
 ) -> None:
     """Find the pose of five parts from near and far, with clutter and 40 % missing, and refuse what must be refused."""
-    from lab.bench.inversion.campaign import campaign
+    from lab.bench.inversion.campaign import CASES, campaign
+    from lab.bench.inversion.scenes import PARTS
 
     with bar() as told:
-        report = campaign(starts, cases, lambda done, total: told(done, "", total))
+        report = campaign(starts, cases, counted(told, starts * len(PARTS) + cases * (len(CASES) + 5)))
     show(report, json)
 
 
@@ -164,7 +166,6 @@ def placed(
     job: JobOption = "pot",
     corrections: Annotated[int, typer.Option(min=0, max=5, help="place.corrections of the job.")] = 0,
     accept: Annotated[str | None, typer.Option(help='place.accept of the job, such as "0.05 mm".')] = None,
-    whole: Annotated[bool, typer.Option("--whole", help="The part covers its surface, and hides all of it.")] = False,
     workers: WorkersOption = 0,
     json: JsonOption = False,
 ) -> None:
@@ -179,10 +180,8 @@ def placed(
     chosen = list(dict.fromkeys(effect or EFFECTS))
     place = f"corrections = {corrections}" + ("" if accept is None else f'\naccept = "{accept}"')
     with bar() as told:
-        result = campaign(
-            range(1, seeds + 1), level.value, job, chosen, place=place,
-            done=counted(told, len(chosen) * seeds), whole=whole, workers=workers,
-        )  # fmt: skip
+        done = counted(told, len(chosen) * seeds)
+        result = campaign(range(1, seeds + 1), level.value, job, chosen, place=place, done=done, workers=workers)
     show(result, json, without=("runs",), failed=result["outside_bound"])
 
 
@@ -383,9 +382,7 @@ def interim(
 
     with bar() as told:
         told(0, "the first cells are on their way")
-        found = campaign(
-            range(1, seeds + 1), level.value, checks, lambda done, total: told(done, "cells", total), workers
-        )
+        found = campaign(range(1, seeds + 1), level.value, checks, counted(told, seeds), workers)
     show(found, json, without=("runs",), failed=found["shifts"][UNTOUCHED]["found"])
 
 
@@ -402,4 +399,4 @@ def verify(
     with bar() as told:
         progress = counted(told, seeds * (len(chosen) + KINDS_OF_CHANGE + 1))
         found = campaign(range(1, seeds + 1), level.value, chosen, progress)
-    show(found.summary(level.value, seeds), json)
+    show(found, json)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from cell.apps.cli.options import JsonOption
-from lab.cli.shown import bar, show
+from lab.cli.shown import bar, counted, show
 
 OutOption = Annotated[
     Path | None, typer.Option("--out", help="Folder for the pictures and the numbers as JSON; made if it is not there.")
@@ -40,7 +40,7 @@ def table1(seeds: SeedsOption = 20, json: JsonOption = False, out: OutOption = N
     from lab.paper.table1 import table1 as campaign
 
     with bar() as told:
-        result = campaign(range(seeds), lambda done, total: told(done, "heads", total))
+        result = campaign(range(seeds), counted(told, seeds))
     _show(result, json, out, "table1")
 
 

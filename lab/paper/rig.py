@@ -19,8 +19,7 @@ from cell.measure.geometry.light_plane import LightPlane
 from cell.measure.geometry.poses import from_parts, perturbed
 from cell.measure.reconstruction.build import ScanGeometry
 from cell.measure.vision.board.view import BoardView, centre_of, parse_board
-from cell.measure.vision.stripe.profile import StripeProfile
-from lab.bench.calibration.world import Noise, centroids, circle
+from lab.bench.calibration.world import Noise, centroids, circle, profile_of
 from sim_backends.optics import Board, BoardInstance, CameraOptics, LaserOptics, Mesh, MeshInstance
 from sim_backends.optics.laser.sheet import lit
 from sim_backends.optics.laser.stripe import crossings
@@ -148,13 +147,6 @@ def dot_centres(optics: CameraOptics, camera_from_board: pin.SE3, board: Board) 
     return centroids(optics.project(rims).reshape(-1, RIM, 2))
 
 
-def profile_of(columns: Array, sigma: float) -> StripeProfile:
-    """A profile of stripe centres (h,) with one standard deviation each."""
-    none = np.zeros(len(columns), dtype=np.bool_)
-    same = np.ones(len(columns))
-    return StripeProfile("rows", columns, sigma * same, 150 * same, 2 * same, none, none)
-
-
 def observe(spec: RigSpec, head: TrueHead, rng: np.random.Generator) -> list[ScanObservation]:
     """The calibration's views: board and stripe at `spec.views` poses over depths, tilts, turns and rail positions."""
     board, known = Board.parse(spec.board), parse_board(spec.board)
@@ -184,7 +176,7 @@ def observe(spec: RigSpec, head: TrueHead, rng: np.random.Generator) -> list[Sca
         made.append(
             ScanObservation(
                 view,
-                profile_of(columns, spec.noise.stripe),
+                profile_of(columns, spec.noise.stripe, 2.0),
                 perturbed(flange, arm_error(spec.noise, rng)),
                 reading + spec.noise.rail * rng.standard_normal(),
             )

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from cell.measure.geometry.poses import perturbed, transform
 from cell.measure.reconstruction.build import ScanGeometry
 from cell.measure.reconstruction.cloud import Cloud
-from lab.bench.over_cores import Progress, run_all
+from lab.bench.calibration.world import profile_of
+from lab.bench.over_cores import Done, over_cores
 from lab.bench.reconstruction.scenes import swept
 from lab.paper.rig import (
     RigSpec,
@@ -29,7 +30,6 @@ from lab.paper.rig import (
     in_scan_frame,
     observe,
     point_covariances,
-    profile_of,
     solve,
     sweep,
 )
@@ -68,9 +68,9 @@ NEAR_MM, FAR_MM = (0.3, 0.85), (1.0, 6.0)
 STREAK_ROWS = (4, 10)
 
 
-def table1(seeds: Iterable[int], progress: Progress) -> dict[str, Any]:
+def table1(seeds: Iterable[int], done: Done) -> dict[str, Any]:
     """Both tests over the seeds, summarised beside the paper's figures. All lengths in mm."""
-    runs = run_all(one_seed, seeds, progress=progress)
+    runs = over_cores([(one_seed, seed) for seed in seeds], ended=lambda run: done("heads"))
     ways = ("nominal", "staged", "joint")
     return {
         "note": "simulated; the paper's figures were measured on its hardware and are quoted as printed",
@@ -263,7 +263,7 @@ def spoil(sweep: Sweep, spec: RigSpec, share: float, rng: np.random.Generator) -
 def reconstruct(sweep: Sweep, centres: Array, geometry: ScanGeometry, spec: RigSpec) -> Cloud:
     """The product's own reconstruction of the centres, in the frame of `geometry`, with its outlier filter."""
     profiles = (
-        (profile_of(columns, spec.noise.stripe), float(reading))
+        (profile_of(columns, spec.noise.stripe, 2.0), float(reading))
         for columns, reading in zip(centres, sweep.readings, strict=True)
     )
     return swept(geometry, profiles, spec.noise.rail, pin.SE3.Identity())

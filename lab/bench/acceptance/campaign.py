@@ -8,7 +8,6 @@ sensor noise; stripe, cloud and outlier filter are the product's own. Frame: the
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -23,6 +22,7 @@ from cell.measure.reconstruction.cloud import Cloud
 from cell.measure.vision.stripe.extract import StripeStream
 from drivers.errors import RefusedError
 from lab.bench.calibration.world import Noise
+from lab.bench.over_cores import Done
 from lab.bench.reconstruction.scenes import swept
 from lab.paper.rig import RigSpec, TrueHead, draw_head, from_axes, in_scan_frame, observe, solve
 from sim_backends.optics import Mesh, MeshInstance, PlaneInstance, SceneObject, render
@@ -159,11 +159,11 @@ MOST = 0.95
 LEAST_POINTS = 50
 GAUSS_95 = 2 * 1.959964
 """Width of the band that holds 95 % of a Gaussian variable, in standard deviations."""
+PLACES = 23
+"""Of ball, ball bar and flat together."""
 
-Progress = Callable[[int, int], None]
 
-
-def acceptance(seed: int, level: str = "nominal", progress: Progress | None = None) -> dict[str, Any]:
+def acceptance(seed: int, level: str, done: Done = lambda name: None) -> dict[str, Any]:
     """The three tests on the head of `seed` at a level of deviations, calibrated first. Lengths in mm.
 
     `worst` has the figures that a limit would be set on: `probing_form_mm` (all points but 3 ‰), `probing_form_95_mm`
@@ -177,24 +177,19 @@ def acceptance(seed: int, level: str = "nominal", progress: Progress | None = No
     rng = np.random.default_rng([seed, 2634])
     head = draw_head(spec, rng, level)
     geometry = in_scan_frame(solve(spec, observe(spec, head, rng)).joint)
-    balls, bars, flats = ball_places(spec), bar_places(spec), flat_poses(spec)
-    total, done = len(balls) + len(bars) + len(flats), 0
     found: dict[str, list[dict[str, float]]] = {"ball": [], "bar": [], "flat": []}
 
     def step(name: str, row: dict[str, float]) -> None:
-        nonlocal done
         found[name].append(row)
-        done += 1
-        if progress is not None:
-            progress(done, total)
+        done(name)
 
-    for centre in balls:
+    for centre in ball_places(spec):
         cloud = scan_balls(spec, head, geometry, [centre], rng)[0]
         step("ball", _probing(cloud, BALL_DIAMETER))
-    for ends in bars:
+    for ends in bar_places(spec):
         clouds = scan_balls(spec, head, geometry, list(ends), rng)
         step("bar", _spacing(clouds, float(np.linalg.norm(ends[1] - ends[0]))))
-    for pose in flats:
+    for pose in flat_poses(spec):
         step("flat", _flatness(scan_flat(spec, head, geometry, pose, rng)))
     return {
         "note": "simulated; after VDI/VDE 2634 part 2 and ISO 10360-13, raw points, no smoothing",

@@ -8,7 +8,6 @@ very noise that was drawn is its linear estimate: so luck is told from loss.
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -22,21 +21,20 @@ from cell.measure.calibration.solve.normal import tangents
 from cell.measure.calibration.solve.results import PARAMETERS
 from cell.measure.geometry.poses import difference, from_matrix
 from cell.measure.vision.board.view import BoardView
-from cell.measure.vision.stripe.profile import StripeProfile
 from lab.bench.calibration.world import (
     HEIGHT,
     OWN,
     SHARED,
-    STRIPE_WIDTH_PX,
     WIDTH,
     Array,
     HeadWorld,
     Noise,
     draw_head,
+    profile_of,
     seen_dots,
     seen_rows,
 )
-from lab.bench.over_cores import run_all
+from lab.bench.over_cores import Done, over_cores
 from sim_backends.optics.camera import project_points
 
 STEPS = np.array(
@@ -158,10 +156,10 @@ class Trial:
     errors: dict[str, dict[str, float]]
 
 
-def campaign(seeds: Sequence[int], noise: Noise, notify: Callable[[int], None]) -> dict[str, Any]:
-    """Run the seeds on all cores and sum them up; `notify` hears how many are done."""
-    trials = run_all(partial(one_trial, noise=noise), seeds, progress=lambda done, _: notify(done))
-    return summed_up(trials, noise)
+def campaign(seeds: Sequence[int], noise: Noise, done: Done) -> dict[str, Any]:
+    """Run the seeds on all cores and sum them up; `done` is told of each."""
+    tasks = [(one_trial, seed, noise) for seed in seeds]
+    return summed_up(over_cores(tasks, ended=lambda trial: done(f"head {trial.seed}")), noise)
 
 
 def one_trial(seed: int, noise: Noise) -> Trial:
@@ -210,13 +208,11 @@ def observe(world: HeadWorld, noise: Noise, rng: np.random.Generator) -> list[An
         ids = seen_dots(pixels)
         columns, _ = seen_rows(world, view, own)
         columns += noise.stripe * rng.normal(size=HEIGHT)
-        flat, none = np.ones(HEIGHT), np.zeros(HEIGHT, dtype=np.bool_)
         board = BoardView(
             world.spec, (WIDTH, HEIGHT), ids, pixels[ids], np.full(len(ids), noise.dots), False, world.spec.dot_radius
         )
-        stripe = StripeProfile("rows", columns, noise.stripe * flat, 150 * flat, STRIPE_WIDTH_PX * flat, none, none)
-        reading = float(world.rails[view] + noise.rail * rng.normal())
-        made.append(ScanObservation(board, stripe, from_matrix(world.flanges[view]), reading, f"view {view + 1}"))
+        reading, flange = float(world.rails[view] + noise.rail * rng.normal()), from_matrix(world.flanges[view])
+        made.append(ScanObservation(board, profile_of(columns, noise.stripe), flange, reading, f"view {view + 1}"))
     return made
 
 

@@ -23,7 +23,7 @@ from cell.procedures.calibrate.interim import InterimCheck, interim_check
 from cell.run.recorded_work import WorkContext
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import NoFrames, on_calibrated
-from lab.bench.over_cores import run_all
+from lab.bench.over_cores import Done, over_cores
 from sim_backends.world.scene import Scene, rotation
 
 Row = dict[str, Any]
@@ -89,11 +89,10 @@ def planted() -> list[PlantedShift]:
     ]
 
 
-def campaign(
-    seeds: Sequence[int], level: str, untouched: int, done: Callable[[int, int], None], workers: int = 0
-) -> Row:
+def campaign(seeds: Sequence[int], level: str, untouched: int, done: Done, workers: int = 0) -> Row:
     """`untouched` checks of each seed's cell as it is, and one under each planted shift; figures in mm."""
-    rows = [row for rows in run_all(partial(one_world, level, untouched), seeds, workers, done) for row in rows]
+    worlds = over_cores([(one_world, level, untouched, seed) for seed in seeds], workers, lambda rows: done("cells"))
+    rows = [row for world in worlds for row in world]
     names = [UNTOUCHED, *(each.name for each in planted())]
     creeping = [row for row in rows if row["shift"] == CREEPING]
     shifts = {name: _tally([row for row in rows if row["shift"] == name]) for name in names}

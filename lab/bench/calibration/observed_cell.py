@@ -2,13 +2,13 @@
 
 For campaigns over many worlds. Projection, light plane, arm and every deviation are the simulator's; nothing here comes
 from the estimators, so that an error cannot cancel. Rendering and picture processing are left out: their noise is
-stated in `Noise`, as measured on rendered pictures.
+stated here, as measured on rendered pictures.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from cell.motion.kinematics import HOME, Joints, arm_kinematics
 from cell.procedures.arm.photograph import CalibrationView, scan_calibration_views, target_calibration_views
 from cell.procedures.calibrate.boards import RAIL_MOVE, RAIL_MOVE_VIEWS
 from drivers.interfaces import LinkTable
-from lab.bench.calibration.world import circle
+from lab.bench.calibration.world import circle, profile_of
 from sim_backends.models.arm_kinematics import UR10E_DH, Kinematics
 from sim_backends.optics.camera import CameraOptics
 from sim_backends.world import drawing
@@ -34,14 +34,8 @@ Array = NDArray[np.float64]
 
 EDGE_PX = 12.0
 RIM = 24
-
-
-@dataclass(frozen=True)
-class Noise:
-    """One standard deviation of what picture processing adds: of a dot and of a stripe centre per row, px."""
-
-    dots_px: float = 0.03
-    stripe_px: float = 0.07
+DOTS_PX, STRIPE_PX = 0.03, 0.07
+"""One standard deviation of what picture processing adds: of a dot and of a stripe centre per row, px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +84,6 @@ class ObservedCell:
     scene: Scene
     config: CellConfig
     rng: np.random.Generator
-    noise: Noise = field(default_factory=Noise)
-    bend: float = 0.0
-    """Sagitta in m of the fine board, bent along its x about its middle."""
 
     def __post_init__(self) -> None:
         self.truth = Truth.of(self.scene)
@@ -126,15 +117,13 @@ class ObservedCell:
 
     def scan_view(self, rest: Rest, carriage: float) -> BoardView:
         """The fine board in a photograph of the scan camera."""
-        return self._photo(
-            self._camera_from(rest, self.truth.base_from_fine, carriage), self.truth.scan_lens, drawing.SCAN_SIZE,
-            self.fine, self.bend,
-        )  # fmt: skip
+        seen = self._camera_from(rest, self.truth.base_from_fine, carriage)
+        return self._photo(seen, self.truth.scan_lens, drawing.SCAN_SIZE, self.fine)
 
     def target_view(self, rest: Rest) -> BoardView:
         """The large board in a photograph of the target camera."""
         seen = inverse(rest.true @ self.truth.flange_from_target) @ self.truth.base_from_large
-        return self._photo(seen, self.truth.target_lens, drawing.TARGET_SIZE, self.large, 0.0)
+        return self._photo(seen, self.truth.target_lens, drawing.TARGET_SIZE, self.large)
 
     def stripe(self, rest: Rest, carriage: float) -> StripeProfile:
         """The laser's stripe on the fine board's plate, one centre per image row."""
@@ -149,14 +138,6 @@ class ObservedCell:
         foot = np.linalg.solve(system, np.array([truth.plane_distance, normal @ at, system[2] @ middle]))
         line = foot + np.linspace(-0.04, 0.04, 801)[:, None] * system[2]
         local = (line - at) @ seen[:3, :3]
-        if self.bend:
-            # Two rounds move the line onto the bent surface: the rest of the shift is far below a micrometre.
-            for _ in range(3):
-                sag = bend_of(self.fine, self.bend, local)
-                slope = truth.plane_normal @ normal
-                away = normal - slope * truth.plane_normal
-                line = foot + np.linspace(-0.04, 0.04, 801)[:, None] * system[2] + sag[:, None] * away / (1 - slope**2)
-                local = (line - at) @ seen[:3, :3]
         centre = centre_of(self.fine)[:2]
         on = (np.abs(local[:, :2] - centre) < size / 2).all(axis=1)
         columns = np.full(height, np.nan)
@@ -165,30 +146,22 @@ class ObservedCell:
             pixels = pixels[np.argsort(pixels[:, 1])]
             columns = np.interp(np.arange(height), pixels[:, 1], pixels[:, 0], left=np.nan, right=np.nan)
             columns[(columns < 5) | (columns > width - 6)] = np.nan
-        columns = columns + self.rng.normal(0.0, self.noise.stripe_px, height)
-        none = np.zeros(height, dtype=np.bool_)
-        return StripeProfile(
-            "rows", columns, np.full(height, self.noise.stripe_px), np.full(height, 150.0), np.full(height, 1.5), none,
-            none,
-        )  # fmt: skip
+        columns = columns + self.rng.normal(0.0, STRIPE_PX, height)
+        return profile_of(columns, STRIPE_PX)
 
     def _camera_from(self, rest: Rest, base_from_board: Array, carriage: float) -> Array:
         base_from_camera = rest.true @ self.truth.flange_from_scan
         base_from_camera = base_from_camera @ shifted(carriage * self.truth.rail_direction)
         return np.asarray(inverse(base_from_camera) @ base_from_board, dtype=np.float64)
 
-    def _photo(self, pose: Array, lens: Array, size: tuple[int, int], spec: BoardSpec, bend: float) -> BoardView:
+    def _photo(self, pose: Array, lens: Array, size: tuple[int, int], spec: BoardSpec) -> BoardView:
         points = spec.points()
         rims = (points[:, None] + spec.dot_radius * circle(RIM)).reshape(-1, 3)
-        if bend:
-            rims[:, 2] += bend_of(spec, bend, rims)
         pixels = _optics(lens, size).project(rims @ pose[:3, :3].T + pose[:3, 3]).reshape(len(points), RIM, 2)
-        centres = ellipse_centres(pixels) + self.rng.normal(0.0, self.noise.dots_px, (len(points), 2))
+        centres = ellipse_centres(pixels) + self.rng.normal(0.0, DOTS_PX, (len(points), 2))
         inside = ((pixels > EDGE_PX) & (pixels < np.array(size) - 1 - EDGE_PX)).all(axis=(1, 2))
         ids = np.flatnonzero(inside)
-        return BoardView(
-            spec, size, ids, centres[ids], np.full(len(ids), self.noise.dots_px), dot_radius=spec.dot_radius
-        )
+        return BoardView(spec, size, ids, centres[ids], np.full(len(ids), DOTS_PX), dot_radius=spec.dot_radius)
 
     def collect_scan(self, views: Sequence[CalibrationView] | None = None) -> list[ScanObservation]:
         """What `cell.procedures.calibrate.boards.collect_scan` brings, at the same views."""
@@ -217,12 +190,6 @@ class ObservedCell:
             rest = self.move(view.base_from_flange.homogeneous)
             made.append(TargetObservation(self.target_view(rest), from_matrix(rest.reported), f"large {k + 1}"))
         return made
-
-
-def bend_of(spec: BoardSpec, sagitta: float, local: Array) -> Array:
-    """How far (n,) in m a board bent along x stands out of its plane at board coordinates (n, 3)."""
-    half = 0.5 * float(np.ptp(spec.points()[:, 0]))
-    return np.asarray(sagitta * ((local[:, 0] - centre_of(spec)[0]) / half) ** 2, dtype=np.float64)
 
 
 def shifted(translation: Array) -> Array:

@@ -6,7 +6,7 @@ direction, and with one moved anyhow so that the place of a job is off by a thir
 are `lab.bench.calibration.observed_cell`'s: the simulator's optics, arm and deviations.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -49,25 +49,13 @@ class Disturbance:
 
 
 @dataclass
-class Tally:
-    """Of the checks under one disturbance: how many, how many found, named first, and among the suspects."""
-
-    part: str
-    kind: str
-    checks: int = 0
-    found: int = 0
-    first: int = 0
-    among: int = 0
-
-
-@dataclass
 class Promise:
     """The checks under a change of one kind as large as the verification says that it finds: sizes in m or rad."""
 
     change: Change
     sizes: list[float] = field(default_factory=list)
-    found: int = 0
-    bad_at_a_third: int = 0
+    found: list[bool] = field(default_factory=list)
+    bad_at_a_third: list[bool] = field(default_factory=list)
     """Called bad, of as many checks of a change that moves the place by a third of its tolerance."""
 
     def summary(self) -> dict[str, Any]:
@@ -81,56 +69,9 @@ class Promise:
             "wanted": round(factor * self.change.wanted, 4),
             "unit": ("mm" if self.change.unit == "m" else "deg") + self.change.where,
             "checks": len(self.sizes),
-            "found_percent": round(100 * self.found / len(self.sizes), 1),
-            "bad_at_a_third_percent": round(100 * self.bad_at_a_third / len(self.sizes), 1),
+            "found_percent": _percent(self.found),
+            "bad_at_a_third_percent": _percent(self.bad_at_a_third),
         }
-
-
-@dataclass
-class Campaign:
-    """Result: tallies by disturbance, promises by kind of change, and the checks of good calibrations.
-
-    Of these `alarms` called the calibration bad, `told` saw a change; `alarmed` calibrations were called bad by any.
-    """
-
-    good: int = 0
-    alarms: int = 0
-    told: int = 0
-    alarmed: int = 0
-    tallies: dict[str, Tally] = field(default_factory=dict)
-    promises: dict[tuple[str, str], Promise] = field(default_factory=dict)
-
-    def summary(self, level: str, seeds: int) -> dict[str, Any]:
-        """For reports. Beside each disturbance stands what the verifications said of the size they find of its kind."""
-        promised = {key: promise.summary() for key, promise in self.promises.items()}
-        return {
-            "level": level,
-            "seeds": seeds,
-            "false_alarm_percent": round(100 * self.alarms / max(1, self.good), 2),
-            "checks_of_good": self.good,
-            "change_seen_percent": round(100 * self.told / max(1, self.good), 2),
-            "calibrations_with_a_false_alarm": self.alarmed,
-            "disturbances": [
-                {
-                    "name": name,
-                    "checks": t.checks,
-                    "found_percent": round(100 * t.found / t.checks, 1),
-                    "detectable_mean": promised[t.part, t.kind]["mean"],
-                    "wanted": promised[t.part, t.kind]["wanted"],
-                    "unit": promised[t.part, t.kind]["unit"],
-                    "named_first_percent": round(100 * t.first / max(1, t.found), 1),
-                    "among_suspects_percent": round(100 * t.among / max(1, t.found), 1),
-                }
-                for name, t in self.tallies.items()
-            ],
-            "detectable": list(promised.values()),
-            "bad_at_a_third_percent": self._percent([p.bad_at_a_third for p in self.promises.values()]),
-            "found_at_detectable_percent": self._percent([p.found for p in self.promises.values()]),
-        }
-
-    def _percent(self, counts: Sequence[int]) -> float:
-        """Of all checks under changes of a stated size."""
-        return round(100 * sum(counts) / max(1, sum(len(p.sizes) for p in self.promises.values())), 1)
 
 
 def disturbances() -> list[Disturbance]:
@@ -196,51 +137,76 @@ def look_again(cell: ObservedCell, calibration: CellCalibration) -> CheckObserva
 
 
 def campaign(
-    seeds: Iterable[int], level: str, chosen: Iterable[Disturbance], progress: Callable[[str], None]
-) -> Campaign:
-    """Calibrate each seed's world, check it as it is and under each disturbance."""
-    result = Campaign()
-    chosen = list(chosen)
+    seeds: Sequence[int], level: str, chosen: Sequence[Disturbance], progress: Callable[[str], None]
+) -> dict[str, Any]:
+    """Calibrate each seed's world, check it as it is and under each disturbance; for reports.
+
+    Beside each disturbance stands what the verifications said of the size they find of its kind.
+    """
     config, job = load_config(None), load_job("pot")[0]
+    alarms: list[list[bool]] = []
+    told: list[bool] = []
+    suspected: dict[str, list[list[str]]] = {disturbance.name: [] for disturbance in chosen}
+    promises: dict[tuple[str, str], Promise] = {}
     for seed in seeds:
         progress(f"seed {seed}: calibrating")
         cell = ObservedCell(draw(seed, level), config, np.random.default_rng([seed, 20]))
         calibration = cell.calibrated(str(seed))
         truth, effect = cell.truth, at_place(calibration, job)
-        alarms = result.alarms
-        for _ in range(CHECKS_OF_A_GOOD_ONE):
-            verification = Verification.of(calibration, job, look_again(cell, calibration))
-            result.good += 1
-            result.alarms += not verification.good
-            result.told += not verification.verdict.good
-        result.alarmed += result.alarms > alarms
-        for seen in verification.verdict.detectable:
+        checks = [Verification.of(calibration, job, look_again(cell, calibration)) for _ in range(CHECKS_OF_A_GOOD_ONE)]
+        alarms.append([not check.good for check in checks])
+        told += [not check.verdict.good for check in checks]
+        for seen in checks[-1].verdict.detectable:
             key = seen.change.part, seen.change.kind
             progress(f"seed {seed}: {', '.join(key)}")
             cell.truth = changed(truth, seen)
             verdict = verify(calibration.scan, calibration.target, look_again(cell, calibration))
-            promise = result.promises.setdefault(key, Promise(seen.change))
+            promise = promises.setdefault(key, Promise(seen.change))
             promise.sizes.append(seen.size)
-            promise.found += not verdict.good
+            promise.found.append(not verdict.good)
             step = seen.change.directions @ cell.rng.normal(size=seen.change.directions.shape[1])
             step *= 1e-4 / np.linalg.norm(step)
             for _ in range(3):
                 step *= job.place.tolerance / 3 / effect(seen.change.chain, step)
             cell.truth = changed(truth, replace(seen, step=step))
-            promise.bad_at_a_third += not Verification.of(calibration, job, look_again(cell, calibration)).good
+            third = Verification.of(calibration, job, look_again(cell, calibration))
+            promise.bad_at_a_third.append(not third.good)
         for disturbance in chosen:
             progress(f"seed {seed}: {disturbance.name}")
             cell.truth = disturbance.moved(truth)
             verdict = verify(calibration.scan, calibration.target, look_again(cell, calibration))
-            tally = result.tallies.setdefault(disturbance.name, Tally(disturbance.part, disturbance.kind))
-            tally.checks += 1
-            if not verdict.good:
-                parts = [suspect.part for suspect in verdict.suspects]
-                tally.found += 1
-                tally.first += parts[0] == disturbance.part
-                tally.among += disturbance.part in parts
-        cell.truth = truth
-    return result
+            parts = [] if verdict.good else [suspect.part for suspect in verdict.suspects]
+            suspected[disturbance.name].append(parts)
+    promised = {key: promise.summary() for key, promise in promises.items()}
+    false = [alarm for checks_of_one in alarms for alarm in checks_of_one]
+    return {
+        "level": level,
+        "seeds": len(seeds),
+        "false_alarm_percent": _percent(false, 2),
+        "checks_of_good": len(false),
+        "change_seen_percent": _percent(told, 2),
+        "calibrations_with_a_false_alarm": sum(map(any, alarms)),
+        "disturbances": [_row(each, suspected[each.name], promised[each.part, each.kind]) for each in chosen],
+        "detectable": list(promised.values()),
+        "bad_at_a_third_percent": _percent([bad for each in promises.values() for bad in each.bad_at_a_third]),
+        "found_at_detectable_percent": _percent([found for each in promises.values() for found in each.found]),
+    }
+
+
+def _row(disturbance: Disturbance, suspected: Sequence[Sequence[str]], promised: dict[str, Any]) -> dict[str, Any]:
+    """How often it was found, and its part named first and among the suspects; a check that is good suspects none."""
+    found = [parts for parts in suspected if parts]
+    return {
+        "name": disturbance.name, "checks": len(suspected),
+        "found_percent": _percent([bool(parts) for parts in suspected]), "detectable_mean": promised["mean"],
+        "wanted": promised["wanted"], "unit": promised["unit"],
+        "named_first_percent": _percent([parts[0] == disturbance.part for parts in found]),
+        "among_suspects_percent": _percent([disturbance.part in parts for parts in found]),
+    }  # fmt: skip
+
+
+def _percent(those: Sequence[bool], digits: int = 1) -> float:
+    return round(100 * sum(those) / max(1, len(those)), digits)
 
 
 def changed(truth: Truth, seen: Detectable) -> Truth:

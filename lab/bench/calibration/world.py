@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from cell.config.cell_config import load_config
 from cell.measure.calibration import Priors
 from cell.measure.vision.board.view import BoardSpec, centre_of, parse_board
+from cell.measure.vision.stripe.profile import StripeProfile
 from cell.procedures.arm.photograph import scan_calibration_views
 from sim_backends.optics.camera import project_points, undistort_pixels
 from sim_backends.world.levels import NOMINAL
@@ -158,6 +159,12 @@ class HeadWorld:
         xy = undistort_pixels(np.ascontiguousarray(pixels), self.lens)
         rays = np.column_stack([xy, np.ones(len(xy))])
         return np.asarray(rays / (rays @ self.plane)[:, None] + rails[:, None] * self.rail)
+
+
+def profile_of(columns: Array, sigma: float, width: float = STRIPE_WIDTH_PX) -> StripeProfile:
+    """A profile of stripe centres (h,), one of each row, with one standard deviation and one width, px."""
+    same, none = np.ones(len(columns)), np.zeros(len(columns), dtype=np.bool_)
+    return StripeProfile("rows", columns, sigma * same, 150 * same, width * same, none, none)
 
 
 def circle(count: int) -> Array:

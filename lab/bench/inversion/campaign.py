@@ -10,7 +10,6 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -28,12 +27,13 @@ from lab.bench.inversion.scenes import (
     SETTINGS,
     STRIPE_SIGMA,
     TRUE,
+    WILD,
     Setting,
     nominal,
     scan,
     start_away,
 )
-from lab.bench.over_cores import Progress, Task, run_all
+from lab.bench.over_cores import Done, Task, over_cores
 
 TOLERANCE = Tolerance(0.0006, 0.006)
 """The one of the job `pot`."""
@@ -53,10 +53,7 @@ def _moved(cloud: Cloud, motions: Array) -> Cloud:
 
 
 def _warped(warp: Callable[[Array, Array, np.random.Generator], Array]) -> Draw:
-    def draw(rng: np.random.Generator) -> Drawn:
-        return scan(PARTS["pot"], rng, height=lambda x, y: _POT(x, y) + warp(x, y, rng)), TRUE, (TRUE,)
-
-    return draw
+    return lambda rng: (scan(PARTS["pot"], rng, height=lambda x, y: _POT(x, y) + warp(x, y, rng)), TRUE, (TRUE,))
 
 
 def _bent(x: Array, y: Array, rng: np.random.Generator) -> Array:
@@ -83,17 +80,11 @@ def _sunk(setting: Setting) -> Draw:
 
 
 def _other(name: str) -> Draw:
-    def draw(rng: np.random.Generator) -> Drawn:
-        return scan(PARTS["pot"], rng, height=PARTS[name].height), TRUE, (TRUE,)
-
-    return draw
+    return lambda rng: (scan(PARTS["pot"], rng, height=PARTS[name].height), TRUE, (TRUE,))
 
 
 def _flipped(sx: int, sy: int) -> Draw:
-    def draw(rng: np.random.Generator) -> Drawn:
-        return scan(PARTS["pot"], rng, height=lambda x, y: _POT(sx * x, sy * y)), TRUE, (TRUE,)
-
-    return draw
+    return lambda rng: (scan(PARTS["pot"], rng, height=lambda x, y: _POT(sx * x, sy * y)), TRUE, (TRUE,))
 
 
 def _scaled(rng: np.random.Generator) -> Drawn:
@@ -255,12 +246,12 @@ def _percent(group: list[Outcome]) -> float:
     return round(100 * sum(o.converged for o in group) / len(group), 1)
 
 
-def campaign(starts: int, cases: int, progress: Progress) -> dict[str, object]:
+def campaign(starts: int, cases: int, done: Done) -> dict[str, object]:
     """Rows of `registration`, of `refusals` and the figures of `coverage`."""
     tasks: list[Task] = [(task, part, seed) for seed in range(starts) for part in PARTS]
     tasks += [(judge_case, case, seed) for case in CASES for seed in range(cases)]
     tasks += [(coverage, seed) for seed in range(5 * cases)]
-    found = run_all(_run, tasks, progress=progress)
+    found = over_cores(tasks, ended=lambda made: done(""))
     outcomes = [outcome for made in found if isinstance(made, list) for outcome in made]
     judged = [made for made in found if isinstance(made, Judged)]
     order = {part: k for k, part in enumerate(PARTS)}
@@ -269,12 +260,12 @@ def campaign(starts: int, cases: int, progress: Progress) -> dict[str, object]:
         "registration": table(outcomes),
         "refusals": [_case_row(case, [j for j in judged if j.case == case]) for case in CASES],
         "coverage": _coverage([made for made in found if isinstance(made, tuple)]),
-        "assumed_noise": {"stripe_mm": 1e3 * STRIPE_SIGMA, "rail_mm": 1e3 * RAIL_SIGMA, "wild_points_percent": 1.0},
+        "assumed_noise": {
+            "stripe_mm": 1e3 * STRIPE_SIGMA,
+            "rail_mm": 1e3 * RAIL_SIGMA,
+            "wild_points_percent": 100 * WILD,
+        },
     }
-
-
-def _run(task: Task) -> Any:
-    return task[0](*task[1:])
 
 
 def _case_row(case: str, judged: list[Judged]) -> dict[str, object]:

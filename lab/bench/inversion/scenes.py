@@ -160,15 +160,16 @@ STRIPE_SIGMA, RAIL_SIGMA = 40e-6, 8e-6
 TRUE = pin.SE3(pin.exp3(np.array([0.01, -0.02, 0.03])), np.array([0.75, 0.01, 0.05]))
 """base_from_surface of every scene, before `Scene.moved`."""
 LINES, ROWS = 200, 200
+WILD = 0.01
+"""Share of points that lie anywhere."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """What is wrong with a scan: shares of the part's points that are clutter or missing, and of wild ones."""
+    """What is wrong with a scan: shares of the part's points that are clutter or missing."""
 
     clutter: float = 0.0
     missing: float = 0.0
-    wild: float = 0.01
 
 
 SETTINGS = {
@@ -200,7 +201,7 @@ def scan(
     across = np.array([0.06, 0.0, 1.0]) * STRIPE_SIGMA
     points += across * rng.standard_normal((LINES, ROWS, 1))
     points[:, :, 0] += RAIL_SIGMA * rng.standard_normal((LINES, 1))
-    wild = rng.random((LINES, ROWS)) < setting.wild
+    wild = rng.random((LINES, ROWS)) < WILD
     points[wild, 2] += rng.uniform(-0.004, 0.004, int(wild.sum()))
     points[~np.isfinite(z)] = np.nan
     return Cloud(

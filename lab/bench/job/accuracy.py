@@ -7,7 +7,7 @@ cores; at every level the acceptance tests of the trade on the first seed's scan
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,7 +26,7 @@ from lab.bench.acceptance.campaign import acceptance
 from lab.bench.job.expected import expect
 from lab.bench.job.scan_errors import COVERED, by_pose, own_base, scan_errors, surface_at_middle
 from lab.bench.job.whole_job import JobRecord, job_and_surface, run_whole_job
-from lab.bench.over_cores import over_cores
+from lab.bench.over_cores import Done, over_cores
 from sim_backends.world.levels import assumed_noise
 
 LIMITS: dict[str, dict[str, float]] = {
@@ -41,29 +41,22 @@ WANTED = (0.90, 0.98)
 """True coverage that a stated 95 % ellipsoid may have."""
 
 
-def campaign(
-    seeds: Sequence[int], levels: Sequence[str], job: str, done: Callable[[str], None], workers: int = 0
-) -> dict[str, Any]:
+def campaign(seeds: Sequence[int], levels: Sequence[str], job: str, done: Done, workers: int = 0) -> dict[str, Any]:
     """Run every seed at every level and sum up; `done` is told in words of each run and acceptance test that ended.
 
     `workers` processes, by default one a core. Figures of one level stand at the top as well, that of the first.
     """
     load_job(job)
     worlds = [(one_run, job, seed, level) for level in levels for seed in seeds]
-    runs: list[dict[str, Any]] = []
-    tests: dict[str, Any] = {}
-    for number, made in over_cores([*worlds, *((acceptance, seeds[0], level) for level in levels)], workers):
-        if number < len(worlds):
-            runs.append(made)
-            done(f"seed {made['seed']} {made['level']}: {made['outcome']}")
-        else:
-            tests[made["level"]] = made
-            done(f"acceptance {made['level']}: measured")
-    runs.sort(key=lambda run: run["seed"])
-    by_level = {
-        level: summed_up([run for run in runs if run["level"] == level], level) | {"acceptance": tests[level]}
-        for level in levels
-    }
+    tests = [(acceptance, seeds[0], level) for level in levels]
+    made = over_cores(
+        [*worlds, *tests], workers,
+        lambda one: done(f"seed {one['seed']} {one['level']}: {one.get('outcome', 'acceptance measured')}"),
+    )  # fmt: skip
+    by_level = {}
+    for number, level in enumerate(levels):
+        runs = made[number * len(seeds) : (number + 1) * len(seeds)]
+        by_level[level] = summed_up(runs, level) | {"acceptance": made[len(worlds) + number]}
     return {"job": job, "seeds": list(seeds), **by_level[levels[0]], "levels": by_level}
 
 
@@ -81,7 +74,6 @@ def figures(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSur
         "outcome": record.outcome,
         "reason": record.reason,
         "stage": record.stage,
-        "wall_s": round(sum(record.wall_s.values()), 1),
     }
     if record.calibration is not None:
         made["chi2_calibration"] = record.calibration.scan.quality.chi2_per_dof
@@ -92,15 +84,8 @@ def figures(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSur
     assert record.at_sweep is not None and record.kinematic is not None
     scan = scan_errors(record, nominal, record.kinematic)
     assert scan is not None
-    expected = expect(record, config, job, nominal)
-    made["seams"] = [seam.as_dict() for seam in record.results["reconstruct"].seams]
     made |= {name: _mm(getattr(scan, name)) for name in ("scan", "aligned", "own", "absolute")}
-    made["bound"] = {
-        "sensor": 1e3 * expected.sensor_m,
-        "own": 1e3 * expected.own_m,
-        "absolute": 1e3 * expected.absolute_m,
-        "placing": 1e3 * expected.placing_m,
-    }
+    made["bound"] = {name: 1e3 * mean for name, mean in expect(record, config, job, nominal).items()}
     made["chi2_registration"] = pose.chi2_per_dof
     true = own_base(record) * surface_at_middle(record)
     off = difference(pose.base_from_surface, true)

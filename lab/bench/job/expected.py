@@ -7,8 +7,6 @@ lean. Least squares with these covariances attains the Cramér–Rao bound, save
 adjustment does not know of: for that part the figure is what this estimator is expected to make of it.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import pinocchio as pin
 
@@ -37,27 +35,12 @@ UNDERSIDE = 400
 """So many points of the underside are looked at for the first contact."""
 
 
-@dataclass(frozen=True, eq=False)
-class Expected:
-    """Covariances (6, 6) of (translation, rotation) in base axes about the surface's origin, m² and rad².
+def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurface) -> dict[str, float]:
+    """Mean distances in m to expect, of a record that got as far as the place pose.
 
-    `absolute`: of the surface in the arm's true base. `own`: in the base as the arm itself realises it where it places.
-    `placing`: of the part in the air, with all that placing adds. The mean distances to expect of them over the part's
-    45 points are `absolute_m`, `own_m` and, once contact has let the part rest, `placing_m`; `sensor_m` that of single
-    points in the camera's frame at rail zero.
+    Over the part's 45 points: `absolute` in the arm's true base, `own` in the base as the arm itself realises it where
+    it places, `placing` once contact has let the part rest. `sensor`: single points in the camera's frame at rail zero.
     """
-
-    absolute: Vector
-    own: Vector
-    placing: Vector
-    absolute_m: float
-    own_m: float
-    placing_m: float
-    sensor_m: float
-
-
-def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurface) -> Expected:
-    """For a record that got as far as the place pose."""
     assert record.calibration is not None and record.at_sweep is not None and record.rests is not None
     noise = {name: entry["sigma"] for name, entry in record.at_sweep["assumed_noise"].items()}
     cloud: Cloud = record.results["reconstruct"].cloud
@@ -80,7 +63,6 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
     common = pose.random + _square(head.by_rests) + _square(head.poses(covariance_root(shared)))
     placing = common + _square(own) + at_part @ rest @ at_part.T + _grasp(noise, pose.base_from_surface)
     placing = placing + _square(_lean(noise, config, sweep.base_from_flange, place_flange, pose.base_from_surface))
-    absolute, of_own = common + _square(scan), common + _square(own)
     points = transform(pose.base_from_surface, part_points(nominal)) - pose.base_from_surface.translation
 
     def mean(covariance: Vector) -> float:
@@ -88,8 +70,10 @@ def expect(record: JobRecord, config: CellConfig, job: Job, nominal: NominalSurf
         return mean_distance(arms @ covariance @ arms.transpose(0, 2, 1))
 
     in_camera = head.in_camera(np.concatenate([covariance_root(shared), by_kinematics * sigma], axis=1))
-    placed = mean_after_contact(placing, nominal, pose)
-    return Expected(absolute, of_own, placing, mean(absolute), mean(of_own), placed, mean_distance(in_camera))
+    return {
+        "absolute": mean(common + _square(scan)), "own": mean(common + _square(own)),
+        "placing": mean_after_contact(placing, nominal, pose), "sensor": mean_distance(in_camera),
+    }  # fmt: skip
 
 
 def mean_distance(covariances: Vector) -> float:

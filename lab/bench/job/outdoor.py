@@ -5,7 +5,7 @@ the virtual clock. Beside it stands how far the line's centres scatter in drawn 
 same light: as they are, and less a picture without the laser, which a sweep would take 0.1 mm farther on.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -22,7 +22,7 @@ from cell.procedures.sweep.stored_sweep import SweepRecord
 from drivers.make import FilterConfig
 from lab.bench.job.accuracy import figures
 from lab.bench.job.whole_job import JobRecord, job_and_surface, run_whole_job
-from lab.bench.over_cores import over_cores
+from lab.bench.over_cores import Done, over_cores
 from sim_backends.optics.camera import CameraOptics, sensor
 from sim_backends.optics.daylight import ROOMS_PER_KLX, laser_passed, share_passed
 from sim_backends.optics.lighting import AMBIENT_RATE
@@ -39,14 +39,12 @@ WISH_S = 0.002
 
 
 def campaign(
-    job: str, seeds: Sequence[int], illuminances: Sequence[int], done: Callable[[str], None], workers: int = 0
+    job: str, seeds: Sequence[int], illuminances: Sequence[int], done: Done, workers: int = 0
 ) -> dict[str, Any]:
     """Each illuminance, klx, on every seed, with the filter and without it; `done` is told of each; JSON-ready."""
-    runs: list[dict[str, Any]] = []
     asked = [(one_world, job, seed, tuple(illuminances), band) for seed in seeds for band in (True, False)]
-    for _, made in over_cores(asked, workers):
-        runs += made
-        done(f"{made[0]['row']} and more, seed {made[0]['seed']}")
+    worlds = over_cores(asked, workers, lambda made: done(f"{made[0]['row']} and more, seed {made[0]['seed']}"))
+    runs = [run for world in worlds for run in world]
     rows = {}
     for klx in illuminances:
         for band in (True, False):
@@ -92,13 +90,12 @@ def told(record: JobRecord, made: dict[str, Any], row: str) -> dict[str, Any]:
     """What of one job the page has; `made` are its `figures`."""
     sweep = record.results.get("laser_sweep")
     return {
-        "row": row, **{key: made[key] for key in ("seed", "outcome", "reason", "stage", "wall_s")},
+        "row": row, **{key: made[key] for key in ("seed", "outcome", "reason", "stage")},
         "mean": float(np.mean(made["placement"])) if "placement" in made else None,
         "largest": float(np.max(made["placement"])) if "placement" in made else None,
         "inside": made["covered"]["place_pose"] if "covered" in made else None,
         "within_tolerance": made.get("within_tolerance"),
         "exposure": 1e3 * sweep.middle.exposure if isinstance(sweep, SweepRecord) else None,
-        "notes": [note for result in record.results.values() for note in getattr(result, "notes", ())],
     }  # fmt: skip
 
 

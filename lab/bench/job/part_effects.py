@@ -56,11 +56,9 @@ def motion(x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: tuple[float, fl
 
 def held(by: Floats) -> Change:
     """The claw holds the part elsewhere than stated."""
-
-    def change(world: World) -> None:
-        world.remake(replace(world.scene, flange_from_part=world.scene.flange_from_part @ by), world.station)
-
-    return change
+    return lambda world: world.remake(
+        replace(world.scene, flange_from_part=world.scene.flange_from_part @ by), world.station
+    )
 
 
 def opened(by: Floats) -> Change:
@@ -160,10 +158,6 @@ def raised(where: Callable[[Floats], NDArray[np.bool_]], by: float) -> Callable[
     return lambda corners: corners + np.multiply.outer(where(corners), [0.0, 0.0, 1e-3 * by])
 
 
-def _everywhere(corners: Floats) -> NDArray[np.bool_]:
-    return np.ones(len(corners), dtype=np.bool_)
-
-
 def _bent(corners: Floats) -> Floats:
     return corners - np.outer((corners[:, 0] / 0.022) ** 2, [0.0, 0.0, 0.15e-3])
 
@@ -191,8 +185,8 @@ EFFECTS: dict[str, PartEffect] = {
     "underside .3 mm low at a corner": PartEffect(
         ON_SOMETHING, underside=raised(lambda v: (v[:, 0] > 0.012) & (v[:, 1] > 0.008), -0.3)
     ),
-    "underside .4 mm low": PartEffect(ON_SOMETHING, underside=raised(_everywhere, -0.4)),
-    "underside .4 mm worn": PartEffect(("deep",), underside=raised(_everywhere, 0.4)),
+    "underside .4 mm low": PartEffect(ON_SOMETHING, underside=lambda v: np.add(v, [0.0, 0.0, -0.4e-3])),
+    "underside .4 mm worn": PartEffect(("deep",), underside=lambda v: np.add(v, [0.0, 0.0, 0.4e-3])),
     "underside .3 mm worn on one half": PartEffect(("tilted",), underside=raised(lambda v: v[:, 0] > 0, 0.3)),
     "underside 5 mrad askew": PartEffect(("tilted",), underside=lambda v: v + np.outer(v[:, 0], [0.0, 0.0, 0.005])),
     "underside bulged by .3 mm": PartEffect(

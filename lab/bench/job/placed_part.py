@@ -1,11 +1,11 @@
 """`cell bench placed`: what is seen of placed parts, against where they truly lie, under effects that nobody told of.
 
-The jobs' part covers the middle of its surface, or all of it. An effect is well where the true error of every part that
+The jobs' part covers the middle of its surface. An effect is well where the true error of every part that
 was placed lies below the stated bound.
 """
 
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,31 +21,31 @@ from cell.procedures.placed_part import LIKELY, PlacedPart
 from cell.run.report.report import place_error, pose_of
 from drivers.errors import ConfigError
 from lab.bench.job.part_effects import EFFECTS, PartEffect
-from lab.bench.job.part_jobs import ALL, MIDDLE, job_with_part
+from lab.bench.job.part_jobs import MIDDLE, job_with_part
 from lab.bench.job.scan_errors import COVERED
 from lab.bench.job.whole_job import JobRecord, job_and_surface, run_whole_job
-from lab.bench.over_cores import over_cores
+from lab.bench.over_cores import Done, over_cores
 
 Row = dict[str, Any]
 """JSON-ready, mm and mrad."""
 
 
 def campaign(
-    seeds: Sequence[int], level: str, job: str, names: Sequence[str], place: str, done: Callable[[str], None],
-    *, whole: bool = False, workers: int = 0,
-) -> Row:  # fmt: skip
+    seeds: Sequence[int], level: str, job: str, names: Sequence[str], place: str, done: Done, workers: int = 0
+) -> Row:
     """Run each effect of `names` on each seed; `place` are lines of the job's [place], `done` is told of each run.
 
-    With `whole` the part covers its surface, and nothing of that shows. Raises `ConfigError` for an unknown effect.
+    Raises `ConfigError` for an unknown effect.
     """
     if unknown := [name for name in names if name not in EFFECTS]:
         raise ConfigError(f"--effect {unknown[0]!r}: allowed are {', '.join(EFFECTS)}")
-    runs: list[Row] = []
-    for _, rows in over_cores([(one_world, job, seed, level, tuple(names), place, whole) for seed in seeds], workers):
-        runs += rows
+
+    def ended(rows: list[Row]) -> None:
         for row in rows:
             done(f"seed {row['seed']}, {row['effect']}: {row['outcome']}")
-    runs.sort(key=lambda run: (names.index(run["effect"]), run["seed"]))
+
+    worlds = over_cores([(one_world, job, seed, level, tuple(names), place) for seed in seeds], workers, ended)
+    runs = [row for rows in zip(*worlds, strict=True) for row in rows]
     return {
         "job": job, "level": level, "seeds": len(seeds), "seen": _seen(runs), "placed_mm": _placed(runs),
         "effects": {name: _effect([run for run in runs if run["effect"] == name]) for name in names},
@@ -53,22 +53,21 @@ def campaign(
     }  # fmt: skip
 
 
-def one_world(job: str, seed: int, level: str, names: Sequence[str], place: str, whole: bool) -> list[Row]:
+def one_world(job: str, seed: int, level: str, names: Sequence[str], place: str) -> list[Row]:
     """The effects on one world, which is calibrated once."""
     rows: list[Row] = []
     calibrated: JobRecord | None = None
     for name in names:
         with tempfile.TemporaryDirectory(prefix="cell-placed-") as folder:
-            half = ALL if whole else MIDDLE
-            file = job_with_part(Path(folder), job, verify="all", half=half, also=place)
-            record, row = one_part(file, seed, level, EFFECTS[name], half=half, calibrated=calibrated)
+            file = job_with_part(Path(folder), job, verify="all", half=MIDDLE, also=place)
+            record, row = one_part(file, seed, level, EFFECTS[name], calibrated)
         calibrated = calibrated or record
         rows.append({"seed": seed, "effect": name, **row})
     return rows
 
 
 def one_part(
-    file: Path, seed: int, level: str, effect: PartEffect, *, half: tuple[float, float], calibrated: JobRecord | None
+    file: Path, seed: int, level: str, effect: PartEffect, calibrated: JobRecord | None
 ) -> tuple[JobRecord, Row]:
     """A job with its part in one world under one effect, and how that part did."""
     job, nominal = job_and_surface(file)
@@ -76,7 +75,7 @@ def one_part(
     assert mesh is not None
     record = run_whole_job(
         load_config(None), job, nominal, seed, level, calibrated=calibrated,
-        changed=lambda cell: effect.put_into(cell.world, job, mesh, half, file.parent),
+        changed=lambda cell: effect.put_into(cell.world, job, mesh, MIDDLE, file.parent),
     )  # fmt: skip
     return record, figures(record, nominal, job, effect)
 

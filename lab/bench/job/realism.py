@@ -5,14 +5,14 @@ runner on the virtual clock. It is well when what was placed lies within what wa
 refused with the effect's name; it is ill when something wrong was told with confidence.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
 
 from cell.apps.qualify.intervals import Share
-from cell.config.cell_config import CellConfig, load_config
+from cell.config.cell_config import load_config
 from cell.config.job import Job, load_job
 from cell.measure.geometry.poses import difference
 from cell.measure.inversion import PlacePose
@@ -21,7 +21,7 @@ from cell.run.report.report import pose_of
 from lab.bench.job.accuracy import WANTED, figures, interval
 from lab.bench.job.scan_errors import COVERED
 from lab.bench.job.whole_job import JobRecord, job_and_surface, run_whole_job
-from lab.bench.over_cores import over_cores
+from lab.bench.over_cores import Done, over_cores
 from sim_backends.world.levels import Effects, assumed_noise
 
 STOOD_S = 3600.0
@@ -52,16 +52,13 @@ WORDS: dict[str, tuple[str, ...]] = {
 """A refusal with one of these words names the effect: words that no other refusal has."""
 
 
-def campaign(
-    effects: Sequence[str], seeds: Sequence[int], job: str, done: Callable[[str], None], workers: int = 0
-) -> dict[str, Any]:
+def campaign(effects: Sequence[str], seeds: Sequence[int], job: str, done: Done, workers: int = 0) -> dict[str, Any]:
     """Every effect alone on every seed, then all together if "workshop" is among `effects`; `done` is told of each."""
     load_job(job)
-    runs: list[dict[str, Any]] = []
-    for _, run in over_cores([(one_run, job, seed, effect) for effect in effects for seed in seeds], workers):
-        runs.append(run)
-        done(f"{run['effect']}, seed {run['seed']}: {run['verdict']}")
-    runs.sort(key=lambda run: run["seed"])
+    runs = over_cores(
+        [(one_run, job, seed, effect) for effect in effects for seed in seeds], workers,
+        lambda run: done(f"{run['effect']}, seed {run['seed']}: {run['verdict']}"),
+    )  # fmt: skip
     by_effect = {name: summed_up(name, [run for run in runs if run["effect"] == name]) for name in effects}
     return {"job": job, "seeds": list(seeds), "effects": by_effect, "placed": pooled(by_effect)}
 
@@ -76,15 +73,14 @@ def one_run(job: str, seed: int, effect: str) -> dict[str, Any]:
     config, (loaded, nominal) = load_config(None), job_and_surface(job)
     record = run_whole_job(config, loaded, nominal, seed, level_of(effect), stood=STOOD_S)
     made = figures(record, config, loaded, nominal)
-    run: dict[str, Any] = {key: made[key] for key in ("seed", "outcome", "reason", "stage", "wall_s")}
+    run: dict[str, Any] = {key: made[key] for key in ("seed", "outcome", "reason", "stage")}
     run["effect"] = effect
-    run["chi2"] = {key[5:]: value for key, value in made.items() if key.startswith("chi2_")}
     run["pose_inside"] = made["covered"]["place_pose"] if "covered" in made else None
     run["arm_base_mm"] = float(np.mean(made["own"])) if "own" in made else None
     run["placement_mm"] = float(np.mean(made["placement"])) if "placement" in made else None
     run["within_tolerance"] = made.get("within_tolerance")
     run["flags"] = flags_of(record)
-    run |= _part(record, config, loaded)
+    run["part_inside"] = part_inside(record, loaded)
     return run | {"verdict": verdict(run)}
 
 
@@ -94,19 +90,15 @@ def flags_of(record: JobRecord) -> list[str]:
     return flags + [note for result in record.results.values() for note in getattr(result, "notes", ())]
 
 
-def _part(record: JobRecord, config: CellConfig, job: Job) -> dict[str, Any]:
-    """Where the part ended, in the surface's plane, and whether that is within what was stated of it."""
+def part_inside(record: JobRecord, job: Job) -> bool | None:
+    """Whether the part ended within what was stated of it, in the surface's plane; None of one that was not placed."""
     pose = record.results.get("invert_pose")
     if record.outcome != "placed" or not isinstance(pose, PlacePose) or record.placing is None:
-        return {"part_inside": None}
+        return None
     assert record.at_end is not None
     off = difference(pose_of(record.at_end, "surface_from_part"), job.place.surface_from_part.se3())[PLANE]
     stated = part_covariance(job, pose, record.placing)[np.ix_(PLANE, PLANE)]
-    return {
-        "part_inside": bool(off @ np.linalg.solve(stated, off) <= chi2.ppf(COVERED, len(PLANE))),
-        "part_off": [1e3 * float(v) for v in off],
-        "part_stated": [1e3 * float(v) for v in np.sqrt(np.diag(stated))],
-    }
+    return bool(off @ np.linalg.solve(stated, off) <= chi2.ppf(COVERED, len(PLANE)))
 
 
 def verdict(run: dict[str, Any]) -> str:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import tempfile
-import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from cell.config.calibrations.store import CellCalibration, gathered, solve_observations
+from cell.config.calibrations.store import CellCalibration, solve_observations
 from cell.config.cell_config import NO_FILES, CellConfig
 from cell.config.job import Job, load_job
 from cell.devices.simulated.described import Described
@@ -20,16 +19,14 @@ from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration import ScanObservation, TargetObservation
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
-from cell.procedures.calibrate.boards import collect_scan, collect_target
-from cell.procedures.calibrate.reference_plate import see_reference_plate, with_edge
+from cell.procedures.calibrate.reference_plate import with_edge
 from cell.procedures.calibrate.timing import look_at_shutter
 from cell.procedures.drive.way import Whereabouts
 from cell.procedures.frame_store import Cut, FrameStore
 from cell.procedures.sought_part import nominal_of, sought
 from cell.procedures.steps.kinds import kind_of
 from cell.procedures.steps.workplace import Workplace
-from cell.procedures.sweep.stored_sweep import SweepRecord
-from cell.run.calibration import arm_table
+from cell.run.calibration import observe_boards
 from cell.run.job_run import JobRun, ReadyJob
 from cell.run.recorded_work import RecordedWork, WorkContext, classify
 from cell.run.resumption import mesh_source
@@ -40,7 +37,6 @@ from sim_backends.direct.camera import Shot
 from statemachine.runner import NO_SCRIPT
 from statemachine.step import Event
 
-Progress = Callable[[float, str], None]
 Result = TypeVar("Result")
 
 
@@ -71,7 +67,7 @@ class JobRecord:
     `results` are the steps' results by name; `at_sweep` and `at_end` are the world's truth then. `kinematic` is the
     configured (6, 6) covariance of a place that the arm goes to, `placing` that of the flange each time it comes to
     rest; `rests` (n, 6) the joint angles at the end of each motion, rad; `shots` the truth at each line of the cloud,
-    sweep after sweep. `wall_s` are seconds on the wall by stage; `folder` is the run's, where it was kept.
+    sweep after sweep. `folder` is the run's, where it was kept.
     """
 
     seed: int
@@ -88,12 +84,11 @@ class JobRecord:
     placing: Vector | None = None
     rests: Vector | None = None
     shots: list[Shot] = field(default_factory=list)
-    wall_s: dict[str, float] = field(default_factory=dict)
     folder: Path | None = None
 
 
 def run_whole_job(
-    config: CellConfig, job: Job, nominal: NominalSurface, seed: int, level: str, progress: Progress | None = None,
+    config: CellConfig, job: Job, nominal: NominalSurface, seed: int, level: str,
     calibrated: JobRecord | None = None, stood: float = 0.0, runs: Path | None = None,
     changed: Callable[[VirtualCell], None] = lambda cell: None,
 ) -> JobRecord:  # fmt: skip
@@ -110,7 +105,7 @@ def run_whole_job(
     job, mesh = sought(job, nominal.source)
     nominal = nominal if mesh == nominal.source else nominal_of(job, mesh)
     record = JobRecord(seed, level)
-    whole = _WholeJob(cell, config, job, nominal, record, progress or (lambda fraction, text: None))
+    whole = _WholeJob(cell, config, job, nominal, record)
     try:
         with nullcontext(runs) if runs else tempfile.TemporaryDirectory(prefix="cell-bench-") as folder:
             Run("job", lambda run: whole.perform(run, Path(folder), calibrated, stood)).result()
@@ -130,7 +125,7 @@ def on_calibrated(
     """Calibrate the cell of `seed` and `level`, and do `work` on it as recorded work; raises what that raises."""
     assert nominal.source is not None
     cell = VirtualCell(config, seed, level, Described(job, nominal.source))
-    whole = _WholeJob(cell, config, job, nominal, JobRecord(seed, level), lambda fraction, text: None)
+    whole = _WholeJob(cell, config, job, nominal, JobRecord(seed, level))
 
     def done(context: WorkContext) -> Result:
         calibration = whole._calibrate(context)
@@ -152,7 +147,6 @@ class _WholeJob:
     job: Job
     nominal: NominalSurface
     record: JobRecord
-    notify: Progress
 
     def perform(self, run: Run[None], folder: Path, calibrated: JobRecord | None, stood: float) -> None:
         """Fill the record; runs go to `folder`."""
@@ -160,9 +154,8 @@ class _WholeJob:
         if calibrated is not None:
             record.calibration, record.observations = calibrated.calibration, calibrated.observations
         else:
-            with _Timed(record, "calibrate"):
-                work = RecordedWork(run, "calibration", devices, folder, self.cell.facts)
-                record.calibration = work.perform(self._calibrate)
+            work = RecordedWork(run, "calibration", devices, folder, self.cell.facts)
+            record.calibration = work.perform(self._calibrate)
         assert record.calibration is not None and self.nominal.source is not None
         whereabouts = Whereabouts(devices.vehicle)
         whereabouts.say_at_start()
@@ -176,53 +169,27 @@ class _WholeJob:
             calibration=record.calibration, info={**self.cell.facts, "mesh": mesh_source(self.nominal.source)},
             inline=(self._follow,), truth=self.cell.truth,
         )  # fmt: skip
-        with _Timed(record, "job"):
-            ended = job_run.perform(folder, whereabouts)
+        ended = job_run.perform(folder, whereabouts)
         record.results, record.folder = dict(ended.results), ended.folder
         if ended.outcome != "placed":
             record.outcome, record.reason = ended.outcome, ended.reason
         if "laser_sweep" in record.results:
-            record.shots = _shots(self.cell, record.results["laser_sweep"])
+            frames = [number for swath in record.results["laser_sweep"].swaths for number in swath.frame_ids]
+            record.shots = [self.cell.scan_camera.shots[int(number)] for number in frames]
 
     def _calibrate(self, context: WorkContext) -> CellCalibration:
         mover = Mover(self.cell.devices.arm, self.cell.clock, self.config, self.job, context.safe_point)
         self.cell.devices.vehicle.brake()
-        devices, notify = self.cell.devices, self.notify
-        given, keep = (self.config, devices, mover, context.check), NoFrames().keep
-        scan = collect_scan(*given, lambda f, t: notify(0.36 * f, f"calibrate: {t}"), keep)
-        witness = see_reference_plate(self.config, devices, keep)
-        target = collect_target(*given, lambda f, t: notify(0.36 + 0.12 * f, f"calibrate: {t}"), keep)
-        self.record.observations = (scan, target)
-        notify(0.48, "calibrate: solving")
-        named = (devices.arm, devices.rail, devices.scan_camera, devices.target_camera)
-        identities = {device.name: device.identity().serial for device in named}
-        known = identities, self.config, arm_table(self.config, self.cell.devices), witness
-        made = solve_observations(gathered(scan, target, *known)).calibration
+        devices, keep = self.cell.devices, NoFrames().keep
+        seen = observe_boards(self.config, devices, mover, replace(context, keep=keep), lambda fraction, text: None)
+        self.record.observations = seen.scan, seen.target
+        made = solve_observations(seen).calibration
         made = look_at_shutter(self.config, devices, mover, made, context.check, keep)
         return with_edge(self.config, devices, keep, made)
 
     def _follow(self, event: Event) -> None:
         """What the run comes to."""
-        names = kind_of(self.job).names
-        if event.kind == "step_started" and event.step in names:
+        if event.kind == "step_started" and event.step in kind_of(self.job).names:
             self.record.stage = str(event.step)
-            self.notify(0.6 + 0.4 * names.index(str(event.step)) / len(names), str(event.step))
         if event.kind == "step_done" and event.step == "laser_sweep":
             self.record.at_sweep = self.cell.truth()
-
-
-def _shots(cell: VirtualCell, sweep: SweepRecord) -> list[Shot]:
-    return [cell.scan_camera.shots[int(number)] for swath in sweep.swaths for number in swath.frame_ids]
-
-
-class _Timed:
-    """Notes how long its block took on the wall."""
-
-    def __init__(self, record: JobRecord, stage: str) -> None:
-        self._record, self._stage = record, stage
-
-    def __enter__(self) -> None:
-        self._begun = time.monotonic()
-
-    def __exit__(self, *_: object) -> None:
-        self._record.wall_s[self._stage] = round(time.monotonic() - self._begun, 3)

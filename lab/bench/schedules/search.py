@@ -3,6 +3,7 @@
 Each runs in a process of its own pool with the calibration of its cell, which is made once for all of them.
 """
 
+import itertools
 import math
 import shlex
 from collections import Counter
@@ -81,11 +82,8 @@ def days(schedules: Sequence[Schedule], stored: dict[World, Path], workers: int,
 
 def _each(tasks: Sequence[Task], workers: int, told: Callable[[int, int], None]) -> list[Any]:
     """What each task makes, in their order; `told` how many have ended."""
-    made: dict[int, Any] = {}
-    for number, one in over_cores(tasks, workers) if tasks else ():
-        made[number] = one
-        told(len(made), len(tasks))
-    return [made[number] for number in range(len(tasks))]
+    number = itertools.count(1)
+    return over_cores(tasks, workers, lambda made: told(next(number), len(tasks)))
 
 
 def one_day(schedule: Schedule, calibrations: Path) -> DayRecord:

@@ -1,6 +1,4 @@
-"""A calibration is made for the devices that are there, and what is refused of their times is kept."""
-
-from __future__ import annotations
+"""A calibration is made for the devices that are there."""
 
 from pathlib import Path
 

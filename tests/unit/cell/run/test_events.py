@@ -1,7 +1,5 @@
 """A run's events: typed, in order, and nobody who listens can hold the run up."""
 
-from __future__ import annotations
-
 import threading
 import time
 

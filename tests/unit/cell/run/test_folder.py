@@ -1,7 +1,5 @@
 """Run folders: found by name, number or as the newest, and what goes on in them is told."""
 
-from __future__ import annotations
-
 import logging
 import os
 import sqlite3
@@ -35,6 +33,7 @@ def test_runs_are_found_by_name_id_or_as_the_newest(tmp_path: Path) -> None:
         find_run(root, None)
     first = new_run(root)
     second = new_run(root)
+    (root / "notes").mkdir()
     assert set(list_runs(root)) == {first, second}
     assert find_run(root, None) == sorted((first, second))[-1]
     assert find_run(root, first.name.split("-")[1]) == first
@@ -88,61 +87,54 @@ def test_what_a_run_waits_for_is_read_from_its_journal(tmp_path: Path) -> None:
     assert awaited_word(folder) is None
 
 
-def test_of_two_that_go_on_one_has_to_be_named(tmp_path: Path) -> None:
-    root = tmp_path / "runs"
-    two = [new_run(root), new_run(root)]
-    # Held, or they are closed as soon as they are collected.
-    journals = [Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()}) for folder in two]
+def begun(root: Path, kind: str = "job") -> Journal:
+    """Of a run that goes on as long as its journal is held: one that nobody holds is closed at some time."""
+    folder = new_run(root)
+    return Journal(folder, folder.name, {"kind": kind, "pid": os.getpid()})
+
+
+@pytest.fixture
+def two(here: Path) -> list[Journal]:
+    """Of two runs that go on, the first by its name first."""
+    return sorted([begun(here / "runs"), begun(here / "runs")], key=lambda journal: journal.run)
+
+
+def test_of_two_that_go_on_one_has_to_be_named(here: Path, two: list[Journal]) -> None:
     with pytest.raises(ConfigError, match="more than one is going on"):
-        find_going(root, None)
-    assert find_going(root, two[0].name) == two[0]
-    assert len(journals) == 2
+        find_going(here / "runs", None)
+    assert find_going(here / "runs", two[0].run) == two[0].path.parent
 
 
 def test_a_time_of_maintenance_takes_no_requests_and_keeps_no_run_from_being_asked(tmp_path: Path) -> None:
-    root = tmp_path / "runs"
-    job, maintenance = new_run(root), new_run(root)
-    # Kept: a journal that nobody holds is closed at some time, and its run has ended then.
-    journals = [Journal(job, job.name, {"kind": "job", "pid": os.getpid()})]
-    journals.append(Journal(maintenance, maintenance.name, {"kind": "maintenance", "pid": os.getpid()}))
-    assert is_going(maintenance)
-    assert find_going(root, None) == job
+    job, maintenance = begun(tmp_path), begun(tmp_path, "maintenance")
+    assert is_going(maintenance.path.parent)
+    assert find_going(tmp_path, None) == job.path.parent
     with pytest.raises(ConfigError, match="nothing is going on there"):
-        find_going(root, maintenance.name)
-    for journal in journals:
-        journal.close()
+        find_going(tmp_path, maintenance.run)
 
 
-def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(here: Path) -> None:
-    root = here / "runs"
-    going = [new_run(root), new_run(root)]
-    journals = [Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()}) for folder in going]
-    first = min(going)
-    base = sqlite3.connect(first / "journal.sqlite")
-    base.execute("DROP TABLE requests")
-    base.commit()
+def test_one_that_cannot_be_asked_keeps_no_other_from_being_asked_to_end(two: list[Journal]) -> None:
+    first, other = two
+    with sqlite3.connect(first.path.parent / "journal.sqlite") as base:
+        base.execute("DROP TABLE requests")
     base.close()
-    with pytest.raises(ConfigError, match=f"not asked to end: .*{first.name}"):
+    with pytest.raises(ConfigError, match=f"not asked to end: .*{first.run}"):
         abort()
-    other = journals[going.index(max(going))]
     assert [request.kind for request in other.take_requests()] == ["abort"]
 
 
 def test_a_run_that_ended_as_the_others_were_asked_to_end_is_no_failure(
-    here: Path, monkeypatch: pytest.MonkeyPatch
+    two: list[Journal], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root = here / "runs"
-    going = sorted([new_run(root), new_run(root)])
-    journals = [Journal(folder, folder.name, {"kind": "job", "pid": os.getpid()}) for folder in going]
     said = []
 
     def echo(line: str) -> None:
         said.append(line)
-        journals[1].run_ended("placed", "all steps done")
+        two[1].run_ended("placed", "all steps done")
 
     monkeypatch.setattr("typer.echo", echo)
     abort()
-    assert said == [f"asked {going[0].name} to end", f"{going[1].name} has ended meanwhile"]
+    assert said == [f"asked {two[0].run} to end", f"{two[1].run} has ended meanwhile"]
 
 
 def test_a_process_that_took_over_the_number_of_a_dead_one_is_not_the_run(tmp_path: Path) -> None:
@@ -169,6 +161,14 @@ def test_the_newest_run_is_the_last_whatever_the_clock_says(tmp_path: Path) -> N
     made = [new_run(tmp_path) for _ in range(3)]
     assert [folder.name[:15] for folder in made] == ["21000101T000000", "21000101T000001", "21000101T000002"]
     assert find_run(tmp_path, None) == made[-1]
+
+
+def test_what_is_logged_in_a_run_stands_in_its_folder(tmp_path: Path) -> None:
+    with run_log(tmp_path):
+        logging.getLogger("cell.run").warning("the lamp flickers")
+    logging.getLogger("cell.run").warning("after it")
+    told = (tmp_path / "run.log").read_text(encoding="utf-8")
+    assert "the lamp flickers" in told and "after it" not in told
 
 
 def test_a_log_that_cannot_be_written_ends_nothing(

@@ -1,7 +1,5 @@
 """How good the cell is today: series of figures of reports, their trends against closed forms, and what is due."""
 
-from __future__ import annotations
-
 import datetime as dt
 import json
 from dataclasses import replace
@@ -12,14 +10,12 @@ import numpy as np
 import pytest
 
 from cell.base.storage import write_json
-from cell.config.calibrations.store import CellCalibration, save_calibration
-from cell.config.cell_config import load_config
+from cell.config.calibrations.store import save_calibration
 from cell.procedures.calibrate.interim import MOVED
 from cell.run.folder import new_run
 from cell.run.health import DriftSeries, health
-from lab.bench.calibration.observed_cell import ObservedCell
-from sim_backends.world.scene import draw
 from tests.support import Typed
+from tests.unit.cell.config.calibrations.test_store import made
 
 MADE = dt.datetime(2026, 11, 1, 8, 0, 0).astimezone()
 CALIBRATED = MADE.strftime("%Y-%m-%d %H:%M:%S")
@@ -44,13 +40,6 @@ def job(root: Path, day: float, off: list[float] | None = None, shared: bool = F
     } | more  # fmt: skip
     write_json(folder / "report.json", report)
     return folder.name
-
-
-@pytest.fixture(scope="module")
-def placed_calibration() -> CellCalibration:
-    config, rng = load_config(None), np.random.default_rng([3, 31])
-    cell = ObservedCell(draw(3, "nominal"), config, rng)
-    return cell.calibrated("3")
 
 
 def series(values: list[list[float]], limit: float = 0.18) -> DriftSeries:
@@ -141,12 +130,11 @@ def test_what_was_refused_because_it_moved_is_due_now_until_a_job_passes_its_loo
     assert (found.moved, found.due_now) == ("", False)
 
 
-def test_after_a_new_calibration_the_jobs_before_it_count_no_more(
-    tmp_path: Path, placed_calibration: CellCalibration
-) -> None:
+def test_after_a_new_calibration_the_jobs_before_it_count_no_more(tmp_path: Path) -> None:
     name = job(tmp_path, 0.0, outcome="refused", refusal={"numbers": [{"name": MOVED, "value": 0.4}]}, steps=[])
-    save_calibration(placed_calibration, tmp_path / name / "calibration.json")
-    newer = replace(placed_calibration, made=(MADE + dt.timedelta(days=3)).timestamp())
+    calibration = made()
+    save_calibration(calibration, tmp_path / name / "calibration.json")
+    newer = replace(calibration, made=(MADE + dt.timedelta(days=3)).timestamp())
     save_calibration(newer, tmp_path / "calibrations" / f"{newer.name}.json")
     found = health(tmp_path, tmp_path / "calibrations", MAX_AGE_S, MADE + dt.timedelta(days=4))
     assert (found.calibrated, found.jobs, found.moved) == (newer.date, 0, "")

@@ -1,7 +1,5 @@
 """What a job's run gives its starter, and who is told of its events."""
 
-from __future__ import annotations
-
 import pytest
 
 from cell.run.job_run import each_of

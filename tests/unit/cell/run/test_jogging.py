@@ -1,7 +1,5 @@
 """What may be typed after `cell jog`."""
 
-from __future__ import annotations
-
 import math
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """A run is resumed with its own job, and its sweep is trusted only as long as nothing that it stands on has changed."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Promises of `cell.run.runs`."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """How the laboratory's commands show results: every value once, under its own name."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

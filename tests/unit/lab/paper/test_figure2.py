@@ -1,7 +1,4 @@
-"""The paper's design study, against the figures of docs/explanation/theory.md, section 3, and the
-simulator."""
-
-from __future__ import annotations
+"""The paper's design study, against the figures of docs/explanation/theory.md, section 3, and traced rays."""
 
 import json
 
@@ -12,7 +9,6 @@ from typer.testing import CliRunner
 
 from lab.cli import register
 from lab.paper.figure2 import Head, Light, delta_limit, errors, figure2, largest_dz, smallest_baseline, uniformity
-from tests.unit.lab.paper.test_equations import FOCAL, point_of
 
 
 @pytest.mark.parametrize(
@@ -35,6 +31,17 @@ def test_light_is_the_more_even_the_longer_the_baseline() -> None:
 def test_35_mm_is_the_smallest_that_meets_a_fifth_of_a_millimetre_at_a_tenth_of_a_pixel() -> None:
     assert (smallest_baseline(0.1 * 4.8e-6), smallest_baseline(0.31e-6)) == (0.035, 0.035)
     assert (smallest_baseline(0.29e-6), smallest_baseline(0.55e-6)) == (0.030, 0.040)
+
+
+FOCAL = 8e-3
+
+
+def point_of(x: float, y: float, baseline: float, theta: float) -> np.ndarray:
+    """Where the ray through x', y' meets the laser's fan, which stands at (−l, 0, 0) and holds the y axis; m."""
+    ray, laser = np.array([x, y, FOCAL]), np.array([-baseline, 0.0, 0.0])
+    middle, side = np.array([np.cos(theta), 0.0, np.sin(theta)]), np.array([0.0, 1.0, 0.0])
+    # t ray = laser + a middle + b side
+    return ray * np.linalg.solve(np.column_stack([ray, -middle, -side]), laser)[0]
 
 
 def test_errors_are_what_moved_rays_do() -> None:
@@ -70,13 +77,9 @@ def test_the_paper_is_told_right_and_wrong() -> None:
     assert result["maps"][1]["largest_mm"]["dz"] < 0.6 * result["maps"][0]["largest_mm"]["dz"]
 
 
-# --- commands ---
-
-app = typer.Typer()
-register(app)
-
-
 def test_commands_print_json_alone_and_keep_numbers_and_pictures(tmp_path) -> None:
+    app = typer.Typer()
+    register(app)
     result = CliRunner().invoke(app, ["paper", "figure2", "--json", "--out", str(tmp_path)])
     assert result.exit_code == 0
     assert json.loads(result.stdout)["choice"]["chosen_mm"] == 35.0

@@ -1,7 +1,5 @@
 """A placed job's record, as the library's own reader gives it."""
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 from pathlib import Path
@@ -19,7 +17,6 @@ Messages = dict[str, list[tuple[int, Any]]]
 
 @pytest.fixture(scope="module")
 def folder(placed_pot: JobRecord) -> Path:
-    assert placed_pot.folder is not None
     return placed_pot.folder
 
 
@@ -30,7 +27,6 @@ def by_the_library(path: Path) -> Messages:
     with path.open("rb") as stream:
         reader = make_reader(stream)
         for schema, channel, message in reader.iter_messages(log_time_order=False):
-            assert schema is not None
             decode = factory.decoder_for(channel.message_encoding, schema) or json.loads
             found[channel.topic].append((message.log_time, decode(message.data)))
     return found

@@ -1,10 +1,9 @@
 """What is drawn of a job: frames, lenses, pictures, bodies and points tell one story."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections import defaultdict
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,6 @@ def matrix(transform: Any) -> np.ndarray[Any, Any]:
 def test_pictures_are_the_files_and_carry_the_lens_they_were_taken_with(
     read: Messages, folder: Path, placed_pot: JobRecord
 ) -> None:
-    assert placed_pot.calibration is not None
     lenses = {"scan_camera": placed_pot.calibration.scan.camera, "target_camera": placed_pot.calibration.target.camera}
     kept = {path.name for path in (folder / "frames").iterdir()}
     for name, camera in lenses.items():
@@ -69,20 +67,17 @@ def test_pictures_are_the_files_and_carry_the_lens_they_were_taken_with(
 def test_the_lines_and_all_of_them_are_the_cloud_of_the_run(read: Messages, folder: Path) -> None:
     stored = read_cloud(folder / "cloud.ply")
     measured = stored.points[~stored.interpolated].astype("<f4")
-    lines = [np.frombuffer(message.data, "<f4").reshape(-1, 3) for _, message in sorted(read["/cloud/line"], key=first)]
+    told = sorted(read["/cloud/line"], key=itemgetter(0))
+    lines = [np.frombuffer(message.data, "<f4").reshape(-1, 3) for _, message in told]
     assert np.array_equal(np.concatenate(lines), measured)
     [(_, whole)] = read["/cloud/whole"]
     assert np.array_equal(np.frombuffer(whole.data, "<f4").reshape(-1, 3), measured)
 
 
-def first(pair: tuple[int, Any]) -> int:
-    return pair[0]
-
-
 def test_the_clouds_points_lie_on_the_stripe_of_the_picture_taken_then(read: Messages) -> None:
     """Frames, lens, picture and cloud tell one story: by OpenCV's projection and the bright line in the picture."""
     poses, chain = [], {}
-    for stamp, message in sorted(read["/tf"], key=first):
+    for stamp, message in sorted(read["/tf"], key=itemgetter(0)):
         chain |= {t.child_frame_id: t for t in message.transforms}
         if "flange" in chain and any(t.child_frame_id == "scan_camera" for t in message.transforms):
             poses.append((stamp, followed(chain, "scan_camera", "base")))

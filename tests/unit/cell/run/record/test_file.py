@@ -1,7 +1,5 @@
 """Promises of `cell.run.record.file`."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

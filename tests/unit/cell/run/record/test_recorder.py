@@ -1,11 +1,10 @@
 """A run's record: what others' readers find in it, how it survives being cut off, and perception fed with it again."""
 
-from __future__ import annotations
-
 import json
 import logging
 import math
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -87,19 +86,11 @@ def test_without_the_packages_that_is_said_once(
 
 def test_a_recorder_that_fails_keeps_no_stop_and_no_command_from_passing(caplog: pytest.LogCaptureFixture) -> None:
     devices = VirtualCell(CONFIG, 1, "ideal").devices
-
-    class Broken:
-        def command(self, command: object, refused: str | None) -> None:
-            raise OSError("no room")
-
-        def reading(self, device: str, reading: object) -> None:
-            raise OSError("no room")
-
-    devices.gate.listener = Broken()
-    devices.arm.state()
-    devices.gate.listener = Broken()
-    devices.rail.stop()
-    assert devices.gate.listener is None
+    broken = Mock(command=Mock(side_effect=OSError("no room")), reading=Mock(side_effect=OSError("no room")))
+    for use in (devices.arm.state, devices.rail.stop):
+        devices.gate.listener = broken
+        use()
+        assert devices.gate.listener is None
     assert sum("told nothing more" in line.getMessage() for line in caplog.records) == 2
 
 

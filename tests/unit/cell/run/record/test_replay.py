@@ -1,7 +1,5 @@
 """Perception fed again with what a run kept gives the same bits, and what was changed is found."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

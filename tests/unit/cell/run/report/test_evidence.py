@@ -1,7 +1,5 @@
 """A refusal leaves what it looked at, and a run is measured against its limits."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace
@@ -19,13 +17,7 @@ from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.bodies.station import Station
 from tests.support import report_runs
 from tests.support.at_station import AtStation
-from tests.support.report_runs import Ended, Ends, Make, read_strictly
-
-
-@pytest.fixture(scope="module")
-def placed(ends: Ends) -> Ended:
-    return ends(report_runs.placed)
-
+from tests.support.report_runs import Ends, Make, read_strictly
 
 REFUSALS: list[tuple[Make, str, str | None, bool, bool]] = [
     (report_runs.no_board, "drive_to_target", None, True, False),
@@ -62,10 +54,10 @@ def test_a_refusal_leaves_what_it_looked_at(
 
 
 def test_a_place_that_was_refused_is_shown_with_all_its_figures(ends: Ends) -> None:
-    run = ends(report_runs.other_surface)
-    names = {row["name"] for row in run.report["refusal"]["numbers"]}
+    report = ends(report_runs.other_surface).report
+    names = {row["name"] for row in report["refusal"]["numbers"]}
     assert {"fit, χ²/dof", "surface covered", "points off the surface, RMS"} <= names
-    assert run.report["place_pose"] is None
+    assert report["place_pose"] is None
 
 
 def test_a_part_that_met_nothing_says_how_far_it_was_lowered(ends: Ends) -> None:
@@ -99,10 +91,10 @@ def test_a_fault_keeps_the_last_frames_and_every_fault_before_it(ends: Ends) -> 
     assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d[+-]\d{4}", first["at"])
 
 
-def test_a_placed_run_measures_itself_against_its_limits(placed: Ended) -> None:
-    rows = {row["name"]: row for row in placed.report["measured"]}
+def test_a_placed_run_measures_itself_against_its_limits(ends: Ends) -> None:
+    report = ends(report_runs.placed).report
+    rows, truth = {row["name"]: row for row in report["measured"]}, report["truth"]
     assert all(row["kept"] for row in rows.values())
-    truth = placed.report["truth"]
     assert rows["place error, largest of 45 points"]["value"] == truth["error_mm"]["d"]["max"]
     assert rows["place error, largest of 45 points"]["limit"] == 0.6
     assert (rows["place error, stated 95 % bound"]["limit"], rows["contact depth"]["limit"]) == (0.6, 1.0)
@@ -113,23 +105,20 @@ def test_a_placed_run_measures_itself_against_its_limits(placed: Ended) -> None:
 def test_a_real_cell_has_its_own_figures(ends: Ends) -> None:
     report = ends(report_runs.real).report
     assert report["truth"] is None
-    names = [row["name"] for row in report["measured"]]
-    assert names[:5] == [
-        "place error, stated 95 % bound",
-        "contact depth",
-        "first touch, off what the scan says",
-        "fit, χ²/dof",
-        "surface covered",
-    ]
+    assert "; ".join(row["name"] for row in report["measured"][:5]) == (
+        "place error, stated 95 % bound; contact depth; first touch, off what the scan says; fit, χ²/dof; "
+        "surface covered"
+    )
 
 
-def test_a_surface_as_drawn_shows_no_waviness(placed: Ended) -> None:
-    texture, row = placed.report["scan"]["texture"], placed.report["measured"][-2]
+def test_a_surface_as_drawn_shows_no_waviness(ends: Ends) -> None:
+    report = ends(report_runs.placed).report
+    texture, row = report["scan"]["texture"], report["measured"][-2]
     assert (texture["sa_mm"], texture["sq_mm"], texture["sz_mm"]) == (None, None, None)
     assert texture["nesting_mm"] == 5.0 and 0.003 < texture["limit_mm"] < 0.01
     assert texture["area_mm2"] == pytest.approx(63.0 * 32.0, rel=0.1)
     assert row["name"].endswith("is less than") and row["value"] == pytest.approx(texture["limit_mm"], abs=1e-5)
-    assert texture_words(placed.report).startswith(f"no waviness told: {texture['reason']}; left: no waviness told: ")
+    assert texture_words(report).startswith(f"no waviness told: {texture['reason']}; left: no waviness told: ")
 
 
 def test_waves_on_the_scanned_surface_are_told(placed_pot: JobRecord, tmp_path: Path) -> None:

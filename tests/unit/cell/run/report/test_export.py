@@ -1,7 +1,5 @@
 """A run's cloud leaves for other programs with every point where it was measured, and its deviations where known."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

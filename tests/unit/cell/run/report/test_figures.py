@@ -3,8 +3,6 @@
 All lengths here are round in m and all angles in rad, so that every figure is written down rather than computed.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any
@@ -141,7 +139,6 @@ def test_what_a_verification_suspects() -> None:
 
 def test_a_calibrations_figures(placed_pot: JobRecord) -> None:
     calibration = placed_pot.calibration
-    assert calibration is not None
     told, scan = calibration.summary(), calibration.scan
     direction = scan.rail_direction
     assert told["light_plane"]["distance_mm"] == pytest.approx(1e3 * scan.light_plane.distance, abs=1e-4)

@@ -1,7 +1,4 @@
-"""What a run says at its end: a refusal leaves what it looked at, the report is strict and documented, and what it
-states of its own error is what its covariance says."""
-
-from __future__ import annotations
+"""What a run says at its end: the report is strict and documented, and keeps its contract."""
 
 import re
 from dataclasses import replace
@@ -21,11 +18,6 @@ from tests.support.report_runs import Ended, Ends, pot, read_strictly
 DOCUMENT = ROOT / "docs" / "reference" / "report.md"
 
 
-@pytest.fixture(scope="module")
-def placed(ends: Ends) -> Ended:
-    return ends(report_runs.placed)
-
-
 def test_no_number_that_is_none_comes_into_the_report(placed_pot: JobRecord, tmp_path: Path) -> None:
     broken = replace(placed_pot.results["place"], depth_error=float("nan"))
     record = replace(placed_pot, results={**placed_pot.results, "place": broken})
@@ -39,9 +31,6 @@ def test_no_number_that_is_none_comes_into_the_report(placed_pot: JobRecord, tmp
     assert strict({"a": (np.float32(1.5), np.int64(2), float("-inf"))}) == {"a": [1.5, 2, None]}
     # What a foreign step may have said.
     assert strict({"at": np.array([[1.0, np.nan]]), "file": Path("x")}) == {"at": [[1.0, None]], "file": "x"}
-
-
-# --- docs/reference/report.md ---
 
 
 def keys(value: object, at: str = "") -> set[str]:
@@ -70,21 +59,19 @@ def documented() -> set[str]:
     return found
 
 
-@pytest.fixture(scope="module")
-def two_sweeps(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> Ended:
+def in_two_sweeps(placed_pot: JobRecord, folder: Path) -> Ended:
     """The middle of the pot in two sweeps side by side."""
-    job, _ = pot(length=0.036, swath=(SwathSection(across="-4 mm"), SwathSection(across="4 mm")))
-    folder = tmp_path_factory.mktemp("two")
+    job, _ = pot(length=0.030, swath=(SwathSection(across="-4 mm"), SwathSection(across="4 mm")))
     site = AtStation(placed_pot, folder, job)
     site.do("laser_sweep", "reconstruct", "invert_pose", "place")
     return report_runs.placed(site.ended, folder / "runs")
 
 
 def test_every_key_of_a_report_is_documented_and_every_documented_key_exists(
-    ends: Ends, placed: Ended, two_sweeps: Ended
+    ends: Ends, placed_pot: JobRecord, tmp_path: Path
 ) -> None:
-    others = (report_runs.too_strict, report_runs.faulted, report_runs.aborted)
-    reports = [placed.report, two_sweeps.report, *(ends(make).report for make in others)]
+    made = (report_runs.placed, report_runs.too_strict, report_runs.faulted, report_runs.aborted)
+    reports = [in_two_sweeps(placed_pot, tmp_path).report, *(ends(make).report for make in made)]
     found = set().union(*(keys(report) for report in reports))
     # What other places of the program add, each only where something out of the ordinary was asked for or went wrong.
     elsewhere = {
@@ -119,8 +106,8 @@ def test_what_went_wrong_with_the_report_itself_is_told_in_it(placed_pot: JobRec
     assert run.report["outcome"] == "placed"
 
 
-def test_the_report_keeps_its_contract(placed: Ended) -> None:
-    report = read_strictly(placed.folder / "report.json")
+def test_the_report_keeps_its_contract(ends: Ends) -> None:
+    report = read_strictly(ends(report_runs.placed).folder / "report.json")
     assert {"outcome", "seed", "level", "steps", "place_pose", "place_sigma", "assumed_noise", "truth"} <= set(report)
     assert all({"name", "state", "duration_s", "retries", "wall_s"} <= set(step) for step in report["steps"])
     truth = report["truth"]

@@ -1,7 +1,5 @@
 """How a cell may be opened: what does not go together is refused before anything is started."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

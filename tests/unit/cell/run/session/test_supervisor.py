@@ -1,7 +1,5 @@
 """What a person may say of a cell: that a stop is over, which rules a maintenance lifts; and what that leaves."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os

@@ -1,7 +1,5 @@
 """What a first job needs is compiled beside its calibration, by a process that ends with its own."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -34,7 +32,6 @@ def test_who_compiles_ahead_ends_with_the_other(tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "cell.run.session.warm_up"], stdin=subprocess.PIPE, env=environment
     ) as ahead:
-        assert ahead.stdin is not None
         ahead.stdin.close()
         assert ahead.wait(60) == 0
     assert len(list(tmp_path.rglob("*.nbi"))) < 40

@@ -1,8 +1,7 @@
 """Acceptance figures: form, size and spacing against shapes with known errors, and against a head without any."""
 
-from __future__ import annotations
-
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from cell.measure.geometry.light_plane import LightPlane
@@ -54,11 +53,8 @@ def exact():
     """A head without deviations or noise but the sensor's, and its true geometry."""
     spec = RigSpec(noise=Noise().times(1e-3))
     head = draw_head(spec, np.random.default_rng(1), "ideal")
-    camera = spec.nominal_camera()
     plane = LightPlane.of(head.laser.normal, head.laser.distance)
-    import pinocchio as pin
-
-    return spec, head, ScanGeometry(camera, plane, head.rail_direction, pin.SE3.Identity())
+    return spec, head, ScanGeometry(spec.nominal_camera(), plane, head.rail_direction, pin.SE3.Identity())
 
 
 def test_a_head_that_is_known_exactly_measures_the_artefacts_true(exact) -> None:
@@ -87,12 +83,11 @@ def test_a_wrong_scale_of_the_rail_shows_in_the_spacing(exact) -> None:
 
 def test_places_cover_the_volume_as_the_standard_asks() -> None:
     spec = RigSpec()
-    assert len(campaign.ball_places(spec)) == 10
     bars = campaign.bar_places(spec)
-    assert len(bars) == 7
+    counts = len(campaign.ball_places(spec)), len(bars), len(campaign.flat_poses(spec))
+    assert counts == (10, 7, 6) and sum(counts) == campaign.PLACES
     for first, second in bars:
         assert np.linalg.norm(second - first) == pytest.approx(campaign.SPACING)
-    assert len(campaign.flat_poses(spec)) == 6
 
 
 def test_every_level_has_its_noise() -> None:

@@ -3,8 +3,6 @@
 A small part of `cell bench board`: the renderer shares no code with the detection, and OpenCV's lens is the truth.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

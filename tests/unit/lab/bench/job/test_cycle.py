@@ -1,7 +1,5 @@
 """The least time of a motion is that of a straight one at the limits, and what a run's time is made of adds up."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +27,6 @@ def test_a_motion_takes_at_least_what_speed_acceleration_and_jerk_need(placed_po
 
 
 def test_what_a_run_is_made_of_adds_up(placed_pot: JobRecord, tmp_path: Path) -> None:
-    assert placed_pot.folder is not None
     site = AtStation(placed_pot, tmp_path)
     found = activities(placed_pot.folder)
     length = max(one.end for one in found)

@@ -1,7 +1,5 @@
 """What contact makes of the expected placement: the ground decides how far down, the cell's errors all else."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, cast
 

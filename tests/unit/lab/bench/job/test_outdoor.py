@@ -1,7 +1,5 @@
 """The bench of jobs in the open: what it says of a row, and how far the line's centres scatter in the sun."""
 
-from __future__ import annotations
-
 from lab.bench.job.outdoor import configured, scatter, summed_up
 
 

@@ -1,7 +1,5 @@
 """What `cell bench placed` sums up, and what it refuses; its effects are at work in the tests of `verify`."""
 
-from __future__ import annotations
-
 import pytest
 
 from cell.procedures.placed_part import LIKELY

@@ -1,7 +1,5 @@
 """Schedules as data, what is drawn and shrunk of them, the files of a process that is gone, and a computer's disk."""
 
-from __future__ import annotations
-
 import time
 from contextlib import suppress
 from dataclasses import replace

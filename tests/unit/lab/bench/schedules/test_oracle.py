@@ -1,8 +1,6 @@
 """The oracle sees each violation, on a world that is driven by hand: the devices without the cell's gate."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -39,15 +37,19 @@ def rules(oracle: Oracle) -> set[str]:
     return {violation.rule for violation in oracle.violations}
 
 
-def turned(cell: VirtualCell, angle: float = 0.3) -> np.ndarray:
-    joints = cell.arm.state().joints.copy()
-    joints[5] += angle
-    return joints
-
-
 def drive(cell: VirtualCell) -> None:
     cell.vehicle.enable()
     cell.vehicle.drive(0.2, 0.0)
+
+
+def turn(cell: VirtualCell) -> None:
+    joints = cell.arm.state().joints.copy()
+    joints[5] += 0.3
+    cell.arm.move_joints(joints, 0.5, 1.0).wait(5.0)
+
+
+def shine(cell: VirtualCell) -> None:
+    cell.arm.set_digital_output(LASER, True)
 
 
 def end(outcome: str = "faulted", reason: str = "", part: str | None = None, bound: float | None = None) -> RunEnd:
@@ -55,11 +57,11 @@ def end(outcome: str = "faulted", reason: str = "", part: str | None = None, bou
 
 
 def test_a_cell_that_works_as_it_should_breaks_no_rule(cell: VirtualCell, oracle: Oracle) -> None:
-    cell.arm.move_joints(turned(cell), 0.5, 1.0).wait(5.0)
+    turn(cell)
     drive(cell)
     cell.clock.sleep(0.5)
     cell.vehicle.brake()
-    cell.arm.set_digital_output(LASER, True)
+    shine(cell)
     for _ in range(3):
         cell.scan_camera.grab()
     cell.arm.set_digital_output(LASER, False)
@@ -70,23 +72,20 @@ def test_a_cell_that_works_as_it_should_breaks_no_rule(cell: VirtualCell, oracle
     assert oracle.violations == []
 
 
-def test_an_arm_that_moves_while_the_vehicle_drives(cell: VirtualCell, oracle: Oracle) -> None:
+@pytest.mark.parametrize(("act", "rule"), [(turn, "arm and vehicle"), (shine, "laser")])
+def test_an_arm_that_moves_or_a_laser_that_shines_while_the_vehicle_drives(
+    cell: VirtualCell, oracle: Oracle, act: Callable[[VirtualCell], None], rule: str
+) -> None:
     drive(cell)
-    cell.arm.move_joints(turned(cell), 0.5, 1.0).wait(5.0)
-    assert rules(oracle) == {"arm and vehicle"}
+    act(cell)
+    assert rules(oracle) == {rule}
 
 
 def test_a_laser_that_shines_for_nobody(cell: VirtualCell, oracle: Oracle) -> None:
-    cell.arm.set_digital_output(LASER, True)
+    shine(cell)
     cell.clock.sleep(0.5)
     assert rules(oracle) == set()
     cell.clock.sleep(2.5)
-    assert rules(oracle) == {"laser"}
-
-
-def test_a_laser_that_shines_while_the_vehicle_drives(cell: VirtualCell, oracle: Oracle) -> None:
-    drive(cell)
-    cell.arm.set_digital_output(LASER, True)
     assert rules(oracle) == {"laser"}
 
 
@@ -109,21 +108,16 @@ def test_too_much_force(
     assert (rules(oracle) == {"force"}) is broken
 
 
-@pytest.mark.parametrize("what", ["arm", "vehicle", "rail", "laser"])
-def test_something_that_goes_on_after_the_end(cell: VirtualCell, oracle: Oracle, what: str) -> None:
+@pytest.mark.parametrize(
+    ("what", "act"), [("arm", turn), ("vehicle", drive), ("rail", lambda cell: cell.rail.home()), ("laser", shine)]
+)
+def test_something_that_goes_on_after_the_end(
+    cell: VirtualCell, oracle: Oracle, what: str, act: Callable[[VirtualCell], None]
+) -> None:
     oracle.stopped()
     cell.clock.sleep(0.6)
-    match what:
-        case "arm":
-            cell.arm.move_joints(turned(cell), 0.5, 1.0).wait(5.0)
-        case "vehicle":
-            drive(cell)
-            cell.clock.sleep(0.5)
-        case "rail":
-            cell.rail.home()
-            cell.clock.sleep(0.5)
-        case "laser":
-            cell.arm.set_digital_output(LASER, True)
+    act(cell)
+    cell.clock.sleep(0.5)
     assert rules(oracle) == {"after the end"}
     assert what in oracle.violations[0].how
 

@@ -1,7 +1,5 @@
 """What `cell bench soak` and `cell bench servo` reckon with, against numbers that are known."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 
@@ -46,7 +44,6 @@ def test_a_thread_and_a_handle_more_are_counted() -> None:
     with subprocess.Popen(
         [sys.executable, "-c", GROWING], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as child:
-        assert child.stdin is not None and child.stdout is not None
         assert child.stdout.readline() == "ready\n"
         before = counted(child.pid)["this program"]
         print(file=child.stdin, flush=True)
@@ -60,7 +57,6 @@ def test_a_pace_is_told_by_its_rate_and_its_gaps() -> None:
     times = [0.002 * k for k in range(201)]
     times[100] += 0.001
     pace = pace_of(times)
-    assert pace is not None
     assert (pace.points, pace.rate, pace.median) == (201, pytest.approx(500.0), pytest.approx(0.002))
     assert (pace.p99, pace.longest) == (pytest.approx(0.002), pytest.approx(0.003))
     assert pace_of([0.0, 1.0]) is None

@@ -1,7 +1,5 @@
 """Where steps and faults stand in the time of a run, and which runs it is shown among."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path
@@ -88,7 +86,6 @@ def test_what_was_refused_is_not_drawn_and_a_laser_that_nobody_put_out_is(tmp_pa
 
 
 def test_of_a_whole_job_the_arm_and_the_vehicle_never_move_at_once(placed_pot: JobRecord) -> None:
-    assert placed_pot.folder is not None
     found = activities(placed_pot.folder)
     moves = {name: [one for one in found if one.device == name] for name in ("arm", "vehicle", "rail", "laser")}
     assert all(moves.values())
@@ -112,7 +109,6 @@ def test_steps_follow_each_other_in_the_cells_time_on_the_virtual_clock(tmp_path
     journal.close()
     fault = {"step": "laser_sweep", "attempt": 1, "code": "c", "reason": "r", "remedy": "tried again"}
     course = timeline(tmp_path, {"clock": "virtual", "faults": [fault]})
-    assert course is not None
     assert [(bar.begin, bar.end, bar.state) for bar in course.bars] == [(0.0, 2.0, "failed"), (2.0, 6.0, "done")]
     assert [mark.at for mark in course.marks] == [2.0]
 
@@ -126,7 +122,6 @@ def test_steps_and_faults_stand_where_the_wall_had_them(tmp_path: Path) -> None:
     at = time.strftime("%Y-%m-%dT%H:%M:%S%z", time.localtime(time.time() + 3600))
     fault = {"at": at, "step": "laser_sweep", "attempt": 1, "code": "c", "reason": "r", "remedy": "ended the run"}
     course = timeline(tmp_path, {"clock": "wall", "faults": [fault]})
-    assert course is not None
     assert [(bar.step, bar.state) for bar in course.bars] == [("laser_sweep", "failed")]
     assert [mark.text.split(":")[0] for mark in course.marks] == ["confirm needed", "c in laser_sweep"]
     # A date of another clock does not leave the drawing.

@@ -1,7 +1,5 @@
 """A run's page: one file that asks for nothing, says what the report says, and what it cannot show."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -15,7 +13,6 @@ from typer.testing import CliRunner
 from cell.apps.cli.app import app
 from cell.base.storage import write_json
 from cell.measure.reconstruction.ply import write_cloud
-from cell.procedures.steps.reconstruct import Reconstruction
 from cell.run.report.page.make import MOST_BYTES, compared, identities, judged, make_page, verdict, write_page
 from drivers.errors import CellError
 from lab.bench.job.whole_job import JobRecord
@@ -63,7 +60,6 @@ def folder(placed_pot: JobRecord, ends: Ends, tmp_path_factory: pytest.TempPathF
     folder = tmp_path_factory.mktemp("page") / ends(report_runs.placed).folder.name
     shutil.copytree(ends(report_runs.placed).folder, folder)
     made = placed_pot.results["reconstruct"]
-    assert isinstance(made, Reconstruction)
     write_cloud(folder / "cloud.ply", made.cloud)
     write_json(folder / "job.json", pot()[0].model_dump(mode="json"))
     journal = Journal(folder, folder.name, {"clock": "virtual"})
@@ -82,16 +78,11 @@ def test_the_page_of_a_placed_run(folder: Path) -> None:
     # An inline script or style could ask as well; the policy is what a browser holds it to.
     assert "default-src 'none'; img-src data:;" in text
     assert not re.search(r"https?:|@import|url\(|fetch|XMLHttp|import\(", text)
+    true, stated = report["truth"]["error_mm"]["d"]["max"], report["place_bound_95"]["d"]
     for said in (
-        f"{report['truth']['error_mm']['d']['max']:.3f} mm (simulated world)",
-        f"{report['place_bound_95']['d']:.3f} mm",
-        "tolerance 0.6 mm",
-        "Simulated",
-        report["calibration_hash"],
-        report["job_hash"],
-        "camera.frames_lost in laser_sweep",
-        "camera's read noise",
-    ):
+        f"{true:.3f} mm (simulated world)", f"{stated:.3f} mm", "tolerance 0.6 mm", "Simulated",
+        report["calibration_hash"], report["job_hash"], "camera.frames_lost in laser_sweep", "camera's read noise",
+    ):  # fmt: skip
         assert said in page.text, said
     data = json.loads(re.findall(r'id="cloud-data">(.*?)</script>', text)[0])
     assert f"{data['count']} of {data['total']} measured points are shown" in page.text
@@ -153,11 +144,7 @@ def test_the_command_writes_it_beside_the_run_or_where_it_is_asked_to(tmp_path: 
 
 
 TOLERANCE = {"tolerance": {"translation_mm": 0.6}}
-
-
 BOUND = {"place_bound_95": {"x": 0.1, "y": 0.1, "z": 0.2, "d": 0.25}}
-
-
 OUTSIDE = {"name": "first touch", "value": 2.0, "unit": "mm", "limit": 1.0, "bound": "at most", "kept": False}
 
 
@@ -197,7 +184,6 @@ def test_a_calibration_is_told_with_its_age(tmp_path: Path, seconds: float | Non
 
 
 def test_where_nobody_knows_the_truth_the_part_is_where_it_was_seen() -> None:
-    """Of a run that placed and of one that ended misplaced."""
     seen = {"off_mm": 0.08, "shift_mm": [0.05, -0.06, 0.01]}
     for more in ({"steps": [{"name": "verify", "result": seen}]}, {"refusal": {"placed": seen}}):
         rows = {row.cells[0]: row.cells for row in compared({**TOLERANCE, **BOUND, **more})}

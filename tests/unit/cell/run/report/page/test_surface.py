@@ -1,7 +1,5 @@
 """What a page shows of a cloud: its points where they are, coloured by their deviation or their height."""
 
-from __future__ import annotations
-
 import base64
 
 import numpy as np
