@@ -16,9 +16,11 @@ from xdist.scheduler import LoadFileScheduling
 
 from cell.apps.cli import main
 from cell.config.calibrations.store import save_calibration
+from cell.devices.simulated.direct import VirtualCell
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.support import Typed
 from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
+from tests.support.unloading import unloaded
 
 GROUPS = (
     # One cell at a time, as an engineer runs it; those first that need little of what the job compiles.
@@ -181,6 +183,18 @@ def placed_pot(tmp_path_factory: pytest.TempPathFactory) -> JobRecord:
     """The job `pot` on the virtual clock, calibrated by itself: seed 2, nominal, swept twice as fast as shipped."""
     job, nominal = pot()
     record = run_whole_job(CONFIG, job, nominal, 2, "nominal", runs=tmp_path_factory.mktemp("placed"))
+    assert (record.outcome, record.reason) == ("placed", "")
+    return record
+
+
+@pytest.fixture(scope="session")
+def unloaded_part(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> JobRecord:
+    """The job `unload` in the world of `placed_pot`, with a part that clings to its surface."""
+
+    def clings(cell: VirtualCell) -> None:
+        cell.world.part.sticks = 10.0
+
+    record = unloaded(placed_pot, clings, runs=tmp_path_factory.mktemp("unloaded"))
     assert (record.outcome, record.reason) == ("placed", "")
     return record
 

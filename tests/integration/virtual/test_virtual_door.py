@@ -125,16 +125,6 @@ def test_a_script_that_allows_one_decision_is_asked_once() -> None:
     assert asked == ["drive_to_target"]
 
 
-def test_it_takes_the_course_of_another_seed_otherwise() -> None:
-    with opened() as cell:
-        here = cell.simulated
-        assert here is not None
-        with Cell.open(sim="all", seed=SEED + 1, clock="virtual") as other:
-            there = other.simulated
-            assert there is not None
-            assert here.truth()["poses"]["world_from_surface"] != there.truth()["poses"]["world_from_surface"]
-
-
 def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
     outcome = done(("rail.reset@laser_sweep:40%",), until="reconstruct")
     assert outcome.outcome == "done"
@@ -244,16 +234,6 @@ def test_without_a_word_the_run_waits_and_can_be_ended() -> None:
         assert cell.simulated is not None
         assert cell.simulated.truth()["arm"]["safety"] == "protective_stop"
     assert (outcome.outcome, outcome.reason) == ("aborted", "enough waited")
-
-
-@pytest.mark.campaign
-def test_a_job_that_does_not_fit_what_is_there_is_refused(folder: Path) -> None:
-    text = (folder / "pot.toml").read_text(encoding="utf-8")
-    assert 'tolerance = "0.6 mm"' in text
-    (folder / "pot.toml").write_text(text.replace('tolerance = "0.6 mm"', 'tolerance = "0.05 mm"'), encoding="utf-8")
-    outcome = done()
-    assert (outcome.outcome, outcome.report["refusal"]["step"]) == ("refused", "invert_pose")
-    require_safe(dict(outcome.report))
 
 
 @pytest.mark.parametrize(

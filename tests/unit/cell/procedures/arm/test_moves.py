@@ -49,11 +49,20 @@ def test_the_arm_goes_the_same_way_at_a_share_of_its_speed_from_the_next_motion_
     assert speeds(line)[1] == pytest.approx(0.5 * straight, rel=0.05)
 
 
-def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints() -> None:
-    """But for whole turns, of which it makes the fewest: the last joint's is spared from one turn further on."""
+WIDE = (0.6, 0.6, 0.02)
+
+
+def mover_with(size: tuple[float, float, float] | None) -> Mover:
+    """In a cell of its own, with a part of this size in the claw."""
     cell = VirtualCell(CONFIG, 2, "nominal")
     cell.devices.vehicle.brake()
-    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None, interlocks=cell.devices.interlocks)
+    job = None if size is None else JOB.model_copy(update={"grasp": JOB.grasp.model_copy(update={"size": size})})
+    return Mover(cell.devices.arm, cell.clock, CONFIG, job, interlocks=cell.devices.interlocks)
+
+
+def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints() -> None:
+    """But for whole turns, of which it makes the fewest: the last joint's is spared from one turn further on."""
+    mover = mover_with(None)
     pose = drawn_interim_view(CONFIG).base_from_flange
     expected = mover.kinematics.ik(pose, HOME)
 
@@ -72,9 +81,7 @@ def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints() -> No
 
 
 def test_between_jobs_the_arm_rests_where_the_next_looks_first_or_else_at_home() -> None:
-    cell = VirtualCell(CONFIG, 2, "nominal")
-    cell.devices.vehicle.brake()
-    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None, interlocks=cell.devices.interlocks)
+    mover = mover_with(None)
     mover.fold()
     assert mover.joints == pytest.approx(HOME, abs=1e-3)
     rest = resting_pose(drawn_interim_view(CONFIG))
@@ -84,18 +91,7 @@ def test_between_jobs_the_arm_rests_where_the_next_looks_first_or_else_at_home()
         assert mover.joints == pytest.approx(HOME, abs=1e-3)
     mover.rest_at(rest)
     mover.fold()
-    assert np.linalg.norm(from_ur(cell.devices.arm.state().flange).actInv(rest).translation) < 1e-4
-
-
-WIDE = (0.6, 0.6, 0.02)
-
-
-def mover_with(size: tuple[float, float, float] | None) -> Mover:
-    """In a cell of its own, with a part of this size in the claw."""
-    cell = VirtualCell(CONFIG, 2, "nominal")
-    cell.devices.vehicle.brake()
-    job = None if size is None else JOB.model_copy(update={"grasp": JOB.grasp.model_copy(update={"size": size})})
-    return Mover(cell.devices.arm, cell.clock, CONFIG, job, interlocks=cell.devices.interlocks)
+    assert np.linalg.norm(mover.kinematics.fk(mover.joints).actInv(rest).translation) < 1e-4
 
 
 def test_with_a_part_that_has_no_room_there_the_arm_rests_at_home() -> None:

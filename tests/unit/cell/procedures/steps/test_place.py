@@ -113,6 +113,12 @@ def site() -> Site:
     return Site()
 
 
+@pytest.fixture(scope="module")
+def work(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> Workplace:
+    """Where `placed_pot` placed."""
+    return AtStation(placed_pot, tmp_path_factory.mktemp("place"), folded=False).work
+
+
 def normal() -> np.ndarray:
     return np.asarray(JOB.grasp.flange_from_part.se3().rotation[:, 2])
 
@@ -222,9 +228,8 @@ def test_a_surface_that_comes_early_or_not_at_all_is_refused_with_the_part_held_
 
 @pytest.mark.parametrize(("off", "from_mm"), [(None, 1.0), (0.02e-3, 0.47), (-0.2e-3, 1.0)])
 def test_where_the_part_before_touched_as_expected_contact_is_felt_for_nearer(
-    placed_pot: JobRecord, tmp_path: Path, off: float | None, from_mm: float
+    work: Workplace, off: float | None, from_mm: float
 ) -> None:
-    work = AtStation(placed_pot, tmp_path, folded=False).work
     work.parts_before = PartsBefore(touch_off=off)
     # Above all that would be placed: 3.5 standard deviations over the expected touch.
     assert 1e3 * felt_from(work, TouchHeight(0.05e-3, 0.07e-3)) == pytest.approx(from_mm, abs=0.01)
@@ -246,12 +251,9 @@ def test_a_touch_that_contradicts_the_scan_is_refused_with_the_part_held_and_lif
     assert site.height_above() > 0.5 * JOB.place.approach
 
 
-@pytest.mark.parametrize("too_low", [0.3e-3, 0.38e-3, 0.45e-3, 0.55e-3, 0.7e-3, 0.9e-3])
-def test_one_that_touches_before_it_is_felt_for_is_refused_as_well(
-    placed_pot: JobRecord, tmp_path: Path, site: Site, too_low: float
-) -> None:
+@pytest.mark.parametrize("too_low", [0.38e-3, 0.45e-3, 0.55e-3, 0.9e-3])
+def test_one_that_touches_before_it_is_felt_for_is_refused_as_well(work: Workplace, site: Site, too_low: float) -> None:
     """Whether the force begins on the slow part of the descent, just before it, or on the fast one."""
-    work = AtStation(placed_pot, tmp_path, folded=False).work
     work.parts_before = PartsBefore(touch_off=0.0)
     feel = felt_from(work, STATED)
     assert 0.3e-3 < feel < 0.5e-3

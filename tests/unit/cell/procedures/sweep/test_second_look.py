@@ -63,7 +63,7 @@ def looked(
 def test_one_that_lies_where_it_lay_is_told_so(placed_pot: JobRecord, tmp_path: Path) -> None:
     look = looked(placed_pot, tmp_path)
     found = look.moved
-    assert look.notes == () and look.creep is None
+    assert look.notes == () and look.creep is None and not look.counted
     assert np.linalg.norm(found.motion[:3]) < 0.2e-3 and np.linalg.norm(found.motion[3:]) < 0.5e-3
     assert not found.moved and found.times < 0.9
     assert found.matched == pytest.approx(1.0, abs=0.1)
@@ -103,7 +103,7 @@ def test_a_way_back_is_too_blunt_where_it_is_not_known_how_late_the_stamps_come(
     assert site.do("laser_sweep").back is None
 
 
-@pytest.mark.parametrize(("shift", "late"), [(0.0, 0.0), (0.25e-3, 0.0), (0.0, 6.0), (0.25e-3, 6.0)])
+@pytest.mark.parametrize(("shift", "late"), [(0.0, 0.0), (0.25e-3, 0.0), (0.25e-3, 6.0)])
 def test_the_way_back_of_a_sweep_is_its_second_look_unless_it_is_too_long_ago(
     placed_pot: JobRecord, tmp_path: Path, shift: float, late: float
 ) -> None:
@@ -130,7 +130,7 @@ def test_the_way_back_of_a_sweep_is_its_second_look_unless_it_is_too_long_ago(
             look_again(site)
     else:
         look = look_again(site)
-        assert look.counted == (late == 0.0) and not look.moved.moved and look.notes == ()
+        assert look.counted and not look.moved.moved and look.notes == ()
     assert begun
 
 
