@@ -140,7 +140,6 @@ def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
         ("vehicle.motor_fault@drive_to_target:40%", "vehicle.error"),
         ("arm.emergency_stop@board_photo", "arm.emergency_stop"),
         ("arm.protective_stop@place:40%", "arm.protective_stop"),
-        ("rail.lost_steps@drive_to_target:0%", "rail.lost_steps"),
         ("rail.lost_steps@laser_sweep:1%", "rail.lost_steps"),
         ("rail.lost_steps@place:2%", "rail.lost_steps"),
     ],

@@ -53,7 +53,7 @@ def inverted_of_droop(record: JobRecord, sag: float) -> PlacePose:
     return step(replace(made["reconstruct"], cloud=bent), made["board_photo"], job, nominal, record.kinematic, taken)
 
 
-@pytest.mark.parametrize("sag", [0.1e-3, -0.1e-3, 0.15e-3])
+@pytest.mark.parametrize("sag", [0.15e-3, -0.1e-3])
 def test_a_carriage_that_droops_is_told_and_in_the_stated_covariance(placed_pot: JobRecord, sag: float) -> None:
     good, found = placed_pot.results["invert_pose"], inverted_of_droop(placed_pot, sag)
     (note,) = found.notes

@@ -14,6 +14,7 @@ import pytest
 import trimesh
 
 from cell import Cell
+from cell.config.cell_config import NO_FILES
 from cell.config.job import FeatureSection, load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, transform
@@ -341,7 +342,7 @@ def test_what_is_accepted_is_no_farther_off_than_is_allowed(tmp_path: Path) -> N
 
 def test_a_run_tells_how_its_part_lies_in_report_page_and_picture_and_is_replayed(calibrated_folder: Path) -> None:
     job = job_with_part(calibrated_folder, "pot", verify="all", half=MIDDLE)
-    text = quick(job.read_text(encoding="utf-8"))
+    text = quick(job.read_text(encoding="utf-8"), 20.0)
     job.write_text(
         f'{text}[[part.feature]]\nname = "left"\nkind = "edge"\nat = {FRONT}\naxis = [1, 0, 0]\ntolerance = "0.4 mm"\n',
         encoding="utf-8",
@@ -381,8 +382,8 @@ def test_a_part_that_slips_as_the_claw_opens_ends_the_run_as_misplaced(placed_po
     slips = opened(motion(y=0.9, turn=(0, 0, 4)))
     nominal = NominalSurface.load(mesh, unit=job.surface.mesh_unit)
     done = run_whole_job(
-        CONFIG, job, nominal, placed_pot.seed, placed_pot.level, calibrated=placed_pot, runs=tmp_path / "runs",
-        changed=lambda cell: slips(cell.world),
+        CONFIG.model_copy(update={"cell": CONFIG.cell.model_copy(update=NO_FILES)}), job, nominal, placed_pot.seed,
+        placed_pot.level, calibrated=placed_pot, runs=tmp_path, changed=lambda cell: slips(cell.world),
     )  # fmt: skip
     assert (done.outcome, done.stage) == ("misplaced", "verify")
     assert "the part is already down" in done.reason and LIKELY["shifted"] in done.reason
@@ -397,4 +398,3 @@ def test_a_part_that_slips_as_the_claw_opens_ends_the_run_as_misplaced(placed_po
     assert np.allclose(report["refusal"]["placed"]["shift_mm"][1], 1e3 * true.translation[1], atol=0.2)
     assert max(map(abs, report["truth"]["seen_error"]["translation_mm"])) < 0.03
     assert not all(row["kept"] for row in report["measured"])
-    assert (done.folder / "picture.png").is_file()
