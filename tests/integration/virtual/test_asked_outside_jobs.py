@@ -53,9 +53,7 @@ def stop_on_the_way(cell: Cell, times: int = 1) -> None:
 def asked(cell: Cell) -> Run[Any]:
     """The run that waits for a person."""
     assert until(lambda: (run := cell.current) is not None and run.control.question is not None)
-    run = cell.current
-    assert run is not None
-    return run
+    return cell.current  # type: ignore[return-value]
 
 
 def in_background(work: Callable[[], object]) -> tuple[threading.Thread, list[object]]:

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from cell import Cell
-from cell.devices.simulated.direct import VirtualCell
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
 from statemachine.step import Event
@@ -23,7 +22,6 @@ def test_a_part_is_placed_at_each_stop_also_when_the_second_run_was_cut_short(
     fast.write_text(changed(fast.read_text(encoding="utf-8"), {"place": {"verify": '"none"'}}), encoding="utf-8")
     cell_file, _ = described(calibrated_folder, UNDRAWN)
     with Cell.open(cell_file, sim="all", seed=placed_pot.seed, clock="virtual", job=fast) as cell:
-        assert isinstance(cell.simulated, VirtualCell)
         world = cell.simulated.world
 
         def end(event: Event) -> None:

@@ -16,7 +16,6 @@ import pytest
 from cell import Cell
 from cell.config.cell_config import default_toml
 from cell.config.job import load_job
-from cell.devices.simulated.direct import VirtualCell
 from cell.run.events import ConfirmNeeded, Held, RunEnded, RunEvent, StepStarted
 from cell.run.job_run import RunOutcome
 from cell.run.record.reading import Parts, said
@@ -97,7 +96,6 @@ def test_a_vehicle_that_was_moved_in_a_fault_is_not_swept_from_where_it_stood() 
 
         def push(event: Event) -> None:
             if event.kind == "recovered" or (event.kind == "state" and event.data["trigger"] == "recovered"):
-                assert isinstance(cell.simulated, VirtualCell)
                 cell.simulated.world.vehicle._x += 0.01
 
         run = cell.start("pot.toml", inject=[STOP])
@@ -140,6 +138,7 @@ def test_a_rail_that_is_reset_is_homed_and_sweeps_again() -> None:
         ("vehicle.motor_fault@drive_to_target:40%", "vehicle.error"),
         ("arm.emergency_stop@board_photo", "arm.emergency_stop"),
         ("arm.protective_stop@place:40%", "arm.protective_stop"),
+        ("rail.lost_steps@drive_to_target:0%", "rail.lost_steps"),
         ("rail.lost_steps@laser_sweep:1%", "rail.lost_steps"),
         ("rail.lost_steps@place:2%", "rail.lost_steps"),
     ],
@@ -212,7 +211,6 @@ def test_a_protective_stop_waits_for_a_persons_word() -> None:
 @pytest.mark.parametrize("button", ["arm", "vehicle"])
 def test_an_emergency_stop_ends_a_run_that_waits_for_a_persons_word(button: str) -> None:
     with opened() as cell:
-        assert cell.simulated is not None
         run = cell.start("pot.toml", inject=["arm.protective_stop@drive_to_target:10%"])
         upto(run, ConfirmNeeded)
         cell.simulated.fault({"arm": "arm.emergency_stop", "vehicle": "vehicle.emergency_stop"}[button])
@@ -230,7 +228,6 @@ def test_without_a_word_the_run_waits_and_can_be_ended() -> None:
         assert cell.devices.clock.now() == before
         run.abort("enough waited")
         outcome = run.result(60.0)
-        assert cell.simulated is not None
         assert cell.simulated.truth()["arm"]["safety"] == "protective_stop"
     assert (outcome.outcome, outcome.reason) == ("aborted", "enough waited")
 
@@ -249,7 +246,6 @@ def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str, step: str, re
     with opened() as cell:
         run = cell.start("pot.toml")
         upto(run, StepStarted, step)
-        assert run.folder is not None
         match way:
             case "handle":
                 run.abort("by its handle")
@@ -259,7 +255,6 @@ def test_who_ends_a_run_from_outside_finds_the_cell_safe(way: str, step: str, re
                 cell.stop()
             case "close":
                 cell.close()
-        assert cell.simulated is not None
         stood = cell.simulated.truth()["poses"]["base_from_flange"]
         outcome = run.result(60.0)
         if step == "reconstruct":
@@ -302,7 +297,6 @@ def test_a_paused_run_stands_until_it_goes_on() -> None:
         assert not threading.Event().wait(0.1)
         assert cell.devices.clock.now() == before
         # Held, it still hears other processes.
-        assert run.folder is not None
         request(run.folder, "go-on", "by the journal")
         run.events()
         assert run.result(60.0).outcome == "done"

@@ -15,9 +15,8 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import LEAST, Mover, Pace, nested_parts, placed_parts
 from cell.procedures.arm.photograph import drawn_interim_view
 from cell.procedures.calibrate.interim import resting_pose
-from cell.procedures.steps.drive_to_target import TargetDrive
 from drivers.errors import ConfigError
-from tests.unit.cell.procedures.drive.test_way import JOB, VEHICLE_FROM_BASE, Site
+from tests.unit.cell.procedures.drive.test_way import JOB, Site
 
 CONFIG = load_config(None)
 
@@ -118,14 +117,7 @@ def test_the_vehicle_drives_at_a_share_of_the_jobs_speed() -> None:
         site, pace, speeds = Site(), Pace(), [0.0]
         pace.share = share
         site.whereabouts.say_at_start()
-        site.vehicle.enable()
-        site.whereabouts.enter(JOB)
-        drive = TargetDrive(
-            JOB, VEHICLE_FROM_BASE, site.vehicle, site.whereabouts, site.photograph, clock=site.cell.clock, pace=pace,
-            check=lambda: speeds.append(abs(site.vehicle.state().speed)),
-            progress=lambda share, text: None, note=site.notes.append,
-        )  # fmt: skip
-        drive.to_target()
+        site.run(check=lambda: speeds.append(abs(site.vehicle.state().speed)), pace=pace)
         return max(speeds)
 
     for share in (1.0, 0.5):

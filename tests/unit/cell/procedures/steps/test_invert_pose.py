@@ -28,7 +28,6 @@ from tests.support.report_runs import CONFIG, NAMES, changed, pot
 
 
 def head_of(record: JobRecord, cloud: Cloud) -> Head:
-    assert record.calibration is not None
     scan, sweep = record.calibration.scan, record.results["laser_sweep"]
     travel = CONFIG.rail.travel[1]
     return Head.of(cloud, sweep.base_from_flange, scan.flange_from_camera, scan.rail_direction, travel)
@@ -49,7 +48,6 @@ def inverted_of_droop(record: JobRecord, sag: float) -> PlacePose:
     sweep, bent = made["laser_sweep"], drooped(record, sag)
     vehicle = CONFIG.arm.vehicle_from_base.se3().inverse()
     taken = LineTimes(sweep.times, vehicle, head_of(record, bent))
-    assert record.kinematic is not None
     return step(replace(made["reconstruct"], cloud=bent), made["board_photo"], job, nominal, record.kinematic, taken)
 
 
@@ -104,7 +102,6 @@ def test_a_vehicle_that_rolls_is_in_the_stated_covariance_though_no_height_of_th
 ) -> None:
     site = rolling(placed_pot, tmp_path, 0.3e-3)
     pose, found = site.do(*NAMES[1:]).pose, site.ended
-    assert found.placing is not None and found.at_end is not None
     # ±.3 mrad at .6 m above the ground, one standard deviation.
     assert pose.sigma[1] == pytest.approx(0.3e-3 * 0.6 / np.sqrt(2), rel=0.25)
     error = place_error(site.job, site.nominal, found.at_end)["d_p95"]
@@ -128,7 +125,6 @@ def test_a_droop_since_the_calibration_is_in_the_stated_covariance_or_refused(na
     assert (good.outcome, good.reason) == ("placed", "")
     found, cloud = good.results["invert_pose"], good.results["reconstruct"].cloud
     untouched = bow(cloud, nominal, found.base_from_surface, head_of(good, cloud))
-    assert untouched is not None
     told = " ".join(found.notes)
     print(f"{name} {seed}: bow {1e6 * untouched[0]:.1f} ± {1e6 * untouched[1]:.1f} µm {told}")
     worn = run_whole_job(CONFIG, job, nominal, seed, "nominal+droop", calibrated=good)

@@ -83,11 +83,9 @@ def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_r
     once = described_cells.changed(file.read_text(encoding="utf-8"), {"place": {"corrections": "0"}})
     file.write_text(once, encoding="utf-8")
     with Cell.open(undrawn, sim="all", seed=placed_pot.seed, clock="virtual", job=file) as cell:
-        assert isinstance(cell.simulated, VirtualCell)
         world, begun = cell.simulated.world, list[str]()
         # It lies as the world has drawn it, which is not where the job expects it.
         nest = load_job(f"{file}#2")[0].nest
-        assert nest is not None
         lay = from_matrix(world._items[1].part._base_from_part)
         off = difference(lay, nest.base_from_part.se3())
         assert 0.1e-3 < np.linalg.norm(off[:3]) < 2e-3

@@ -23,7 +23,6 @@ def misplaced(
     record: JobRecord, folder: Path, off: pin.SE3, changed: Callable[[VirtualCell], None] = lambda cell: None
 ) -> str:
     """Why a part that lies `off` where `record` set it down is misplaced, in a cell that is `changed`."""
-    assert record.at_end is not None
     site = where_unloaded(record, folder)
     lies = from_matrix(record.at_end["poses"]["base_from_part"]) * off
     site.cell.world.part._base_from_part = lies.homogeneous
