@@ -8,7 +8,7 @@ over wires would disturb each other's time.
 from __future__ import annotations
 
 import os
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
@@ -19,6 +19,8 @@ from cell.config.calibrations.store import save_calibration
 from cell.devices.simulated.direct import VirtualCell
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.support import Typed
+from tests.support.at_station import AtStation, Station
+from tests.support.lying_part import Lying, LyingPart
 from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
 from tests.support.unloading import unloaded
 
@@ -211,6 +213,18 @@ def ends(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> End
         return made[make]
 
     return get
+
+
+@pytest.fixture
+def station(placed_pot: JobRecord, tmp_path: Path) -> Station:
+    """Gives a cell that stands where `placed_pot` placed."""
+    return partial(AtStation, placed_pot, tmp_path)
+
+
+@pytest.fixture
+def lying_part(placed_pot: JobRecord, tmp_path: Path) -> Lying:
+    """Gives a part that lies in the cell of `placed_pot`."""
+    return partial(LyingPart, placed_pot, tmp_path)
 
 
 @pytest.fixture

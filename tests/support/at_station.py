@@ -89,6 +89,10 @@ class AtStation:
         return replace(self.record, results=self.made, rests=np.array(self.cell.arm.rests), at_end=self.cell.truth())
 
 
+Station = Callable[..., AtStation]
+"""Gives a cell that stands where `placed_pot` placed, as `AtStation` has it."""
+
+
 def lose_few_steps_after_the_look(patch: pytest.MonkeyPatch, cell: Callable[[], VirtualCell]) -> None:
     """Have the cell's rail lose .09 mm where it stands after the second look, whose lines do not show as little."""
 

@@ -103,6 +103,10 @@ class LyingPart:
         return from_matrix(inverse(scene.world_from_surface) @ world.part.part_pose(flange))
 
 
+Lying = Callable[..., LyingPart]
+"""Gives a part that lies in the cell of `placed_pot`, as `LyingPart` has it."""
+
+
 def moved(
     x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> pin.SE3:

@@ -23,7 +23,7 @@ from cell.run.report.report import place_error
 from drivers.errors import NotObservable, RefusedError
 from lab.bench.job.scan_errors import own_base, surface_at_middle
 from lab.bench.job.whole_job import JobRecord, run_whole_job
-from tests.support.at_station import AtStation
+from tests.support.at_station import AtStation, Station
 from tests.support.report_runs import CONFIG, NAMES, changed, pot
 
 
@@ -71,9 +71,9 @@ def test_without_a_droop_nothing_is_added_and_too_large_a_one_is_refused(placed_
 
 
 def test_a_place_that_is_carried_on_for_a_creep_keeps_what_the_droop_adds(
-    placed_pot: JobRecord, tmp_path: Path
+    placed_pot: JobRecord, station: Station
 ) -> None:
-    made, work = placed_pot.results, AtStation(placed_pot, tmp_path, folded=False).work
+    made, work = placed_pot.results, station(folded=False).work
     good, sweep = made["invert_pose"], made["laser_sweep"]
     rate, origin = np.array([6e-6, 0, 0, 0, 3e-6, 0]), good.base_from_surface.translation
     creep = Creep(rate, np.diag(np.full(6, 0.1e-6**2)), origin, float(sweep.times.mean()))
@@ -142,10 +142,10 @@ def test_a_droop_since_the_calibration_is_in_the_stated_covariance_or_refused(na
 
 @pytest.mark.parametrize("doubts", [(), ("nobody looked where the laser points",)])
 def test_where_the_place_is_known_too_little_what_was_noted_of_the_sweep_is_told(
-    placed_pot: JobRecord, tmp_path: Path, doubts: tuple[str, ...]
+    placed_pot: JobRecord, station: Station, doubts: tuple[str, ...]
 ) -> None:
     job, made = changed(pot()[0], "place", tolerance=0.05e-3), placed_pot.results
-    workplace = AtStation(placed_pot, tmp_path, job, folded=False).work
+    workplace = station(job, folded=False).work
     sweep = replace(made["laser_sweep"], doubts=doubts)
     with pytest.raises(NotObservable) as caught:
         inverted(workplace, sweep, made["reconstruct"], made["board_photo"])

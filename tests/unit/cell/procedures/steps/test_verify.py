@@ -32,7 +32,7 @@ from sim_backends.models import rail
 from sim_backends.optics.mesh import Mesh
 from sim_backends.world.world import World
 from tests.support.described_cells import quick
-from tests.support.lying_part import LyingPart, creeps, moved
+from tests.support.lying_part import Lying, LyingPart, creeps, moved
 from tests.support.report_runs import CONFIG, changed
 
 FRONT = ["0 mm", "18 mm", "26.3 mm"]
@@ -85,9 +85,7 @@ def lifted(places: np.ndarray, off: pin.SE3) -> np.ndarray:
 
 
 @pytest.mark.parametrize("much", [1.0, 1.5])
-def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(
-    placed_pot: JobRecord, tmp_path: Path, much: float
-) -> None:
+def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(lying_part: Lying, much: float) -> None:
     """As much as 1.5 the quarters of the part disagree, but for its waves."""
 
     def rocks(cell: VirtualCell) -> None:
@@ -97,7 +95,7 @@ def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(
         )
         cell.world.remake(replace(scene, workshop=rocking), cell.world.station)
 
-    found = LyingPart(placed_pot, tmp_path, changed=rocks, faster=2.0).looked(moved(0.1e-3, z=0.05e-3))
+    found = lying_part(changed=rocks, faster=2.0).looked(moved(0.1e-3, z=0.05e-3))
     error = difference(found.seen.surface_from_part, moved(0.1e-3, z=0.05e-3))
     assert np.linalg.norm(error[:3]) < 0.03e-3 and np.abs(error[3:]).max() < 0.3e-3
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
@@ -108,9 +106,7 @@ def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(
     assert (np.abs(found.flush.higher - lifted(found.flush.places, moved(0.1e-3, z=0.05e-3))) < found.flush.noise).all()
 
 
-def test_a_vehicle_that_was_pushed_since_the_sweep_does_not_make_the_part_look_turned(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+def test_a_vehicle_that_was_pushed_since_the_sweep_does_not_make_the_part_look_turned(lying_part: Lying) -> None:
     pushed = list[str]()
 
     def push(cell: VirtualCell, text: str) -> None:
@@ -120,7 +116,7 @@ def test_a_vehicle_that_was_pushed_since_the_sweep_does_not_make_the_part_look_t
             cell.world.vehicle.world_from_vehicle = lambda t: turn @ stands(t)
         pushed.append(text)
 
-    site = LyingPart(placed_pot, tmp_path, heard=push, also='corrections = 1\naccept = "0.05 mm"')
+    site = lying_part(heard=push, also='corrections = 1\naccept = "0.05 mm"')
     found = site.looked(moved(0.1e-3, z=0.05e-3))
     error = difference(found.seen.surface_from_part, moved(0.1e-3, z=0.05e-3))
     assert np.linalg.norm(error[:3]) < 0.03e-3 and np.abs(error[3:]).max() < 0.3e-3
@@ -128,19 +124,15 @@ def test_a_vehicle_that_was_pushed_since_the_sweep_does_not_make_the_part_look_t
     assert not found.before and "nobody looked where the claw would go" in str(site.notes)
 
 
-def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lies(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
-    found = LyingPart(placed_pot, tmp_path, half=(1.0, 1.0)).looked(moved(0.2e-3))
+def test_where_nothing_of_the_surface_shows_the_earlier_sweep_tells_where_it_lies(lying_part: Lying) -> None:
+    found = lying_part(half=(1.0, 1.0)).looked(moved(0.2e-3))
     error = difference(found.seen.surface_from_part, moved(0.2e-3))
     assert found.seen.beside == 0 and "against the surface as swept before" in found.words
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
     assert 0.1e-3 < found.unsure < 0.25e-3
 
 
-def test_a_part_that_is_not_as_drawn_about_its_features_is_told_though_it_lies_in_its_place(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+def test_a_part_that_is_not_as_drawn_about_its_features_is_told_though_it_lies_in_its_place(lying_part: Lying) -> None:
     """Of its top 12 mm are .5 mm lower, and its front ends .5 mm sooner."""
 
     def other(cell: VirtualCell) -> None:
@@ -159,7 +151,7 @@ def test_a_part_that_is_not_as_drawn_about_its_features_is_told_though_it_lies_i
     ]
     features = tuple(map(FeatureSection.model_validate, named))
     with pytest.raises(MisplacedError, match=r"lies 0.0\d ± 0.0\d mm off") as told:
-        LyingPart(placed_pot, tmp_path, changed=other, features=features).looked(pin.SE3.Identity())
+        lying_part(changed=other, features=features).looked(pin.SE3.Identity())
     for out in ("edge front is 0.2", "flat top is 0.4", OFF_DRAWING):
         assert out in str(told.value)
     assert str(told.value).count("Out of tolerance") == 2
@@ -181,13 +173,13 @@ def spoiled(cell: VirtualCell, covered: bool) -> None:
 
 @pytest.mark.parametrize("covered", [False, True])
 def test_a_part_of_which_a_piece_broke_off_or_that_is_covered_is_told_though_the_rest_lies_in_its_place(
-    placed_pot: JobRecord, tmp_path: Path, covered: bool
+    lying_part: Lying, covered: bool
 ) -> None:
     """The job names no feature: a robust fit passes over a corner of 10 mm, and over what lies there.
 
     Nor is it gripped again.
     """
-    site = LyingPart(placed_pot, tmp_path, also="corrections = 2", changed=lambda cell: spoiled(cell, covered))
+    site = lying_part(also="corrections = 2", changed=lambda cell: spoiled(cell, covered))
     with pytest.raises(MisplacedError, match=r"lies 0.\d\d ± 0.0\d mm off") as told:
         site.looked(pin.SE3.Identity())
     assert (COVERED if covered else OFF_DRAWING) in str(told.value), str(told.value)
@@ -199,13 +191,13 @@ def test_a_part_of_which_a_piece_broke_off_or_that_is_covered_is_told_though_the
     assert site.parts == [] and "of its face about" in why
 
 
-def test_another_part_or_none_is_not_found(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_another_part_or_none_is_not_found(lying_part: Lying) -> None:
     with pytest.raises(MisplacedError, match="is not where it was put down, or is not the part as drawn"):
-        LyingPart(placed_pot, tmp_path).looked(moved(0.05, 0.03, 0.02))
+        lying_part().looked(moved(0.05, 0.03, 0.02))
 
 
-def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(placed_pot: JobRecord, tmp_path: Path) -> None:
-    site = LyingPart(placed_pot, tmp_path, flat=True, verify="seen")
+def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(lying_part: Lying) -> None:
+    site = lying_part(flat=True, verify="seen")
     found = site.looked(moved(0.2e-3, z=0.1e-3))
     assert any("not seen of the placed part: translation" in note for note in site.notes)
     error = difference(found.seen.surface_from_part, moved(0.2e-3, z=0.1e-3))
@@ -216,7 +208,7 @@ def test_what_the_parts_faces_do_not_show_is_not_taken_as_seen(placed_pot: JobRe
 
 @pytest.mark.parametrize("share", [0.002, 0.10])
 def test_steps_that_the_rail_lost_over_the_placed_part_are_found(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
+    lying_part: Lying, monkeypatch: pytest.MonkeyPatch, share: float
 ) -> None:
     """Few show at the reference switch alone; many look like a part that moved."""
     monkeypatch.setattr(rail, "_LOST", share)
@@ -226,10 +218,10 @@ def test_steps_that_the_rail_lost_over_the_placed_part_are_found(
         cell.fault("rail.lost_steps")
 
     with pytest.raises(DeviceFault, match="lost steps"):
-        LyingPart(placed_pot, tmp_path, changed=lost).looked(moved())
+        lying_part(changed=lost).looked(moved())
 
 
-def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(lying_part: Lying) -> None:
     """It moves nothing of the part, so nobody has to come for that."""
     again = "the part is swept again"
 
@@ -237,13 +229,13 @@ def test_a_sweep_over_the_part_that_lost_frames_is_done_again_twice(placed_pot: 
         for _ in range(12 if text.startswith(again) else 0):
             cell.fault("camera.frame_loss")
 
-    site = LyingPart(placed_pot, tmp_path, changed=lossy, heard=lossy)
+    site = lying_part(changed=lossy, heard=lossy)
     with pytest.raises(DeviceFault, match="frames came from the sweep and 12 were lost"):
         site.looked(moved())
     assert sum(note.startswith(again) for note in site.notes) == 2
 
 
-def test_a_sweep_over_the_part_whose_replies_came_too_late_is_done_again(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_a_sweep_over_the_part_whose_replies_came_too_late_is_done_again(lying_part: Lying) -> None:
     def late(cell: VirtualCell) -> None:
         cell.rail.late = 0.05
 
@@ -251,7 +243,7 @@ def test_a_sweep_over_the_part_whose_replies_came_too_late_is_done_again(placed_
         if text.startswith("the part is swept again: rail: replies come so late"):
             cell.rail.late = 0.0
 
-    site = LyingPart(placed_pot, tmp_path, changed=late, heard=in_time)
+    site = lying_part(changed=late, heard=in_time)
     assert site.looked(moved()).seen.beside > 1000
     assert sum("replies come so late" in note for note in site.notes) == 1
 
@@ -264,9 +256,9 @@ def test_a_sweep_over_the_part_whose_replies_came_too_late_is_done_again(placed_
     ],
 )
 def test_a_head_that_moved_after_the_sweep_is_neither_a_push_nor_a_part_that_lies_aside(
-    placed_pot: JobRecord, tmp_path: Path, happened: Change, half: tuple[float, float], told: str
+    lying_part: Lying, happened: Change, half: tuple[float, float], told: str
 ) -> None:
-    site = LyingPart(placed_pot, tmp_path, half=half, changed=lambda cell: happened(cell.world))
+    site = lying_part(half=half, changed=lambda cell: happened(cell.world))
     with pytest.raises(MisplacedError, match=told):
         site.looked(moved())
 
@@ -294,32 +286,28 @@ def test_a_part_whose_upper_side_lies_elsewhere_than_drawn_is_not_moved_by_it(
         pytest.param(moved(z=-0.02e-3), id="sinks", marks=pytest.mark.campaign),
     ],
 )
-def test_a_part_that_does_not_come_to_rest_is_misplaced(placed_pot: JobRecord, tmp_path: Path, rate: pin.SE3) -> None:
+def test_a_part_that_does_not_come_to_rest_is_misplaced(lying_part: Lying, rate: pin.SE3) -> None:
     """At first each lies within its tolerances, and one sweep says no more."""
-    site = LyingPart(placed_pot, tmp_path, changed=lambda cell: creeps(cell, rate))
+    site = lying_part(changed=lambda cell: creeps(cell, rate))
     with pytest.raises(MisplacedError, match="does not lie still: in the last of 3 sweeps to and fro") as met:
         site.looked(moved())
     assert not met.value.numbers[0].kept
     assert sum("swept again: it moved by" in note for note in site.notes) == 2
 
 
-def test_a_part_that_comes_to_rest_is_swept_again_and_lies_where_the_last_sweep_saw_it(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+def test_a_part_that_comes_to_rest_is_swept_again_and_lies_where_the_last_sweep_saw_it(lying_part: Lying) -> None:
     # It rides up the slopes of the surface, through which no part goes.
     rate = moved(0.02e-3, 0.03e-3, 0.015e-3, turn=(0.0, 0.0, 0.5e-3))
-    site = LyingPart(placed_pot, tmp_path, changed=lambda cell: creeps(cell, rate, 4.0))
+    site = lying_part(changed=lambda cell: creeps(cell, rate, 4.0))
     found = site.looked(moved())
     assert sum("swept again: it moved by" in note for note in site.notes) == 1
     require_seen(found, site.lies())
 
 
-def test_a_vehicle_that_creeps_takes_part_and_surface_along(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_vehicle_that_creeps_takes_part_and_surface_along(lying_part: Lying, monkeypatch: pytest.MonkeyPatch) -> None:
     stands, rate = World.world_from_base, pin.Motion(np.array([8e-6, -9e-6, 5e-6, 4e-6, 6e-6, -9e-6]))
     monkeypatch.setattr(World, "world_from_base", lambda world, t: stands(world, t) @ pin.exp6(t * rate).homogeneous)
-    site = LyingPart(placed_pot, tmp_path)
+    site = lying_part()
     assert site.looked(moved()).in_tolerance(load_job("pot")[0].place)
     assert not any("swept again" in note for note in site.notes)
 
