@@ -11,7 +11,7 @@ from cell import Cell
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
 from statemachine.step import Event
-from tests.support.described_cells import UNDRAWN, changed, described, quick_job
+from tests.support.described_cells import LEAN, changed, described, quick_job
 
 
 def test_a_part_is_placed_at_each_stop_also_when_the_second_run_was_cut_short(
@@ -20,7 +20,7 @@ def test_a_part_is_placed_at_each_stop_also_when_the_second_run_was_cut_short(
     fast, told = quick_job("two-stations", calibrated_folder, 20.0), list[str]()
     # How a placed part is looked at is the same at each.
     fast.write_text(changed(fast.read_text(encoding="utf-8"), {"place": {"verify": '"none"'}}), encoding="utf-8")
-    cell_file, _ = described(calibrated_folder, UNDRAWN)
+    cell_file, _ = described(calibrated_folder, LEAN)
     with Cell.open(cell_file, sim="all", seed=placed_pot.seed, clock="virtual", job=fast) as cell:
         world = cell.simulated.world
 
