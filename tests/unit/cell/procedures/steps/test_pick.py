@@ -79,6 +79,18 @@ def test_steps_that_the_rail_lost_are_found_before_the_grip(
     assert not site.cell.world.part.held
 
 
+def test_a_part_that_is_lost_as_it_is_lifted_is_known_to_nobody_and_that_is_noted(
+    unloaded_part: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, parts = where_unloaded(unloaded_part, tmp_path), list[object]()
+    site.notify = lambda event: parts.append(event.data.get("part"))
+    monkeypatch.setattr(type(site.cell.devices.claw), "holding", property(lambda claw: False))
+    with pytest.raises(RefusedError, match="the claw lost the part as it lifted it"):
+        site.do("pick")
+    assert [part for part in parts if part] == ["unknown", "held", "unknown"]
+    assert site.work.part.state is PartState.UNKNOWN
+
+
 def take_away(cell: VirtualCell) -> None:
     part = cell.world.part
     part._world_from_part[0, 3] += 0.2

@@ -95,7 +95,7 @@ def test_a_vehicle_that_rocks_moves_what_is_seen_no_farther_than_is_stated(lying
         )
         cell.world.remake(replace(scene, workshop=rocking), cell.world.station)
 
-    found = lying_part(changed=rocks, faster=2.0).looked(moved(0.1e-3, z=0.05e-3))
+    found = lying_part(changed=rocks, faster=1.5).looked(moved(0.1e-3, z=0.05e-3))
     error = difference(found.seen.surface_from_part, moved(0.1e-3, z=0.05e-3))
     assert np.linalg.norm(error[:3]) < 0.03e-3 and np.abs(error[3:]).max() < 0.3e-3
     assert error @ np.linalg.solve(found.covariance, error) < 22.5
