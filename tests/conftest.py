@@ -8,7 +8,7 @@ over wires would disturb each other's time.
 from __future__ import annotations
 
 import os
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import pytest
@@ -17,9 +17,13 @@ from xdist.scheduler import LoadFileScheduling
 
 from cell.apps.cli import main
 from cell.config.calibrations.store import save_calibration
+from cell.devices.simulated.direct import VirtualCell
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from tests.support import Typed
+from tests.support.at_station import AtStation, Station
+from tests.support.lying_part import Lying, LyingPart
 from tests.support.report_runs import CONFIG, Ended, Ends, Make, pot
+from tests.support.unloading import unloaded
 
 GROUPS = (
     # One cell at a time, as an engineer runs it; those first that need little of what the job compiles.
@@ -189,6 +193,18 @@ def placed_pot(tmp_path_factory: pytest.TempPathFactory) -> JobRecord:
 
 
 @pytest.fixture(scope="session")
+def unloaded_part(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> JobRecord:
+    """The job `unload` in the world of `placed_pot`, with a part that clings to its surface."""
+
+    def clings(cell: VirtualCell) -> None:
+        cell.world.part.sticks = 10.0
+
+    record = unloaded(placed_pot, clings, runs=tmp_path_factory.mktemp("unloaded"))
+    assert (record.outcome, record.reason) == ("placed", "")
+    return record
+
+
+@pytest.fixture(scope="session")
 def ends(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> Ends:
     """Gives the run that ends as `tests.support.report_runs` says; each is made once."""
     root = tmp_path_factory.mktemp("cell") / "runs"
@@ -200,6 +216,18 @@ def ends(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> End
         return made[make]
 
     return get
+
+
+@pytest.fixture
+def station(placed_pot: JobRecord, tmp_path: Path) -> Station:
+    """Gives a cell that stands where `placed_pot` placed."""
+    return partial(AtStation, placed_pot, tmp_path)
+
+
+@pytest.fixture
+def lying_part(placed_pot: JobRecord, tmp_path: Path) -> Lying:
+    """Gives a part that lies in the cell of `placed_pot`."""
+    return partial(LyingPart, placed_pot, tmp_path)
 
 
 @pytest.fixture

@@ -19,6 +19,8 @@ from cell.measure.calibration.drift.timing import StampTiming
 from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.effects.between_sweeps import SurfaceMotion
 from cell.motion.kinematics import HOME
+from cell.procedures.arm.moves import PartState
+from cell.procedures.sought_part import nominal_of, sought
 from cell.procedures.steps.kinds import kind_of
 from cell.procedures.sweep import second_look
 from cell.procedures.sweep.second_look import require_surface_unmoved
@@ -52,12 +54,15 @@ class AtStation:
     def __post_init__(self) -> None:
         assert self.nominal.source is not None
         described = Described(self.job, self.nominal.source)
+        self.job, mesh = sought(self.job, self.nominal.source)
+        self.nominal = self.nominal if mesh == self.nominal.source else nominal_of(self.job, mesh)
         self.cell = VirtualCell(CONFIG, self.record.seed, self.level or self.record.level, described)
         at_station(self.cell, self.record, self.further)
         self.cell.devices.vehicle.brake()
         self.changed(self.cell)
         self.kind, self.control = kind_of(self.job), RunControl()
         self.work = work_of(self.cell, self.job, self.nominal, self.record, NoFrames(), self.folder)
+        self.work.part.state = PartState.first(self.job)
         if self.timed:
             scan = self.work.calibration.scan
             timing = StampTiming(0.0, 0.1e-3, 0.0, 2e-6, 0.0, 1e-5, 0.0, 1e9, link_of(CONFIG))
@@ -82,6 +87,10 @@ class AtStation:
     def ended(self) -> JobRecord:
         """The record of what was done here instead, with the world's truth now."""
         return replace(self.record, results=self.made, rests=np.array(self.cell.arm.rests), at_end=self.cell.truth())
+
+
+Station = Callable[..., AtStation]
+"""Gives a cell that stands where `placed_pot` placed, as `AtStation` has it."""
 
 
 def lose_few_steps_after_the_look(patch: pytest.MonkeyPatch, cell: Callable[[], VirtualCell]) -> None:

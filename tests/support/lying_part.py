@@ -40,7 +40,7 @@ class LyingPart:
     verify: str = "all"
     flat: bool = False
     also: str = "corrections = 0"
-    faster: float = 2.0
+    faster: float = 2.6
     changed: Callable[[VirtualCell], None] = lambda cell: None
     heard: Callable[[VirtualCell, str], None] = lambda cell, text: None
     series: GraspSeries = field(default_factory=GraspSeries)
@@ -52,7 +52,8 @@ class LyingPart:
 
     def looked(self, off: pin.SE3) -> PlacedPart:
         """What the step makes of a part that lies `off` its place."""
-        file = job_with_part(self.folder, "pot", verify=self.verify, half=self.half, flat=self.flat, also=self.also)
+        self.drawn.mkdir(exist_ok=True)
+        file = job_with_part(self.drawn, "pot", verify=self.verify, half=self.half, flat=self.flat, also=self.also)
         job, mesh = load_job(file)
         quick = changed(job, "scan", speed=self.faster * job.scan.speed)
         quick = changed(quick, "part", feature=self.features) if self.features else quick
@@ -72,6 +73,11 @@ class LyingPart:
         found = site.do("verify")
         assert isinstance(found, PlacedPart)
         return found
+
+    @property
+    def drawn(self) -> Path:
+        """Where job and meshes are, for all such parts: the world keeps by its file what it has read of a mesh."""
+        return self.folder.parent / "drawn"
 
     @property
     def cell(self) -> VirtualCell:
@@ -97,6 +103,10 @@ class LyingPart:
         return from_matrix(inverse(scene.world_from_surface) @ world.part.part_pose(flange))
 
 
+Lying = Callable[..., LyingPart]
+"""Gives a part that lies in the cell of `placed_pot`, as `LyingPart` has it."""
+
+
 def moved(
     x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> pin.SE3:
@@ -104,12 +114,12 @@ def moved(
     return from_parts((x, y, z), pin.exp3(np.array(turn)))
 
 
-def creeps(cell: VirtualCell, rate: pin.SE3, until: float = 1e9, nested: bool = False) -> None:
-    """Each second the part moves on by `rate`, part frame, for so many seconds of its sweep, or in its nest."""
+def creeps(cell: VirtualCell, rate: pin.SE3, until: float = 1e9) -> None:
+    """Each second the part moves on by `rate`, part frame, for so many seconds of its sweep."""
     part, stands, began = cell.world.part, cell.world.part._pose, list[float]()
 
     def pose(flange: np.ndarray) -> np.ndarray:
-        if not began and (part._base_from_part is not None if nested else cell.devices.laser.is_on):
+        if not began and cell.devices.laser.is_on:
             began.append(cell.clock.now())
         since = min(until, cell.clock.now() - began[0]) if began else 0.0
         return stands(flange) @ pin.exp6(since * pin.log6(rate).vector).homogeneous

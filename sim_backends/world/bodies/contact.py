@@ -180,7 +180,7 @@ class PartContact:
         if self._nest is None:
             return None
         world_from_nest = self._nest.world_from_base() @ self._nest.base_from_surface
-        apart = [np.linalg.norm(at[:2, 3] - pose[:2, 3]) for pose in (world_from_nest, self._world_from_surface)]
+        apart = [math.dist(at[:2, 3], pose[:2, 3]) for pose in (world_from_nest, self._world_from_surface)]
         return self._world_from_surface @ inverse(world_from_nest) if apart[0] < apart[1] else None
 
     def _grip(self, world_from_flange: Pose) -> None:

@@ -53,9 +53,7 @@ def stop_on_the_way(cell: Cell, times: int = 1) -> None:
 def asked(cell: Cell) -> Run[Any]:
     """The run that waits for a person."""
     assert until(lambda: (run := cell.current) is not None and run.control.question is not None)
-    run = cell.current
-    assert run is not None
-    return run
+    return cell.current  # type: ignore[return-value]
 
 
 def in_background(work: Callable[[], object]) -> tuple[threading.Thread, list[object]]:
@@ -73,8 +71,7 @@ def in_background(work: Callable[[], object]) -> tuple[threading.Thread, list[ob
     return thread, ended
 
 
-def away(cell: Cell) -> np.ndarray:
-    return HOME + np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
+AWAY = HOME + np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("kind", ["calibration", "verification", "timing", "commission", "homing", "jog"])
@@ -86,7 +83,7 @@ def test_a_protective_stop_is_asked_about_and_the_work_goes_on_or_ends(cell: Cel
 
     def work(context: Any) -> str:
         attempts.append(None)
-        cell.mover(None, context.safe_point).to_joints(away(cell))
+        cell.mover(None, context.safe_point).to_joints(AWAY)
         return "made"
 
     thread, ended = in_background(lambda: cell.perform(kind, work))
@@ -99,7 +96,7 @@ def test_a_protective_stop_is_asked_about_and_the_work_goes_on_or_ends(cell: Cel
     report = json.loads((cell.runs_folder / run.folder.name / "report.json").read_text())  # type: ignore[union-attr]
     if answer == "confirm":
         assert (ended, len(attempts), report["outcome"]) == (["made"], 2, "done")
-        assert np.abs(arm.drive.q - away(cell)).max() < 1e-3
+        assert np.abs(arm.drive.q - AWAY).max() < 1e-3
         # The stop of the first attempt keeps nobody from going on.
         assert cell.devices.gate.is_open
     else:
@@ -184,7 +181,7 @@ def test_a_pendant_that_is_switched_to_local_refuses_the_next_motion_of_a_job(ce
     cell.home("arm")
     simulated(cell).fault("arm.local_control")
     with pytest.raises(DeviceFault, match="in local control") as caught:
-        cell.perform("homing", lambda context: cell.mover(None, context.safe_point).to_joints(away(cell)))
+        cell.perform("homing", lambda context: cell.mover(None, context.safe_point).to_joints(AWAY))
     assert caught.value.code == "arm.local_control"
     assert np.abs(simulated(cell).arm.model.drive.q - HOME).max() < 1e-3
 

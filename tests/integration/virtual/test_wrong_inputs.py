@@ -6,6 +6,7 @@ Every case goes through the real command line: exit code 2, no traceback, no wor
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -17,7 +18,7 @@ import typer.main
 
 from cell.config.cell_config import default_toml
 from cell.config.job import job_path
-from tests.support import Typed
+from tests.support import Typed, described_cells
 
 JARGON = (
     "Traceback", "pydantic", "Input should be", "type=", "input_value", "valid string", "valid dictionary",
@@ -30,26 +31,15 @@ JARGON = (
 def changed(text: str, key: str, value: str | None) -> str:
     """A TOML text with the value of "table.key" replaced, added, or with None removed."""
     table, _, name = key.rpartition(".")
-    lines, here, done = [], "", False
-    for line in text.splitlines():
-        if line.startswith("["):
-            here = line[1 : line.index("]")]
-        if here == table and line.split(" = ")[0] == name:
-            done = True
-            if value is not None:
-                lines.append(f"{name} = {value}")
-            continue
-        lines.append(line)
-        if not done and here == table and line.startswith("[") and f"\n{name} = " not in text.partition(line)[2]:
-            lines.append(f"{name} = {value}")
-            done = True
-    return "\n".join(lines) + "\n"
+    if value is None:
+        return re.sub(rf"(?m)^{name} = .*\n", "", text)
+    return described_cells.changed(text, {table: {name: value}})
 
 
 def pose(*numbers: float) -> str:
     """A pose in TOML, mm and deg."""
-    moved, turned = [f'"{v:g} mm"' for v in numbers[:3]], [f'"{v:g} deg"' for v in (*numbers[3:], 0, 0, 0)[:3]]
-    return f"{{ translation = [{', '.join(moved)}], rotation = [{', '.join(turned)}] }}"
+    x, y, z, a, b, c = (*numbers, 0.0, 0.0, 0.0)[:6]
+    return described_cells.pose((x, y, z), (a, b, c))
 
 
 def write_mesh(path: Path, size: tuple[float, float] = (0.07, 0.036), height: float = 0.008, at: float = 0.0) -> None:
@@ -110,8 +100,6 @@ WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("rail.lead", "2", ("rail.lead", "has no unit", '"0.1 mm"')),
     ("rail.lead", '"-2 mm"', ("rail.lead", "0.1 to 50 mm")),
     ("rail.microsteps", "3", ("rail.microsteps", "1, 2, 4, 8")),
-    ("rail.motor", "6", ("rail.motor", "0 to 5")),
-    ("rail.address", "0", ("rail.address", "1 to 255")),
     ("rail.steps_per_turn", "200.5", ("rail.steps_per_turn", "no whole number")),
     ("rail.travel", '["0 mm", "0 mm"]', ("rail:", "the first must be smaller")),
     ("rail.travel", '["0 mm"]', ("rail.travel[1]", "missing")),
@@ -120,27 +108,20 @@ WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("rail.travel", '["0 mm", "100 m"]', ("rail.travel[1]", "-100 to 2000 mm")),
     ("rail.max_speed", '"5 kHz"', ("rail.max_speed", "not a quantity in mm/s")),
     ("rail.acceleration", '"200 mm/s"', ("rail.acceleration", "not a quantity in mm/s^2")),
-    ("arm.max_joint_speed", '"0 deg/s"', ("arm.max_joint_speed", "1 to 120 deg/s")),
     ("arm.max_tool_speed", '"5 m/s"', ("arm.max_tool_speed", "1 to 1500 mm/s")),
     ("arm.payload", '"20 kg"', ("arm.payload", "0 to 12.5 kg")),
     ("arm.payload_centre", '["0 mm", "0 mm", "2 m"]', ("arm.payload_centre[2]", "-500 to 500 mm")),
-    ("arm.settle_time", '"1 hour"', ("arm.settle_time", "0 to 5 s")),
-    ("arm.repeatability", '"0 mm"', ("arm.repeatability", "0.0001 to 2 mm")),
     ("arm.model", '"UR4"', ("arm.model", '"UR4" is not one of "UR3", "UR5"')),
     ("arm.model", '"UR5"', ("job pot does not fit this cell", "calibration view 1")),
     ("arm.vehicle_from_base", pose(300, 0, 5500), ("arm:", "off the vehicle")),
     ("arm.vehicle_from_base", pose(300, 0, 550, 90), ("arm:", "upright")),
     ("arm.vehicle_from_base", '"here"', ("arm.vehicle_from_base", "is no table")),
     ("vehicle.max_yaw_rate", '"5 deg/s"', ("vehicle.max_yaw_rate", "25 to 90 deg/s")),
-    ("vehicle.track", '"0 mm"', ("vehicle.track", "100 to 3000 mm")),
     ("laser.tan_theta", "nan", ("laser.tan_theta", "0.2 to 20")),
     ("laser.tan_theta", '"3.5"', ("laser.tan_theta", "no plain number")),
     ("laser.baseline", '"350 mm"', ("the laser's line is not in the scan camera's picture",)),
-    ("scan_camera.width", "64000", ("scan_camera.width", "64 to 8192")),
     ("scan_camera.height", "64", ("scan_camera:", "no shape of a sensor")),
-    ("scan_camera.pixel", '"0 um"', ("scan_camera.pixel", "0.5 to 30 um")),
     ("target_camera.focal_length", '"200 mm"', ("board.spec", "pixels of 1280 x 1024")),
-    ("scan_camera.photo_exposure", '"1 s"', ("scan_camera.photo_exposure", "0.01 to 100 ms")),
     ("scan_camera.flange_from_camera", pose(90, -50, 80000), ("scan_camera.flange_from_camera", "-1000 to 1000 mm")),
     ("target_camera.flange_from_camera", pose(0, 0, 0), ("target_camera.flange_from_camera", "into the claw")),
     # boards and calibration
@@ -151,16 +132,12 @@ WRONG_CONFIGURATIONS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("calibration.fine.base_from_board", pose(-5650, 262, 20, 180), ("fine.base_from_board", "not on the deck")),
     ("calibration.large.base_from_board", pose(-680, -190, 900, 180), ("calibration.large.base_from_board", "300 mm")),
     ("calibration.fine.base_from_board", pose(-565, 262, 20), ("calibration view 1",)),
-    ("calibration.max_age", '"0 day"', ("calibration.max_age", "0.01 to 3650 day")),
-    ("calibration.rail_sigma", '"0 mm"', ("calibration.rail_sigma", "0.0001 to 2 mm")),
-    ("calibration.stripe_exposure", '"0 ms"', ("calibration.stripe_exposure", "0.01 to 100 ms")),
     # the cell as a whole
     ("cell.name", '""', ("cell.name", "is no name")),
     ("cell.runs", '"/var/runs"', ("cell.runs", "no absolute path")),
     ("cell.runs", '"calibrations"', ("cell:", "both")),
     ("cell.calibrations", '"~/store"', ("cell.calibrations", "no folder beside this file")),
     ("cell.time_scale", "3.0", ("cell:", "real devices need time_scale = 1")),
-    ("cell.time_scale", "0", ("cell.time_scale", "0.01 to 100")),
     ("cell.confirm", '"simulated"', ("cell.confirm", "only for a simulated cell", "a person looks")),
     ("cell.colour", '"red"', ("cell.colour", "unknown key")),
     ("rail.driver", '"plc"', ("rail.driver", '"plc" is not one of "tmcl"')),
@@ -184,7 +161,6 @@ WRONG_JOBS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("board.spec", '"dots:9x7:20mm"', ("board.spec", "half a turn")),
     ("board.spec", '"marked_dots:9x7:40mm"', ("board.spec", "larger than the plate")),
     ("board.place_from_board", pose(142, 400, -300, -135, 0, -90), ("board.place_from_board", "above the table")),
-    ("board.place_from_board", pose(142, 40000, 162, -135, 0, -90), ("board.place_from_board", "-20000 to 20000")),
     ("board.place_from_board", pose(142, 2400, 162, -135, 0, -90), ("looking pose", "out of reach")),
     ("board.place_from_board", pose(142, 400, 162, 45, 0, -90), ("board", "looking pose")),
     ("approach.staging", pose(-900, 0, -600), ("approach", "staging has to lie between")),
@@ -196,13 +172,9 @@ WRONG_JOBS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("approach.target", pose(-1050, 0, 600), ("approach", "one height")),
     ("approach.target", pose(-1700, 0, -600), ("out of reach",)),
     ("approach.speed", '"0.9 m/s"', ("approach.speed 900 mm/s exceeds vehicle.max_speed",)),
-    ("approach.tolerance", '"0 mm"', ("approach.tolerance", "1 to 100 mm")),
-    ("approach.tolerance_angle", '"0.1 deg"', ("approach.tolerance_angle", "0.3 to 10 deg")),
     ("photo.stand_off", '"150 mm"', ("board.spec", "pixels of 1280 x 1024")),
     ("photo.stand_off", '"5 m"', ("board.spec", "pixels apart")),
     ("photo.stand_off", '"2500 mm"', ("out of reach",)),
-    ("photo.count", "0", ("photo.count", "1 to 100")),
-    ("photo.max_residual", "nan", ("photo.max_residual", "0.01 to 10")),
     ("surface.mesh", '""', ("surface.mesh", "name an STL or PLY")),
     ("surface.mesh", '"gone.stl"', ("gone.stl", "is not a file")),
     ("surface.mesh", '"text.stl"', ("text.stl", "give an STL or PLY")),
@@ -216,9 +188,7 @@ WRONG_JOBS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("surface.place_from_surface", pose(0, 0, -100), ("into the table",)),
     ("surface.place_from_surface", pose(900, 0, 0), ("beside the table",)),
     ("surface.place_from_surface", pose(0, 0, 0, 180), ("into the table",)),
-    ("surface.prior_sigma", '"0 mm"', ("surface.prior_sigma", "0.01 to 100 mm")),
     ("scan.length", '"99.5 mm"', ("scan.length 99.5 mm", "rail.travel")),
-    ("scan.length", '"-64 mm"', ("scan.length", "1 to 2000 mm")),
     ("scan.speed", '"45 mm/s"', ("scan.speed 45 mm/s exceeds rail.max_speed, 40 mm/s",)),
     ("scan.speed", '"0.1 mm/s"', ("scan:", "640 s", "at most 100 s")),
     ("scan.exposure", '"50 ms"', ("scan:", "longer than a frame at 30 Hz", "33.33 ms")),
@@ -228,22 +198,16 @@ WRONG_JOBS: list[tuple[str, str | None, tuple[str, ...]]] = [
     ("scan.swath", "[]", ("scan.swath", "at least 1")),
     ("scan.swath", '[{ acros = "1 mm" }]', ("scan.swath[0].acros", "unknown key")),
     ("scan.swath", '[{ roll = "80 deg" }]', ("scan.swath[0].roll", "-40 to 40 deg")),
-    ("scan.largest_hole", '"1 m"', ("scan.largest_hole", "0 to 10 mm")),
     ("grasp.size", '["-70 mm", "36 mm", "20 mm"]', ("grasp.size[0]", "1 to 1000 mm")),
     ("grasp.size", '["700 mm", "700 mm", "20 mm"]', ("part", "beside the table")),
     ("grasp.size", '["300 mm", "300 mm", "300 mm"]', ("part", "closer than")),
     ("scan.swath", '[{ across = "150 mm" }]', ("sweep 1", "sees too little of it")),
     ("photo.look_down", '"0 deg"', ("looking pose", "not in the target camera's picture", "photo.look_down")),
     ("photo.max_obliquity", '"15 deg"', ("approach.staging", "21 deg from square")),
-    ("photo.max_obliquity", '"0 deg"', ("photo.max_obliquity", "5 to 80 deg")),
-    ("grasp.flange_from_part", pose(0, 0, 17000, 180, 0, 90), ("grasp.flange_from_part", "-1000 to 1000 mm")),
     ("grasp.flange_from_part", pose(0, 0, 170, 0, 0, 90), ("place.approach",)),
-    ("place.approach", '"0 mm"', ("place.approach", "5 to 500 mm")),
     ("place.speed", '"600 mm/s"', ("place.speed", "0.1 to 500 mm/s")),
     ("place.speed", '"0.5 mm/s"', ("place:", "exceeds speed")),
-    ("place.contact_speed", '"0 mm/s"', ("place.contact_speed", "0.1 to 50 mm/s")),
     ("place.contact_force", '"500 N"', ("place.contact_force", "2 to 120 N")),
-    ("place.tolerance", '"0 mm"', ("place.tolerance", "0.01 to 10 mm")),
     ("place.tolerance_angle", '"6 percent"', ("place.tolerance_angle", "not a quantity in mrad")),
     ("place.surface_from_part", pose(0, 0, -60), ("into the table",)),
     ("place.surface_from_part", pose(0, 0, 900), ("place",)),

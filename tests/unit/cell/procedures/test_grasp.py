@@ -23,7 +23,6 @@ def series(*aside: tuple[float, float, float]) -> GraspSeries:
 
 def test_two_parts_that_came_alike_are_allowed_for_in_the_next() -> None:
     found = series((0.30, -0.10, 4.0), (0.34, -0.14, 5.0)).allowance(POINTS, NOISE)
-    assert found is not None
     assert np.allclose(found.translation, [0.32e-3, -0.12e-3, 0.0])
     assert pin.log3(found.rotation)[2] == pytest.approx(4.5e-3)
 

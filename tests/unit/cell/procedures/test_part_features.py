@@ -148,7 +148,6 @@ def test_what_is_no_feature_is_told(change: dict[str, object], told: str) -> Non
 
 def test_features_beside_the_part_and_those_that_nobody_looks_at_are_told_before_anything_moves(tmp_path: Path) -> None:
     job, mesh = load_job(job_with_part(tmp_path, "pot", verify="all"))
-    assert job.part is not None
     on, off = (
         feature("edge", (0, 1, 0), ("0 mm", "0 mm", "5 mm")),
         feature("edge", (0, 1, 0), ("0 mm", "90 mm", "5 mm")),

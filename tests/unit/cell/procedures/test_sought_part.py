@@ -20,13 +20,13 @@ from tests.support.unloading import JOB, MESH
 CONFIG = load_config(None)
 
 
+def changed(**update: object) -> Job:
+    return JOB.model_copy(update=update)
+
+
 def test_a_part_to_be_unloaded_is_sought_by_its_upper_side_where_it_lies() -> None:
-    aside = JOB.place.model_copy(
-        update={
-            "surface_from_part": JOB.place.surface_from_part.model_copy(update={"translation": (0.004, 0.0, 0.001)})
-        }
-    )
-    found, file = sought(JOB.model_copy(update={"place": aside}), MESH)
+    aside = JOB.place.surface_from_part.model_copy(update={"translation": (0.004, 0.0, 0.001)})
+    found, file = sought(changed(place=JOB.place.model_copy(update={"surface_from_part": aside})), MESH)
     assert JOB.part is not None and file == Path(JOB.part.mesh)
     assert np.allclose(found.surface.place_from_surface.translation, (0.004, 0.0, 0.001))
     assert found.place.surface_from_part.translation == (0.0, 0.0, 0.0)
@@ -53,8 +53,7 @@ def test_the_underside_of_a_part_is_the_ground_that_fits_it() -> None:
     assert np.nanmax(np.abs(ground.deviations(below.samples))) < 1e-5
 
 
-def changed(**update: object) -> Job:
-    return JOB.model_copy(update=update)
+FAR = Mounting.model_construct(translation=(-1.0, 0.9, 0.0), rotation=(0, 0, 0))
 
 
 @pytest.mark.parametrize(
@@ -63,17 +62,7 @@ def changed(**update: object) -> Job:
         (changed(nest=None), r'job\.kind "unload" finds the part by its mesh .*give \[part\] and \[nest\]'),
         (changed(part=None), r"give \[part\] and \[nest\]"),
         (changed(job=JOB.job.model_copy(update={"kind": "place"})), r'\[nest\]: job\.kind "place" has no use for it'),
-        (
-            changed(
-                nest=JOB.nest
-                and JOB.nest.model_copy(
-                    update={
-                        "base_from_part": Mounting.model_construct(translation=(-1.0, 0.9, 0.0), rotation=(0, 0, 0))
-                    }
-                )
-            ),
-            r"nest\.base_from_part",
-        ),
+        (changed(nest=JOB.nest and JOB.nest.model_copy(update={"base_from_part": FAR})), r"nest\.base_from_part"),
     ],
 )
 def test_what_keeps_a_part_from_its_nest_is_told_before_anything_moves(job: Job, told: str) -> None:

@@ -15,9 +15,8 @@ from cell.motion.kinematics import HOME
 from cell.procedures.arm.moves import LEAST, Mover, Pace, nested_parts, placed_parts
 from cell.procedures.arm.photograph import drawn_interim_view
 from cell.procedures.calibrate.interim import resting_pose
-from cell.procedures.steps.drive_to_target import TargetDrive
 from drivers.errors import ConfigError
-from tests.unit.cell.procedures.drive.test_way import JOB, VEHICLE_FROM_BASE, Site
+from tests.unit.cell.procedures.drive.test_way import JOB, Site
 
 CONFIG = load_config(None)
 
@@ -49,11 +48,20 @@ def test_the_arm_goes_the_same_way_at_a_share_of_its_speed_from_the_next_motion_
     assert speeds(line)[1] == pytest.approx(0.5 * straight, rel=0.05)
 
 
-def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints() -> None:
-    """But for whole turns, of which it makes the fewest: the last joint's is spared from one turn further on."""
+WIDE = (0.6, 0.6, 0.02)
+
+
+def mover_with(size: tuple[float, float, float] | None) -> Mover:
+    """In a cell of its own, with a part of this size in the claw."""
     cell = VirtualCell(CONFIG, 2, "nominal")
     cell.devices.vehicle.brake()
-    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None, interlocks=cell.devices.interlocks)
+    job = None if size is None else JOB.model_copy(update={"grasp": JOB.grasp.model_copy(update={"size": size})})
+    return Mover(cell.devices.arm, cell.clock, CONFIG, job, interlocks=cell.devices.interlocks)
+
+
+def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints() -> None:
+    """But for whole turns, of which it makes the fewest: the last joint's is spared from one turn further on."""
+    mover = mover_with(None)
     pose = drawn_interim_view(CONFIG).base_from_flange
     expected = mover.kinematics.ik(pose, HOME)
 
@@ -72,9 +80,7 @@ def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints() -> No
 
 
 def test_between_jobs_the_arm_rests_where_the_next_looks_first_or_else_at_home() -> None:
-    cell = VirtualCell(CONFIG, 2, "nominal")
-    cell.devices.vehicle.brake()
-    mover = Mover(cell.devices.arm, cell.clock, CONFIG, None, interlocks=cell.devices.interlocks)
+    mover = mover_with(None)
     mover.fold()
     assert mover.joints == pytest.approx(HOME, abs=1e-3)
     rest = resting_pose(drawn_interim_view(CONFIG))
@@ -84,18 +90,7 @@ def test_between_jobs_the_arm_rests_where_the_next_looks_first_or_else_at_home()
         assert mover.joints == pytest.approx(HOME, abs=1e-3)
     mover.rest_at(rest)
     mover.fold()
-    assert np.linalg.norm(from_ur(cell.devices.arm.state().flange).actInv(rest).translation) < 1e-4
-
-
-WIDE = (0.6, 0.6, 0.02)
-
-
-def mover_with(size: tuple[float, float, float] | None) -> Mover:
-    """In a cell of its own, with a part of this size in the claw."""
-    cell = VirtualCell(CONFIG, 2, "nominal")
-    cell.devices.vehicle.brake()
-    job = None if size is None else JOB.model_copy(update={"grasp": JOB.grasp.model_copy(update={"size": size})})
-    return Mover(cell.devices.arm, cell.clock, CONFIG, job, interlocks=cell.devices.interlocks)
+    assert np.linalg.norm(mover.kinematics.fk(mover.joints).actInv(rest).translation) < 1e-4
 
 
 def test_with_a_part_that_has_no_room_there_the_arm_rests_at_home() -> None:
@@ -122,14 +117,7 @@ def test_the_vehicle_drives_at_a_share_of_the_jobs_speed() -> None:
         site, pace, speeds = Site(), Pace(), [0.0]
         pace.share = share
         site.whereabouts.say_at_start()
-        site.vehicle.enable()
-        site.whereabouts.enter(JOB)
-        drive = TargetDrive(
-            JOB, VEHICLE_FROM_BASE, site.vehicle, site.whereabouts, site.photograph, clock=site.cell.clock, pace=pace,
-            check=lambda: speeds.append(abs(site.vehicle.state().speed)),
-            progress=lambda share, text: None, note=site.notes.append,
-        )  # fmt: skip
-        drive.to_target()
+        site.run(check=lambda: speeds.append(abs(site.vehicle.state().speed)), pace=pace)
         return max(speeds)
 
     for share in (1.0, 0.5):

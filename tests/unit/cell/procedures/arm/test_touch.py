@@ -72,7 +72,6 @@ def test_force_errors_that_last_are_stated(follows: float, still: ArmState) -> N
             [replace(s, wrench=np.concatenate([(f + more) * UP, np.zeros(3)])) for s, f, more in
              zip(made, forces, lasting, strict=False)], ORIGIN, UP
         )  # fmt: skip
-        assert found is not None
         off.append((found.height - 0.1e-3) / found.sigma)
     assert np.sqrt(np.mean(np.square(off))) < 1.5 and np.abs(off).max() < 3.5
 
@@ -89,7 +88,6 @@ def test_a_touch_is_noted_before_it_is_refused() -> None:
 
 
 def test_a_part_that_may_be_tilted_is_expected_to_touch_early(placed_pot: JobRecord) -> None:
-    assert placed_pot.placing is not None
     pose, known = placed_pot.results["invert_pose"], replaced_grasp(1e-6, 1e-6)
     tilted = replaced_grasp(1e-6, 3e-3)
     steady, early = (expected_touch(job, NOMINAL, pose, placed_pot.placing) for job in (known, tilted))
@@ -103,7 +101,6 @@ def test_a_laser_that_turned_unseen_is_caught_when_the_part_touches(
     placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One milliradian, no plate to see it on, and a job that knows its grasp as this level's claw holds it."""
-    assert placed_pot.calibration is not None
     blind = replace(placed_pot.calibration, scan=replace(placed_pot.calibration.scan, witness=None))
     monkeypatch.setattr(levels, "ALONE", replace(levels.ALONE, laser_pointing=150e-6))
     job = changed(replaced_grasp(0.02e-3, 0.1e-3), "scan", speed=2 * JOB.scan.speed)

@@ -34,7 +34,6 @@ def looked(
     made: JobRecord, put_in: Callable[[VirtualCell], None] = lambda cell: None
 ) -> tuple[InterimCheck, list[str]]:
     """What the check says of the cell that was calibrated for `placed_pot`, and which frames were kept."""
-    assert made.calibration is not None
     cell = VirtualCell(CONFIG, made.seed)
     put_in(cell)
     cell.devices.vehicle.brake()
@@ -66,7 +65,6 @@ def test_a_cell_that_nobody_touched_passes_and_says_what_it_saw(
     assert isinstance(arrival, VehicleArrival) and arrival.head is not None
     assert arrival.summary()["interim"] == arrival.head.summary()
     # It rests above where the next job looks first.
-    assert placed_pot.calibration is not None and placed_pot.at_end is not None
     rest = resting_pose(fine_board_view(CONFIG, placed_pot.calibration))
     assert np.linalg.norm(rest.actInv(pose_of(placed_pot.at_end, "base_from_flange")).translation) < 1e-3
 
@@ -103,7 +101,6 @@ def test_a_job_whose_head_has_moved_ends_before_the_vehicle_drives(placed_pot: J
     ended = run_whole_job(CONFIG, JOB, nominal, placed_pot.seed, "nominal", calibrated=placed_pot, changed=moved)
     assert (ended.outcome, ended.stage) == ("refused", "drive_to_target")
     assert "the scan head on the flange, a joint's zero, or the fine board" in ended.reason
-    assert ended.at_end is not None and placed_pot.at_end is not None
     here, there = (pose_of(end, "world_from_vehicle").translation for end in (ended.at_end, placed_pot.at_end))
     assert np.linalg.norm(here - there) > 1.0
 
@@ -121,7 +118,6 @@ def arrived(
 def test_a_cell_that_does_not_want_it_is_not_looked_at(placed_pot: JobRecord, tmp_path: Path) -> None:
     unlooked = CONFIG.calibration.model_copy(update={"each_job": False})
     config = CONFIG.model_copy(update={"calibration": unlooked})
-    assert placed_pot.calibration is not None
     arrival, _ = arrived(placed_pot, tmp_path, placed_pot.calibration, config)
     assert arrival.head is None and "interim" not in arrival.summary()
 
@@ -130,7 +126,6 @@ def test_a_calibration_of_an_older_program_is_not_looked_at_and_the_job_says_so(
     placed_pot: JobRecord, tmp_path: Path
 ) -> None:
     made = placed_pot.calibration
-    assert made is not None
     old = replace(made, scan=replace(made.scan, reference=None))
     arrival, notes = arrived(placed_pot, tmp_path, old)
     assert arrival.head is None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +16,6 @@ from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.timing import collect_timing, look_at_shutter
 from cell.procedures.steps.laser_sweep import times_known
-from cell.run.recorded_work import RecordedWork, WorkContext
-from cell.run.runs import Run
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world import scene
@@ -27,16 +24,13 @@ CONFIG = load_config(None)
 
 
 def test_a_calibration_has_looked_at_the_shutter(placed_pot: JobRecord) -> None:
-    assert placed_pot.calibration is not None
     shutter = placed_pot.calibration.scan.shutter
-    assert shutter is not None
     assert abs(shutter.readout) < 5 * shutter.sigma < 0.25e-3
     assert times_known(placed_pot.calibration.scan, CONFIG) == (None, ())
 
 
 def test_a_calibration_of_a_cell_with_a_rolling_shutter_is_refused(placed_pot: JobRecord) -> None:
     made = placed_pot.calibration
-    assert made is not None
     cell = VirtualCell(CONFIG, 2, "nominal+rolling_shutter")
     cell.devices.vehicle.brake()
     mover = Mover(cell.devices.arm, cell.clock, CONFIG, None)
@@ -46,7 +40,6 @@ def test_a_calibration_of_a_cell_with_a_rolling_shutter_is_refused(placed_pot: J
 
 def test_a_shutter_that_could_not_be_looked_at_is_a_note_and_the_calibration_holds(placed_pot: JobRecord) -> None:
     made = placed_pot.calibration
-    assert made is not None
     spoilt = replace(made, scan=replace(made.scan, shutter=None))
     short = CONFIG.model_copy(update={"rail": CONFIG.rail.model_copy(update={"travel": (0.04, 0.055)})})
     cell = VirtualCell(CONFIG, 2)
@@ -56,23 +49,17 @@ def test_a_shutter_that_could_not_be_looked_at_is_a_note_and_the_calibration_hol
     assert "whether the scan camera has a rolling shutter was not seen: the fine board stays" in seen.scan.notes[-1]
 
 
-def measured(made: CellCalibration, seed: int, level: str, folder: Path) -> StampTiming:
+def measured(made: CellCalibration, seed: int, level: str) -> StampTiming:
     """What the simulated cell of `seed` finds."""
     cell = VirtualCell(CONFIG, seed, level)
-    job, _ = load_job("pot")
-
-    def look(context: WorkContext) -> StampTiming:
-        cell.devices.interlocks.work_with(made.configuration)
-        cell.devices.vehicle.brake()
-        mover = Mover(cell.devices.arm, cell.clock, CONFIG, job, context.safe_point)
-        given = CONFIG, cell.devices, mover, made, context.check, lambda f, t: None, lambda what, frame: None
-        return collect_timing(*given)
-
-    return Run("timing", lambda run: RecordedWork(run, "timing", cell.devices, folder, {}).perform(look)).result()
+    cell.devices.interlocks.work_with(made.configuration)
+    cell.devices.vehicle.brake()
+    mover = Mover(cell.devices.arm, cell.clock, CONFIG, load_job("pot")[0])
+    return collect_timing(CONFIG, cell.devices, mover, made, lambda: None, lambda f, t: None, lambda what, frame: None)
 
 
 @pytest.mark.campaign
-def test_ten_simulated_cells_know_their_lateness(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_ten_simulated_cells_know_their_lateness(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two milliseconds late each; the eleventh has a rolling shutter."""
     drawn = scene._clock
     monkeypatch.setattr(scene, "_clock", lambda *given: replace(drawn(*given), latency=2e-3))
@@ -80,10 +67,9 @@ def test_ten_simulated_cells_know_their_lateness(tmp_path: Path, monkeypatch: py
     nominal, off = NominalSurface.load(mesh, unit=job.surface.mesh_unit), []
     for seed in range(1, 11):
         record = run_whole_job(CONFIG, job, nominal, seed, "nominal")
-        assert record.calibration is not None
-        found = measured(record.calibration, seed, "nominal", tmp_path)
+        found = measured(record.calibration, seed, "nominal")
         assert found.sigma <= 0.2e-3
         off.append((found.late - 2e-3) / found.sigma)
     assert np.abs(off).max() < 3.5
     with pytest.raises(RefusedError, match="rolling shutter"):
-        measured(record.calibration, 10, "nominal+rolling_shutter", tmp_path)
+        measured(record.calibration, 10, "nominal+rolling_shutter")

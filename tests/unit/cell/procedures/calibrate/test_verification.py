@@ -19,8 +19,6 @@ from cell.measure.calibration.drift.reference_plate import ConfirmedTurn, Pointi
 from cell.measure.inversion import NominalSurface
 from cell.procedures.arm.moves import Mover
 from cell.procedures.calibrate.verification import Verification, collect_verification, keep_confirmed
-from cell.run.recorded_work import RecordedWork, WorkContext
-from cell.run.runs import Run
 from lab.bench.job.whole_job import JobRecord, run_whole_job
 from sim_backends.world import levels
 from sim_backends.world.scene import draw
@@ -57,42 +55,32 @@ def test_it_is_stored_and_what_is_no_turn_is_not_read() -> None:
             ConfirmedTurn.read(vars(TURN) | spoilt)
 
 
-def verified(calibration: CellCalibration, seed: int, folder: Path) -> Verification:
+def verified(calibration: CellCalibration, seed: int) -> Verification:
     """The cell of `seed` after it has stood for an hour."""
     cell = VirtualCell(CONFIG, seed, LEVEL)
     cell.world.stand(STOOD_S)
-    devices = cell.devices
-
-    def look(context: WorkContext) -> Verification:
-        devices.interlocks.work_with(calibration.configuration)
-        devices.vehicle.brake()
-        mover = Mover(devices.arm, cell.clock, CONFIG, JOB, context.safe_point)
-        given = CONFIG, devices, mover, calibration, context.check, lambda f, t: None, lambda what, frame: None
-        return Verification.of(calibration, JOB, collect_verification(*given))
-
-    return Run(
-        "verification", lambda run: RecordedWork(run, "verification", devices, folder, {}).perform(look)
-    ).result()
+    cell.devices.interlocks.work_with(calibration.configuration)
+    cell.devices.vehicle.brake()
+    mover = Mover(cell.devices.arm, cell.clock, CONFIG, JOB)
+    given = CONFIG, cell.devices, mover, calibration, lambda: None, lambda f, t: None, lambda what, frame: None
+    return Verification.of(calibration, JOB, collect_verification(*given))
 
 
 @pytest.fixture
-def turned(placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Verification, float]:
+def turned(placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch) -> tuple[Verification, float]:
     """A verification of a cell whose laser has turned by half a milliradian, and by how much, rad."""
-    assert placed_pot.calibration is not None
     monkeypatch.setattr(levels, "ALONE", replace(levels.ALONE, laser_pointing=80e-6))
     true = abs(draw(placed_pot.seed, LEVEL).workshop.pointing) * (1 - np.exp(-STOOD_S / levels.WARMING_S))
-    return verified(placed_pot.calibration, placed_pot.seed, tmp_path / "runs"), float(true)
+    return verified(placed_pot.calibration, placed_pot.seed), float(true)
 
 
 def test_a_verification_keeps_the_turn_for_jobs_and_takes_it_back_when_the_plate_was_knocked(
     turned: tuple[Verification, float], placed_pot: JobRecord, here: Path
 ) -> None:
     found, true = turned
-    assert placed_pot.calibration is not None
     folder, path = here / "calibrations", here / "calibrations" / f"{placed_pot.calibration.name}.json"
     save_calibration(placed_pot.calibration, path)
     kept = keep_confirmed(folder, placed_pot.calibration, found)
-    assert kept is not None
     assert found.good
     assert abs(abs(kept.turn) - true) < 3 * kept.sigma < 0.15e-3
     again = read_calibration(path)
@@ -103,7 +91,6 @@ def test_a_verification_keeps_the_turn_for_jobs_and_takes_it_back_when_the_plate
     assert row["laser_since"] == shown["laser_since"] == kept.summary()
     assert "verified" in CliRunner().invoke(app, ["calibrate", "list"]).stdout
 
-    assert found.witness is not None
     plate = found.witness.plate
     knocked = replace(found, witness=replace(found.witness, plate=replace(plate, turn=plate.turn + 0.8e-3)))
     assert keep_confirmed(folder, again, knocked) is None
@@ -128,7 +115,6 @@ def test_a_job_that_was_refused_for_the_turn_goes_on_once_it_is_confirmed(
     before = run(placed_pot)
     assert before.outcome == "refused"
     assert "laser points" in before.reason
-    assert placed_pot.calibration is not None
     keep_confirmed(tmp_path, placed_pot.calibration, turned[0])
     known = read_calibration(tmp_path / f"{placed_pot.calibration.name}.json")
     after = run(replace(placed_pot, calibration=known))

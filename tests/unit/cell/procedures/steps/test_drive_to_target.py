@@ -181,8 +181,7 @@ class TwoStations(Site):
         return (place * Planar.of(self.right.approach.target.se3())).inverse() * self.truth()
 
 
-@pytest.mark.parametrize("known", [True, False])
-@pytest.mark.parametrize("seed", [2, 5])
+@pytest.mark.parametrize(("seed", "known"), [(2, True), (5, False)])
 def test_from_one_stop_it_backs_and_drives_round_to_the_next(seed: int, known: bool) -> None:
     """By odometry, or in a new process by the board of the stop before which it stands."""
     site = TwoStations(seed)

@@ -23,12 +23,11 @@ from cell.run.report.report import place_error
 from drivers.errors import NotObservable, RefusedError
 from lab.bench.job.scan_errors import own_base, surface_at_middle
 from lab.bench.job.whole_job import JobRecord, run_whole_job
-from tests.support.at_station import AtStation
+from tests.support.at_station import AtStation, Station
 from tests.support.report_runs import CONFIG, NAMES, changed, pot
 
 
 def head_of(record: JobRecord, cloud: Cloud) -> Head:
-    assert record.calibration is not None
     scan, sweep = record.calibration.scan, record.results["laser_sweep"]
     travel = CONFIG.rail.travel[1]
     return Head.of(cloud, sweep.base_from_flange, scan.flange_from_camera, scan.rail_direction, travel)
@@ -49,11 +48,10 @@ def inverted_of_droop(record: JobRecord, sag: float) -> PlacePose:
     sweep, bent = made["laser_sweep"], drooped(record, sag)
     vehicle = CONFIG.arm.vehicle_from_base.se3().inverse()
     taken = LineTimes(sweep.times, vehicle, head_of(record, bent))
-    assert record.kinematic is not None
     return step(replace(made["reconstruct"], cloud=bent), made["board_photo"], job, nominal, record.kinematic, taken)
 
 
-@pytest.mark.parametrize("sag", [0.1e-3, -0.1e-3, 0.15e-3])
+@pytest.mark.parametrize("sag", [0.15e-3, -0.1e-3])
 def test_a_carriage_that_droops_is_told_and_in_the_stated_covariance(placed_pot: JobRecord, sag: float) -> None:
     good, found = placed_pot.results["invert_pose"], inverted_of_droop(placed_pot, sag)
     (note,) = found.notes
@@ -73,9 +71,9 @@ def test_without_a_droop_nothing_is_added_and_too_large_a_one_is_refused(placed_
 
 
 def test_a_place_that_is_carried_on_for_a_creep_keeps_what_the_droop_adds(
-    placed_pot: JobRecord, tmp_path: Path
+    placed_pot: JobRecord, station: Station
 ) -> None:
-    made, work = placed_pot.results, AtStation(placed_pot, tmp_path, folded=False).work
+    made, work = placed_pot.results, station(folded=False).work
     good, sweep = made["invert_pose"], made["laser_sweep"]
     rate, origin = np.array([6e-6, 0, 0, 0, 3e-6, 0]), good.base_from_surface.translation
     creep = Creep(rate, np.diag(np.full(6, 0.1e-6**2)), origin, float(sweep.times.mean()))
@@ -104,7 +102,6 @@ def test_a_vehicle_that_rolls_is_in_the_stated_covariance_though_no_height_of_th
 ) -> None:
     site = rolling(placed_pot, tmp_path, 0.3e-3)
     pose, found = site.do(*NAMES[1:]).pose, site.ended
-    assert found.placing is not None and found.at_end is not None
     # ±.3 mrad at .6 m above the ground, one standard deviation.
     assert pose.sigma[1] == pytest.approx(0.3e-3 * 0.6 / np.sqrt(2), rel=0.25)
     error = place_error(site.job, site.nominal, found.at_end)["d_p95"]
@@ -128,7 +125,6 @@ def test_a_droop_since_the_calibration_is_in_the_stated_covariance_or_refused(na
     assert (good.outcome, good.reason) == ("placed", "")
     found, cloud = good.results["invert_pose"], good.results["reconstruct"].cloud
     untouched = bow(cloud, nominal, found.base_from_surface, head_of(good, cloud))
-    assert untouched is not None
     told = " ".join(found.notes)
     print(f"{name} {seed}: bow {1e6 * untouched[0]:.1f} ± {1e6 * untouched[1]:.1f} µm {told}")
     worn = run_whole_job(CONFIG, job, nominal, seed, "nominal+droop", calibrated=good)
@@ -146,10 +142,10 @@ def test_a_droop_since_the_calibration_is_in_the_stated_covariance_or_refused(na
 
 @pytest.mark.parametrize("doubts", [(), ("nobody looked where the laser points",)])
 def test_where_the_place_is_known_too_little_what_was_noted_of_the_sweep_is_told(
-    placed_pot: JobRecord, tmp_path: Path, doubts: tuple[str, ...]
+    placed_pot: JobRecord, station: Station, doubts: tuple[str, ...]
 ) -> None:
     job, made = changed(pot()[0], "place", tolerance=0.05e-3), placed_pot.results
-    workplace = AtStation(placed_pot, tmp_path, job, folded=False).work
+    workplace = station(job, folded=False).work
     sweep = replace(made["laser_sweep"], doubts=doubts)
     with pytest.raises(NotObservable) as caught:
         inverted(workplace, sweep, made["reconstruct"], made["board_photo"])

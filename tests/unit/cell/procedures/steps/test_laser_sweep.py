@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
-from pathlib import Path
 
 import pytest
 
@@ -15,7 +14,7 @@ from cell.procedures.sweep.sweeping import UNCHECKED
 from drivers.errors import DeviceFault
 from lab.bench.job.whole_job import JobRecord
 from statemachine.runner import Event
-from tests.support.at_station import AtStation
+from tests.support.at_station import Station
 
 
 @pytest.mark.parametrize(("attempt", "share"), [(1, 1.0), (2, 0.5), (3, 0.25)])
@@ -35,10 +34,10 @@ def test_a_repetition_is_no_slower_than_its_step_has_time_for() -> None:
 
 @pytest.mark.parametrize(("fault", "mode"), [("", 5), ("rail.lost_steps", 5), ("", 1)])
 def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
-    placed_pot: JobRecord, tmp_path: Path, fault: str, mode: int, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, station: Station, fault: str, mode: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Lost steps refuse what was swept; a rail that does not show its switch leaves a doubt."""
-    site, told = AtStation(placed_pot, tmp_path), []
+    site, told = station(), []
     rail = site.cell.devices.rail
     rail.home().wait(60.0)
     if fault:
@@ -58,14 +57,12 @@ def test_after_a_sweep_the_rails_count_is_compared_with_its_reference_switch(
     assert "looking whether the rail has lost steps" in told
 
 
-def test_steps_lost_in_a_sweep_with_a_second_look_are_found_after_its_way_back(
-    placed_pot: JobRecord, tmp_path: Path
-) -> None:
+def test_steps_lost_in_a_sweep_with_a_second_look_are_found_after_its_way_back(station: Station) -> None:
     def lose(event: Event) -> None:
         if "whether the surface lies still: preparing" in event.data.get("text", ""):
             site.cell.fault("rail.lost_steps")
 
-    site = AtStation(placed_pot, tmp_path, timed=True, notify=lose)
+    site = station(timed=True, notify=lose)
     site.work.looks_again = True
     with pytest.raises(DeviceFault, match="lost steps"):
         site.do("laser_sweep")
@@ -79,11 +76,11 @@ def test_steps_lost_in_a_sweep_with_a_second_look_are_found_after_its_way_back(
     ],
 )  # fmt: skip
 def test_a_part_goes_by_the_look_at_the_head_of_a_part_before_for_ten_minutes(
-    placed_pot: JobRecord, tmp_path: Path, ago: float, seen: bool, attempt: int, held: bool, shared: bool,
+    placed_pot: JobRecord, station: Station, ago: float, seen: bool, attempt: int, held: bool, shared: bool,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     """Where nobody looks at the placed parts, not at all."""
-    site = AtStation(placed_pot, tmp_path)
+    site = station()
     site.work.shares_look, kept = seen, list[str]()
     monkeypatch.setattr(site.work.frames, "keep", lambda name, frame, cut=None: kept.append(name.split("-")[0]))
     pointing = Pointing(0.5e-3, 0.02e-3)

@@ -13,29 +13,29 @@ import pytest
 from cell import Cell
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.geometry.poses import difference, from_matrix, from_parts
+from cell.procedures.arm.moves import PartState
 from cell.procedures.grasp import GRIPPED, job_with_grasp
 from cell.run.record.replay import replay
 from cell.run.report.page.make import make_page
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, DeviceFault, RefusedError
 from lab.bench.job.whole_job import JobRecord
+from sim_backends.models.arm import Safety
 from statemachine.step import Event
 from tests.support.at_station import lose_few_steps_after_the_look
 from tests.support.described_cells import LEAN, described, quick_job
-from tests.support.unloading import JOB, Change, unloaded
+from tests.support.unloading import JOB, Change, unloaded, where_unloaded
 
 
-def test_a_part_that_sticks_is_let_go_where_it_lies(placed_pot: JobRecord, tmp_path: Path) -> None:
-    def sticks(cell: VirtualCell) -> None:
-        cell.world.part.sticks = 60.0
-
-    stuck = unloaded(placed_pot, sticks, runs=tmp_path)
-    assert (stuck.outcome, stuck.stage) == ("refused", "pick")
-    assert re.search(r"the part sticks, or is heavier .* pulled with more than 24 N and let go", stuck.reason)
-    assert stuck.at_end and stuck.at_sweep and not stuck.at_end["part"]["held"] and stuck.folder is not None
-    moved = difference(*(from_matrix(truth["poses"]["surface_from_part"]) for truth in (stuck.at_end, stuck.at_sweep)))
+def test_a_part_that_sticks_is_let_go_where_it_lies(unloaded_part: JobRecord, tmp_path: Path) -> None:
+    site = where_unloaded(unloaded_part, tmp_path)
+    lay, part = from_matrix(site.cell.truth()["poses"]["surface_from_part"]), site.cell.world.part
+    part.sticks = 60.0
+    with pytest.raises(RefusedError, match=r"the part sticks, or is heavier .* pulled with more than 24 N and let go"):
+        site.do("pick")
+    assert not part.held and site.work.part.state is PartState.LIES
+    moved = difference(from_matrix(site.cell.truth()["poses"]["surface_from_part"]), lay)
     assert np.linalg.norm(moved[:3]) < 0.1e-3
-    report = json.loads((stuck.folder / "report.json").read_text(encoding="utf-8"))
-    assert report["part"] == "at the station" and report["end_state"]["arm"]["safety"] == "normal"
+    assert site.cell.world.arm.safety is Safety.NORMAL
 
 
 def test_a_grasp_that_was_seen_is_known_to_that_and_to_what_closing_moves() -> None:
@@ -47,12 +47,9 @@ def test_a_grasp_that_was_seen_is_known_to_that_and_to_what_closing_moves() -> N
     assert grasp.sigma_angle == float(np.sqrt(0.3e-3**2 + GRIPPED[3, 3])) and grasp.size == JOB.grasp.size
 
 
-def test_a_part_is_taken_from_its_surface_into_its_nest(placed_pot: JobRecord, tmp_path: Path) -> None:
-    def clings(cell: VirtualCell) -> None:
-        cell.world.part.sticks = 10.0
-
-    done = unloaded(placed_pot, clings, runs=tmp_path)
-    assert (done.outcome, done.reason) == ("placed", "") and done.at_sweep and done.at_end and done.folder and JOB.nest
+def test_a_part_is_taken_from_its_surface_into_its_nest(unloaded_part: JobRecord) -> None:
+    done = unloaded_part
+    assert done.at_sweep and done.at_end and done.folder and JOB.nest
     lay, lies = (from_matrix(truth["poses"]["base_from_part"]) for truth in (done.at_sweep, done.at_end))
     # Where the world has put it is drawn: some tenths of a millimetre from where the job expects it.
     found = difference(done.results["invert_pose"].base_from_surface, lay)
@@ -73,18 +70,29 @@ def test_a_part_is_taken_from_its_surface_into_its_nest(placed_pot: JobRecord, t
 
 
 def test_steps_that_the_rail_lost_are_found_before_the_grip(
-    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
+    unloaded_part: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cells: list[VirtualCell] = []
-    lose_few_steps_after_the_look(monkeypatch, lambda: cells[0])
-    done = unloaded(placed_pot, cells.append)
-    assert (done.outcome, done.stage) == ("faulted", "pick") and "lost steps" in done.reason
-    assert not cells[0].world.part.held
+    site = where_unloaded(unloaded_part, tmp_path)
+    lose_few_steps_after_the_look(monkeypatch, lambda: site.cell)
+    with pytest.raises(DeviceFault, match="lost steps"):
+        site.do("pick")
+    assert not site.cell.world.part.held
+
+
+def test_a_part_that_is_lost_as_it_is_lifted_is_known_to_nobody_and_that_is_noted(
+    unloaded_part: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, parts = where_unloaded(unloaded_part, tmp_path), list[object]()
+    site.notify = lambda event: parts.append(event.data.get("part"))
+    monkeypatch.setattr(type(site.cell.devices.claw), "holding", property(lambda claw: False))
+    with pytest.raises(RefusedError, match="the claw lost the part as it lifted it"):
+        site.do("pick")
+    assert [part for part in parts if part] == ["unknown", "held", "unknown"]
+    assert site.work.part.state is PartState.UNKNOWN
 
 
 def take_away(cell: VirtualCell) -> None:
     part = cell.world.part
-    assert part._world_from_part is not None
     part._world_from_part[0, 3] += 0.2
 
 

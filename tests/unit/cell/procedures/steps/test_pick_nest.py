@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,8 +13,10 @@ from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
 from cell.measure.calibration.drift.slip import Slip
 from cell.measure.geometry.poses import difference, from_matrix
+from cell.measure.inversion import NominalSurface
 from cell.measure.inversion.place_pose import PlacePose
 from cell.motion.collision import PLACED
+from cell.procedures.arm.moves import PartState
 from cell.procedures.steps import pick_nest, verify_nest
 from cell.procedures.steps.kinds import PLACE
 from cell.run.record.replay import replay
@@ -23,12 +24,18 @@ from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
 from statemachine.step import Event
+from tests.support import described_cells
+from tests.support.at_station import AtStation
 from tests.support.described_cells import UNDRAWN, described, quick_job
 from tests.support.report_runs import changed
-from tests.support.unloading import unloaded
 
-SHIPPED, _ = load_job("load")
+SHIPPED, MESH = load_job("load")
 JOB = changed(SHIPPED, "scan", speed=2.0 * SHIPPED.scan.speed, frame_rate=20.0)
+
+
+def before_pick(record: JobRecord, folder: Path) -> AtStation:
+    """A cell where `record` placed, with the part of `load` in its nest."""
+    return AtStation(record, folder, JOB, NominalSurface.load(MESH, unit=JOB.surface.mesh_unit))
 
 
 @pytest.mark.parametrize(
@@ -39,21 +46,19 @@ JOB = changed(SHIPPED, "scan", speed=2.0 * SHIPPED.scan.speed, frame_rate=20.0)
         (0.2, "the nest is empty: nothing was seen where the part belongs"),
     ],
 )
-def test_a_part_that_is_not_in_its_nest_is_not_gripped(placed_pot: JobRecord, metres: float, told: str) -> None:
-    cells: list[VirtualCell] = []
-
-    def aside(cell: VirtualCell) -> None:
-        cells.append(cell)
-        cell.world.part._base_from_part[0, 3] += metres  # type: ignore[index]
-
-    done = unloaded(placed_pot, aside, job=JOB)
-    assert (done.outcome, done.stage) == ("refused", "pick")
-    assert re.search(told, done.reason), done.reason
-    assert not cells[0].world.part.held and cells[0].world.part.untouched
+def test_a_part_that_is_not_in_its_nest_is_not_gripped(
+    placed_pot: JobRecord, tmp_path: Path, metres: float, told: str
+) -> None:
+    site = before_pick(placed_pot, tmp_path)
+    part = site.cell.world.part
+    part._base_from_part[0, 3] += metres  # type: ignore[index]
+    with pytest.raises(RefusedError, match=told):
+        site.do("pick")
+    assert not part.held and part.untouched and site.work.part.state is PartState.NESTED
 
 
 def test_what_a_head_that_slipped_leaves_open_of_the_held_part_is_known(
-    placed_pot: JobRecord, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shares, slips = [], iter([Slip(0.0, 0.0, 0.0), Slip(0.09e-3, 0.0, 0.0)])
     look = pick_nest.seen_on_plate
@@ -65,7 +70,8 @@ def test_what_a_head_that_slipped_leaves_open_of_the_held_part_is_known(
     monkeypatch.setattr(pick_nest, "seen_on_plate", lambda *given: (look(*given)[0], next(slips)))
     monkeypatch.setattr(verify_nest, "register", register)
     for _ in range(2):
-        assert "seen enough" in unloaded(placed_pot, job=JOB).reason
+        with pytest.raises(RefusedError, match="seen enough"):
+            before_pick(placed_pot, tmp_path).do("pick")
     still, slipped = shares
     assert np.linalg.norm(slipped) > 0.09e-3 > 1.5 * np.linalg.norm(still)
 
@@ -74,12 +80,12 @@ def test_an_old_part_is_swapped_for_a_new_one_and_the_item_that_was_aborted_is_r
     placed_pot: JobRecord, calibrated_folder: Path
 ) -> None:
     file, (undrawn, _) = quick_job("swap", calibrated_folder, 20.0), described(calibrated_folder, UNDRAWN)
+    once = described_cells.changed(file.read_text(encoding="utf-8"), {"place": {"corrections": "0"}})
+    file.write_text(once, encoding="utf-8")
     with Cell.open(undrawn, sim="all", seed=placed_pot.seed, clock="virtual", job=file) as cell:
-        assert isinstance(cell.simulated, VirtualCell)
         world, begun = cell.simulated.world, list[str]()
         # It lies as the world has drawn it, which is not where the job expects it.
         nest = load_job(f"{file}#2")[0].nest
-        assert nest is not None
         lay = from_matrix(world._items[1].part._base_from_part)
         off = difference(lay, nest.base_from_part.se3())
         assert 0.1e-3 < np.linalg.norm(off[:3]) < 2e-3
@@ -132,6 +138,8 @@ def test_a_part_that_the_claw_took_from_its_nest_is_placed_by_the_run_that_resum
     placed_pot: JobRecord, calibrated_folder: Path
 ) -> None:
     load, (undrawn, _) = quick_job("load", calibrated_folder, 20.0), described(calibrated_folder, UNDRAWN)
+    unseen = described_cells.changed(load.read_text(encoding="utf-8"), {"place": {"verify": '"none"'}})
+    load.write_text(unseen, encoding="utf-8")
     with Cell.open(undrawn, sim="all", seed=placed_pot.seed, clock="virtual", job=load) as cell:
 
         def until(step: str, text: str) -> Callable[[Event], None]:

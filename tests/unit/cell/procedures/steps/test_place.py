@@ -77,7 +77,6 @@ class Site:
         self.way: list[tuple[float, np.ndarray]] = []
         """Times, and where the flange was."""
         touch = world.arm.contact
-        assert touch is not None
 
         def watched(base_from_flange: Any) -> Any:
             wrench = touch(base_from_flange)
@@ -113,6 +112,12 @@ def site() -> Site:
     return Site()
 
 
+@pytest.fixture(scope="module")
+def work(placed_pot: JobRecord, tmp_path_factory: pytest.TempPathFactory) -> Workplace:
+    """Where `placed_pot` placed."""
+    return AtStation(placed_pot, tmp_path_factory.mktemp("place"), folded=False).work
+
+
 def normal() -> np.ndarray:
     return np.asarray(JOB.grasp.flange_from_part.se3().rotation[:, 2])
 
@@ -133,7 +138,6 @@ def test_the_part_is_put_down_in_contact_and_that_is_noted_before_the_retreat(si
     assert max(site.forces) < 3 * JOB.place.contact_force
     assert site.cell.world.collisions.found == ()
     where = site.part.where
-    assert where is not None
     with pytest.raises(CollisionError, match="claw and placed part"):
         site.mover.plan_to(where * JOB.grasp.flange_from_part.se3().inverse(), "where the part stands now")
     true = pin.SE3(site.base_from_surface * JOB.place.surface_from_part.se3())
@@ -187,7 +191,6 @@ def test_near_its_place_a_line_of_a_higher_speed_takes_no_longer() -> None:
 
 def test_what_the_force_sensor_showed_before_the_descent_is_no_touch(site: Site) -> None:
     touch = site.cell.world.arm.contact
-    assert touch is not None
     drift = np.array([0.0, 0.0, 1.5 * JOB.place.contact_force, 0.0, 0.0, 0.0])
     site.cell.world.arm.contact = lambda base_from_flange: np.asarray(touch(base_from_flange)) + drift
     result = site.place()
@@ -222,9 +225,8 @@ def test_a_surface_that_comes_early_or_not_at_all_is_refused_with_the_part_held_
 
 @pytest.mark.parametrize(("off", "from_mm"), [(None, 1.0), (0.02e-3, 0.47), (-0.2e-3, 1.0)])
 def test_where_the_part_before_touched_as_expected_contact_is_felt_for_nearer(
-    placed_pot: JobRecord, tmp_path: Path, off: float | None, from_mm: float
+    work: Workplace, off: float | None, from_mm: float
 ) -> None:
-    work = AtStation(placed_pot, tmp_path, folded=False).work
     work.parts_before = PartsBefore(touch_off=off)
     # Above all that would be placed: 3.5 standard deviations over the expected touch.
     assert 1e3 * felt_from(work, TouchHeight(0.05e-3, 0.07e-3)) == pytest.approx(from_mm, abs=0.01)
@@ -246,12 +248,9 @@ def test_a_touch_that_contradicts_the_scan_is_refused_with_the_part_held_and_lif
     assert site.height_above() > 0.5 * JOB.place.approach
 
 
-@pytest.mark.parametrize("too_low", [0.3e-3, 0.38e-3, 0.45e-3, 0.55e-3, 0.7e-3, 0.9e-3])
-def test_one_that_touches_before_it_is_felt_for_is_refused_as_well(
-    placed_pot: JobRecord, tmp_path: Path, site: Site, too_low: float
-) -> None:
+@pytest.mark.parametrize("too_low", [0.38e-3, 0.45e-3, 0.55e-3, 0.9e-3])
+def test_one_that_touches_before_it_is_felt_for_is_refused_as_well(work: Workplace, site: Site, too_low: float) -> None:
     """Whether the force begins on the slow part of the descent, just before it, or on the fast one."""
-    work = AtStation(placed_pot, tmp_path, folded=False).work
     work.parts_before = PartsBefore(touch_off=0.0)
     feel = felt_from(work, STATED)
     assert 0.3e-3 < feel < 0.5e-3
@@ -263,7 +262,6 @@ def test_one_that_touches_before_it_is_felt_for_is_refused_as_well(
 @pytest.mark.parametrize("too_low", [0.1e-3, -0.1e-3])
 def test_a_touch_within_what_is_stated_is_placed_and_told(too_low: float) -> None:
     result = Site().place(too_low=too_low)
-    assert result.touch is not None
     assert result.touch.off == pytest.approx(too_low, abs=0.02e-3)
     # Pressed on until the force that lets go: the surface gives way by half a millimetre.
     assert result.depth_error < result.touch.felt.height - 0.3e-3
@@ -281,7 +279,6 @@ def test_a_stiff_touch_as_soon_as_it_is_felt_for_is_refused_with_the_part_held(
     if not told:
         monkeypatch.setattr(touch_height, "LEAST_STATES", 10_000)
     touch = site.cell.world.arm.contact
-    assert touch is not None
     site.cell.world.arm.contact = lambda base_from_flange: 6.0 * np.asarray(touch(base_from_flange))
     with pytest.raises(RefusedError, match="mm higher than the scan says"):
         site.place(too_low=1.06e-3)
@@ -441,7 +438,6 @@ def test_what_the_part_goes_into_the_surface_is_in_the_expected_touch_and_in_the
     site = with_part(placed_pot, tmp_path, lambda v: v - np.multiply.outer(v[:, 0] > 0.0, [0.0, 0.0, 0.25e-3]))
     site.do("place")
     job, nominal, done = site.job, site.nominal, site.ended
-    assert done.at_end is not None and done.placing is not None
     placed, before = done.results["place"], placed_pot.results["place"]
     assert placed.mating.lift == pytest.approx(0.25e-3, abs=0.03e-3)
     assert placed.touch.expected.height - before.touch.expected.height == pytest.approx(0.25e-3, abs=0.03e-3)

@@ -18,14 +18,14 @@ from cell.procedures.steps import reconstruct
 from cell.procedures.sweep.stored_sweep import FILE, SweepRecord
 from drivers.errors import RefusedError
 from lab.bench.job.whole_job import JobRecord
-from tests.support.at_station import AtStation
+from tests.support.at_station import Station
 from tests.support.report_runs import with_few_lines
 
 CONFIG = load_config(None)
 
 
 def test_the_cloud_of_an_earlier_sweep_is_gone_whatever_becomes_of_this_one(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, station: Station, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*given: object) -> None:
         raise MemoryError("too many points")
@@ -33,14 +33,14 @@ def test_the_cloud_of_an_earlier_sweep_is_gone_whatever_becomes_of_this_one(
     (tmp_path / "cloud.ply").write_text("of the sweep before")
     monkeypatch.setattr(reconstruct, "build_cloud", fails)
     with pytest.raises(MemoryError):
-        reconstruct.reconstructed(AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["laser_sweep"])
+        reconstruct.reconstructed(station(folded=False).work, placed_pot.results["laser_sweep"])
     assert not (tmp_path / "cloud.ply").exists()
 
 
 def test_the_cloud_is_built_with_the_laser_where_it_pointed(
-    placed_pot: JobRecord, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    placed_pot: JobRecord, station: Station, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    workplace, sweep, given = AtStation(placed_pot, tmp_path, folded=False).work, placed_pot.results["laser_sweep"], []
+    workplace, sweep, given = station(folded=False).work, placed_pot.results["laser_sweep"], []
     monkeypatch.setattr(ScanCalibration, "variants", lambda head: given.append(head) or ())
     turned, head = Pointing(1e-3, 1e-5, 0.0), workplace.calibration.scan
     for pointing in (None, turned):
@@ -51,9 +51,9 @@ def test_the_cloud_is_built_with_the_laser_where_it_pointed(
     assert not np.allclose(expected.normal, head.geometry().light_plane.normal, atol=1e-4)
 
 
-def test_a_sweep_is_kept_and_its_cloud_shown_also_where_it_is_refused(placed_pot: JobRecord, tmp_path: Path) -> None:
+def test_a_sweep_is_kept_and_its_cloud_shown_also_where_it_is_refused(placed_pot: JobRecord, station: Station) -> None:
     assert placed_pot.folder is not None and (placed_pot.folder / FILE).is_file()
-    workplace, told = AtStation(placed_pot, tmp_path, folded=False).work, []
+    workplace, told = station(folded=False).work, []
     workplace.devices.gate.listener = cast(Any, SimpleNamespace(reading=lambda device, reading: told.append(device)))
     few = with_few_lines(placed_pot, 1).results["laser_sweep"]
     for sweep in (placed_pot.results["laser_sweep"], few):

@@ -2,26 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
+import pinocchio as pin
+import pytest
+
 from cell.config.job import load_job
 from cell.devices.simulated.direct import VirtualCell
+from cell.measure.geometry.poses import from_matrix
+from cell.procedures.arm.moves import PartState
 from cell.procedures.steps.verify_nest import where_seen
+from drivers.errors import MisplacedError
 from lab.bench.job.whole_job import JobRecord
 from tests.support.lying_part import creeps, moved
-from tests.support.unloading import JOB, unloaded
+from tests.support.unloading import JOB, where_unloaded
 
 
-def test_a_part_that_comes_to_lie_beside_its_nest_is_misplaced(placed_pot: JobRecord) -> None:
-    def slips(cell: VirtualCell) -> None:
-        cell.world.part.opening[1, 3] = 1.8e-3
+def misplaced(
+    record: JobRecord, folder: Path, off: pin.SE3, changed: Callable[[VirtualCell], None] = lambda cell: None
+) -> str:
+    """Why a part that lies `off` where `record` set it down is misplaced, in a cell that is `changed`."""
+    site = where_unloaded(record, folder)
+    lies = from_matrix(record.at_end["poses"]["base_from_part"]) * off
+    site.cell.world.part._base_from_part = lies.homogeneous
+    site.work.part.state, site.work.part.where = PartState.RELEASED, lies
+    site.work.mover.avoid_part(lies, JOB.grasp.size)
+    changed(site.cell)
+    with pytest.raises(MisplacedError) as told:
+        site.do("verify")
+    return str(told.value)
 
-    done = unloaded(placed_pot, slips)
-    assert (done.outcome, done.stage) == ("misplaced", "verify")
-    assert "in axes of the arm base" in done.reason and "the part is already down" in done.reason
+
+def test_a_part_that_comes_to_lie_beside_its_nest_is_misplaced(unloaded_part: JobRecord, tmp_path: Path) -> None:
+    told = misplaced(unloaded_part, tmp_path, moved(y=1.8e-3))
+    assert "in axes of the arm base" in told and "mm off" in told
 
 
-def test_a_part_that_creeps_in_its_nest_is_misplaced(placed_pot: JobRecord) -> None:
-    done = unloaded(placed_pot, lambda cell: creeps(cell, moved(y=0.06e-3), nested=True))
-    assert (done.outcome, done.stage) == ("misplaced", "verify") and "does not lie still" in done.reason
+def test_a_part_that_creeps_in_its_nest_is_misplaced(unloaded_part: JobRecord, tmp_path: Path) -> None:
+    told = misplaced(unloaded_part, tmp_path, moved(), lambda cell: creeps(cell, moved(y=0.06e-3)))
+    assert "does not lie still" in told
 
 
 def test_the_place_where_a_part_is_looked_at_is_its_own_or_the_nest() -> None:

@@ -174,7 +174,6 @@ def test_more_lost_frames_than_a_twentieth_are_a_fault() -> None:
 def test_replies_that_are_all_late_are_refused_with_what_they_leave_open(late: float) -> None:
     said = refused("rail.late_readings", late=late)
     told = re.search(r"those of the rail to ±([\d.]+) ms", said)
-    assert told is not None
     assert float(told[1]) == pytest.approx(0.5e3 * late, abs=0.25)
     assert "allowed are 0.150 mm" in said
     assert "sweep more slowly" in said
@@ -252,7 +251,6 @@ def test_states_that_are_all_late_are_refused_with_what_they_leave_open(late: fl
     assert caught.value.code == "arm.late_readings"
     assert caught.value.recoverable
     told = re.search(r"those of the arm to ±([\d.]+) ms", str(caught.value))
-    assert told is not None
     assert float(told[1]) == pytest.approx(0.5e3 * late, abs=0.6)
     assert "allowed are 0.150 mm" in str(caught.value)
 
