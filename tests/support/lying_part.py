@@ -52,8 +52,7 @@ class LyingPart:
 
     def looked(self, off: pin.SE3) -> PlacedPart:
         """What the step makes of a part that lies `off` its place."""
-        self.drawn.mkdir(exist_ok=True)
-        file = job_with_part(self.drawn, "pot", verify=self.verify, half=self.half, flat=self.flat, also=self.also)
+        file = job_with_part(self.folder, "pot", verify=self.verify, half=self.half, flat=self.flat, also=self.also)
         job, mesh = load_job(file)
         quick = changed(job, "scan", speed=self.faster * job.scan.speed)
         quick = changed(quick, "part", feature=self.features) if self.features else quick
@@ -73,11 +72,6 @@ class LyingPart:
         found = site.do("verify")
         assert isinstance(found, PlacedPart)
         return found
-
-    @property
-    def drawn(self) -> Path:
-        """Where job and meshes are, for all such parts: the world keeps by its file what it has read of a mesh."""
-        return self.folder.parent / "drawn"
 
     @property
     def cell(self) -> VirtualCell:

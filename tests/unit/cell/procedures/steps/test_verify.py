@@ -1,4 +1,4 @@
-"""The placed part as the scan head sees it, against where it truly lies."""
+"""The placed part as the scan head sees it: against where it truly lies, and against a fit that others wrote."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pinocchio as pin
 import pytest
+import scipy
 import trimesh
 
 from cell import Cell
 from cell.config.cell_config import NO_FILES
 from cell.config.job import FeatureSection, load_job
 from cell.devices.simulated.direct import VirtualCell
-from cell.measure.geometry.poses import difference, from_matrix, transform
+from cell.measure.geometry.poses import difference, from_matrix, from_parts, transform
 from cell.measure.inversion import NominalSurface
 from cell.procedures.placed_part import COVERED, LIKELY, NO_FLUSH, OFF_DRAWING, PlacedPart
 from cell.procedures.steps.kinds import PLACE, kind_of
@@ -68,6 +69,49 @@ def test_where_the_placed_part_lies_is_seen_beside_the_surface_to_hundredths(
 def test_a_part_in_its_place_is_left_there_although_it_might_lie_better(lying: tuple[PlacedPart, LyingPart]) -> None:
     found, site = lying
     assert found.before == () and site.parts == []
+
+
+def test_a_fit_that_others_wrote_finds_the_part_in_the_same_place(
+    placed_pot: JobRecord, lying: tuple[PlacedPart, LyingPart]
+) -> None:
+    """Samples of the meshes by trimesh, least squares by scipy, on the cloud and the meshes as files."""
+    found, site = lying
+    cloud = np.asarray(trimesh.load(site.folder / CLOUD).vertices)
+    pose = placed_pot.results["invert_pose"].base_from_surface
+    local = (cloud - pose.translation) @ pose.rotation
+    high = local[:, 2] > 0.012
+    poses = []
+    for points, file in ((local[high], "pot-part.ply"), (local[~high], "pot.ply")):
+        mesh = trimesh.load(site.folder / file)
+        chosen = points[np.random.default_rng(0).permutation(len(points))[:4_000]]
+        poses.append(fitted(chosen, mesh))
+    apart = poses[1].inverse() * poses[0]
+    assert np.linalg.norm(apart.translation - found.seen.surface_from_part.translation) < 0.01e-3
+    assert np.linalg.norm(pin.log3(apart.rotation.T @ found.seen.surface_from_part.rotation)) < 0.3e-3
+
+
+def fitted(points: np.ndarray, mesh: trimesh.Trimesh) -> pin.SE3:
+    """Where the mesh lies by points on its faces that look up; those at a rim are left out."""
+    samples, faces = trimesh.sample.sample_surface(mesh, 200_000, seed=0)
+    up = mesh.face_normals[faces][:, 2] > 0.3
+    samples, normals = samples[up], mesh.face_normals[faces[up]]
+    tree, start, used = scipy.spatial.cKDTree(samples), pin.SE3.Identity(), points
+    for gate in (0.3e-3, 0.1e-3, 0.1e-3):
+        here = (points - start.translation) @ start.rotation
+        apart, nearest = tree.query(here)
+        rim = np.abs(np.abs(samples[nearest, 0]) - MIDDLE[0]) < 0.8e-3
+        high = np.abs(np.einsum("ni,ni->n", here - samples[nearest], normals[nearest]))
+        used = points[(apart < 1e-3) & (high < gate) & ~rim]
+
+        def left(v: np.ndarray, used: np.ndarray = used, start: pin.SE3 = start) -> np.ndarray:
+            pose = start * from_parts(v[:3], pin.exp3(v[3:]))
+            there = (used - pose.translation) @ pose.rotation
+            _, nearest = tree.query(there)
+            return np.asarray(np.einsum("ni,ni->n", there - samples[nearest], normals[nearest]))
+
+        found = scipy.optimize.least_squares(left, np.zeros(6), loss="soft_l1", f_scale=0.02e-3, x_scale=1e-4)
+        start = start * from_parts(found.x[:3], pin.exp3(found.x[3:]))
+    return start
 
 
 def test_the_flush_along_its_edge_is_by_how_much_its_pose_lifts_it(lying: tuple[PlacedPart, LyingPart]) -> None:
