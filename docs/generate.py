@@ -3,8 +3,6 @@
 `python docs/generate.py` writes them; a test compares what it would write with what is there.
 """
 
-from __future__ import annotations
-
 import ast
 import inspect
 import re

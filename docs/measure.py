@@ -5,8 +5,6 @@ the figure, the date and the commit. A tree with changes that are not committed 
 `--from FILE` takes the JSON that the one chosen command has printed already.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import shlex

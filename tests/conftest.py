@@ -5,8 +5,6 @@ of a group run on one worker, one after the other, because they share what is ma
 over wires would disturb each other's time.
 """
 
-from __future__ import annotations
-
 import os
 from functools import cache, partial
 from pathlib import Path

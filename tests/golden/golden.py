@@ -6,8 +6,6 @@ Another kind of processor or another release of a numerical library may round di
 which you compare.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Files that an earlier version wrote stay readable: a calibration, a journal, and a record that was cut short."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from cell.config.calibrations.store import read_calibration

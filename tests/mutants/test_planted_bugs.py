@@ -4,8 +4,6 @@ Run with `pytest -m mutants -n 2 --dist load`. A change that no longer applies f
 without any.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -4,8 +4,6 @@
 outcomes of its runs, and `why` says what it is about. `cell bench schedules` finds more.
 """
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A cell that stands where a whole job placed: single steps are done there, without all that comes before them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """A part that lies somewhere on its surface, in a cell that stands before it: what `verify` makes of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path

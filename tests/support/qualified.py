@@ -1,7 +1,5 @@
 """Rows of campaigns without their worlds, and worlds that cost nothing: for the tests of `cell qualify`."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -3,8 +3,6 @@
 What a step returns or raises is the product's; only the runner's record of it is put together here.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

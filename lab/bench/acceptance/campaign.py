@@ -6,8 +6,6 @@ go, the second over all points and over 95 % of them. Every frame is rendered by
 sensor noise; stripe, cloud and outlier filter are the product's own. Frame: the camera's at rail position 0, m.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -224,7 +222,7 @@ def acceptance(seed: int, level: str, done: Done = lambda name: None) -> dict[st
     }  # fmt: skip
 
 
-def _ball(cloud: Cloud) -> tuple[SphereFit, NDArray[np.bool_]]:
+def _ball(cloud: Cloud) -> "tuple[SphereFit, NDArray[np.bool_]]":
     """The sphere through the part of a ball that is judged, and which of the cloud's valid points those are."""
     points = cloud.points[cloud.valid]
     chosen = cap(points, fit_sphere(points).centre, np.array([0.0, 0.0, -1.0]), CAP)

@@ -6,8 +6,6 @@ rotations about them, in the camera), coverage the share of errors inside the st
 detectors look at the same pictures; they have to find all of the board, but for ChArUco.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -78,7 +76,7 @@ class Tally:
             "reasons": dict(sorted(self.reasons.items())),
         }
 
-    def __iadd__(self, other: Tally) -> Tally:
+    def __iadd__(self, other: "Tally") -> "Tally":
         for name, value in vars(other).items():
             if isinstance(value, dict):
                 for key, count in value.items():

@@ -5,8 +5,6 @@ from the estimators, so that an error cannot cancel. Rendering and picture proce
 stated here, as measured on rendered pictures.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -57,7 +55,7 @@ class Truth:
     base_from_large: Array
 
     @classmethod
-    def of(cls, scene: Scene) -> Truth:
+    def of(cls, scene: Scene) -> "Truth":
         """The truth of a drawn world."""
         scan, target = scene.scan_lens, scene.target_lens
         return cls(

@@ -4,8 +4,6 @@ The simulator's lens, and rays, planes and poses written anew here, so that erro
 one vector of parameters, which lets `cramer_rao` differentiate the very generator of the observations.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -55,7 +53,7 @@ class Noise:
         """The same for the adjustment."""
         return Priors(self.arm / np.sqrt(3), self.arm_angle, self.rail)
 
-    def times(self, factor: float) -> Noise:
+    def times(self, factor: float) -> "Noise":
         """The same noise, all of it `factor` times as large."""
         return Noise(**{name: factor * value for name, value in vars(self).items()})
 
@@ -83,7 +81,7 @@ class HeadWorld:
     spec: BoardSpec
     bow: float = 0.0
 
-    def moved(self, step: Array) -> HeadWorld:
+    def moved(self, step: Array) -> "HeadWorld":
         """Another head, away by a step (26,) of the shared parameters."""
         return replace(
             self, parameters=self.parameters + step[:14], hand=turned(self.hand, step[14:20]),

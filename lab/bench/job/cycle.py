@@ -4,8 +4,6 @@ A batch on the virtual clock, in a cell that is calibrated, its time stamps as w
 middle repeated. What a device did comes from the run's record, as the report's drawing shows it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -58,7 +56,7 @@ class LeastTimes:
     vehicle_speed: float
 
     @classmethod
-    def of(cls, devices: Devices, config: CellConfig, job: Job) -> LeastTimes:
+    def of(cls, devices: Devices, config: CellConfig, job: Job) -> "LeastTimes":
         """With the job's part in the claw."""
         mover = Mover(devices.arm, devices.clock, config, None)
         tool = tool_bodies(job.grasp.size, job.grasp.flange_from_part.se3(), mounted(config))

@@ -4,8 +4,6 @@ Everything happens in the thread of the run, after a tick of the virtual clock o
 same schedule takes the same course. People ask through the journal, as another process would.
 """
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -57,7 +55,7 @@ class DayRecord:
 class _Session(Cell):
     """The cell as a program opens it, whose runs the `day` hears before they go on."""
 
-    def __init__(self, opened: OpenCell, day: Day) -> None:
+    def __init__(self, opened: OpenCell, day: "Day") -> None:
         super().__init__(opened)
         self._day = day
 

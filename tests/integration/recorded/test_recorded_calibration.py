@@ -1,7 +1,5 @@
 """Promises on photographs and poses that others recorded on real hardware, whole and spoilt."""
 
-from __future__ import annotations
-
 import shutil
 
 import cv2

@@ -1,7 +1,5 @@
 """Work outside a job asks a person after a protective stop, as a job does; then it goes on or ends."""
 
-from __future__ import annotations
-
 import json
 import math
 import threading

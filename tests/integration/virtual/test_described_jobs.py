@@ -1,8 +1,6 @@
 """Jobs of one's own from their files to `placed`, on the virtual clock: one after another in one world, and in cells
 that are described otherwise than the one that ships."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`cell qualify` as a user runs it: worlds in processes of their own, killed, resumed, and compared bit for bit."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """A job with two stations: a part is placed at each, and a run that was cut short is resumed at its own stop."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`cell calibrate verify` and `accept`, typed: a good calibration passes, a disturbed one is told with its part."""
 
-from __future__ import annotations
-
 import json
 from functools import partial
 from pathlib import Path

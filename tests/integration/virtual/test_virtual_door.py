@@ -1,7 +1,5 @@
 """The whole product through the door without wires: one thread, no waiting, and the same seed gives the same bytes."""
 
-from __future__ import annotations
-
 import json
 import re
 import threading

@@ -1,7 +1,5 @@
 """Every step of a job works behind the gate, with the token that ends it."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Every case goes through the real command line: exit code 2, no traceback, no word of the libraries underneath.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator

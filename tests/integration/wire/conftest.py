@@ -1,7 +1,5 @@
 """What several of the wire tests start from."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

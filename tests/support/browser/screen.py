@@ -1,7 +1,5 @@
 """The operator's screen as tests use it: the server of a simulated cell, a browser, and a person before the page."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -80,7 +78,7 @@ class Screen:
     @classmethod
     def of(
         cls, browser: Browser, link: str, size: tuple[int, int] = WIDE, changes: dict[str, Any] | None = None
-    ) -> Screen:
+    ) -> "Screen":
         """A page that has followed the link and hears the cell; of its state it is told these `changes` instead."""
         context = browser.new_context(viewport={"width": size[0], "height": size[1]})
         if changes is not None:

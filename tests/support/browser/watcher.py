@@ -1,7 +1,5 @@
 """A client without a browser that follows the live link: what the cell does, as somebody else is told."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time
@@ -30,7 +28,7 @@ class Watcher:
                         self.state = said
                         self._changed.notify_all()
 
-    def __enter__(self) -> Watcher:
+    def __enter__(self) -> "Watcher":
         threading.Thread(target=self._hear, daemon=True).start()
         self.until(lambda state: True)
         return self

@@ -1,8 +1,6 @@
 """Pages that flood a console, in a process of their own: `python -m tests.support.console.flood HOST` with cookie and
 key of each on standard input, a line each. It prints that it begins and, when its input ends, how much was said."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading
@@ -36,7 +34,7 @@ class Flood:
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
 
-    def __enter__(self) -> Flood:
+    def __enter__(self) -> "Flood":
         self._process.stdin.write(self._keys)
         self._process.stdin.flush()
         self._process.stdout.readline()

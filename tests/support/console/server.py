@@ -1,7 +1,5 @@
 """A server as a cell starts it, for tests that talk to it as strangers do: over sockets, with clients not made here."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import queue
@@ -95,7 +93,7 @@ class Served:
 
     def ask(
         self, method: str, path: str, body: str | bytes | None = None, *, cookie: str | None = "", **headers: str | None
-    ) -> Reply:
+    ) -> "Reply":
         """One request by the standard library's client; headers of None are left out."""
         sent: dict[str, str | None] = {"host": self.host, "origin": self.origin if method == "POST" else None}
         sent |= {"cookie": self.cookie if cookie == "" else cookie}
@@ -113,7 +111,7 @@ class Served:
             link.endheaders(data)
             return Reply(link.getresponse())
 
-    def do(self, **words: Any) -> Reply:
+    def do(self, **words: Any) -> "Reply":
         """A command."""
         return self.ask("POST", "/api/do", json.dumps(words))
 

@@ -3,8 +3,6 @@
 It answers on 127.0.0.1 alone, keeps the wall's time, has no latch of its clock and sends no packet again.
 """
 
-from __future__ import annotations
-
 import ctypes
 import socket
 import time

@@ -5,8 +5,6 @@ Commands come on standard input, one a line, and are answered by one JSON line e
 `show` for what the arm itself knows.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -47,7 +45,7 @@ class ArmBench:
         )  # fmt: skip
         self.address = self._line()["address"]
 
-    def __enter__(self) -> ArmBench:
+    def __enter__(self) -> "ArmBench":
         return self
 
     def __exit__(self, *error: object) -> None:

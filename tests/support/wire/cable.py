@@ -1,7 +1,5 @@
 """A cable to an arm that can be pulled: bytes pass through as long as it is in, and are kept while it is out."""
 
-from __future__ import annotations
-
 import itertools
 import select
 import socket
@@ -41,7 +39,7 @@ class Cable:
         """In again."""
         self._in.set()
 
-    def __enter__(self) -> Cable:
+    def __enter__(self) -> "Cable":
         return self
 
     def __exit__(self, *error: object) -> None:

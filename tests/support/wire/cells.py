@@ -1,7 +1,5 @@
 """Simulated cells and the command line for tests that use the whole as an engineer would."""
 
-from __future__ import annotations
-
 import json
 import signal
 import socket

@@ -1,7 +1,5 @@
 """How far a test's clock is ahead of its simulated world's, though the test may not be run between two readings."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from drivers.clock import Clock

@@ -1,7 +1,5 @@
 """A simulated GigE Vision camera whose pictures carry the world time that they show, and its driver."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

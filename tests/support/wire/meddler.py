@@ -1,7 +1,5 @@
 """A controller of another kind: an arm behind a cable on which its RTDE packets come out changed."""
 
-from __future__ import annotations
-
 import socket
 import struct
 from collections.abc import Callable, Iterable

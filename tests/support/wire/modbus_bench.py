@@ -1,7 +1,5 @@
 """A simulated Modbus drive of a register map, and the rail connected to it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,7 +30,7 @@ class Drive:
     clock: Clock
 
     @classmethod
-    def of(cls, record: ModbusRailConfig, *, pty: bool = False, echo: bool = False) -> Drive:
+    def of(cls, record: ModbusRailConfig, *, pty: bool = False, echo: bool = False) -> "Drive":
         world = WorldClock(SPEED)
         params = RailParams(steps_per_turn=record.counts_per_turn, start=0.02, serial=4711)
         model = RailModel(params, np.random.default_rng(1))

@@ -1,7 +1,5 @@
 """Tables of other makes as docs/how-to/other-makes.md prints them, and cells with them."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from typing import Any

@@ -1,7 +1,5 @@
 """A rail's driver on the wire of a simulated TMCL module, beside the truth of its carriage."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass

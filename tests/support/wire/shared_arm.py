@@ -1,7 +1,5 @@
 """One arm over its wires for all tests of a file, and the one connection that they share."""
 
-from __future__ import annotations
-
 import pytest
 
 from drivers.errors import CellError

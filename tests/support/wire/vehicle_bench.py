@@ -1,7 +1,5 @@
 """The AgileX vehicle's driver on the simulated CAN bus, beside the vehicle's truth."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """A device's clock on the host's, where that clock was set while nobody looked."""
 
-from __future__ import annotations
-
 import pytest
 
 from drivers.clock import MAX_DRIFT, ClockMap, Latch

@@ -1,7 +1,5 @@
 """What is done at the end of a piece of work is done, and does not hide why the work ended."""
 
-from __future__ import annotations
-
 import pytest
 
 from drivers.errors import DeadlineError, DeviceFault, InterlockError, in_the_end

@@ -1,7 +1,5 @@
 """A process that is killed or frozen leaves nothing moving and no light on: by the simulated world's truth."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Promises of `drivers.last_words_child`."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """Makes beside the stock cell's: their records as docs/how-to/other-makes.md prints them, what is refused, no wires."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """Promises of `drivers.ports`."""
 
-from __future__ import annotations
-
 import socket
 import time
 

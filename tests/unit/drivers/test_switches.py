@@ -1,7 +1,5 @@
 """Laser and claw on the outputs of an arm: the interlock holds, and the feedback decides."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

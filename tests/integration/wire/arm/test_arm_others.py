@@ -1,7 +1,5 @@
 """The arm driver beside others: what they set, hold or switch at the arm is noticed and named, or is no fault."""
 
-from __future__ import annotations
-
 import socket
 import time
 from contextlib import closing, nullcontext

@@ -1,7 +1,5 @@
 """The controller's own kinematics over its wires: read, planned with, compared; what is done where it is not told."""
 
-from __future__ import annotations
-
 import socket
 import struct
 import threading

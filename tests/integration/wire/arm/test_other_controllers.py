@@ -1,7 +1,5 @@
 """The arm driver at controllers that are not as its own simulated one: refused in words at once, or understood."""
 
-from __future__ import annotations
-
 import itertools
 import struct
 import time

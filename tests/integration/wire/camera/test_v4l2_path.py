@@ -4,8 +4,6 @@ No camera and no kernel module is needed: `video_device.c` answers the calls by 
 loaded before the C library of a process of its own. What a real camera's firmware does otherwise is not tested.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

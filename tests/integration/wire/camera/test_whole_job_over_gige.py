@@ -1,7 +1,5 @@
 """A whole job whose scan camera is on GigE Vision: as accurate as over the frame stream."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

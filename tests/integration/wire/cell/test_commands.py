@@ -1,7 +1,5 @@
 """Single commands on one served cell: they connect what they need, move, refuse, look without touching, and recover."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """A served cell is the one of its files, its own file describes it, and its claw is filled as a person would."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

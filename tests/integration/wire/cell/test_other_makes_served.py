@@ -1,8 +1,6 @@
 """A cell with a Modbus rail, a laser on a relay board and a Robotiq-style claw, as docs/how-to/other-makes.md has
 it."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

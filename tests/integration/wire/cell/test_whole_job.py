@@ -1,7 +1,5 @@
 """The whole job on the simulated cell, as an engineer runs it: placed, aborted, killed, faulted, refused."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

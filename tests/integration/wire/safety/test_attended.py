@@ -1,8 +1,6 @@
 """A motion that somebody attends ends within 250 ms of their silence, of a frozen and of a killed program: by what the
 simulated arm and carriage themselves know."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

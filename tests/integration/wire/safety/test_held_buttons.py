@@ -1,8 +1,6 @@
 """A button held at a page moves a simulated arm and rail over their wires; whatever ends it, they stand within 250 ms,
 by the simulated world's own knowledge."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

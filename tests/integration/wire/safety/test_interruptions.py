@@ -1,7 +1,5 @@
 """Runs that something interrupts: scheduled faults and what the cell makes of them, and going on afterwards."""
 
-from __future__ import annotations
-
 import json
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The safe stop brings everything to rest at once, by the world's truth, and shuts the gate for whoever works."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The vehicle on CANopen keeps the contract of every vehicle, over its wire."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """The vehicle's driver on the simulated CAN bus, its odometry and its stops against the simulated vehicle."""
 
-from __future__ import annotations
-
 import math
 import time
 

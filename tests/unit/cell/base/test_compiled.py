@@ -1,7 +1,5 @@
 """Promises of the compiled loops: of a machine where numba does not load, and of when the others are loaded."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """A computer that wakes up late is noticed while somebody asks, and a person is told before a run begins."""
 
-from __future__ import annotations
-
 import pytest
 
 from cell.base import lateness

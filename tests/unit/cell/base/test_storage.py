@@ -1,7 +1,5 @@
 """Files that must survive are there whole, or as they were; a run whose output nobody reads says so."""
 
-from __future__ import annotations
-
 import os
 import resource
 import subprocess

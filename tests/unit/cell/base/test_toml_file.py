@@ -1,7 +1,5 @@
 """A file that is no TOML of ours is refused by name, with the line and what to do about it."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """A way between two stops that the vehicle cannot go is refused; the other refusals: `test_wrong_inputs.py`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

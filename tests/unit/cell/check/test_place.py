@@ -1,7 +1,5 @@
 """Jobs whose put-down makes no sense are refused with the value and what is allowed, before anything moves."""
 
-from __future__ import annotations
-
 import re
 from functools import reduce
 from operator import getitem

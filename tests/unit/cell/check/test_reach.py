@@ -1,7 +1,5 @@
 """What the arm has to reach for a job, and what is told of what it does not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

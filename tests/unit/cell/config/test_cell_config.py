@@ -2,8 +2,6 @@
 
 Boxes that a configuration or a job names are kept away from: by planned ways, by raw commands, by the vehicle."""
 
-from __future__ import annotations
-
 import tomllib
 from itertools import product
 from pathlib import Path

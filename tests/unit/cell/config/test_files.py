@@ -1,7 +1,5 @@
 """Which configuration a command works with: the named one, else the present folder's; nothing moves at another."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Promises of `cell.config.job`."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A UR10e over the placement area: its poses, its planner among the bodies of a cell, its flange by plain matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,7 +1,5 @@
 """Bodies that touch are named, between two looks at a way as well; those that may are left out."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -2,8 +2,6 @@
 
 Arms of every model, as drawn and as calibrated in the factory: against the vendor's description and real tables."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

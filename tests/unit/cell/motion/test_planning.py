@@ -1,7 +1,5 @@
 """Planned ways touch nothing, all along, and the same question gives the same way."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

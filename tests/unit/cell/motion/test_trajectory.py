@@ -1,7 +1,5 @@
 """Motions keep to the limits of joints, lines and carried points, and rest at both ends."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ambient light: the exposure that it allows, photographs taken again, and a line that it hides."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Frames are kept as they are, by a thread of its own; what cannot be written is told."""
 
-from __future__ import annotations
-
 import hashlib
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What the parts of a batch have alike is told from what they have by chance."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

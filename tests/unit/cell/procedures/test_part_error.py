@@ -1,7 +1,5 @@
 """What a place pose's stated uncertainty means at the part, by closed forms."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Named features of a placed part against closed forms."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from functools import partial

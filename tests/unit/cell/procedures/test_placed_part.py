@@ -1,7 +1,5 @@
 """A placed part's figures against closed forms; where it is seen is tested at `verify`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import cast
 

@@ -1,7 +1,5 @@
 """What the sweep of a job looks for, and what keeps a part from being unloaded."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A dashboard server, and an arm with its driver over the wires, one for each file."""
 
-from __future__ import annotations
-
 import itertools
 import socket
 import threading

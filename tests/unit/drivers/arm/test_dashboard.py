@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.dashboard`."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.factory`."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.faults`."""
 
-from __future__ import annotations
-
 import pytest
 
 from drivers.arm.faults import fault, unlock

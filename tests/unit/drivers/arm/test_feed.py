@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.feed`."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.limits`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

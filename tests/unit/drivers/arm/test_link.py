@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.link`."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.motion`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation

@@ -1,7 +1,5 @@
 """How the arm's motions end: by a stop, a pulled cable, a recovery that is stopped; and what is not the driver's."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import re

@@ -1,7 +1,5 @@
 """The arm driver against a simulated arm over the real protocols, through everything that can go wrong."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A folder of recorded pictures with their times, as a camera; and what V4L2 pictures become."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Frames between the thread that receives them and the one that uses them: which are lost, stale, or too many."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Callable

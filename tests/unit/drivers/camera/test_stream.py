@@ -1,7 +1,5 @@
 """The camera driver on the simulated camera's wire: fresh frames, true times, known losses."""
 
-from __future__ import annotations
-
 import math
 import socket
 import threading

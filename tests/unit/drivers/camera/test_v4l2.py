@@ -1,7 +1,5 @@
 """Promises of `drivers.camera.v4l2`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

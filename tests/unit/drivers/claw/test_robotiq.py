@@ -1,7 +1,5 @@
 """A Robotiq-style claw on its socket: what it finds is the evidence, whatever was commanded."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """An address that cannot be one is refused with what it should look like; a right one passes as it was written."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import pytest

@@ -1,7 +1,5 @@
 """Promises of `drivers.common.units`."""
 
-from __future__ import annotations
-
 from itertools import product
 
 import numpy as np

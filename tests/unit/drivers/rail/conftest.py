@@ -1,7 +1,5 @@
 """The rail on its wire, and the same homed."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Promises of `drivers.rail.axis`."""
 
-from __future__ import annotations
-
 import re
 from typing import Any
 

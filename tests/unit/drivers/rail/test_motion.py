@@ -1,7 +1,5 @@
 """The watch over a motion of the rail, and what a sweep tells, by readings that are written down here."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 

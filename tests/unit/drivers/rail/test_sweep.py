@@ -1,7 +1,5 @@
 """What round trips tell of a rail's place in time: never less than the truth, as much as the shortest ones allow."""
 
-from __future__ import annotations
-
 import re
 import threading
 from collections.abc import Callable

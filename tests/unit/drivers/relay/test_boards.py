@@ -1,7 +1,5 @@
 """Laser and claw on relay boards over a pseudo terminal: what is known of a relay, and when; and who else can tell."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

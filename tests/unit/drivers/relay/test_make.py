@@ -1,7 +1,5 @@
 """Promises of `drivers.relay.make`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

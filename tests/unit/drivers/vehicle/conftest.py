@@ -1,7 +1,5 @@
 """The AgileX vehicle on its bus, and the same enabled."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """The vehicle's driver with the simulated vehicle's own frames, on a bus inside this process: what must never fail."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

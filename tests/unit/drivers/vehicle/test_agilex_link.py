@@ -1,7 +1,5 @@
 """The vehicle's message table against the protocol's byte layout, and odometry against geometry."""
 
-from __future__ import annotations
-
 import math
 import struct
 

@@ -1,7 +1,5 @@
 """Promises of `drivers.vehicle.can_link`."""
 
-from __future__ import annotations
-
 import can
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Promises of `drivers.vehicle.faults`."""
 
-from __future__ import annotations
-
 from drivers.vehicle.faults import driver_trouble, system_trouble
 
 

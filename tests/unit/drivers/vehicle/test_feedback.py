@@ -1,7 +1,5 @@
 """What the vehicle's feedback means: error bits in words, and when odometry no longer tells where the vehicle is."""
 
-from __future__ import annotations
-
 import pytest
 
 from drivers.errors import DeadlineError, DeviceFault

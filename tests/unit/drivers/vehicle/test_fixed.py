@@ -1,7 +1,5 @@
 """An arm on a fixed frame: there is nothing to drive, and a station that stands elsewhere is refused with how far."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from pathlib import Path

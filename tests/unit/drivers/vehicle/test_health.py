@@ -1,7 +1,5 @@
 """Promises of `drivers.vehicle.health`."""
 
-from __future__ import annotations
-
 import struct
 
 import can

@@ -1,7 +1,5 @@
 """Promises of `drivers.vehicle.protocol_bufsocket`."""
 
-from __future__ import annotations
-
 import socket
 
 import pytest

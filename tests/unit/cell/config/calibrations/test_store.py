@@ -1,7 +1,5 @@
 """A stored calibration is taken for its own devices, its own configuration and its own time only."""
 
-from __future__ import annotations
-
 import json
 import time
 from dataclasses import replace

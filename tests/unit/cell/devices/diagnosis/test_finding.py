@@ -1,7 +1,5 @@
 """`cell find` on systems of many kinds: what is there is listed with what to write, what is odd is said."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket

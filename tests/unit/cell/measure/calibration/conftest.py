@@ -1,7 +1,5 @@
 """Observations of a scan head that is drawn independently of the estimators, and their calibration."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

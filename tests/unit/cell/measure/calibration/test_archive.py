@@ -1,7 +1,5 @@
 """Promises of the archive, and of the adjustment beside the bound, on observations drawn independently."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A board is seen where the camera projects it, and the equations of its pose are those of finite differences."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 

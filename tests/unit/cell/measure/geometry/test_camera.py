@@ -1,7 +1,5 @@
 """Promises of `cell.measure.geometry.camera`."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Promises of the geometry: derivatives are those of finite differences, closed forms are cases of the general one."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Poses in and out of other forms, their covariances, and the root that variants of a calibration are made with."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,7 +1,5 @@
 """A figure that is no number passes no gate: each asks whether it is good, not whether it is bad."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from types import SimpleNamespace as Told
 from typing import Any

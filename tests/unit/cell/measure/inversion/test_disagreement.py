@@ -2,8 +2,6 @@
 
 What stands on the place is seen in the scan, and refused before the part is put onto it."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Flush along the edge of a placed part, against closed forms; that of a part in the world is tested at `verify`."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the points about a feature say by themselves, in scans whose truth is known; a part in the world: `verify`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The gap below a part as drawn: against rays, in the scan of a simulated cell, and what does not fit is refused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

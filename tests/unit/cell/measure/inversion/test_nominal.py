@@ -1,7 +1,5 @@
 """Promises of `cell.measure.inversion.nominal`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

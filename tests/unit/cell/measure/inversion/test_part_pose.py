@@ -1,7 +1,5 @@
 """Which motions of a part its faces show, and what of it a sweep sees; where it lies is tested at `verify`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

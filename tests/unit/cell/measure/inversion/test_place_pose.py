@@ -1,7 +1,5 @@
 """What neighbouring points are off by together is found from the scan, and stated where few patches tell a motion."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """The pose found is the true one, its stated uncertainty is true, and what cannot be known is refused by name."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

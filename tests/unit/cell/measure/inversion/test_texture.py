@@ -1,7 +1,5 @@
 """Sa, Sq and Sz of sines are their closed forms, the filter is scipy's, and noise is never taken for a surface."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter

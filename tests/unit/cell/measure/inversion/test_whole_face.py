@@ -1,7 +1,5 @@
 """What is gone of a placed part's face, or covered, in scans whose truth is known; in the world: `verify`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The cloud lies where an independent ray trace puts the surface, and its noise is what it says."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pinocchio as pin

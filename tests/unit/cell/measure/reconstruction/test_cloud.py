@@ -1,7 +1,5 @@
 """Sweeps from several poses make one cloud; their seams show what the poses err by; the arm alone can sweep too."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

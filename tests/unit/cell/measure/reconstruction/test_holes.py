@@ -1,7 +1,5 @@
 """Filled holes are as good as they say and never taken for measurements; other programs read what is written."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Promises of `cell.measure.reconstruction.outliers`."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

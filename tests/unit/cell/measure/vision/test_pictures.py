@@ -1,7 +1,5 @@
 """Pictures that cannot be read are refused with their reason."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

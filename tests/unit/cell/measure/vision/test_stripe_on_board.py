@@ -1,7 +1,5 @@
 """Which stripe points lie on a board, against the plane in closed form."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 

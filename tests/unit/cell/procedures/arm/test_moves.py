@@ -1,7 +1,5 @@
 """The arm's moves: at a person's pace, with the same joints wherever it comes from, and to where it rests."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

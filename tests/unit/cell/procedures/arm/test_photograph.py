@@ -1,7 +1,5 @@
 """A photograph of the station's board by the simulated camera: what it states, and what it refuses."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

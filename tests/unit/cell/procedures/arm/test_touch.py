@@ -1,7 +1,5 @@
 """First touch: where a force begins, by closed forms; and a laser that turned unseen, on the simulated cell."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A calibration view that misses the board is taken again from where the earlier views say that the board is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,7 +1,5 @@
 """The interim check on the devices without wires: a job is refused, or told, before its part moves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path

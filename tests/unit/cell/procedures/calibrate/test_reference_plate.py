@@ -1,7 +1,5 @@
 """The plate on the claw is looked at by a simulated head: where its edge is, and what has slipped since."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

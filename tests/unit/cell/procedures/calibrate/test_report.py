@@ -1,7 +1,5 @@
 """How good a calibration is: what its report says of noise and of the place, and draws."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

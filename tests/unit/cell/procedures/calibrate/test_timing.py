@@ -1,7 +1,5 @@
 """How late a simulated camera's stamps come, and its shutter, from sweeps over the fine board."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

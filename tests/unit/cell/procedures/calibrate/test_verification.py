@@ -1,7 +1,5 @@
 """A laser that turned: what a verification's board confirms is kept for jobs, what the plate alone tells is stated."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

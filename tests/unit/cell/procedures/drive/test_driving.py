@@ -1,7 +1,5 @@
 """Along a line and on the spot the vehicle comes to rest where it was sent, on odometry, also with late feedback."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

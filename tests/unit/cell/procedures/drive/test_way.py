@@ -1,7 +1,5 @@
 """The vehicle drives only from where it is known to stand, not too far unseen, and not through the station."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A vehicle that rocks is waited for, and stated where it does not rest."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 

@@ -1,7 +1,5 @@
 """A part out of its place is gripped again and placed by what was seen, where that helps, and only there."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

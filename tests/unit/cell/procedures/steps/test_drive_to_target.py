@@ -1,7 +1,5 @@
 """The drive to the target: only from a known place, until the board says that it stands there."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The place by the job's step: a carriage that droops is in its covariance, and what is known too little is told."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A sequence per job: its steps as data, and one more of them from outside."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint

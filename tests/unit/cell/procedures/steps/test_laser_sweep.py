@@ -1,7 +1,5 @@
 """A sweep counts its steps afterwards; a repeated one is slower, with its lines as close as before."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 
 import pytest

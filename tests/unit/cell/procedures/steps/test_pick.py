@@ -1,7 +1,5 @@
 """A part is found by its own mesh, gripped where it lies, set into its nest and looked at there: whole virtual jobs."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

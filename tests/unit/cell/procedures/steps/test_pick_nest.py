@@ -1,7 +1,5 @@
 """A part is found in its nest, gripped where it lies, and placed; and what keeps it from being gripped."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Placing, on the simulated arm without wires: what the force, the claw and a fault make of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace

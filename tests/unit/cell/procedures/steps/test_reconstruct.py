@@ -1,7 +1,5 @@
 """The cloud of a job: no earlier one is taken for it, and what was refused is shown."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The placed part as the scan head sees it: against where it truly lies, and against a fit that others wrote."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

@@ -1,7 +1,5 @@
 """A part in its nest is looked at, with the nest's own tolerances."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Where a job is done: what is stated of the arm."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """A surface that lies elsewhere than where it was swept is seen before the part is put down."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A stored sweep is trusted only as long as nothing that it stands on has changed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast

@@ -2,8 +2,6 @@
 
 By the rail, and by the arm alone: then its place is known as well as the arm's times are."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.child.control`."""
 
-from __future__ import annotations
-
 import threading
 import time
 

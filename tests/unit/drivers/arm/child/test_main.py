@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.child.main`."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.child.outputs`."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.support.wire.arm_bench import soon

@@ -1,7 +1,5 @@
 """What the arm driver's child makes of the arm's states, with states that are written down here and no arm."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace

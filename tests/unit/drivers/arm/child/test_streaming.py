@@ -1,7 +1,5 @@
 """Promises of `drivers.arm.child.streaming`."""
 
-from __future__ import annotations
-
 import signal
 import time
 

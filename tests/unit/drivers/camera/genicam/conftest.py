@@ -1,7 +1,5 @@
 """A simulated camera on GigE Vision."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Promises of `drivers.camera.genicam.acquisition`."""
 
-from __future__ import annotations
-
 import struct
 import time
 

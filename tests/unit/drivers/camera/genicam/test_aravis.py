@@ -3,8 +3,6 @@
 The latter stands for USB3 Vision: everything but the USB transport itself is tested, without addresses, heartbeat and
 resends."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """The GenICam driver over real GigE Vision: Aravis on one side, the simulated camera on the other, loopback between."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

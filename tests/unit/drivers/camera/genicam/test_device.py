@@ -1,7 +1,5 @@
 """Promises of `drivers.camera.genicam.device`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

@@ -1,7 +1,5 @@
 """Promises of `drivers.camera.genicam.make`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

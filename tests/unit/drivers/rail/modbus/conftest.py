@@ -1,7 +1,5 @@
 """A simulated Modbus drive."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

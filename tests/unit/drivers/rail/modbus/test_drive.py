@@ -1,7 +1,5 @@
 """Promises of `drivers.rail.modbus.drive`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace

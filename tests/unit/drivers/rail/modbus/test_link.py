@@ -1,7 +1,5 @@
 """Promises of `drivers.rail.modbus.link`."""
 
-from __future__ import annotations
-
 import itertools
 import socket
 import struct

@@ -1,7 +1,5 @@
 """Promises of `drivers.rail.modbus.make`."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The rail on Modbus RTU, with two register maps: the drive is simulated with pymodbus, the frames are our own."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

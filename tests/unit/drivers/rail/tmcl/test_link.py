@@ -1,7 +1,5 @@
 """TMCL telegrams against the vendor's manual and the vendor's own library."""
 
-from __future__ import annotations
-
 import itertools
 import socket
 import threading

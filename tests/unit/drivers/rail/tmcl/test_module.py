@@ -1,7 +1,5 @@
 """Promises of `drivers.rail.tmcl.module`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

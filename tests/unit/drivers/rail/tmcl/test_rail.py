@@ -1,7 +1,5 @@
 """The rail's driver on the simulated rail's wire, its motions against the simulated carriage."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """The vehicle on CANopen with its simulated drives, on a bus inside this process."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """Promises of `drivers.vehicle.cia402.bus`."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

@@ -1,7 +1,5 @@
 """Promises of `drivers.vehicle.cia402.drive`."""
 
-from __future__ import annotations
-
 import pytest
 
 from drivers.vehicle.cia402.drive import DriveState, leads_to_enabled, leads_to_switched_on, may_turn, meaning, state_of

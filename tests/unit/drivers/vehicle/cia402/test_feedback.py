@@ -1,7 +1,5 @@
 """What a CANopen drive's numbers mean: states, emergencies, units, and readings that belong together."""
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Promises of `drivers.vehicle.cia402.make`."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Promises of `drivers.vehicle.cia402.master`."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest

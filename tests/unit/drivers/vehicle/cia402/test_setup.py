@@ -1,7 +1,5 @@
 """Promises of `drivers.vehicle.cia402.setup`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest

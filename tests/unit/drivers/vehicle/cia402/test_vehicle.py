@@ -1,7 +1,5 @@
 """The vehicle on CANopen with its simulated drives, on a bus inside this process: what must never fail."""
 
-from __future__ import annotations
-
 import time
 
 import pytest

@@ -1,7 +1,5 @@
 """Promises of the verification and of the named faults, on worlds that the simulator's optics and arm observe."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

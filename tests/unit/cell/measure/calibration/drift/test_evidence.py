@@ -1,7 +1,5 @@
 """Promises of the evidence for a change: of a good calibration it scatters as it says, and its reference is stored."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The witness of the laser's pointing: what it says of a turned light plane, by pictures of the simulator's optics."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

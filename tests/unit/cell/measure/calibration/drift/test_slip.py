@@ -1,7 +1,5 @@
 """A scan head that slipped since the calibration, and pictures that come later, are seen on the plate on the claw."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How late a camera's stamps come, from sweeps to and fro: on boards projected by OpenCV, and on the simulated cell."""
 
-from __future__ import annotations
-
 import time
 from contextlib import nullcontext, suppress
 from dataclasses import replace

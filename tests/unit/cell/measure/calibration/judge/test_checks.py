@@ -1,7 +1,5 @@
 """A figure is held against its limits, and says what is the matter."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

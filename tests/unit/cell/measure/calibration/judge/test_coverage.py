@@ -1,7 +1,5 @@
 """Promises of the examination of a calibration: what was seen, what limits it, and what would better it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

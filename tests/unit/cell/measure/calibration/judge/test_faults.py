@@ -1,7 +1,5 @@
 """Promises of the faults that a calibration names, on worlds that the simulator's optics and arm observe."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stripes that are no line, or lie in no plane with the others, are named; a plane is as sure as it scatters."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

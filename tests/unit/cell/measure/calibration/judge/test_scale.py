@@ -1,7 +1,5 @@
 """A board that was printed larger or smaller than its name says is told by the arm's ways."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Promises of the adjustment: deviations as large as stated over many draws, and misread dots that do no harm."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 The observations come from a generator that shares nothing with the estimator; it tells the bow by the distance from the
 laser, the product by that along the camera's axis."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

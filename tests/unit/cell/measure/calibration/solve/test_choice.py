@@ -1,7 +1,5 @@
 """A camera that the arm contradicts is stated with what parts the two."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Promises of a camera from pictures of a board that is bent."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

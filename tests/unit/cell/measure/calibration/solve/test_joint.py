@@ -1,7 +1,5 @@
 """Promises of photographs between which only the rail moves: they share where the arm really stands."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Promises of the normal equations: rests eliminated as in the dense system, derivatives as by finite differences."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

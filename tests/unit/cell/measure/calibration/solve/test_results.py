@@ -1,7 +1,5 @@
 """Promises of the calibration, on observations of a head that is drawn independently of it, with known noise."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Promises of the closed forms that the adjustment starts from: hand-eye, and the light plane by the paper's steps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

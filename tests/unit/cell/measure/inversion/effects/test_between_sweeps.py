@@ -1,7 +1,5 @@
 """A surface that creeps between two sweeps: its cloud is put back, its place carried on with what is not known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A vehicle that rocks while the laser sweeps: seen in a made-up scan of known motion, and not seen where it stands."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Pictures of boards from the simulator's optics, which share no code with the detection."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 

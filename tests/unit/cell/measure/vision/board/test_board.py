@@ -1,7 +1,5 @@
 """Promises of the board detection, on pictures rendered by the simulator's optics, which share no code with it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

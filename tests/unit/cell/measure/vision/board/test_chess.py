@@ -1,7 +1,5 @@
 """Promises of chessboards in pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

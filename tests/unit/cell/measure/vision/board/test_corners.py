@@ -1,7 +1,5 @@
 """Light that falls off moves no chessboard corner."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import erf

@@ -1,7 +1,5 @@
 """Promises of a dot's edge, on dots drawn from a formula."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.special import ndtr

@@ -1,8 +1,6 @@
 """Promises of a board's uncertainty: each point counts by its own σ, light that falls off moves nothing, what was moved
 is dropped. Truths are closed forms and known places; no picture is drawn by the code that is tested."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A board that ends elsewhere than the named one, or that could be two, is refused."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Which dot of a board is which: by its rings also in part, and of a symmetric board by an assumption."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

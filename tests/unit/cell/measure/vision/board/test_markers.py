@@ -1,7 +1,5 @@
 """Promises on grids of AprilTags: corners to hundredths of a pixel, and a refusal that names the dictionary seen."""
 
-from __future__ import annotations
-
 from functools import cache
 
 import cv2

@@ -1,7 +1,5 @@
 """Promises of the boards' names."""
 
-from __future__ import annotations
-
 import pytest
 
 from cell.measure.vision.board.view import parse_board

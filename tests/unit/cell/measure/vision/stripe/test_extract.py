@@ -1,7 +1,5 @@
 """Promises of the stripe extraction, on pictures drawn from a formula; how near to its bound: `test_fit.py`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Points of a stripe that may be off are marked with the reason."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.ndimage import gaussian_filter
 

@@ -1,7 +1,5 @@
 """Promises of the stripe as workshops have it: other profiles, widths, texture, colour, depth, edges, second lines."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """The colour in which a line stands out is found."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from cell.measure.vision.stripe.extract import extract

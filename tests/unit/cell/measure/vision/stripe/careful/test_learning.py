@@ -1,7 +1,5 @@
 """The profile that lines share is learned from a picture, and comes near its own bound."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

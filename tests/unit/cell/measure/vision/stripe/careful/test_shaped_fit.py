@@ -1,7 +1,5 @@
 """Centres by a profile of any shape, and the shape that samples show, against closed forms."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Promises of `cell.measure.vision.stripe.careful.surroundings`."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

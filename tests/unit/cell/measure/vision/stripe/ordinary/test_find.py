@@ -1,7 +1,5 @@
 """The search that takes most lines side by side, against the one that takes any line by itself."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

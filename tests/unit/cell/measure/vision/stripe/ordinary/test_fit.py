@@ -1,7 +1,5 @@
 """Promises of the stripe's centres beside the Cramér–Rao bound, and of their stated deviations."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

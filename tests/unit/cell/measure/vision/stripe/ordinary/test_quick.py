@@ -1,7 +1,5 @@
 """Ordinary pictures: gaps, saturated cores, second peaks, and what is refused."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

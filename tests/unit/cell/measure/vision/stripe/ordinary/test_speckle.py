@@ -1,7 +1,5 @@
 """Promises of the stated deviations where the laser speckles, in single pictures and in streams."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
