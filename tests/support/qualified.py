@@ -41,8 +41,12 @@ def quick(task: WorldTask) -> Row:
 
 
 def deadly(task: WorldTask) -> Row:
-    """As `quick`; world 3 kills each process that runs it."""
-    if task.seed == 3:
+    """As `quick`; world 3 kills each process that runs it, world 5 the first one."""
+    once = task.folder / "killed"
+    if task.seed == 3 or (task.seed == 5 and not once.exists()):
+        task.folder.mkdir(exist_ok=True)
+        if task.seed == 5:
+            once.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return quick(task)
 

@@ -1,5 +1,7 @@
 """What a run was judged by: its measured figures beside their limits, and what it looked at when it was refused."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +42,7 @@ class RefusalEvidence:
     seen: Mapping[str, object]
 
     @classmethod
-    def of(cls, result: RunResult) -> "RefusalEvidence":
+    def of(cls, result: RunResult) -> RefusalEvidence:
         """What the error behind the end of a run shows; nothing for other ends."""
         error = result.error
         if result.outcome in JUDGED and isinstance(error, RefusedError):

@@ -82,6 +82,8 @@ class ObservedCell:
     scene: Scene
     config: CellConfig
     rng: np.random.Generator
+    bend: float = 0.0
+    """Sagitta in m of the fine board, bent along its x about its middle."""
 
     def __post_init__(self) -> None:
         self.truth = Truth.of(self.scene)
@@ -116,7 +118,7 @@ class ObservedCell:
     def scan_view(self, rest: Rest, carriage: float) -> BoardView:
         """The fine board in a photograph of the scan camera."""
         seen = self._camera_from(rest, self.truth.base_from_fine, carriage)
-        return self._photo(seen, self.truth.scan_lens, drawing.SCAN_SIZE, self.fine)
+        return self._photo(seen, self.truth.scan_lens, drawing.SCAN_SIZE, self.fine, self.bend)
 
     def target_view(self, rest: Rest) -> BoardView:
         """The large board in a photograph of the target camera."""
@@ -136,6 +138,14 @@ class ObservedCell:
         foot = np.linalg.solve(system, np.array([truth.plane_distance, normal @ at, system[2] @ middle]))
         line = foot + np.linspace(-0.04, 0.04, 801)[:, None] * system[2]
         local = (line - at) @ seen[:3, :3]
+        if self.bend:
+            # Two rounds move the line onto the bent surface: the rest of the shift is far below a micrometre.
+            for _ in range(3):
+                sag = bend_of(self.fine, self.bend, local)
+                slope = truth.plane_normal @ normal
+                away = normal - slope * truth.plane_normal
+                line = foot + np.linspace(-0.04, 0.04, 801)[:, None] * system[2] + sag[:, None] * away / (1 - slope**2)
+                local = (line - at) @ seen[:3, :3]
         centre = centre_of(self.fine)[:2]
         on = (np.abs(local[:, :2] - centre) < size / 2).all(axis=1)
         columns = np.full(height, np.nan)
@@ -152,9 +162,11 @@ class ObservedCell:
         base_from_camera = base_from_camera @ shifted(carriage * self.truth.rail_direction)
         return np.asarray(inverse(base_from_camera) @ base_from_board, dtype=np.float64)
 
-    def _photo(self, pose: Array, lens: Array, size: tuple[int, int], spec: BoardSpec) -> BoardView:
+    def _photo(self, pose: Array, lens: Array, size: tuple[int, int], spec: BoardSpec, bend: float = 0.0) -> BoardView:
         points = spec.points()
         rims = (points[:, None] + spec.dot_radius * circle(RIM)).reshape(-1, 3)
+        if bend:
+            rims[:, 2] += bend_of(spec, bend, rims)
         pixels = _optics(lens, size).project(rims @ pose[:3, :3].T + pose[:3, 3]).reshape(len(points), RIM, 2)
         centres = ellipse_centres(pixels) + self.rng.normal(0.0, DOTS_PX, (len(points), 2))
         inside = ((pixels > EDGE_PX) & (pixels < np.array(size) - 1 - EDGE_PX)).all(axis=(1, 2))
@@ -188,6 +200,12 @@ class ObservedCell:
             rest = self.move(view.base_from_flange.homogeneous)
             made.append(TargetObservation(self.target_view(rest), from_matrix(rest.reported), f"large {k + 1}"))
         return made
+
+
+def bend_of(spec: BoardSpec, sagitta: float, local: Array) -> Array:
+    """How far (n,) in m a board bent along x stands out of its plane at board coordinates (n, 3)."""
+    half = 0.5 * float(np.ptp(spec.points()[:, 0]))
+    return np.asarray(sagitta * ((local[:, 0] - centre_of(spec)[0]) / half) ** 2, dtype=np.float64)
 
 
 def shifted(translation: Array) -> Array:

@@ -4,7 +4,6 @@ import threading
 import time
 from multiprocessing import active_children
 from pathlib import Path
-from typing import Any
 
 import distributed
 import pytest
@@ -12,26 +11,27 @@ import pytest
 from cell.apps.qualify import workers as module
 from cell.apps.qualify.campaign import Prefix, Target
 from cell.apps.qualify.rows import Row, RowStore
-from cell.apps.qualify.workers import Processes, open_workers
+from cell.apps.qualify.workers import Cluster, Processes, Workers, open_workers
 from drivers.errors import CellError, ConfigError
 from tests.support.qualified import campaign, deadly, other_code, quick
 
 pytest.importorskip("pyarrow")
 
 
-@pytest.mark.parametrize("dask", [False, True], ids=["processes", "cluster"])
-def test_a_worker_that_dies_takes_no_other_world_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dask: bool
-) -> None:
-    """World 3 kills each of its workers; one more is enough here, each takes seconds to begin."""
-    monkeypatch.setattr("cell.apps.qualify.campaign.DEATHS", 1)
-    workers: Any = open_workers(None, None, "local:1") if dask else Processes(2)
-    workers.work = deadly
-    wanted = campaign(tmp_path, Target(4))
-    wanted.run(RowStore(tmp_path), lambda: workers, lambda prefix: None)
-    found = {row["seed"]: row for row in wanted.rows(RowStore(tmp_path), 4)}
+def rows(folder: Path, workers: Workers, count: int = 6) -> dict[int, Row]:
+    wanted = campaign(folder, Target(count))
+    wanted.run(RowStore(folder), lambda: workers, lambda prefix: None)
+    return {int(str(row["seed"])): row for row in wanted.rows(RowStore(folder), count)}
+
+
+def require_same(found: dict[int, Row], folder: Path) -> None:
+    """As worlds give them whose workers live, but for the third, which kills each of its own."""
     assert found.pop(3)["code"] == "WorkerDied"
-    assert found == {seed: quick(wanted.task(seed)) for seed in (1, 2, 4)}
+    assert found == {seed: quick(campaign(folder, Target(1)).task(seed)) for seed in found}
+
+
+def test_a_process_that_dies_takes_no_other_world_with_it(tmp_path: Path) -> None:
+    require_same(rows(tmp_path, Processes(2, deadly), 4), tmp_path)
 
 
 def test_a_process_that_died_or_has_run_enough_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,9 +56,8 @@ def test_a_process_that_died_or_has_run_enough_is_replaced(tmp_path: Path, monke
 
 
 def test_a_worker_with_other_files_ends_the_campaign(tmp_path: Path) -> None:
-    workers = Processes(1, other_code)
     with pytest.raises(ConfigError, match="another code"):
-        campaign(tmp_path, Target(1)).run(RowStore(tmp_path), lambda: workers, lambda prefix: None)
+        rows(tmp_path, Processes(1, other_code))
 
 
 @pytest.mark.parametrize(
@@ -86,9 +85,18 @@ def test_by_default_each_core_has_a_process() -> None:
     assert open_workers(None, None, None).room == module.cores()
 
 
+def test_a_cluster_gives_the_same_rows_although_workers_are_killed(tmp_path: Path) -> None:
+    cluster = open_workers(None, None, "local:2")
+    assert isinstance(cluster, Cluster)
+    cluster.work = deadly
+    require_same(rows(tmp_path, cluster, 12), tmp_path)
+    assert (tmp_path / "killed").exists()
+
+
 def test_a_scheduler_that_goes_away_leaves_the_rows_and_says_how_to_go_on(tmp_path: Path) -> None:
-    started = distributed.LocalCluster(n_workers=1, processes=False, protocol="tcp", dashboard_address=None)
+    started = distributed.LocalCluster(n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
     cluster = open_workers(None, started.scheduler_address, None)
+    assert isinstance(cluster, Cluster)
     cluster.work = slow
     ends = threading.Thread(target=started.close)
 
