@@ -33,7 +33,7 @@ FAR_M = 1.0
 BESIDE_PART_M = 2e-3
 """A pin or a hole's rim may stand out of the mesh of a part so far."""
 OUT_OF_BOX_M = 0.5e-3
-"""So much of the mesh of a part outside its box is not worth a word."""
+"""A part's mesh may go so far beyond its box, m, without a word."""
 
 
 def contact_problems(job: Job, config: CellConfig, mesh: Path) -> Iterator[str]:
@@ -147,8 +147,11 @@ def contact_notes(job: Job, mesh: Path) -> Iterator[str]:
         return
     low, high = NominalSurface.load(Path(job.part.mesh), unit=job.part.mesh_unit).extent
     x, y, z = job.grasp.size
-    if (out := float(max(*(np.maximum(-low, high)[:2] - (x / 2, y / 2)), high[2] - z, -low[2]))) > OUT_OF_BOX_M:
-        yield f"the part's mesh goes {1e3 * out:.1f} mm beyond its box, grasp.size: the arm keeps only that box clear"
+    beyond = float(np.max([high - (x / 2, y / 2, z), (-x / 2, -y / 2, 0.0) - low]))
+    if beyond > OUT_OF_BOX_M:
+        yield (
+            f"the part's mesh goes {1e3 * beyond:.1f} mm beyond its box, grasp.size: the arm keeps only that box clear"
+        )
     if (found := _drawn(job, mesh)) is not None:
         yield f"the part's mating face, as drawn: {found.words}"
     if verify.STEP.name not in kind_of(job).names:

@@ -108,8 +108,10 @@ def _where(folder: Path) -> str:
 
 
 def _dry_run(report: Mapping[str, object]) -> str:
-    """The command for the same simulated world, without defaults; after a busy computer's fault on the other clock."""
-    report = {**report, "clock": "virtual"} if ".owner_frozen)" in str(report.get("reason")) else report
+    """The command for the same simulated world, without defaults; on the virtual clock where this computer was too busy
+    for the wall's. A calibration's report tells that in its reason alone."""
+    if ".owner_frozen)" in str(report.get("reason")):
+        report = {**report, "clock": "virtual"}
     usual = {"seed": 1, "level": "nominal", "clock": "wall"}
     options = (f"--{key} {report[key]}" for key, value in usual.items() if report.get(key, value) != value)
     return " ".join(["cell dry-run", *options])

@@ -16,6 +16,7 @@ from cell.config.cell_config import default_toml, load_config
 from drivers.errors import Aborted, ConfigError, RefusedError
 from tests.support import Typed
 from tests.support.described_cells import quick_job
+from tests.support.qualified import compared
 
 SEED = 2
 
@@ -48,9 +49,13 @@ def test_of_its_runs_nothing_is_kept_but_the_calibration(row: Row, task: WorldTa
     assert kept[0].endswith("-TARGET.json")
 
 
-def test_it_is_calibrated_once(row: Row, task: WorldTask, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_again_it_is_the_same_without_another_calibration(
+    row: Row, task: WorldTask, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Cell, "calibrate", None)
-    world._calibrate(task, world._config(task, tmp_path))
+    again = run_world(task)
+    assert again is not None
+    assert compared(again) == compared(row)
 
 
 def test_its_command_repeats_it(row: Row, task: WorldTask, here: Path, typed: Typed) -> None:
