@@ -6,20 +6,21 @@ import numpy as np
 import pytest
 
 from cell import Cell
+from cell.devices.simulated.direct import VirtualCell
+from cell.run.record.replay import replay
 from lab.bench.job.whole_job import JobRecord
 from sim_backends.world.drawing import inverse
 from statemachine.step import Event
-from tests.support.described_cells import LEAN, changed, described, quick_job
+from tests.support.described_cells import UNDRAWN, described, quick_job
 
 
 def test_a_part_is_placed_at_each_stop_also_when_the_second_run_was_cut_short(
     placed_pot: JobRecord, calibrated_folder: Path
 ) -> None:
-    fast, told = quick_job("two-stations", calibrated_folder, 20.0), list[str]()
-    # How a placed part is looked at is the same at each.
-    fast.write_text(changed(fast.read_text(encoding="utf-8"), {"place": {"verify": '"none"'}}), encoding="utf-8")
-    cell_file, _ = described(calibrated_folder, LEAN)
+    fast, told = quick_job("two-stations", calibrated_folder), list[str]()
+    cell_file, _ = described(calibrated_folder, UNDRAWN)
     with Cell.open(cell_file, sim="all", seed=placed_pot.seed, clock="virtual", job=fast) as cell:
+        assert isinstance(cell.simulated, VirtualCell)
         world = cell.simulated.world
 
         def end(event: Event) -> None:
@@ -34,7 +35,7 @@ def test_a_part_is_placed_at_each_stop_also_when_the_second_run_was_cut_short(
         assert batch.runs[1].report["part"] == "held"
         done = cell.resume()
         assert (done.outcome, done.report["stop"], done.report["job"]) == ("placed", "right", "two-stations#2")
-        assert world.collisions.found == ()
+        assert world.collisions.found == () and all(each.same for each in replay(done.folder))
         for item in world._items:
             lies = inverse(item.scene.world_from_surface) @ item.part.part_pose(np.eye(4))
             assert not item.part.held and np.linalg.norm(lies[:3, 3]) < 0.6e-3
