@@ -17,7 +17,7 @@ SPIN = """
 import os, sys, threading, time
 from drivers.last_words_child import raise_priority
 def spin():
-    end = time.monotonic() + 0.5
+    end = time.monotonic() + 1.0
     while time.monotonic() < end:
         pass
 raise_priority()

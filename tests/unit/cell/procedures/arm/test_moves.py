@@ -57,6 +57,12 @@ def mover_with(size: tuple[float, float, float] | None) -> Mover:
     return Mover(cell.devices.arm, cell.clock, CONFIG, job, interlocks=cell.devices.interlocks)
 
 
+@pytest.mark.parametrize("size", [None, WIDE])
+def test_the_gate_knows_the_part_that_a_job_has_in_the_claw(size: tuple[float, float, float] | None) -> None:
+    known = mover_with(size)._interlocks.situation.part
+    assert [body.size for body in known] == ([] if size is None else [size])
+
+
 def test_wherever_the_arm_stands_it_comes_to_a_pose_with_the_same_joints() -> None:
     """But for whole turns, of which it makes the fewest: the last joint's is spared from one turn further on."""
     mover = mover_with(None)

@@ -123,11 +123,11 @@ def test_pictures_that_are_paired_one_off_are_seen(cell, monkeypatch: pytest.Mon
 
 def test_a_laser_that_flickers_is_named_before_it_looks_like_a_slip(cell, monkeypatch: pytest.MonkeyPatch) -> None:
     cameras, clock = cell[0].world._cameras, cell[0].devices.clock
-    laser = cameras.laser
+    laser, begun = cameras.laser, clock.now()
 
     def flickers(warm: float) -> LaserOptics:
         now = laser(warm)
-        return replace(now, brightness=(0.75 + 0.25 * np.sin(9.0 * clock.now())) * now.brightness)
+        return replace(now, brightness=(0.75 + 0.25 * np.cos(9.0 * (clock.now() - begun))) * now.brightness)
 
     monkeypatch.setattr(cameras, "laser", flickers)
     with pytest.raises(RefusedError, match=r"\d\.\d times as bright in one passage .*: the laser flickers"):
