@@ -158,11 +158,6 @@ def test_a_question_stands_beside_the_view_and_says_what_comes_of_an_answer(
     screen.hold()
     page.click("#question .choices button >> nth=0")
     assert page.input_value("#question textarea") == "nothing touches the arm"
-    page.fill("#question textarea", "the way is clear")
-    with page.expect_request("**/api/do") as decided:
-        page.click("#question [data-choice=confirm]")
-    said = {"do": "decide", "number": 1, "choice": "confirm", "reason": "the way is clear"}
-    assert said.items() <= decided.value.post_data_json.items()
     # A second attempt that runs is not told the fault of a run before it as its own end.
     fault = {"device": "arm", "code": "c", "text": "arm: lost", "remedy": "ended the run"}
     ended = {**fault, "t": time.time(), "over": True}
@@ -170,26 +165,6 @@ def test_a_question_stands_beside_the_view_and_says_what_comes_of_an_answer(
     screen.shows("state", "RUNNING")
     screen.shows("run-text", "attempt 2")
     assert "ended the run" not in page.inner_text("body")
-    screen.close()
-
-
-def test_a_person_unlocks_an_idle_arm_and_homes_the_cell(browser: Browser, console: Console, watcher: Watcher) -> None:
-    devices = watcher.state["devices"]
-    fault = {"code": "arm.protective_stop", "text": "the arm is in protective stop", "remedy": ""}
-    changes: dict[str, object] = {"devices": {**devices, "arm": {**devices["arm"], "fault": fault}}}
-    screen = Screen.of(browser, console.link(), changes=changes)
-    screen.hold()
-    screen.shows("unlock", r"protective stop[\s\S]*I have looked: unlock")
-    screen.page.click("#recover")
-    watcher.until(lambda state: state["last"] is not None and state["last"]["kind"] == "recovery")
-    changes.clear()
-    screen.page.wait_for_selector("#unlock", state="hidden")
-    screen.page.click("[data-do=home]")
-    watcher.until(lambda state: state["run"] is not None and state["run"]["kind"] == "homing")
-    screen.page.click("#stop")
-    watcher.until(idle)
-    screen.page.click("#clear-stop")
-    watcher.until(lambda state: not state["safety"]["stopped"])
     screen.close()
 
 
