@@ -162,7 +162,7 @@ class PlacedPart:
         there = self.belongs * along_surface(motion).inverse() * motion
         return replace(self, seen=replace(self.seen, surface_from_part=there))
 
-    @property
+    @cached_property
     def unsure(self) -> float:
         """What 95 % of the points are known to, m."""
         return float(np.percentile(np.linalg.norm(self._errors, axis=-1), 95))
@@ -179,7 +179,7 @@ class PlacedPart:
             name: float(np.percentile(np.percentile(each, 95, axis=1), SURE_PERCENT)) for name, each in found.items()
         }
 
-    @property
+    @cached_property
     def turn_bound(self) -> float:
         """By how much the part is turned at most, rad, `SURE_PERCENT`."""
         turned = self.turn + draws_of(self.covariance)[:, 3:]

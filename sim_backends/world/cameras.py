@@ -130,7 +130,7 @@ class Cameras:
         mesh, optics = station.part_seen, self._cold["scan"]
         if mesh is None:
             return []
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        low, high = mesh.low[0], mesh.high[0]
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
         seen = in_picture(optics, corners @ pose[:3, :3].T + pose[:3, 3])
         return [MeshInstance(pose, mesh, SURFACE_ALBEDO)] if seen else []
