@@ -6,7 +6,8 @@ cancelled once and for ever, by whoever asks first. After that nothing of the ru
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 
@@ -148,7 +149,7 @@ class RunControl:
 
     @property
     def held_s(self) -> float:
-        """Wall seconds that the run was held in its steps, until now: they count towards no deadline."""
+        """Wall seconds that the run was held, until now: they count towards no deadline, and people come near."""
         with self._lock:
             since = self._held_since
             return self._held_s + (0.0 if since is None else time.monotonic() - since)
@@ -165,18 +166,24 @@ class RunControl:
         if not self.paused():
             return
         say(True)
-        with self._lock:
-            self._held_since = time.monotonic()
-        try:
+        with self.held():
             while self.paused():
                 if token.event.wait(0.02):
                     token.check()
                 check()
+        say(False)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Count this time as held."""
+        with self._lock:
+            self._held_since = time.monotonic()
+        try:
+            yield
         finally:
             with self._lock:
                 self._held_s += time.monotonic() - (self._held_since or time.monotonic())
                 self._held_since = None
-        say(False)
 
     def ask(self, what: str) -> int:
         """From now on the run waits for a person's word about `what`; the number of this question."""

@@ -134,7 +134,7 @@ class Journal:
     ) -> None:
         """Record how the attempt ended: with the summary of its result, or with an error text."""
         summary, state = None if result is None else _dump(result), "done" if error is None else "failed"
-        ended = time.time(), state, float(duration_s), summary, error
+        ended = time.time(), state, float(duration_s), summary, None if error is None else _plain(error)
         self._write(
             "UPDATE steps SET ended = ?, state = ?, duration_s = ?, result = ?, error = ?, crc = ? WHERE id = ?",
             *ended, _crc(self.run, *self._begun_steps[key], *ended), key,
@@ -147,7 +147,7 @@ class Journal:
     def run_ended(self, outcome: str, reason: str) -> None:
         """Record the end of the run."""
         run, started, _, _, _, *rest = self._begun
-        ended = time.time(), outcome, reason
+        ended = time.time(), outcome, _plain(reason)
         self._write(
             "UPDATE runs SET ended = ?, outcome = ?, reason = ?, crc = ? WHERE id = ?",
             *ended, _crc(run, started, *ended, *rest), run,
@@ -325,6 +325,11 @@ def _in_existing(folder: Path, use: Callable[[sqlite3.Connection], Result]) -> R
             base.close()
     except sqlite3.Error as error:
         raise JournalError(f"the journal {path} cannot be used: {error}") from error
+
+
+def _plain(text: str) -> str:
+    """A name of a file may hold bytes that are no text."""
+    return text.encode(errors="backslashreplace").decode()
 
 
 def _dump(data: Mapping[str, object]) -> str:

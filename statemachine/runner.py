@@ -253,9 +253,10 @@ class Runner:
         step = self.sequence.state
         self.sequence.fire(JobTrigger.PAUSE)
         self._events.notify(Event("paused", step, {"text": f"held before {step}"}))
-        while end is None and self.control.paused() and attempts.met is None:
-            end = watchman.wait_briefly()
-            attempts.met = watchman.examine()
+        with self.control.held():
+            while end is None and self.control.paused() and attempts.met is None:
+                end = watchman.wait_briefly()
+                attempts.met = watchman.examine()
         if end is None:
             self.sequence.fire(JobTrigger.RESUME)
             text = "goes on" if attempts.met is None else f"held no longer: {attempts.met}"

@@ -166,10 +166,11 @@ def perform(
             # A person makes the first item of each round ready, but in a cell that is simulated as a whole.
             more = number < count and (number % len(jobs) > 0 or is_whole(open_cell.simulated))
             last = run(number, replace(before, more=more))
-            before = _known_after(before, last, each_job=open_cell.config.calibration.each_job)
             # What its steps made is large, and in its folder.
             batch = replace(batch, runs=(*batch.runs, replace(last, results={}))).written()
             notify(Event("note", None, {"text": str(batch), "part": number, "count": count, "counts": batch.counts}))
+            # Afterwards: whoever is told may have held the batch.
+            before = _known_after(before, last, each_job=open_cell.config.calibration.each_job)
             interrupted = last.interrupted
             why = _ended_by(open_cell, job, last, number)
     except (CellError, SignalInterrupt) as error:

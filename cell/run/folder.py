@@ -69,7 +69,7 @@ def list_runs(root: Path) -> list[Path]:
 def find_run(root: Path, name: str | None, kind: str | None = None) -> Path:
     """A run by its folder, name or id; without a name the newest, of one kind if given. Raises `ConfigError`."""
     if name is not None and (Path(name) / "journal.sqlite").exists():
-        return Path(name)
+        return Path(name).resolve()
     runs = list_runs(root)
     if name is None:
         matching = [run for run in runs if kind is None or _info(run).get("kind", "job") == kind][-1:]

@@ -107,7 +107,7 @@ class UnfinishedRun:
 FACTS: dict[str, tuple[type, ...]] = {
     "job_file": (str,), "job_hash": (str,), "configuration_hash": (str,), "calibration_hash": (str,),
     "simulated": (bool, str, list), "seed": (int, NoneType), "level": (str, NoneType), "clock": (str,),
-    "speed": (int, float, NoneType), "until": (str,), "scripted": (bool,),
+    "speed": (int, float, NoneType), "pace": (int, float), "until": (str,), "scripted": (bool,),
 }  # fmt: skip
 """What a journal tells of a run that a resumed one goes by, where it is there."""
 

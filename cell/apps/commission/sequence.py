@@ -105,7 +105,9 @@ class Commissioning:
         return good
 
     def _good(self, check: CommissionCheck) -> bool:
-        return self.progress.standing(check, self.workplace.config) == CheckVerdict.GOOD
+        """Whether it and all that it rests on came out well."""
+        good = self.progress.standing(check, self.workplace.config) == CheckVerdict.GOOD
+        return good and all(self._good(by_name(name)) for name in check.needs)
 
     def _until_good(self, check: CommissionCheck) -> bool:
         """Do a check, mend what it found, and do it again, as often as that helps."""
@@ -180,9 +182,6 @@ class Commissioning:
         if not wanted or not self.workplace.person.sees(f"Write {shown}? The old file is kept."):
             return False
         backups = [write_changes(path, keys) for path, keys in wanted]
-        for finding in result.findings:
-            if finding.write or finding.write_job:
-                self.progress.keep_mended(check, asdict(finding), ", ".join(backup.name for backup in backups))
         self.workplace.close()
         try:
             self.progress.work_for(self.workplace.job)
@@ -195,6 +194,9 @@ class Commissioning:
             raise ConfigError(
                 f"what was measured does not fit the configuration, which is as it was: {error}"
             ) from error
+        for finding in result.findings:
+            if finding.write or finding.write_job:
+                self.progress.keep_mended(check, asdict(finding), ", ".join(backup.name for backup in backups))
         return True
 
     def _again(self, check: CommissionCheck, result: Result) -> bool:

@@ -12,6 +12,7 @@ from cell.measure.reconstruction.ply import StoredCloud, deviation_colours, read
 from cell.procedures.sought_part import nominal_of, sought
 from cell.run.folder import Report, read_report
 from cell.run.report.figures import simulated_words
+from cell.run.resumption import job_hash
 from drivers.errors import ConfigError
 
 SUFFIXES = {"ply": ".ply", "stl": ".stl", "mesh": ".ply"}
@@ -71,8 +72,11 @@ def _deviations(cloud: StoredCloud, report: Report, name: str | None) -> NDArray
     if pose is None:
         return None
     try:
-        job, mesh = sought(*load_job(name or report["job"]))
-    except ConfigError as error:
+        file = name or report["job_file"]
+        if name is None and job_hash(file) != report["job_hash"]:
+            raise ConfigError(f"{file} or a mesh of it was changed since the run")
+        job, mesh = sought(*load_job(file))
+    except (ConfigError, OSError) as error:
         raise ConfigError(f"{error}; name the run's job file with --job") from error
     values = np.array([*(1e-3 * v for v in pose["translation_mm"]), *pose["rotation_vector_rad"]])
     base_from_surface = from_ur(values) * job.place.surface_from_part.se3().inverse()

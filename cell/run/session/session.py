@@ -67,12 +67,12 @@ class OpenCell:
 
     @property
     def world(self) -> dict[str, object]:
-        """Whether this cell is simulated, and which world; and the interlocks that do not hold, if any."""
+        """Whether this cell is simulated, and which world; its pace; and the interlocks that do not hold, if any."""
         facts: dict[str, object] = {"simulated": False, "seed": None, "level": None, "clock": "wall"}
         if self.simulated is not None:
             facts = self.simulated.facts
         lifted = sorted(self.devices.interlocks.names_lifted)
-        return {**facts, "interlocks_lifted": lifted} if lifted else facts
+        return {**facts, "pace": self.pace.share, **({"interlocks_lifted": lifted} if lifted else {})}
 
     @property
     def facts(self) -> dict[str, object]:

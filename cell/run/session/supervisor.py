@@ -357,6 +357,7 @@ class Cell:
         folder = find_run(self.runs_folder, None if run is None else str(run), "job")
         before = UnfinishedRun.find(folder, scripted=not script.idle)
         info: dict[str, object] = {"resumed_from": before.folder.name}
+        self.pace = min(self.pace, before.info.get("pace", 1.0))
         until = before.info.get("until")
         return self._start(before.job, observer, info, before, at_start=at_start, until=until, script=script).result()
 

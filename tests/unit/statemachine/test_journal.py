@@ -163,3 +163,11 @@ def test_a_missing_or_foreign_file_is_a_clear_error(tmp_path):
         read(tmp_path)
     with pytest.raises(JournalError, match="cannot be opened"):
         Journal(tmp_path / "nowhere", "r1")
+
+
+def test_an_end_is_told_though_its_reason_holds_bytes_that_are_no_text(tmp_path):
+    journal = Journal(tmp_path, "r")
+    journal.step_ended(journal.step_started("place", 1), 1.0, error="no job J\udcf6rg.toml")
+    journal.run_ended("faulted", "no job J\udcf6rg.toml")
+    record = read(tmp_path)
+    assert record.run.reason == record.steps[0].error == "no job J\\udcf6rg.toml"

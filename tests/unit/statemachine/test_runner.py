@@ -1,6 +1,7 @@
 """The runner: every run ends safe, with the outcome that its steps deserve, and everything is in the journal."""
 
 import signal
+import threading
 
 import pytest
 
@@ -310,3 +311,11 @@ def test_a_step_alone_ends_as_it_did_though_that_cannot_be_written_down(tmp_path
     assert isinstance(result.unrecorded, JournalError)
     assert (result.end and result.end.reason) == end
     assert result.made == (None if error else "made in attempt 1")
+
+
+def test_a_hold_between_two_steps_counts_as_held(tmp_path):
+    """Whoever held the run may have reached in, wherever it stood."""
+    bench = Bench(tmp_path, board_photo=lambda context: bench.runner.control.pause())
+    threading.Timer(0.4, lambda: bench.runner.control.go_on()).start()
+    assert bench.run().outcome is Outcome.PLACED
+    assert bench.runner.control.held_s > 0.0

@@ -83,12 +83,9 @@ def shown(cell: Cell, job: str, address: Address, *, open_page: bool) -> int:
             pass
         if gone.is_set():
             typer.echo("the page's server has ended, so nobody sees the cell any more: it is stopped", err=True)
-            try:
-                cell.stop()
-            except CellError as error:
-                typer.echo(str(error), err=True)
-            return 1
-        return 0 if cell.current is None else 130
+        code = 1 if gone.is_set() else 0 if cell.current is None else 130
+        _stop(cell)
+    return code
 
 
 def run_shown(
@@ -108,7 +105,16 @@ def run_shown(
         with SignalWatch() as signals:
             while signals.reason is None and console.seen:
                 time.sleep(0.2)
+            _stop(cell)
     return outcome
+
+
+def _stop(cell: Cell) -> None:
+    """Before anything is waited for: the page's server may hang."""
+    try:
+        cell.stop()
+    except CellError as error:
+        typer.echo(str(error), err=True)
 
 
 def page_notifier(open_page: bool) -> Callable[[str], None]:

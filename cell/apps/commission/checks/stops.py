@@ -11,7 +11,7 @@ from cell.apps.commission.check import CommissionCheck, Result, refused
 from cell.apps.commission.workplace import CommissionWorkplace
 from cell.procedures.drive.driving import Planar, RelativeOdometry, drive_line, driven
 from cell.run.recorded_work import WorkContext
-from drivers.errors import Aborted, InterlockError
+from drivers.errors import Aborted, InterlockError, RefusedError
 from drivers.interfaces import ArmSafety, Motion
 
 RAIL_SPEED = 0.020
@@ -204,8 +204,7 @@ def _emergency(workplace: CommissionWorkplace, result: Result) -> None:
     elif not workplace.person.does("Press the emergency stop now, while joint 1 turns."):
         workplace.cell.stop()
         workplace.cell.clear_stop(BY)
-        result.notes.append("the emergency stop was not tried")
-        return
+        raise RefusedError("the emergency stop was not tried")
     deadline = time.monotonic() + 5.0
     while arm.state().safety is ArmSafety.NORMAL and time.monotonic() < deadline:
         clock.sleep(PERIOD_S)

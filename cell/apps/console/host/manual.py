@@ -30,6 +30,8 @@ from drivers.errors import Aborted, CellError, ConfigError, DeviceError, DeviceF
 from drivers.interfaces import ATTENDED_S, Arm, Attended, Motion, Rail
 
 LATE_S = 0.25
+CLOCKS_PART = 2e-4
+"""Seconds a second that the clocks of page and cell come apart at most: without it an hour makes all beats late."""
 """A beat that was longer under way than the quickest of its page by more than this is none: the button may be up."""
 
 
@@ -82,7 +84,7 @@ class Presses:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._last: dict[str, int] = {}
-        self._quickest: dict[str, float] = {}
+        self._quickest: dict[str, tuple[float, float]] = {}
         self.present: Press | None = None
 
     def beat(
@@ -132,8 +134,11 @@ class Presses:
             self._quickest.pop(client, None)
 
     def _late(self, client: str, at_ms: float) -> bool:
-        behind = time.monotonic() - 1e-3 * at_ms
-        quickest = self._quickest[client] = min(behind, self._quickest.get(client, behind))
+        now = time.monotonic()
+        behind = now - 1e-3 * at_ms
+        quickest, since = self._quickest.get(client, (behind, now))
+        quickest = min(behind, quickest + CLOCKS_PART * (now - since))
+        self._quickest[client] = quickest, now
         return behind - quickest > LATE_S
 
 
@@ -174,6 +179,7 @@ class Manual:
         self._wanted: queue.SimpleQueue[_Step | Press] = queue.SimpleQueue()
         self._off = threading.Event()
         self._on = threading.Event()
+        self._stepping = threading.Event()
         self._busy = threading.Lock()
         self._thread: threading.Thread | None = None
         self._failure: BaseException | None = None
@@ -207,6 +213,9 @@ class Manual:
     def end(self) -> str:
         """Switch it off: what moves is stopped."""
         self._off.set()
+        # Nothing looks at `_off` during a step.
+        if self._stepping.is_set() and (run := self._cell.current) is not None:
+            run.abort("manual mode was switched off")
         return "manual mode is off"
 
     def join(self, timeout: float) -> None:
@@ -267,10 +276,15 @@ class Manual:
 
     def _do_step(self, step: _Step, context: WorkContext) -> None:
         wish = step.wish
+        self._stepping.set()
         try:
+            if self._off.is_set():
+                raise Aborted("manual mode was switched off; the step was not done")
             step.answer.set_result(moved(self._cell, wish, self._job, context))
         except (Aborted, CellError) as error:
             step.answer.set_exception(error)
+        finally:
+            self._stepping.clear()
         failure = step.answer.exception()
         log.info("jog step: %s %s %+g: %s", wish.device, wish.axis, wish.amount, failure or step.answer.result())
         context.check()

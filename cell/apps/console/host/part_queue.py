@@ -68,9 +68,12 @@ class PartQueue:
 
     def _between(self, shown: dict[str, object], stops: int) -> None:
         """Called after each part: the next one begins when this returns, not after a stop (`Cell.run_batch`)."""
-        while self._wanted == "hold" and self._cell.stops == stops:
-            shown["state"] = "holding"
-            time.sleep(LOOK_S)
+        if self._run is not None and self._wanted == "hold":
+            # Whoever comes near meanwhile may bump the scan head or move the station.
+            with self._run.control.held():
+                while self._wanted == "hold" and self._cell.stops == stops:
+                    shown["state"] = "holding"
+                    time.sleep(LOOK_S)
         shown["state"] = "running"
         if self._run is not None and self._wanted == "end":
             self._run.end_batch()

@@ -92,7 +92,7 @@ class Archive:
 
     def __init__(self, root: Path, calibrations: Path, max_age_s: float) -> None:
         self._root, self._calibrated = root, (str(calibrations), str(max_age_s))
-        self._rows: dict[Path, dict[str, Any]] = {}
+        self._rows: dict[tuple[Path, int], dict[str, Any]] = {}
         self._pages = tempfile.TemporaryDirectory(prefix="cell-console-")
         self._drawing = threading.Lock()
 
@@ -140,7 +140,7 @@ class Archive:
         # What draws it reads whatever lies there.
         if folder is None or any(path.is_symlink() for path in folder.rglob("*")):
             return None
-        page = Path(self._pages.name) / f"{name}.html"
+        page = Path(self._pages.name) / f"{name}-{_written(folder)}.html"
         with self._drawing:
             if not page.exists() and self._printed("-c", _DRAW, str(folder), str(page)) is None:
                 return None
@@ -194,7 +194,7 @@ class Archive:
         return folder if all(below(self._root, name, path.name) for path in read) else None
 
     def _row(self, folder: Path) -> dict[str, Any]:
-        if (known := self._rows.get(folder)) is not None:
+        if (known := self._rows.get((folder, written := _written(folder)))) is not None:
             return known
         row = run_row(folder)
         try:
@@ -202,9 +202,17 @@ class Archive:
         except (CellError, OSError):
             report = {}
         row |= {"d_mean_mm": true_error_mm(report), "expected_mm": _stated(report)}
-        if (folder / "report.json").exists():
-            self._rows[folder] = row
+        if written:
+            self._rows[folder, written] = row
         return row
+
+
+def _written(folder: Path) -> int:
+    """When a run's report was last written, ns, 0 for never: at first it lacks what takes long to reckon."""
+    try:
+        return (folder / "report.json").stat().st_mtime_ns
+    except OSError:
+        return 0
 
 
 def true_error_mm(report: Mapping[str, Any]) -> float | None:

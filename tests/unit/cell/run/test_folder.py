@@ -39,6 +39,10 @@ def test_runs_are_found_by_name_id_or_as_the_newest(tmp_path: Path) -> None:
     assert find_run(root, first.name.split("-")[1]) == first
     with pytest.raises(ConfigError, match="no run nothing"):
         find_run(root, "nothing")
+    # However a folder is written, it is known which runs come after it.
+    (second / "journal.sqlite").touch()
+    (tmp_path / "latest").symlink_to(second)
+    assert find_run(root, str(tmp_path / "latest")) == find_run(root, str(second / ".." / second.name)) == second
 
 
 def test_a_run_without_a_report_tells_what_its_journal_does(tmp_path: Path) -> None:

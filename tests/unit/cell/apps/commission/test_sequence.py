@@ -3,14 +3,16 @@
 import re
 import tomllib
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from cell.apps.commission.sequence import CHECKS, chosen, edited, write_changes
+from cell.apps.commission.check import CheckVerdict, Result
+from cell.apps.commission.sequence import CHECKS, by_name, chosen, edited, write_changes
 from cell.config.cell_config import default_toml, load_config
-from drivers.errors import ConfigError
+from drivers.errors import ConfigError, RefusedError
 from tests.support import ROOT
 from tests.support.commissioning import Shown, commissioned, files, opened, replaced, same
 
@@ -146,3 +148,26 @@ def test_the_documents_table_is_current() -> None:
     text = (ROOT / "docs" / "how-to" / "commission.md").read_text(encoding="utf-8")
     rows = [f"| `{c.name}` | {c.moves} | {c.far} | {c.fast} | {c.limit} |" for c in CHECKS]
     assert "\n".join(["| check | moves | how far | how fast | has to hold |", "|---|---|---|---|---|", *rows]) in text
+
+
+def test_what_rests_on_a_check_that_came_out_wrong_waits_though_it_was_good_before(tmp_path: Path) -> None:
+    files(tmp_path)
+    good, _ = commissioned(tmp_path, "payload")
+    assert good
+    shown = Shown()
+    made = opened(tmp_path, shown)
+    made.progress.keep(by_name("links"), made.workplace.config, Result(verdict=CheckVerdict.WRONG), 0.1, "")
+    assert not made.go([by_name("payload")])
+    assert [verdict for _, verdict, _ in shown.rows] == ["waits for arm_axes"]
+
+
+@pytest.mark.parametrize("check", ["outputs", "stops"])
+def test_what_a_person_would_not_do_is_not_good(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, check: str) -> None:
+    files(tmp_path)
+    made = opened(tmp_path, Shown())
+    unwilling = ("Keep a hand below", "Press the emergency stop")
+    with closing(made.workplace):
+        monkeypatch.setattr(made.workplace, "simulated", False)
+        monkeypatch.setattr(made.workplace.person, "_ask", lambda text: not text.startswith(unwilling))
+        with pytest.raises(RefusedError, match="not tried"):
+            by_name(check).work(made.workplace, Result())

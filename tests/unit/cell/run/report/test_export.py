@@ -42,6 +42,7 @@ def test_without_a_place_pose_there_is_no_deviation_and_an_unknown_job_is_asked_
     del report["sha256"]
     write_json(folder / "report.json", {**report, "place_pose": None})
     assert "deviation_mm" not in export_run(folder, "ply", folder / "out.ply", None, 1e-4)
-    write_json(folder / "report.json", {**report, "job": "gone"})
-    with pytest.raises(ConfigError, match="name the run's job file with --job"):
-        export_run(folder, "ply", folder / "out.ply", None, 1e-4)
+    for changed in ({"job_file": "gone"}, {"job_hash": "that of another surface"}):
+        write_json(folder / "report.json", {**report, **changed})
+        with pytest.raises(ConfigError, match="name the run's job file with --job"):
+            export_run(folder, "ply", folder / "out.ply", None, 1e-4)

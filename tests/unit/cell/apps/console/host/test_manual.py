@@ -2,6 +2,7 @@
 
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from typing import Any
 
@@ -10,8 +11,9 @@ import pytest
 
 from cell.apps.console.host.controller import ConsoleController
 from cell.apps.console.host.manual import LATE_S, Presses
+from cell.run.jogging import Jog
 from cell.run.session.supervisor import Cell
-from drivers.errors import InterlockError
+from drivers.errors import Aborted, InterlockError
 from drivers.interfaces import ATTENDED_S
 from tests.support import until
 
@@ -132,3 +134,30 @@ def test_what_ends_a_held_button_stops_the_motion(
     beat(1)
     cell.devices.clock.sleep(0.5)
     assert np.abs(place() - stood).max() < 1e-5
+
+
+def test_a_clock_of_the_page_that_goes_slow_makes_no_beat_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """60 ppm are .43 s after two hours. A line that is slow at once is told from that."""
+    presses, now = Presses(), time.monotonic()
+    for number in range(1, 120):
+        monkeypatch.setattr(time, "monotonic", lambda number=number: now + 60.0 * number)
+        assert presses.beat("c1", number, *Z_UP, at_ms=1e3 * (now + 60.0 * number * (1 - 60e-6))) is not None, number
+        presses.end("c1", "up")
+    assert presses.beat("c1", 200, *Z_UP, at_ms=1e3 * (now + 60.0 * 119 * (1 - 60e-6) - LATE_S - 0.05)) is None
+
+
+@pytest.mark.parametrize("end", ["manual off", "page gone"])
+def test_what_ends_manual_mode_stops_a_step_on_its_way(cell: Cell, controller: ConsoleController, end: str) -> None:
+    controller.do("c1", {"do": "hold", "name": "Ann"})
+    controller.do("c1", {"do": "manual", "on": True})
+    before = cell.devices.arm.state().flange[2]
+    with ThreadPoolExecutor() as beside:
+        step = beside.submit(controller.manual.step, Jog("arm", "z", 0.25))
+        assert until(lambda: cell.devices.arm.state().flange[2] > before + 1e-3)
+        ends = {"manual off": lambda: controller.do("c1", {"do": "manual", "on": False})}
+        ends.get(end, lambda: controller.left("c1"))()
+        assert isinstance(step.exception(20.0), Aborted)
+    assert until(lambda: cell.current is None)
+    stood = cell.devices.arm.state().flange[2]
+    cell.devices.clock.sleep(1.0)
+    assert cell.devices.arm.state().flange[2] == pytest.approx(stood, abs=1e-5) and stood < before + 0.2

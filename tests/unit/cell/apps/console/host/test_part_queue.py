@@ -49,6 +49,7 @@ def test_a_queue_holds_between_two_parts_goes_on_and_ends_when_it_is_told(contro
     assert (first["part"], first["count"], first["wanted"]) == (1, 3, "hold")
     assert {name: n for name, n in first["counts"].items() if n} == {"refused": 1, "not tried": 2}
     assert controller.cell.current is None
+    assert controller.queue._run is not None and controller.queue._run.control.held_s > 0.0, "people may come near"
     for words in ({"do": "start"}, {"do": "start", "count": 2}, {"do": "resume"}):
         assert "a batch of own is going on" in str(refusal(controller, "c1", **words))
     controller.do("c1", {"do": "queue", "parts": "run"})
