@@ -61,9 +61,11 @@ def measure(image: Image, centres: Array, shapes: Array, rounds: int, sigma: Arr
             deviation = _fit(edge[0], edge[1], fit)
             if math.isnan(deviation):
                 break
-            change = max(abs(fit[0] - 1.0), np.abs(fit[1:]).max())
-            fit[1:] = np.minimum(np.maximum(fit[1:], -0.5), 0.5)
+            change = abs(fit[0] - 1.0)
             fit[0] = min(max(fit[0], 0.5), 1.6)
+            for i in range(1, TERMS):
+                change = max(change, abs(fit[i]))
+                fit[i] = min(max(fit[i], -0.5), 0.5)
             x, y = x + a * fit[1] + b * fit[2], y + c * fit[1] + d * fit[2]
             # A circle stretched by the second harmonic, in the dot's own coordinates.
             wide, high, skew = fit[0] + fit[3], fit[0] - fit[3], fit[4]
@@ -159,25 +161,30 @@ def _slope_of_light(own: Array, ring: Array, slope: Array) -> bool:
 @compiled
 def _fit(edge: Array, seen: Array, fit: Array) -> float:
     """Fit the Fourier terms (5,) of an edge, robustly: the deviation of its centre in radii, NaN where rays miss."""
-    weight, residual, z = seen.copy(), edge.copy(), edge.copy()
-    scatter, away = 1.0, np.empty(RAYS)
+    weight, residual, z, away = seen.copy(), np.empty(RAYS), np.empty(RAYS), np.empty(RAYS)
+    scatter = 1.0
     if seen.sum() < RAYS // 2:
         return math.nan
     for _ in range(TURNS):
         _solve(edge, weight, fit)
-        residual[:] = edge - DESIGN @ fit
-        away[:] = np.where(seen > 0.5, np.abs(residual), np.inf)
+        for k in range(RAYS):
+            residual[k] = edge[k]
+            for i in range(TERMS):
+                residual[k] -= DESIGN[k, i] * fit[i]
+            away[k] = abs(residual[k]) if seen[k] > 0.5 else math.inf
         scatter = 1.4826 * _median(away)
         scatter = max(scatter if math.isfinite(scatter) else 1.0, LEAST_SCATTER)
-        z[:] = residual / (4.0 * scatter)
-        weight[:] = np.where((seen > 0.5) & (np.abs(z) < 1.0), (1.0 - z * z) ** 2, 0.0)
-    used = weight > 0.2
-    gap = longest = 0
+        for k in range(RAYS):
+            z[k] = residual[k] / (4.0 * scatter)
+            weight[k] = (1.0 - z[k] * z[k]) ** 2 if seen[k] > 0.5 and abs(z[k]) < 1.0 else 0.0
+    used = gap = longest = 0
     for k in range(2 * RAYS):
-        gap = 0 if used[k % RAYS] else gap + 1
+        counts = weight[k % RAYS] > 0.2
+        used += counts and k < RAYS
+        gap = 0 if counts else gap + 1
         longest = max(longest, gap)
     # The rays that count must surround the dot: no gap of a third of the circle.
-    if used.sum() < RAYS // 2 or longest > RAYS // 3 or not scatter < MOST_SCATTER:
+    if used < RAYS // 2 or longest > RAYS // 3 or not scatter < MOST_SCATTER:
         return math.nan
     # The variance of an M-estimator: the mean square of what each ray pulls over the square of how stiffly it holds.
     pulled = held = within = 0.0

@@ -147,11 +147,11 @@ def widen_what_departs(centres: Array, sigma: Array) -> None:
     """
     lines = len(centres)
     blocks = (lines + BLOCK - 1) // BLOCK
-    curves, known = np.zeros((blocks, 5)), np.zeros(blocks, np.bool_)
+    plain, curves, known = np.zeros(5), np.zeros((blocks, 5)), np.zeros(blocks, np.bool_)
     off, usual = np.zeros(lines), np.ones(lines)
     for block in range(blocks):
         own = range(block * BLOCK, min(lines, (block + 1) * BLOCK))
-        plain = _curve(centres, sigma, block * BLOCK, 1)
+        _curve(centres, sigma, block * BLOCK, 1, plain)
         suspect = False
         for r in own:
             suspect = suspect or abs(centres[r] - _at(plain, r)) > SUSPECT * sigma[r]
@@ -165,12 +165,15 @@ def widen_what_departs(centres: Array, sigma: Array) -> None:
             beside = max(beside, int(abs(centres[r] - centres[r - 1] - plain[1] / BESIDE) > BREAK_PX))
         for k in range(max(0, block - beside), min(blocks, block + beside + 1)):
             if not known[k]:
-                curves[k], known[k] = _curve(centres, sigma, k * BLOCK, ROUNDS), True
+                _curve(centres, sigma, k * BLOCK, ROUNDS, curves[k])
+                known[k] = True
             for r in own:
                 away = abs(centres[r] - _at(curves[k], r))
                 if curves[k, 3] > 0.0 and away < off[r]:
                     off[r], usual[r] = away, max(sigma[r], curves[k, 4])
-    departs = np.isfinite(off) & (off > DEPARTS * usual)
+    departs = np.zeros(lines, np.bool_)
+    for r in range(lines):
+        departs[r] = DEPARTS * usual[r] < off[r] < np.inf
     # A spot covers several lines: beside one that departs less tells.
     for r in range(1, lines):
         departs[r] |= departs[r - 1] and LESS * usual[r] < off[r] < np.inf
@@ -189,10 +192,11 @@ def _at(curve: Array, line: int) -> float:
 
 
 @compiled
-def _curve(centres: Array, sigma: Array, begin: int, rounds: int) -> Array:
-    """Parabola through the lines from `begin` to `begin + BLOCK` and those beside: three coefficients, its origin (0
-    where too few lines have a centre) and the lines' scatter about it, px. Of one round it is not robust."""
-    made = np.zeros(5)
+def _curve(centres: Array, sigma: Array, begin: int, rounds: int, made: Array) -> None:
+    """Parabola through the lines from `begin` to `begin + BLOCK` and those beside, into `made` (5,): three
+    coefficients, its origin (0 where too few lines have a centre) and the lines' scatter about it, px. Of one round it
+    is not robust."""
+    made[:] = 0.0
     low, high = max(0, begin - BESIDE), min(len(centres), begin + BLOCK + BESIDE)
     t, y, weight = np.empty(high - low), np.empty(high - low), np.empty(high - low)
     n, origin = 0, begin + 0.5 * BLOCK
@@ -201,18 +205,25 @@ def _curve(centres: Array, sigma: Array, begin: int, rounds: int) -> Array:
             t[n], y[n], weight[n] = (r - origin) / BESIDE, centres[r], 1.0 / max(sigma[r] * sigma[r], 1e-12)
             n += 1
     if n < LEAST:
-        return made
+        return
     t, y, weight = t[:n], y[:n], weight[:n]
     usual = np.median(weight) ** -0.5
     made[3] = origin
+    told = np.empty(n)
     if rounds > 1:
         # A step or a spot changes few of the slopes.
-        made[1] = np.median((y[LAG:] - y[:-LAG]) / (t[LAG:] - t[:-LAG]))
-        made[0] = np.median(y - made[1] * t)
+        for i in range(n - LAG):
+            told[i] = (y[i + LAG] - y[i]) / (t[i + LAG] - t[i])
+        made[1] = np.median(told[: n - LAG])
+        for i in range(n):
+            told[i] = y[i] - made[1] * t[i]
+        made[0] = np.median(told)
     for turn in range(rounds):
         s0, s1, s2, s3, s4, r0, r1, r2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         if rounds > 1 and turn < SCALED:
-            made[4] = 1.4826 * np.median(np.abs(y - (made[0] + t * (made[1] + t * made[2]))))
+            for i in range(n):
+                told[i] = abs(y[i] - (made[0] + t[i] * (made[1] + t[i] * made[2])))
+            made[4] = 1.4826 * np.median(told)
         cut = TUKEY * max(made[4], usual)
         for i in range(n):
             x, w = t[i], weight[i]
@@ -227,7 +238,6 @@ def _curve(centres: Array, sigma: Array, begin: int, rounds: int) -> Array:
         whole = s0 * a + s1 * b + s2 * c
         if whole <= 1e-9 * s0 * s2 * s4:
             made[3] = 0.0
-            return made
+            return
         made[0], made[1], made[2] = a * r0 + b * r1 + c * r2, b * r0 + d * r1 + e * r2, c * r0 + e * r1 + f * r2
-        made[:3] /= whole
-    return made
+        made[0], made[1], made[2] = made[0] / whole, made[1] / whole, made[2] / whole
