@@ -76,11 +76,9 @@ class SimulatedPerson(Person):
         super().__init__(agree)
 
     def again(self, question: str) -> bool:
-        """See `Person.again`."""
         return False
 
     def does(self, task: str, by_itself: Callable[[], None] | None = None) -> bool:
-        """See `Person.does`."""
         agreed = super().does(task)
         if by_itself is not None:
             by_itself()
@@ -91,11 +89,9 @@ class SlowMover(Mover):
     """Moves that are planned anew, once, after a fault that a program may clear by itself, such as a lost program."""
 
     def to(self, base_from_flange: pin.SE3, what: str, within: float = 0.0) -> None:
-        """See `Mover.to`."""
         moved_once_more(self._arm, lambda: Mover.to(self, base_from_flange, what, within))
 
     def to_joints(self, joints: Joints, settle: bool = True) -> None:
-        """See `Mover.to_joints`."""
         moved_once_more(self._arm, lambda: Mover.to_joints(self, joints, settle))
 
 

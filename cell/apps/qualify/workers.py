@@ -79,7 +79,6 @@ class Processes:
         limit_threads()
 
     def begin(self, task: WorldTask) -> None:
-        """See `Workers`."""
         while True:
             pool = self._free.pop() if self._free else _new_process()
             # One that died while it waited is left out.
@@ -88,7 +87,6 @@ class Processes:
                 return
 
     def ended(self) -> Iterator[Ended]:
-        """See `Workers`."""
         done, _ = wait(self._running, return_when=FIRST_COMPLETED)
         for future in done:
             task, pool = self._running.pop(future)
@@ -107,7 +105,6 @@ class Processes:
             yield task, row
 
     def close(self) -> None:
-        """See `Workers`."""
         for pool in [*self._free, *(pool for _, pool in self._running.values())]:
             for process in list((pool._processes or {}).values()):
                 process.kill()
@@ -153,7 +150,6 @@ class Cluster:
         return WAITING * max(1, len(self.client.scheduler_info(n_workers=-1)["workers"]))
 
     def begin(self, task: WorldTask) -> None:
-        """See `Workers`."""
         self._require_scheduler()
         self._running[self._executor.submit(self.work, task)] = task
 

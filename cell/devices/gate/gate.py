@@ -155,18 +155,14 @@ class Gated(Generic[Bare]):
         self.statistics = bare.statistics
 
     def identity(self) -> Identity:
-        """See `Device.identity`."""
         return self.bare.identity()
 
     def ping(self) -> float:
-        """See `Device.ping`."""
         return self.bare.ping()
 
     def stop(self) -> None:
-        """See `Device.stop`."""
         self.gate.asked(DeviceCommand(self.name, "stop"))
         self.bare.stop()
 
     def close(self) -> None:
-        """See `Device.close`."""
         self.bare.close()

@@ -1,6 +1,7 @@
 """The devices behind the gate: each holds a device of any make and lets begin only what the gate lets begin.
 
-Reading, stopping and closing always pass. What a make offers beyond its interface is asked of the bare device (`bare`).
+Reading, stopping and closing always pass. What a method does stands in `drivers.interfaces`; what a make offers beyond
+them is asked of the bare device (`bare`).
 """
 
 from __future__ import annotations
@@ -95,7 +96,6 @@ class GuardedMotion:
         return self._motion.contact
 
     def wait(self, timeout: float) -> None:
-        """See `drivers.interfaces.Motion`."""
         self._motion.wait(timeout)
         if self.contact and self.rest is None:
             self.rest = self._arm.state().joints
@@ -116,16 +116,13 @@ class GatedArm(Gated[interfaces.Arm]):
     touch: SimulatedTouch | None = None
 
     def link_table(self) -> interfaces.LinkTable | None:
-        """See `Arm.link_table`."""
         return self.bare.link_table()
 
     @property
     def untold(self) -> str:
-        """See `SaysWhyUntold.untold`."""
         return interfaces.why_untold(self.bare)
 
     def state(self, max_age: float = 0.1) -> interfaces.ArmState:
-        """See `Arm.state`."""
         state = self.bare.state(max_age)
         if self.touch is not None:
             state = self.touch.felt(state)
@@ -134,7 +131,6 @@ class GatedArm(Gated[interfaces.Arm]):
 
     @contextmanager
     def record(self) -> Iterator[list[interfaces.ArmState]]:
-        """See `Arm.record`."""
         with self.bare.record() as states:
             yield states
         if self.touch is not None:
@@ -143,7 +139,6 @@ class GatedArm(Gated[interfaces.Arm]):
             self.gate.seen("arm", state)
 
     def latch_clock(self) -> Latch:
-        """See `Arm.latch_clock`."""
         return self.bare.latch_clock()
 
     def move_joints(self, joints: interfaces.Vector, speed: float, acceleration: float) -> interfaces.ArmMotion:
@@ -158,14 +153,12 @@ class GatedArm(Gated[interfaces.Arm]):
         return self._move(DeviceCommand("arm", "move_joints", {"joints": goal}), start)
 
     def move_linear(self, flange: interfaces.Vector, speed: float, acceleration: float) -> interfaces.ArmMotion:
-        """See `Arm.move_linear`."""
         command = DeviceCommand("arm", "move_linear", {"flange": checked_pose(self.name, flange)})
         return self._move(command, lambda: self.bare.move_linear(flange, speed, acceleration))
 
     def follow(
         self, times: interfaces.Vector, joints: interfaces.Vector, force_limit: float | None = None
     ) -> interfaces.ArmMotion:
-        """See `Arm.follow`."""
         way = checked_way(self.name, joints)
         command = DeviceCommand("arm", "follow", {"joints": way, "force_limit": force_limit})
         if force_limit is None:
@@ -192,14 +185,12 @@ class GatedArm(Gated[interfaces.Arm]):
         return self.gate.begin(command, begin, self.bare.stop)
 
     def zero_force(self) -> None:
-        """See `Arm.zero_force`."""
         self.gate.require(DeviceCommand("arm", "zero_force"))
         self.bare.zero_force()
         if self.touch is not None:
             self.touch.zero()
 
     def set_payload(self, mass: float, centre: interfaces.Vector) -> None:
-        """See `Arm.set_payload`."""
         self.gate.require(DeviceCommand("arm", "set_payload"))
         self.bare.set_payload(mass, centre)
 
@@ -211,11 +202,9 @@ class GatedArm(Gated[interfaces.Arm]):
         self.bare.set_digital_output(index, value)
 
     def digital_input(self, index: int) -> bool:
-        """See `Arm.digital_input`."""
         return self.bare.digital_input(index)
 
     def recover(self, *, confirmed: bool = False) -> None:
-        """See `Arm.recover`."""
 
         def begin() -> None:
             self.gate.interlocks.situation.last = None
@@ -234,17 +223,14 @@ class GatedRail(Gated[interfaces.Rail]):
         """The newest motion that was begun, also one that has ended."""
 
     def state(self) -> interfaces.RailState:
-        """See `Rail.state`."""
         state = self.bare.state()
         self.gate.seen("rail", state)
         return state
 
     def home(self) -> interfaces.Motion:
-        """See `Rail.home`."""
         return self._begin(DeviceCommand("rail", "home"), self.bare.home)
 
     def move_to(self, position: float, speed: float | None = None) -> interfaces.Motion:
-        """See `Rail.move_to`."""
         command = DeviceCommand("rail", "move_to", {"position": position})
         return self._begin(command, lambda: self.bare.move_to(position, speed))
 
@@ -266,12 +252,10 @@ class GatedRail(Gated[interfaces.Rail]):
         return motion
 
     def sweep(self, start: float, stop: float, speed: float) -> interfaces.Sweep:
-        """See `Rail.sweep`."""
         command = DeviceCommand("rail", "sweep", {"start": start, "stop": stop})
         return self._begin(command, lambda: self.bare.sweep(start, stop, speed))
 
     def sweep_start(self, start: float, stop: float, speed: float) -> float:
-        """See `Rail.sweep_start`."""
         return self.bare.sweep_start(start, stop, speed)
 
     def _begin(self, command: DeviceCommand, start: Callable[[], Begun]) -> Begun:
@@ -284,17 +268,14 @@ class GatedVehicle(Gated[interfaces.Vehicle]):
     """The vehicle, taken into command and driven through a gate."""
 
     def state(self, max_age: float = 0.2) -> interfaces.VehicleState:
-        """See `Vehicle.state`."""
         state = self.bare.state(max_age)
         self.gate.seen("vehicle", state)
         return state
 
     def check(self) -> None:
-        """See `Vehicle.check`."""
         self.bare.check()
 
     def enable(self) -> None:
-        """See `Vehicle.enable`."""
 
         def begin() -> None:
             # Only now may it drive away: one that could not be enabled still stands where it stood.
@@ -304,7 +285,6 @@ class GatedVehicle(Gated[interfaces.Vehicle]):
         self.gate.begin(DeviceCommand("vehicle", "enable"), begin, self.bare.brake)
 
     def recover(self) -> None:
-        """See `Vehicle.recover`."""
         self.gate.begin(DeviceCommand("vehicle", "recover"), self.bare.recover, self.bare.brake)
 
     def drive(self, speed: float, yaw_rate: float) -> None:
@@ -318,7 +298,6 @@ class GatedVehicle(Gated[interfaces.Vehicle]):
             raise
 
     def brake(self) -> None:
-        """See `Vehicle.brake`."""
         self.gate.asked(DeviceCommand("vehicle", "brake"))
         self.bare.brake()
 
@@ -327,11 +306,9 @@ class GatedClaw(Gated[interfaces.Claw]):
     """The claw, closed and opened through a gate; what it did is not undone, because that could drop the part."""
 
     def grip(self, timeout: float = 2.0) -> None:
-        """See `Claw.grip`."""
         self._begin("grip", lambda: self.bare.grip(timeout))
 
     def release(self, timeout: float = 2.0) -> None:
-        """See `Claw.release`."""
         self._begin("release", lambda: self.bare.release(timeout))
         self.gate.interlocks.carry(())
 
@@ -343,7 +320,6 @@ class GatedClaw(Gated[interfaces.Claw]):
 
     @property
     def holding(self) -> bool:
-        """See `Claw.holding`."""
         holding = self.bare.holding
         self.gate.seen("claw", {"holding": holding})
         return holding
@@ -371,11 +347,9 @@ class GatedCamera(Gated[interfaces.Camera]):
 
     @property
     def time_bound(self) -> float:
-        """See `Camera.time_bound`."""
         return self.bare.time_bound
 
     def configure(self, exposure: float, frame_rate: float) -> None:
-        """See `Camera.configure`."""
         self._asked, exposure = (exposure, frame_rate), min(exposure, self.longest_exposure)
         self.gate.asked(DeviceCommand(self.name, "configure", {"exposure": exposure, "frame_rate": frame_rate}))
         self.bare.configure(exposure, frame_rate)
@@ -398,7 +372,6 @@ class GatedCamera(Gated[interfaces.Camera]):
 
     @contextmanager
     def stream(self) -> Iterator[interfaces.FrameStream]:
-        """See `Camera.stream`."""
         self.gate.asked(DeviceCommand(self.name, "stream"))
         try:
             with self.bare.stream() as frames:
@@ -446,7 +419,6 @@ class GatedLaser(Gated[interfaces.Laser]):
 
     @property
     def is_on(self) -> bool:
-        """See `Laser.is_on`."""
         on = self.bare.is_on
         self.gate.seen("laser", {"on": on})
         return on

@@ -47,7 +47,6 @@ class ArmFeed:
 
     @contextmanager
     def open(self) -> Iterator[Callable[[], Rows]]:
-        """See `Feed`."""
         with self._arm.record() as states:
             yield lambda: self._rows(states)
 
@@ -86,7 +85,6 @@ class RailFeed:
 
     @contextmanager
     def open(self) -> Iterator[Callable[[], Rows]]:
-        """See `Feed`."""
         self._arrived = self._seen = self._rail.motion
         self._told, self._position = 0, self._rail.state().position
         self._looked = self._clock.now()
@@ -121,7 +119,6 @@ class VehicleFeed:
 
     @contextmanager
     def open(self) -> Iterator[Callable[[], Rows]]:
-        """See `Feed`."""
         yield self._rows
 
     def _rows(self) -> Rows:

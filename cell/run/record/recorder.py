@@ -244,13 +244,11 @@ class Recorder(logging.Handler):
         self._json("/sequence/event", at, {"kind": event.kind, "step": event.step or "", "data": data})
 
     def command(self, command: DeviceCommand, refused: str | None) -> None:
-        """See `cell.devices.gate.gate.Listener`."""
         if command.device in COMMANDED:
             told = {"name": command.name, "arguments": dict(command.arguments), "refused": refused or ""}
             self._json(f"/{command.device}/command", self._times.now(), told)
 
     def reading(self, device: str, reading: object) -> None:
-        """See `cell.devices.gate.gate.Listener`."""
         if isinstance(reading, RailPath):
             for stamp, position in reading.samples.tolist():
                 at = self._times.of(stamp)
@@ -291,7 +289,6 @@ class Recorder(logging.Handler):
             self._put(f"/{camera}/image", at, lambda draw: draw.image(at, camera, picture))
 
     def emit(self, record: logging.LogRecord) -> None:
-        """See `logging.Handler.emit`."""
         at = self._times.of_wall(record.created)
         text = record.getMessage()
         self._put("/log", at, lambda draw: draw.log_line(at, record, text))

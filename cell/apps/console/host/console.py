@@ -78,7 +78,8 @@ class Address:
     @property
     def hosts(self) -> tuple[str, ...]:
         """The names in a browser's address line."""
-        own = (_LOOPBACK, "localhost") if self.host == _LOOPBACK else (self.host,)
+        bare = f"[{self.host}]" if ":" in self.host else self.host
+        own = (_LOOPBACK, "localhost") if self.host == _LOOPBACK else (bare,)
         return tuple(name.lower() for name in (*own, *self.names))
 
 

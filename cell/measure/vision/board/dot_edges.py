@@ -177,14 +177,7 @@ def _fit(edge: Array, seen: Array, fit: Array) -> float:
         for k in range(RAYS):
             z[k] = residual[k] / (4.0 * scatter)
             weight[k] = (1.0 - z[k] * z[k]) ** 2 if seen[k] > 0.5 and abs(z[k]) < 1.0 else 0.0
-    used = gap = longest = 0
-    for k in range(2 * RAYS):
-        counts = weight[k % RAYS] > 0.2
-        used += counts and k < RAYS
-        gap = 0 if counts else gap + 1
-        longest = max(longest, gap)
-    # The rays that count must surround the dot: no gap of a third of the circle.
-    if used < RAYS // 2 or longest > RAYS // 3 or not scatter < MOST_SCATTER:
+    if not (_surround(weight) and scatter < MOST_SCATTER):
         return math.nan
     # The variance of an M-estimator: the mean square of what each ray pulls over the square of how stiffly it holds.
     pulled = held = within = 0.0
@@ -195,6 +188,18 @@ def _fit(edge: Array, seen: Array, fit: Array) -> float:
             within += 1.0
     freedom = max(within - TERMS, 1.0) / max(within, 1.0)
     return math.sqrt(2.0 * pulled / max(held, 1.0) ** 2 / freedom)
+
+
+@compiled
+def _surround(weight: Array) -> bool:
+    """Whether half of the rays count, and leave no gap of a third of the circle."""
+    used = gap = longest = 0
+    for k in range(2 * RAYS):
+        counts = weight[k % RAYS] > 0.2
+        used += counts and k < RAYS
+        gap = 0 if counts else gap + 1
+        longest = max(longest, gap)
+    return used >= RAYS // 2 and longest <= RAYS // 3
 
 
 @compiled
