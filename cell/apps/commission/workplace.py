@@ -25,6 +25,7 @@ from cell.devices.simulated.process import cause_fault, make_ready
 from cell.motion.kinematics import HOME, Joints
 from cell.procedures.arm.moves import Mover, moved_once_more
 from cell.run.recorded_work import WorkContext
+from drivers.errors import RefusedError
 from drivers.interfaces import Frame, Image
 from statemachine.step import Observer
 
@@ -95,7 +96,7 @@ class SlowMover(Mover):
         moved_once_more(self._arm, lambda: Mover.to_joints(self, joints, settle))
 
 
-class Declined(Exception):
+class Declined(RefusedError):
     """A person did not want this check to go on."""
 
 

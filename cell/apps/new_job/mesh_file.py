@@ -108,7 +108,7 @@ def _loaded(path: Path) -> tuple[Array, Faces]:
 
 def _joined(vertices: Array, faces: Faces) -> tuple[Array, Faces]:
     """Corners at the same place are one: an STL has three for each triangle, a STEP some for each of its faces."""
-    grain = SAME_PLACE * float(np.ptp(vertices[faces.ravel()], axis=0).max())
+    grain = SAME_PLACE * max(float(np.ptp(vertices[faces.ravel()], axis=0).max()), 1e-9)
     _, first, one = np.unique(np.round(vertices / grain), axis=0, return_index=True, return_inverse=True)
     return vertices[first], one.reshape(-1)[faces]
 

@@ -302,6 +302,7 @@ def test_a_paused_run_stands_until_it_goes_on() -> None:
 
 def test_an_aborted_run_is_resumed_through_the_same_door_and_ends_where_it_was_to_end(typed: Typed) -> None:
     with opened() as cell:
+        cell.pace = 0.5
         run = cell.start("pot.toml", until="board_photo")
         upto(run, StepStarted, "board_photo")
         run.abort("to be resumed")
@@ -310,7 +311,7 @@ def test_an_aborted_run_is_resumed_through_the_same_door_and_ends_where_it_was_t
     code, out, _ = typed("resume", aborted.folder.name, "--json")
     report = json.loads(out)
     assert (code, report["outcome"], report["clock"], report["until"]) == (0, "done", "virtual", "board_photo")
-    assert report["resumed_from"] == aborted.folder.name
+    assert (report["resumed_from"], report["pace"]) == (aborted.folder.name, 0.5)
     with opened() as cell, pytest.raises(ConfigError, match="has ended done"):
         cell.resume(cell.runs_folder / report["run"])
 
