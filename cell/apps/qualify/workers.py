@@ -80,7 +80,8 @@ class Processes:
 
     def begin(self, task: WorldTask) -> None:
         while True:
-            pool = self._free.pop() if self._free else _new_process()
+            spawn = multiprocessing.get_context("spawn")
+            pool = self._free.pop() if self._free else ProcessPoolExecutor(1, spawn, initializer=_begin_process)
             # One that died while it waited is left out.
             with suppress(BrokenProcessPool):
                 self._running[pool.submit(self.work, task)] = task, pool
@@ -111,10 +112,6 @@ class Processes:
             pool.shutdown(wait=True, cancel_futures=True)
         self._running.clear()
         self._free.clear()
-
-
-def _new_process() -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), initializer=_begin_process)
 
 
 def _begin_process() -> None:

@@ -180,7 +180,9 @@ class ConsoleController:
             "pause": lambda client, words: self._running("pause", Run.pause),
             "go_on": lambda client, words: self._running("go on", Run.go_on),
             "queue": lambda client, words: self.queue.want(words["parts"]),
-            "abort": self._abort,
+            "abort": lambda client, words: self._running(
+                "end", lambda run: run.abort(f"{self.holders.name(client)}: {words['reason']}")
+            ),
             "decide": self._decide,
             "calibrate": lambda client, words: self._long(
                 client, "calibration", lambda: cell.calibrate(job=self.named_job(words["job"]))
@@ -371,9 +373,6 @@ class ConsoleController:
             raise InterlockError("cell", f"nothing is going on that could {what}")
         act(run)
         return f"asked the {run.kind} to {'hold before its next motion' if what == 'pause' else what}"
-
-    def _abort(self, client: str, words: Words) -> str:
-        return self._running("end", lambda run: run.abort(f"{self.holders.name(client)}: {words['reason']}"))
 
     def _decide(self, client: str, words: Words) -> str:
         if (run := self.cell.current) is None:

@@ -209,10 +209,8 @@ class Archive:
 
 def _written(folder: Path) -> int:
     """When a run's report was last written, ns, 0 for never: at first it lacks what takes long to reckon."""
-    try:
-        return (folder / "report.json").stat().st_mtime_ns
-    except OSError:
-        return 0
+    report = folder / "report.json"
+    return report.stat().st_mtime_ns if report.exists() else 0
 
 
 def true_error_mm(report: Mapping[str, Any]) -> float | None:
