@@ -5,7 +5,6 @@ import os
 import signal
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +13,9 @@ import pytest
 from cell.apps.cli.commands.console import shown
 from cell.apps.console.host.console import Address, Console
 from cell.apps.console.host.link import ServerProcess
-from cell.run.recorded_work import WorkContext
+from cell.run.runs import Run
 from cell.run.session.supervisor import Cell
-from drivers.errors import Aborted, ConfigError
+from drivers.errors import ConfigError
 from statemachine.step import Failure, Outcome
 from tests.support import until
 from tests.support.console.server import Browser
@@ -95,24 +94,21 @@ def test_a_question_about_a_job_that_a_command_began_ends_with_it(cell: Cell, co
 
 def test_ctrl_c_stops_the_cell_before_its_server_is_waited_for(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
     """A server that hangs is what makes somebody turn to Ctrl-C."""
-    open_yet: list[bool] = []
+    ended: list[str | None] = []
     close = ServerProcess.close
 
     def closing(server: ServerProcess) -> None:
-        open_yet.append(cell.devices.gate.is_open)
+        ended.append(run.control.token.reason)
         close(server)
 
-    def waits(context: WorkContext) -> None:
-        while True:
-            context.check()
+    def waits(run: Run[None]) -> None:
+        while run.control.token.reason is None:
             time.sleep(0.01)
 
     monkeypatch.setattr(ServerProcess, "close", closing)
-    with ThreadPoolExecutor() as beside:
-        work = beside.submit(cell.perform, "commission", waits)
-        assert until(lambda: cell.current is not None)
-        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
-        assert shown(cell, "pot", Address(), open_page=False) == 130
-        assert isinstance(work.exception(5.0), Aborted)
-    assert open_yet == [False]
+    run = cell.begin("check", waits, None, cell.stops)
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    assert shown(cell, "pot", Address(), open_page=False) == 130
+    run.abort()
+    assert ended == ["stopped with Cell.stop()"]
     cell.clear_stop("the test")
