@@ -189,8 +189,9 @@ class TargetDrive:
     def _go(self, goal: Planar) -> None:
         self._sent = goal
         self.hold()
-        self._way.require_line(goal)
-        speed = speed_onto(self.job, goal.inverse() * self.whereabouts.pose()) * self.pace.share
+        share = self.pace.share
+        self._way.require_line(goal, share)
+        speed = speed_onto(self.job, goal.inverse() * self.whereabouts.pose()) * share
         drive_line(self.vehicle, self.whereabouts, goal, speed=speed, clock=self.clock, check=self.check)
 
     def _photograph(self) -> BoardFix:
