@@ -152,7 +152,7 @@ def _own_place(heights: Array, slopes: Array, sigmas: Array, by_calibration: Arr
 
 
 REACH_M = 6e-3
-"""What stands higher is felt on the way down."""
+"""What is farther from a part as drawn, or from the surface below it, tells nothing of the gap between them."""
 SQUARE_M, LEAST_POINTS, LEAST_LINES = 2e-3, 8, 2
 """Squares over which heights are taken together, and what one needs to count: a single line may be a reflection."""
 ROWS = 100_000
@@ -183,14 +183,15 @@ def highest_standing(
     """
     lines, rows = np.nonzero(cloud.valid)
     local = (cloud.points[lines, rows] - pose.translation) @ pose.rotation
-    index, feet = nominal.feet(local, REACH_M)
-    below = (feet.points - surface_from_part.translation) @ surface_from_part.rotation
+    # However high: the part comes down onto it from above all of it.
+    index, feet = nominal.feet(local)
+    places = local[index]
+    below = (places - surface_from_part.translation) @ surface_from_part.rotation
     up = feet.normals @ surface_from_part.rotation[:, 2]
     kept = feet.inner & (up > STEEPEST) & (np.abs(below[:, :2]) <= 0.5 * np.asarray(size)[:2]).all(axis=1)
     if not kept.any():
         return None
-    line, lift, below = lines[index[kept]], (feet.heights / up)[kept], below[kept]
-    places = local[index[kept]]
+    line, lift, below, places = lines[index[kept]], (feet.heights / up)[kept], below[kept], places[kept]
     found = None
     # Squares that overlap by half: in some of them a small thing is in the middle.
     for shift in np.ndindex(2, 2):

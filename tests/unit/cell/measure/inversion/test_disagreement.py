@@ -159,6 +159,17 @@ def test_a_chip_of_three_millimetres_is_seen_as_high_as_it_is(
     assert number.value > number.most == pytest.approx(0.3)
 
 
+def test_what_stands_higher_than_the_part_is_seen_too() -> None:
+    job, cloud = pot()[0], scan(PARTS["pot"], np.random.default_rng(3))
+    local = (cloud.points - TRUE.translation) @ TRUE.rotation
+    on_bolt = np.abs(local[..., :2] - 0.004).max(axis=-1) < 0.005
+    cloud.points[on_bolt] += 0.02 * TRUE.rotation[:, 2]
+    found = highest_standing(cloud, nominal("pot"), TRUE, from_parts((0.0, 0.0, 0.0)), job.grasp.size)
+    assert found is not None and found.height == pytest.approx(0.02, abs=2e-3)
+    with pytest.raises(RefusedError, match="something stands"):
+        require_bare(found, job.place.tolerance)
+
+
 def test_what_lies_beside_the_part_or_below_the_surface_does_not_lift_it(placed_pot: JobRecord) -> None:
     beside = standing(placed_pot, with_chip(placed_pot, 1e-3), aside=-0.03)
     hollow = standing(placed_pot, with_chip(placed_pot, -1e-3))
