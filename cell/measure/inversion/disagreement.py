@@ -152,7 +152,7 @@ def _own_place(heights: Array, slopes: Array, sigmas: Array, by_calibration: Arr
 
 
 REACH_M = 6e-3
-"""What is farther from a part as drawn, or from the surface below it, tells nothing of the gap between them."""
+"""Farther from what is drawn, part or surface, a point belongs to something else."""
 SQUARE_M, LEAST_POINTS, LEAST_LINES = 2e-3, 8, 2
 """Squares over which heights are taken together, and what one needs to count: a single line may be a reflection."""
 ROWS = 100_000
@@ -192,26 +192,13 @@ def highest_standing(
     if not kept.any():
         return None
     line, lift, below, places = lines[index[kept]], (feet.heights / up)[kept], below[kept], places[kept]
-    found = None
     # Squares that overlap by half: in some of them a small thing is in the middle.
-    for shift in np.ndindex(2, 2):
-        if (highest := _highest(square_of(below, shift), lift, line)) is not None and (
-            found is None or highest[1] > found.height
-        ):
-            found = Standing(highest[1], places[highest[0]])
-    return found
-
-
-def _highest(square: Indices, lift: Array, line: Indices) -> tuple[int, float] | None:
-    """Of the squares (n,) with points enough the highest: the point of its median, and its height less noise.
-
-    None where no square has enough.
-    """
-    medians, middle, noise = squares(square, lift, line)
+    each = [squares(square_of(below, shift), lift, line) for shift in np.ndindex(2, 2)]
+    medians, middle, noise = (np.concatenate(of_all) for of_all in zip(*each, strict=True))
     if not len(medians):
         return None
     best = int(np.argmax(middle - noise))
-    return int(medians[best]), float(middle[best] - noise[best])
+    return Standing(float(middle[best] - noise[best]), places[medians[best]])
 
 
 def square_of(places: Array, shift: tuple[int, ...] = (0, 0)) -> Indices:
@@ -255,9 +242,15 @@ def _medians(owner: Indices, values: Array, count: Indices) -> tuple[Indices, Ar
 
 
 def require_bare(found: Standing | None, tolerance: float) -> None:
-    """Raise `RefusedError` for a place, of this `tolerance` in m, on which something stands that lifts the part."""
+    """Raise `RefusedError` for a place, of this `tolerance` in m, on which something stands that lifts the part, or of
+    which nothing was seen."""
     allowed = ALLOWED * tolerance
-    if found is None or found.height <= allowed:
+    if found is None:
+        raise RefusedError(
+            "the scan shows nothing of the surface below the part: whether something stands there is not known. See "
+            "that place.surface_from_part and grasp.size are right, or widen scan.swath or scan.length, and sweep again"
+        )
+    if found.height <= allowed:
         return
     x, y, z = 1e3 * found.at
     raise RefusedError(

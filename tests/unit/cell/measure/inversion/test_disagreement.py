@@ -159,7 +159,7 @@ def test_a_chip_of_three_millimetres_is_seen_as_high_as_it_is(
     assert number.value > number.most == pytest.approx(0.3)
 
 
-def test_what_stands_higher_than_the_part_is_seen_too() -> None:
+def test_what_stands_higher_than_the_part_is_seen_too_and_a_place_that_was_not_seen_is_not_bare() -> None:
     job, cloud = pot()[0], scan(PARTS["pot"], np.random.default_rng(3))
     local = (cloud.points - TRUE.translation) @ TRUE.rotation
     on_bolt = np.abs(local[..., :2] - 0.004).max(axis=-1) < 0.005
@@ -168,6 +168,9 @@ def test_what_stands_higher_than_the_part_is_seen_too() -> None:
     assert found is not None and found.height == pytest.approx(0.02, abs=2e-3)
     with pytest.raises(RefusedError, match="something stands"):
         require_bare(found, job.place.tolerance)
+    aside = highest_standing(cloud, nominal("pot"), TRUE, from_parts((0.2, 0.0, 0.0)), job.grasp.size)
+    with pytest.raises(RefusedError, match=r"nothing of the surface below the part.*scan\.swath"):
+        require_bare(aside, job.place.tolerance)
 
 
 def test_what_lies_beside_the_part_or_below_the_surface_does_not_lift_it(placed_pot: JobRecord) -> None:
